@@ -1,0 +1,57 @@
+# make render [SCENE=3] [ARGS="aa=2"]   render a scene to out/sceneN.png and .exr
+# make test   [ARGS="-k llvm"]          run the tests
+# make setup                            the environment alone: .venv with the commands mrt and mrt-validate
+# make lint, make types, make package   style, types, wheel and sdist
+PYTHON ?= python3
+VENV   ?= .venv
+SCENE  ?= 3
+ARGS   ?=
+OUT    ?= out
+
+BIN  := $(VENV)/bin
+# One stamp per set of extras: installing one leaves the others as they are.
+STAMP := $(VENV)/.mrt
+
+.PHONY: setup render test lint types package clean
+setup: $(STAMP)-base
+
+render: $(STAMP)-base
+	@mkdir -p $(OUT)
+	$(BIN)/mrt $(OUT)/scene$(SCENE) $(SCENE) $(ARGS)
+
+test: $(STAMP)-test
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(STAMP)-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+# Types are checked on an installed copy: mypy does not follow the mapping of folders to one import name.
+types: $(STAMP)-dev
+	rm -rf build/types
+	$(BIN)/pip install --quiet --no-deps --target build/types .
+	cd build/types && $(abspath $(BIN))/mypy --config-file $(CURDIR)/pyproject.toml -p mrt_mitsuba
+
+package: $(STAMP)-dev
+	$(BIN)/python -m build
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+		{ echo "mrt-mitsuba needs Python 3.10 or newer: make PYTHON=python3.11 ..."; exit 1; }
+	$(PYTHON) -m venv $(VENV) || \
+		{ echo "no venv module: on Debian and Ubuntu, apt install python3-venv"; rm -rf $(VENV); exit 1; }
+
+$(STAMP)-base: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+$(STAMP)-test: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable '.[test,validation]'
+	@touch $@ $(STAMP)-base
+
+$(STAMP)-dev: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@touch $@ $(STAMP)-base

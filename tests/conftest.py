@@ -1,0 +1,3 @@
+"""Fixtures shared by all tiers of tests."""
+
+from __future__ import annotations

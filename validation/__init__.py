@@ -1,0 +1,1 @@
+"""Checks of the renderer against independent references."""
