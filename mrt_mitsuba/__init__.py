@@ -1,13 +1,92 @@
-"""A Whitted-style ray tracer with a Beckmann material, built from Mitsuba 3 plugins in Dr.Jit."""
+"""A Whitted-style ray tracer with a Beckmann material, built from Mitsuba 3 plugins in Dr.Jit.
+
+Importing the package sets the LLVM library for Dr.Jit (see ``mrt_mitsuba.llvm``) and nothing else: Mitsuba is
+imported with the first name that needs it. Import it before ``mitsuba`` and ``drjit``.
+"""
 
 from __future__ import annotations
 
 import os as _os
+import sys as _sys
 
 __version__ = "0.1.0"
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from mrt_mitsuba import filters as filters
+    from mrt_mitsuba.errors import MrtError as MrtError
+    from mrt_mitsuba.errors import MrtWarning as MrtWarning
+    from mrt_mitsuba.errors import OutputError as OutputError
+    from mrt_mitsuba.errors import SceneError as SceneError
+    from mrt_mitsuba.errors import UsageError as UsageError
+    from mrt_mitsuba.errors import VariantError as VariantError
+    from mrt_mitsuba.render import Result as Result
+    from mrt_mitsuba.render import render as render
+    from mrt_mitsuba.runtime import register as register
+    from mrt_mitsuba.scenes import scene_dict as scene_dict
+    from mrt_mitsuba.validation.roughconductor import compare_roughconductor as compare_roughconductor
+
+# Where each public name lives; the module is imported when the name is first used.
+_HOME = {
+    "MrtError": "mrt_mitsuba.errors",
+    "MrtWarning": "mrt_mitsuba.errors",
+    "OutputError": "mrt_mitsuba.errors",
+    "Result": "mrt_mitsuba.render",
+    "SceneError": "mrt_mitsuba.errors",
+    "UsageError": "mrt_mitsuba.errors",
+    "VariantError": "mrt_mitsuba.errors",
+    "compare_roughconductor": "mrt_mitsuba.validation.roughconductor",
+    "register": "mrt_mitsuba.runtime",
+    "render": "mrt_mitsuba.render",
+    "scene_dict": "mrt_mitsuba.scenes",
+}
+_SUBMODULES = ("filters",)
+
+__all__ = [
+    "__version__",
+    *_HOME,  # type: ignore[misc]
+    *_SUBMODULES,
+]
+
+
+class _Package(type(_sys)):  # type: ignore[misc]
+    """The module of this package: functions keep their names where their module has the same one.
+
+    Importing ``mrt_mitsuba.render`` would otherwise put the module in the place of the function
+    ``mrt.render``.
+    """
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in _HOME and isinstance(value, type(_sys))):
+            super().__setattr__(name, value)
+
+
+_sys.modules[__name__].__class__ = _Package
+
+
+def __getattr__(name: str) -> object:
+    from importlib import import_module
+
+    if name in _HOME:
+        value = getattr(import_module(_HOME[name]), name)
+    elif name in _SUBMODULES:
+        value = import_module(f"{__name__}.{name}")
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
 
 if not _os.path.isdir(_os.path.join(_os.path.dirname(__file__), "plugins")):
     # A source checkout: plugins and the like are folders beside this one.
     from mrt_mitsuba import _checkout
 
     _checkout.install()
+
+from mrt_mitsuba import llvm as _llvm  # noqa: E402 - after the finder, and the last thing: it may warn
+
+_llvm.prepare()

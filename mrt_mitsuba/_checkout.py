@@ -1,24 +1,26 @@
 """Makes the sub-packages that are top-level folders of a source checkout importable from there.
 
-An installed copy holds them inside the package and never loads this module. Without it, Python started in a checkout
-would find this package in the current folder, but not its sub-packages.
+An installed copy holds them inside the package and never loads this module. Without it, Python started in a
+checkout would find this package in the current folder, but not its sub-packages.
 """
 
 from __future__ import annotations
 
-import importlib.util
+import os
 import sys
-from collections.abc import Sequence
-from importlib.machinery import ModuleSpec
-from pathlib import Path
-from types import ModuleType
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from importlib.machinery import ModuleSpec
+    from types import ModuleType
 
 FOLDERS = ("plugins", "scenes_xml", "validation")
-_ROOT = Path(__file__).resolve().parent.parent
+_ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 
 class CheckoutFinder:
-    """Finds ``mrt_mitsuba.<folder>`` beside the package; asked last, after the finders of an installed copy."""
+    """Finds ``mrt_mitsuba.<folder>`` beside the package; asked last, after an installed copy."""
 
     @staticmethod
     def find_spec(
@@ -28,11 +30,11 @@ class CheckoutFinder:
         package, _, folder = name.rpartition(".")
         if package != __package__ or folder not in FOLDERS:
             return None
-        location = _ROOT / folder
-        init = location / "__init__.py"
-        if not init.is_file():
-            return None
-        return importlib.util.spec_from_file_location(name, init, submodule_search_locations=[str(location)])
+        from importlib.util import spec_from_file_location
+
+        location = os.path.join(_ROOT, folder)
+        init = os.path.join(location, "__init__.py")
+        return spec_from_file_location(name, init, submodule_search_locations=[location])
 
 
 def install() -> None:

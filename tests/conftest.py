@@ -1,3 +1,37 @@
 """Fixtures shared by all tiers of tests."""
 
 from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import mrt_mitsuba  # noqa: F401 - before anything imports mitsuba or drjit: it chooses the LLVM library
+
+
+@pytest.fixture
+def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run Python code in a process and a folder of its own: ``run_python(code, *arguments, VARIABLE=value)``.
+
+    A variable set to None is taken out of the environment. ``DRJIT_LIBLLVM_PATH`` is out unless given.
+    """
+
+    def run(code: str, *arguments: str, **variables: str | None) -> subprocess.CompletedProcess[str]:
+        variables = {"DRJIT_LIBLLVM_PATH": None, **variables}
+        environ = {key: value for key, value in os.environ.items() if key not in variables}
+        environ |= {key: value for key, value in variables.items() if value is not None}
+        return subprocess.run(
+            [sys.executable, "-c", code, *arguments],
+            cwd=tmp_path,
+            env=environ,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+
+    return run

@@ -1,0 +1,285 @@
+"""Chooses the LLVM library that Dr.Jit compiles its kernels with.
+
+The rule: the library that ``DRJIT_LIBLLVM_PATH`` names, else the one from the package karellen-llvm-core,
+else the newest of the system, each only from LLVM 17 on: with an older one Dr.Jit aborts the whole process at
+the first kernel with a minimum, maximum or clip in it. If there is none, the variable is set to a path that
+does not exist, so that Dr.Jit reports a missing library and never picks up an old one by itself.
+
+Dr.Jit loads the library when it is first imported, so the choice is made by ``import mrt_mitsuba``. It takes
+well under a millisecond and loads nothing: versions are read from file names. Hence also the sparing use of
+imports here.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+VARIABLE = "DRJIT_LIBLLVM_PATH"
+OLDEST = 17
+WHEEL = "karellen-llvm-core"
+BLOCKED = "/LLVM-17-or-newer-is-needed/try-pip-install-karellen-llvm-core"
+HELP = (
+    f"Get one with 'pip install {WHEEL}' (Linux x86-64), with 'apt install libllvm19' or the like, "
+    f"or set {VARIABLE} to a libLLVM of version {OLDEST} or newer."
+)
+
+Version = tuple[int, ...]
+
+
+class Choice:
+    """What was chosen, and why.
+
+    ``path``: the library, or None. ``version``: its version, or None where nobody knows before it is loaded.
+    ``source``: "user", "wheel", "system", "none", or "drjit" where Dr.Jit is left to search by itself (macOS
+    and Windows). ``rejected``: one line for each library that was passed over.
+    """
+
+    __slots__ = ("path", "rejected", "source", "version")
+
+    def __init__(
+        self, path: str | None, version: Version | None, source: str, rejected: Sequence[str] = ()
+    ) -> None:
+        self.path = path
+        self.version = version
+        self.source = source
+        self.rejected = tuple(rejected)
+
+    def __repr__(self) -> str:
+        return f"Choice({self.path!r}, {self.version!r}, {self.source!r}, rejected={self.rejected!r})"
+
+    @property
+    def usable(self) -> bool:
+        """Whether LLVM variants can be expected to work."""
+        return self.source != "none"
+
+    def describe(self) -> str:
+        """Return one sentence for people."""
+        if self.source == "none":
+            return f"no LLVM {OLDEST} or newer was found. {HELP}"
+        if self.source == "drjit":
+            return "left to Dr.Jit's own search"
+        origin = {
+            "user": f"named by {VARIABLE}",
+            "wheel": f"from the package {WHEEL}",
+            "system": "the newest of the system",
+        }
+        return f"LLVM {version_text(self.version)}, {origin[self.source]}: {self.path}"
+
+
+def version_text(version: Version | None) -> str:
+    """Return a version as text, e.g. "19.1"."""
+    if not version:
+        return "of unknown version"
+    return ".".join(map(str, version)) if version[0] else "older than 16"
+
+
+def choose(
+    environ: Mapping[str, str] = os.environ,
+    search_path: Iterable[str] | None = None,
+    system: Iterable[str] | None = None,
+) -> Choice:
+    """Choose a library by the rule above; changes nothing.
+
+    ``search_path``: folders that may hold installed packages (default ``sys.path``). ``system``: folders to
+    search for a system library (default: the usual ones of a Linux system).
+    """
+    rejected: list[str] = []
+    named = environ.get(VARIABLE, "")
+    wheel = wheel_library(sys.path if search_path is None else search_path)
+    if named and named not in (BLOCKED, wheel):
+        version = version_of(named)
+        if version and version[0] >= OLDEST:
+            return Choice(named, version, "user")
+        problem = f"is LLVM {version_text(version)}" if version else "cannot be loaded"
+        rejected.append(f"{VARIABLE}={named} {problem}")
+    if not sys.platform.startswith("linux"):
+        return Choice(None, None, "drjit", rejected)
+    if wheel:
+        version = version_of(wheel)
+        if version and version[0] >= OLDEST:
+            return Choice(wheel, version, "wheel", rejected)
+        rejected.append(f"{wheel} of {WHEEL} is LLVM {version_text(version)}")
+    candidates = sorted(system_libraries(system_folders(environ) if system is None else system), reverse=True)
+    rejected += [
+        f"{path} is LLVM {version_text(version)}" for version, path in candidates if version[0] < OLDEST
+    ]
+    if candidates and candidates[0][0][0] >= OLDEST:
+        return Choice(candidates[0][1], candidates[0][0], "system", rejected)
+    return Choice(None, None, "none", rejected)
+
+
+def wheel_library(search_path: Iterable[str]) -> str | None:
+    """Return the library that the package karellen-llvm-core installed, or None.
+
+    Its path is taken from the list of files (RECORD) in the package's metadata. ``importlib.metadata`` gives
+    the same, but importing it takes 30 ms.
+    """
+    prefix = WHEEL.replace("-", "_") + "-"
+    for folder in search_path:
+        for name in _list(folder):
+            if name.startswith(prefix) and name.endswith(".dist-info"):
+                library = _library_in_record(folder, os.path.join(folder, name, "RECORD"))
+                if library:
+                    return library
+    return None
+
+
+def _library_in_record(folder: str, record: str) -> str | None:
+    try:
+        with open(record, encoding="utf-8") as lines:
+            files = [line.split(",", 1)[0] for line in lines if "/libLLVM.so." in line]
+    except (OSError, UnicodeDecodeError):
+        return None
+    for file in files:
+        path = os.path.normpath(os.path.join(folder, file))
+        if os.path.isfile(path):
+            return path
+    return None
+
+
+def system_folders(environ: Mapping[str, str] = os.environ) -> list[str]:
+    """Return the folders in which a Linux system keeps libLLVM."""
+    folders = [folder for folder in environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
+    folders.append(os.path.join(sys.prefix, "lib"))  # conda
+    machine = os.uname().machine
+    folders += ["/usr/local/lib", f"/usr/lib/{machine}-linux-gnu", "/usr/lib64", "/usr/lib"]
+    folders += [f"/usr/lib/{name}/lib" for name in _list("/usr/lib") if name.startswith("llvm")]
+    return folders
+
+
+def system_libraries(folders: Iterable[str]) -> Iterator[tuple[Version, str]]:
+    """Yield version and path of every libLLVM in ``folders``, each file once."""
+    seen = set()
+    for folder in folders:
+        for name in _list(folder):
+            if not (name.startswith("libLLVM") and ".so" in name):
+                continue
+            path = os.path.realpath(os.path.join(folder, name))
+            version = version_in_name(path)
+            if version and path not in seen and os.path.isfile(path):
+                seen.add(path)
+                yield version, path
+
+
+def _list(folder: str) -> list[str]:
+    try:
+        return sorted(os.listdir(folder or "."))
+    except OSError:
+        return []
+
+
+def version_in_name(path: str) -> Version | None:
+    """Return the version in a file name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1, or None."""
+    name = os.path.basename(path)
+    if not name.startswith("libLLVM"):
+        return None
+    before, _, after = name[len("libLLVM") :].partition(".so")
+    numbers = (before.lstrip("-") or after.lstrip(".")).split(".")
+    if not all(number.isdecimal() for number in numbers):
+        return None
+    return tuple(int(number) for number in numbers)
+
+
+def version_of(library: str) -> Version | None:
+    """Return the version of a library, given by path or by a name for the dynamic linker; None: unusable.
+
+    Where neither the name nor the target of a symbolic link tells it, the library is asked, in a process of
+    its own.
+    """
+    path = library
+    if os.path.dirname(library):
+        path = os.path.realpath(library)
+        if not os.path.isfile(path):
+            return None
+        version = version_in_name(path)
+        if version:
+            return version
+    return _ask(library)
+
+
+_ASK = """
+import ctypes, sys
+numbers = [ctypes.c_uint(0) for _ in range(3)]
+library = ctypes.CDLL(sys.argv[1])
+library.LLVMContextCreate
+if hasattr(library, "LLVMGetVersion"):
+    library.LLVMGetVersion(*map(ctypes.byref, numbers))
+print(*(number.value for number in numbers))
+"""
+
+
+def _ask(library: str) -> Version | None:
+    """Load a library in a child process and ask for its version; (0, 0, 0) if it is older than LLVM 16."""
+    import subprocess
+
+    try:
+        answer = subprocess.run(
+            [sys.executable, "-I", "-c", _ASK, library],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=True,
+        )
+        return tuple(int(number) for number in answer.stdout.split())
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return None
+
+
+_prepared: Choice | None = None
+
+
+def prepare() -> Choice:
+    """Choose once per process and tell Dr.Jit through the environment; return the choice.
+
+    Warns where the user's own setting is not followed, and where Dr.Jit was imported too early to be told.
+    """
+    global _prepared
+    if _prepared is None:
+        _prepared = choose()
+        _set(_prepared)
+        if "drjit" not in sys.modules and _prepared.rejected and _prepared.rejected[0].startswith(VARIABLE):
+            _warn(
+                f"{_prepared.rejected[0]}, which Dr.Jit cannot use; it needs {OLDEST} or newer. "
+                f"Instead: {_prepared.describe()}"
+            )
+        problem = too_early()
+        if problem:
+            _warn(problem)
+    return _prepared
+
+
+def _set(choice: Choice) -> None:
+    if choice.path:
+        os.environ[VARIABLE] = choice.path
+    elif choice.source == "none":
+        os.environ[VARIABLE] = BLOCKED
+    elif choice.rejected:
+        os.environ.pop(VARIABLE, None)
+
+
+def too_early() -> str | None:
+    """Return what is wrong if Dr.Jit was imported before the choice was made and has no good LLVM."""
+    drjit = sys.modules.get("drjit")
+    if drjit is None or _prepared is None or _prepared.source in ("none", "drjit"):
+        return None
+    loaded = drjit.detail.llvm_version()[0]
+    if loaded >= OLDEST:
+        return None
+    found = f"loaded LLVM {loaded}, with which it would abort" if loaded > 0 else "found no LLVM"
+    return (
+        f"Dr.Jit was imported before mrt_mitsuba and {found}. Import mrt_mitsuba before mitsuba and drjit, "
+        f"or set {VARIABLE}={_prepared.path}"
+    )
+
+
+def _warn(text: str) -> None:
+    import warnings
+
+    from mrt_mitsuba.errors import MrtWarning
+
+    warnings.warn(text, MrtWarning, stacklevel=4)

@@ -1,0 +1,115 @@
+"""Start-up of Mitsuba: which variant, which LLVM, and the plugins registered in it."""
+
+from __future__ import annotations
+
+import difflib
+import warnings
+
+from mrt_mitsuba import llvm
+from mrt_mitsuba.errors import MrtWarning, UnknownVariantError, VariantError
+
+FAST = "llvm_ad_rgb"
+SLOW = "scalar_rgb"
+
+_warned: set[str] = set()
+
+
+def use(variant: str | None = None) -> str:
+    """Make a Mitsuba variant current, with the plugins registered in it, and return its name.
+
+    Without a name, the variant that is already set stays; if there is none, it is ``llvm_ad_rgb``, or
+    ``scalar_rgb`` with one warning where LLVM cannot be used.
+
+    Raises ``UnknownVariantError`` for a name that this Mitsuba does not know, and ``VariantError`` for one
+    that cannot run here.
+    """
+    llvm.prepare()
+    import mitsuba as mi
+
+    if variant is None:
+        variant = mi.variant() or default_variant()
+    elif variant not in mi.variants():
+        raise UnknownVariantError(_unknown(variant, mi.variants()))
+    problem = obstacle(variant)
+    if problem:
+        raise VariantError(f"the variant {variant} cannot be used: {problem}")
+    if mi.variant() != variant:
+        try:
+            mi.set_variant(variant)
+        except ImportError as error:
+            raise VariantError(f"the variant {variant} cannot be used: {error}") from error
+    _register_plugins()
+    return variant
+
+
+def register() -> None:
+    """Register the plugins with Mitsuba, so that ``mi.load_dict`` and ``mi.load_file`` know them.
+
+    They follow every later switch of the variant. Where no variant is set yet, the default one is.
+    """
+    use()
+
+
+def default_variant() -> str:
+    """Return ``llvm_ad_rgb`` if LLVM works here, else ``scalar_rgb`` with one warning per process."""
+    problem = obstacle(FAST)
+    if problem is None:
+        return FAST
+    if problem not in _warned:
+        _warned.add(problem)
+        warnings.warn(f"rendering in the slow variant {SLOW}: {problem}", MrtWarning, stacklevel=4)
+    return SLOW
+
+
+def obstacle(variant: str) -> str | None:
+    """Return why a known variant cannot run here, with the fix, or None if nothing speaks against it."""
+    if variant.startswith("llvm"):
+        return _llvm_obstacle()
+    if variant.startswith("cuda"):
+        return _cuda_obstacle()
+    return None
+
+
+def usable_variants() -> list[str]:
+    """Return the variants of this Mitsuba that can run here."""
+    llvm.prepare()
+    import mitsuba as mi
+
+    return [variant for variant in mi.variants() if obstacle(variant) is None]
+
+
+def _llvm_obstacle() -> str | None:
+    choice = llvm.prepare()
+    import drjit as dr
+
+    early = llvm.too_early()
+    if early:
+        return early
+    if not choice.usable:
+        return choice.describe()
+    loaded = dr.detail.llvm_version()
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        return f"Dr.Jit could not load {choice.path or 'any LLVM'}. {llvm.HELP}"
+    if loaded[0] < llvm.OLDEST:
+        return f"Dr.Jit loaded LLVM {llvm.version_text(loaded)}, with which it would abort. {llvm.HELP}"
+    return None
+
+
+def _cuda_obstacle() -> str | None:
+    import drjit as dr
+
+    if dr.has_backend(dr.JitBackend.CUDA):
+        return None
+    return f"it needs an NVIDIA GPU with its driver, and none was found. Use {FAST} or {SLOW}."
+
+
+def _unknown(variant: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(variant, known, n=1)
+    hint = f" Did you mean {close[0]}?" if close else ""
+    return f"unknown variant {variant!r}.{hint} This Mitsuba has {', '.join(known)}."
+
+
+def _register_plugins() -> None:
+    from mrt_mitsuba import plugins
+
+    plugins.register()

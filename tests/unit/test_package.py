@@ -1,0 +1,89 @@
+"""The package as installed: its folders, its lazy names, what an import costs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+import mrt_mitsuba
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    tomllib = pytest.importorskip("tomli")
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_every_package_is_listed() -> None:
+    """pyproject.toml lists them by hand; a folder that it lacks would be missing from the wheel."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    places = settings["package-dir"]
+    found = set()
+    for package, folder in places.items():
+        for init in (ROOT / folder).rglob("__init__.py"):
+            found.add(".".join([package, *init.parent.relative_to(ROOT / folder).parts]))
+    assert found == set(settings["packages"])
+
+
+def test_modules_come_from_one_place() -> None:
+    import mrt_mitsuba.plugins
+    import mrt_mitsuba.validation
+
+    assert Path(mrt_mitsuba.plugins.__file__).parent.name == "plugins"
+    assert not {"plugins", "validation", "scenes_xml", "filters"} & set(sys.modules)
+
+
+@pytest.mark.parametrize("name", ["errors", "llvm", "plugins", "validation", "scenes_xml", "filters"])
+def test_submodule_imports_from_any_folder(run_python, name: str) -> None:
+    done = run_python(f"import mrt_mitsuba.{name} as module; print(module.__name__)")
+    assert done.stdout == f"mrt_mitsuba.{name}\n", done.stderr
+
+
+def test_import_loads_nothing_heavy(run_python) -> None:
+    """Importing the package starts neither Mitsuba nor anything that takes as long."""
+    heavy = "drjit mitsuba numpy OpenEXR PIL tqdm matplotlib scipy importlib.metadata dataclasses"
+    code = f"""
+import sys
+before = set(sys.modules)
+import mrt_mitsuba
+print([name for name in {heavy.split()} if name in set(sys.modules) - before])
+"""
+    assert run_python(code).stdout == "[]\n"
+
+
+def test_function_is_not_hidden_by_its_module(run_python) -> None:
+    """``mrt.render`` stays the function when its module is imported by name, before or after."""
+    code = """
+import sys, types
+fake = types.ModuleType("mrt_mitsuba.render")
+fake.render = lambda: "called"
+class Finder:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        if name == "mrt_mitsuba.render":
+            from importlib.machinery import ModuleSpec
+            return ModuleSpec(name, Finder)
+    @staticmethod
+    def create_module(spec):
+        return fake
+    @staticmethod
+    def exec_module(module):
+        pass
+sys.meta_path.insert(0, Finder)
+import mrt_mitsuba.render
+import mrt_mitsuba as mrt
+print(mrt.render())
+from mrt_mitsuba.render import render
+print(mrt.render(), render())
+"""
+    done = run_python(code)
+    assert done.stdout.split() == ["called"] * 3, done.stderr
+
+
+def test_unknown_name() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'no_such_name'"):
+        _ = mrt_mitsuba.no_such_name
+    assert {"render", "scene_dict", "filters", "__version__"} <= set(dir(mrt_mitsuba))
