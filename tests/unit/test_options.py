@@ -1,0 +1,233 @@
+"""The table of options: what is taken, what is refused and how the refusal reads."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mrt_mitsuba import options
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.options import Options, parse
+
+
+def test_defaults_of_the_report() -> None:
+    parsed = parse(["out"])
+    assert (parsed.filename, parsed.scene_number, parsed.width, parsed.height) == ("out", 0, 800, 600)
+    assert (parsed.aa, parsed.aamode, parsed.focaldist, parsed.focalrange) == (4, "sobel", None, None)
+    assert (parsed.fresnel, parsed.tonemap, parsed.lattice, parsed.dof) == (
+        "schlick",
+        "report",
+        "report",
+        "report",
+    )
+    assert parsed.outputs() == ("out.png", "out.exr")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "values"),
+    [
+        (["o", "3"], {"scene_number": 3}),
+        (["o", "9", "width=1", "height=65536"], {"scene_number": 9, "width": 1, "height": 65536}),
+        (["o", "aa=2", "aamode=luma"], {"aa": 2, "aamode": "luma", "scene_number": 0}),
+        (["o", "1", "focaldist=2", "focalrange=.5"], {"focaldist": 2.0, "focalrange": 0.5}),
+        (["o", "focaldist=0"], {"focaldist": 0.0}),
+        (
+            ["o", "fresnel=dielectric", "variant=scalar_rgb"],
+            {"fresnel": "dielectric", "variant": "scalar_rgb"},
+        ),
+        (["o", "layers=depth,normal"], {"layers": ("depth", "normal")}),
+        (["o", "layers=all"], {"layers": tuple(options.LAYERS)}),
+        (["o", "motion=0.1,-2,3e-1", "motionsamples=4"], {"motion": (0.1, -2.0, 0.3), "motionsamples": 4}),
+        (["o", "memory=4G"], {"memory": 4 * 2**30}),
+        (["o", "memory=1.5gib"], {"memory": 3 * 2**29}),
+        (["o", "memory=512MB"], {"memory": 2**29}),
+        (["o", "memory=100000000"], {"memory": 10**8}),
+        (["o", "scene=a=b.xml"], {"scene": "a=b.xml", "scene_number": 0}),
+        (["o", "quiet=1", "plan=show"], {"quiet": True, "plan": "show"}),
+        (["o", "quiet=no"], {"quiet": False}),
+        (["dir.v1/o.v2"], {"filename": "dir.v1/o.v2"}),
+        (["a=b"], {"filename": "a=b"}),
+    ],
+)
+def test_accepted(arguments: list[str], values: dict[str, object]) -> None:
+    parsed = parse(arguments)
+    assert {name: getattr(parsed, name) for name in values} == values
+    others = {"filename", "scene_number", *values}
+    for field in dataclasses.fields(Options):
+        if field.name not in others:
+            assert getattr(parsed, field.name) == field.default
+
+
+@pytest.mark.parametrize(("form", "files"), [("png", ("o.v1.png",)), ("exr", ("o.v1.exr",))])
+def test_outputs(form: str, files: tuple[str, ...]) -> None:
+    assert parse(["o.v1", f"format={form}"]).outputs() == files
+
+
+BAD = [
+    # argument(s), what the message must hold
+    ("width=0", "width=0: width must be a whole number from 1 to 65536"),
+    ("width=65537", "from 1 to 65536"),
+    ("width=-5", "from 1 to 65536"),
+    ("width=1e3", "width=1e3: width must be a whole number"),
+    ("width=", "width=: width must be a whole number"),
+    ("width=1_000", "whole number"),
+    ("width= 10", "whole number"),
+    ("width=" + "9" * 5000, "whole number"),
+    ("width=\u0663", "whole number"),
+    ("height=600.5", "whole number"),
+    ("aa=0", "aa must be a whole number from 1 to 64"),
+    ("aa=65", "aa must be a whole number from 1 to 64"),
+    ("aamode=sobal", "aamode=sobal: aamode must be none, luma or sobel"),
+    ("aamode=Sobel", "none, luma or sobel"),
+    ("focaldist=nan", "focaldist must be a finite number, 0 or more"),
+    ("focaldist=inf", "finite number"),
+    ("focaldist=1e999", "finite number"),
+    ("focaldist=-1", "0 or more"),
+    ("focalrange=-0.1", "focalrange must be a finite number, 0 or more"),
+    ("focalrange=two", "finite number"),
+    ("fresnel=unity", "schlick or dielectric"),
+    ("variant=llvm ad", "variant must be a name such as llvm_ad_rgb"),
+    ("layers=depth,depth", "each once"),
+    ("layers=depht", "a comma list out of depth, normal"),
+    ("layers=", "a comma list"),
+    ("layers=depth,", "a comma list"),
+    ("format=jpg", "png, exr or both"),
+    ("tonemap=gamma", "report or srgb"),
+    ("motion=1,2", "three finite numbers"),
+    ("motion=1,2,3,4", "three finite numbers"),
+    ("motion=1,2,nan", "three finite numbers"),
+    ("motion=1,2,x", "three finite numbers"),
+    ("memory=4X", "bytes with an optional unit"),
+    ("memory=1M", "at least 64M"),
+    ("memory=nanG", "bytes with"),
+    ("memory=infG", "bytes with"),
+    ("memory=-4G", "bytes with"),
+    ("seed=-1", "from 0 to 4294967295"),
+    ("scene=", "path of a file"),
+    ("quiet=2", "quiet must be 1 or 0"),
+    ("quiet=maybe", "quiet must be 1 or 0"),
+    ("widht=3", "unknown option 'widht'. Did you mean width?"),
+    ("WIDTH=3", "Did you mean width?"),
+    ("--width=3", "Did you mean width?"),
+    ("zzz=3", "unknown option 'zzz'. 'mrt help' lists the options."),
+    ("=3", "unknown option ''"),
+    ("filename=x", "unknown option 'filename'"),
+    ("scene_number=3", "unknown option"),
+    ("width=3 width=4", "width is given twice"),
+    ("1 2", "unexpected argument '2'"),
+    ("width=3 1", "unexpected argument '1'"),
+    ("1 scene=a.xml", "both SCENE 1 and scene=a.xml"),
+    ("motionsamples=4", "only with motion"),
+    ("-1", "SCENE -1: must be a number from 0 to 9"),
+    ("10", "from 0 to 9"),
+    ("1.0", "must be a number"),
+    ("three", "SCENE 'three': must be a number from 0 to 9 ('mrt scenes' lists them)."),
+    ("my.xml", "For a file of your own, write scene=my.xml"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "text"), BAD)
+def test_refused(arguments: str, text: str) -> None:
+    rest = [arguments] if arguments in ("width= 10", "variant=llvm ad") else arguments.split()
+    with pytest.raises(UsageError, match=re.escape(text)) as caught:
+        parse(["out", *rest])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ([], "FILENAME is missing"),
+        (["width=3"], "FILENAME is missing before width=3"),
+        (["out.png"], "FILENAME has no extension: write out format=png"),
+        (["a/b.EXR"], "write a/b format=exr"),
+        (["--fast"], "unknown option --fast"),
+        (["folder/"], "names no file"),
+        ([""], "names no file"),
+        (["a\0b"], "names no file"),
+    ],
+)
+def test_refused_file_names(arguments: list[str], text: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(text)):
+        parse(arguments)
+
+
+@given(st.sampled_from(sorted(options.TABLE)), st.text(max_size=20))
+def test_any_text_is_taken_or_refused_in_one_line(name: str, text: str) -> None:
+    """Whatever is typed, the answer is a value that the table's own check accepts, or a UsageError."""
+    extra = ["motion=1,0,0"] if name == "motionsamples" else []
+    try:
+        value = getattr(parse(["out", f"{name}={text}", *extra]), name)
+    except UsageError as error:
+        assert name in str(error)
+    else:
+        assert options.check(name, value) == value
+
+
+@given(st.lists(st.text(max_size=12), max_size=5))
+def test_any_command_line(arguments: list[str]) -> None:
+    try:
+        parsed = parse(arguments)
+    except UsageError:
+        return
+    assert parsed.filename == arguments[0]
+
+
+@given(st.floats(0, 1e30))
+def test_floats_keep_every_bit(value: float) -> None:
+    assert parse(["o", f"focaldist={value!r}"]).focaldist == value
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "taken"),
+    [
+        ("width", 640, 640),
+        ("focaldist", 2, 2.0),
+        ("focaldist", None, None),
+        ("layers", ["depth"], ("depth",)),
+        ("layers", "depth,normal", ("depth", "normal")),
+        ("motion", [1, 2, 3], (1.0, 2.0, 3.0)),
+        ("memory", "4G", 2**32),
+    ],
+)
+def test_values_from_python(name: str, value: object, taken: object) -> None:
+    assert options.check(name, value) == taken
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("width", 640.0),
+        ("width", True),
+        ("width", "640"),
+        ("width", None),
+        ("aa", 0),
+        ("aamode", 3),
+        ("focaldist", math.nan),
+        ("focaldist", "2"),
+        ("layers", [1]),
+        ("layers", None),
+        ("motion", 3),
+        ("motion", (1, 2)),
+        ("seed", -1),
+        ("nothing", 1),
+    ],
+)
+def test_values_from_python_refused(name: str, value: object) -> None:
+    with pytest.raises(UsageError, match=name) as caught:
+        options.check(name, value)
+    assert isinstance(caught.value, ValueError)
+
+
+def test_usage_names_every_option_with_its_default() -> None:
+    text = options.usage()
+    assert max(map(len, text.splitlines())) <= options.HELP_WIDTH
+    entries = re.split(r"\n  (?=\w+=)", text.partition("\n\ncommands:")[0])[1:]
+    assert [entry.partition("=")[0] for entry in entries] == list(options.TABLE)
+    assert all(re.search(r"\(default:\s+[^)]+\)$", entry) for entry in entries)
+    assert "(default: 800)" in text and "(default: from the scene)" in text
