@@ -62,7 +62,7 @@ class Choice:
         if self.source == "none":
             return f"no LLVM {OLDEST} or newer was found. {HELP}"
         if self.source == "drjit":
-            return "left to Dr.Jit's own search"
+            return "LLVM: left to Dr.Jit's own search"
         origin = {
             "user": f"named by {VARIABLE}",
             "wheel": f"from the package {WHEEL}",

@@ -8,7 +8,6 @@ values are allowed) and a line of help. The Python interface checks its argument
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import operator
 import os
@@ -19,12 +18,12 @@ from typing import Any
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.output import LAYERS
+from mrt_mitsuba.scenes import NUMBERS
 
 LARGEST_SIDE = (
     65536  # pixels; an image has to fit in 32-bit indices, its memory is checked where it is planned
 )
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
-SCENES = range(10)
 HELP_WIDTH = 100  # characters
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 SMALLEST_MEMORY = 64 * 2**20  # bytes; about what one tile with all layers takes
@@ -231,6 +230,11 @@ class Options:
     plan: str = option("hide", choice("show", "hide"), "print what will run and what is left out, and why")
     quiet: bool = option(False, switch(), "print errors only", "0")
 
+    def render_arguments(self) -> dict[str, Any]:
+        """Return the options that say how to render, by name, without those about files and messages."""
+        others = {"filename", "scene_number", "scene", "format", "tonemap", "plan", "quiet"}
+        return {name: getattr(self, name) for name in TABLE if name not in others}
+
     def outputs(self) -> tuple[str, ...]:
         """Return the paths of the pictures to write."""
         endings = ("png", "exr") if self.format == "both" else (self.format,)
@@ -309,16 +313,18 @@ def _scene_number(text: str) -> int:
     except ValueError:
         hint = f" For a file of your own, write scene={text}" if "." in text or os.path.exists(text) else ""
         raise UsageError(f"SCENE {text!r}: must be {_scenes()}.{hint}") from None
-    if number not in SCENES:
+    if number not in NUMBERS:
         raise UsageError(f"SCENE {number}: must be {_scenes()}")
     return number
 
 
 def _scenes() -> str:
-    return f"a number from {SCENES[0]} to {SCENES[-1]} ('mrt scenes' lists them)"
+    return f"{_either([str(number) for number in NUMBERS])} ('mrt scenes' lists them)"
 
 
 def _unknown(name: str) -> str:
+    import difflib
+
     close = difflib.get_close_matches(name.lstrip("-").lower(), TABLE, n=1)
     hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
     return f"unknown option {name!r}.{hint}"
@@ -331,7 +337,7 @@ def usage() -> str:
         "       mrt help | doctor | scenes | export SCENE --xml PATH",
         "",
         "Renders a scene and writes FILENAME.png and FILENAME.exr.",
-        f"FILENAME has no extension; SCENE is a number from {SCENES[0]} to {SCENES[-1]} (default: 0).",
+        f"FILENAME has no extension; SCENE is {_either([str(number) for number in NUMBERS])} (default: 0).",
         "",
         "options:",
     ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import warnings
 
 from mrt_mitsuba import llvm
@@ -104,6 +103,8 @@ def _cuda_obstacle() -> str | None:
 
 
 def _unknown(variant: str, known: list[str]) -> str:
+    import difflib
+
     close = difflib.get_close_matches(variant, known, n=1)
     hint = f" Did you mean {close[0]}?" if close else ""
     return f"unknown variant {variant!r}.{hint} This Mitsuba has {', '.join(known)}."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -46,6 +47,7 @@ def test_import_loads_nothing_heavy(run_python) -> None:
     """Importing the package starts neither Mitsuba nor anything that takes as long."""
     heavy = "drjit mitsuba numpy OpenEXR PIL tqdm matplotlib scipy importlib.metadata dataclasses"
     code = f"""
+import re
 import sys
 before = set(sys.modules)
 import mrt_mitsuba
@@ -87,3 +89,12 @@ def test_unknown_name() -> None:
     with pytest.raises(AttributeError, match="no attribute 'no_such_name'"):
         _ = mrt_mitsuba.no_such_name
     assert {"render", "scene_dict", "filters", "__version__"} <= set(dir(mrt_mitsuba))
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern"), [("CITATION.cff", r"^version: (.+)$"), ("CHANGELOG.md", r"^## (.+)$")]
+)
+def test_version_is_told_everywhere(name: str, pattern: str) -> None:
+    """The version is written once in the package; the citation repeats it, the changelog may be ahead of it."""
+    told = re.findall(pattern, (ROOT / name).read_text(), re.MULTILINE)
+    assert told[0] in (mrt_mitsuba.__version__, "Unreleased")

@@ -1,0 +1,193 @@
+"""The ``mrt`` command. Nothing heavy is imported before arguments and output files are checked."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from types import FrameType
+
+from mrt_mitsuba.errors import MrtError, MrtWarning, UsageError
+from mrt_mitsuba.options import Options, parse, usage
+
+INTERRUPTED = 128 + signal.SIGINT
+TRACEBACK = (
+    "MRT_TRACEBACK"  # environment variable: set to anything, unexpected errors show where they came from
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code: 0, 1 for a failure, 2 for wrong usage, 130 when interrupted."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    with warnings.catch_warnings(), _leaving_on(signal.SIGTERM):
+        warnings.showwarning = _show_warning
+        return _guarded(arguments)
+
+
+def _guarded(arguments: list[str]) -> int:
+    """Run the command; whatever goes wrong becomes one line and an exit code."""
+    try:
+        code = _dispatch(arguments)
+        sys.stdout.flush()
+        return code
+    except MrtError as error:
+        return _fail(str(error), error.exit_code)
+    except KeyboardInterrupt:
+        return _fail("interrupted", INTERRUPTED)
+    except BrokenPipeError:
+        # whoever read the output has gone; keep Python from complaining about it once more at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except MemoryError:
+        return _fail("out of memory: choose a smaller width, height or aa", 1)
+    except Exception as error:
+        if os.environ.get(TRACEBACK):
+            raise
+        return _fail(f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)", 1)
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments:
+        sys.stderr.write(usage())
+        return UsageError.exit_code
+    command, rest = arguments[0], arguments[1:]
+    if command in COMMANDS:
+        return COMMANDS[command](rest)
+    return render(parse(arguments))
+
+
+def render(options: Options) -> int:
+    """Render and write what the options say."""
+    from mrt_mitsuba.output import check_target
+
+    for path in options.outputs():
+        check_target(path)
+    from mrt_mitsuba.progress import Progress, TerminalProgress
+    from mrt_mitsuba.render import render as render_scene
+
+    if options.quiet:
+        warnings.simplefilter("ignore", MrtWarning)
+    else:
+        print(banner(options), flush=True)
+    progress = Progress() if options.quiet else TerminalProgress(show_plan=options.plan == "show")
+    start = time.perf_counter()
+    scene = options.scene if options.scene is not None else options.scene_number
+    result = render_scene(scene, progress=progress, **options.render_arguments())
+    seconds = time.perf_counter() - start
+    for path in options.outputs():
+        result.save(path, tonemap=options.tonemap)
+    if not options.quiet:
+        print(f"Render time: {seconds:.6f}s")
+    return 0
+
+
+def banner(options: Options) -> str:
+    """Return the parameters of the render, one per line."""
+    distance, reach = options.focaldist, options.focalrange
+    if options.scene is None:
+        from mrt_mitsuba.scenes import report_scene
+
+        scene = report_scene(options.scene_number)
+        distance = scene.focal_distance if distance is None else distance
+        reach = scene.focal_range if reach is None else reach
+    lines = {
+        "Scene": options.scene if options.scene is not None else options.scene_number,
+        "Width": options.width,
+        "Height": options.height,
+        "AA": options.aa,
+        "AA mode": options.aamode,
+        "F distance": distance or "off",
+        "F range": reach if distance else "off",
+    }
+    return "\n".join(f"{name + ':':<12}{value}" for name, value in lines.items())
+
+
+def _help(arguments: list[str]) -> int:
+    sys.stdout.write(usage())
+    return 0
+
+
+def _version(arguments: list[str]) -> int:
+    from mrt_mitsuba import __version__
+
+    print(f"mrt-mitsuba {__version__}")
+    return 0
+
+
+def _doctor(arguments: list[str]) -> int:
+    _no_arguments("doctor", arguments)
+    from mrt_mitsuba import doctor
+
+    return 0 if doctor.report() else 1
+
+
+def _scenes(arguments: list[str]) -> int:
+    _no_arguments("scenes", arguments)
+    from mrt_mitsuba.scenes import NUMBERS, report_scene
+
+    for number in NUMBERS:
+        print(f"{number}  {report_scene(number).title}")
+    return 0
+
+
+def _export(arguments: list[str]) -> int:
+    if len(arguments) != 3 or arguments[1] != "--xml":
+        raise UsageError("write mrt export SCENE --xml PATH")
+    number = parse(["export", arguments[0]]).scene_number
+    from mrt_mitsuba.output import check_target
+    from mrt_mitsuba.scenes import write_xml
+
+    check_target(arguments[2])
+    write_xml(number, arguments[2])
+    return 0
+
+
+def _no_arguments(command: str, arguments: list[str]) -> None:
+    if arguments:
+        raise UsageError(f"unexpected argument {arguments[0]!r} after mrt {command}")
+
+
+COMMANDS: dict[str, Callable[[list[str]], int]] = {
+    "help": _help,
+    "-h": _help,
+    "--help": _help,
+    "--version": _version,
+    "doctor": _doctor,
+    "scenes": _scenes,
+    "export": _export,
+}
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"mrt: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
+    print(f"mrt: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _leaving_on(number: signal.Signals) -> Iterator[None]:
+    """Leave on a signal as on Ctrl-C: temporary files go, the terminal is restored."""
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        sys.exit(128 + number)
+
+    if threading.current_thread() is not threading.main_thread():  # Python sets handlers in the main one only
+        yield
+        return
+    before = signal.signal(number, leave)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

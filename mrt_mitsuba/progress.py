@@ -1,0 +1,63 @@
+"""Progress of a render: what runs now, and a bar with the time left where someone is watching."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import TextIO
+
+Advance = Callable[[int], object]
+
+
+class Progress:
+    """Receives what a render tells of its progress. This one keeps it to itself."""
+
+    def plan(self, plan: object) -> None:
+        """Called once, before anything is traced, with the render plan."""
+
+    @contextlib.contextmanager
+    def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
+        """Open a stage of ``total`` steps; the value is called with the number of steps just done.
+
+        ``title`` names the stage on the bar, ``message`` is a line of its own.
+        """
+        yield lambda steps: None
+
+
+class TerminalProgress(Progress):
+    """Prints messages, and a bar if ``bar_file`` is a terminal.
+
+    ``show_plan``: whether to print the render plan. Messages go to ``file``, bars to ``bar_file``.
+    """
+
+    def __init__(
+        self, *, show_plan: bool = False, file: TextIO | None = None, bar_file: TextIO | None = None
+    ) -> None:
+        self.show_plan = show_plan
+        self.file = file or sys.stdout
+        self.bar_file = bar_file or sys.stderr
+
+    def plan(self, plan: object) -> None:
+        if self.show_plan:
+            print(plan, file=self.file, flush=True)
+
+    @contextlib.contextmanager
+    def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
+        if message:
+            print(message, file=self.file, flush=True)
+        if not self.bar_file.isatty():
+            yield lambda steps: None
+            return
+        from tqdm import tqdm
+
+        with tqdm(
+            total=total,
+            desc=title,
+            unit="px",
+            unit_scale=True,
+            dynamic_ncols=True,
+            leave=False,
+            file=self.bar_file,
+        ) as bar:
+            yield bar.update

@@ -1,0 +1,295 @@
+"""The mrt command: what it prints and writes, its exit codes, and how it fails."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import types
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mrt_mitsuba import cli, output
+from mrt_mitsuba.errors import MrtWarning, SceneError
+
+
+class Recorder:
+    """Takes the place of the renderer; keeps what it was asked for."""
+
+    def __init__(self, error: BaseException | None = None) -> None:
+        self.error = error
+        self.calls: list[tuple[object, dict]] = []
+
+    def render(self, scene: object, *, progress, **arguments: object) -> Recorder:
+        self.calls.append((scene, arguments))
+        if self.error:
+            raise self.error
+        progress.plan("THE PLAN")
+        with progress.stage("Rendering", 10) as advance:
+            advance(10)
+        with progress.stage("Anti-aliasing", 5, "Computing Anti aliasing..") as advance:
+            advance(5)
+        return self
+
+    def save(self, path: str, tonemap: str) -> None:
+        output.save(path, np.full((2, 2, 3), 0.5, np.float32), tonemap=tonemap)
+
+
+@pytest.fixture
+def renderer(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    recorder = Recorder()
+    monkeypatch.setitem(sys.modules, "mrt_mitsuba.render", types.SimpleNamespace(render=recorder.render))
+    return recorder
+
+
+def test_render_writes_and_says_what_the_report_says(renderer: Recorder, tmp_path: Path, capsys) -> None:
+    out = str(tmp_path / "out")
+    assert cli.main([out, "3", "width=80", "height=60", "aa=2", "aamode=luma"]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.exr", "out.png"]
+    text, errors = capsys.readouterr()
+    lines = text.splitlines()
+    assert "Width:      80" in lines and "Height:     60" in lines and "AA:         2" in lines
+    assert "AA mode:    luma" in lines and "F distance: 2.0" in lines and "F range:    2.0" in lines
+    assert lines[-2] == "Computing Anti aliasing.."
+    assert lines[-1].startswith("Render time: ") and lines[-1].endswith("s")
+    float(lines[-1].removeprefix("Render time: ").removesuffix("s"))
+    assert "PLAN" not in text and errors == ""
+    ((scene, arguments),) = renderer.calls
+    assert scene == 3
+    assert (arguments["width"], arguments["aa"], arguments["aamode"]) == (80, 2, "luma")
+    assert not {"filename", "scene", "format", "tonemap", "quiet", "plan"} & arguments.keys()
+
+
+def test_plan_is_shown_before_the_first_stage(renderer: Recorder, tmp_path: Path, capsys) -> None:
+    assert cli.main([str(tmp_path / "out"), "plan=show"]) == 0
+    text = capsys.readouterr().out
+    assert text.index("Width") < text.index("THE PLAN") < text.index("Computing")
+
+
+def test_quiet_prints_nothing(renderer: Recorder, tmp_path: Path, capsys) -> None:
+    assert cli.main([str(tmp_path / "out"), "quiet=1", "plan=show", "format=png"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert [path.name for path in tmp_path.iterdir()] == ["out.png"]
+
+
+def test_scene_file_goes_to_the_renderer(renderer: Recorder, tmp_path: Path, capsys) -> None:
+    assert cli.main([str(tmp_path / "out"), "scene=mine.xml", "focaldist=3"]) == 0
+    assert renderer.calls[0][0] == "mine.xml"
+    assert "F distance: 3.0" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("scene", "arguments", "distance"),
+    [("0", [], "off"), ("3", [], "2.0"), ("4", [], "0.1"), ("3", ["focaldist=0"], "off")],
+)
+def test_banner_names_the_scenes_own_focus(
+    renderer: Recorder, tmp_path: Path, capsys, scene: str, arguments: list[str], distance: str
+) -> None:
+    assert cli.main([str(tmp_path / "out"), scene, *arguments]) == 0
+    assert f"F distance: {distance}\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [["help"], ["--help"], ["-h"]])
+def test_help(arguments: list[str], capsys) -> None:
+    assert cli.main(arguments) == 0
+    text, errors = capsys.readouterr()
+    assert text.startswith("usage: mrt FILENAME [SCENE] [name=value ...]") and errors == ""
+
+
+def test_no_argument_prints_the_usage(capsys) -> None:
+    assert cli.main([]) == 2
+    text, errors = capsys.readouterr()
+    assert text == "" and errors.startswith("usage: mrt FILENAME")
+
+
+def test_scenes(capsys) -> None:
+    assert cli.main(["scenes"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines][:5] == ["0", "1", "2", "3", "4"]
+    assert all(len(line) > 10 for line in lines)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["out", "width=0"],
+        ["out", "aamode=fancy"],
+        ["out", "colour=1"],
+        ["out", "17"],
+        ["out.png"],
+        ["--colour"],
+        ["scenes", "all"],
+        ["doctor", "now"],
+        ["export"],
+        ["export", "3"],
+        ["export", "3", "--xml"],
+        ["export", "17", "--xml", "a.xml"],
+        ["export", "3", "--obj", "a.xml"],
+    ],
+)
+def test_wrong_usage(renderer: Recorder, tmp_path: Path, monkeypatch, capsys, arguments: list[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 2
+    text, errors = capsys.readouterr()
+    assert text == "" and errors.startswith("mrt: ") and errors.count("\n") == 1
+    assert renderer.calls == [] and list(tmp_path.iterdir()) == []
+
+
+def test_unwritable_target_is_found_before_rendering(renderer: Recorder, tmp_path: Path, capsys) -> None:
+    (tmp_path / "out.exr").mkdir()
+    assert cli.main([str(tmp_path / "out")]) == 1
+    text, errors = capsys.readouterr()
+    assert "out.exr: it is a folder" in errors and text == ""
+    assert renderer.calls == [] and not (tmp_path / "out.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (SceneError("no such file: a.xml"), 1, "mrt: no such file: a.xml\n"),
+        (KeyboardInterrupt(), 130, "mrt: interrupted\n"),
+        (MemoryError(), 1, "mrt: out of memory: choose a smaller width, height or aa\n"),
+        (
+            RuntimeError("first\nsecond"),
+            1,
+            "mrt: RuntimeError: first second (set MRT_TRACEBACK=1 to see where)\n",
+        ),
+    ],
+)
+def test_failures_are_one_line(
+    renderer: Recorder, tmp_path: Path, capsys, error: BaseException, code: int, text: str
+) -> None:
+    renderer.error = error
+    assert cli.main([str(tmp_path / "out")]) == code
+    assert capsys.readouterr().err == text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unexpected_errors_show_where_on_request(renderer: Recorder, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv(cli.TRACEBACK, "1")
+    renderer.error = RuntimeError("inside")
+    with pytest.raises(RuntimeError, match="inside"):
+        cli.main([str(tmp_path / "out")])
+
+
+@pytest.mark.parametrize(("quiet", "text"), [("0", "mrt: warning: slow here\n"), ("1", "")])
+def test_warnings_are_one_line(
+    renderer: Recorder, tmp_path: Path, monkeypatch, capsys, quiet: str, text: str
+) -> None:
+    def render(scene: object, **arguments: object) -> Recorder:
+        warnings.warn("slow\nhere", MrtWarning, stacklevel=2)
+        return renderer
+
+    monkeypatch.setattr(sys.modules["mrt_mitsuba.render"], "render", render)
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert cli.main([str(tmp_path / "out"), f"quiet={quiet}"]) == 0
+    assert capsys.readouterr().err == text
+
+
+def test_process_state_is_as_before(renderer: Recorder, tmp_path: Path) -> None:
+    before = warnings.showwarning, signal.getsignal(signal.SIGTERM)
+    cli.main([str(tmp_path / "out"), "quiet=1"])
+    assert (warnings.showwarning, signal.getsignal(signal.SIGTERM)) == before
+
+
+SLOW_RENDER = """
+import sys, time, types
+class Slow:
+    def save(self, path, tonemap):
+        from mrt_mitsuba.output import replacing
+        with replacing(path) as file:
+            file.write(b"half")
+            file.flush()
+            print("saving", flush=True)
+            time.sleep(60)
+sys.modules["mrt_mitsuba.render"] = types.SimpleNamespace(render=lambda *a, **k: Slow())
+from mrt_mitsuba import cli
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signal_while_saving_leaves_the_old_file(tmp_path: Path, number: signal.Signals, code: int) -> None:
+    (tmp_path / "out.png").write_bytes(b"old")
+    command = [sys.executable, "-c", SLOW_RENDER, "out", "format=png"]
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        while "saving" not in process.stdout.readline():
+            assert process.poll() is None, process.stderr.read()
+        start = time.monotonic()
+        process.send_signal(number)
+        process.wait(timeout=30)
+        seconds = time.monotonic() - start
+        errors = process.stderr.read()
+    assert process.returncode == code and "Traceback" not in errors
+    assert seconds < 2
+    assert [path.name for path in tmp_path.iterdir()] == ["out.png"]
+    assert (tmp_path / "out.png").read_bytes() == b"old"
+
+
+def test_reader_that_goes_away(tmp_path: Path) -> None:
+    """``mrt help | head -1`` ends without complaint."""
+    command = (
+        f"{sys.executable} -c 'import sys; from mrt_mitsuba import cli; sys.exit(cli.main())' help | head -1"
+    )
+    done = subprocess.run(
+        command, shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout.startswith("usage: mrt") and done.stderr == ""
+
+
+def test_wrong_usage_starts_nothing_heavy(run_python) -> None:
+    code = """
+import sys
+from mrt_mitsuba import cli
+code = cli.main(["out", "width=0"])
+print(code, [name for name in ("drjit", "mitsuba", "numpy", "OpenEXR", "PIL", "tqdm") if name in sys.modules])
+"""
+    assert run_python(code).stdout == "2 []\n"
+
+
+class Terminal:
+    """A stream that says it is a terminal."""
+
+    def __init__(self) -> None:
+        self.text = ""
+
+    def isatty(self) -> bool:
+        return True
+
+    def write(self, text: str) -> int:
+        self.text += text
+        return len(text)
+
+    def flush(self) -> None:
+        pass
+
+
+def test_bar_on_a_terminal_shows_the_time_left() -> None:
+    from mrt_mitsuba.progress import TerminalProgress
+
+    messages, bars = Terminal(), Terminal()
+    with TerminalProgress(file=messages, bar_file=bars).stage("Rendering", 1000, "message") as advance:
+        for _ in range(4):
+            time.sleep(0.12)  # tqdm draws ten times a second at most
+            advance(200)
+    assert messages.text == "message\n"
+    assert "Rendering:" in bars.text and "80%" in bars.text and "<00:00" in bars.text
+    assert bars.text.endswith("\r")  # cleared at the end
+
+
+def test_header_survives_json() -> None:
+    """The options go into the EXR header as JSON."""
+    from mrt_mitsuba.options import parse
+
+    arguments = parse(["o", "layers=depth", "motion=1,2,3", "memory=4G"]).render_arguments()
+    assert json.loads(json.dumps(arguments))["motion"] == [1, 2, 3]
