@@ -1,0 +1,137 @@
+"""A scene in the report's terms, and its translation to a Mitsuba dict.
+
+Lengths are in scene units, colours are linear RGB. ``Scene.to_dict()`` gives the plugins of this project,
+``Scene.to_stock_dict()`` the nearest equivalents among Mitsuba's own.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+Vector = tuple[float, float, float]
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole camera; ``hfov`` is the horizontal field of view in degrees."""
+
+    position: Vector
+    target: Vector
+    up: Vector = (0, 1, 0)
+    hfov: float = 60.0
+
+
+@dataclass(frozen=True)
+class Material:
+    """Index of refraction, roughness alpha, specular Ks and diffuse Kd."""
+
+    ior: float
+    alpha: float
+    specular: Color
+    diffuse: Color
+
+
+@dataclass(frozen=True)
+class Light:
+    """Point light without falloff."""
+
+    position: Vector
+    color: Color
+
+
+@dataclass(frozen=True)
+class Sphere:
+    center: Vector
+    radius: float
+    material: Material
+
+
+@dataclass(frozen=True)
+class Plane:
+    """normal · P + distance = 0, with the normal taken as normalised."""
+
+    normal: Vector
+    distance: float
+    material: Material
+
+
+@dataclass(frozen=True)
+class Cone:
+    apex: Vector
+    base_center: Vector
+    radius: float
+    material: Material
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything a render needs, but for the picture's size and sampling."""
+
+    camera: Camera
+    sky: Color
+    lights: tuple[Light, ...]
+    spheres: tuple[Sphere, ...] = ()
+    planes: tuple[Plane, ...] = ()
+    cones: tuple[Cone, ...] = ()
+    focal_distance: float | None = None
+    focal_range: float = 2.0
+    title: str = field(default="", compare=False)
+
+    def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> dict[str, Any]:
+        """The scene as a Mitsuba dict of this project's plugins, materials shared by reference."""
+        materials = _Materials(lambda m: _mrt_bsdf(m, fresnel))
+        shapes: dict[str, Any] = {}
+        for i, s in enumerate(self.spheres):
+            shapes[f"sphere_{i}"] = _sphere(s, materials)
+        for i, p in enumerate(self.planes):
+            shapes[f"plane_{i}"] = {"type": "mrt_plane", "normal": list(p.normal), "distance": p.distance,
+                                    "bsdf": materials.reference(p.material)}
+        for i, c in enumerate(self.cones):
+            shapes[f"cone_{i}"] = {"type": "mrt_cone", "apex": list(c.apex), "base_center": list(c.base_center),
+                                   "radius": c.radius, "bsdf": materials.reference(c.material)}
+        lights = {f"light_{i}": {"type": "mrt_light", "position": list(light.position),
+                                 "intensity": _rgb(light.color)} for i, light in enumerate(self.lights)}
+        return {"type": "scene", "integrator": {"type": "mrt_whitted"}, "sensor": self._sensor(width, height),
+                "sky": {"type": "constant", "radiance": _rgb(self.sky)}, **lights, **materials.definitions, **shapes}
+
+    def _sensor(self, width: int, height: int) -> dict[str, Any]:
+        import mitsuba as mi
+
+        camera = self.camera
+        # The original's picture is mirrored left to right against a right-handed camera
+        to_world = mi.ScalarTransform4f().look_at(list(camera.position), list(camera.target), list(camera.up))
+        to_world = to_world @ mi.ScalarTransform4f().scale([-1, 1, 1])
+        film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb",
+                "component_format": "float32", "rfilter": {"type": "box"}}
+        return {"type": "perspective", "fov": camera.hfov, "fov_axis": "x", "near_clip": 0.01, "far_clip": 1e5,
+                "to_world": to_world, "film": film, "sampler": {"type": "independent", "sample_count": 16}}
+
+
+class _Materials:
+    """BSDF definitions by material: one for each that differs, referred to by the shapes."""
+
+    def __init__(self, to_bsdf):
+        self._to_bsdf = to_bsdf
+        self._names: dict[Material, str] = {}
+        self.definitions: dict[str, Any] = {}
+
+    def reference(self, material: Material) -> dict[str, str]:
+        name = self._names.get(material)
+        if name is None:
+            name = self._names[material] = f"material_{len(self._names)}"
+            self.definitions[name] = self._to_bsdf(material)
+        return {"type": "ref", "id": name}
+
+
+def _rgb(color: Color) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(color)}
+
+
+def _sphere(s: Sphere, materials: _Materials) -> dict[str, Any]:
+    return {"type": "sphere", "center": list(s.center), "radius": s.radius, "bsdf": materials.reference(s.material)}
+
+
+def _mrt_bsdf(m: Material, fresnel: str) -> dict[str, Any]:
+    return {"type": "mrt_bsdf", "alpha": m.alpha, "int_ior": m.ior, "fresnel": fresnel,
+            "diffuse_reflectance": _rgb(m.diffuse), "specular_reflectance": _rgb(m.specular)}

@@ -1,0 +1,98 @@
+"""``mrt_light``: the report's point light, as bright far away as near by."""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .parameters import vector
+from .variants import pointer
+
+
+class MrtLight(mi.Emitter):
+    r"""Point light without distance falloff.
+
+    A surface point receives ``intensity`` from the direction of ``position``, whatever the distance d; a physical point
+    light would give intensity/d².
+
+    ============= ========== ========== ==========================================================
+    name          type       default    unit or range
+    ============= ========== ========== ==========================================================
+    ``position``  point      (0, 0, 0)  scene units
+    ``intensity`` spectrum   1          irradiance at normal incidence, at any distance; may exceed 1
+    ============= ========== ========== ==========================================================
+
+    .. code-block:: python
+
+        {'type': 'mrt_light', 'position': [3, 2, 3], 'intensity': {'type': 'rgb', 'value': 2.0}}
+
+    .. code-block:: xml
+
+        <emitter type="mrt_light">
+            <point name="position" x="3" y="2" z="3"/>
+            <rgb name="intensity" value="2"/>
+        </emitter>
+
+    Nearest stock plugin: ``point``, which falls off with the squared distance. Light tracing (``ptracer``) is refused: a
+    light without falloff emits no finite power.
+    """
+
+    def __init__(self, props: mi.Properties):
+        mi.Emitter.__init__(self, props)
+        self.position = mi.Point3f(vector(props, "position", (0, 0, 0)))
+        self.intensity = props.get_emissive_texture("intensity", 1.0)
+        self.m_flags = +mi.EmitterFlags.DeltaPosition
+        self._update()
+
+    def _update(self) -> None:
+        dr.make_opaque(self.position)
+
+    def traverse(self, callback) -> None:
+        callback.put("position", self.position, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
+        callback.put("intensity", self.intensity, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys=()) -> None:
+        self._update()
+
+    def sample_direction(self, it, sample, active=True):
+        ds = mi.DirectionSample3f()
+        ds.p = self.position
+        ds.d = ds.p - it.p
+        ds.dist = dr.norm(ds.d)
+        # A point on the light itself has no direction to it; any will do, and scalar variants raise on 0/0
+        away = ds.dist > 0
+        ds.d = dr.select(away, ds.d / dr.select(away, ds.dist, 1), mi.Vector3f(0, 0, 1))
+        ds.n = mi.Normal3f(-ds.d)
+        ds.uv = mi.Point2f(0)
+        ds.time = it.time
+        ds.pdf = mi.Float(1)
+        ds.delta = mi.Bool(True)
+        ds.emitter = pointer("Emitter", self)
+        return ds, mi.depolarizer(self.irradiance(it, active))
+
+    def irradiance(self, it, active=True):
+        """The light's colour at the wavelengths of ``it``, as an unpolarised spectrum."""
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wavelengths = it.wavelengths
+        return self.intensity.eval(si, active)
+
+    def pdf_direction(self, it, ds, active=True):
+        return mi.Float(0)
+
+    def eval_direction(self, it, ds, active=True):
+        return mi.depolarizer(dr.select(active, self.irradiance(it, active), 0))
+
+    def eval(self, si, active=True):
+        return mi.Spectrum(0)
+
+    def sample_ray(self, time, sample1, sample2, sample3, active=True):
+        raise NotImplementedError("mrt_light: light tracing needs a finite emitted power; use a stock 'point' light")
+
+    def bbox(self):
+        p = mi.ScalarPoint3f([float(c) if isinstance(c, float) else c[0] for c in self.position])
+        return mi.ScalarBoundingBox3f(p, p)
+
+    def to_string(self) -> str:
+        return f"MrtLight[position={self.position}, intensity={self.intensity}]"
+
+
+mi.register_emitter("mrt_light", MrtLight)

@@ -1,0 +1,62 @@
+"""Reading and checking plugin parameters: the one place where their error messages are made."""
+from __future__ import annotations
+
+import math
+from typing import Sequence
+
+
+class ParameterError(ValueError):
+    """A plugin parameter has a wrong value. The text names plugin, key, value and what is allowed."""
+
+
+def _fail(props, name: str, value, allowed: str) -> None:
+    raise ParameterError(f'{props.plugin_name()}: "{name}" is {value!r}, but must be {allowed}')
+
+
+def number(props, name: str, default: float, *, above: float = -math.inf, least: float = -math.inf) -> float:
+    """A finite float parameter, > ``above`` and >= ``least``."""
+    value = props.get(name, default)
+    limits = "".join(f" {sign} {bound:g}" for sign, bound in ((">", above), (">=", least)) if bound > -math.inf)
+    try:
+        value = float(value)
+    except (TypeError, ValueError):
+        _fail(props, name, value, f"a number{limits}")
+    if not (math.isfinite(value) and value > above and value >= least):
+        _fail(props, name, value, f"a finite number{limits}")
+    return value
+
+
+def integer(props, name: str, default: int, *, least: int) -> int:
+    """An integer parameter >= ``least``."""
+    value = props.get(name, default)
+    if isinstance(value, bool) or value != int(value) or value < least:
+        _fail(props, name, value, f"an integer >= {least}")
+    return int(value)
+
+
+def flag(props, name: str, default: bool) -> bool:
+    """A boolean parameter."""
+    value = props.get(name, default)
+    if not isinstance(value, bool):
+        _fail(props, name, value, "true or false")
+    return value
+
+
+def choice(props, name: str, allowed: Sequence[str]) -> str:
+    """One of a few strings; the first is the default."""
+    value = props.get(name, allowed[0])
+    if value not in allowed:
+        _fail(props, name, value, "one of " + ", ".join(allowed))
+    return value
+
+
+def vector(props, name: str, default: Sequence[float] | None = None, *, nonzero: bool = False) -> list[float]:
+    """Three finite numbers; ``nonzero`` refuses the null vector. Without a default the key is required."""
+    if name not in props and default is None:
+        raise ParameterError(f'{props.plugin_name()}: "{name}" is missing; give three numbers')
+    value = [float(x) for x in (props[name] if name in props else default)]
+    if len(value) != 3 or not all(map(math.isfinite, value)):
+        _fail(props, name, value, "three finite numbers")
+    if nonzero and not any(value):
+        _fail(props, name, value, "a vector of non-zero length")
+    return value

@@ -1,0 +1,74 @@
+"""``mrt_plane``: an infinite plane, with a finite stand-in for stock integrators."""
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from .parameters import ParameterError, number, vector
+
+
+class MrtPlane(mi.Mesh):
+    r"""The plane of all points P with normal · P + distance = 0, lit on the side its normal points to.
+
+    ``mrt_whitted`` intersects the plane itself, analytically and without bound. To every other integrator the shape is a
+    square mesh of side ``extent`` around the foot of the origin: large squares lose precision in float32 (the
+    intersection error grows with the side), so it should be as small as the picture allows.
+
+    ============ ======== ========= ==============================================================
+    name         type     default   unit or range
+    ============ ======== ========= ==============================================================
+    ``normal``   vector   required  not the null vector; normalised on construction
+    ``distance`` float    0         n · P + distance = 0 with the *normalised* n, scene units
+    ``extent``   float    100       > 0, side of the square seen by stock integrators, scene units
+    ============ ======== ========= ==============================================================
+
+    uv are the coordinates along two tangents, in scene units, zero at the foot of the origin.
+
+    .. code-block:: python
+
+        {'type': 'mrt_plane', 'normal': [0, 1, 0], 'distance': 0.2, 'bsdf': {'type': 'mrt_bsdf'}}
+
+    .. code-block:: xml
+
+        <shape type="mrt_plane">
+            <vector name="normal" x="0" y="1" z="0"/>
+            <float name="distance" value="0.2"/>
+            <bsdf type="mrt_bsdf"/>
+        </shape>
+
+    Nearest stock plugin: ``rectangle`` with a ``to_world``; here the plane's own equation places it, so ``to_world`` is
+    refused.
+    """
+
+    def __init__(self, props: mi.Properties):
+        if "to_world" in props:
+            raise ParameterError('mrt_plane: "to_world" is not accepted; give "normal" and "distance" in world space')
+        normal = np.array(vector(props, "normal", nonzero=True))
+        self.unit_normal = normal / np.linalg.norm(normal)  # [3], float64
+        self.distance = number(props, "distance", 0.0)
+        extent = number(props, "extent", 100.0, above=0)
+        self.tangents = _tangents(self.unit_normal)  # [2, 3]
+        mi.Mesh.__init__(self, "mrt_plane", 4, 2, props, has_vertex_normals=False, has_vertex_texcoords=True)
+        corners = 0.5 * extent * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # [4, 2]
+        positions = corners @ self.tangents - self.distance * self.unit_normal  # [4, 3]
+        mesh = mi.traverse(self)
+        mesh["vertex_positions"] = positions.astype(np.float32).ravel()
+        mesh["vertex_texcoords"] = corners.astype(np.float32).ravel()
+        mesh["faces"] = np.array([0, 1, 2, 0, 2, 3], dtype=np.uint32)
+        mesh.update()
+        # Mitsuba merges meshes that share a BSDF when it loads a scene, but leaves those with attributes alone
+        self.add_attribute("face_mrt_plane", 1, [0.0, 0.0])
+
+
+def _tangents(n: np.ndarray) -> np.ndarray:
+    """Two unit vectors [2, 3] that make a right-handed frame with the unit vector ``n`` [3].
+
+    Crossing with the axis that ``n`` has least of keeps axis-aligned planes axis-aligned.
+    """
+    axis = np.eye(3)[np.argmin(np.abs(n))]
+    s = np.cross(axis, n)
+    s /= np.linalg.norm(s)
+    return np.array([s, np.cross(n, s)])
+
+
+mi.register_shape("mrt_plane", MrtPlane)

@@ -1,0 +1,14 @@
+"""What differs between Mitsuba's scalar and vectorised variants."""
+from __future__ import annotations
+
+import mitsuba as mi
+
+
+def is_jit() -> bool:
+    """Is the current variant a vectorised one (LLVM or CUDA)?"""
+    return not mi.variant().startswith("scalar")
+
+
+def pointer(kind: str, objects):
+    """A Dr.Jit pointer array (``kind`` "Shape", "Emitter", ...) to objects; scalar variants have none: the objects."""
+    return getattr(mi, kind + "Ptr")(objects) if is_jit() else objects

@@ -1,0 +1,466 @@
+"""``mrt_whitted``: the report's recursive ray tracer as a Mitsuba integrator."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .intersect import intersect_plane
+from .parameters import choice, flag, integer, number
+from .variants import is_jit, pointer
+
+BUDGETS = ("report", "plain")
+
+# A sixteenth of a step of an 8-bit picture: what many cut paths add up to stays below half a step, and on average over the
+# report's scenes below 1e-5
+MIN_CONTRIBUTION = 1 / 16 / 255
+
+# A secondary ray starts this far off its surface, relative to the size of the coordinates involved: 32 float32
+# roundings, a few times what intersection, projection and ray test lose together
+OFFSET = 32 * 2.0**-24
+
+# Up to this many lights the kernel holds the code of each; beyond, it loops over them
+UNROLLED_LIGHTS = 8
+
+
+@dataclass
+class Hit:
+    """What a ray meets first: an interaction, valid where ``found``, and the size of its coordinates."""
+
+    si: mi.SurfaceInteraction3f
+    found: mi.Bool
+    scale: mi.Float
+
+
+@dataclass
+class Trace:
+    """Radiance of a bundle of camera rays, and what fell out of computing it."""
+
+    radiance: mi.UnpolarizedSpectrum
+    direct: mi.UnpolarizedSpectrum  # the part of it that needs no mirror ray
+    hit: Hit  # of the camera ray
+    bounces: mi.UInt32  # mirror rays traced
+    shadow_rays: mi.UInt32  # shadow rays traced
+
+
+@dataclass
+class LightSample:
+    """One light as seen from a hit."""
+
+    ds: mi.DirectionSample3f
+    wo: mi.Vector3f  # local direction to it
+    weight: mi.UnpolarizedSpectrum  # what arrives from there, over the density of the direction
+    facing: mi.Bool  # is it on the lit side
+
+
+@dataclass
+class Shading:
+    """What a surface adds to a path."""
+
+    radiance: mi.UnpolarizedSpectrum
+    shadow_rays: mi.UInt32
+    reflectance: mi.UnpolarizedSpectrum  # of the mirror ray
+    cost: mi.UInt32  # of the mirror ray, to the bounce budget
+
+
+class MrtWhitted(mi.SamplingIntegrator):
+    r"""Whitted-style ray tracing: direct light, hard shadows, perfect mirror rays.
+
+    .. math::
+        L(x, d) = \sum_i \mathrm{clamp}_{[0,1]}\bigl(E_i f(x, \omega_i, -d) \cos\theta_i\bigr) V_i
+                  + k_s F(\theta)\, L(x', r)
+
+    with r the mirror direction, and the sky where a ray meets nothing. Shading goes through ``si.bsdf()``: k_s F is
+    the attribute ``mirror_reflectance`` of an ``mrt_bsdf``, and the delta reflection of any other BSDF. Lights are
+    all emitters of the scene; those without a delta position take one random sample each. ``mrt_plane`` shapes are
+    intersected analytically.
+
+    ==================== =========== ============ ============================================================
+    name                 type        default      unit or range
+    ==================== =========== ============ ============================================================
+    ``max_depth``        integer     10           >= 1, bounce budget: a ray at this depth is black
+    ``sky``              spectrum    (from scene) radiance of a miss; default the environment emitter, else 0
+    ``clamp``            boolean     true         clamp each light's contribution to [0, 1], as the report does
+    ``min_contribution`` float       1/16/255     >= 0; a path ends when its throughput times the number of lights
+                                                  plus one (the sky) is below, and a light is taken as visible
+                                                  when what it adds, times the number of lights, is below
+    ``bounce_budget``    string      report       ``report``: a bounce costs max(1, 10 - int(10 int_ior));
+                                                  ``plain``: 1
+    ==================== =========== ============ ============================================================
+
+    .. code-block:: python
+
+        {'type': 'mrt_whitted', 'max_depth': 10, 'clamp': True}
+
+    .. code-block:: xml
+
+        <integrator type="mrt_whitted">
+            <integer name="max_depth" value="10"/>
+        </integrator>
+
+    Nearest stock plugin: ``direct``, which it equals at ``max_depth`` 1 without clamp. Differentiable at
+    ``max_depth`` 1 only (the bounces are a loop of unknown length). The equation of an ``mrt_plane`` is fixed when it is
+    made; moving its vertices changes only its stand-in for other integrators. Polarisation is ignored.
+    """
+
+    def __init__(self, props: mi.Properties):
+        mi.SamplingIntegrator.__init__(self, props)
+        self.max_depth = integer(props, "max_depth", 10, least=1)
+        self.sky = props.get_emissive_texture("sky") if "sky" in props else None
+        self.clamp = flag(props, "clamp", True)
+        self.min_contribution = number(props, "min_contribution", MIN_CONTRIBUTION, least=0)
+        self.bounce_budget = choice(props, "bounce_budget", BUDGETS)
+        self._prepared = None
+
+    # ------------------------------------- Mitsuba's interface ----------------------------------------
+
+    def render(self, scene, sensor, seed=0, spp=0, develop=True, evaluate=True):
+        self.prepare(scene)
+        return mi.SamplingIntegrator.render(self, scene, sensor, seed, spp, develop, evaluate)
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        trace = self.trace(scene, sampler, mi.Ray3f(ray), active)
+        return mi.depolarizer(trace.radiance), trace.hit.found, []
+
+    def aov_names(self):
+        return []
+
+    def to_string(self) -> str:
+        return (f"MrtWhitted[max_depth={self.max_depth}, clamp={self.clamp}, "
+                f"min_contribution={self.min_contribution:g}, bounce_budget={self.bounce_budget}, sky={self.sky}]")
+
+    # ------------------------------------------- Scene -------------------------------------------------
+
+    def prepare(self, scene) -> Prepared:
+        """Read what a render needs from the scene; cheap where nothing has changed since the last call."""
+        if self._prepared is None or self._prepared.is_stale(scene):
+            self._prepared = Prepared(scene)
+        return self._prepared
+
+    # ------------------------------------------- Tracing -----------------------------------------------
+
+    def trace(self, scene, sampler, ray, active=True) -> Trace:
+        """Radiance along ``ray`` and its by-products; what is not read from the result is not computed."""
+        prepared = self._prepared
+        if prepared is None or prepared.scene_id != id(scene):
+            prepared = self.prepare(scene)
+
+        # ------------------------- The camera ray: coherent, and first of a peeled loop -------------------------
+        active = mi.Bool(active)
+        hit = prepared.intersect(scene, ray, active, coherent=True)
+        shading = self._shade(prepared, scene, sampler, ray, hit, mi.UnpolarizedSpectrum(1), active)
+        if not self._bounces(prepared):
+            return Trace(shading.radiance, shading.radiance, hit, mi.UInt32(0), shading.shadow_rays)
+        throughput, depth = shading.reflectance, shading.cost
+        state = {
+            "radiance": shading.radiance,
+            "throughput": throughput,
+            "ray": prepared.mirror_ray(ray, hit),
+            "depth": depth,
+            "bounces": mi.UInt32(0),
+            "shadow_rays": shading.shadow_rays,
+            "active": hit.found & self._continues(prepared, throughput, depth),
+            "sampler": sampler if prepared.random else None,
+        }
+
+        # ------------------------------------------ Mirror bounces ----------------------------------------------
+        def bounce(s: dict) -> tuple[dict]:
+            ray, active = s["ray"], s["active"]
+            hit = prepared.intersect(scene, ray, active, coherent=False)
+            shading = self._shade(prepared, scene, s["sampler"], ray, hit, s["throughput"], active)
+            throughput = s["throughput"] * shading.reflectance
+            depth = s["depth"] + shading.cost
+            return ({
+                "radiance": s["radiance"] + dr.select(active, s["throughput"] * shading.radiance, 0),
+                "throughput": throughput,
+                "ray": prepared.mirror_ray(ray, hit),
+                "depth": depth,
+                "bounces": s["bounces"] + 1,
+                "shadow_rays": s["shadow_rays"] + shading.shadow_rays,
+                "active": active & hit.found & self._continues(prepared, throughput, depth),
+                "sampler": s["sampler"],
+            },)
+
+        final, = dr.while_loop((state,), lambda s: s["active"], bounce, label="mirror bounces")
+        return Trace(final["radiance"], shading.radiance, hit, final["bounces"], final["shadow_rays"])
+
+    def _bounces(self, prepared) -> bool:
+        return prepared.mirrors and self.max_depth > 1
+
+    def _continues(self, prepared, throughput, depth):
+        """May a path of this throughput and depth still change the picture?"""
+        bound = len(prepared.lights) + 1
+        return (depth < self.max_depth) & (dr.max(throughput) * bound > self.min_contribution)
+
+    # ------------------------------------------- Shading -----------------------------------------------
+
+    def _shade(self, prepared, scene, sampler, ray, hit, throughput, active) -> Shading:
+        """Light that leaves ``hit`` back along ``ray``, and its mirror reflection; ``throughput`` is the path's."""
+        si = hit.si
+        radiance = self._sky(prepared, ray, active & ~hit.found)
+        if prepared.emissive:
+            radiance += mi.unpolarized_spectrum(si.emitter(scene, hit.found).eval(si, hit.found))
+        unrolled = prepared.lights if len(prepared.lights) <= UNROLLED_LIGHTS else []
+        samples = [self._light_sample(prepared, light, sampler, hit) for light in unrolled]
+        values, reflectance, int_ior = prepared.eval_bsdf(hit, samples, mirror=self._bounces(prepared))
+        shadow_rays = mi.UInt32(0)
+        for sample, value in zip(samples, values):
+            lit, traced = self._visible_part(prepared, scene, hit, throughput, sample, value)
+            radiance += lit
+            shadow_rays += traced
+        if len(prepared.lights) > UNROLLED_LIGHTS:
+            radiance, shadow_rays = self._loop_over_lights(prepared, scene, sampler, hit, throughput, radiance)
+        return Shading(radiance, shadow_rays, reflectance, self._cost(int_ior))
+
+    def _cost(self, int_ior):
+        """What a bounce off a material of this index takes from the bounce budget."""
+        if self.bounce_budget == "plain":
+            return mi.UInt32(1)
+        return mi.UInt32(dr.maximum(10 - mi.Int32(dr.minimum(10 * int_ior, 10)), 1))
+
+    def _loop_over_lights(self, prepared, scene, sampler, hit, throughput, radiance):
+        lights = prepared.light_pointers
+
+        def step(i, radiance, shadow_rays, sampler):
+            light = dr.gather(mi.EmitterPtr, lights, i, hit.found)
+            sample = self._light_sample(prepared, light, sampler, hit)
+            (value,), _, _ = prepared.eval_bsdf(hit, [sample], mirror=False)
+            lit, traced = self._visible_part(prepared, scene, hit, throughput, sample, value)
+            return i + 1, radiance + lit, shadow_rays + traced, sampler
+
+        state = (mi.UInt32(0), radiance, mi.UInt32(0), sampler if prepared.random else None)
+        state = dr.while_loop(state, lambda i, *_: hit.found & (i < dr.width(lights)), step, label="lights")
+        return state[1], state[2]
+
+    def _light_sample(self, prepared, light, sampler, hit) -> LightSample:
+        """The direction to a light and what arrives from it, if nothing is in between."""
+        u = sampler.next_2d(hit.found) if prepared.random else mi.Point2f(0.5)
+        ds, weight = light.sample_direction(hit.si, u, hit.found)
+        wo = hit.si.to_local(ds.d)
+        facing = hit.found & (ds.pdf > 0)
+        if prepared.one_sided:
+            facing &= mi.Frame3f.cos_theta(wo) > 0
+        return LightSample(ds, wo, mi.unpolarized_spectrum(weight), facing)
+
+    def _visible_part(self, prepared, scene, hit, throughput, sample, bsdf_value):
+        """A light's contribution where nothing blocks it, and the number of shadow rays that took to know."""
+        value = sample.weight * bsdf_value
+        if self.clamp:
+            value = dr.clip(value, 0, 1)
+        matters = dr.max(dr.abs(throughput * value)) * len(prepared.lights) > self.min_contribution
+        traced = sample.facing & matters
+        visible = sample.facing & ~prepared.occluded(scene, hit, sample.ds, traced)
+        return dr.select(visible, value, 0), dr.select(traced, mi.UInt32(1), mi.UInt32(0))
+
+    def _sky(self, prepared, ray, active):
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi = -ray.d
+        si.wavelengths = ray.wavelengths
+        if self.sky is not None:
+            return dr.select(active, self.sky.eval(si, active), 0)
+        if prepared.environment is None:
+            return mi.UnpolarizedSpectrum(0)
+        return dr.select(active, mi.unpolarized_spectrum(prepared.environment.eval(si, active)), 0)
+
+
+def _eval_bsdf(bsdf, si, wos, facing, active, mirror: bool):
+    """Of one BSDF: its values f cos θo towards ``wos``, its mirror reflectance and its index of refraction."""
+    values = [mi.UnpolarizedSpectrum(0) for _ in wos]
+    reflectance, int_ior = mi.UnpolarizedSpectrum(0), mi.Float(1)
+    if bsdf is None:
+        return values, reflectance, int_ior
+    context = mi.BSDFContext()
+    values = [mi.unpolarized_spectrum(bsdf.eval(context, si, wo, seen)) for wo, seen in zip(wos, facing)]
+    if mirror and bsdf.has_attribute("mirror_reflectance"):
+        reflectance = bsdf.eval_attribute("mirror_reflectance", si, active)
+        int_ior = bsdf.eval_attribute_1("int_ior", si, active)
+    elif mirror and _has_mirror(bsdf):
+        context.type_mask = +mi.BSDFFlags.DeltaReflection
+        reflectance = mi.unpolarized_spectrum(bsdf.sample(context, si, mi.Float(0), mi.Point2f(0), active)[1])
+    return values, reflectance, int_ior
+
+
+class Prepared:
+    """What the integrator reads from a scene once, before it traces anything, and its ray queries."""
+
+    def __init__(self, scene):
+        # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed. The fingerprint
+        # holds the shapes, so that no later scene can be taken for this one
+        self.scene_id = id(scene)
+        self.fingerprint = _fingerprint(scene)
+        shapes = scene.shapes()
+        self.planes = [_Plane(s) for s in shapes if hasattr(s, "unit_normal")]
+        others = [s for s in shapes if not hasattr(s, "unit_normal")]
+        # The stand-ins of the planes must not be hit: rays are traced in a scene that holds the other shapes only
+        self.bvh = _scene_of(others) if self.planes else None
+        self.analytic_only = not others
+        self.scales = _Scales(others)
+        self._read_emitters(scene)
+        self._read_bsdfs({id(b): b for b in (s.bsdf() for s in shapes)}.values())
+        if any(s.is_mesh() for s in others):
+            self.ray_flags |= +mi.RayFlags.ShadingFrame
+
+    def _read_emitters(self, scene) -> None:
+        self.environment = scene.environment()
+        self.lights = [e for e in scene.emitters() if not e.is_environment()]
+        self.light_pointers = pointer("Emitter", self.lights) if len(self.lights) > UNROLLED_LIGHTS else None
+        delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
+        self.random = any(not mi.has_flag(e.flags(), delta) for e in self.lights)
+        self.emissive = any(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in self.lights)
+
+    def _read_bsdfs(self, bsdfs) -> None:
+        self.mirrors = any(_has_mirror(b) for b in bsdfs)
+        self.one_sided = not any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in bsdfs)
+        self.textured = any(mi.has_flag(b.flags(), mi.BSDFFlags.SpatiallyVarying) for b in bsdfs)
+        self.ray_flags = +mi.RayFlags.Minimal
+        if self.textured:
+            self.ray_flags |= +mi.RayFlags.UV
+
+    def is_stale(self, scene) -> bool:
+        return id(scene) != self.scene_id or _fingerprint(scene) != self.fingerprint
+
+    # ----------------------------------------- Ray queries ---------------------------------------------
+
+    def intersect(self, scene, ray, active, coherent: bool) -> Hit:
+        """The nearest of Mitsuba's shapes and the analytic planes."""
+        ray = mi.Ray3f(ray)
+        on_plane = []
+        for plane in self.planes:
+            t = intersect_plane(ray.o, ray.d, plane.normal, plane.distance)
+            closer = active & (t < ray.maxt)
+            on_plane.append(closer)
+            ray.maxt = dr.select(closer, t, ray.maxt)  # what lies behind the plane need not be looked for
+        si, found = self._intersect_shapes(scene, ray, active, coherent)
+        scale = self.scales(si, found)
+        # A later plane overrides an earlier one, as it was closer
+        for plane, closer in zip(self.planes, on_plane):
+            closer = closer & ~found
+            plane.put_into(si, ray, closer)
+            scale = dr.select(closer, plane.scale, scale)
+        for closer in on_plane:
+            found = found | closer
+        si.sh_frame = mi.Frame3f(si.sh_frame.n)
+        si.wi = si.to_local(-ray.d)
+        si.time, si.wavelengths = ray.time, ray.wavelengths
+        return Hit(si, found, dr.maximum(scale, dr.max(dr.abs(si.p))))
+
+    def _intersect_shapes(self, scene, ray, active, coherent):
+        if self.analytic_only:
+            return dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False)
+        pi = (self.bvh or scene).ray_intersect_preliminary(ray, coherent, active)
+        found = active & pi.is_valid()
+        return pi.compute_surface_interaction(ray, self.ray_flags, found), found
+
+    def occluded(self, scene, hit, ds, active):
+        """Does anything block the segment from ``hit`` to the light sample ``ds``?"""
+        o = self._off_surface(hit, ds.d)
+        blocked = mi.Bool(False)
+        for plane in self.planes:
+            # Opposite sides: no distance is computed, so none can be wrong
+            blocked |= plane.height(o) * plane.height(ds.p) < 0
+        if self.analytic_only:
+            return blocked
+        to_light = ds.p - o
+        # Stop short of a light that has a surface of its own
+        reach = 1 - mi.math.ShadowEpsilon if self.emissive else 1
+        ray = mi.Ray3f(o, to_light, reach, hit.si.time, hit.si.wavelengths)
+        return blocked | (self.bvh or scene).ray_test(ray, False, active & ~blocked)
+
+    def eval_bsdf(self, hit, samples, mirror: bool):
+        """Values of the BSDF at ``hit`` towards light samples, and its mirror reflection: all of it in one call."""
+        arguments = (hit.si, [s.wo for s in samples], [s.facing for s in samples], hit.found, mirror)
+        if is_jit():
+            return dr.dispatch(hit.si.bsdf(), _eval_bsdf, *arguments)
+        return _eval_bsdf(hit.si.bsdf() if hit.found else None, *arguments)
+
+    def mirror_ray(self, ray, hit):
+        """The ray reflected at ``hit``."""
+        n = hit.si.sh_frame.n
+        d = ray.d - 2 * dr.dot(ray.d, n) * n
+        return mi.Ray3f(self._off_surface(hit, d), d, dr.largest(mi.Float), ray.time, ray.wavelengths)
+
+    @staticmethod
+    def _off_surface(hit, d):
+        """The point of ``hit`` moved to the side of its surface that ``d`` points to, clear of rounding errors."""
+        distance = OFFSET * hit.scale
+        n = hit.si.n
+        return hit.si.p + n * dr.select(dr.dot(n, d) >= 0, distance, -distance)
+
+
+class _Plane:
+    """The analytic side of an ``mrt_plane``, as kernel data."""
+
+    def __init__(self, shape):
+        self.shape = shape
+        self.normal = mi.Vector3f(shape.unit_normal.tolist())
+        self.tangents = [mi.Vector3f(t.tolist()) for t in shape.tangents]
+        self.distance = mi.Float(shape.distance)
+        self.scale = mi.Float(abs(shape.distance))
+        dr.make_opaque(self.normal, self.distance, self.scale, self.tangents)
+
+    def height(self, p):
+        """Signed distance of a point from the plane."""
+        return dr.dot(self.normal, p) + self.distance
+
+    def put_into(self, si, ray, where) -> None:
+        """Make ``si`` the interaction of ``ray`` with this plane, at t = ray.maxt."""
+        p = dr.fma(ray.d, ray.maxt, ray.o)
+        p -= self.normal * self.height(p)  # along a grazing ray the error of t is far larger than that of the plane
+        si.t = dr.select(where, ray.maxt, si.t)
+        si.p = dr.select(where, p, si.p)
+        si.n = dr.select(where, mi.Normal3f(self.normal), si.n)
+        si.sh_frame.n = dr.select(where, mi.Normal3f(self.normal), si.sh_frame.n)
+        si.uv = dr.select(where, mi.Point2f(*(dr.dot(t, p) for t in self.tangents)), si.uv)
+        si.shape = dr.select(where, pointer("Shape", self.shape), si.shape)
+
+
+class _Scales:
+    """Size of the coordinates of the shape that was hit: the largest number in its bounding box."""
+
+    def __init__(self, shapes):
+        self.by_shape = [_coordinate_size(s.bbox()) for s in shapes]
+        self.largest = max(self.by_shape, default=0.0)
+        if is_jit() and shapes:
+            ids = dr.reinterpret_array(mi.UInt32, pointer("Shape", shapes))
+            self.table = dr.full(mi.Float, self.largest, dr.max(ids)[0] + 1)
+            dr.scatter(self.table, mi.Float(self.by_shape), ids)
+            dr.eval(self.table)
+
+    def __call__(self, si, found):
+        if not self.by_shape:
+            return mi.Float(0)
+        if not is_jit():
+            return _coordinate_size(si.shape.bbox()) if found else 0.0
+        ids = dr.reinterpret_array(mi.UInt32, si.shape)
+        # The shapes inside an instance are not of the scene's own: take the largest for them
+        known = found & (ids < dr.width(self.table))
+        return dr.select(known, dr.gather(mi.Float, self.table, ids, known), self.largest)
+
+
+def _has_mirror(bsdf) -> bool:
+    return bsdf.has_attribute("mirror_reflectance") or mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
+
+
+def _scene_of(shapes):
+    if not shapes:
+        return None
+    return mi.load_dict({"type": "scene", **{f"shape{i}": s for i, s in enumerate(shapes)}})
+
+
+def _coordinate_size(bbox) -> float:
+    return max(abs(float(x)) for corner in (bbox.min, bbox.max) for x in corner)
+
+
+def _fingerprint(scene) -> tuple:
+    """Changes whenever a shape was moved or a mesh edited: what ``Prepared`` holds would then be out of date."""
+    return tuple(_shape_fingerprint(s) for s in scene.shapes())
+
+
+def _shape_fingerprint(shape) -> tuple:
+    bbox = shape.bbox()
+    version = shape.vertex_positions_buffer().index if is_jit() and isinstance(shape, mi.Mesh) else 0
+    return (shape, version, *bbox.min, *bbox.max)
+
+
+mi.register_integrator("mrt_whitted", MrtWhitted)
