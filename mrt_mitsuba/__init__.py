@@ -44,7 +44,7 @@ _SUBMODULES = ("filters",)
 
 __all__ = [
     "__version__",
-    *_HOME,  # type: ignore[misc]
+    *_HOME,
     *_SUBMODULES,
 ]
 

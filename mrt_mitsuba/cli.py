@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import sys
-import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from types import FrameType
+from collections.abc import Callable, Sequence
 
 from mrt_mitsuba.errors import MrtError, MrtWarning, UsageError
+from mrt_mitsuba.interrupt import Terminated, ending_soon, leave_now
 from mrt_mitsuba.options import Options, parse, usage
 
 INTERRUPTED = 128 + signal.SIGINT
-TRACEBACK = (
-    "MRT_TRACEBACK"  # environment variable: set to anything, unexpected errors show where they came from
-)
+TERMINATED = 128 + signal.SIGTERM
+# An environment variable; set to anything, unexpected errors show where they came from
+TRACEBACK = "MRT_TRACEBACK"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit code: 0, 1 for a failure, 2 for wrong usage, 130 when interrupted."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    with warnings.catch_warnings(), _leaving_on(signal.SIGTERM):
+    """Run the command; return its exit code: 0, 1 for a failure, 2 for wrong usage, 130 when interrupted.
+
+    Without arguments, those of the process are taken, and an interrupt ends the process at once.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    with warnings.catch_warnings(), ending_soon(_end_by_force):
         warnings.showwarning = _show_warning
-        return _guarded(arguments)
+        code = _guarded(words)
+        if code in (INTERRUPTED, TERMINATED) and arguments is None:
+            leave_now(code)  # the interpreter would wait for the kernels that run
+        return code
 
 
 def _guarded(arguments: list[str]) -> int:
@@ -37,6 +41,8 @@ def _guarded(arguments: list[str]) -> int:
         return code
     except MrtError as error:
         return _fail(str(error), error.exit_code)
+    except Terminated:
+        return _fail("terminated", TERMINATED)
     except KeyboardInterrupt:
         return _fail("interrupted", INTERRUPTED)
     except BrokenPipeError:
@@ -168,25 +174,16 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
+def _end_by_force() -> None:
+    from mrt_mitsuba.output import discard_unfinished
+
+    discard_unfinished()
+    newline = "\n" if sys.stderr.isatty() else ""  # below the progress bar
+    print(f"{newline}mrt: interrupted", file=sys.stderr)
+
+
 def _show_warning(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
     print(f"mrt: warning: {' '.join(str(message).split())}", file=sys.stderr)
-
-
-@contextlib.contextmanager
-def _leaving_on(number: signal.Signals) -> Iterator[None]:
-    """Leave on a signal as on Ctrl-C: temporary files go, the terminal is restored."""
-
-    def leave(number: int, frame: FrameType | None) -> None:
-        sys.exit(128 + number)
-
-    if threading.current_thread() is not threading.main_thread():  # Python sets handlers in the main one only
-        yield
-        return
-    before = signal.signal(number, leave)
-    try:
-        yield
-    finally:
-        signal.signal(number, before)
 
 
 if __name__ == "__main__":

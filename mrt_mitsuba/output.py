@@ -36,6 +36,7 @@ LAYERS = {
     "reflection": "RGB",
     "bounces": "Y",
 }
+_unfinished: set[str] = set()  # temporary files
 _ROWS = 256  # rows converted to 8 bit at a time, to bound the memory of intermediate arrays
 
 
@@ -188,6 +189,7 @@ def check_target(path: str | os.PathLike[str]) -> None:
         temporary, file = _open_beside(_target(path))
         file.close()
         os.unlink(temporary)
+        _unfinished.discard(temporary)
 
 
 @contextlib.contextmanager
@@ -212,6 +214,15 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
             with contextlib.suppress(OSError):
                 os.unlink(temporary)
             raise
+        finally:
+            _unfinished.discard(temporary)
+
+
+def discard_unfinished() -> None:
+    """Remove the temporary files of pictures that are being written; for a process about to end by force."""
+    for temporary in tuple(_unfinished):
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
 
 
 @contextlib.contextmanager
@@ -248,5 +259,6 @@ def _target(path: str | os.PathLike[str]) -> str:
 def _open_beside(target: str) -> tuple[str, IO[bytes]]:
     """Create a new file in the folder of ``target``, with the rights the user's umask gives."""
     temporary = os.path.join(os.path.dirname(target), f".mrt-{secrets.token_hex(8)}.tmp")
+    _unfinished.add(temporary)
     descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
     return temporary, os.fdopen(descriptor, "w+b")

@@ -9,8 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 import mrt_mitsuba  # noqa: F401 - before anything imports mitsuba or drjit: it chooses the LLVM library
+
+# --hypothesis-profile=long for the thorough run. No deadline: a busy machine is not a failure. Without a
+# database and with fixed seeds, a run neither depends on an earlier one nor leaves anything behind.
+settings.register_profile("short", max_examples=200, deadline=None, derandomize=True, database=None)
+settings.register_profile("long", max_examples=10_000, deadline=None, database=None)
+settings.load_profile("short")
 
 
 @pytest.fixture

@@ -95,6 +95,6 @@ def test_unknown_name() -> None:
     ("name", "pattern"), [("CITATION.cff", r"^version: (.+)$"), ("CHANGELOG.md", r"^## (.+)$")]
 )
 def test_version_is_told_everywhere(name: str, pattern: str) -> None:
-    """The version is written once in the package; the citation repeats it, the changelog may be ahead of it."""
+    """The package holds the version; the citation repeats it, the changelog may be ahead of it."""
     told = re.findall(pattern, (ROOT / name).read_text(), re.MULTILINE)
     assert told[0] in (mrt_mitsuba.__version__, "Unreleased")

@@ -1,0 +1,69 @@
+"""Ends the process soon after Ctrl-C or a termination signal, whatever it is doing.
+
+Python acts on a signal between two of its own steps. While Dr.Jit runs a kernel there is none, and the
+interpreter does not end either before the kernel has: that can take minutes. A thread of its own waits for
+the signal, gives the program the time to end by itself, and then ends the process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
+
+GRACE = 1.0  # seconds; more than an orderly end takes without a kernel, and well under the two promised
+
+
+class Terminated(KeyboardInterrupt):
+    """The termination signal, raised wherever the program is."""
+
+
+@contextlib.contextmanager
+def ending_soon(clean_up: Callable[[], object]) -> Iterator[None]:
+    """Within the block, SIGTERM raises ``Terminated``, and the process ends within ``GRACE`` seconds.
+
+    ``clean_up`` is called before the process is ended by force; its exit code is 128 + the number of the
+    signal. Without effect outside the main thread, where Python sets no handlers, and without POSIX signals.
+    """
+    if os.name != "posix" or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    read_end, write_end = os.pipe()
+    os.set_blocking(write_end, False)
+    ended = threading.Event()
+    threading.Thread(target=_watch, args=(read_end, ended, clean_up), daemon=True).start()
+    handler = signal.signal(signal.SIGTERM, _terminate)
+    wakeup = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(wakeup)
+        signal.signal(signal.SIGTERM, handler)
+        ended.set()
+        os.close(write_end)  # ends the thread
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise Terminated
+
+
+def _watch(read_end: int, ended: threading.Event, clean_up: Callable[[], object]) -> None:
+    """Wait for the number of a signal, which Python's low-level handler writes at once, kernel or not."""
+    with open(read_end, "rb", buffering=0) as numbers:
+        while byte := numbers.read(1):
+            number = byte[0]
+            if number in (signal.SIGINT, signal.SIGTERM) and not ended.wait(GRACE):
+                clean_up()
+                leave_now(128 + number)
+
+
+def leave_now(code: int) -> None:
+    """End the process without waiting for kernels; what was printed is not lost."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
