@@ -7,9 +7,7 @@ under a temporary name, which also disappears if anything goes wrong.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
-import secrets
 import stat
 import warnings
 from collections.abc import Iterator, Mapping
@@ -180,6 +178,8 @@ def channels(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
 
 
 def _attribute(value: Any) -> str | int | float:
+    import json
+
     return value if isinstance(value, str | int | float) else json.dumps(value)
 
 
@@ -258,7 +258,7 @@ def _target(path: str | os.PathLike[str]) -> str:
 
 def _open_beside(target: str) -> tuple[str, IO[bytes]]:
     """Create a new file in the folder of ``target``, with the rights the user's umask gives."""
-    temporary = os.path.join(os.path.dirname(target), f".mrt-{secrets.token_hex(8)}.tmp")
+    temporary = os.path.join(os.path.dirname(target), f".mrt-{os.urandom(8).hex()}.tmp")
     _unfinished.add(temporary)
     descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
     return temporary, os.fdopen(descriptor, "w+b")
