@@ -40,4 +40,4 @@ class CheckoutFinder:
 def install() -> None:
     """Append the finder to ``sys.meta_path``, once."""
     if CheckoutFinder not in sys.meta_path:
-        sys.meta_path.append(CheckoutFinder)  # type: ignore[arg-type]
+        sys.meta_path.append(CheckoutFinder)
