@@ -60,7 +60,8 @@ class Choice:
     def describe(self) -> str:
         """Return one sentence for people."""
         if self.source == "none":
-            return f"no LLVM {OLDEST} or newer was found. {HELP}"
+            but = f", but {'; '.join(self.rejected)}" if self.rejected else ""
+            return f"no usable LLVM {OLDEST} or newer was found{but}. {HELP}"
         if self.source == "drjit":
             return "LLVM: left to Dr.Jit's own search"
         origin = {
@@ -90,31 +91,31 @@ def choose(
     """
     rejected: list[str] = []
     named = environ.get(VARIABLE, "")
-    wheel = wheel_library(sys.path if search_path is None else search_path)
+    wheel, problem = wheel_library(sys.path if search_path is None else search_path)
     if named and named not in (BLOCKED, wheel):
         version = version_of(named)
         if version and version[0] >= OLDEST:
             return Choice(named, version, "user")
-        problem = f"is LLVM {version_text(version)}" if version else "cannot be loaded"
-        rejected.append(f"{VARIABLE}={named} {problem}")
+        what = f"is LLVM {version_text(version)}" if version else "cannot be loaded"
+        rejected.append(f"{VARIABLE}={named} {what}")
     if not sys.platform.startswith("linux"):
         return Choice(None, None, "drjit", rejected)
-    if wheel:
-        version = version_of(wheel)
-        if version and version[0] >= OLDEST:
-            return Choice(wheel, version, "wheel", rejected)
-        rejected.append(f"{wheel} of {WHEEL} is LLVM {version_text(version)}")
-    candidates = sorted(system_libraries(system_folders(environ) if system is None else system), reverse=True)
-    rejected += [
-        f"{path} is LLVM {version_text(version)}" for version, path in candidates if version[0] < OLDEST
-    ]
+    if wheel and not problem:
+        return Choice(wheel, version_of(wheel), "wheel", rejected)
+    if problem:
+        rejected.append(problem)
+    libraries = set(system_libraries(system_folders(environ) if system is None else system))
+    candidates = sorted(
+        (found for found in libraries if found[1] != os.path.realpath(wheel or "")), reverse=True
+    )
+    rejected += [f"{path} is LLVM {version_text(found)}" for found, path in candidates if found[0] < OLDEST]
     if candidates and candidates[0][0][0] >= OLDEST:
         return Choice(candidates[0][1], candidates[0][0], "system", rejected)
     return Choice(None, None, "none", rejected)
 
 
-def wheel_library(search_path: Iterable[str]) -> str | None:
-    """Return the library that the package karellen-llvm-core installed, or None.
+def wheel_library(search_path: Iterable[str]) -> tuple[str | None, str | None]:
+    """Return the library of the package karellen-llvm-core and what speaks against it, or None for each.
 
     Its path is taken from the list of files (RECORD) in the package's metadata. ``importlib.metadata`` gives
     the same, but importing it takes 30 ms.
@@ -123,9 +124,24 @@ def wheel_library(search_path: Iterable[str]) -> str | None:
     for folder in search_path:
         for name in _list(folder):
             if name.startswith(prefix) and name.endswith(".dist-info"):
-                library = _library_in_record(folder, os.path.join(folder, name, "RECORD"))
+                info = os.path.join(folder, name)
+                library = _library_in_record(folder, os.path.join(info, "RECORD"))
                 if library:
-                    return library
+                    return library, _wheel_problem(library, info)
+    return None, None
+
+
+def _wheel_problem(library: str, info: str) -> str | None:
+    version = version_of(library)
+    if not version or version[0] < OLDEST:
+        return f"{library} of {WHEEL} is LLVM {version_text(version)}"
+    # Its symbolic links are made at the next start of Python; without them, libraries it needs are not found.
+    files = _list(info)
+    if "symlinks.txt" in files and "axle.done" not in files:
+        return (
+            f"the installation of {WHEEL} is unfinished: whoever may write to {info} has to start Python "
+            f"once ({sys.executable} -c '')"
+        )
     return None
 
 
@@ -231,6 +247,7 @@ def _ask(library: str) -> Version | None:
 
 
 _prepared: Choice | None = None
+_drjit_came_first = False
 
 
 def prepare() -> Choice:
@@ -238,11 +255,12 @@ def prepare() -> Choice:
 
     Warns where the user's own setting is not followed, and where Dr.Jit was imported too early to be told.
     """
-    global _prepared
+    global _prepared, _drjit_came_first
     if _prepared is None:
         _prepared = choose()
+        _drjit_came_first = "drjit" in sys.modules
         _set(_prepared)
-        if "drjit" not in sys.modules and _prepared.rejected and _prepared.rejected[0].startswith(VARIABLE):
+        if not _drjit_came_first and _prepared.rejected and _prepared.rejected[0].startswith(VARIABLE):
             _warn(
                 f"{_prepared.rejected[0]}, which Dr.Jit cannot use; it needs {OLDEST} or newer. "
                 f"Instead: {_prepared.describe()}"
@@ -264,10 +282,9 @@ def _set(choice: Choice) -> None:
 
 def too_early() -> str | None:
     """Return what is wrong if Dr.Jit was imported before the choice was made and has no good LLVM."""
-    drjit = sys.modules.get("drjit")
-    if drjit is None or _prepared is None or _prepared.source in ("none", "drjit"):
+    if not _drjit_came_first or _prepared is None or _prepared.source in ("none", "drjit"):
         return None
-    loaded = drjit.detail.llvm_version()[0]
+    loaded = sys.modules["drjit"].detail.llvm_version()[0]
     if loaded >= OLDEST:
         return None
     found = f"loaded LLVM {loaded}, with which it would abort" if loaded > 0 else "found no LLVM"

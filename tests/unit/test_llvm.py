@@ -109,8 +109,24 @@ def test_broken_metadata_and_folders_are_passed_over(tmp_path: Path) -> None:
     (tmp_path / "b" / "karellen_llvm_core-1.dist-info" / "RECORD").write_bytes(b"\xff\xfe/libLLVM.so.1")
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
-    assert llvm.wheel_library([str(tmp_path / n) for n in ("a", "b", "none", "loop")] + [site]) == path
+    assert llvm.wheel_library([str(tmp_path / n) for n in ("a", "b", "none", "loop")] + [site]) == (
+        path,
+        None,
+    )
     assert llvm.choose({llvm.VARIABLE: str(loop)}, [site], []).path == path
+
+
+@linux
+def test_unfinished_installation_is_not_used(tmp_path: Path) -> None:
+    """As after an installation by the superuser, until Python first starts with the right to write there."""
+    site, path = wheel(tmp_path / "venv")
+    info = next(Path(site).iterdir())
+    (info / "symlinks.txt").touch()
+    for environ in ({}, {llvm.VARIABLE: path}):
+        choice = llvm.choose(environ, [site], [str(Path(path).parent)])
+        assert choice.source == "none" and "is unfinished: whoever may write" in choice.describe()
+    (info / "axle.done").touch()
+    assert llvm.choose({}, [site], []).path == path
 
 
 @linux
@@ -166,7 +182,9 @@ except mrt_mitsuba.VariantError as error:
     done = run_python(HIDE + code)
     assert done.returncode == 0, done.stderr
     first, loaded, refused = done.stdout.splitlines()
-    assert first.startswith("scalar_rgb scalar_rgb 1 rendering in the slow variant scalar_rgb: no LLVM 17")
+    assert first.startswith(
+        "scalar_rgb scalar_rgb 1 rendering in the slow variant scalar_rgb: no usable LLVM 17"
+    )
     assert "pip install karellen-llvm-core" in first and "pip install karellen-llvm-core" in refused
     assert loaded == "False"
 
