@@ -191,8 +191,8 @@ class Options:
     )
     aamode: str = option(
         "sobel",
-        choice("none", "luma", "sobel"),
-        "refine every pixel, or only where contrast (luma) or a Sobel filter finds an edge",
+        choice("none", "luma", "sobel", "geometry"),
+        "refine every pixel, or only edges in brightness (luma, sobel) or in normals and depth (geometry)",
     )
     focaldist: float | None = option(
         None, number(0), "distance in focus, from the camera; 0: no depth of field", "from the scene"

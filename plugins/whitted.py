@@ -150,7 +150,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         active = mi.Bool(active)
         hit = prepared.intersect(scene, ray, active, coherent=True)
         shading = self._shade(prepared, scene, sampler, ray, hit, mi.UnpolarizedSpectrum(1), active)
-        if not self._bounces(prepared):
+        if not self.bounces(prepared):
             return Trace(shading.radiance, shading.radiance, hit, mi.UInt32(0), shading.shadow_rays)
         throughput, depth = shading.reflectance, shading.cost
         state = {
@@ -185,7 +185,8 @@ class MrtWhitted(mi.SamplingIntegrator):
         final, = dr.while_loop((state,), lambda s: s["active"], bounce, label="mirror bounces")
         return Trace(final["radiance"], shading.radiance, hit, final["bounces"], final["shadow_rays"])
 
-    def _bounces(self, prepared) -> bool:
+    def bounces(self, prepared) -> bool:
+        """Can a mirror ray matter anywhere in the scene?"""
         return prepared.mirrors and self.max_depth > 1
 
     def _continues(self, prepared, throughput, depth):
@@ -201,15 +202,15 @@ class MrtWhitted(mi.SamplingIntegrator):
         radiance = self._sky(prepared, ray, active & ~hit.found)
         if prepared.emissive:
             radiance += mi.unpolarized_spectrum(si.emitter(scene, hit.found).eval(si, hit.found))
-        unrolled = prepared.lights if len(prepared.lights) <= UNROLLED_LIGHTS else []
+        unrolled = prepared.lights if prepared.unrolled else []
         samples = [self._light_sample(prepared, light, sampler, hit) for light in unrolled]
-        values, reflectance, int_ior = prepared.eval_bsdf(hit, samples, mirror=self._bounces(prepared))
+        values, reflectance, int_ior = prepared.eval_bsdf(hit, samples, mirror=self.bounces(prepared))
         shadow_rays = mi.UInt32(0)
         for sample, value in zip(samples, values):
             lit, traced = self._visible_part(prepared, scene, hit, throughput, sample, value)
             radiance += lit
             shadow_rays += traced
-        if len(prepared.lights) > UNROLLED_LIGHTS:
+        if not prepared.unrolled:
             radiance, shadow_rays = self._loop_over_lights(prepared, scene, sampler, hit, throughput, radiance)
         return Shading(radiance, shadow_rays, reflectance, self._cost(int_ior))
 
@@ -294,7 +295,7 @@ class Prepared:
         others = [s for s in shapes if not hasattr(s, "unit_normal")]
         # The stand-ins of the planes must not be hit: rays are traced in a scene that holds the other shapes only
         self.bvh = _scene_of(others) if self.planes else None
-        self.analytic_only = not others
+        self.shape_count = len(others)
         self.scales = _Scales(others)
         self._read_emitters(scene)
         self._read_bsdfs({id(b): b for b in (s.bsdf() for s in shapes)}.values())
@@ -304,7 +305,9 @@ class Prepared:
     def _read_emitters(self, scene) -> None:
         self.environment = scene.environment()
         self.lights = [e for e in scene.emitters() if not e.is_environment()]
-        self.light_pointers = pointer("Emitter", self.lights) if len(self.lights) > UNROLLED_LIGHTS else None
+        self.unrolled = len(self.lights) <= UNROLLED_LIGHTS or not is_jit()
+        self.light_pointers = None if self.unrolled else pointer("Emitter", self.lights)
+        self.light_handling = "unrolled" if self.unrolled else "in a loop"
         delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
         self.random = any(not mi.has_flag(e.flags(), delta) for e in self.lights)
         self.emissive = any(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in self.lights)
@@ -346,7 +349,7 @@ class Prepared:
         return Hit(si, found, dr.maximum(scale, dr.max(dr.abs(si.p))))
 
     def _intersect_shapes(self, scene, ray, active, coherent):
-        if self.analytic_only:
+        if not self.shape_count:
             return dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False)
         pi = (self.bvh or scene).ray_intersect_preliminary(ray, coherent, active)
         found = active & pi.is_valid()
@@ -359,7 +362,7 @@ class Prepared:
         for plane in self.planes:
             # Opposite sides: no distance is computed, so none can be wrong
             blocked |= plane.height(o) * plane.height(ds.p) < 0
-        if self.analytic_only:
+        if not self.shape_count:
             return blocked
         to_light = ds.p - o
         # Stop short of a light that has a surface of its own

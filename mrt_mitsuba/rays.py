@@ -1,0 +1,118 @@
+"""Where in a pixel the samples lie, and the camera rays through them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+LATTICES = ("report", "centered")
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """A grid of aa × aa samples in a pixel.
+
+    ``report``: sample (i, j) at (0.5 + i/aa, 0.5 + j/aa), y upwards, as in the original: sample 0 is the pixel's centre
+    and the others reach into the next pixels, which shifts the picture by up to half a pixel. ``centered``: the middles
+    of aa × aa equal cells.
+    """
+
+    kind: str
+    aa: int
+
+    @property
+    def count(self) -> int:
+        """Samples in a pixel."""
+        return self.aa**2
+
+    @property
+    def holds_centre(self) -> bool:
+        """Is the pixel's centre one of the samples? It then comes first."""
+        return self.kind == "report" or self.aa % 2 == 1
+
+    def offset(self, sample: Any, aa: Any) -> tuple[Any, Any]:
+        """Place of sample number ``sample`` in its pixel as (x, y), y downwards; ``aa`` as the same type of integer."""
+        import mitsuba as mi
+
+        if self.kind == "centered" and self.holds_centre:
+            # start from the middle one, so that sample 0 is the centre
+            sample = (sample + self.count // 2) % self.count
+        i, j = sample // aa, sample % aa
+        if self.kind == "report":
+            return 0.5 + mi.Float(i) / mi.Float(aa), 0.5 - mi.Float(j) / mi.Float(aa)
+        return (mi.Float(i) + 0.5) / mi.Float(aa), (mi.Float(j) + 0.5) / mi.Float(aa)
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Samples ``first`` to ``first + count - 1`` of some pixels, each traced ``repeats`` times.
+
+    ``pixels``: indices into the picture, row by row from the top, as an array; or a range, for which no indices are
+    stored. The rays of a pixel lie side by side.
+    """
+
+    pixels: Any
+    lattice: Lattice
+    first: int = 0
+    count: int = 1
+    repeats: int = 1
+
+    @property
+    def rays_per_pixel(self) -> int:
+        return self.count * self.repeats
+
+    @property
+    def ray_count(self) -> int:
+        return len(self.pixels) * self.rays_per_pixel
+
+    def part(self, start: int, stop: int) -> Bundle:
+        """The bundle of some of the pixels."""
+        return replace(self, pixels=self.pixels[start:stop])
+
+    def samples(self, width: int, height: int) -> Samples:
+        """Where every ray of the bundle starts. Vectorised variants only."""
+        import drjit as dr
+        import mitsuba as mi
+
+        per_pixel = dr.opaque(mi.UInt32, self.rays_per_pixel)
+        lane = dr.arange(mi.UInt32, self.ray_count)
+        order = lane // per_pixel
+        if isinstance(self.pixels, range):
+            pixel = order + dr.opaque(mi.UInt32, self.pixels.start)
+        else:
+            pixel = dr.gather(mi.UInt32, mi.UInt32(self.pixels), order)
+        # Sizes are data, not constants: another picture size needs no other kernel
+        width, height, repeats, first, aa = (
+            dr.opaque(mi.UInt32, n) for n in (width, height, self.repeats, self.first, self.lattice.aa))
+        return self._samples(lane, order, pixel, lane - order * per_pixel, width, height, repeats, first, aa)
+
+    def each_sample(self, width: int, height: int) -> Iterator[Samples]:
+        """The same, one ray at a time, for scalar variants."""
+        for lane in range(self.ray_count):
+            order, rest = divmod(lane, self.rays_per_pixel)
+            yield self._samples(lane, order, int(self.pixels[order]), rest, width, height, self.repeats, self.first,
+                                self.lattice.aa)
+
+    def _samples(self, lane, order, pixel, rest, width, height, repeats, first, aa) -> Samples:
+        import mitsuba as mi
+
+        row = pixel // width
+        x, y = self.lattice.offset(rest // repeats + first, aa)
+        place = mi.Point2f((mi.Float(pixel - row * width) + x) / mi.Float(width),
+                           (mi.Float(row) + y) / mi.Float(height))
+        return Samples(lane=lane, order=order, is_first=rest == 0, place=place)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Rays of a bundle before they are rays.
+
+    ``lane``: the ray's number; ``order``: its pixel's place in the bundle; ``is_first``: is it its pixel's first; ``place``:
+    on the film, x to the right, y down, the picture being [0, 1]².
+    """
+
+    lane: Any
+    order: Any
+    is_first: Any
+    place: Any

@@ -1,0 +1,109 @@
+"""Opening what ``render`` is given as a scene."""
+
+from __future__ import annotations
+
+import operator
+import os
+from dataclasses import dataclass
+from typing import Any
+
+from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.scene import Scene
+from mrt_mitsuba.scenes import report_scene
+
+SIZE = (800, 600)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A loaded Mitsuba scene, how to look at it, and the focus it suggests."""
+
+    name: str
+    scene: Any
+    sensor: Any
+    integrator: Any
+    width: int
+    height: int
+    focal_distance: float | None = None
+    focal_range: float = 2.0
+
+
+def open_scene(
+    scene: Any,
+    *,
+    width: int | None = None,
+    height: int | None = None,
+    fresnel: str | None = None,
+    convention: str = "report",
+    integrator: Any = None,
+) -> Source:
+    """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``."""
+    import mitsuba as mi
+
+    if isinstance(scene, Scene):
+        return _report_source(scene.title or "a scene", scene, width, height, fresnel, integrator)
+    if hasattr(scene, "__index__"):
+        number = operator.index(scene)
+        return _report_source(str(number), report_scene(number), width, height, fresnel, integrator)
+    if fresnel is not None:
+        raise UsageError("fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf")
+    if isinstance(scene, dict):
+        return _own_source("a dict", _load(mi.load_dict, scene, "the dict"), width, height, integrator)
+    if isinstance(scene, str | os.PathLike):
+        path = os.fspath(scene)
+        return _own_source(os.path.basename(path), _load_file(path), width, height, integrator)
+    if isinstance(scene, mi.Scene):
+        return _own_source("a Mitsuba scene", scene, width, height, integrator)
+    raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")
+
+
+def _report_source(name, scene: Scene, width, height, fresnel, integrator) -> Source:
+    import mitsuba as mi
+
+    width, height = width or SIZE[0], height or SIZE[1]
+    loaded = _load(mi.load_dict, scene.to_dict(width=width, height=height, fresnel=fresnel or "schlick"), name)
+    return Source(name, loaded, loaded.sensors()[0], _integrator(integrator, loaded), width, height,
+                  scene.focal_distance, scene.focal_range)
+
+
+def _own_source(name, scene, width, height, integrator) -> Source:
+    if not scene.sensors():
+        raise SceneError(f"{name} has no sensor: add one, so that there is something to look through")
+    sensor = scene.sensors()[0]
+    size = tuple(int(n) for n in sensor.film().crop_size())
+    if (width or size[0], height or size[1]) != size:
+        raise UsageError(f"{name} brings a film of {size[0]}x{size[1]}: change it there, or leave out width and height")
+    return Source(name, scene, sensor, _integrator(integrator, scene), *size)
+
+
+def _integrator(integrator: Any, scene: Any) -> Any:
+    import mitsuba as mi
+
+    if integrator is None:
+        integrator = scene.integrator()
+    if integrator is None:
+        integrator = {"type": "mrt_whitted"}
+    if isinstance(integrator, str):
+        integrator = {"type": integrator}
+    if isinstance(integrator, dict):
+        integrator = _load(mi.load_dict, integrator, f"the integrator {integrator.get('type')!r}")
+    if not isinstance(integrator, mi.SamplingIntegrator):
+        raise UsageError(f"the integrator is {integrator!r}: it must be a sampling integrator, such as path or direct")
+    return integrator
+
+
+def _load_file(path: str) -> Any:
+    import mitsuba as mi
+
+    if not os.path.isfile(path):
+        raise SceneError(f"cannot read {path}: there is no such file")
+    if not path.lower().endswith(".xml"):
+        raise UsageError(f"cannot read {path}: a scene file ends in .xml")
+    return _load(mi.load_file, path, path)
+
+
+def _load(loader: Any, what: Any, name: str) -> Any:
+    try:
+        return loader(what)
+    except RuntimeError as error:
+        raise SceneError(f"cannot load {name}: {error}") from error
