@@ -103,8 +103,8 @@ def banner(options: Options) -> str:
         reach = scene.focal_range if reach is None else reach
     lines = {
         "Scene": options.scene if options.scene is not None else options.scene_number,
-        "Width": options.width,
-        "Height": options.height,
+        "Width": options.width or "from the file",
+        "Height": options.height or "from the file",
         "AA": options.aa,
         "AA mode": options.aamode,
         "F distance": distance or "off",

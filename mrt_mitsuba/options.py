@@ -20,10 +20,10 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.output import LAYERS
 from mrt_mitsuba.scenes import NUMBERS
 
-LARGEST_SIDE = (
-    65536  # pixels; an image has to fit in 32-bit indices, its memory is checked where it is planned
-)
+LARGEST_SIDE = 65536  # pixels; whether the memory suffices is checked where it is planned
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
+# A scene file has its own, unless these are given
+DECIDED_BY_FILE = ("width", "height", "fresnel")
 HELP_WIDTH = 100  # characters
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 SMALLEST_MEMORY = 64 * 2**20  # bytes; about what one tile with all layers takes
@@ -184,15 +184,17 @@ class Options:
 
     filename: str
     scene_number: int = 0
-    width: int = option(800, integer(1, LARGEST_SIDE), f"image width in pixels, up to {LARGEST_SIDE}")
-    height: int = option(600, integer(1, LARGEST_SIDE), f"image height in pixels, up to {LARGEST_SIDE}")
+    width: int | None = option(800, integer(1, LARGEST_SIDE), f"image width in pixels, up to {LARGEST_SIDE}")
+    height: int | None = option(
+        600, integer(1, LARGEST_SIDE), f"image height in pixels, up to {LARGEST_SIDE}"
+    )
     aa: int = option(
         4, integer(1, LARGEST_AA), f"anti-aliasing: aa x aa samples per pixel, up to {LARGEST_AA}"
     )
     aamode: str = option(
         "sobel",
         choice("none", "luma", "sobel", "geometry"),
-        "refine every pixel, or only edges in brightness (luma, sobel) or in normals and depth (geometry)",
+        "refine every pixel, or only edges in brightness (luma, sobel) or in shape (geometry)",
     )
     focaldist: float | None = option(
         None, number(0), "distance in focus, from the camera; 0: no depth of field", "from the scene"
@@ -200,7 +202,7 @@ class Options:
     focalrange: float | None = option(
         None, number(0), "half-width of the sharp zone around it", "from the scene"
     )
-    fresnel: str = option("schlick", choice("schlick", "dielectric"), "reflectance formula")
+    fresnel: str | None = option("schlick", choice("schlick", "dielectric"), "reflectance formula")
     variant: str | None = option(None, word(), "Mitsuba variant", "llvm_ad_rgb, without LLVM scalar_rgb")
     layers: tuple[str, ...] = option(
         (), subset(LAYERS), f"further EXR layers: all, or some of {', '.join(LAYERS)}", "none"
@@ -267,6 +269,10 @@ def parse(arguments: Sequence[str]) -> Options:
         raise UsageError(f"both SCENE {values['scene_number']} and scene={values['scene']}: give one of them")
     if "motionsamples" in values and "motion" not in values:
         raise UsageError("motionsamples is of use only with motion=dx,dy,dz")
+    if "scene" in values:
+        values = dict.fromkeys(DECIDED_BY_FILE) | values
+    if "layers=all" in rest and values.get("aamode") == "none":
+        values["layers"] = tuple(layer for layer in values["layers"] if layer != "edges")  # nothing detects
     return Options(**values)
 
 

@@ -1,0 +1,123 @@
+"""The installed ``mrt`` command from end to end, in a process and a folder of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mrt_mitsuba.output import read_exr
+
+Mrt = Callable[..., subprocess.CompletedProcess[str]]
+SMALL = ("width=64", "height=48")
+
+
+@pytest.fixture
+def mrt(tmp_path: Path) -> Mrt:
+    """Run ``mrt`` with arguments in an empty folder, as after installation: LLVM is found by the package."""
+    command = Path(sys.executable).with_name("mrt")
+    environ = {name: value for name, value in os.environ.items() if name != "DRJIT_LIBLLVM_PATH"}
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [command, *arguments],
+            cwd=tmp_path,
+            env=environ,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+
+    return run
+
+
+def test_picture_and_its_two_files(mrt: Mrt, tmp_path: Path) -> None:
+    done = mrt("out", "1", *SMALL, "aa=2", "layers=depth,normal")
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    assert done.stdout.splitlines()[-1].startswith("Render time: ")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.exr", "out.png"]
+    exr = read_exr(tmp_path / "out.exr")
+    assert exr.image.shape == (48, 64, 3)
+    assert {"depth.Z", "normal.X", "normal.Y", "normal.Z"} <= exr.layers.keys()
+    given = json.loads(exr.header["mrt:options"])
+    assert (exr.header["mrt:scene"], exr.header["mrt:variant"]) == ("1", "llvm_ad_rgb")
+    assert (given["width"], given["aa"], given["fresnel"]) == (64, 2, "schlick")
+    with Image.open(tmp_path / "out.png") as png:
+        np.testing.assert_array_equal(np.asarray(png), np.clip(np.trunc(exr.image * 255), 0, 255))
+
+
+def test_same_command_twice_gives_the_same_pixels(mrt: Mrt, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        assert mrt(name, "2", *SMALL, "aa=2").returncode == 0
+    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr").image, read_exr(tmp_path / "b.exr").image)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_plan_is_shown(mrt: Mrt) -> None:
+    done = mrt("out", "0", *SMALL, "aa=1", "plan=show")
+    assert done.returncode == 0
+    assert "Plan for 0" in done.stdout and "without depth of field" in done.stdout
+
+
+def test_scene_file_keeps_its_size(mrt: Mrt, tmp_path: Path) -> None:
+    (tmp_path / "mine.xml").write_text(
+        """<scene version="3.0.0">
+        <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="20"/>
+            <integer name="height" value="10"/><rfilter type="box"/></film></sensor>
+        <emitter type="constant"><rgb name="radiance" value="0.25 0.5 0.75"/></emitter>
+        <shape type="sphere"><point name="center" x="0" y="5" z="9"/></shape></scene>"""
+    )
+    done = mrt("out", "scene=mine.xml", "aa=1")
+    assert done.returncode == 0, done.stderr
+    picture = read_exr(tmp_path / "out.exr")
+    assert picture.image.shape == (10, 20, 3)
+    np.testing.assert_array_equal(picture.image[-1, 0], np.float32([0.25, 0.5, 0.75]))  # the sky, as given
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (None, "no such file"),
+        ("", "cannot load mine.xml"),
+        ("<scene", "cannot load mine.xml"),
+        ("<scene version='3.0.0'><shape type='potato'/></scene>", "potato"),
+    ],
+)
+def test_broken_scene_file(mrt: Mrt, tmp_path: Path, content: str | None, text: str) -> None:
+    if content is not None:
+        (tmp_path / "mine.xml").write_text(content)
+    before = sorted(tmp_path.iterdir())
+    done = mrt("out", "scene=mine.xml", "quiet=1")
+    assert done.returncode == 1 and done.stdout == ""
+    assert text in done.stderr and done.stderr.startswith("mrt: ") and done.stderr.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("variant", "code", "text"),
+    [
+        ("llvm_ad_rbg", 2, "unknown variant 'llvm_ad_rbg'. Did you mean llvm_ad_rgb?"),
+        ("cuda_ad_rgb", 1, "needs an NVIDIA GPU"),
+    ],
+)
+def test_variant_that_cannot_be_used(mrt: Mrt, tmp_path: Path, variant: str, code: int, text: str) -> None:
+    done = mrt("out", *SMALL, f"variant={variant}")
+    if variant.startswith("cuda") and done.returncode == 0:
+        pytest.skip("this machine has a GPU")
+    assert done.returncode == code and text in done.stderr and done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_doctor(mrt: Mrt) -> None:
+    done = mrt("doctor")
+    assert done.returncode == 0, done.stdout
+    assert "self-test: scene 0 at 16x12 in llvm_ad_rgb: passed" in done.stdout
+    assert "LLVM" in done.stdout and "variants: scalar_rgb" in done.stdout
