@@ -15,6 +15,7 @@ from .microfacet import (
     tan2_theta,
 )
 from .parameters import ParameterError, choice, flag, number
+from .variants import first
 
 FRESNEL_FORMS = ("schlick", "dielectric", "unity")
 
@@ -243,6 +244,15 @@ class MrtBSDF(mi.BSDF):
         if name == "int_ior":
             return self._value(self.int_ior, si, active)
         raise ParameterError(f'mrt_bsdf: no scalar attribute "{name}"; there is "int_ior"')
+
+    def mirror_bound(self) -> tuple[float, float]:
+        """An upper bound of ``mirror_reflectance``, and ``int_ior``; infinite where they vary or are not known."""
+        reflectance = int_ior = float("inf")
+        if not (self.specular_reflectance.is_spatially_varying() or mi.is_spectral):
+            reflectance = max(map(first, self.specular_reflectance.eval(dr.zeros(mi.SurfaceInteraction3f))))
+        if not isinstance(self.int_ior, mi.Texture):
+            int_ior = first(self.int_ior)
+        return reflectance, int_ior
 
     def to_string(self) -> str:
         names = ("alpha", "int_ior", "ext_ior", "diffuse_reflectance", "specular_reflectance", "f0")

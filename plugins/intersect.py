@@ -6,6 +6,9 @@ components with + and -, which is why a vector stands left of a scalar in produc
 """
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import drjit as dr
 
 
@@ -44,3 +47,249 @@ def intersect_sphere(o, d, center, radius):
     near, far = dr.select(ahead, small, large), dr.select(ahead, large, small)
     t = dr.select(near > 0, near, far)
     return dr.select(meets & (t > 0), t, dr.inf)
+
+
+# ------------------------------------ Quadrics of revolution ------------------------------------------
+#
+# A cone or cylinder is intersected in its unit frame, to which a ``Frame`` maps world space: a cone has its apex at 0
+# and its base disc of radius 1 at z = 1, a cylinder of radius 1 lies between z = 0 and z = 1. The map is affine, so it
+# changes neither t nor what is hit, and sizes, aspect ratios and shears are gone before anything is squared.
+#
+# The solid is convex: a line is inside it for one interval. It is cut out of the interval inside the infinite quadric
+# by the slab between the caps, so no ray slips through between two surfaces, at a rim or an apex.
+
+LATERAL, BASE, TOP = 0, 1, 2
+"""Parts of a surface: the curved side, the disc at z = 1, the disc at z = 0 (of a cylinder)."""
+
+# Divisors are kept this far from zero; quotients of unit-frame numbers (< 1e6) stay finite in float32
+_TINY = 1e-30
+
+
+@dataclass
+class Frame:
+    """An affine map from world space to the unit frame of a shape: local = rows · (world − origin)."""
+
+    origin: Any  # point
+    x: Any  # rows of the matrix, vectors
+    y: Any
+    z: Any
+
+    def point(self, p: Any) -> Any:
+        """A world-space point in the unit frame."""
+        return self.vector(p - self.origin)
+
+    def vector(self, v: Any) -> Any:
+        """A world-space vector in the unit frame."""
+        return type(v)(dr.dot(self.x, v), dr.dot(self.y, v), dr.dot(self.z, v))
+
+    def gradient(self, g: Any) -> Any:
+        """World-space gradient of a function whose gradient in the unit frame is ``g``: the transposed matrix."""
+        return self.x * g.x + self.y * g.y + self.z * g.z
+
+
+@dataclass
+class SurfaceHit:
+    """Where a ray meets a surface first: distance ``t`` in units of |d|, inf for a miss, and the ``part`` it is on."""
+
+    t: Any
+    part: Any
+
+
+@dataclass
+class SurfacePoint:
+    """A point ``p`` put onto a surface, the outward unit normal ``n`` there, and texture coordinates ``u, v``."""
+
+    p: Any
+    n: Any
+    u: Any
+    v: Any
+
+
+def cone_frame(apex: Any, base_center: Any, radius: Any) -> Frame:
+    """Unit frame of a right circular cone."""
+    return _frame_along(apex, base_center - apex, radius)
+
+
+def cylinder_frame(p0: Any, p1: Any, radius: Any) -> Frame:
+    """Unit frame of a right circular cylinder from ``p0`` (z = 0) to ``p1`` (z = 1)."""
+    return _frame_along(p0, p1 - p0, radius)
+
+
+def _frame_along(origin: Any, axis: Any, radius: Any) -> Frame:
+    """The frame whose z runs along ``axis``; seen against it, u grows counter-clockwise."""
+    length2 = dr.squared_norm(axis)
+    n = axis / -dr.sqrt(length2)
+    s, t = tangents(n)
+    return Frame(origin, s / radius, t / radius, axis / length2)
+
+
+def tangents(n: Any) -> tuple[Any, Any]:
+    """Two unit vectors that make a right-handed frame with the unit vector ``n``.
+
+    Source: Duff et al., "Building an Orthonormal Basis, Revisited", 2017.
+    """
+    sign = dr.select(n.z >= 0, 1, -1)
+    a = -1 / (sign + n.z)
+    b = n.x * n.y * a
+    make = type(n)
+    return make(1 + sign * n.x * n.x * a, sign * b, -sign * n.x), make(b, sign + n.y * n.y * a, -n.y)
+
+
+def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> SurfaceHit:
+    """First intersection at t > 0 of a ray with a cone: its lateral surface and, if ``capped``, its base disc.
+
+    Seen from inside, the far side is met. With p the point of the line nearest to the apex, u its unit direction and
+    ⟨a, b⟩ = a.x b.x + a.y b.y − a.z b.z, the lateral surface is at the roots of ⟨u,u⟩ s² + 2⟨p,u⟩ s + ⟨p,p⟩. Their
+    discriminant is written as m.x² + m.y² − m.z² with the line's moment m = p × u (Lagrange's identity), so that it is
+    accurate relative to |p|², and p · u = 0 makes ⟨p,u⟩ = −2 p.z u.z.
+    """
+    line = _line(o, d, frame)
+    p, u = line.p, line.u
+    rho = dr.sqrt(dr.square(u.x) + dr.square(u.y))
+    r = dr.sqrt(dr.square(p.x) + dr.square(p.y))
+    a = (rho - dr.abs(u.z)) * (rho + dr.abs(u.z))
+    half_b = -2 * p.z * u.z
+    c = (r - dr.abs(p.z)) * (r + dr.abs(p.z))
+    m = dr.cross(p, u)
+    m_xy = dr.sqrt(dr.square(m.x) + dr.square(m.y))
+    discriminant = (m_xy - dr.abs(m.z)) * (m_xy + dr.abs(m.z))
+    first, second = _roots(a, half_b, c, discriminant)
+    # Steeper than the side: the line is inside each half of the double cone once, up to or from infinity. Shallower:
+    # both roots are on the half on whose side of the apex p is
+    steep, down = a <= 0, u.z > 0
+    near = dr.select(steep, dr.select(down, second, -dr.inf), first)
+    far = dr.select(steep, dr.select(down, dr.inf, first), second)
+    inside = steep | ((discriminant >= 0) & (p.z > 0))
+    # The slab has one side only, z <= 1; the apex is the other
+    to_base = (1 - p.z) / _off_zero(u.z)
+    level = u.z == 0
+    enter_base = dr.select(level | down, -dr.inf, to_base)
+    leave_base = dr.select(level | (u.z < 0), dr.inf, to_base)
+    inside = inside & dr.select(level, p.z <= 1, True)
+    near_part = dr.select(enter_base > near, BASE, LATERAL)
+    far_part = dr.select(leave_base < far, BASE, LATERAL)
+    return _first_boundary(line, inside, dr.maximum(near, enter_base), near_part, dr.minimum(far, leave_base),
+                           far_part, capped)
+
+
+def intersect_cylinder(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> SurfaceHit:
+    """First intersection at t > 0 of a ray with a cylinder: its lateral surface and, if ``capped``, its two discs.
+
+    As ``intersect_cone``, for the form a.x b.x + a.y b.y: the discriminant is ρ² − (p × u).z², ρ² = u.x² + u.y².
+    """
+    line = _line(o, d, frame)
+    p, u = line.p, line.u
+    rho = dr.sqrt(dr.square(u.x) + dr.square(u.y))
+    r = dr.sqrt(dr.square(p.x) + dr.square(p.y))
+    moment = dr.abs(p.x * u.y - p.y * u.x)
+    discriminant = (rho - moment) * (rho + moment)
+    first, second = _roots(dr.square(rho), p.x * u.x + p.y * u.y, (r - 1) * (r + 1), discriminant)
+    along = rho == 0
+    near, far = dr.select(along, -dr.inf, first), dr.select(along, dr.inf, second)
+    inside = dr.select(along, r <= 1, discriminant >= 0)
+    level = u.z == 0
+    inside = inside & dr.select(level, (p.z >= 0) & (p.z <= 1), True)
+    to_top, to_base = -p.z / _off_zero(u.z), (1 - p.z) / _off_zero(u.z)
+    down = u.z > 0
+    enter = dr.select(level, -dr.inf, dr.minimum(to_top, to_base))
+    leave = dr.select(level, dr.inf, dr.maximum(to_top, to_base))
+    near_part = dr.select(enter > near, dr.select(down, TOP, BASE), LATERAL)
+    far_part = dr.select(leave < far, dr.select(down, BASE, TOP), LATERAL)
+    return _first_boundary(line, inside, dr.maximum(near, enter), near_part, dr.minimum(far, leave), far_part, capped)
+
+
+def cone_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
+    """Put a point near a cone onto the given part of it, along the normal.
+
+    Side: u = azimuth / 2π in [0, 1), v = 0 at the base and 1 at the apex. Base: the unit square around the disc.
+    At the apex the normal is that of one of the generatrices.
+    """
+    q = frame.point(p)
+    r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
+    on_side = part == LATERAL
+    x, y = _azimuth(q, r)
+    gradient = type(q)(dr.select(on_side, x, 0), dr.select(on_side, y, 0), dr.select(on_side, -1, 1))
+    return _surface_point(p, q, dr.select(on_side, r - q.z, q.z - 1), gradient, on_side, frame)
+
+
+def cylinder_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
+    """Put a point near a cylinder onto the given part of it, along the normal.
+
+    Side: u = azimuth / 2π in [0, 1), v = 0 at the disc ``BASE``, 1 at ``TOP``. Discs: the unit square around each.
+    """
+    q = frame.point(p)
+    r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
+    on_side, on_base = part == LATERAL, part == BASE
+    x, y = _azimuth(q, r)
+    off_disc = dr.select(on_base, q.z - 1, -q.z)
+    z = dr.select(on_side, 0, dr.select(on_base, 1, -1))
+    gradient = type(q)(dr.select(on_side, x, 0), dr.select(on_side, y, 0), z)
+    return _surface_point(p, q, dr.select(on_side, r - 1, off_disc), gradient, on_side, frame)
+
+
+@dataclass
+class _Line:
+    """A ray's line in the unit frame: s ↦ p + s u with |u| = 1, p · u = 0, and s = t length − start."""
+
+    p: Any
+    u: Any
+    start: Any
+    length: Any
+
+
+def _line(o: Any, d: Any, frame: Frame) -> _Line:
+    o, d = frame.point(o), frame.vector(d)
+    length = dr.norm(d)
+    u = d / length
+    along = dr.dot(o, u)
+    p = type(d)(o) - u * along
+    rest = dr.dot(p, u)  # from far away, the rounding of the first step is not small beside the shape
+    return _Line(p - u * rest, u, -(along + rest), length)
+
+
+def _off_zero(x: Any) -> Any:
+    """``x``, or a tiny number of the same sign where it is smaller."""
+    return dr.select(dr.abs(x) >= _TINY, x, dr.select(x < 0, -_TINY, _TINY))
+
+
+def _roots(a: Any, half_b: Any, c: Any, discriminant: Any) -> tuple[Any, Any]:
+    """The roots of a s² + 2 half_b s + c in ascending order; where a vanishes, one of them is huge.
+
+    Source: the cancellation-free form, e.g. Press et al., Numerical Recipes, §5.6.
+    """
+    root = dr.sqrt(dr.maximum(discriminant, 0))
+    q = dr.select(half_b >= 0, -half_b - root, root - half_b)
+    one, other = q / dr.select(a == 0, -_TINY, a), c / _off_zero(q)
+    return dr.minimum(one, other), dr.maximum(one, other)
+
+
+def _first_boundary(line: _Line, inside: Any, near: Any, near_part: Any, far: Any, far_part: Any,
+                    capped: bool) -> SurfaceHit:
+    """The first end at t > 0 of the interval [near, far] of s, with what is hit there; open solids have no caps."""
+    inside = inside & (near <= far)
+    near_t, far_t = (near + line.start) / line.length, (far + line.start) / line.length
+    if not capped:
+        near_t = dr.select(near_part == LATERAL, near_t, -dr.inf)
+        far_t = dr.select(far_part == LATERAL, far_t, -dr.inf)
+    from_outside = near_t > 0
+    t = dr.select(from_outside, near_t, far_t)
+    part = dr.select(from_outside, near_part, far_part)
+    return SurfaceHit(dr.select(inside & (t > 0), t, dr.inf), part)
+
+
+def _azimuth(q: Any, r: Any) -> tuple[Any, Any]:
+    """Cosine and sine of the azimuth of ``q`` at distance r from the axis; on the axis, those of 0."""
+    on_axis = r == 0
+    inverse = 1 / dr.select(on_axis, 1, r)
+    return dr.select(on_axis, 1, q.x * inverse), q.y * inverse
+
+
+def _surface_point(p: Any, q: Any, distance: Any, gradient: Any, on_side: Any, frame: Frame) -> SurfacePoint:
+    """Move ``p`` (``q`` in the unit frame) by one Newton step: ``distance`` is linear along its ``gradient``."""
+    g = frame.gradient(gradient)
+    inverse = 1 / dr.norm(g)
+    n = g * inverse
+    azimuth = dr.atan2(q.y, q.x) / (2 * dr.pi)
+    u = dr.select(on_side, dr.select(azimuth < 0, azimuth + 1, azimuth), 0.5 + 0.5 * q.x)
+    v = dr.select(on_side, 1 - q.z, 0.5 + 0.5 * q.y)
+    return SurfacePoint(p - n * (distance * inverse), n, u, dr.clip(v, 0, 1))

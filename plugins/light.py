@@ -5,7 +5,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .parameters import vector
-from .variants import pointer
+from .variants import first, pointer
 
 
 class MrtLight(mi.Emitter):
@@ -88,7 +88,7 @@ class MrtLight(mi.Emitter):
         raise NotImplementedError("mrt_light: light tracing needs a finite emitted power; use a stock 'point' light")
 
     def bbox(self):
-        p = mi.ScalarPoint3f([float(c) if isinstance(c, float) else c[0] for c in self.position])
+        p = mi.ScalarPoint3f(list(map(first, self.position)))
         return mi.ScalarBoundingBox3f(p, p)
 
     def to_string(self) -> str:

@@ -12,3 +12,13 @@ def is_jit() -> bool:
 def pointer(kind: str, objects):
     """A Dr.Jit pointer array (``kind`` "Shape", "Emitter", ...) to objects; scalar variants have none: the objects."""
     return getattr(mi, kind + "Ptr")(objects) if is_jit() else objects
+
+
+def first(value) -> float:
+    """The first entry of a Dr.Jit array, or the number itself, as a Python float."""
+    return float(value) if isinstance(value, float) else float(value[0])
+
+
+def but_not(mask, excluded):
+    """``mask & ~excluded``; on a Python bool, ~ gives a number."""
+    return mask & ~excluded if is_jit() else mask and not excluded

@@ -8,7 +8,7 @@ import mitsuba as mi
 
 from .intersect import intersect_plane
 from .parameters import choice, flag, integer, number
-from .variants import is_jit, pointer
+from .variants import but_not, is_jit, pointer
 
 BUDGETS = ("report", "plain")
 
@@ -19,6 +19,9 @@ MIN_CONTRIBUTION = 1 / 16 / 255
 # A secondary ray starts this far off its surface, relative to the size of the coordinates involved: 32 float32
 # roundings, a few times what intersection, projection and ray test lose together
 OFFSET = 32 * 2.0**-24
+
+# Reach of a mirror ray: any number that float32 holds
+FARTHEST = 2.0**127
 
 # Up to this many lights the kernel holds the code of each; beyond, it loops over them
 UNROLLED_LIGHTS = 8
@@ -186,8 +189,10 @@ class MrtWhitted(mi.SamplingIntegrator):
         return Trace(final["radiance"], shading.radiance, hit, final["bounces"], final["shadow_rays"])
 
     def bounces(self, prepared) -> bool:
-        """Can a mirror ray matter anywhere in the scene?"""
-        return prepared.mirrors and self.max_depth > 1
+        """Can any mirror ray of the scene matter: is one bright enough, and within the bounce budget?"""
+        continues = [self._continues(prepared, mi.UnpolarizedSpectrum(reflectance), self._cost(mi.Float(int_ior)))
+                     for reflectance, int_ior in prepared.mirror_bounds]
+        return any(c if isinstance(c, bool) else c[0] for c in continues)
 
     def _continues(self, prepared, throughput, depth):
         """May a path of this throughput and depth still change the picture?"""
@@ -199,7 +204,7 @@ class MrtWhitted(mi.SamplingIntegrator):
     def _shade(self, prepared, scene, sampler, ray, hit, throughput, active) -> Shading:
         """Light that leaves ``hit`` back along ``ray``, and its mirror reflection; ``throughput`` is the path's."""
         si = hit.si
-        radiance = self._sky(prepared, ray, active & ~hit.found)
+        radiance = self._sky(prepared, ray, but_not(active, hit.found))
         if prepared.emissive:
             radiance += mi.unpolarized_spectrum(si.emitter(scene, hit.found).eval(si, hit.found))
         unrolled = prepared.lights if prepared.unrolled else []
@@ -251,7 +256,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             value = dr.clip(value, 0, 1)
         matters = dr.max(dr.abs(throughput * value)) * len(prepared.lights) > self.min_contribution
         traced = sample.facing & matters
-        visible = sample.facing & ~prepared.occluded(scene, hit, sample.ds, traced)
+        visible = but_not(sample.facing, prepared.occluded(scene, hit, sample.ds, traced))
         return dr.select(visible, value, 0), dr.select(traced, mi.UInt32(1), mi.UInt32(0))
 
     def _sky(self, prepared, ray, active):
@@ -313,7 +318,10 @@ class Prepared:
         self.emissive = any(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in self.lights)
 
     def _read_bsdfs(self, bsdfs) -> None:
+        bsdfs = list(bsdfs)
         self.mirrors = any(_has_mirror(b) for b in bsdfs)
+        self.mirror_bounds = [b.mirror_bound() if hasattr(b, "mirror_bound") else (1.0, 1.0)
+                              for b in bsdfs if _has_mirror(b)]
         self.one_sided = not any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in bsdfs)
         self.textured = any(mi.has_flag(b.flags(), mi.BSDFFlags.SpatiallyVarying) for b in bsdfs)
         self.ray_flags = +mi.RayFlags.Minimal
@@ -338,7 +346,7 @@ class Prepared:
         scale = self.scales(si, found)
         # A later plane overrides an earlier one, as it was closer
         for plane, closer in zip(self.planes, on_plane):
-            closer = closer & ~found
+            closer = but_not(closer, found)
             plane.put_into(si, ray, closer)
             scale = dr.select(closer, plane.scale, scale)
         for closer in on_plane:
@@ -368,7 +376,7 @@ class Prepared:
         # Stop short of a light that has a surface of its own
         reach = 1 - mi.math.ShadowEpsilon if self.emissive else 1
         ray = mi.Ray3f(o, to_light, reach, hit.si.time, hit.si.wavelengths)
-        return blocked | (self.bvh or scene).ray_test(ray, False, active & ~blocked)
+        return blocked | (self.bvh or scene).ray_test(ray, False, but_not(active, blocked))
 
     def eval_bsdf(self, hit, samples, mirror: bool):
         """Values of the BSDF at ``hit`` towards light samples, and its mirror reflection: all of it in one call."""
@@ -381,7 +389,7 @@ class Prepared:
         """The ray reflected at ``hit``."""
         n = hit.si.sh_frame.n
         d = ray.d - 2 * dr.dot(ray.d, n) * n
-        return mi.Ray3f(self._off_surface(hit, d), d, dr.largest(mi.Float), ray.time, ray.wavelengths)
+        return mi.Ray3f(self._off_surface(hit, d), d, FARTHEST, ray.time, ray.wavelengths)
 
     @staticmethod
     def _off_surface(hit, d):
@@ -395,12 +403,15 @@ class _Plane:
     """The analytic side of an ``mrt_plane``, as kernel data."""
 
     def __init__(self, shape):
-        self.shape = shape
+        self.shape = pointer("Shape", shape)
         self.normal = mi.Vector3f(shape.unit_normal.tolist())
         self.tangents = [mi.Vector3f(t.tolist()) for t in shape.tangents]
         self.distance = mi.Float(shape.distance)
         self.scale = mi.Float(abs(shape.distance))
+        # The same kernel serves every plane of every scene: its numbers are data
         dr.make_opaque(self.normal, self.distance, self.scale, self.tangents)
+        if is_jit():
+            dr.make_opaque(self.shape)
 
     def height(self, p):
         """Signed distance of a point from the plane."""
@@ -415,7 +426,7 @@ class _Plane:
         si.n = dr.select(where, mi.Normal3f(self.normal), si.n)
         si.sh_frame.n = dr.select(where, mi.Normal3f(self.normal), si.sh_frame.n)
         si.uv = dr.select(where, mi.Point2f(*(dr.dot(t, p) for t in self.tangents)), si.uv)
-        si.shape = dr.select(where, pointer("Shape", self.shape), si.shape)
+        si.shape = dr.select(where, self.shape, si.shape)
 
 
 class _Scales:
@@ -423,11 +434,13 @@ class _Scales:
 
     def __init__(self, shapes):
         self.by_shape = [_coordinate_size(s.bbox()) for s in shapes]
-        self.largest = max(self.by_shape, default=0.0)
+        largest = max(self.by_shape, default=0.0)
         if is_jit() and shapes:
             ids = dr.reinterpret_array(mi.UInt32, pointer("Shape", shapes))
-            self.table = dr.full(mi.Float, self.largest, dr.max(ids)[0] + 1)
+            self.table = dr.full(mi.Float, largest, dr.max(ids)[0] + 1)
             dr.scatter(self.table, mi.Float(self.by_shape), ids)
+            self.fallback = dr.opaque(mi.Float, largest)
+            self.table_size = dr.opaque(mi.UInt32, dr.width(self.table))
             dr.eval(self.table)
 
     def __call__(self, si, found):
@@ -437,8 +450,8 @@ class _Scales:
             return _coordinate_size(si.shape.bbox()) if found else 0.0
         ids = dr.reinterpret_array(mi.UInt32, si.shape)
         # The shapes inside an instance are not of the scene's own: take the largest for them
-        known = found & (ids < dr.width(self.table))
-        return dr.select(known, dr.gather(mi.Float, self.table, ids, known), self.largest)
+        known = found & (ids < self.table_size)
+        return dr.select(known, dr.gather(mi.Float, self.table, ids, known), self.fallback)
 
 
 def _has_mirror(bsdf) -> bool:
