@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mrt_mitsuba.render import Result as Result
     from mrt_mitsuba.render import render as render
     from mrt_mitsuba.runtime import register as register
-    from mrt_mitsuba.scenes import scene_dict as scene_dict
+    from mrt_mitsuba.export import scene_dict as scene_dict
     from mrt_mitsuba.validation.roughconductor import compare_roughconductor as compare_roughconductor
 
 # Where each public name lives; the module is imported when the name is first used.
@@ -38,7 +38,7 @@ _HOME = {
     "compare_roughconductor": "mrt_mitsuba.validation.roughconductor",
     "register": "mrt_mitsuba.runtime",
     "render": "mrt_mitsuba.render",
-    "scene_dict": "mrt_mitsuba.scenes",
+    "scene_dict": "mrt_mitsuba.export",
 }
 _SUBMODULES = ("filters",)
 

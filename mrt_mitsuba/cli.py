@@ -146,7 +146,7 @@ def _export(arguments: list[str]) -> int:
         raise UsageError("write mrt export SCENE --xml PATH")
     number = parse(["export", arguments[0]]).scene_number
     from mrt_mitsuba.output import check_target
-    from mrt_mitsuba.scenes import write_xml
+    from mrt_mitsuba.export import write_xml
 
     check_target(arguments[2])
     write_xml(number, arguments[2])

@@ -85,7 +85,7 @@ class Scene:
         for i, s in enumerate(self.spheres):
             shapes[f"sphere_{i}"] = _sphere(s, materials)
         for i, p in enumerate(self.planes):
-            shapes[f"plane_{i}"] = {"type": "mrt_plane", "normal": list(p.normal), "distance": p.distance,
+            shapes[f"plane_{i}"] = {"type": "mrt_plane", "normal": list(p.normal), "distance": float(p.distance),
                                     "bsdf": materials.reference(p.material)}
         for i, c in enumerate(self.cones):
             shapes[f"cone_{i}"] = {"type": "mrt_cone", "apex": list(c.apex), "base_center": list(c.base_center),
@@ -129,9 +129,9 @@ def _rgb(color: Color) -> dict[str, Any]:
 
 
 def _sphere(s: Sphere, materials: _Materials) -> dict[str, Any]:
-    return {"type": "sphere", "center": list(s.center), "radius": s.radius, "bsdf": materials.reference(s.material)}
+    return {"type": "sphere", "center": list(s.center), "radius": float(s.radius), "bsdf": materials.reference(s.material)}
 
 
 def _mrt_bsdf(m: Material, fresnel: str) -> dict[str, Any]:
-    return {"type": "mrt_bsdf", "alpha": m.alpha, "int_ior": m.ior, "fresnel": fresnel,
+    return {"type": "mrt_bsdf", "alpha": float(m.alpha), "int_ior": float(m.ior), "fresnel": fresnel,
             "diffuse_reflectance": _rgb(m.diffuse), "specular_reflectance": _rgb(m.specular)}
