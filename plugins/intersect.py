@@ -1,9 +1,11 @@
 """Ray intersections with analytic surfaces, as pure functions over points and directions.
 
-Shared by the float32 plugins and the float64 reference: everything works on scalars and on Dr.Jit arrays of any
-precision. A ray is ``o + t d``; distances are in units of |d|. A miss has ``t = inf``. Vectors may also be lists of
-components with + and -, which is why a vector stands left of a scalar in products, and is never selected as a whole.
+Shared by the float32 plugins and the float64 reference: everything works on scalars and on Dr.Jit arrays of
+any precision. A ray is ``o + t d``; distances are in units of |d|. A miss has ``t = inf``. Vectors may also
+be lists of components with + and -, which is why a vector stands left of a scalar in products, and is never
+selected as a whole.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -27,10 +29,10 @@ def intersect_sphere(o, d, center, radius):
     """Distance t > 0 at which the ray meets the sphere of ``radius`` > 0 around ``center``; inf for none.
 
     Both roots without cancellation: the discriminant from the distance s of the line to the centre, as
-    (r − s)(r + s), instead of b² − ac; the root that b ∓ √… would lose from the product of the roots, c/q; and
-    c = |f|² − r² from its factors, so that an origin on the surface stays there.
-    Source: Haines, Günther and Akenine-Möller, "Precision Improvements for Ray/Sphere Intersection", Ray Tracing
-    Gems, 2019, ch. 7.
+    (r − s)(r + s), instead of b² − ac; the root that b ∓ √… would lose from the product of the roots, c/q;
+    and c = |f|² − r² from its factors, so that an origin on the surface stays there.
+    Source: Haines, Günther and Akenine-Möller, "Precision Improvements for Ray/Sphere Intersection", Ray
+    Tracing Gems, 2019, ch. 7.
     """
     f = o - center
     a = dr.squared_norm(d)
@@ -51,12 +53,13 @@ def intersect_sphere(o, d, center, radius):
 
 # ------------------------------------ Quadrics of revolution ------------------------------------------
 #
-# A cone or cylinder is intersected in its unit frame, to which a ``Frame`` maps world space: a cone has its apex at 0
-# and its base disc of radius 1 at z = 1, a cylinder of radius 1 lies between z = 0 and z = 1. The map is affine, so it
-# changes neither t nor what is hit, and sizes, aspect ratios and shears are gone before anything is squared.
+# A cone or cylinder is intersected in its unit frame, to which a ``Frame`` maps world space: a cone has its
+# apex at 0 and its base disc of radius 1 at z = 1, a cylinder of radius 1 lies between z = 0 and z = 1. The
+# map is affine, so it changes neither t nor what is hit, and sizes, aspect ratios and shears are gone before
+# anything is squared.
 #
-# The solid is convex: a line is inside it for one interval. It is cut out of the interval inside the infinite quadric
-# by the slab between the caps, so no ray slips through between two surfaces, at a rim or an apex.
+# The solid is convex: a line is inside it for one interval. It is cut out of the interval inside the infinite
+# quadric by the slab between the caps, so no ray slips through between two surfaces, at a rim or an apex.
 
 LATERAL, BASE, TOP = 0, 1, 2
 """Parts of a surface: the curved side, the disc at z = 1, the disc at z = 0 (of a cylinder)."""
@@ -80,16 +83,16 @@ class Frame:
 
     def vector(self, v: Any) -> Any:
         """A world-space vector in the unit frame."""
-        return type(v)(dr.dot(self.x, v), dr.dot(self.y, v), dr.dot(self.z, v))
+        return type(v)([dr.dot(self.x, v), dr.dot(self.y, v), dr.dot(self.z, v)])
 
     def gradient(self, g: Any) -> Any:
-        """World-space gradient of a function whose gradient in the unit frame is ``g``: the transposed matrix."""
+        """World-space gradient of a function whose unit-frame gradient is ``g``: by the transposed matrix."""
         return self.x * g.x + self.y * g.y + self.z * g.z
 
 
 @dataclass
 class SurfaceHit:
-    """Where a ray meets a surface first: distance ``t`` in units of |d|, inf for a miss, and the ``part`` it is on."""
+    """Where a ray meets a surface first: ``t`` in units of |d|, inf for a miss, and the ``part`` it is on."""
 
     t: Any
     part: Any
@@ -97,7 +100,7 @@ class SurfaceHit:
 
 @dataclass
 class SurfacePoint:
-    """A point ``p`` put onto a surface, the outward unit normal ``n`` there, and texture coordinates ``u, v``."""
+    """A point ``p`` put onto a surface, the outward unit normal ``n``, and texture coordinates ``u, v``."""
 
     p: Any
     n: Any
@@ -132,16 +135,16 @@ def tangents(n: Any) -> tuple[Any, Any]:
     a = -1 / (sign + n.z)
     b = n.x * n.y * a
     make = type(n)
-    return make(1 + sign * n.x * n.x * a, sign * b, -sign * n.x), make(b, sign + n.y * n.y * a, -n.y)
+    return make([1 + sign * n.x * n.x * a, sign * b, -sign * n.x]), make([b, sign + n.y * n.y * a, -n.y])
 
 
 def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> SurfaceHit:
-    """First intersection at t > 0 of a ray with a cone: its lateral surface and, if ``capped``, its base disc.
+    """First intersection at t > 0 of a ray with a cone: lateral surface and, if ``capped``, base disc.
 
-    Seen from inside, the far side is met. With p the point of the line nearest to the apex, u its unit direction and
-    ⟨a, b⟩ = a.x b.x + a.y b.y − a.z b.z, the lateral surface is at the roots of ⟨u,u⟩ s² + 2⟨p,u⟩ s + ⟨p,p⟩. Their
-    discriminant is written as m.x² + m.y² − m.z² with the line's moment m = p × u (Lagrange's identity), so that it is
-    accurate relative to |p|², and p · u = 0 makes ⟨p,u⟩ = −2 p.z u.z.
+    Seen from inside, the far side is met. With p the point of the line nearest to the apex, u its unit
+    direction and ⟨a, b⟩ = a.x b.x + a.y b.y − a.z b.z, the lateral surface is at the roots of ⟨u,u⟩ s² +
+    2⟨p,u⟩ s + ⟨p,p⟩. Their discriminant is written as m.x² + m.y² − m.z² with the line's moment m = p × u
+    (Lagrange's identity), so that it is accurate relative to |p|², and p · u = 0 makes ⟨p,u⟩ = −2 p.z u.z.
     """
     line = _line(o, d, frame)
     p, u = line.p, line.u
@@ -150,12 +153,12 @@ def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> Surf
     a = (rho - dr.abs(u.z)) * (rho + dr.abs(u.z))
     half_b = -2 * p.z * u.z
     c = (r - dr.abs(p.z)) * (r + dr.abs(p.z))
-    m = dr.cross(p, u)
-    m_xy = dr.sqrt(dr.square(m.x) + dr.square(m.y))
-    discriminant = (m_xy - dr.abs(m.z)) * (m_xy + dr.abs(m.z))
+    m_x, m_y, m_z = p.y * u.z - p.z * u.y, p.z * u.x - p.x * u.z, dr.abs(p.x * u.y - p.y * u.x)
+    m_xy = dr.sqrt(dr.square(m_x) + dr.square(m_y))
+    discriminant = (m_xy - m_z) * (m_xy + m_z)
     first, second = _roots(a, half_b, c, discriminant)
-    # Steeper than the side: the line is inside each half of the double cone once, up to or from infinity. Shallower:
-    # both roots are on the half on whose side of the apex p is
+    # Steeper than the side: the line is inside each half of the double cone once, up to or from infinity.
+    # Shallower: both roots are on the half on whose side of the apex p is
     steep, down = a <= 0, u.z > 0
     near = dr.select(steep, dr.select(down, second, -dr.inf), first)
     far = dr.select(steep, dr.select(down, dr.inf, first), second)
@@ -168,14 +171,16 @@ def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> Surf
     inside = inside & dr.select(level, p.z <= 1, True)
     near_part = dr.select(enter_base > near, BASE, LATERAL)
     far_part = dr.select(leave_base < far, BASE, LATERAL)
-    return _first_boundary(line, inside, dr.maximum(near, enter_base), near_part, dr.minimum(far, leave_base),
-                           far_part, capped)
+    return _first_boundary(
+        line, inside, dr.maximum(near, enter_base), near_part, dr.minimum(far, leave_base), far_part, capped
+    )
 
 
 def intersect_cylinder(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> SurfaceHit:
-    """First intersection at t > 0 of a ray with a cylinder: its lateral surface and, if ``capped``, its two discs.
+    """First intersection at t > 0 of a ray with a cylinder: lateral surface and, if ``capped``, two discs.
 
-    As ``intersect_cone``, for the form a.x b.x + a.y b.y: the discriminant is ρ² − (p × u).z², ρ² = u.x² + u.y².
+    As ``intersect_cone``, for the form a.x b.x + a.y b.y: the discriminant is ρ² − (p × u).z², ρ² = u.x² +
+    u.y².
     """
     line = _line(o, d, frame)
     p, u = line.p, line.u
@@ -195,27 +200,30 @@ def intersect_cylinder(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> 
     leave = dr.select(level, dr.inf, dr.maximum(to_top, to_base))
     near_part = dr.select(enter > near, dr.select(down, TOP, BASE), LATERAL)
     far_part = dr.select(leave < far, dr.select(down, BASE, TOP), LATERAL)
-    return _first_boundary(line, inside, dr.maximum(near, enter), near_part, dr.minimum(far, leave), far_part, capped)
+    return _first_boundary(
+        line, inside, dr.maximum(near, enter), near_part, dr.minimum(far, leave), far_part, capped
+    )
 
 
 def cone_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
     """Put a point near a cone onto the given part of it, along the normal.
 
-    Side: u = azimuth / 2π in [0, 1), v = 0 at the base and 1 at the apex. Base: the unit square around the disc.
-    At the apex the normal is that of one of the generatrices.
+    Side: u = azimuth / 2π in [0, 1), v = 0 at the base and 1 at the apex. Base: the unit square around the
+    disc. At the apex the normal is that of one of the generatrices.
     """
     q = frame.point(p)
     r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
     on_side = part == LATERAL
     x, y = _azimuth(q, r)
-    gradient = type(q)(dr.select(on_side, x, 0), dr.select(on_side, y, 0), dr.select(on_side, -1, 1))
+    gradient = type(q)([dr.select(on_side, x, 0), dr.select(on_side, y, 0), dr.select(on_side, -1, 1)])
     return _surface_point(p, q, dr.select(on_side, r - q.z, q.z - 1), gradient, on_side, frame)
 
 
 def cylinder_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
     """Put a point near a cylinder onto the given part of it, along the normal.
 
-    Side: u = azimuth / 2π in [0, 1), v = 0 at the disc ``BASE``, 1 at ``TOP``. Discs: the unit square around each.
+    Side: u = azimuth / 2π in [0, 1), v = 0 at the disc ``BASE``, 1 at ``TOP``. Discs: the unit square around
+    each.
     """
     q = frame.point(p)
     r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
@@ -223,7 +231,7 @@ def cylinder_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
     x, y = _azimuth(q, r)
     off_disc = dr.select(on_base, q.z - 1, -q.z)
     z = dr.select(on_side, 0, dr.select(on_base, 1, -1))
-    gradient = type(q)(dr.select(on_side, x, 0), dr.select(on_side, y, 0), z)
+    gradient = type(q)([dr.select(on_side, x, 0), dr.select(on_side, y, 0), z])
     return _surface_point(p, q, dr.select(on_side, r - 1, off_disc), gradient, on_side, frame)
 
 
@@ -263,9 +271,10 @@ def _roots(a: Any, half_b: Any, c: Any, discriminant: Any) -> tuple[Any, Any]:
     return dr.minimum(one, other), dr.maximum(one, other)
 
 
-def _first_boundary(line: _Line, inside: Any, near: Any, near_part: Any, far: Any, far_part: Any,
-                    capped: bool) -> SurfaceHit:
-    """The first end at t > 0 of the interval [near, far] of s, with what is hit there; open solids have no caps."""
+def _first_boundary(
+    line: _Line, inside: Any, near: Any, near_part: Any, far: Any, far_part: Any, capped: bool
+) -> SurfaceHit:
+    """The first end at t > 0 of the interval [near, far] of s, and what is hit there."""
     inside = inside & (near <= far)
     near_t, far_t = (near + line.start) / line.length, (far + line.start) / line.length
     if not capped:
@@ -285,7 +294,7 @@ def _azimuth(q: Any, r: Any) -> tuple[Any, Any]:
 
 
 def _surface_point(p: Any, q: Any, distance: Any, gradient: Any, on_side: Any, frame: Frame) -> SurfacePoint:
-    """Move ``p`` (``q`` in the unit frame) by one Newton step: ``distance`` is linear along its ``gradient``."""
+    """Move ``p`` (``q`` in the unit frame) by a Newton step; ``distance`` is linear along ``gradient``."""
     g = frame.gradient(gradient)
     inverse = 1 / dr.norm(g)
     n = g * inverse
