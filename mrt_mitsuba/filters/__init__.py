@@ -1,0 +1,16 @@
+"""Filters over rendered images: pure functions from arrays to arrays, for the pictures of any renderer."""
+
+from __future__ import annotations
+
+from mrt_mitsuba.filters.dof import blur_amount, gaussian_dof
+from mrt_mitsuba.filters.edges import EdgeMap, edges_image, geometry_edges, luma_edges, sobel_edges
+
+__all__ = [
+    "EdgeMap",
+    "blur_amount",
+    "edges_image",
+    "gaussian_dof",
+    "geometry_edges",
+    "luma_edges",
+    "sobel_edges",
+]

@@ -1,0 +1,192 @@
+"""Depth of field as a filter over a finished picture, from the distances of its first hits.
+
+Two models share the amount of blur (``blur_amount``, the report's "height map").
+
+``report`` is the original ray tracer's filter, number for number. With a the amount at a pixel and k =
+int(a), its window is the rows [y − k, y + k) and columns [x − k, x + k) cut to the picture, rows counted from
+the bottom. A neighbour weighs P[row]·P[column], with P the line of Pascal's triangle that has 2k entries,
+counted from the start of the cut window. Neighbours with a = 0 are left out. Its flaws are kept: the window
+has no centre, so what is blurred moves by half a pixel to the right and up; at the left and lower border the
+weights belong to other pixels; the amount comes in steps; blurred foreground ends at the outline of sharp
+background; background takes in foreground.
+
+``corrected`` gathers what a lens would see (``mrt_mitsuba.filters.lens``): a pixel becomes a disc that is as
+wide as the report's Pascal line at every whole amount, and grows continuously in between. The line has the
+variance (2k − 1)/4 along each axis; below a = 1 it is continued as a²/4. A disc of radius r touches only the
+four nearest pixels while r ≤ √2 − 1, where its variance is 2r/(1 + 4r); above, it is close to ((r + ½)² +
+7/16)/4. Hence ``r(a) = a²/(8 − 4a²)`` below 1 and ``√(2a − 23/16) − ½`` from there.
+
+In both, a pixel whose colour is no finite number gives nothing to its neighbours and stays as it is; one
+whose depth is NaN counts as sharp. Results are the same bit for bit from run to run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.filters.grid import Grid, finite
+from mrt_mitsuba.filters.lens import gather_discs
+
+MAX_AMOUNT = 8
+MODES = ("report", "corrected")
+
+
+def blur_amount(depth: Any, *, focal_distance: float | None, focal_range: float = 2.0) -> Any:
+    """Return the amount of blur a, [H, W] float32: ``clamp(|focal_distance − depth| − focal_range, 0, 8)``.
+
+    A miss gives 8, NaN gives 0, and without a focal distance (None, zero or negative) all is 0.
+
+    Args:
+        depth: [H, W], distances along the ray (not z); infinity, zero or negative for a miss.
+        focal_distance: the distance in focus, in the unit of ``depth``.
+        focal_range: half the width of the sharp zone around it, in the same unit.
+
+    Raises:
+        UsageError: for a wrong shape, or a distance or range that is no number.
+    """
+    grid = Grid(depth)
+    distance = grid.plane(depth, "depth")
+    if not _enabled(focal_distance, focal_range):
+        return grid.output([dr.zeros(grid.Float, grid.count)])
+    return grid.output([_amount(grid, distance, focal_distance, focal_range)])
+
+
+def gaussian_dof(
+    image: Any,
+    depth: Any,
+    *,
+    focal_distance: float | None,
+    focal_range: float = 2.0,
+    mode: str = "report",
+) -> Any:
+    """Return the picture as a lens focused at a distance would show it, [H, W, 3] float32.
+
+    Without a focal distance (None, zero or negative) the picture comes back as it is, the same object.
+    Otherwise the result is an array of the same kind: NumPy for NumPy, a Dr.Jit tensor for a tensor.
+
+    Args:
+        image: [H, W, 3], linear, top row first.
+        depth: [H, W], distances along the ray (not z); infinity, zero or negative for a miss.
+        focal_distance: the distance in focus, in the unit of ``depth``.
+        focal_range: half the width of the sharp zone around it, in the same unit.
+        mode: "report" for the original's filter, "corrected" for the one without its flaws; see the module.
+
+    Raises:
+        UsageError: for a wrong shape, a distance or range that is no number, or an unknown mode.
+    """
+    if mode not in MODES:
+        raise UsageError(f"unknown depth-of-field mode {mode!r}; use one of {', '.join(MODES)}")
+    if not _enabled(focal_distance, focal_range):
+        return image
+    grid = Grid(image)
+    planes = grid.planes(image, "image")
+    distance = grid.plane(depth, "depth")
+    amount = _amount(grid, distance, focal_distance, focal_range)
+    if mode == "report":
+        blurred = _report(grid, planes, amount)
+    else:
+        near = (distance > 0) & (distance < grid.opaque(focal_distance))
+        radius = _radius(amount)
+        blurred = gather_discs(grid, planes, dr.select(near, -radius, radius), max_radius=_radius(MAX_AMOUNT))
+    return grid.output(blurred, (3,))
+
+
+def _enabled(focal_distance: float | None, focal_range: float) -> bool:
+    for name, value in (("focal_distance", focal_distance), ("focal_range", focal_range)):
+        if value is not None and math.isnan(value):
+            raise UsageError(f"{name} is not a number; give one")
+    return focal_distance is not None and focal_distance > 0
+
+
+def _amount(grid: Grid, distance: Any, focal_distance: float, focal_range: float) -> Any:
+    amount = dr.abs(grid.opaque(focal_distance) - distance) - grid.opaque(focal_range)
+    amount = dr.select(amount > 0, dr.minimum(amount, MAX_AMOUNT), 0)  # NaN > 0 is false
+    return dr.select((distance <= 0) | (distance == math.inf), MAX_AMOUNT, amount)
+
+
+def _radius(amount: Any) -> Any:
+    small = dr.square(amount) / (8 - 4 * dr.square(dr.minimum(amount, 1)))
+    return dr.select(amount < 1, small, dr.sqrt(dr.maximum(2 * amount - 23 / 16, 0)) - 0.5)
+
+
+def _report(grid: Grid, planes: Sequence[Any], amount: Any) -> list[Any]:
+    """Blur with Pascal windows: for each k that occurs one pass along rows and one along columns.
+
+    The weights of a window are the product of a row's and a column's, at the borders too, so two passes of 2k
+    values replace one of 4k². The first pass runs only over the pixels that the second one reads.
+    """
+    good = finite(planes)
+    gives = good & (amount > 0)
+    sources = [dr.select(gives, plane, 0) for plane in planes]
+    sources.append(dr.select(gives, grid.Float(1), 0))  # the sum of weights is blurred along
+    steps = dr.select(good, grid.Int(amount), 0)
+    blurred = [grid.Float(plane) for plane in planes]
+    dr.eval(sources, steps, blurred)
+    for k in range(1, MAX_AMOUNT + 1):
+        pixels = dr.compress(steps == k)
+        if dr.width(pixels) == 0:
+            continue
+        sums = _pascal_passes(grid, sources, grid.Int(pixels), k)
+        for target, total in zip(blurred, sums, strict=False):
+            dr.scatter(target, total / sums[3], pixels, active=sums[3] > 0)
+        dr.eval(blurred)
+    return blurred
+
+
+def _pascal_passes(grid: Grid, sources: Sequence[Any], pixels: Any, k: int) -> list[Any]:
+    """Return the weighted sums over the windows of ``pixels``, one per source plane."""
+    weights = [math.comb(2 * k - 1, j) / 2 ** (2 * k - 1) for j in range(2 * k)]
+    column, row = grid.coordinates(pixels)
+    from_bottom = grid.height - 1 - row
+    start, count = _cut(from_bottom, k, grid.height)
+    vertical = _Taps((grid.height - 1 - start) * grid.width + column, -grid.width, count, weights)
+
+    needed = vertical.pixels(grid)
+    column, row = grid.coordinates(needed)
+    start, count = _cut(column, k, grid.width)
+    horizontal = _Taps(row * grid.width + start, 1, count, weights)
+
+    along_rows = []
+    for source in sources:
+        along_rows.append(dr.empty(grid.Float, grid.count))  # read below only where written here
+        dr.scatter(along_rows[-1], horizontal.sum(grid, source), needed)
+    dr.eval(along_rows)
+    return [vertical.sum(grid, plane) for plane in along_rows]
+
+
+def _cut(centre: Any, k: int, size: Any) -> tuple[Any, Any]:
+    """Return start and length of [centre − k, centre + k) cut to [0, size)."""
+    start = dr.maximum(centre - k, 0)
+    return start, dr.minimum(centre + k, size) - start
+
+
+class _Taps:
+    """Weighted pixels in a line: ``count`` of them from ``first`` on, ``stride`` apart."""
+
+    def __init__(self, first: Any, stride: Any, count: Any, weights: Sequence[float]) -> None:
+        self._first = first
+        self._stride = stride
+        self._count = count
+        self._weights = weights
+
+    def sum(self, grid: Grid, plane: Any) -> Any:
+        """Return the weighted sum of a plane's values."""
+        total = grid.Float(0)
+        for j, weight in enumerate(self._weights):
+            index = self._first + j * self._stride
+            total += weight * dr.gather(grid.Float, plane, index, active=j < self._count)
+        return total
+
+    def pixels(self, grid: Grid) -> Any:
+        """Return the indices of all pixels in any of the lines, in ascending order."""
+        dr.eval(self._first, self._count)
+        touched = dr.zeros(grid.Bool, grid.count)
+        for step in range(len(self._weights)):
+            j = dr.opaque(grid.Int, step)  # every step is a launch of its own, of the same kernel
+            dr.scatter(touched, grid.Bool(True), self._first + j * self._stride, active=j < self._count)
+        return grid.Int(dr.compress(touched))

@@ -1,0 +1,273 @@
+"""Edge detectors: which pixels of a picture are worth tracing again.
+
+``luma_edges`` and ``sobel_edges`` are the two of the original ray tracer, number for number; they read the
+picture. ``geometry_edges`` reads normals and distances instead, so it sees outlines however faint and never a
+texture, shadow or reflection.
+
+Common to all:
+
+* The outermost rows and columns are never edges, and their value is 0.
+* A pixel that is no finite number makes its 3×3 neighbourhood edges with value infinity, and nothing further
+  away.
+* NumPy arrays give NumPy arrays; Dr.Jit tensors give tensors of the same backend, without derivatives.
+* Arithmetic is float32 in a fixed order, so a result does not change from run to run.
+
+Noise. A Monte Carlo picture differs from pixel to pixel without any edge. Where the variance of the pixels is
+given, ``luma_edges`` and ``sobel_edges`` first take from the detector's value what noise alone explains:
+``noise_sigmas`` standard deviations of that value, propagated to first order. Colour channels are taken as
+fully correlated, which is the upper bound for the noise of a weighted sum and close to the truth, since
+samples vary in brightness above all. The variances of the neighbourhood are pooled, so a pixel whose own
+estimate came out too small does no harm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.filters.grid import Grid, finite
+
+LUMA_WEIGHTS = (0.299, 0.587, 0.114)
+GREY_WEIGHTS = (0.07, 0.72, 0.21)
+
+_OFFSETS = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+
+
+@dataclass(frozen=True)
+class EdgeMap:
+    """What a detector found.
+
+    ``mask``: [H, W] truth values, the pixels to refine. ``value``: [H, W] float32, the detector's own
+    measure, in the unit that its function names; infinity beside a pixel that is no finite number.
+    """
+
+    mask: Any
+    value: Any
+
+
+def luma_edges(
+    image: Any,
+    *,
+    contrast_offset: float = 0.05,
+    absolute_threshold: float = 0.0312,
+    relative_threshold: float = 0.125,
+    variance: Any = None,
+    noise_sigmas: float = 3.0,
+) -> EdgeMap:
+    """Find edges by the contrast of luma.
+
+    With ``L = √(0.299 R + 0.587 G + 0.114 B)`` and the largest and smallest L of the 3×3 neighbourhood, a
+    pixel's value is ``r = max − min + contrast_offset``, and it is left alone if ``r <
+    max(absolute_threshold, relative_threshold · max)``. With the defaults every pixel whose neighbourhood
+    stays below L = 0.4 is an edge, flat or not: the offset alone exceeds the threshold. A negative sum counts
+    as 0.
+
+    With ``variance``, ``max − min`` shrinks by ``noise_sigmas`` standard deviations of L at either end, and a
+    neighbourhood of which nothing remains is left alone, dark ones included. L's variance is ``σ²/(4 Y)``, at
+    most σ (the change of √Y for a change σ from zero), where σ is the deviation of ``Y = L²``.
+
+    Args:
+        image: [H, W, 3], linear, top row first.
+        variance: [H, W, 3], the variance of each pixel's mean; where it is no number, nothing is an edge.
+
+    Raises:
+        UsageError: for a wrong shape, or a threshold that is no number.
+    """
+    _check_numbers(
+        contrast_offset=contrast_offset,
+        absolute_threshold=absolute_threshold,
+        relative_threshold=relative_threshold,
+    )
+    grid = Grid(image)
+    planes = grid.planes(image, "image")
+    sum_ = _weighted(planes, LUMA_WEIGHTS)
+    luma = dr.select(dr.isfinite(sum_), dr.sqrt(dr.maximum(sum_, 0)), math.inf)
+    near = _Neighbourhood(grid, luma)
+    high, low = near.window[0], near.window[0]
+    for value in near.window[1:]:
+        high, low = dr.maximum(high, value), dr.minimum(low, value)
+    offset = grid.opaque(contrast_offset)
+    value = high - low + offset
+    if variance is not None:
+        deviation = _deviation(grid, variance, LUMA_WEIGHTS)
+        # the last term keeps 0/0 out where the pixel is black and free of noise
+        luma_variance = dr.square(deviation) / dr.maximum(dr.maximum(4 * sum_, deviation), 1e-30)
+        noise = dr.sqrt(near.weighted_sum(luma_variance, [1 / 9] * 9))
+        excess = high - low - 2 * _sigmas(grid, noise_sigmas) * noise
+        value = dr.select(excess > 0, excess + offset, 0)
+    value = dr.select(dr.isfinite(high), value, math.inf)
+    threshold = dr.maximum(grid.opaque(absolute_threshold), grid.opaque(relative_threshold) * high)
+    return near.edge_map(~(value < threshold), value)
+
+
+def sobel_edges(
+    image: Any, *, threshold: float = 0.0, variance: Any = None, noise_sigmas: float = 3.0
+) -> EdgeMap:
+    """Find edges by the Sobel gradient of an integer grey.
+
+    ``grey = int(255 (0.07 R + 0.72 G + 0.21 B))``, truncated towards zero as in C, also outside 0..255. A
+    pixel's value is ``|Gx| + |Gy|`` with the 3×3 Sobel kernels, and it is an edge if that exceeds
+    ``threshold``. Sums are exact for grey below 2²¹, a brightness of about 8000.
+
+    With ``variance``, grey is not truncated, since noise makes truncation flicker; the value is the whole
+    part of what ``|Gx| + |Gy|`` exceeds ``noise_sigmas`` standard deviations by. A difference of one grey
+    level counts, as it does without noise. The variance of ``|Gx| + |Gy|`` is that of Gx plus that of Gy.
+
+    Args:
+        image: [H, W, 3], linear, top row first.
+        variance: [H, W, 3], the variance of each pixel's mean; where it is no number, nothing is an edge.
+
+    Raises:
+        UsageError: for a wrong shape, or a threshold that is no number.
+    """
+    _check_numbers(threshold=threshold)
+    grid = Grid(image)
+    grey = 255 * _weighted(grid.planes(image, "image"), GREY_WEIGHTS)
+    near = _Neighbourhood(grid, grey if variance is not None else dr.trunc(grey))
+    value = near.sobel()
+    if variance is not None:
+        grey_variance = dr.square(255 * _deviation(grid, variance, GREY_WEIGHTS))
+        squares = [2, 4, 2, 4, 0, 4, 2, 4, 2]  # of Gx's and Gy's weights, summed
+        noise = dr.sqrt(near.weighted_sum(grey_variance, squares))
+        excess = value - _sigmas(grid, noise_sigmas) * noise
+        value = dr.select(excess > 0, dr.trunc(excess), 0)
+    value = dr.select(near.finite(), value, math.inf)
+    return near.edge_map(value > grid.opaque(threshold), value)
+
+
+def geometry_edges(
+    normal: Any, depth: Any, *, crease_angle: float = 20.0, depth_step: float = 0.02
+) -> EdgeMap:
+    """Find outlines and creases from the first hits.
+
+    A pixel's value is the larger of two measures, each in units of its threshold; it is an edge above 1.
+
+    * Crease: ``(1 − n·n') / (1 − cos crease_angle)``, the largest over the eight neighbours that hit
+      something.
+    * Step: the second difference of the inverse distance, ``|1/a + 1/b − 2/t|``, over the largest of the
+      three inverse distances and ``depth_step``; the largest over the four pairs a, b of opposite neighbours.
+      Inverse distance grows linearly over a flat surface in perspective, so a floor is no edge however
+      steeply it is seen. A miss has the inverse distance 0, so a hit beside a miss is always an edge.
+
+    Args:
+        normal: [H, W, 3], unit normals in any fixed frame; ignored at a miss.
+        depth: [H, W], distances along the ray; infinity, zero or negative for a miss. NaN is no finite
+        number.
+        crease_angle: degrees, above 0 and at most 180.
+        depth_step: relative, above 0.
+
+    Raises:
+        UsageError: for a wrong shape, or a threshold out of its range.
+    """
+    _check_numbers(crease_angle=crease_angle, depth_step=depth_step)
+    if not 0 < crease_angle <= 180:
+        raise UsageError(f"crease_angle={crease_angle} is out of range; give degrees above 0, at most 180")
+    if not depth_step > 0:
+        raise UsageError(f"depth_step={depth_step} is out of range; give a relative step above 0")
+    grid = Grid(normal)
+    normals = grid.planes(normal, "normal")
+    distance = grid.plane(depth, "depth")
+    hit = (distance > 0) & (distance < math.inf)
+    bad = dr.isnan(distance) | (hit & ~finite(normals))
+    inverse = dr.select(bad, math.inf, dr.select(hit, 1 / distance, 0))
+    dr.eval(inverse, normals)  # in one kernel; reading neighbours needs them evaluated
+    near = _Neighbourhood(grid, inverse)
+    step = _depth_measure(near.window) / grid.opaque(depth_step)
+    crease = _crease_measure(near, normals) / grid.opaque(1 - math.cos(math.radians(crease_angle)))
+    value = dr.select(near.finite(), dr.maximum(step, crease), math.inf)
+    return near.edge_map(value > 1, value)
+
+
+def edges_image(edges: EdgeMap) -> np.ndarray:
+    """Return the contours as a picture: [H, W] float32, 1 at an edge, else 0."""
+    return np.array(edges.mask).astype(np.float32)
+
+
+class _Neighbourhood:
+    """The 3×3 window of a plane around every pixel, row by row; zeros on the picture's border."""
+
+    def __init__(self, grid: Grid, plane: Any) -> None:
+        self._grid = grid
+        column, row = grid.coordinates(grid.index)
+        self._inner = (column > 0) & (row > 0) & (column < grid.width - 1) & (row < grid.height - 1)
+        self.window = self.of(plane)
+
+    def at(self, plane: Any, dx: int, dy: int) -> Any:
+        """Return the plane's value at the neighbour ``dx`` columns to the right and ``dy`` rows down."""
+        index = self._grid.index + dx + dy * self._grid.width
+        return dr.gather(self._grid.Float, plane, index, active=self._inner)
+
+    def of(self, plane: Any) -> list[Any]:
+        """Return the nine values of another plane."""
+        return [self.at(plane, dx, dy) for dx, dy in _OFFSETS]
+
+    def weighted_sum(self, plane: Any, weights: Sequence[float]) -> Any:
+        """Return the sum of nine weights times another plane's values; not a number counts as infinity."""
+        plane = dr.select(plane >= 0, plane, math.inf)
+        return sum(weight * value for weight, value in zip(weights, self.of(plane), strict=True) if weight)
+
+    def finite(self) -> Any:
+        """Return where all nine values are finite numbers."""
+        return finite(self.window)
+
+    def sobel(self) -> Any:
+        """Return |Gx| + |Gy|; both sides of a difference are summed alike, so equal sides give 0."""
+        w = self.window
+        gx = (w[2] + 2 * w[5] + w[8]) - (w[0] + 2 * w[3] + w[6])
+        gy = (w[6] + 2 * w[7] + w[8]) - (w[0] + 2 * w[1] + w[2])
+        return dr.abs(gx) + dr.abs(gy)
+
+    def edge_map(self, mask: Any, value: Any) -> EdgeMap:
+        """Return the result, with the border left out."""
+        mask, value = mask & self._inner, dr.select(self._inner, value, 0)
+        dr.eval(mask, value)  # both in one kernel
+        return EdgeMap(mask=self._grid.output([mask]), value=self._grid.output([value]))
+
+
+def _weighted(planes: Sequence[Any], weights: Sequence[float]) -> Any:
+    return weights[0] * planes[0] + weights[1] * planes[1] + weights[2] * planes[2]
+
+
+def _deviation(grid: Grid, variance: Any, weights: Sequence[float]) -> Any:
+    """Return the standard deviation of a weighted sum of fully correlated channels."""
+    return _weighted([dr.sqrt(plane) for plane in grid.planes(variance, "variance")], weights)
+
+
+def _sigmas(grid: Grid, noise_sigmas: float) -> Any:
+    if not 0 <= noise_sigmas < math.inf:
+        raise UsageError(f"noise_sigmas={noise_sigmas} is out of range; give a number from 0 on")
+    return grid.opaque(noise_sigmas)
+
+
+def _depth_measure(inverse: Sequence[Any]) -> Any:
+    """Return the largest relative second difference over the four pairs of opposite neighbours."""
+    centre, result = inverse[4], 0
+    for first in range(4):
+        one, other = inverse[first], inverse[8 - first]
+        largest = dr.maximum(dr.maximum(one, other), centre)
+        difference = dr.abs((one - centre) + (other - centre))
+        result = dr.maximum(result, dr.select(largest > 0, difference / largest, 0))
+    return result
+
+
+def _crease_measure(near: _Neighbourhood, normals: Sequence[Any]) -> Any:
+    """Return the largest ``1 − n·n'`` over the neighbours, where both pixels hit something."""
+    windows = [near.of(plane) for plane in normals]
+    result = 0
+    for k in (0, 1, 2, 3, 5, 6, 7, 8):
+        dot = sum(window[4] * window[k] for window in windows)
+        both = (near.window[4] > 0) & (near.window[k] > 0)
+        result = dr.maximum(result, dr.select(both, 1 - dot, 0))
+    return result
+
+
+def _check_numbers(**options: float) -> None:
+    for name, value in options.items():
+        if math.isnan(value):
+            raise UsageError(f"{name} is not a number; give one")

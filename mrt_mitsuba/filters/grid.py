@@ -1,0 +1,120 @@
+"""The pixels of one picture as flat Dr.Jit arrays, in whichever backend is at hand."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.errors import UsageError
+
+_MODULES = {dr.JitBackend.LLVM: "drjit.llvm", dr.JitBackend.CUDA: "drjit.cuda"}
+
+
+class Grid:
+    """A picture's pixels row by row, top row first, and the arrays to compute with.
+
+    A filter writes its maths once over these flat arrays: the JIT backends fuse it into kernels, and
+    ``drjit.scalar`` runs the same operations one after the other.
+
+    The backend is that of ``image`` if it is a Dr.Jit tensor. For anything else it is that of the current
+    Mitsuba variant, or without one LLVM where that works and else ``drjit.scalar``.
+
+    Sizes are opaque to Dr.Jit, so a new size makes no new kernel.
+    """
+
+    def __init__(self, image: Any) -> None:
+        module = _backend_module(image)
+        self._tensor = module.TensorXf
+        self._kind = type(image) if dr.is_tensor_v(image) else np.ndarray
+        self.Float: Any = dr.array_t(module.TensorXf)
+        self.Int: Any = dr.int32_array_t(self.Float)
+        self.Bool: Any = dr.mask_t(self.Float)
+        self.rows, self.columns = _shape(image)[:2]
+        self.count = self.rows * self.columns
+        self.height = dr.opaque(self.Int, self.rows)
+        self.width = dr.opaque(self.Int, self.columns)
+        self.index = dr.arange(self.Int, self.count)
+
+    def flat(self, array: Any, channels: Sequence[int], name: str) -> Any:
+        """Return an array of shape [rows, columns, *channels] as a flat float32 array of this backend.
+
+        Raises ``UsageError`` under the name ``name`` if the shape is another one.
+        """
+        wanted = (self.rows, self.columns, *channels)
+        if _shape(array) != wanted or self.count == 0:
+            raise UsageError(f"{name} has shape {_shape(array)}; expected {_wanted(wanted)}")
+        if dr.is_tensor_v(array):
+            return self._tensor(dr.detach(array, preserve_type=False)).array
+        return self.Float(np.ascontiguousarray(array, dtype=np.float32).ravel())
+
+    def plane(self, array: Any, name: str) -> Any:
+        """Return an array [rows, columns] as one flat plane."""
+        return self.flat(array, (), name)
+
+    def planes(self, array: Any, name: str) -> list[Any]:
+        """Return an array [rows, columns, 3] as three flat planes."""
+        flat = self.flat(array, (3,), name)
+        return [dr.gather(self.Float, flat, 3 * self.index + channel) for channel in range(3)]
+
+    def opaque(self, value: float) -> Any:
+        """Return a number as an array that is no literal in a kernel: a new value makes no new kernel."""
+        return dr.opaque(self.Float, value)
+
+    def coordinates(self, index: Any) -> tuple[Any, Any]:
+        """Return column and row of pixels given by their index."""
+        row = index // self.width
+        return index - row * self.width, row
+
+    def output(self, planes: Sequence[Any], channels: Sequence[int] = ()) -> Any:
+        """Return planes as one array [rows, columns, *channels] of the kind that the filter was given.
+
+        ``planes``: one plane of numbers or truth values, or several to be interleaved.
+        """
+        flat = planes[0]
+        if len(planes) > 1:
+            flat = dr.empty(self.Float, len(planes) * self.count)
+            for channel, plane in enumerate(planes):
+                dr.scatter(flat, plane, len(planes) * self.index + channel)
+        shape = (self.rows, self.columns, *channels)
+        if self._kind is np.ndarray:
+            return np.array(flat).reshape(shape)
+        dr.eval(flat)
+        wanted = dr.float32_array_t(self._kind)
+        if dr.is_mask_v(flat):
+            return dr.mask_t(wanted)(dr.mask_t(self._tensor)(flat, shape))
+        return wanted(self._tensor(flat, shape))
+
+
+def finite(planes: Sequence[Any]) -> Any:
+    """Return where all of several planes hold finite numbers."""
+    result = dr.isfinite(planes[0])
+    for plane in planes[1:]:
+        result &= dr.isfinite(plane)
+    return result
+
+
+def _shape(array: Any) -> tuple[int, ...]:
+    return tuple(array.shape) if hasattr(array, "shape") else np.shape(array)
+
+
+def _wanted(shape: tuple[int, ...]) -> str:
+    if 0 in shape:
+        return "at least one pixel"
+    return f"[{', '.join(map(str, shape))}]"
+
+
+def _backend_module(image: Any) -> ModuleType:
+    if dr.is_tensor_v(image):
+        return importlib.import_module(_MODULES.get(dr.backend_v(image), "drjit.scalar"))
+    mitsuba = sys.modules.get("mitsuba")
+    variant = mitsuba.variant() if mitsuba else None
+    if variant is None:
+        return importlib.import_module("drjit.scalar" if runtime.obstacle(runtime.FAST) else "drjit.llvm")
+    return importlib.import_module(f"drjit.{variant.partition('_')[0]}")

@@ -1,0 +1,460 @@
+"""Depth of field: the report's filter against the float64 loops, the corrected one against a lens."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mrt_mitsuba import UsageError, runtime
+from mrt_mitsuba.filters import blur_amount, gaussian_dof
+from mrt_mitsuba.validation import filters_reference as reference
+
+needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, reason="no LLVM to run kernels")
+BACKENDS = [pytest.param("llvm", marks=needs_llvm), pytest.param("llvm.ad", marks=needs_llvm), "scalar"]
+MODES = ["report", "corrected"]
+
+# Float32 sums of up to 16 weighted values along rows, 16 along columns, and a quotient: 33 roundings of 6e-8.
+REPORT_TOLERANCE = 2e-6
+
+SIXTEENTH = st.integers(0, 16 * 14).map(
+    lambda n: n / 16
+)  # exact in float32, and so is every amount made of them
+
+
+def tensor(backend: str, array: np.ndarray) -> Any:
+    return importlib.import_module(f"drjit.{backend}").TensorXf(np.ascontiguousarray(array, dtype=np.float32))
+
+
+def depths(size: tuple[int, int], seed: int) -> np.ndarray:
+    """Distances in sixteenths from 0 to 14 in patches and speckles, with misses of all kinds."""
+    rng = np.random.default_rng(seed)
+    patches = rng.integers(0, 16 * 14, (3, 4)) / 16
+    depth = patches[np.arange(size[0]) * 3 // size[0]][:, np.arange(size[1]) * 4 // size[1]]
+    speckles = rng.random(size) < 0.2
+    depth[speckles] = rng.choice([1 / 16, 1, 2.5, 6, 12, 0, -1, np.inf], speckles.sum())
+    return depth
+
+
+def colours(size: tuple[int, int], seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, (*size, 3)).astype(np.float32)
+
+
+def far(*, amount: np.ndarray | float) -> np.ndarray:
+    """Distances behind a focus at 1 with range 0 that give these amounts."""
+    return 1 + np.asarray(amount, dtype=np.float64)
+
+
+def near(*, amount: np.ndarray | float) -> np.ndarray:
+    """Distances before a focus at 10 with range 0 that give these amounts."""
+    return 10 - np.asarray(amount, dtype=np.float64)
+
+
+def blurred(image: np.ndarray, depth: np.ndarray, *, focal_distance: float = 1.0, mode: str) -> np.ndarray:
+    return gaussian_dof(image, depth, focal_distance=focal_distance, focal_range=0, mode=mode)
+
+
+# ---- amount ----
+
+
+@given(
+    size=st.tuples(st.integers(1, 9), st.integers(1, 9)),
+    seed=st.integers(0, 2**32 - 1),
+    focal_distance=SIXTEENTH.filter(bool),
+    focal_range=st.one_of(SIXTEENTH, st.sampled_from([1e30, math.inf])),
+)
+@settings(max_examples=40, deadline=None)
+def test_amount_equals_the_definition(
+    size: tuple[int, int], seed: int, focal_distance: float, focal_range: float
+) -> None:
+    depth = depths(size, seed)
+    amount = blur_amount(depth, focal_distance=focal_distance, focal_range=focal_range)
+    assert amount.dtype == np.float32
+    # sixteenths: no rounding anywhere
+    np.testing.assert_array_equal(amount, reference.blur_amount(depth, focal_distance, focal_range))
+
+
+def test_amount_of_a_depth_that_is_no_number_is_none() -> None:
+    depth = np.array([[np.nan, 5.0, np.inf]])
+    assert blur_amount(depth, focal_distance=2.0, focal_range=1.0).tolist() == [[0, 2, 8]]
+
+
+@pytest.mark.parametrize("focal_distance", [None, 0.0, -1.0])
+def test_without_a_focal_distance_nothing_happens(focal_distance: float | None) -> None:
+    image, depth = colours((4, 5), 0), depths((4, 5), 0)
+    assert not blur_amount(depth, focal_distance=focal_distance).any()
+    for mode in MODES:
+        assert gaussian_dof(image, depth, focal_distance=focal_distance, mode=mode) is image
+
+
+def test_the_range_is_two_unless_given() -> None:
+    image, depth = colours((9, 9), 0), np.full((9, 9), 5.0)
+    assert blur_amount(depth, focal_distance=1.0)[0, 0] == 2
+    np.testing.assert_array_equal(
+        gaussian_dof(image, depth, focal_distance=1.0),
+        gaussian_dof(image, depth, focal_distance=1.0, focal_range=2.0, mode="report"),
+    )
+
+
+# ---- the report's filter ----
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@given(
+    size=st.one_of(
+        st.sampled_from([(1, 1), (1, 30), (30, 1), (2, 2), (7, 5)]),
+        st.tuples(st.integers(1, 20), st.integers(1, 20)),
+    ),
+    seed=st.integers(0, 2**32 - 1),
+    focal_distance=SIXTEENTH.filter(bool),
+    focal_range=SIXTEENTH,
+)
+@settings(max_examples=25, deadline=None)
+def test_report_equals_the_loops(
+    backend: str, size: tuple[int, int], seed: int, focal_distance: float, focal_range: float
+) -> None:
+    image, depth = colours(size, seed), depths(size, seed)
+    found = gaussian_dof(
+        tensor(backend, image),
+        tensor(backend, depth),
+        focal_distance=focal_distance,
+        focal_range=focal_range,
+        mode="report",
+    )
+    truth = reference.gaussian_dof(image, reference.blur_amount(depth, focal_distance, focal_range))
+    np.testing.assert_allclose(np.array(found), truth, atol=REPORT_TOLERANCE, rtol=0)
+
+
+@pytest.mark.parametrize("size", [(37, 41), (20, 50)])
+def test_report_equals_the_loops_with_every_window_size(size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(7)
+    amount = rng.choice(np.arange(0, 8.5, 0.5), size)
+    image = colours(size, 3)
+    found = blurred(image, far(amount=amount), mode="report")
+    np.testing.assert_allclose(found, reference.gaussian_dof(image, amount), atol=REPORT_TOLERANCE, rtol=0)
+
+
+@pytest.mark.parametrize(("amount", "shift"), [(1.0, 0.5), (4.0, 0.5), (8.0, 0.5), (7.99, 0.5)])
+def test_report_moves_the_picture_right_and_up_by_half_a_pixel(amount: float, shift: float) -> None:
+    row, column = np.mgrid[0:40, 0:50].astype(np.float64)
+    image = np.stack([column, row, np.ones_like(row)], axis=-1)
+    found = blurred(image, np.full((40, 50), far(amount=amount)), mode="report")
+    inner = (slice(8, -8), slice(8, -8))  # a window of 8 does not reach the border
+    # 33 roundings of values up to 50
+    np.testing.assert_allclose(found[inner][..., 0], column[inner] - shift, atol=1e-4)
+    np.testing.assert_allclose(found[inner][..., 1], row[inner] + shift, atol=1e-4)
+
+
+@pytest.mark.parametrize("k", range(1, 9))
+def test_report_spreads_by_the_line_of_pascal(k: int) -> None:
+    image = np.zeros((41, 41, 3))
+    image[20, 20] = 1
+    found = blurred(image, np.full((41, 41), far(amount=k)), mode="report")[..., 0]
+    line = np.array([math.comb(2 * k - 1, j) for j in range(2 * k)]) / 2 ** (2 * k - 1)
+    expected = np.zeros((41, 41))
+    # the pixel is read by the windows that start up to 2k − 1 pixels before it
+    expected[20 - k : 20 + k, 21 - k : 21 + k] = np.outer(line, line)
+    np.testing.assert_allclose(found, expected, atol=1e-7)  # products of exact numbers, rounded once
+
+
+def test_report_counts_weights_from_the_start_of_the_cut_window() -> None:
+    image = np.zeros((40, 40, 3))
+    image[:, 0] = 1
+    k = 4
+    found = blurred(image, np.full((40, 40), far(amount=k)), mode="report")[20, :, 0]
+    line = [math.comb(7, j) for j in range(8)]
+    for column in range(6):
+        held = min(column + k, 40) - max(column - k, 0)
+        expected = line[0] / sum(line[:held]) if column <= k else 0
+        assert found[column] == pytest.approx(expected, abs=1e-6)
+
+
+def test_report_leaves_out_neighbours_in_focus_and_no_others() -> None:
+    image = np.zeros((9, 30, 3))
+    image[:, 15:] = 1
+    amount = np.full((9, 30), 5.0)
+    amount[:, 15:] = 0
+    found = blurred(image, far(amount=amount), mode="report")
+    np.testing.assert_array_equal(found, image)  # no white bleeds into the black
+    amount[:, 15:] = 1 / 1024  # k = 0: kept as it is, but it gives
+    found = blurred(image, far(amount=amount), mode="report")
+    np.testing.assert_array_equal(found[:, 15:], image[:, 15:])
+    assert found[4, 14, 0] > 0.2
+
+
+def test_report_leaves_pixels_without_a_window_untouched() -> None:
+    image = colours((30, 30), 1)
+    amount = np.random.default_rng(2).choice([0, 0.25, 0.999, 1, 5], (30, 30))
+    found = blurred(image, far(amount=amount), mode="report")
+    np.testing.assert_array_equal(found[amount < 1], image[amount < 1])
+    assert (found[amount >= 1] != image[amount >= 1]).any(-1).mean() > 0.99
+
+
+def launches(filter_: Callable[[], Any]) -> list[int]:
+    """Return the widths of the kernels that a call runs."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        filter_()
+        return [entry["size"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+
+
+@needs_llvm
+def test_report_runs_only_what_is_needed() -> None:
+    image, amount = tensor("llvm", colours((60, 80), 0)), np.zeros((60, 80))
+
+    def small_launches() -> set[int]:
+        depth = tensor("llvm", far(amount=amount))
+        sizes = launches(lambda: gaussian_dof(image, depth, focal_distance=1.0, focal_range=0))
+        assert max(sizes) == 60 * 80  # the maps of amounts and sizes, once for all
+        return set(sizes) - {60 * 80}
+
+    assert small_launches() == set()
+    amount[30, 40:43] = 4.5
+    # along columns the three pixels themselves, along rows the eight rows of their windows
+    assert small_launches() == {3, 3 * 8}
+    amount[10, 10] = 7
+    assert small_launches() == {3, 3 * 8, 1, 14}
+
+
+# ---- both modes ----
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_bad_colour_stays_where_it_is(mode: str, bad: float) -> None:
+    image, amount = colours((25, 30), 4), np.random.default_rng(4).choice([0, 2, 3.5, 8], (25, 30))
+    amount[12, 15] = 8
+    marred = image.copy()
+    marred[12, 15, 1] = bad
+    found = blurred(marred, far(amount=amount), mode=mode)
+    np.testing.assert_array_equal(found[12, 15], marred[12, 15])
+    others = np.ones((25, 30), dtype=bool)
+    others[12, 15] = False
+    assert np.isfinite(found[others]).all()
+    # and it gives nothing: the same as if another colour of no number stood there
+    marred[12, 15] = np.nan
+    np.testing.assert_array_equal(blurred(marred, far(amount=amount), mode=mode)[others], found[others])
+    if mode == "report":
+        amount[12, 15] = 0  # gives nothing, stays as it is
+        truth = reference.gaussian_dof(image, amount)
+        np.testing.assert_allclose(found[others], truth[others], atol=REPORT_TOLERANCE, rtol=0)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_bad_depth_is_sharp(mode: str) -> None:
+    image = colours((25, 30), 4)
+    depth = np.full((25, 30), far(amount=5))
+    depth[12, 15] = 1  # in focus
+    in_focus = blurred(image, depth, mode=mode)
+    depth[12, 15] = np.nan
+    np.testing.assert_array_equal(blurred(image, depth, mode=mode), in_focus)
+    np.testing.assert_array_equal(in_focus[12, 15], image[12, 15])
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("size", [(1, 1), (1, 20), (20, 1), (2, 2), (3, 17)])
+def test_a_flat_picture_stays_flat_at_any_size(mode: str, size: tuple[int, int]) -> None:
+    image = np.full((*size, 3), [0.25, 0.5, 3.0])
+    for seed in range(5):
+        found = gaussian_dof(image, depths(size, seed), focal_distance=3.0, focal_range=0.5, mode=mode)
+        # the weights add up to one but for the rounding of their sums, of 61 terms at most
+        np.testing.assert_allclose(found, image, rtol=61 * 6e-8)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("mode", MODES)
+def test_results_repeat_bit_for_bit(backend: str, mode: str) -> None:
+    image, depth = tensor(backend, colours((40, 50), 1)), tensor(backend, depths((40, 50), 1))
+    runs = [
+        np.array(gaussian_dof(image, depth, focal_distance=3.0, focal_range=0.5, mode=mode)) for _ in range(3)
+    ]
+    np.testing.assert_array_equal(runs[0], runs[1])
+    np.testing.assert_array_equal(runs[0], runs[2])
+    assert (runs[0] != np.array(image)).any()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("mode", MODES)
+def test_backends_agree(backend: str, mode: str) -> None:
+    image, depth = colours((40, 50), 1), depths((40, 50), 1)
+    plain = gaussian_dof(image, depth, focal_distance=3.0, focal_range=0.5, mode=mode)
+    assert isinstance(plain, np.ndarray) and plain.dtype == np.float32 and plain.shape == (40, 50, 3)
+    module = importlib.import_module(f"drjit.{backend}")
+    found = gaussian_dof(tensor(backend, image), depth, focal_distance=3.0, focal_range=0.5, mode=mode)
+    assert type(found) is module.TensorXf and found.shape == (40, 50, 3)
+    # the same operations in the same order, but for fused multiply-adds: as many roundings as there are terms
+    np.testing.assert_allclose(np.array(found), plain, atol=61 * 6e-8)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_input_is_not_changed(mode: str) -> None:
+    image, depth = colours((20, 20), 0), np.full((20, 20), 9.0)
+    for given_image in (image, tensor("scalar", image)):
+        before = np.array(given_image)
+        gaussian_dof(given_image, depth, focal_distance=1.0, mode=mode)
+        np.testing.assert_array_equal(np.array(given_image), before)
+
+
+def test_wrong_arguments_are_named() -> None:
+    image, depth = np.zeros((4, 5, 3)), np.ones((4, 5))
+    with pytest.raises(UsageError, match="unknown depth-of-field mode 'lens'; use one of report, corrected"):
+        gaussian_dof(image, depth, focal_distance=1.0, mode="lens")
+    with pytest.raises(UsageError, match="focal_distance is not a number"):
+        gaussian_dof(image, depth, focal_distance=math.nan)
+    with pytest.raises(UsageError, match="focal_range is not a number"):
+        blur_amount(depth, focal_distance=1.0, focal_range=math.nan)
+    with pytest.raises(UsageError, match=r"depth has shape \(5, 4\); expected \[4, 5\]"):
+        gaussian_dof(image, depth.T, focal_distance=1.0)
+    with pytest.raises(UsageError, match="image has shape"):
+        gaussian_dof(depth, depth, focal_distance=1.0)
+
+
+# ---- the corrected filter ----
+
+
+def disc_share(distance: float, radius: float) -> float:
+    """The share of a disc beyond a straight line at a distance from its centre (negative: most of it)."""
+    ratio = np.clip(distance / radius, -1, 1)
+    return float((math.acos(ratio) - ratio * math.sqrt(1 - ratio**2)) / math.pi)
+
+
+@pytest.mark.parametrize("amount", [2.0, 5.0, 8.0])
+def test_a_blurred_foreground_covers_and_uncovers_like_before_a_lens(amount: float) -> None:
+    """A white half plane near the camera, over a black picture in focus: the lens sees its share."""
+    image = np.zeros((21, 40, 3))
+    image[:, 20:] = 1
+    depth = np.full((21, 40), 10.0)
+    depth[:, 20:] = near(amount=amount)
+    found = blurred(image, depth, focal_distance=10.0, mode="corrected")[10, :, 0]
+    radius = math.sqrt(2 * amount - 1)
+    for column in range(40):
+        truth = disc_share(19.5 - column, radius)  # the outline runs between columns 19 and 20
+        # pixels instead of a smooth disc, and a rim one pixel wide: a tenth at the smallest radius, 1.7
+        assert found[column] == pytest.approx(truth, abs=0.16 / radius)
+    assert found[20 + math.ceil(radius)] == 1 and found[19 - math.ceil(radius)] == 0
+
+
+@pytest.mark.parametrize("amount", [0.5, 2.0, 8.0])
+def test_a_sharp_foreground_keeps_its_outline(amount: float) -> None:
+    """In focus before a blurred background: neither takes anything from the other."""
+    image = np.zeros((21, 40, 3))
+    image[:, 20:] = 1
+    depth = np.full((21, 40), far(amount=amount))
+    depth[:, 20:] = 1
+    np.testing.assert_array_equal(blurred(image, depth, mode="corrected"), image)
+
+
+def test_a_blurred_background_is_blurred_up_to_the_sharp_outline() -> None:
+    """The background's own stripes mix beside the outline; what is hidden is taken as more of the same."""
+    image = np.zeros((40, 60, 3))
+    image[::4] = image[1::4] = 1
+    depth = np.full((40, 60), far(amount=8))
+    depth[:, 30:] = 1
+    image[:, 30:] = 0.125
+    found = blurred(image, depth, mode="corrected")[..., 0]
+    np.testing.assert_array_equal(found[:, 30:], np.float32(0.125))
+    # stripes of 4 pixels under a disc of almost 8: within a quarter of grey, right up to the outline
+    assert np.abs(found[10:30, 15:30] - 0.5).max() < 0.25
+
+
+@pytest.mark.parametrize("amount", [1.0, 2.5, 4.0, 8.0])
+@pytest.mark.parametrize("side", [near, far])
+def test_a_point_becomes_a_disc_of_the_stated_size(amount: float, side: Callable[..., np.ndarray]) -> None:
+    image = np.zeros((31, 31, 3))
+    image[15, 15] = 1
+    focus = 10.0 if side is near else 1.0
+    found = blurred(image, np.full((31, 31), side(amount=amount)), focal_distance=focus, mode="corrected")[
+        ..., 0
+    ]
+    row, column = np.mgrid[-15:16, -15:16]
+    core = math.sqrt(2 * amount - 23 / 16) - 0.5
+    assert found.sum() == pytest.approx(1, abs=1e-5)  # light is kept; 61 roundings
+    assert (found * column).sum() == pytest.approx(0, abs=1e-5)  # and centred
+    assert (found * row).sum() == pytest.approx(0, abs=1e-5)
+    assert found[np.hypot(row, column) >= core + 1].max() == 0
+    assert np.ptp(found[np.hypot(row, column) <= core]) < 1e-7  # an even disc
+    # as wide as Pascal's line of 2a entries, but for the coarseness of pixels: worst at a = 1.2, by 14 %
+    assert (found * column**2).sum() == pytest.approx((2 * amount - 1) / 4, rel=0.1)
+
+
+def test_no_steps_in_the_amount() -> None:
+    """Blurring a little more changes the picture a little; the report's filter jumps wherever k steps."""
+    image = colours((16, 16), 2)
+
+    def largest_change(mode: str, frames: int) -> float:
+        depths = [np.full((16, 16), far(amount=a)) for a in np.linspace(0, 3, frames)]
+        pictures = [blurred(image, depth, mode=mode) for depth in depths]
+        return max(np.abs(b - a).max() for a, b in pairwise(pictures))
+
+    coarse, fine = largest_change("corrected", 61), largest_change("corrected", 121)
+    assert fine < 0.6 * coarse  # half the step, half the change, and a little for its curvature
+    assert largest_change("report", 121) > 10 * fine
+
+
+def test_no_seam_where_depth_passes_from_one_layer_to_another() -> None:
+    """Two surfaces whose blur grows apart: no jump where they stop being taken for one layer."""
+    rng = np.random.default_rng(6)
+    image = rng.uniform(0, 1, (16, 40, 3))
+    frames = []
+    for apart in np.linspace(0, 3, 121):
+        amount = np.full((16, 40), 4.0)
+        amount[:, 20:] += apart
+        frames.append(blurred(image, far(amount=amount), mode="corrected"))
+    # of a disc of 2.6 pixels, a step of 0.025 in the amount moves less than 0.01 pixels of rim
+    assert max(np.abs(b - a).max() for a, b in pairwise(frames)) < 0.02
+
+
+def test_mirrored_pictures_give_mirrored_results() -> None:
+    """The window has a centre, and no border is special; the report's filter fails both."""
+    image, depth = colours((33, 36), 8), depths((33, 36), 8)
+
+    def both(mode: str, axis: int) -> tuple[np.ndarray, np.ndarray]:
+        options = {"focal_distance": 3.0, "focal_range": 0.5, "mode": mode}
+        mirrored = gaussian_dof(np.flip(image, axis), np.flip(depth, axis), **options)
+        return np.flip(mirrored, axis), gaussian_dof(image, depth, **options)
+
+    for axis in (0, 1):
+        # the same 61 terms, added in another order
+        np.testing.assert_allclose(*both("corrected", axis), atol=61 * 6e-8)
+        assert np.abs(np.subtract(*both("report", axis))).max() > 0.1
+
+
+def test_beyond_the_border_the_picture_goes_on() -> None:
+    """A cut-out of a picture whose colours do not change across the cut is blurred as the whole is."""
+    rng = np.random.default_rng(9)
+    column = rng.uniform(0, 1, (50, 1, 3))
+    whole, cut = np.repeat(column, 60, axis=1), np.repeat(column, 20, axis=1)
+    full = blurred(whole, np.full((50, 60), far(amount=8)), mode="corrected")
+    part = blurred(cut, np.full((50, 20), far(amount=8)), mode="corrected")
+    np.testing.assert_array_equal(part, full[:, :20])
+    np.testing.assert_array_equal(part, full[:, 20:40])
+
+
+def test_a_blurred_background_shows_no_foreground_behind_its_own_gap() -> None:
+    """Three layers: a blurred background does not shine through a sharp thing onto another sharp thing."""
+    image = np.zeros((15, 30, 3))
+    image[:, :10, 0] = 1  # blurred, far
+    image[:, 10:12, 1] = 1  # sharp
+    image[:, 12:, 2] = 1  # sharp
+    depth = np.full((15, 30), 1.0)
+    depth[:, :10] = far(amount=8)
+    # equal colours, but for the rounding of their sums of 61 terms at most
+    np.testing.assert_allclose(blurred(image, depth, mode="corrected"), image, atol=61 * 6e-8)
+
+
+@needs_llvm
+def test_corrected_computes_only_what_a_disc_reaches() -> None:
+    image, amount = tensor("llvm", colours((60, 80), 0)), np.zeros((60, 80))
+    amount[30, 40] = 8
+    depth = tensor("llvm", far(amount=amount))
+    sizes = launches(lambda: gaussian_dof(image, depth, focal_distance=1.0, focal_range=0, mode="corrected"))
+    assert 9 * 9 in sizes  # the largest disc reaches four pixels each way
+    assert set(sizes) <= {81, 60 * 80, 3 * 60 * 80}
