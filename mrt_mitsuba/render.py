@@ -83,6 +83,7 @@ def render(
     job = _Job(Progress() if progress is None else progress)
     with job.counting_kernels():
         variant = runtime.use(variant)
+        runtime.warn_if_slow()
         source = open_scene(scene, width=given["width"], height=given["height"], fresnel=given["fresnel"],
                             convention=given["convention"], integrator=integrator)
         tracer, features = _tracer(source)

@@ -69,6 +69,17 @@ def obstacle(variant: str) -> str | None:
     return None
 
 
+def warn_if_slow() -> None:
+    """Say once in a process that the current variant is slow, if it is."""
+    import mitsuba as mi
+
+    variant = mi.variant()
+    if variant.startswith("scalar") and not _warned:
+        _warned.add(variant)
+        message = f"{variant} traces one ray at a time in Python: use it for small pictures, {FAST} for others"
+        warnings.warn(message, MrtWarning, stacklevel=3)
+
+
 def usable_variants() -> list[str]:
     """Return the variants of this Mitsuba that can run here."""
     llvm.prepare()

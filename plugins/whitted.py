@@ -108,7 +108,7 @@ class MrtWhitted(mi.SamplingIntegrator):
     """
 
     def __init__(self, props: mi.Properties):
-        mi.SamplingIntegrator.__init__(self, props)
+        _construct(self, props)
         self.max_depth = integer(props, "max_depth", 10, least=1)
         self.sky = props.get_emissive_texture("sky") if "sky" in props else None
         self.clamp = flag(props, "clamp", True)
@@ -452,6 +452,16 @@ class _Scales:
         # The shapes inside an instance are not of the scene's own: take the largest for them
         known = found & (ids < self.table_size)
         return dr.select(known, dr.gather(mi.Float, self.table, ids, known), self.fallback)
+
+
+def _construct(integrator, props) -> None:
+    """Mitsuba logs a warning about every Python integrator in a scalar variant; ``mrt.render`` gives its own."""
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        mi.SamplingIntegrator.__init__(integrator, props)
+    finally:
+        mi.set_log_level(level)
 
 
 def _has_mirror(bsdf) -> bool:
