@@ -17,7 +17,8 @@ setup: $(STAMP)-base
 
 render: $(STAMP)-base
 	@mkdir -p $(OUT)
-	$(BIN)/mrt $(OUT)/scene$(SCENE) $(SCENE) $(ARGS)
+	@$(BIN)/mrt $(OUT)/scene$(SCENE) $(SCENE) $(ARGS)
+	@echo "The picture is in $(OUT)/"
 
 test: $(STAMP)-test
 	$(BIN)/python -m pytest $(ARGS)
