@@ -142,14 +142,17 @@ def _scenes(arguments: list[str]) -> int:
 
 
 def _export(arguments: list[str]) -> int:
-    if len(arguments) != 3 or arguments[1] != "--xml":
-        raise UsageError("write mrt export SCENE --xml PATH")
-    number = parse(["export", arguments[0]]).scene_number
+    flavor = "stock" if "--stock" in arguments else "mrt"
+    words = [argument for argument in arguments if argument != "--stock"]
+    if len(words) != 3 or words[1] != "--xml":
+        raise UsageError("write mrt export SCENE --xml PATH [--stock]")
+    number, path = parse(["export", words[0]]).scene_number, words[2]
     from mrt_mitsuba.output import check_target
+
+    check_target(path)
     from mrt_mitsuba.export import write_xml
 
-    check_target(arguments[2])
-    write_xml(number, arguments[2])
+    write_xml(number, path, flavor=flavor)
     return 0
 
 

@@ -340,7 +340,7 @@ def usage() -> str:
     """Return the help text of the command."""
     lines = [
         "usage: mrt FILENAME [SCENE] [name=value ...]",
-        "       mrt help | doctor | scenes | export SCENE --xml PATH",
+        "       mrt help | doctor | scenes | export SCENE --xml PATH [--stock]",
         "",
         "Renders a scene and writes FILENAME.png and FILENAME.exr.",
         f"FILENAME has no extension; SCENE is {_either([str(number) for number in NUMBERS])} (default: 0).",
@@ -358,6 +358,6 @@ def usage() -> str:
         "  help                        print this text",
         "  doctor                      print versions, the LLVM in use, the variants; render a self-test",
         "  scenes                      list the scenes",
-        "  export SCENE --xml PATH     write a scene as Mitsuba XML",
+        "  export SCENE --xml PATH     write a scene as Mitsuba XML; --stock: with Mitsuba's own plugins only",
     ]
     return "\n".join(lines) + "\n"

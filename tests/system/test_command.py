@@ -111,9 +111,26 @@ def test_broken_scene_file(mrt: Mrt, tmp_path: Path, content: str | None, text: 
 def test_variant_that_cannot_be_used(mrt: Mrt, tmp_path: Path, variant: str, code: int, text: str) -> None:
     done = mrt("out", *SMALL, f"variant={variant}")
     if variant.startswith("cuda") and done.returncode == 0:
-        pytest.skip("this machine has a GPU")
+        pytest.skip("there is a GPU here")
     assert done.returncode == code and text in done.stderr and done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("flavor", "plugin"), [((), "mrt_bsdf"), (("--stock",), "roughplastic")])
+def test_exported_scene_renders(mrt: Mrt, tmp_path: Path, flavor: tuple[str, ...], plugin: str) -> None:
+    done = mrt("export", "0", "--xml", "zero.xml", *flavor)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    text = (tmp_path / "zero.xml").read_text()
+    assert plugin in text and ("mrt_" in text) is not bool(flavor)
+    done = mrt("out", "scene=zero.xml", "aa=1", "aamode=none", "format=exr")
+    assert done.returncode == 0, done.stderr
+    image = read_exr(tmp_path / "out.exr").image
+    np.testing.assert_allclose(image[0, 0], (0.1, 0.3, 0.5), atol=1e-6)  # the sky of scene 0, in float32
+
+
+def test_export_to_a_folder_that_does_not_exist(mrt: Mrt) -> None:
+    done = mrt("export", "0", "--xml", "none/zero.xml")
+    assert done.returncode == 1 and "the folder" in done.stderr and "does not exist" in done.stderr
 
 
 def test_doctor(mrt: Mrt) -> None:
