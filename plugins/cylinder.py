@@ -1,0 +1,95 @@
+"""``mrt_cylinder``: a closed cylinder, exact where it matters and a mesh where it must be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .intersect import Frame, cylinder_frame
+from .parameters import flag, integer, number, vector
+from .revolution import Placement, check_axis, fill, number64, refill, unit_cylinder_mesh, vector64
+from .variants import is_jit
+
+
+class MrtCylinder(mi.Mesh):
+    r"""A right circular cylinder with its two discs.
+
+    ``mrt_whitted`` intersects the quadric and the discs themselves. To every other integrator the shape is a
+    mesh of ``segments`` sides with smooth normals, inscribed in the cylinder, as ``mrt_cone`` is.
+
+    ============ ========= ========== ==============================================================
+    name         type      default    unit or range
+    ============ ========= ========== ==============================================================
+    ``p0``       point     required   one end of the axis, scene units
+    ``p1``       point     required   the other end, scene units
+    ``radius``   float     1          > 0, scene units
+    ``capped``   boolean   true       with discs; without, the tube is open and lit on its outside only
+    ``segments`` integer   256        >= 3, sides of the mesh
+    ``to_world`` transform identity   any invertible affine transform; under a skew one it is elliptic
+    ============ ========= ========== ==============================================================
+
+    ``p0``, ``p1`` and ``radius`` are differentiable scene parameters: the vertices follow them. Side: u is
+    the azimuth over 2π, v = 1 at ``p0`` and 0 at ``p1``. Discs: the unit square around each.
+
+    .. code-block:: python
+
+        {'type': 'mrt_cylinder', 'p0': [0, 0, 0], 'p1': [0, 1, 0], 'radius': 0.2}
+
+    .. code-block:: xml
+
+        <shape type="mrt_cylinder">
+            <point name="p0" x="0" y="0" z="0"/>
+            <point name="p1" x="0" y="1" z="0"/>
+            <float name="radius" value="0.2"/>
+        </shape>
+
+    Nearest stock plugin: ``cylinder``, which is open.
+    """
+
+    quadric = "cylinder"  # what ``mrt_whitted`` intersects in place of the mesh
+
+    def __init__(self, props: mi.Properties) -> None:
+        ends = {name: vector(props, name) for name in ("p0", "p1")}
+        check_axis("mrt_cylinder", "p0", ends["p0"], "p1", ends["p1"])
+        self.p0, self.p1 = (mi.Point3f(p) for p in ends.values())
+        self.radius = mi.Float(number(props, "radius", 1.0, above=0))
+        self.capped = flag(props, "capped", True)
+        self.placement = Placement(props)
+        self.unit = unit_cylinder_mesh(integer(props, "segments", 256, least=3), self.capped)
+        dr.make_opaque(self.p0, self.p1, self.radius)
+        sizes = len(self.unit.points), len(self.unit.faces)
+        mi.Mesh.__init__(
+            self, "mrt_cylinder", *sizes, props, has_vertex_normals=True, has_vertex_texcoords=True
+        )
+        fill(self, self.unit, self.frame())
+        # Mitsuba merges meshes that share a BSDF when it loads a scene, but leaves those with attributes
+        # alone
+        self.add_attribute("face_mrt_cylinder", 1, [0.0] * sizes[1])
+
+    def frame(self) -> Frame:
+        """The shape's unit frame in world space, in double precision (see ``intersect``)."""
+        ends = vector64(self.p0), vector64(self.p1)
+        return self.placement(cylinder_frame(*ends, number64(self.radius)))
+
+    def traverse(self, callback: Any) -> None:
+        mi.Mesh.traverse(self, callback)
+        flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
+        for name in ("p0", "p1", "radius"):
+            callback.put(name, getattr(self, name), flags)
+
+    def parameters_changed(self, keys: Any = ()) -> None:
+        if not {"p0", "p1", "radius"}.isdisjoint(keys):
+            if is_jit():
+                refill(self, self.unit, self.placement(cylinder_frame(self.p0, self.p1, self.radius)))
+            else:
+                fill(self, self.unit, self.frame())
+        mi.Mesh.parameters_changed(self, keys)
+
+    def to_string(self) -> str:
+        ends = f"p0={list(vector64(self.p0))}, p1={list(vector64(self.p1))}"
+        return f"MrtCylinder[{ends}, radius={number64(self.radius):g}, capped={self.capped}]"
+
+
+mi.register_shape("mrt_cylinder", MrtCylinder)

@@ -1,0 +1,243 @@
+"""``mrt_cone`` and ``mrt_cylinder`` as meshes: what stock integrators see of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.plugins import intersect
+
+SHAPES = {
+    "cone": {"type": "mrt_cone", "apex": [0.2, 1.5, -0.1], "base_center": [0.5, 0.4, 0.3], "radius": 0.65},
+    "cylinder": {"type": "mrt_cylinder", "p0": [0.2, 1.5, -0.1], "p1": [0.5, 0.4, 0.3], "radius": 0.65},
+}
+PARTS = {"cone": 2, "cylinder": 3}
+HEIGHT, RADIUS = math.sqrt(0.3**2 + 1.1**2 + 0.4**2), 0.65
+AREA = {
+    "cone": np.pi * RADIUS * (RADIUS + np.hypot(HEIGHT, RADIUS)),
+    "cylinder": 2 * np.pi * RADIUS * (RADIUS + HEIGHT),
+}
+
+
+@pytest.fixture(autouse=True)
+def _vectorised() -> Iterator[None]:
+    runtime.use("llvm_ad_rgb")
+    yield
+    runtime.use("llvm_ad_rgb")
+
+
+def shape(name: str, **more):
+    return mi.load_dict({**SHAPES[name], **more})
+
+
+def world_frame(mesh) -> intersect.Frame:
+    """The frame of a shape, for float32 arrays."""
+    exact = mesh.frame()
+    return intersect.Frame(mi.Point3f(exact.origin), *(mi.Vector3f(r) for r in (exact.x, exact.y, exact.z)))
+
+
+def rays_at(count: int, seed: int = 1):
+    """Rays from a sphere of radius 4 around the shapes towards points near their axis."""
+    rng = np.random.default_rng(seed)
+    o = rng.normal(size=(count, 3))
+    o = 4 * o / np.linalg.norm(o, axis=1, keepdims=True) + np.array([0.35, 0.95, 0.1])
+    towards = np.array([0.35, 0.95, 0.1]) + rng.uniform(-0.4, 0.4, size=(count, 3))
+    return mi.Ray3f(mi.Point3f(o.T), dr.normalize(mi.Vector3f((towards - o).T)))
+
+
+def errors_of(name: str, segments: int, **scene):
+    """Errors of a mesh against the surface: relative distance, normal and uv on the same part."""
+    mesh = shape(name, segments=segments)
+    ray = rays_at(200_000)
+    si = mi.load_dict({"type": "scene", "shape": mesh, **scene}).ray_intersect(ray)
+    frame = world_frame(mesh)
+    exact = getattr(intersect, f"intersect_{name}")(ray.o, ray.d, frame)
+    surface = getattr(intersect, f"{name}_surface")(ray(exact.t), exact.part, frame)
+    both = si.is_valid() & dr.isfinite(exact.t)
+    distance = dr.abs(si.t - exact.t) / exact.t
+    normal = dr.norm(si.sh_frame.n - mi.Normal3f(surface.n))
+    du = dr.abs(si.uv.x - surface.u)
+    uv = dr.maximum(dr.minimum(du, 1 - du), dr.abs(si.uv.y - surface.v))
+    pick = dr.compress(both & (normal < 0.5))  # a ray near a rim may meet another part
+    assert dr.width(pick) > 100_000
+    return [dr.gather(mi.Float, x, pick).numpy() for x in (distance, normal, uv)]
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_error_falls_with_the_square_of_segments(name: str) -> None:
+    """Slope 2 in distance and area: each factor of four in segments is a factor of sixteen in error."""
+    counts = (16, 64, 256)
+    distances = [np.median(errors_of(name, n)[0]) for n in counts]
+    areas = [abs(shape(name, segments=n).surface_area()[0] / AREA[name] - 1) for n in counts]
+    for coarse, fine in pairwise(distances):
+        assert 12 < coarse / fine < 20
+    for coarse, fine in pairwise(areas):
+        assert 12 < coarse / fine < 20
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_normals_and_uv_are_those_of_the_exact_surface(name: str) -> None:
+    _, normal, uv = errors_of(name, 256)
+    # A normal turns by 2π/256 across a side of the mesh. On a cylinder its interpolation is off by the square of
+    # half of that; a triangle of a cone has one normal at its tip, wrong by up to half the turn there
+    assert np.median(normal) < (5e-4 if name == "cylinder" else np.pi / 256 / 4)
+    assert normal.max() < 2 * np.pi / 256
+    assert np.median(uv) < 5e-4
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_bounding_box(name: str) -> None:
+    mesh = shape(name)
+    axis = np.array([0.3, -1.1, 0.4]) / HEIGHT
+    reach = RADIUS * np.sqrt(1 - axis**2)  # half extent of a disc across the axis
+    end0, end1 = np.array([0.2, 1.5, -0.1]), np.array([0.5, 0.4, 0.3])
+    low = np.minimum(end0 - (reach if name == "cylinder" else 0), end1 - reach)
+    high = np.maximum(end0 + (reach if name == "cylinder" else 0), end1 + reach)
+    # The mesh is inscribed: with 256 segments by up to 1 − cos(π/256) = 7.5e-5 of the radius
+    np.testing.assert_allclose(np.array(mesh.bbox().min), low, atol=1e-4 * RADIUS)
+    np.testing.assert_allclose(np.array(mesh.bbox().max), high, atol=1e-4 * RADIUS)
+
+
+@pytest.mark.parametrize("scale", [[1, 1, 1], [1, -1, 1], [2, 0.5, -3]])
+@pytest.mark.parametrize("name", SHAPES)
+def test_closed_and_facing_outwards(name: str, scale: list[float]) -> None:
+    """The volume by the divergence theorem: a hole or a face turned inside out would change it."""
+    mesh = shape(name, to_world=mi.ScalarTransform4f().scale(scale).translate([1, 2, 3]))
+    buffers = mi.traverse(mesh)
+    vertices = buffers["vertex_positions"].numpy().reshape(-1, 3).astype(np.float64)
+    triangles = vertices[buffers["faces"].numpy().reshape(-1, 3)]
+    volume = np.einsum("ij,ij->i", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])).sum() / 6
+    solid = np.pi * RADIUS**2 * HEIGHT * (1 if name == "cylinder" else 1 / 3) * abs(np.prod(scale))
+    assert volume == pytest.approx(solid, rel=2e-4)  # a polygon of 256 sides in place of the circle: 1e-4
+    normals = buffers["vertex_normals"].numpy().reshape(-1, 3)
+    corner = normals[buffers["faces"].numpy().reshape(-1, 3)].mean(axis=1)
+    faces = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    assert (np.einsum("ij,ij->i", faces, corner) > 0).all()
+
+
+def test_open_cone_has_no_base() -> None:
+    up = mi.Ray3f([0.5, -5, 0.5], [0, 1, 0])
+    for capped, t in ((True, 5.4), (False, 5 + 1.5 - 1.1 * 0.2 / RADIUS)):
+        cone = shape("cone", base_center=[0.5, 0.4, 0.3], apex=[0.5, 1.5, 0.3], capped=capped)
+        hit = mi.load_dict({"type": "scene", "cone": cone}).ray_intersect(up)
+        assert hit.t[0] == pytest.approx(t, rel=1e-4)  # the mesh lies inside by up to 7.5e-5 of the radius
+
+
+def test_thousands_of_segments_do_not_leak() -> None:
+    """The scene's robust switch, as our scenes set it, keeps rays from passing between slivers."""
+    distance, _, _ = errors_of("cone", 4096, embree_use_robust_intersections=True)
+    assert (distance > 1e-2).sum() == 0
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_positions_differentiate_with_the_parameters(name: str) -> None:
+    """Derivatives of all vertices by automatic differentiation against finite differences."""
+    ends = [key for key in SHAPES[name] if key not in ("type", "radius")]
+    weights = mi.Float(np.random.default_rng(4).normal(size=3 * len(shape(name, segments=8).unit.points)))
+
+    def weighted_sum(values: dict, gradient: bool):
+        mesh = shape(name, segments=8)
+        parameters = mi.traverse(mesh)
+        for key, value in values.items():
+            parameters[key] = value
+            if gradient:
+                dr.enable_grad(parameters[key])
+        parameters.update()
+        inputs = [parameters[key] for key in values]
+        return dr.sum(mi.traverse(mesh)["vertex_positions"] * weights), inputs
+
+    point = {ends[0]: mi.Point3f(0.1, 1.4, 0), ends[1]: mi.Point3f(0.5, 0.3, 0.3), "radius": mi.Float(0.6)}
+    total, inputs = weighted_sum(point, gradient=True)
+    dr.backward(total)
+    step = 1e-2  # a step of 1e-2 leaves a truncation of 1e-4, and a rounding of 1e-7 / 1e-2
+    for value, key in zip(inputs, point, strict=True):
+        gradient = np.atleast_1d(np.squeeze(dr.grad(value).numpy()))
+        for k, slope in enumerate(gradient):
+            sums = []
+            for sign in (1, -1):
+                moved = np.atleast_1d(np.squeeze(point[key].numpy())).astype(float)
+                moved[k] += sign * step
+                kind = type(point[key])
+                sums.append(weighted_sum({**point, key: kind(*map(float, moved))}, gradient=False)[0][0])
+            assert slope == pytest.approx((sums[0] - sums[1]) / (2 * step), rel=2e-2, abs=2e-2)
+
+
+def test_update_of_parameters_equals_construction() -> None:
+    for variant in ("llvm_ad_rgb", "scalar_rgb"):
+        runtime.use(variant)
+        mesh, wanted = shape("cone"), shape("cone", apex=[0, 2, 0])
+        parameters = mi.traverse(mesh)
+        parameters["apex"] = mi.Point3f(0, 2, 0)
+        parameters.update()
+        got, same = (np.array(mi.traverse(m)["vertex_positions"]) for m in (mesh, wanted))
+        np.testing.assert_allclose(got, same, atol=4e-7)  # some float32 roundings of coordinates up to 2
+        assert np.allclose(list(mesh.frame().z), list(wanted.frame().z))
+
+
+def test_as_an_emitter() -> None:
+    """Under an area light the flux out of the shape is π · radiance · area, and each part gets its share."""
+    cone = shape("cone", emitter={"type": "area", "radiance": 2.0})
+    assert cone.is_emitter()
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 200_000)
+    sample = cone.sample_position(0, sampler.next_2d())
+    assert dr.allclose(sample.pdf * cone.surface_area(), 1, rtol=1e-5)
+    axis = mi.Normal3f([0.3 / HEIGHT, -1.1 / HEIGHT, 0.4 / HEIGHT])
+    on_base = dr.mean(dr.select(dr.dot(sample.n, axis) > 0.99, 1.0, 0.0))[0]
+    share = np.pi * RADIUS**2 / AREA["cone"]
+    assert on_base == pytest.approx(
+        share, abs=4 * np.sqrt(share * (1 - share) / 200_000) + 1e-4
+    )  # 4 sigma, mesh
+
+
+def test_scenes_keep_the_shapes_apart() -> None:
+    """Mitsuba merges meshes that share a material; a merged cone would have lost its frame."""
+    scene = mi.load_dict({
+        "type": "scene", "matter": {"type": "diffuse"},
+        **{f"{name}_{i}": {**SHAPES[name], "bsdf": {"type": "ref", "id": "matter"}}
+           for name in SHAPES for i in range(3)},
+    })  # fmt: skip
+    assert sorted(s.quadric for s in scene.shapes()) == ["cone"] * 3 + ["cylinder"] * 3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"radius": -1.0}, ["mrt_cone", "radius", "-1", "> 0"]),
+        ({"radius": float("nan")}, ["radius", "nan", "> 0"]),
+        ({"segments": 2}, ["segments", "2", ">= 3"]),
+        ({"apex": [0.5, 0.4, 0.3]}, ["apex", "base_center", "two points"]),
+        ({"capped": 1}, ["capped", "true or false"]),
+        ({"to_world": [0.0, 1.0, 1.0]}, ["to_world", "not invertible"]),
+    ],
+)
+def test_wrong_parameters_are_named(change: dict, words: list[str]) -> None:
+    if "to_world" in change:
+        change = {"to_world": mi.ScalarTransform4f().scale(change["to_world"])}
+    with pytest.raises(RuntimeError) as error:
+        shape("cone", **change)
+    for word in words:
+        assert word in str(error.value)
+
+
+@pytest.mark.parametrize("missing", ["apex", "base_center"])
+def test_missing_points_are_named(missing: str) -> None:
+    with pytest.raises(RuntimeError, match=f'"{missing}" is missing'):
+        mi.load_dict({key: value for key, value in SHAPES["cone"].items() if key != missing})
+
+
+def test_scalar_variant_has_the_same_mesh() -> None:
+    buffers = {}
+    for variant in ("llvm_ad_rgb", "scalar_rgb"):
+        runtime.use(variant)
+        buffers[variant] = {k: np.array(v) for k, v in mi.traverse(shape("cone")).items() if "vertex" in k}
+    for key, values in buffers["llvm_ad_rgb"].items():
+        # One rounding: the scalar variant keeps parameters in double precision until the mesh is made
+        np.testing.assert_allclose(values, buffers["scalar_rgb"][key], atol=2.4e-7)
