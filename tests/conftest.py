@@ -42,3 +42,13 @@ def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]
         )
 
     return run
+
+
+@pytest.fixture(scope="session")
+def original_data() -> Path:
+    """The folder of the original program's scenes, tables and renders; skips where it is not at hand."""
+    beside = Path(__file__).resolve().parents[2] / "shared" / "reference"
+    folder = Path(os.environ.get("MRT_REFERENCE", beside))
+    if not folder.is_dir():
+        pytest.skip("no data of the original program: set MRT_REFERENCE to its folder")
+    return folder
