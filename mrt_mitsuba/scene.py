@@ -6,7 +6,10 @@ Lengths are in scene units, colours are linear RGB. ``Scene.to_dict()`` gives th
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
 
 Vector = tuple[float, float, float]
 Color = tuple[float, float, float]
@@ -24,12 +27,13 @@ class Camera:
 
 @dataclass(frozen=True)
 class Material:
-    """Index of refraction, roughness alpha, specular Ks and diffuse Kd."""
+    """Index of refraction, roughness alpha, specular Ks, diffuse Kd; a picture, given as a path, replaces Kd."""
 
     ior: float
     alpha: float
     specular: Color
     diffuse: Color
+    texture: str | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,26 @@ class Cone:
 
 
 @dataclass(frozen=True)
+class Cylinder:
+    """A closed cylinder; its axis goes from p0 to p1."""
+
+    p0: Vector
+    p1: Vector
+    radius: float
+    material: Material
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Flat triangles of one material; a normal is on the side from which corners run counter-clockwise."""
+
+    vertices: np.ndarray  # float32 [N, 3]
+    faces: np.ndarray  # uint32 [M, 3]
+    material: Material
+    uvs: np.ndarray | None = None  # float32 [N, 2]
+
+
+@dataclass(frozen=True)
 class Scene:
     """Everything a render needs, but for the picture's size and sampling."""
 
@@ -74,6 +98,9 @@ class Scene:
     spheres: tuple[Sphere, ...] = ()
     planes: tuple[Plane, ...] = ()
     cones: tuple[Cone, ...] = ()
+    cylinders: tuple[Cylinder, ...] = ()
+    meshes: tuple[Mesh, ...] = ()
+    texturing: str = "report"  # or "standard": bilinear, sRGB-aware
     focal_distance: float | None = None
     focal_range: float = 2.0
     title: str = field(default="", compare=False)

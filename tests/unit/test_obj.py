@@ -1,0 +1,394 @@
+"""OBJ and MTL files: what is read, in both conventions, and one clear error for each broken file."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
+from mrt_mitsuba.mtl import DEFAULT_MATERIAL, read_mtl
+from mrt_mitsuba.obj import read_obj
+from mrt_mitsuba.scene import Mesh
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+UVS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+NORMALS = "vn 0 0 1\n"
+
+MTL = """# two materials
+newmtl red
+Kd 0.9 0.1 0.1
+Ks 0.2 0.3 0.4
+Ka 1.2 0 0
+Ni 0.25
+Ns 98
+newmtl painted
+Kd 0.5
+"""
+PAINTED = MTL + "map_Kd picture.png\n"
+
+
+@pytest.fixture
+def model(tmp_path: Path):
+    """Write an OBJ file, and an MTL file beside it, and read them."""
+
+    def read(obj: str | bytes, mtl: str | None = None, **options) -> tuple[Mesh, ...]:
+        if mtl is not None:
+            (tmp_path / "model.mtl").write_text(mtl)
+        path = tmp_path / "model.obj"
+        path.write_bytes(obj if isinstance(obj, bytes) else obj.encode())
+        return read_obj(path, **options)
+
+    return read
+
+
+def triangles(mesh: Mesh) -> np.ndarray:
+    return mesh.vertices[mesh.faces]
+
+
+# --------------------------------------------- Geometry -------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "face", ["f 1 2 3", "f 1/1 2/2 3/3", "f 1//1 2//1 3//1", "f 1/1/1 2/2/1 3/3/1", "f +1 2 3"]
+)
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r", "  \t\n", " # a comment\n"])
+def test_forms_of_faces_and_line_ends(model, face: str, end: str) -> None:
+    (mesh,) = model((SQUARE + UVS + NORMALS + face + "\n").replace("\n", end))
+    np.testing.assert_array_equal(triangles(mesh), [[[0, 0, 0], [1, 0, 0], [1, 1, 0]]])
+    assert mesh.material == DEFAULT_MATERIAL
+    assert mesh.faces.dtype == np.uint32 and mesh.vertices.dtype == np.float32
+
+
+def test_negative_indices_count_back(model) -> None:
+    (mesh,) = model(SQUARE + "f -4 -3 -2\nv 5 5 5\nf -5 -4 -1\n")
+    np.testing.assert_array_equal(triangles(mesh)[0], [[0, 0, 0], [1, 0, 0], [1, 1, 0]])
+    np.testing.assert_array_equal(triangles(mesh)[1], [[0, 0, 0], [1, 0, 0], [5, 5, 5]])
+
+
+@pytest.mark.parametrize("corners", [4, 5, 6, 9])
+def test_polygons_become_fans(model, corners: int) -> None:
+    angle = 2 * np.pi * np.arange(corners) / corners
+    points = "".join(f"v {math.cos(a):.9f} {math.sin(a):.9f} 0\n" for a in angle)
+    (mesh,) = model(points + "f " + " ".join(str(i + 1) for i in range(corners)) + "\n")
+    a, b, c = triangles(mesh).transpose(1, 0, 2)
+    areas = np.cross(b - a, c - a)[:, 2] / 2
+    assert len(areas) == corners - 2
+    assert (areas > 0).all()
+    assert areas.sum() == pytest.approx(corners / 2 * math.sin(2 * math.pi / corners), rel=1e-6)
+
+
+def test_extra_numbers_and_other_statements_are_skipped(model) -> None:
+    points = "v 0 0 0 1\nv 1 0 0 0.1 0.2 0.3\nv 1 1 0 1 0.1 0.2 0.3\n"
+    text = "o thing\ng a b\ns off\n" + points + "vt 0.5\nvt 0 0 0\nl 1 2\nf 1 2 3\n"
+    (mesh,) = model(text)
+    np.testing.assert_array_equal(triangles(mesh), [[[0, 0, 0], [1, 0, 0], [1, 1, 0]]])
+
+
+def test_continued_lines_keep_line_numbers(model) -> None:
+    (mesh,) = model(SQUARE + "f 1 \\\n2 \\\n3\n")
+    assert len(mesh.faces) == 1
+    with pytest.raises(SceneError, match=r"model\.obj:8: f has the v index 9"):
+        model(SQUARE + "f 1 \\\n2 \\\n3\nf 1 2 9\n")
+
+
+def test_byte_order_mark_and_missing_last_line_end(model) -> None:
+    (mesh,) = model(b"\xef\xbb\xbf" + SQUARE.encode() + b"f 1 2 3")
+    assert len(mesh.faces) == 1
+
+
+def test_runs_of_lines_equal_single_lines(model) -> None:
+    """A comment keeps a line out of the fast path; more lines than it takes at once."""
+    rng = np.random.default_rng(1)
+    points, faces = rng.integers(-999, 999, size=(5000, 3)) / 64, rng.integers(1, 5001, size=(9000, 3))
+    lines = [f"v {x:.9g} {y:.9e} {z}" for x, y, z in points] + [f"vt {x:g} {y:g}" for x, y, _ in points]
+    lines += [f"f {a}/{b} {b}/{c} {c}/{a}" for a, b, c in faces]
+    fast, slow = (model("".join(line + end for line in lines))[0] for end in ("\n", " #\n"))
+    np.testing.assert_array_equal(triangles(fast), triangles(slow))
+    np.testing.assert_array_equal(triangles(fast), points[faces - 1])
+
+
+# --------------------------------------------- Materials ------------------------------------------------
+
+
+def test_report_convention(model) -> None:
+    (mesh,) = model("mtllib model.mtl\n" + SQUARE + "usemtl red\nf 1 2 3\n", MTL)
+    material = mesh.material
+    assert (material.ior, material.alpha) == (1.2, 0.25)  # from Ka and Ni
+    assert material.diffuse == (0.9, 0.1, 0.1) and material.specular == (0.2, 0.3, 0.4)
+
+
+def test_standard_convention(model) -> None:
+    text = "mtllib model.mtl\n" + SQUARE + "usemtl red\nf 1 2 3\n"
+    (mesh,) = model(text, MTL, convention="standard")
+    assert mesh.material.ior == 0.25  # Ni
+    assert mesh.material.alpha == pytest.approx(math.sqrt(2 / 100))  # Ns 98
+
+
+def test_unknown_convention(model) -> None:
+    with pytest.raises(UsageError, match=r"convention='blender': must be report or standard"):
+        model(SQUARE, convention="blender")
+
+
+def test_a_mesh_for_each_material_with_its_own_vertices(model) -> None:
+    text = (
+        "mtllib model.mtl\n"
+        + SQUARE
+        + "f 1 2 3\nusemtl red\nf 1 3 4\nusemtl other\nf 2 3 4\nusemtl red\nf 2 3 4\n"
+    )
+    mtl = MTL.replace("painted", "other")
+    default, red, other = model(text, mtl)
+    assert (
+        default.material == DEFAULT_MATERIAL
+        and red.material.ior == 1.2
+        and other.material.diffuse == (0.5,) * 3
+    )
+    assert [len(m.faces) for m in (default, red, other)] == [1, 2, 1]
+    assert [len(m.vertices) for m in (default, red, other)] == [3, 4, 3]
+    np.testing.assert_array_equal(triangles(red)[0], [[0, 0, 0], [1, 1, 0], [0, 1, 0]])
+
+
+def test_texture_beside_the_obj_file(model, tmp_path: Path) -> None:
+    (tmp_path / "picture.png").write_bytes(b"")
+    text = "mtllib model.mtl\n" + SQUARE + UVS + "usemtl painted\nf 1/4 2/3 3/2\nf 1 3 4\n"
+    textured, plain = model(text, PAINTED)
+    assert textured.material.texture == str(tmp_path / "picture.png")
+    np.testing.assert_array_equal(textured.uvs[textured.faces[0]], [[0, 1], [1, 1], [1, 0]])
+    # A face without coordinates cannot look a texture up: it gets Kd
+    assert plain.material.texture is None and plain.uvs is None and plain.material.diffuse == (0.5,) * 3
+
+
+@pytest.mark.parametrize(
+    "name", ["art\\picture.png", "art/my picture.png", "-s 2 2 -o 0 0 0 -clamp on picture.png"]
+)
+def test_texture_names(model, tmp_path: Path, name: str) -> None:
+    file = tmp_path / name.split("on ")[-1].replace("\\", "/")
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(b"")
+    text = "mtllib model.mtl\n" + SQUARE + UVS + "usemtl painted\nf 1/1 2/2 3/3\n"
+    (mesh,) = model(text, PAINTED.replace("picture.png", name))
+    assert Path(mesh.material.texture) == file
+
+
+def test_missing_texture_is_named_and_replaced_by_kd(model, tmp_path: Path) -> None:
+    text = "mtllib model.mtl\n" + SQUARE + UVS + "usemtl painted\nf 1/1 2/2 3/3\n"
+    with pytest.warns(
+        MrtWarning, match=r"model\.mtl:10: the texture picture\.png is missing in .*Kd is used"
+    ):
+        (mesh,) = model(text, PAINTED)
+    assert mesh.material.texture is None and mesh.material.diffuse == (0.5, 0.5, 0.5)
+
+
+def test_missing_library_is_named_and_the_default_used(model) -> None:
+    with pytest.warns(MrtWarning) as caught:
+        (mesh,) = model("mtllib nowhere.mtl\n" + SQUARE + "usemtl red\nf 1 2 3\n")
+    assert "model.obj:1: the material library nowhere.mtl is missing" in str(caught[0].message)
+    assert "model.obj:6: no library has the material 'red'" in str(caught[1].message)
+    assert mesh.material == DEFAULT_MATERIAL
+
+
+def test_library_with_a_blank_in_its_name(tmp_path: Path) -> None:
+    (tmp_path / "my model.mtl").write_text(MTL)
+    path = tmp_path / "my model.obj"
+    path.write_text("mtllib my model.mtl\n" + SQUARE + "usemtl red\nf 1 2 3\n")
+    assert read_obj(path)[0].material.ior == 1.2
+
+
+def test_kd_above_one_is_kept(model) -> None:
+    (mesh,) = model("mtllib model.mtl\n" + SQUARE + "usemtl a\nf 1 2 3\n", "newmtl a\nKd 1.2 0 0\n")
+    assert mesh.material.diffuse == (1.2, 0, 0)
+
+
+# --------------------------------------------- Broken files ---------------------------------------------
+
+BROKEN_OBJ = {
+    "no vertices": ("f 1 2 3\n", 1, "v index 1, but the file has 0"),
+    "empty": ("", None, "no faces"),
+    "no faces": (SQUARE, None, "no faces"),
+    "index too large": (SQUARE + "f 1 2 9\n", 5, "v index 9, but the file has 4"),
+    "index too large in a long run": (SQUARE + "f 1 2 3\n" * 5000 + "f 1 2 5\n", 5005, "v index 5"),
+    "index zero": (SQUARE + "f 0 1 2\n", 5, "v index 0: indices count from 1"),
+    "negative index too large": (SQUARE + "f -5 1 2\n", 5, "v index -5: only 4 came before"),
+    "texture index too large": (SQUARE + UVS + "f 1/1 2/2 3/5\n", 9, "vt index 5, but the file has 4"),
+    "texture index without coordinates": (SQUARE + "f 1/1 2/1 3/1\n", 5, "vt index 1, but the file has 0"),
+    "negative texture index": (SQUARE + "f 1/-1 2/-1 3/-1\n", 5, "vt index -1: only 0 came before"),
+    "normal index too large": (SQUARE + NORMALS + "f 1//1 2//1 3//2\n", 6, "vn index 2, but the file has 1"),
+    "two corners": (SQUARE + "f 1 2\n", 5, "2 corners"),
+    "no corners": (SQUARE + "f\n", 5, "0 corners"),
+    "mixed corners": (SQUARE + UVS + "f 1/1 2 3/3\n", 9, "different forms"),
+    "empty vertex index": (SQUARE + UVS + "f /1 2/2 3/3\n", 9, "'/1'"),
+    "four indices": (SQUARE + "f 1/1/1/1 2 3\n", 5, "'1/1/1/1'"),
+    "real index": (SQUARE + "f 1.5 2 3\n", 5, "'1.5'"),
+    "word as an index": (SQUARE + "f a b c\n", 5, "'a'"),
+    "huge index": (SQUARE + "f 1 2 99999999999999999999\n", 5, "9999"),
+    "nan": ("v nan 0 0\n" + SQUARE + "f 1 2 3\n", 1, "'nan'"),
+    "infinity": ("v 0 inf 0\n" + SQUARE + "f 1 2 3\n", 1, "'inf'"),
+    "too large for a float": ("v 0 0 0\nv 0 1e39 0\n" + SQUARE + "f 1 2 3\n", 2, "too large"),
+    "far too large": (SQUARE + "v 0 0 0\nv 0 1e999 0\nf 1 2 3\n", 6, "too large"),
+    "two numbers": ("v 0 0\n" + SQUARE + "f 1 2 3\n", 1, "v has 2 numbers"),
+    "five numbers": ("v 0 0 0 0 0\n" + SQUARE + "f 1 2 3\n", 1, "v has 5 numbers"),
+    "eight numbers": ("v 0 0 0 0 0 0 0 0\n" + SQUARE + "f 1 2 3\n", 1, "v has 8 numbers"),
+    "word as a number": ("v 0 zero 0\n" + SQUARE + "f 1 2 3\n", 1, "'zero'"),
+    "decimal comma": ("v 0,5 0 0\n" + SQUARE + "f 1 2 3\n", 1, "'0,5'"),
+    "underscore": ("v 1_0 0 0\n" + SQUARE + "f 1 2 3\n", 1, "'1_0'"),
+    "nan in coordinates": (SQUARE + "vt 0 nan\nf 1 2 3\n", 5, "'nan'"),
+    "empty coordinates": (SQUARE + "vt\nf 1 2 3\n", 5, "vt has 0 numbers"),
+    "short normal": (SQUARE + "vn 0 1\nf 1 2 3\n", 5, "vn has 2 numbers"),
+    "unknown statement": (SQUARE + "vertex 1 2 3\nf 1 2 3\n", 5, "unknown statement 'vertex'"),
+    "not an obj file": ("<?xml version='1.0'?>\n<scene/>\n", 1, "unknown statement"),
+    "binary": ("v 0 0 0\n\0\1\2", None, "zero byte"),
+    "usemtl without a name": (SQUARE + "usemtl\nf 1 2 3\n", 5, "usemtl has no name"),
+    "mtllib without a name": ("mtllib\n" + SQUARE + "f 1 2 3\n", 1, "mtllib has no name"),
+}
+BROKEN_MTL = {
+    "before newmtl": ("Kd 1 1 1\n", 1, "before any newmtl"),
+    "newmtl without a name": ("newmtl\n", 1, "newmtl has no name"),
+    "nan": ("newmtl a\nKd nan 0 0\n", 2, "'nan'"),
+    "negative": ("newmtl a\nKs 0 -1 0\n", 2, "must not be negative"),
+    "two numbers": ("newmtl a\nKd 1 1\n", 2, "2 numbers"),
+    "four numbers": ("newmtl a\nKd 1 1 1 1\n", 2, "4 numbers"),
+    "no number": ("newmtl a\nNi\n", 2, "0 numbers"),
+    "word": ("newmtl a\nNi glass\n", 2, "'glass'"),
+    "negative roughness": ("newmtl a\n\nNi -1\n", 3, "must not be negative"),
+    "spectral": ("newmtl a\nKd spectral file.rfl\n", 2, "not supported"),
+    "no picture": ("newmtl a\nmap_Kd\n", 2, "names no file"),
+    "binary": ("newmtl a\n\0", None, "zero byte"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN_OBJ)
+def test_broken_obj_files(model, name: str) -> None:
+    text, line, words = BROKEN_OBJ[name]
+    with pytest.raises(SceneError) as error:
+        model(text)
+    message = str(error.value)
+    assert words in message and "\n" not in message
+    assert "model.obj" + (f":{line}: " if line else ": ") in message
+
+
+@pytest.mark.parametrize("name", BROKEN_MTL)
+def test_broken_mtl_files(model, name: str) -> None:
+    text, line, words = BROKEN_MTL[name]
+    with pytest.raises(SceneError) as error:
+        model("mtllib model.mtl\n" + SQUARE + "f 1 2 3\n", text)
+    assert words in str(error.value)
+    assert "model.mtl" + (f":{line}: " if line else ": ") in str(error.value)
+
+
+def test_missing_files(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=r"nothing\.obj: cannot be read: No such file"):
+        read_obj(tmp_path / "nothing.obj")
+    with pytest.raises(SceneError, match="cannot be read"):
+        read_obj(tmp_path)
+    with pytest.raises(SceneError, match="cannot be read"):
+        read_mtl(tmp_path / "nothing.mtl")
+
+
+# What files are made of, whole and in pieces
+PIECES = [
+    *(
+        "v",
+        "vt",
+        "vn",
+        "f",
+        "usemtl",
+        "mtllib",
+        "model.mtl",
+        "o",
+        "#",
+        "\\",
+        "/",
+        "//",
+        "1/2/3",
+        "1//2",
+        "-1",
+        "0",
+    ),
+    *(
+        "1",
+        "2",
+        "3",
+        "4",
+        "1e39",
+        "nan",
+        ".5",
+        "-",
+        "\n",
+        "\n",
+        "\n",
+        "\r",
+        " ",
+        " ",
+        "\t",
+        "é",
+        "\0",
+        "9" * 30,
+    ),
+]
+MTL_PIECES = [
+    "newmtl",
+    "Kd",
+    "Ks",
+    "Ka",
+    "Ni",
+    "Ns",
+    "map_Kd",
+    "a",
+    "-s",
+    "1",
+    "0.5",
+    "nan",
+    "-1",
+    "\n",
+    "\n",
+    "#",
+]
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    obj=st.one_of(
+        st.lists(st.sampled_from(PIECES), max_size=60).map("".join).map(str.encode), st.binary(max_size=200)
+    ),
+    start=st.sampled_from(["", SQUARE, "mtllib model.mtl\n" + SQUARE + UVS + NORMALS]),
+    mtl=st.lists(st.sampled_from(MTL_PIECES), max_size=30).map(" ".join),
+)
+def test_any_text_is_read_or_refused(model, obj: bytes, start: str, mtl: str) -> None:
+    """Whatever the file: meshes that hold together, or one error of one line that names a file."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MrtWarning)
+        try:
+            meshes = model(start.encode() + obj, mtl)
+        except SceneError as error:
+            message = str(error)
+            assert "model.obj" in message or "model.mtl" in message
+            return
+    assert meshes
+    for mesh in meshes:
+        assert np.isfinite(mesh.vertices).all()
+        assert mesh.faces.shape[1] == 3 and len(mesh.faces) > 0
+        assert mesh.faces.max() < len(mesh.vertices)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    position=st.integers(0, 10_000), change=st.sampled_from([b"", b" ", b"\n", b"x", b"-", b"9", b"/", b"."])
+)
+def test_one_wrong_byte_is_read_or_refused(model, position: int, change: bytes) -> None:
+    whole = (
+        SQUARE + UVS + NORMALS + "f 1/1/1 2/2/1 3/3/1\nf 1/1 2/2 3/3\nf -1//1 -2//1 -3//1\nf 1 2 3 4\n"
+    ).encode()
+    position %= len(whole)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MrtWarning)
+        try:
+            meshes = model(whole[:position] + change + whole[position + 1 :])
+        except SceneError as error:
+            assert "model.obj:" in str(error)
+            return
+    assert sum(len(mesh.faces) for mesh in meshes) >= 4
