@@ -6,9 +6,14 @@ sines belong to the angle between a direction and the (micro-)normal, on the sid
 ``sin2_theta`` may be given beside ``cos_theta`` where the caller knows it better than ``1 - cos_theta**2``
 does: near the normal that difference cancels.
 """
+
 from __future__ import annotations
 
 import drjit as dr
+
+# Beyond this ratio of the indices, and below its inverse, an interface is a mirror to one part in 10⁸; the
+# square of the ratio would leave float32 from 1.8e19 on
+ETA_MAX = 1e9
 
 
 def f0_from_ior(ext_ior, int_ior):
@@ -30,23 +35,23 @@ def fresnel_schlick(cos_theta, f0, sin2_theta=None):
 def fresnel_dielectric(cos_theta, ext_ior, int_ior, sin2_theta=None):
     """Unpolarised reflectance of a dielectric interface, in [0, 1]; 1 under total internal reflection.
 
-    The textbook form ``½(Rs + Rp)`` (Snell and Fresnel; see e.g. Pharr, Jakob and Humphreys, PBR 4th ed., §9.3)
-    with both numerators expanded by their conjugates, so that the factor ``1 − η²`` stands alone and
+    The textbook form ``½(Rs + Rp)`` (Snell and Fresnel; see e.g. Pharr, Jakob and Humphreys, PBR 4th ed.,
+    §9.3) with both numerators expanded by their conjugates, so that the factor ``1 − η²`` stands alone and
     nothing cancels when the two media are nearly alike: with η = int/ext and g = η cos θt = √(η² − sin²θ),
 
         rs = (cos θ − g) / (cos θ + g)   = (1 − η²) / (cos θ + g)²
         rp = (g − η² cos θ) / (g + η² cos θ) = (η² − 1)(1 − (1 + η²) cos²θ) / (g + η² cos θ)²
+
+    g² itself is taken as (η² − 1) + cos²θ, of two numbers that may both be small, unless η² is small.
     """
     c2 = dr.square(cos_theta)
-    s2 = 1 - c2 if sin2_theta is None else sin2_theta
-    eta = int_ior / ext_ior
+    s2 = (1 - cos_theta) * (1 + cos_theta) if sin2_theta is None else sin2_theta
+    eta = dr.clip(int_ior / ext_ior, 1 / ETA_MAX, ETA_MAX)
     eta2 = dr.square(eta)
-    eta2_minus_1 = (int_ior - ext_ior) * (int_ior + ext_ior) / dr.square(ext_ior)
-    g2 = eta2_minus_1 + c2
+    eta2_minus_1 = dr.minimum((int_ior - ext_ior) / ext_ior, ETA_MAX) * (eta + 1)
+    g2 = dr.select(eta2 < 0.5, eta2 - s2, eta2_minus_1 + c2)
     total = g2 <= 0
     g = dr.sqrt(dr.select(total, 1, g2))
-    rs_root = cos_theta + g
-    rp_root = g + eta2 * cos_theta
-    rs = eta2_minus_1 / dr.square(rs_root)
-    rp = eta2_minus_1 * (s2 - eta2 * c2) / dr.square(rp_root)
+    rs = eta2_minus_1 / dr.square(cos_theta + g)
+    rp = eta2_minus_1 * (s2 - eta2 * c2) / dr.square(g + eta2 * cos_theta)
     return dr.select(total, 1, 0.5 * (dr.square(rs) + dr.square(rp)))

@@ -1,0 +1,220 @@
+"""Fresnel terms against the textbook formulas in 50 digits, and by the laws they obey."""
+
+from __future__ import annotations
+
+import csv
+import math
+from itertools import product
+from pathlib import Path
+
+import drjit as dr
+import drjit.scalar
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from mpmath import mp
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.plugins.fresnel import ETA_MAX, f0_from_ior, fresnel_dielectric, fresnel_schlick
+from mrt_mitsuba.validation import exact
+
+needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, reason="no LLVM to run kernels")
+
+COSINES = st.floats(0, 1)
+INDICES = st.floats(0.2, 8)
+# Of float64: some twenty roundings of 1.1e-16 on numbers of about 1, enlarged tenfold near the critical angle
+ROUNDING = 2e-14
+
+
+def float32(values) -> drjit.scalar.ArrayXf:
+    return drjit.scalar.ArrayXf(np.asarray(values, dtype=np.float32))
+
+
+def relative_errors(found, truth: list) -> np.ndarray:
+    """Of float32 numbers against 50-digit ones, which are not zero."""
+    pairs = zip(np.array(found), truth, strict=True)
+    return np.array([float(abs(exact.number(a) - b) / b) for a, b in pairs])
+
+
+# ------------------------------------------------- Values --------------------------------------------------
+
+# The grid of the course's table; above the diagonal light enters the denser medium, below it may be reflected
+# totally
+TABLE = list(product((0.1, 0.3, 0.5, 0.7, 0.9), (1.1, 1.3, 1.5, 1.7), (1.1, 1.3, 1.5, 1.7)))
+
+
+def test_course_table_to_six_decimals() -> None:
+    """In float64 at the decimal numbers of the table, in float32 at their float32 values."""
+    truth = [float(exact.fresnel_dielectric(*(str(x) for x in row))) for row in TABLE]
+    assert sum(t == 1 for t in truth) > 10 and sum(t < 1e-40 for t in truth) == 20  # all branches are in it
+    double = [fresnel_dielectric(*row) for row in TABLE]
+    np.testing.assert_allclose(double, truth, rtol=0, atol=ROUNDING)
+    columns = [float32(column) for column in zip(*TABLE, strict=True)]
+    truth = [float(exact.fresnel_dielectric(*row)) for row in zip(*map(np.array, columns), strict=True)]
+    np.testing.assert_allclose(np.array(fresnel_dielectric(*columns)), truth, rtol=0, atol=5e-7)
+
+
+def test_course_file_where_at_hand(original_data: Path) -> None:
+    """Its sixth decimal is that of its own float32 arithmetic, up to 1.4e-6 off, at (0.5, 1.5, 1.3)."""
+    with (original_data / "fresnel.csv").open() as lines:
+        rows = [[*map(float, row.values())] for row in csv.DictReader(lines)]
+    errors = {tuple(row[:3]): abs(fresnel_dielectric(*row[:3]) - row[3]) for row in rows}
+    assert len(errors) == 81
+    assert errors.pop((0.5, 1.5, 1.3)) < 1.5e-6
+    assert max(errors.values()) < 6e-7
+
+
+@pytest.mark.parametrize(
+    ("etas", "bound"),
+    [
+        # Index near 1: F is the square of a small difference, and the difference must not cancel
+        (1 + 10 ** np.linspace(-6.5, -2, 400), 1e-6),
+        (1.01 + 10 ** np.linspace(-2, 6, 400), 1e-6),
+        (10 ** np.linspace(-9, -0.2, 400), 2e-6),
+    ],
+)
+def test_float32_is_exact_to_a_few_roundings(etas: np.ndarray, bound: float) -> None:
+    """At the same float32 inputs, cos θ from 1e-7 to 1: a dozen roundings of 6e-8, squared at the end."""
+    rng = np.random.default_rng(1)
+    etas = etas.astype(np.float32)
+    cosines = np.where(rng.random(400) < 0.5, rng.random(400), 10 ** rng.uniform(-7, 0, 400))
+    cosines = cosines.astype(np.float32)
+    # Within a relative 1e-4 of the critical angle dF/dθ is unbounded, and no function of a rounded cos θ is
+    # accurate
+    keep = np.abs(1 - cosines.astype(float) ** 2 - etas.astype(float) ** 2) > 1e-4
+    cosines, etas = cosines[keep], etas[keep]
+    truth = [exact.fresnel_dielectric(c, 1, eta) for c, eta in zip(cosines, etas, strict=True)]
+    found = fresnel_dielectric(float32(cosines), float32(np.ones(len(etas))), float32(etas))
+    assert relative_errors(found, truth).max() < bound
+    truth = [exact.f0_from_ior(1, eta) for eta in etas]
+    assert relative_errors(f0_from_ior(float32(np.ones(len(etas))), float32(etas)), truth).max() < 4e-7
+    f0 = (10 ** rng.uniform(-8, 0, len(etas))).astype(np.float32)
+    truth = [exact.fresnel_schlick(c, f) for c, f in zip(cosines, f0, strict=True)]
+    assert relative_errors(fresnel_schlick(float32(cosines), float32(f0)), truth).max() < 6e-7
+
+
+def test_sine_serves_where_the_cosine_is_rounded_to_one() -> None:
+    """Near the normal there still are Schlick's (1 − cos θ)⁵ and a critical angle."""
+    s2 = float32(10 ** np.linspace(-12, -4, 80))
+    sines = [exact.number(s) for s in np.array(s2)]
+    c = float32([mp.sqrt(1 - s) for s in sines])
+    assert (np.array(c) == 1).sum() > 40
+    truth = [float((s / (1 + mp.sqrt(1 - s))) ** 5) for s in sines]
+    # the fifth power of three roundings; below 1e-37 float32 ends
+    np.testing.assert_allclose(np.array(fresnel_schlick(c, 0, s2)), truth, rtol=2e-6, atol=1e-37)
+    ones = float32(np.ones(80))
+    reflected = fresnel_dielectric(c, ones, 1e-5 * ones, s2)
+    np.testing.assert_array_equal(np.array(reflected) == 1, np.array(s2) >= 1e-10)
+
+
+@pytest.mark.parametrize("values", [0, 1e-45, 1e-30, 1e30, 3e38])
+def test_extreme_indices_stay_in_range(values: float) -> None:
+    eta, c = float32([values]), float32([0.5])
+    one = float32([1.0])
+    for found in (fresnel_dielectric(c, one, eta), f0_from_ior(one, eta)):
+        assert np.array(found) == pytest.approx(1, abs=1e-6)  # so unlike that all is reflected
+    swapped = np.array(fresnel_dielectric(c, float32([max(values, 1e-38)]), one))
+    assert swapped == pytest.approx(1, abs=1e-6)
+
+
+# -------------------------------------------------- Laws ---------------------------------------------------
+
+
+@given(cos_theta=COSINES, f0=st.floats(0, 1))
+def test_schlick_lies_between_f0_and_one(cos_theta: float, f0: float) -> None:
+    value = fresnel_schlick(cos_theta, f0)
+    assert f0 - ROUNDING <= value <= 1 + ROUNDING
+    assert fresnel_schlick(1.0, f0) == f0
+    assert fresnel_schlick(0.0, f0) == pytest.approx(1, abs=ROUNDING)
+    assert fresnel_schlick(0.5 * cos_theta, f0) >= value - ROUNDING  # grows towards grazing
+
+
+@given(cos_theta=COSINES, n1=INDICES, n2=INDICES)
+def test_dielectric_lies_between_zero_and_one(cos_theta: float, n1: float, n2: float) -> None:
+    assume(n1 != n2 or cos_theta > 0)  # a direction along an interface that is none
+    assert 0 <= fresnel_dielectric(cos_theta, n1, n2) <= 1 + ROUNDING
+
+
+@given(n1=INDICES, n2=INDICES)
+def test_dielectric_at_normal_incidence_and_at_grazing(n1: float, n2: float) -> None:
+    """Unpolarised light does not know s from p at normal incidence; along the surface all is reflected."""
+    assert fresnel_dielectric(1.0, n1, n2) == pytest.approx(f0_from_ior(n1, n2), rel=1e-13, abs=1e-30)
+    if abs(n1 - n2) > 1e-3:
+        assert fresnel_dielectric(0.0, n1, n2) == pytest.approx(1, abs=ROUNDING)
+
+
+@given(sin_theta=st.floats(0, 0.999), n1=INDICES, n2=INDICES)
+def test_dielectric_is_the_same_from_both_sides(sin_theta: float, n1: float, n2: float) -> None:
+    """Reversibility: the refracted ray meets the same reflectance, by Snell's law."""
+    sin_t = sin_theta * n1 / n2
+    assume(sin_t < 0.999)  # nearer to the critical angle, F changes by 1e-10 with the rounding of the angle
+    one, other = (math.sqrt((1 - s) * (1 + s)) for s in (sin_theta, sin_t))
+    assert fresnel_dielectric(one, n1, n2) == pytest.approx(fresnel_dielectric(other, n2, n1), rel=1e-10)
+
+
+@given(n1=INDICES, ratio=st.floats(0.05, 0.999), beyond=st.floats(1e-6, 1))
+def test_total_reflection_begins_at_the_critical_angle(n1: float, ratio: float, beyond: float) -> None:
+    n2 = n1 * ratio
+    sin_critical = ratio
+    sin_theta = sin_critical + beyond * (1 - sin_critical)
+    assert fresnel_dielectric(math.sqrt((1 - sin_theta) * (1 + sin_theta)), n1, n2) == 1
+    sin_theta = sin_critical * (1 - beyond)
+    assert fresnel_dielectric(math.sqrt((1 - sin_theta) * (1 + sin_theta)), n1, n2) < 1
+
+
+def test_dielectric_rises_to_one_without_a_jump() -> None:
+    """Towards the critical angle 1 − F falls with the square root of what is missing, to nothing."""
+    eta = 0.7
+    for missing in (1e-4, 1e-8, 1e-12):
+        sin_theta = eta * (1 - missing)
+        value = fresnel_dielectric(math.sqrt((1 - sin_theta) * (1 + sin_theta)), 1.0, eta)
+        assert 0.5 * math.sqrt(missing) < 1 - value < 20 * math.sqrt(missing)
+
+
+@given(cos_theta=st.floats(1e-3, 1), eta=INDICES)
+def test_equal_media_reflect_nothing(cos_theta: float, eta: float) -> None:
+    assert fresnel_dielectric(cos_theta, eta, eta) == 0
+    assert f0_from_ior(eta, eta) == 0
+
+
+@given(cos_theta=COSINES, n1=INDICES, n2=INDICES, scale=st.floats(0.1, 10))
+def test_only_the_ratio_of_the_indices_counts(cos_theta: float, n1: float, n2: float, scale: float) -> None:
+    assume(abs(n2 / n1 - 1) > 1e-6)  # else the rounding of the scaled indices is most of what they differ by
+    # nor may rounding decide on which side of the critical angle they are
+    assume(abs(n1**2 * (1 - cos_theta**2) - n2**2) > 1e-6 * n1**2)
+    scaled = fresnel_dielectric(cos_theta, scale * n1, scale * n2)
+    assert scaled == pytest.approx(fresnel_dielectric(cos_theta, n1, n2), rel=1e-8)
+
+
+def test_index_is_limited_far_from_where_it_matters() -> None:
+    assert fresnel_dielectric(0.3, 1.0, ETA_MAX) == pytest.approx(1, abs=1e-7)
+    assert fresnel_dielectric(0.3, 1.0, 1e300) == pytest.approx(1, abs=1e-7)
+
+
+def test_colours_and_arrays_give_what_numbers_give() -> None:
+    cosines, f0 = [0.2, 0.9], (0.04, 0.5, 0.9)
+    color = drjit.scalar.Array3f64(f0)
+    for c in cosines:
+        expected = [fresnel_schlick(c, f) for f in f0]
+        np.testing.assert_allclose(np.array(fresnel_schlick(c, color)), expected, rtol=1e-15)
+    array = drjit.scalar.ArrayXf64(cosines)
+    expected = [fresnel_dielectric(c, 1.0, 1.5) for c in cosines]
+    np.testing.assert_allclose(np.array(fresnel_dielectric(array, 1.0, 1.5)), expected, rtol=1e-15)
+
+
+@needs_llvm
+@pytest.mark.parametrize("cos_theta", [1.0, 0.5, 1e-3])
+def test_derivative_by_the_index(cos_theta: float) -> None:
+    """Against central differences, and zero, not NaN, where all is reflected."""
+    from drjit.llvm.ad import Float64
+
+    etas = np.array([0.2, 0.5, 0.9, 0.99, 1.01, 1.5, 4.0])
+    eta = Float64(etas)
+    dr.enable_grad(eta)
+    dr.backward(fresnel_dielectric(Float64(cos_theta), 1.0, eta))
+    step = 1e-6
+    above, below = ([fresnel_dielectric(cos_theta, 1, e) for e in etas + d] for d in (step, -step))
+    slope = np.subtract(above, below) / (2 * step)
+    # rounding of F over the step: 1e-16 / 1e-6; error of the difference: step² times a third derivative
+    np.testing.assert_allclose(np.array(dr.grad(eta)), slope, rtol=1e-6, atol=1e-7)
