@@ -107,7 +107,7 @@ class Scene:
 
     def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> dict[str, Any]:
         """The scene as a Mitsuba dict of this project's plugins, materials shared by reference."""
-        materials = _Materials(lambda m: _mrt_bsdf(m, fresnel))
+        materials = _Materials(lambda m: _mrt_bsdf(m, fresnel, self.texturing))
         shapes: dict[str, Any] = {}
         for i, s in enumerate(self.spheres):
             shapes[f"sphere_{i}"] = _sphere(s, materials)
@@ -116,7 +116,12 @@ class Scene:
                                     "bsdf": materials.reference(p.material)}
         for i, c in enumerate(self.cones):
             shapes[f"cone_{i}"] = {"type": "mrt_cone", "apex": list(c.apex), "base_center": list(c.base_center),
-                                   "radius": c.radius, "bsdf": materials.reference(c.material)}
+                                   "radius": float(c.radius), "bsdf": materials.reference(c.material)}
+        for i, y in enumerate(self.cylinders):
+            shapes[f"cylinder_{i}"] = {"type": "mrt_cylinder", "p0": list(y.p0), "p1": list(y.p1),
+                                       "radius": float(y.radius), "bsdf": materials.reference(y.material)}
+        for i, m in enumerate(self.meshes):
+            shapes[f"mesh_{i}"] = {**_mesh(m), "bsdf": materials.reference(m.material)}
         lights = {f"light_{i}": {"type": "mrt_light", "position": list(light.position),
                                  "intensity": _rgb(light.color)} for i, light in enumerate(self.lights)}
         return {"type": "scene", "integrator": {"type": "mrt_whitted"}, "sensor": self._sensor(width, height),
@@ -159,6 +164,28 @@ def _sphere(s: Sphere, materials: _Materials) -> dict[str, Any]:
     return {"type": "sphere", "center": list(s.center), "radius": float(s.radius), "bsdf": materials.reference(s.material)}
 
 
-def _mrt_bsdf(m: Material, fresnel: str) -> dict[str, Any]:
-    return {"type": "mrt_bsdf", "alpha": float(m.alpha), "int_ior": float(m.ior), "fresnel": fresnel,
-            "diffuse_reflectance": _rgb(m.diffuse), "specular_reflectance": _rgb(m.specular)}
+def _mesh(m: Mesh) -> dict[str, Any]:
+    import mitsuba as mi
+    import numpy as np
+
+    arrays = {"positions": m.vertices, "faces": m.faces}
+    if m.uvs is not None:
+        # Bitmaps have one, three or four channels
+        arrays["texcoords"] = np.concatenate([m.uvs, np.zeros_like(m.uvs[:, :1])], axis=1)
+    return {"type": "mrt_mesh", **{name: mi.Bitmap(array[np.newaxis]) for name, array in arrays.items()}}
+
+
+# An index of zero switches reflection off in the report's files. The formulas reflect everything there, as they do, to
+# float32, at this index, of which a BSDF can make sense
+_SMALLEST_IOR = 1e-8
+
+
+def _mrt_bsdf(m: Material, fresnel: str, texturing: str) -> dict[str, Any]:
+    diffuse = _rgb(m.diffuse) if m.texture is None else _texture(m.texture, texturing)
+    return {"type": "mrt_bsdf", "alpha": float(m.alpha), "int_ior": max(float(m.ior), _SMALLEST_IOR),
+            "fresnel": fresnel, "diffuse_reflectance": diffuse, "specular_reflectance": _rgb(m.specular)}
+
+
+def _texture(path: str, texturing: str) -> dict[str, Any]:
+    """A picture as the report looks it up, or as Mitsuba does: bilinear, sRGB-aware, repeated."""
+    return {"type": {"report": "mrt_texture", "standard": "bitmap"}[texturing], "filename": path}

@@ -1,7 +1,7 @@
 """Mitsuba plugins in Dr.Jit, and the maths they share.
 
-``register()`` makes ``mrt_bsdf``, ``mrt_cone``, ``mrt_cylinder``, ``mrt_light``, ``mrt_plane`` and ``mrt_whitted``
-known to Mitsuba.
+``register()`` makes ``mrt_bsdf``, ``mrt_cone``, ``mrt_cylinder``, ``mrt_light``, ``mrt_mesh``, ``mrt_plane``,
+``mrt_texture`` and ``mrt_whitted`` known to Mitsuba.
 """
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import importlib.util
 import sys
 from types import ModuleType
 
-MODULES = ("bsdf", "cone", "cylinder", "light", "plane", "whitted")
+MODULES = ("bsdf", "cone", "cylinder", "light", "mesh", "plane", "texture", "whitted")
 
 _loaded: dict[tuple[str, str], ModuleType] = {}
 _watching = False

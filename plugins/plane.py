@@ -4,6 +4,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from .buffers import write_buffers
 from .parameters import ParameterError, number, vector
 
 
@@ -51,11 +52,9 @@ class MrtPlane(mi.Mesh):
         mi.Mesh.__init__(self, "mrt_plane", 4, 2, props, has_vertex_normals=False, has_vertex_texcoords=True)
         corners = 0.5 * extent * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # [4, 2]
         positions = corners @ self.tangents - self.distance * self.unit_normal  # [4, 3]
-        mesh = mi.traverse(self)
-        mesh["vertex_positions"] = positions.astype(np.float32).ravel()
-        mesh["vertex_texcoords"] = corners.astype(np.float32).ravel()
-        mesh["faces"] = np.array([0, 1, 2, 0, 2, 3], dtype=np.uint32)
-        mesh.update()
+        write_buffers(self, vertex_positions=positions.astype(np.float32).ravel(),
+                      vertex_texcoords=corners.astype(np.float32).ravel(),
+                      faces=np.array([0, 1, 2, 0, 2, 3], dtype=np.uint32))
         # Mitsuba merges meshes that share a BSDF when it loads a scene, but leaves those with attributes alone
         self.add_attribute("face_mrt_plane", 1, [0.0, 0.0])
 

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .buffers import write_buffers
 from .intersect import Frame
 from .parameters import ParameterError
 
@@ -89,12 +90,13 @@ def fill(mesh: Any, unit: UnitMesh, frame: Frame) -> None:
     positions = unit.points @ np.linalg.inv(rows).T + np.array(list(frame.origin))
     normals = unit.gradients @ rows
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    buffers = mi.traverse(mesh)
-    buffers["faces"] = (unit.faces[:, ::-1] if flipped else unit.faces).ravel()
-    buffers["vertex_texcoords"] = unit.uvs.astype(np.float32).ravel()
-    buffers["vertex_positions"] = positions.astype(np.float32).ravel()
-    buffers["vertex_normals"] = normals.astype(np.float32).ravel()
-    buffers.update()
+    write_buffers(
+        mesh,
+        faces=(unit.faces[:, ::-1] if flipped else unit.faces).ravel(),
+        vertex_texcoords=unit.uvs.astype(np.float32).ravel(),
+        vertex_positions=positions.astype(np.float32).ravel(),
+        vertex_normals=normals.astype(np.float32).ravel(),
+    )
 
 
 def refill(mesh: Any, unit: UnitMesh, frame: Frame) -> None:
@@ -107,10 +109,7 @@ def refill(mesh: Any, unit: UnitMesh, frame: Frame) -> None:
     for k in range(3):
         position += columns[k] * mi.Float(unit.points[:, k])
         normal += rows[k] * mi.Float(unit.gradients[:, k])
-    buffers = mi.traverse(mesh)
-    buffers["vertex_positions"] = dr.ravel(position)
-    buffers["vertex_normals"] = dr.ravel(dr.normalize(normal))
-    buffers.update()
+    write_buffers(mesh, vertex_positions=dr.ravel(position), vertex_normals=dr.ravel(dr.normalize(normal)))
 
 
 class Placement:

@@ -1,0 +1,57 @@
+"""``mrt_mesh``: triangles from arrays, so that a scene dict can hold a model without a file."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from .buffers import write_buffers
+from .parameters import ParameterError
+
+
+class MrtMesh(mi.Mesh):
+    r"""Flat triangles given as arrays, which a dict carries as bitmaps of one row.
+
+    ============= =========== ========== ==============================================================
+    name          type        default    unit or range
+    ============= =========== ========== ==============================================================
+    ``positions`` ``Bitmap``  required   float32 [1, N, 3], scene units
+    ``faces``     ``Bitmap``  required   uint32 [1, M, 3], corners counter-clockwise seen from outside
+    ``texcoords`` ``Bitmap``             float32 [1, N, 2 or 3], of which two are used
+    ============= =========== ========== ==============================================================
+
+    .. code-block:: python
+
+        {'type': 'mrt_mesh', 'positions': mi.Bitmap(points[np.newaxis]), 'faces':
+        mi.Bitmap(faces[np.newaxis])}
+
+    There is no XML form; write the mesh to a PLY file and use the nearest stock plugin, ``ply``, there.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        positions, faces = _array(props, "positions"), _array(props, "faces")
+        texcoords = _array(props, "texcoords")[:, :2] if "texcoords" in props else None
+        if len(faces) and faces.max() >= len(positions):
+            raise ParameterError(
+                f'mrt_mesh: "faces" holds {faces.max()}, but there are {len(positions)} positions'
+            )
+        sizes = len(positions), len(faces)
+        mi.Mesh.__init__(self, "mrt_mesh", *sizes, props, has_vertex_texcoords=texcoords is not None)
+        buffers = {"vertex_positions": positions.astype(np.float32), "faces": faces.astype(np.uint32)}
+        if texcoords is not None:
+            buffers["vertex_texcoords"] = texcoords.astype(np.float32)
+        write_buffers(self, **{name: values.ravel() for name, values in buffers.items()})
+
+
+def _array(props: mi.Properties, name: str) -> np.ndarray:
+    if name not in props or not isinstance(props[name], mi.Bitmap):
+        raise ParameterError(
+            f'mrt_mesh: "{name}" must be a mi.Bitmap of one row; write mi.Bitmap(array[np.newaxis])'
+        )
+    array = np.array(props[name])
+    if array.ndim != 3 or array.shape[0] != 1 or array.shape[2] not in (2, 3):
+        raise ParameterError(f'mrt_mesh: "{name}" has the shape {array.shape}, but must have [1, N, 3]')
+    return array[0]
+
+
+mi.register_shape("mrt_mesh", MrtMesh)

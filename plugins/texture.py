@@ -1,0 +1,92 @@
+"""``mrt_texture``: a picture looked up as the original program does it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from .parameters import ParameterError
+
+
+class MrtTexture(mi.Texture):
+    r"""The texel nearest to (u, v), as it is stored.
+
+    With u, v clamped to [0, 1] and a picture of w × h texels, column int((w − 1) u + ½) mod w of row
+    int((h − 1) v + ½) mod h; v = 0 is the first row of the picture, values are not decoded from sRGB.
+
+    ============ ========== ========== ==============================================================
+    name         type       default    unit or range
+    ============ ========== ========== ==============================================================
+    ``filename`` string                path of a picture; 8-bit values are divided by 255
+    ``bitmap``   ``Bitmap``            in place of a file
+    ============ ========== ========== ==============================================================
+
+    .. code-block:: python
+
+        {'type': 'mrt_texture', 'filename': 'wood.png'}
+
+    .. code-block:: xml
+
+        <texture type="mrt_texture"><string name="filename" value="wood.png"/></texture>
+
+    Nearest stock plugin: ``bitmap``, which does the look-up here: with ``filter_type`` "nearest",
+    ``wrap_mode`` "clamp", no sRGB decoding and a ``to_uv`` that maps the report's texel centres to its own.
+    Its defaults (bilinear, sRGB) are the ``standard`` texturing of this project's scenes.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        mi.Texture.__init__(self, props)
+        bitmap = _read(props)
+        width, height = bitmap.size()
+        # int((w − 1) u + ½) = floor(w u') with u' = ((w − 1) u + ½) / w; "clamp" takes u' outside [0, 1] to
+        # the edge
+        scale = [(width - 1) / width, (height - 1) / height, 1]
+        to_uv = mi.ScalarTransform4f().translate([0.5 / width, 0.5 / height, 0]).scale(scale)
+        self.texels = mi.load_dict({"type": "bitmap", "bitmap": bitmap, "filter_type": "nearest",
+                                    "wrap_mode": "clamp", "to_uv": to_uv})  # fmt: skip
+
+    def traverse(self, callback: Any) -> None:
+        callback.put("texels", self.texels, mi.ParamFlags.Differentiable)
+
+    def eval(self, si: Any, active: Any = True) -> Any:
+        return self.texels.eval(si, active)
+
+    def eval_1(self, si: Any, active: Any = True) -> Any:
+        return self.texels.eval_1(si, active)
+
+    def eval_3(self, si: Any, active: Any = True) -> Any:
+        return self.texels.eval_3(si, active)
+
+    def mean(self) -> Any:
+        return self.texels.mean()
+
+    def is_spatially_varying(self) -> bool:
+        return True
+
+    def resolution(self) -> Any:
+        return self.texels.resolution()
+
+    def to_string(self) -> str:
+        return f"MrtTexture[texels={self.texels}]"
+
+
+def _read(props: mi.Properties) -> mi.Bitmap:
+    """The picture in floats, marked as linear."""
+    if ("filename" in props) == ("bitmap" in props):
+        raise ParameterError('mrt_texture: give one of "filename" and "bitmap"')
+    if "bitmap" in props:
+        bitmap = props["bitmap"]
+    else:
+        path = mi.file_resolver().resolve(props["filename"])
+        try:
+            bitmap = mi.Bitmap(str(path))
+        except RuntimeError as error:
+            raise ParameterError(
+                f'mrt_texture: "filename" is {str(path)!r}, which cannot be read: {error}'
+            ) from None
+    bitmap.set_srgb_gamma(False)
+    return bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+
+
+mi.register_texture("mrt_texture", MrtTexture)

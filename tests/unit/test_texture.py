@@ -1,0 +1,166 @@
+"""``mrt_texture`` and ``mrt_mesh``: look-ups as in the report, and meshes from arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.scene import Camera, Light, Material, Mesh, Scene
+
+
+@pytest.fixture(autouse=True)
+def _vectorised() -> Iterator[None]:
+    runtime.use("llvm_ad_rgb")
+    yield
+    runtime.use("llvm_ad_rgb")
+
+
+@pytest.fixture
+def picture(tmp_path: Path) -> tuple[Path, np.ndarray]:
+    """A PNG file of random colours, 7 wide and 5 high, and its values."""
+    values = np.random.default_rng(1).integers(0, 256, (5, 7, 3)).astype(np.uint8)
+    Image.fromarray(values).save(tmp_path / "picture.png")
+    return tmp_path / "picture.png", values
+
+
+def look_up(texture, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    si = dr.zeros(mi.SurfaceInteraction3f, len(u))
+    si.uv = mi.Point2f(u, v)
+    return texture.eval(si).numpy().T
+
+
+def expected(values: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The report's look-up, as it words it."""
+    height, width, _ = values.shape
+    x = ((width - 1) * np.clip(u, 0, 1) + 0.5).astype(int) % width
+    y = ((height - 1) * np.clip(v, 0, 1) + 0.5).astype(int) % height
+    return values[y, x] / 255
+
+
+def test_look_up_is_the_report_s(picture) -> None:
+    path, values = picture
+    u, v = np.random.default_rng(2).uniform(-0.5, 1.5, (2, 10_000)).astype(np.float32)
+    got = look_up(mi.load_dict({"type": "mrt_texture", "filename": str(path)}), u, v)
+    # Texels are stored in float32, 1/255 rounded once
+    np.testing.assert_allclose(got, expected(values, u, v), atol=1e-7)
+
+
+def test_corners_and_first_row(picture) -> None:
+    path, values = picture
+    u, v = np.array([0, 1, 0, 1], np.float32), np.array([0, 0, 1, 1], np.float32)
+    got = look_up(mi.load_dict({"type": "mrt_texture", "filename": str(path)}), u, v)
+    np.testing.assert_allclose(got, values[[0, 0, -1, -1], [0, -1, 0, -1]] / 255, atol=1e-7)
+
+
+@pytest.mark.parametrize("mode", ["L", "RGBA", "P", "LA"])
+def test_other_kinds_of_pictures(tmp_path: Path, mode: str) -> None:
+    values = np.tile(np.array([[0, 80], [160, 240]], np.uint8)[:, :, None], (1, 1, 3))
+    image = Image.fromarray(values).convert(mode)
+    image.save(tmp_path / "grey.png")
+    u, v = np.array([0, 1, 0, 1], np.float32), np.array([0, 0, 1, 1], np.float32)
+    got = look_up(mi.load_dict({"type": "mrt_texture", "filename": str(tmp_path / "grey.png")}), u, v)
+    np.testing.assert_allclose(got[:, 0] * 255, np.array(image.convert("L")).ravel(), atol=1e-4)
+
+
+def test_from_a_bitmap_in_memory(picture) -> None:
+    _, values = picture
+    u, v = np.array([0.2, 0.9], np.float32), np.array([0.4, 0.7], np.float32)
+    got = look_up(mi.load_dict({"type": "mrt_texture", "bitmap": mi.Bitmap(values)}), u, v)
+    np.testing.assert_allclose(got, expected(values, u, v), atol=1e-7)
+
+
+def test_scalar_variant(picture) -> None:
+    path, values = picture
+    runtime.use("scalar_rgb")
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.uv = mi.Point2f(0.3, 0.9)
+    got = mi.load_dict({"type": "mrt_texture", "filename": str(path)}).eval(si)
+    np.testing.assert_allclose(np.array(got), expected(values, np.array(0.3), np.array(0.9)), atol=1e-7)
+
+
+@pytest.mark.parametrize(("keys", "words"), [({}, "one of"), ({"filename": "nothing.png"}, "nothing.png")])
+def test_wrong_parameters_are_named(keys: dict, words: str) -> None:
+    with pytest.raises(RuntimeError, match=f"mrt_texture.*{words}"):
+        mi.load_dict({"type": "mrt_texture", **keys})
+
+
+# A square of side 2 in the plane z = 0, facing +z, whose texture coordinates run along x and y
+SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+SQUARE_UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
+
+
+def square_scene(texture: str | None, texturing: str = "report") -> Scene:
+    material = Material(1.0, 0.5, (0, 0, 0), (0.5, 0.5, 0.5), texture)
+    return Scene(
+        camera=Camera((0, 0, 2), (0, 0, 0), (0, 1, 0), hfov=50),
+        sky=(0, 0, 0),
+        lights=(Light((0, 0, 1e4), (1, 1, 1)),),
+        meshes=(Mesh(SQUARE, FACES, material, SQUARE_UV),),
+        texturing=texturing,
+    )
+
+
+@pytest.mark.parametrize("integrator", ["mrt_whitted", "direct"])
+def test_textured_square(picture, integrator: str) -> None:
+    """Kd/π under a distant light, texel by texel; the camera's picture is mirrored left to right."""
+    path, values = picture
+    nodes = square_scene(str(path)).to_dict(width=64, height=64)
+    del nodes["sky"]  # "direct" would sample it every other time
+    scene = mi.load_dict(nodes)
+    ray, _ = scene.sensors()[0].sample_ray(0, 0, mi.Point2f([0.5, 0.31, 0.77], [0.5, 0.62, 0.45]), 0)
+    si = scene.ray_intersect(ray)
+    assert dr.all(si.is_valid())
+    wanted = expected(values, si.uv.x.numpy(), si.uv.y.numpy()) / np.pi
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 3)
+    tracer = mi.load_dict({"type": integrator})
+    if integrator == "mrt_whitted":
+        tracer.prepare(scene)
+    got = tracer.sample(scene, sampler, ray)[0].numpy().T
+    np.testing.assert_allclose(got, wanted, rtol=1e-4)  # the light is at 10⁴, not at infinity
+
+
+def test_standard_texturing_is_bilinear_and_decodes_srgb(picture) -> None:
+    path, values = picture
+    shape = mi.load_dict(square_scene(str(path), "standard").to_dict(width=8, height=8)).shapes()[0]
+    stored = values / 255
+    decoded = np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
+    si = dr.zeros(mi.SurfaceInteraction3f, 1)
+    si.uv = mi.Point2f(1 / 7, 0.5)  # between two texels of the middle row
+    si.shape = mi.ShapePtr(shape)
+    between = shape.bsdf().eval_diffuse_reflectance(si).numpy()[:, 0]
+    np.testing.assert_allclose(
+        between, decoded[2, :2].mean(axis=0), atol=2e-3
+    )  # texels in half precision or 8 bits
+
+
+def test_mesh_from_arrays() -> None:
+    mesh = mi.load_dict(
+        {"type": "mrt_mesh", "positions": mi.Bitmap(SQUARE[None]), "faces": mi.Bitmap(FACES[None])}
+    )
+    assert (mesh.vertex_count(), mesh.face_count(), mesh.surface_area()[0]) == (4, 2, 4)
+    assert not mesh.has_vertex_normals() and not mesh.has_vertex_texcoords()
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"positions": SQUARE[None]}, '"faces" must be'),
+        ({"positions": SQUARE, "faces": FACES[None]}, '"positions" has the shape'),
+        (
+            {"positions": SQUARE[None], "faces": FACES[None] + np.uint32(2)},
+            '"faces" holds 5, but there are 4',
+        ),
+    ],
+)
+def test_wrong_arrays_are_named(keys: dict, words: str) -> None:
+    with pytest.raises(RuntimeError, match=words):
+        mi.load_dict({"type": "mrt_mesh", **{name: mi.Bitmap(array) for name, array in keys.items()}})
