@@ -242,7 +242,7 @@ def to_rgb(spectrum: Any, ray: Any) -> Any:
 
     if mi.is_spectral:
         xyz = sum(mi.cie1931_xyz(wavelength) * value for wavelength, value in zip(ray.wavelengths, spectrum, strict=True))
-        return mi.xyz_to_srgb(xyz / len(spectrum))
+        return mi.xyz_to_srgb(xyz * (mi.MI_CIE_Y_NORMALIZATION / len(spectrum)))
     if mi.is_monochromatic:
         return mi.Color3f(spectrum[0])
     return mi.Color3f(spectrum)

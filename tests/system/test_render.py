@@ -1,0 +1,331 @@
+"""``mrt.render`` end to end: what it traces, what it leaves out, and that the picture does not depend on how."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.rays import Bundle, Lattice
+from mrt_mitsuba.scenes import report_scene
+from mrt_mitsuba.source import open_scene
+from mrt_mitsuba.trace import Camera, WhittedTracer, trace_bundle
+
+SMALL = {"width": 160, "height": 120}
+SCENES = (0, 1, 2, 3, 4)
+
+
+@pytest.fixture(autouse=True)
+def llvm():
+    mrt.register()
+    mi.set_variant("llvm_ad_rgb")
+
+
+# --------------------------------------------- What is traced ---------------------------------------------
+
+
+@pytest.mark.parametrize("number", SCENES)
+def test_none_traces_the_whole_lattice_in_few_kernels(number):
+    mrt.render(number, **SMALL, aa=3, aamode="none", focaldist=0)
+    result = mrt.render(number, **SMALL, aa=3, aamode="none", focaldist=0, count_rays=True)
+    assert result.rays["primary"] == 160 * 120 * 9
+    # one kernel for all rays, one for the means; loading a scene may fill small tables
+    assert result.kernel_launches <= 6
+    assert np.isfinite(result.image).all()
+
+
+@pytest.mark.parametrize("aamode", ["luma", "sobel", "geometry"])
+@pytest.mark.parametrize("aa", [2, 3])
+def test_refined_pass_traces_the_other_samples_of_edge_pixels_only(aamode, aa):
+    result = mrt.render(1, **SMALL, aa=aa, aamode=aamode, layers=["edges"])
+    refined = result.layers["samples.Y"] > 1
+    assert 0 < refined.sum() < refined.size
+    assert set(np.unique(result.layers["samples.Y"])) == {1.0, float(aa**2)}
+    assert result.rays["primary"] == 160 * 120 + refined.sum() * (aa**2 - 1)
+
+
+@pytest.mark.parametrize("aamode", ["luma", "sobel"])
+def test_refined_pixels_equal_full_supersampling_and_the_others_one_sample(aamode):
+    adaptive = mrt.render(3, **SMALL, aamode=aamode, focaldist=0)
+    one = mrt.render(3, **SMALL, aa=1, aamode="none", focaldist=0)
+    full = mrt.render(3, **SMALL, aa=4, aamode="none", focaldist=0)
+    refined = adaptive.layers["samples.Y"] > 1
+    assert np.array_equal(adaptive.image[~refined], one.image[~refined])
+    # the same 16 values summed in another order: a few roundings of a mean below 4
+    np.testing.assert_allclose(adaptive.image[refined], full.image[refined], atol=2e-6)
+
+
+def test_rays_are_counted_as_the_scene_tells():
+    """One sphere, one light, nothing reflective: shadow rays only where the light is in front."""
+    scene = dataclasses.replace(report_scene(0), planes=(), lights=report_scene(0).lights[:1])
+    result = mrt.render(_without_reflection(scene), **SMALL, aa=1, aamode="none", count_rays=True, layers=["depth"])
+    hits = np.isfinite(result.layers["depth.Z"]).sum()
+    assert result.rays["mirror"] == 0
+    assert 0 < result.rays["shadow"] < hits
+
+
+# ------------------------------------------- What is left out -------------------------------------------
+
+
+def _omitted(result) -> set[str]:
+    return {omission.what for omission in result.plan.left_out}
+
+
+def _without_reflection(scene):
+    """int_ior 0 is how the report switches reflection off; 1e-4 is as near as a dielectric comes."""
+
+    def dull(thing):
+        return dataclasses.replace(thing, material=dataclasses.replace(thing.material, ior=1e-4))
+
+    return dataclasses.replace(scene, spheres=tuple(map(dull, scene.spheres)), planes=tuple(map(dull, scene.planes)))
+
+
+def test_nothing_reflective_means_no_bounce_loop():
+    with_loop = mrt.render(0, **SMALL, aa=1, aamode="none", count_rays=True)
+    without = mrt.render(_without_reflection(report_scene(0)), **SMALL, aa=1, aamode="none", count_rays=True)
+    assert "bounce loop" not in _omitted(with_loop) and with_loop.rays["mirror"] > 0
+    assert "bounce loop" in _omitted(without) and without.rays["mirror"] == 0
+
+
+def test_no_light_means_no_shadow_ray_and_no_plane_no_plane():
+    scene = dataclasses.replace(report_scene(0), lights=(), planes=())
+    result = mrt.render(scene, **SMALL, aa=1, aamode="none", count_rays=True)
+    assert {"shadow rays", "planes"} <= _omitted(result)
+    assert result.rays["shadow"] == 0
+
+
+def test_no_focal_distance_means_no_depth_kept():
+    result = mrt.render(0, **SMALL, aamode="sobel")
+    assert {"depth of field", "depth"} <= _omitted(result)
+    assert not any(name.startswith("depth") for name in result.layers)
+    blurred = mrt.render(0, **SMALL, aamode="sobel", focaldist=3.0, focalrange=0.5)
+    assert "depth.Z" in blurred.layers and "depth of field" not in _omitted(blurred)
+    assert blurred.kernel_launches > result.kernel_launches
+
+
+def test_aa_1_has_no_edge_pass_unless_edges_are_asked_for():
+    assert "edge pass" in _omitted(mrt.render(0, **SMALL, aa=1, aamode="sobel"))
+    asked = mrt.render(0, **SMALL, aa=1, aamode="sobel", layers=["edges"])
+    assert asked.layers["edges.Y"].max() > 0 and asked.rays["primary"] == 160 * 120
+
+
+# ------------------------------------------ The same picture ------------------------------------------
+
+
+def test_the_same_render_twice_is_the_same_bit_for_bit():
+    first, second = (mrt.render(4, **SMALL, aamode="sobel") for _ in range(2))
+    assert np.array_equal(first.image, second.image)
+
+
+def test_splitting_the_wavefront_changes_nothing():
+    source = open_scene(3, width=40, height=30)
+    tracer, camera = WhittedTracer(source.scene, source.integrator), Camera(source.sensor, 40, 30)
+    bundle = Bundle(range(40 * 30), Lattice("report", 2), count=4)
+    wanted = frozenset({"image", "depth", "normal", "bounces"})
+    whole = trace_bundle(tracer, camera, bundle, wanted)
+    parts = trace_bundle(tracer, camera, bundle, wanted, rays_at_once=1000)
+    assert whole.keys() == parts.keys() == wanted
+    for name, values in whole.items():
+        assert np.array_equal(values, parts[name]), name
+
+
+@pytest.mark.parametrize("number", SCENES)
+def test_cutting_off_paths_costs_less_than_half_a_step(number):
+    cut = mrt.render(number, **SMALL, aa=1, aamode="none", focaldist=0)
+    whole = mrt.render(number, **SMALL, aa=1, aamode="none", focaldist=0,
+                       integrator={"type": "mrt_whitted", "min_contribution": 0.0})
+    error = np.abs(cut.image - whole.image)
+    assert 0 < error.max() < 0.5 / 255
+    assert error.mean() < 2e-5
+
+
+@pytest.mark.parametrize("number", SCENES)
+def test_scalar_variant_draws_the_same_picture(number):
+    """Sums in another order and fused operations differ in the last digits; a flipped shadow decision is a whole light."""
+    size = {"width": 32, "height": 24, "aa": 1, "aamode": "none", "focaldist": 0}
+    fast = mrt.render(number, **size, variant="llvm_ad_rgb")
+    with pytest.warns(mrt.MrtWarning, match="one ray at a time") if number == 0 else _nothing():
+        slow = mrt.render(number, **size, variant="scalar_rgb")
+    assert np.abs(fast.image - slow.image).mean() < 1e-5
+
+
+class _nothing:
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        return False
+
+
+def test_scene_numbers_dicts_and_mitsuba_scenes_agree():
+    size = {"width": 64, "height": 48}
+    by_number = mrt.render(3, **size, aa=2, aamode="sobel", focaldist=0).image
+    scene = mrt.scene_dict(3, **size)
+    assert np.array_equal(by_number, mrt.render(scene, aa=2, aamode="sobel").image)
+    assert np.array_equal(by_number, mrt.render(mi.load_dict(scene), aa=2, aamode="sobel").image)
+
+
+def test_a_scene_that_was_edited_renders_as_edited():
+    scene = mi.load_dict(mrt.scene_dict(0, width=64, height=48))
+    before = mrt.render(scene, aa=1, aamode="none").image
+    parameters = mi.traverse(scene)
+    key = "sphere_0.to_world"
+    parameters[key] = mi.ScalarTransform4f().translate([0, 0.5, 0]) @ parameters[key]
+    parameters.update()
+    after = mrt.render(scene, aa=1, aamode="none").image
+    again = mrt.render(scene, aa=1, aamode="none").image
+    assert np.abs(before - after).max() > 0.1
+    assert np.array_equal(after, again)
+
+
+def test_rendering_leaves_no_scene_behind():
+    """Integrator and scene must not own each other: Mitsuba's shapes would pile up in every later kernel."""
+
+    def highest_id() -> int:
+        import drjit as dr
+
+        scene = mi.load_dict(mrt.scene_dict(0, width=16, height=12))
+        mrt.render(scene, aa=1, aamode="none")
+        return int(np.max(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())))
+
+    ids = []
+    gc.collect()  # what earlier tests left to the collector
+    for _ in range(3):
+        ids.append(highest_id())
+        gc.collect()
+    assert ids[0] == ids[2]
+
+
+# ------------------------------------- Other integrators and lights -------------------------------------
+
+
+def _lit_scene(light: dict) -> dict:
+    scene = mrt.scene_dict(0, width=64, height=48)
+    kept = {name: node for name, node in scene.items() if not name.startswith(("light", "sky", "integrator"))}
+    return {**kept, "light": light}
+
+
+@pytest.mark.parametrize("kind", ["point", "directional", "spot", "mrt_light"])
+def test_direct_light_equals_mitsubas_direct(kind):
+    """One delta light, no clamp, no bounce: nothing is left to differ but the stand-in of the plane."""
+    light = {
+        "point": {"position": [2, 3, 1], "intensity": 20.0},
+        "directional": {"direction": [-1, -2, -0.5], "irradiance": 2.0},
+        "spot": {"to_world": mi.ScalarTransform4f().look_at([2, 3, 1], [0, 0, 0], [0, 1, 0]), "intensity": 20.0},
+        "mrt_light": {"position": [2, 3, 1], "intensity": 2.0},
+    }[kind]
+    scene = mi.load_dict(_lit_scene({"type": kind, **light}))
+    ours = mrt.render(scene, aa=1, aamode="none",
+                      integrator={"type": "mrt_whitted", "max_depth": 1, "clamp": False}).image
+    stock = mrt.render(scene, aa=1, aamode="none", integrator="direct").image
+    assert stock.max() > 0.1
+    depth = mrt.render(scene, aa=1, aamode="none", layers=["depth"]).layers["depth.Z"]
+    difference = np.abs(ours - stock).max(axis=-1)[depth < 40]  # the stand-in of the plane ends at 50
+    assert difference.size > 1000
+    # shadow edges may fall on the other side of a pixel's centre
+    assert np.mean(difference > 1e-5 * (1 + stock.max())) < 0.002
+    assert np.median(difference) < 1e-6
+
+
+def test_area_light_agrees_with_path_in_the_mean():
+    """Both are unbiased without bounces; 64 samples in 48 x 36 pixels leave 0.3 % of noise in the mean."""
+    light = {"type": "sphere", "center": [1, 2, 0.5], "radius": 0.3,
+             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 8.0}}}
+    scene = mi.load_dict(_lit_scene(light))
+    whitted = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
+    ours = mrt.render(scene, aa=1, aamode="none", spp=64, integrator=whitted, seed=1).image
+    stock = mrt.render(scene, aa=1, aamode="none", spp=64, integrator={"type": "path", "max_depth": 2}, seed=2).image
+    assert ours.mean() == pytest.approx(stock.mean(), rel=0.02)
+
+
+def test_adaptive_sampling_works_over_a_stock_integrator():
+    scene = mi.load_dict(mrt.scene_dict(0, width=64, height=48, flavor="stock"))
+    result = mrt.render(scene, integrator="path", spp=8, aa=2, aamode="sobel", layers=["albedo", "normal"])
+    refined = (result.layers["samples.Y"] > 1).sum()
+    assert 0 < refined < 64 * 48
+    assert result.rays["primary"] == 8 * (64 * 48 + 3 * refined)
+    assert np.isfinite(result.image).all()
+
+
+def test_whitted_works_in_mi_render():
+    """Mitsuba's own render loop gives the same as ours, but for where its samples lie."""
+    scene = mi.load_dict(mrt.scene_dict(3, width=64, height=48))
+    mitsubas = np.array(mi.render(scene, spp=64))
+    ours = mrt.render(scene, aa=8, aamode="none", lattice="centered").image
+    # both integrate each pixel over its area with 64 samples; edges are all that differs
+    assert np.abs(mitsubas - ours).mean() < 5e-3
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
+def test_other_variants_show_the_same_scene(variant):
+    """Spectral rendering upsamples colours and draws wavelengths; its luminance must agree to a few percent."""
+    options = {"width": 32, "height": 24, "aa": 4, "aamode": "none", "focaldist": 0}
+    rgb = mrt.render(0, **options, variant="llvm_ad_rgb").image @ [0.2126, 0.7152, 0.0722]
+    other = mrt.render(0, **options, variant=variant).image @ [0.2126, 0.7152, 0.0722]
+    assert other.mean() == pytest.approx(rgb.mean(), rel=0.05)
+
+
+# ------------------------------------------------ Layers ------------------------------------------------
+
+
+def test_layers_belong_together():
+    result = mrt.render(3, **SMALL, aa=2, aamode="none", layers=["direct", "reflection", "bounces", "normal", "albedo"])
+    channels = result.layers
+    total = sum(np.stack([channels[f"{part}.{c}"] for c in "RGB"], axis=-1) for part in ("direct", "reflection"))
+    unblurred = mrt.render(3, **SMALL, aa=2, aamode="none", focaldist=0).image
+    np.testing.assert_allclose(total, unblurred, atol=1e-6)
+    length = np.sqrt(sum(channels[f"normal.{c}"] ** 2 for c in "XYZ"))
+    hit = np.isfinite(channels["depth.Z"])
+    np.testing.assert_allclose(length[hit], 1, atol=1e-6)
+    assert np.all(length[~hit] == 0)
+    assert channels["bounces.Y"].max() > 1
+
+
+def test_depth_is_the_distance_from_the_eye():
+    """The pixel in the middle of scene 0 looks from (3, 1, 0) at (0, 0.3, 0), over the spheres, and meets y = 0."""
+    result = mrt.render(0, width=101, height=75, aa=1, aamode="none", layers=["depth"])
+    descent = 0.7 / np.hypot(3, 0.7)  # for each unit along the ray
+    # the eye is one unit up; float32 camera rays are good to a few 1e-7
+    assert result.layers["depth.Z"][37, 50] == pytest.approx(1 / descent, rel=1e-6)
+
+
+def test_motion_blur_averages_shifted_cameras():
+    options = {**SMALL, "aa": 1, "aamode": "none", "focaldist": 0}
+    blurred = mrt.render(0, **options, motion=(0, 0, 0.4), motionsamples=4)
+    scene = report_scene(0)
+    frames = []
+    for k in range(4):
+        shift = np.array([0, 0, 0.4]) * k / 4
+        camera = dataclasses.replace(scene.camera, position=tuple(np.array(scene.camera.position) + shift),
+                                     target=tuple(np.array(scene.camera.target) + shift))
+        frames.append(mrt.render(dataclasses.replace(scene, camera=camera), **options).image)
+    difference = np.abs(blurred.image - np.mean(frames, axis=0))
+    # the same rays up to float32 rounding of their origins; edges may flip in single pixels
+    assert np.median(difference) < 1e-6 and difference.mean() < 1e-3
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    ({"aamode": "none", "layers": ["edges"]}, "edges"),
+    ({"aa": 0}, "aa=0"),
+    ({"width": 0}, "width"),
+    ({"aamode": "fxaa"}, "aamode"),
+    ({"focaldist": float("nan")}, "focaldist"),
+    ({"spp": 0}, "spp"),
+    ({"integrator": "ptracer"}, "sampling integrator"),
+])
+def test_wrong_arguments_are_named(arguments, message):
+    with pytest.raises(mrt.UsageError, match=message):
+        mrt.render(0, **{**SMALL, **arguments})
+
+
+def test_unknown_scenes_and_files_are_named():
+    with pytest.raises(mrt.UsageError, match="no scene 17"):
+        mrt.render(17)
+    with pytest.raises(mrt.SceneError, match=r"nowhere\.xml"):
+        mrt.render("nowhere.xml")
+    with pytest.raises(mrt.SceneError, match="no_such_plugin"):
+        mrt.render({"type": "scene", "a": {"type": "no_such_plugin"}})
