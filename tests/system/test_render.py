@@ -174,7 +174,7 @@ def test_a_scene_that_was_edited_renders_as_edited():
     before = mrt.render(scene, aa=1, aamode="none").image
     parameters = mi.traverse(scene)
     key = "sphere_0.to_world"
-    parameters[key] = mi.ScalarTransform4f().translate([0, 0.5, 0]) @ parameters[key]
+    parameters[key] = mi.Transform4f().translate([0, 0.5, 0]) @ parameters[key]
     parameters.update()
     after = mrt.render(scene, aa=1, aamode="none").image
     again = mrt.render(scene, aa=1, aamode="none").image
