@@ -143,7 +143,9 @@ def whitted_features(integrator: Any, prepared: Any) -> Features:
         else:
             left_out.append(Omission(what, why))
 
-    decide(prepared.shape_count > 0, f"{prepared.shape_count} shapes in Mitsuba's BVH", "BVH", "no shapes but planes")
+    decide(prepared.shape_count > 0, f"{prepared.shape_count} shapes in Mitsuba's BVH", "BVH", "no shapes but analytic ones")
+    quadrics = prepared.quadric_count
+    decide(quadrics > 0, f"{quadrics} exact cones and cylinders", "cones and cylinders", "none in the scene")
     decide(bool(prepared.planes), f"{len(prepared.planes)} analytic planes", "planes", "none in the scene")
     lights = len(prepared.lights)
     decide(lights > 0, f"{lights} lights, {prepared.light_handling}", "shadow rays", "no light")

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 
 from .intersect import Frame, cone_frame
 from .parameters import flag, integer, number, vector
-from .revolution import Placement, check_axis, fill, number64, refill, unit_cone_mesh, vector64
-from .variants import is_jit
+from .revolution import Placement, check_axis, fill, refill, unit_cone_mesh, vector64
+from .variants import first, is_jit, updatable
 
 
 class MrtCone(mi.Mesh):
@@ -55,43 +54,46 @@ class MrtCone(mi.Mesh):
     quadric = "cone"  # what ``mrt_whitted`` intersects in place of the mesh
 
     def __init__(self, props: mi.Properties) -> None:
-        ends = {name: vector(props, name) for name in ("apex", "base_center")}
-        check_axis("mrt_cone", "apex", ends["apex"], "base_center", ends["base_center"])
-        self.apex, self.base_center = (mi.Point3f(p) for p in ends.values())
-        self.radius = mi.Float(number(props, "radius", 1.0, above=0))
+        apex, base_center = vector(props, "apex"), vector(props, "base_center")
+        radius = number(props, "radius", 1.0, above=0)
+        check_axis("mrt_cone", "apex", apex, "base_center", base_center)
         self.capped = flag(props, "capped", True)
         self.placement = Placement(props)
         self.unit = unit_cone_mesh(integer(props, "segments", 256, least=3), self.capped)
-        dr.make_opaque(self.apex, self.base_center, self.radius)
+        self.exact_frame = self.placement(cone_frame(vector64(apex), vector64(base_center), radius))
         sizes = len(self.unit.points), len(self.unit.faces)
         mi.Mesh.__init__(self, "mrt_cone", *sizes, props, has_vertex_normals=True, has_vertex_texcoords=True)
-        fill(self, self.unit, self.frame())
+        fill(self, self.unit, self.exact_frame)
+        self.apex, self.base_center = mi.Point3f(apex), mi.Point3f(base_center)
+        self.radius = updatable(radius)
         # Mitsuba merges meshes that share a BSDF when it loads a scene, but leaves those with attributes
         # alone
         self.add_attribute("face_mrt_cone", 1, [0.0] * sizes[1])
 
     def frame(self) -> Frame:
         """The shape's unit frame in world space, in double precision (see ``intersect``)."""
-        ends = vector64(self.apex), vector64(self.base_center)
-        return self.placement(cone_frame(*ends, number64(self.radius)))
+        return self.exact_frame
 
     def traverse(self, callback: Any) -> None:
         mi.Mesh.traverse(self, callback)
         flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
         for name in ("apex", "base_center", "radius"):
-            callback.put(name, getattr(self, name), flags)
+            if hasattr(self, name):  # not while the mesh is being filled
+                callback.put(name, getattr(self, name), flags)
 
     def parameters_changed(self, keys: Any = ()) -> None:
         if not {"apex", "base_center", "radius"}.isdisjoint(keys):
+            ends = vector64(self.apex), vector64(self.base_center)
+            self.exact_frame = self.placement(cone_frame(*ends, first(self.radius)))
             if is_jit():
                 refill(self, self.unit, self.placement(cone_frame(self.apex, self.base_center, self.radius)))
             else:
-                fill(self, self.unit, self.frame())
+                fill(self, self.unit, self.exact_frame)
         mi.Mesh.parameters_changed(self, keys)
 
     def to_string(self) -> str:
         ends = f"apex={list(vector64(self.apex))}, base_center={list(vector64(self.base_center))}"
-        return f"MrtCone[{ends}, radius={number64(self.radius):g}, capped={self.capped}]"
+        return f"MrtCone[{ends}, radius={first(self.radius):g}, capped={self.capped}]"
 
 
 mi.register_shape("mrt_cone", MrtCone)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 
 from .intersect import Frame, cylinder_frame
 from .parameters import flag, integer, number, vector
-from .revolution import Placement, check_axis, fill, number64, refill, unit_cylinder_mesh, vector64
-from .variants import is_jit
+from .revolution import Placement, check_axis, fill, refill, unit_cylinder_mesh, vector64
+from .variants import first, is_jit, updatable
 
 
 class MrtCylinder(mi.Mesh):
@@ -51,45 +50,47 @@ class MrtCylinder(mi.Mesh):
     quadric = "cylinder"  # what ``mrt_whitted`` intersects in place of the mesh
 
     def __init__(self, props: mi.Properties) -> None:
-        ends = {name: vector(props, name) for name in ("p0", "p1")}
-        check_axis("mrt_cylinder", "p0", ends["p0"], "p1", ends["p1"])
-        self.p0, self.p1 = (mi.Point3f(p) for p in ends.values())
-        self.radius = mi.Float(number(props, "radius", 1.0, above=0))
+        p0, p1 = vector(props, "p0"), vector(props, "p1")
+        radius = number(props, "radius", 1.0, above=0)
+        check_axis("mrt_cylinder", "p0", p0, "p1", p1)
         self.capped = flag(props, "capped", True)
         self.placement = Placement(props)
         self.unit = unit_cylinder_mesh(integer(props, "segments", 256, least=3), self.capped)
-        dr.make_opaque(self.p0, self.p1, self.radius)
+        self.exact_frame = self.placement(cylinder_frame(vector64(p0), vector64(p1), radius))
         sizes = len(self.unit.points), len(self.unit.faces)
         mi.Mesh.__init__(
             self, "mrt_cylinder", *sizes, props, has_vertex_normals=True, has_vertex_texcoords=True
         )
-        fill(self, self.unit, self.frame())
+        fill(self, self.unit, self.exact_frame)
+        self.p0, self.p1, self.radius = mi.Point3f(p0), mi.Point3f(p1), updatable(radius)
         # Mitsuba merges meshes that share a BSDF when it loads a scene, but leaves those with attributes
         # alone
         self.add_attribute("face_mrt_cylinder", 1, [0.0] * sizes[1])
 
     def frame(self) -> Frame:
         """The shape's unit frame in world space, in double precision (see ``intersect``)."""
-        ends = vector64(self.p0), vector64(self.p1)
-        return self.placement(cylinder_frame(*ends, number64(self.radius)))
+        return self.exact_frame
 
     def traverse(self, callback: Any) -> None:
         mi.Mesh.traverse(self, callback)
         flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
         for name in ("p0", "p1", "radius"):
-            callback.put(name, getattr(self, name), flags)
+            if hasattr(self, name):  # not while the mesh is being filled
+                callback.put(name, getattr(self, name), flags)
 
     def parameters_changed(self, keys: Any = ()) -> None:
         if not {"p0", "p1", "radius"}.isdisjoint(keys):
+            ends = vector64(self.p0), vector64(self.p1)
+            self.exact_frame = self.placement(cylinder_frame(*ends, first(self.radius)))
             if is_jit():
                 refill(self, self.unit, self.placement(cylinder_frame(self.p0, self.p1, self.radius)))
             else:
-                fill(self, self.unit, self.frame())
+                fill(self, self.unit, self.exact_frame)
         mi.Mesh.parameters_changed(self, keys)
 
     def to_string(self) -> str:
         ends = f"p0={list(vector64(self.p0))}, p1={list(vector64(self.p1))}"
-        return f"MrtCylinder[{ends}, radius={number64(self.radius):g}, capped={self.capped}]"
+        return f"MrtCylinder[{ends}, radius={first(self.radius):g}, capped={self.capped}]"
 
 
 mi.register_shape("mrt_cylinder", MrtCylinder)

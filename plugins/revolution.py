@@ -13,6 +13,7 @@ import numpy as np
 from .buffers import write_buffers
 from .intersect import Frame
 from .parameters import ParameterError
+from .variants import first
 
 
 @dataclass(frozen=True)
@@ -139,13 +140,8 @@ class Placement:
 
 
 def vector64(v: Any) -> Any:
-    """A point or vector parameter of a shape, in double precision."""
-    return dr.scalar.Array3f64([number64(c) for c in v])
-
-
-def number64(x: Any) -> float:
-    """A number parameter of a shape as a Python float."""
-    return float(x if isinstance(x, float) else x[0])
+    """Three numbers, or a point or vector of one entry, in double precision."""
+    return dr.scalar.Array3f64([first(c) for c in v])
 
 
 def check_axis(plugin: str, end0: str, p0: Sequence[float], end1: str, p1: Sequence[float]) -> None:

@@ -1,6 +1,7 @@
 """What differs between Mitsuba's scalar and vectorised variants."""
 from __future__ import annotations
 
+import drjit.scalar
 import mitsuba as mi
 
 
@@ -17,6 +18,11 @@ def pointer(kind: str, objects):
 def first(value) -> float:
     """The first entry of a Dr.Jit array, or the number itself, as a Python float."""
     return float(value) if isinstance(value, float) else float(value[0])
+
+
+def updatable(number: float):
+    """A plugin parameter in a form that ``mi.traverse`` can update; scalar variants cannot update Python floats."""
+    return mi.Float(number) if is_jit() else drjit.scalar.Array1f64(number)
 
 
 def but_not(mask, excluded):

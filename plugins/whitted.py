@@ -2,12 +2,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
 from .intersect import intersect_plane
 from .parameters import choice, flag, integer, number
+from .quadrics import quadrics_of
 from .variants import but_not, is_jit, pointer
 
 BUDGETS = ("report", "plain")
@@ -76,8 +78,8 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     with r the mirror direction, and the sky where a ray meets nothing. Shading goes through ``si.bsdf()``: k_s F is
     the attribute ``mirror_reflectance`` of an ``mrt_bsdf``, and the delta reflection of any other BSDF. Lights are
-    all emitters of the scene; those without a delta position take one random sample each. ``mrt_plane`` shapes are
-    intersected analytically.
+    all emitters of the scene; those without a delta position take one random sample each. ``mrt_plane``,
+    ``mrt_cone`` and ``mrt_cylinder`` shapes are intersected analytically.
 
     ==================== =========== ============ ============================================================
     name                 type        default      unit or range
@@ -270,7 +272,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         return dr.select(active, mi.unpolarized_spectrum(prepared.environment.eval(si, active)), 0)
 
 
-def _eval_bsdf(bsdf, si, wos, facing, active, mirror: bool):
+def _eval_bsdf(mirror: bool, bsdf, si, wos, facing, active):
     """Of one BSDF: its values f cos θo towards ``wos``, its mirror reflectance and its index of refraction."""
     values = [mi.UnpolarizedSpectrum(0) for _ in wos]
     reflectance, int_ior = mi.UnpolarizedSpectrum(0), mi.Float(1)
@@ -297,9 +299,11 @@ class Prepared:
         self.fingerprint = _fingerprint(scene)
         shapes = scene.shapes()
         self.planes = [_Plane(s) for s in shapes if hasattr(s, "unit_normal")]
-        others = [s for s in shapes if not hasattr(s, "unit_normal")]
-        # The stand-ins of the planes must not be hit: rays are traced in a scene that holds the other shapes only
-        self.bvh = _scene_of(others) if self.planes else None
+        self.quadrics = quadrics_of(shapes)
+        self.quadric_count = sum(hasattr(s, "quadric") for s in shapes)
+        others = [s for s in shapes if not (hasattr(s, "unit_normal") or hasattr(s, "quadric"))]
+        # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the other shapes only
+        self.bvh = _scene_of(others) if len(others) < len(shapes) else None
         self.shape_count = len(others)
         self.scales = _Scales(others)
         self._read_emitters(scene)
@@ -334,7 +338,7 @@ class Prepared:
     # ----------------------------------------- Ray queries ---------------------------------------------
 
     def intersect(self, scene, ray, active, coherent: bool) -> Hit:
-        """The nearest of Mitsuba's shapes and the analytic planes."""
+        """The nearest of Mitsuba's shapes, the quadrics and the analytic planes."""
         ray = mi.Ray3f(ray)
         on_plane = []
         for plane in self.planes:
@@ -344,6 +348,13 @@ class Prepared:
             ray.maxt = dr.select(closer, t, ray.maxt)  # what lies behind the plane need not be looked for
         si, found = self._intersect_shapes(scene, ray, active, coherent)
         scale = self.scales(si, found)
+        if self.quadrics is not None:
+            reach = dr.select(found, si.t, ray.maxt)
+            quadric = self.quadrics.intersect(mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths), active)
+            closer = active & (quadric[0] < reach)
+            self.quadrics.put_into(si, ray, quadric, closer)
+            scale = dr.select(closer, self.quadrics.scale(quadric[1], closer), scale)
+            found = found | closer
         # A later plane overrides an earlier one, as it was closer
         for plane, closer in zip(self.planes, on_plane):
             closer = but_not(closer, found)
@@ -370,20 +381,25 @@ class Prepared:
         for plane in self.planes:
             # Opposite sides: no distance is computed, so none can be wrong
             blocked |= plane.height(o) * plane.height(ds.p) < 0
-        if not self.shape_count:
+        if not self.shape_count and self.quadrics is None:
             return blocked
         to_light = ds.p - o
         # Stop short of a light that has a surface of its own
         reach = 1 - mi.math.ShadowEpsilon if self.emissive else 1
         ray = mi.Ray3f(o, to_light, reach, hit.si.time, hit.si.wavelengths)
-        return blocked | (self.bvh or scene).ray_test(ray, False, but_not(active, blocked))
+        if self.shape_count:
+            blocked |= (self.bvh or scene).ray_test(ray, False, but_not(active, blocked))
+        if self.quadrics is not None:
+            blocked |= self.quadrics.occluded(ray, but_not(active, blocked))
+        return blocked
 
     def eval_bsdf(self, hit, samples, mirror: bool):
         """Values of the BSDF at ``hit`` towards light samples, and its mirror reflection: all of it in one call."""
-        arguments = (hit.si, [s.wo for s in samples], [s.facing for s in samples], hit.found, mirror)
+        arguments = (hit.si, [s.wo for s in samples], [s.facing for s in samples], hit.found)
+        evaluate = partial(_eval_bsdf, mirror)  # dispatch would take a bool among the arguments for its mask
         if is_jit():
-            return dr.dispatch(hit.si.bsdf(), _eval_bsdf, *arguments)
-        return _eval_bsdf(hit.si.bsdf() if hit.found else None, *arguments)
+            return dr.dispatch(hit.si.bsdf(), evaluate, *arguments)
+        return evaluate(hit.si.bsdf() if hit.found else None, *arguments)
 
     def mirror_ray(self, ray, hit):
         """The ray reflected at ``hit``."""
@@ -471,7 +487,11 @@ def _has_mirror(bsdf) -> bool:
 def _scene_of(shapes):
     if not shapes:
         return None
-    return mi.load_dict({"type": "scene", **{f"shape{i}": s for i, s in enumerate(shapes)}})
+    # Mitsuba names an object after its key, and these belong to another scene: they keep their names
+    names = [s.id() or f"shape_{i}" for i, s in enumerate(shapes)]
+    if len(set(names)) < len(names):
+        names = [f"shape_{i}" for i in range(len(shapes))]
+    return mi.load_dict({"type": "scene", **dict(zip(names, shapes, strict=True))})
 
 
 def _coordinate_size(bbox) -> float:
