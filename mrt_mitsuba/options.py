@@ -358,6 +358,6 @@ def usage() -> str:
         "  help                        print this text",
         "  doctor                      print versions, the LLVM in use, the variants; render a self-test",
         "  scenes                      list the scenes",
-        "  export SCENE --xml PATH     write a scene as Mitsuba XML; --stock: with Mitsuba's own plugins only",
+        "  export SCENE --xml PATH     write a scene as Mitsuba XML; --stock: with stock plugins only",
     ]
     return "\n".join(lines) + "\n"

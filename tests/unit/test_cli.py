@@ -215,7 +215,8 @@ sys.modules["mrt_mitsuba.render"] = types.SimpleNamespace(render=render)
 from mrt_mitsuba import cli
 sys.exit(cli.main())
 """
-# What the signal meets: Python code, or a Dr.Jit kernel that runs for minutes (a million steps per entry).
+# What the signal meets: Python code, or a Dr.Jit kernel that runs for minutes (a million steps per entry). Python
+# waits for it there and then, or only at the end of the process.
 SLEEP = """
 def work():
     print("working", flush=True)
@@ -229,12 +230,16 @@ def work():
     x, i = dr.while_loop((x, i), lambda x, i: i < 1_000_000, lambda x, i: (dr.sin(x) + 1, i + 1))
     print("working", flush=True)
     dr.eval(x)
-    dr.sync_thread()
+    {wait}
 """
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
-@pytest.mark.parametrize("work", [SLEEP, KERNEL], ids=["python", "kernel"])
+@pytest.mark.parametrize(
+    "work",
+    [SLEEP, KERNEL.format(wait="dr.sync_thread()"), KERNEL.format(wait="time.sleep(60)")],
+    ids=["python", "kernel", "kernel beside python"],
+)
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_signal_leaves_the_old_file_and_ends_within_two_seconds(
     tmp_path: Path, number: signal.Signals, code: int, work: str
