@@ -7,6 +7,7 @@ from typing import Any
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.rays import Lattice
+from mrt_mitsuba.trace import AVERAGED, FIRST_HIT
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,12 @@ class Plan:
         if self.blur:
             free |= {"depth"}
         return self.layers | free
+
+    @property
+    def channels(self) -> int:
+        """Float32 channels kept for every pixel: the picture, its layers, and the detector's."""
+        sizes = FIRST_HIT | AVERAGED | {"edges": 1, "samples": 1, "blur": 1}
+        return sum(sizes[name] for name in {"image", *self.traced_layers, *self.returned_layers})
 
     def __str__(self) -> str:
         lines = [f"Plan for {self.scene}, {self.width}x{self.height}, {self.integrator} in {self.variant}"]
@@ -144,8 +151,9 @@ def whitted_features(integrator: Any, prepared: Any) -> Features:
             left_out.append(Omission(what, why))
 
     decide(prepared.shape_count > 0, f"{prepared.shape_count} shapes in Mitsuba's BVH", "BVH", "no shapes but analytic ones")
-    quadrics = prepared.quadric_count
-    decide(quadrics > 0, f"{quadrics} exact cones and cylinders", "cones and cylinders", "none in the scene")
+    quadrics = prepared.quadrics
+    text = f"{quadrics.count} exact objects in a tree: {', '.join(quadrics.kinds)}" if quadrics else ""
+    decide(quadrics is not None, text, "cones and cylinders", "none in the scene")
     decide(bool(prepared.planes), f"{len(prepared.planes)} analytic planes", "planes", "none in the scene")
     lights = len(prepared.lights)
     decide(lights > 0, f"{lights} lights, {prepared.light_handling}", "shadow rays", "no light")

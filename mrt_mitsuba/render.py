@@ -15,6 +15,7 @@ import numpy as np
 
 from mrt_mitsuba import options, runtime
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.memory import MOST_RAYS, rays_at_once
 from mrt_mitsuba.plan import Features, Plan, make_plan, stock_features, whitted_features
 from mrt_mitsuba.progress import Progress
 from mrt_mitsuba.rays import Bundle, Lattice
@@ -94,6 +95,7 @@ def render(
             focal_distance=focus.distance, dof=given["dof"], layers=frozenset(given["layers"]),
             count_rays=count_rays, repeats=_repeats(spp), motion_samples=given["motionsamples"] if motion else 1,
             features=features)
+        job.rays_at_once = rays_at_once(plan.width * plan.height, plan.channels, given["memory"])
         job.progress.plan(plan)
         load = time.perf_counter() - start
         frames = _Frames()
@@ -224,6 +226,7 @@ class _Job:
     """A render under way: where to report, and what it has cost so far."""
 
     progress: Progress
+    rays_at_once: int = MOST_RAYS
     passes: dict[str, float] = field(default_factory=dict)
     primary_rays: int = 0
     launches: int = 0
@@ -234,7 +237,8 @@ class _Job:
               seed: int) -> dict[str, np.ndarray]:
         self.primary_rays += bundle.ray_count
         with self.timed(title.lower()), self.progress.stage(title, len(bundle.pixels), message) as advance:
-            return trace_bundle(tracer, camera, bundle, wanted, seed=seed, advance=advance)
+            return trace_bundle(tracer, camera, bundle, wanted, seed=seed, advance=advance,
+                                rays_at_once=self.rays_at_once)
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:

@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from mrt_mitsuba.memory import MOST_RAYS
 from mrt_mitsuba.rays import Bundle, Samples
-
-# Rays of one wavefront: about 100 bytes each in the arrays that a kernel reads and writes
-RAYS_AT_ONCE = 2**23
 
 # Layers taken from the first ray of a pixel, not averaged: they name a point, not a colour
 FIRST_HIT = {"depth": 1, "normal": 3, "albedo": 3}
@@ -63,7 +61,7 @@ def trace_bundle(
     *,
     seed: int = 0,
     advance: Callable[[int], object] = lambda pixels: None,
-    rays_at_once: int = RAYS_AT_ONCE,
+    rays_at_once: int = MOST_RAYS,
 ) -> dict[str, np.ndarray]:
     """Trace a bundle; return ``image`` [pixels, 3] and each wanted layer [pixels] or [pixels, 3], float32.
 
