@@ -28,13 +28,20 @@ class Progress:
 class TerminalProgress(Progress):
     """Prints messages, and a bar if ``bar_file`` is a terminal.
 
-    ``show_plan``: whether to print the render plan. Messages go to ``file``, bars to ``bar_file``.
+    ``show_plan``: whether to print the render plan. Messages go to ``file``, bars to ``bar_file``; these
+    count in ``unit``.
     """
 
     def __init__(
-        self, *, show_plan: bool = False, file: TextIO | None = None, bar_file: TextIO | None = None
+        self,
+        *,
+        show_plan: bool = False,
+        unit: str = "px",
+        file: TextIO | None = None,
+        bar_file: TextIO | None = None,
     ) -> None:
         self.show_plan = show_plan
+        self.unit = unit
         self.file = file or sys.stdout
         self.bar_file = bar_file or sys.stderr
 
@@ -54,7 +61,7 @@ class TerminalProgress(Progress):
         with tqdm(
             total=total,
             desc=title,
-            unit="px",
+            unit=self.unit,
             unit_scale=True,
             dynamic_ncols=True,
             leave=False,
