@@ -1,0 +1,183 @@
+"""The image tests keep their error rate on equal pictures and have power on different ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mrt_mitsuba import UsageError
+from mrt_mitsuba.validation.image_tests import (
+    Comparison,
+    Estimate,
+    compare,
+    estimate,
+    exact,
+    flip,
+    rel_rmse,
+    sidak,
+)
+
+SHAPE = (24, 32, 3)
+RENDERS = 8
+NOISE = 0.1  # standard deviation of one render, relative to the picture
+
+
+def truth() -> np.ndarray:
+    """A picture with bright, dim and black places."""
+    y, x = np.mgrid[:24, :32] / 24
+    return np.stack([0.2 + x, 0.5 * y, np.maximum(x - 0.5, 0)], axis=-1)
+
+
+def noisy(picture: np.ndarray, seed: int, draw: str = "normal") -> Estimate:
+    """An estimate from noise of mean 0 and standard deviation NOISE times the picture."""
+    random = np.random.default_rng(seed)
+    size = (RENDERS, *picture.shape)
+    noise = random.normal(size=size) if draw == "normal" else random.gamma(16, size=size) / 4 - 4
+    return estimate(picture * (1 + NOISE * noise))
+
+
+def pair(changed: np.ndarray, seed: int = 0, **options: float) -> Comparison:
+    return compare(noisy(changed, 2 * seed), noisy(truth(), 2 * seed + 1), **options)
+
+
+@pytest.mark.parametrize("draw", ["normal", "gamma"])
+def test_equal_pictures_are_rejected_as_often_as_the_level_says(draw: str) -> None:
+    """gamma: noise as skewed as a mean of 16 exponential samples, which a picture's noise resembles."""
+    level, trials = 0.1, 300
+    found = [
+        compare(noisy(truth(), 2 * i, draw), noisy(truth(), 2 * i + 1, draw), level=level)
+        for i in range(trials)
+    ]
+    # both bounds fail a right test once in ten thousand times; the seeds are fixed
+    for name in ("pixel", "tile", "image"):
+        rejected = sum(name in comparison.detected_by for comparison in found)
+        low, high = stats.binom.interval(0.9998, trials, 1 - (1 - level) ** (1 / 3))
+        assert low <= rejected <= high, name
+    low, high = stats.binom.interval(0.9998, trials, level)
+    assert low <= sum(c.rejects for c in found) <= high
+
+
+def test_equal_pictures_give_uniform_p_values() -> None:
+    p = [pair(truth(), seed).image.p for seed in range(300)]
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+
+
+def test_a_scale_is_seen_by_the_mean() -> None:
+    """2 % on 768 pixels with 10 % √(2/8) of noise: t of 11, less for the dark ones."""
+    found = pair(1.02 * truth())
+    assert "image" in found.detected_by and found.image.p < 1e-6
+    assert "pixel" not in found.detected_by  # 0.4 standard deviations of a pixel
+
+
+def test_a_single_pixel_is_seen_by_the_pixel_test_only() -> None:
+    changed = truth()
+    # 16 standard deviations of the difference of means: with 14 degrees of freedom it takes as many
+    changed[5, 7] *= 1.8
+    assert pair(changed).detected_by == ("pixel",)
+
+
+def test_a_patch_is_seen_by_the_tile_test_only() -> None:
+    """7 % in one of four tiles: each of its pixels is off by 1.4 standard deviations only."""
+    changed = truth()
+    changed[:16, :16] *= 1.07
+    wrong = pair(changed)
+    assert "tile" in wrong.detected_by and "pixel" not in wrong.detected_by
+    assert wrong.tile.p < wrong.image.p
+
+
+def test_power_grows_with_the_level() -> None:
+    """At a level of 1e-6, the scale must be larger to be seen."""
+    seen = [sum(pair(s * truth(), seed, level=1e-6).rejects for seed in range(20)) for s in (1.002, 1.05)]
+    assert seen[0] <= 1 and seen[1] == 20
+
+
+def test_a_picture_without_noise_is_compared_too() -> None:
+    """The sky has no noise at all: there any difference counts, but that of rounding does not."""
+    flat = exact(np.full(SHAPE, 0.3))
+    assert not compare(exact(np.full(SHAPE, np.float32(0.3))), flat).rejects
+    spot = np.full(SHAPE, 0.3)
+    spot[3, 4, 1] += 1e-3
+    assert compare(exact(spot), flat).detected_by[0] == "pixel"
+    black = exact(np.zeros(SHAPE))
+    assert compare(black, black).p == 1
+    assert not compare(noisy(truth(), 1), exact(truth())).rejects
+    assert compare(noisy(1.05 * truth(), 1), exact(truth())).rejects
+
+
+def test_z_is_the_difference_over_its_deviation() -> None:
+    a, b = noisy(truth(), 1), noisy(truth(), 2)
+    where = truth() > 0.05  # in darker places, the floor for rounding shows
+    expected = (a.mean - b.mean)[where] / np.sqrt(a.variance + b.variance)[where]
+    np.testing.assert_allclose(compare(a, b).z[where], expected, rtol=1e-3)
+
+
+def test_odd_sizes_leave_no_pixel_out() -> None:
+    """The last tile is one pixel wide: an error in it, too small for the pixel test, must be seen."""
+    a, b = np.full((17, 33, 1), 0.5), np.full((17, 33, 1), 0.5)
+    a[:, 32] += 0.02
+    variance = np.full(a.shape, 0.02**2)  # 0.7 standard deviations in each of the 17 pixels
+    found = compare(Estimate(a, variance), Estimate(b, variance), tile=16)
+    assert found.tile.statistic == pytest.approx(4 / np.sqrt(2), rel=1e-3)
+    assert found.image.statistic == pytest.approx(17 * 0.02 / (0.02 * np.sqrt(2 * 17 * 33)), rel=1e-3)
+
+
+def test_sidak() -> None:
+    assert sidak(0.1, 2) == pytest.approx(1 - 0.9**2, rel=1e-12)
+    assert sidak(1e-20, 1000) == pytest.approx(1e-17, rel=1e-12)  # 1 - 1e-20 is 1 in float64
+    assert sidak(1.0, 3) == 1 and sidak(0.0, 3) == 0
+
+
+def test_rel_rmse() -> None:
+    assert rel_rmse(1.1 * truth() + 0.3, 1.1 * truth() + 0.3) == 0
+    b = np.full(SHAPE, 2.0)
+    assert rel_rmse(1.02 * b, b) == pytest.approx(0.04 / np.sqrt(4.01), rel=1e-12)
+
+
+def test_flip_grows_with_the_error_at_fixed_exposures() -> None:
+    reference = truth()
+    first = flip(reference, reference)
+    assert first.mean == 0 and first.map.shape == SHAPE[:2]
+    errors = [flip(reference, s * reference, exposures=first.exposures) for s in (1.02, 1.2, 2.0)]
+    assert 0 < errors[0].mean < errors[1].mean < errors[2].mean < 1
+    assert all(e.exposures == first.exposures for e in errors)
+    assert errors[2].map.max() <= 1
+
+
+def test_flip_takes_the_exposures_given() -> None:
+    reference, image = truth(), 1.2 * truth()
+    own = flip(reference, image)
+    late = {**own.exposures, "startExposure": own.exposures["stopExposure"] - 0.5}
+    other = flip(reference, image, exposures=late)
+    assert other.mean != own.mean
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "message"),
+    [
+        (np.ones((8, 8, 3)), np.ones((8, 9, 3)), "one size"),
+        (np.ones((8, 8)), np.ones((8, 8)), "one size"),
+        (np.ones((8, 8, 3)), -np.ones((8, 8, 3)), ">= 0; the image"),
+        (np.full((8, 8, 3), np.nan), np.ones((8, 8, 3)), ">= 0; the reference"),
+        (np.zeros((8, 8, 3)), np.ones((8, 8, 3)), "black"),
+    ],
+)
+def test_flip_says_what_it_cannot_compare(a: np.ndarray, b: np.ndarray, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        flip(a, b)
+
+
+def test_flip_does_not_end_the_process() -> None:
+    with pytest.raises(UsageError, match="tonemapper"):
+        flip(truth(), truth(), exposures={"tonemapper": "none"})
+
+
+def test_wrong_estimates_are_named() -> None:
+    with pytest.raises(UsageError, match="two or more"):
+        estimate(np.ones((1, *SHAPE)))
+    with pytest.raises(UsageError, match="infinite"):
+        exact(np.full(SHAPE, np.inf))
+    with pytest.raises(UsageError, match="negative variance"):
+        Estimate(np.ones(SHAPE), -np.ones(SHAPE))
+    with pytest.raises(UsageError, match="sizes must be the same"):
+        compare(exact(np.ones(SHAPE)), exact(np.ones((3, 3, 3))))
