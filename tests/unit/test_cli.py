@@ -215,8 +215,8 @@ sys.modules["mrt_mitsuba.render"] = types.SimpleNamespace(render=render)
 from mrt_mitsuba import cli
 sys.exit(cli.main())
 """
-# What the signal meets: Python code, or a Dr.Jit kernel that runs for minutes (a million steps per entry). Python
-# waits for it there and then, or only at the end of the process.
+# What the signal meets: Python code, or a Dr.Jit kernel that runs for minutes (a million steps per entry).
+# Python waits for it there and then, or only at the end of the process.
 SLEEP = """
 def work():
     print("working", flush=True)
