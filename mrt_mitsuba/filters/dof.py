@@ -132,8 +132,8 @@ def _report(grid: Grid, planes: Sequence[Any], amount: Any) -> list[Any]:
         if dr.width(pixels) == 0:
             continue
         sums = _pascal_passes(grid, sources, grid.Int(pixels), k)
-        for target, total in zip(blurred, sums, strict=False):
-            dr.scatter(target, total / sums[3], pixels, active=sums[3] > 0)
+        for target, total in zip(blurred, sums[:3], strict=True):
+            dr.scatter(target, total / sums[3], pixels)  # not zero: the pixel itself gives
         dr.eval(blurred)
     return blurred
 

@@ -99,6 +99,7 @@ def luma_edges(
         # the last term keeps 0/0 out where the pixel is black and free of noise
         luma_variance = dr.square(deviation) / dr.maximum(dr.maximum(4 * sum_, deviation), 1e-30)
         noise = dr.sqrt(near.weighted_sum(luma_variance, [1 / 9] * 9))
+        # not above zero where the variance is no number
         excess = high - low - 2 * _sigmas(grid, noise_sigmas) * noise
         value = dr.select(excess > 0, excess + offset, 0)
     value = dr.select(dr.isfinite(high), value, math.inf)
@@ -208,8 +209,7 @@ class _Neighbourhood:
         return [self.at(plane, dx, dy) for dx, dy in _OFFSETS]
 
     def weighted_sum(self, plane: Any, weights: Sequence[float]) -> Any:
-        """Return the sum of nine weights times another plane's values; not a number counts as infinity."""
-        plane = dr.select(plane >= 0, plane, math.inf)
+        """Return the sum of nine weights times another plane's values."""
         return sum(weight * value for weight, value in zip(weights, self.of(plane), strict=True) if weight)
 
     def finite(self) -> Any:

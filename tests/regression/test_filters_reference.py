@@ -1,7 +1,7 @@
 """The detectors against renders of the original ray tracer, where those are at hand.
 
 A render with a detector is the unrefined one, except where the detector fired: there it is the fully
-supersampled one. So of each pixel whose unrefined and supersampled colours differ, the render tells which it was.
+supersampled one. So it tells, of each pixel whose unrefined and supersampled colours differ, which it was.
 """
 
 from __future__ import annotations

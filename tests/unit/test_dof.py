@@ -87,6 +87,11 @@ def test_amount_of_a_depth_that_is_no_number_is_none() -> None:
     assert blur_amount(depth, focal_distance=2.0, focal_range=1.0).tolist() == [[0, 2, 8]]
 
 
+def test_a_miss_is_blurred_whatever_the_range() -> None:
+    depth = np.array([[np.inf, 0.0, -3.0, 5.0]])
+    assert blur_amount(depth, focal_distance=2.0, focal_range=math.inf).tolist() == [[8, 8, 8, 0]]
+
+
 @pytest.mark.parametrize("focal_distance", [None, 0.0, -1.0])
 def test_without_a_focal_distance_nothing_happens(focal_distance: float | None) -> None:
     image, depth = colours((4, 5), 0), depths((4, 5), 0)
@@ -246,6 +251,39 @@ def test_a_bad_colour_stays_where_it_is(mode: str, bad: float) -> None:
         amount[12, 15] = 0  # gives nothing, stays as it is
         truth = reference.gaussian_dof(image, amount)
         np.testing.assert_allclose(found[others], truth[others], atol=REPORT_TOLERANCE, rtol=0)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_bad_colour_gives_nothing(mode: str) -> None:
+    image = np.full((25, 30, 3), 0.75)
+    image[12, 15, 2] = image[3, 0, 0] = np.nan
+    good = np.isfinite(image).all(axis=-1)
+    for depth in (far(amount=np.full((25, 30), 8)), far(amount=np.arange(750).reshape(25, 30) % 9)):
+        found = blurred(image, depth, mode=mode)
+        # the weights of what is left add up to one, but for the rounding of their sums of 61 terms at most
+        np.testing.assert_allclose(found[good], 0.75, rtol=61 * 6e-8)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("focal_distance", [1.0, 10.0])
+def test_no_colour_is_made_up(mode: str, focal_distance: float) -> None:
+    """A result is a mean: it stays between the darkest and the brightest pixel."""
+    image = np.random.default_rng(3).choice([0.0, 1.0], (40, 50, 1)) * np.ones(3)
+    found = blurred(image, depths((40, 50), 5), focal_distance=focal_distance, mode=mode)
+    assert found.min() >= -61 * 6e-8 and found.max() <= 1 + 61 * 6e-8  # roundings of sums, as above
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_misses_of_all_kinds_are_alike(mode: str) -> None:
+    image, depth = colours((30, 40), 2), np.random.default_rng(2).choice([1.0, 3.5, np.inf], (30, 40))
+    found = [
+        gaussian_dof(
+            image, np.where(np.isinf(depth), miss, depth), focal_distance=3.0, focal_range=0, mode=mode
+        )
+        for miss in (np.inf, 0.0, -1.0)
+    ]
+    np.testing.assert_array_equal(found[1], found[0])
+    np.testing.assert_array_equal(found[2], found[0])
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -448,6 +486,18 @@ def test_a_blurred_background_shows_no_foreground_behind_its_own_gap() -> None:
     depth[:, :10] = far(amount=8)
     # equal colours, but for the rounding of their sums of 61 terms at most
     np.testing.assert_allclose(blurred(image, depth, mode="corrected"), image, atol=61 * 6e-8)
+
+
+def test_a_foreground_covers_no_more_than_all() -> None:
+    """Small discs close by and large ones around them: their shares at the pixel between them exceed one."""
+    image = np.zeros((21, 21, 3))
+    image[10, 10] = 1
+    depth = np.full((21, 21), near(amount=8))
+    depth[9:12, 9:12] = near(amount=2)
+    depth[10, 10] = 18
+    found = blurred(image, depth, focal_distance=10.0, mode="corrected")
+    assert found[10, 10].tolist() == [0, 0, 0]  # hidden, and not more than hidden
+    assert found.min() == 0
 
 
 @needs_llvm

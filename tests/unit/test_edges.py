@@ -335,6 +335,14 @@ def test_geometry_steps_by_their_height() -> None:
         assert not geometry_edges(normal, depth, depth_step=0.03).mask.any()
 
 
+def test_geometry_sees_a_step_in_every_direction() -> None:
+    depth = bump(base=2.0, value=1.9)
+    edges = geometry_edges(np.broadcast_to([0.0, 0.0, 1.0], (7, 9, 3)), depth)
+    around = np.zeros((7, 9), dtype=bool)
+    around[2:5, 3:6] = True
+    np.testing.assert_array_equal(edges.mask, around)
+
+
 @pytest.mark.parametrize("miss", [np.inf, 0.0, -1.0])
 def test_geometry_ignores_normals_where_nothing_is_hit(miss: float) -> None:
     depth = np.full((7, 8), 2.0)
