@@ -140,26 +140,26 @@ def _report(grid: Grid, planes: Sequence[Any], amount: Any) -> list[Any]:
 
 def _pascal_passes(grid: Grid, sources: Sequence[Any], pixels: Any, k: int) -> list[Any]:
     """Return the weighted sums over the windows of ``pixels``, one per source plane."""
-    weights = [math.comb(2 * k - 1, j) / 2 ** (2 * k - 1) for j in range(2 * k)]
+    weights = grid.table(math.comb(2 * k - 1, j) / 2 ** (2 * k - 1) for j in range(2 * k))
+    reach = dr.opaque(grid.Int, k)  # no literal, so that all window sizes share their kernels
     column, row = grid.coordinates(pixels)
-    from_bottom = grid.height - 1 - row
-    start, count = _cut(from_bottom, k, grid.height)
+    start, count = _cut(grid.height - 1 - row, reach, grid.height)
     vertical = _Taps((grid.height - 1 - start) * grid.width + column, -grid.width, count, weights)
 
     needed = vertical.pixels(grid)
     column, row = grid.coordinates(needed)
-    start, count = _cut(column, k, grid.width)
-    horizontal = _Taps(row * grid.width + start, 1, count, weights)
+    start, count = _cut(column, reach, grid.width)
+    horizontal = _Taps(row * grid.width + start, dr.opaque(grid.Int, 1), count, weights)
 
     along_rows = []
-    for source in sources:
+    for total in horizontal.sums(grid, sources):
         along_rows.append(dr.empty(grid.Float, grid.count))  # read below only where written here
-        dr.scatter(along_rows[-1], horizontal.sum(grid, source), needed)
+        dr.scatter(along_rows[-1], total, needed)
     dr.eval(along_rows)
-    return [vertical.sum(grid, plane) for plane in along_rows]
+    return vertical.sums(grid, along_rows)
 
 
-def _cut(centre: Any, k: int, size: Any) -> tuple[Any, Any]:
+def _cut(centre: Any, k: Any, size: Any) -> tuple[Any, Any]:
     """Return start and length of [centre − k, centre + k) cut to [0, size)."""
     start = dr.maximum(centre - k, 0)
     return start, dr.minimum(centre + k, size) - start
@@ -168,25 +168,33 @@ def _cut(centre: Any, k: int, size: Any) -> tuple[Any, Any]:
 class _Taps:
     """Weighted pixels in a line: ``count`` of them from ``first`` on, ``stride`` apart."""
 
-    def __init__(self, first: Any, stride: Any, count: Any, weights: Sequence[float]) -> None:
+    def __init__(self, first: Any, stride: Any, count: Any, weights: Any) -> None:
         self._first = first
         self._stride = stride
         self._count = count
         self._weights = weights
 
-    def sum(self, grid: Grid, plane: Any) -> Any:
-        """Return the weighted sum of a plane's values."""
-        total = grid.Float(0)
-        for j, weight in enumerate(self._weights):
-            index = self._first + j * self._stride
-            total += weight * dr.gather(grid.Float, plane, index, active=j < self._count)
-        return total
+    def sums(self, grid: Grid, planes: Sequence[Any]) -> list[Any]:
+        """Return the weighted sum of each plane's values."""
+
+        def add(j: Any, totals: Sequence[Any]) -> list[Any]:
+            weight, index, active = dr.gather(grid.Float, self._weights, j), self._index(j), j < self._count
+            return [
+                total + weight * dr.gather(grid.Float, plane, index, active=active)
+                for total, plane in zip(totals, planes, strict=True)
+            ]
+
+        zero = dr.zeros(grid.Float, dr.width(self._first))
+        return list(grid.accumulate(dr.width(self._weights), [zero] * len(planes), add))
+
+    def _index(self, j: Any) -> Any:
+        return self._first + j * self._stride
 
     def pixels(self, grid: Grid) -> Any:
         """Return the indices of all pixels in any of the lines, in ascending order."""
         dr.eval(self._first, self._count)
         touched = dr.zeros(grid.Bool, grid.count)
-        for step in range(len(self._weights)):
+        for step in range(dr.width(self._weights)):
             j = dr.opaque(grid.Int, step)  # every step is a launch of its own, of the same kernel
-            dr.scatter(touched, grid.Bool(True), self._first + j * self._stride, active=j < self._count)
+            dr.scatter(touched, grid.Bool(True), self._index(j), active=j < self._count)
         return grid.Int(dr.compress(touched))

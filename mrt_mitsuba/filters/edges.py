@@ -177,7 +177,7 @@ def geometry_edges(
     hit = (distance > 0) & (distance < math.inf)
     bad = dr.isnan(distance) | (hit & ~finite(normals))
     inverse = dr.select(bad, math.inf, dr.select(hit, 1 / distance, 0))
-    dr.eval(inverse, normals)  # in one kernel; reading neighbours needs them evaluated
+    dr.eval(inverse, normals)  # in one kernel
     near = _Neighbourhood(grid, inverse)
     step = _depth_measure(near.window) / grid.opaque(depth_step)
     crease = _crease_measure(near, normals) / grid.opaque(1 - math.cos(math.radians(crease_angle)))
@@ -206,6 +206,7 @@ class _Neighbourhood:
 
     def of(self, plane: Any) -> list[Any]:
         """Return the nine values of another plane."""
+        dr.eval(plane)  # computed once for each pixel, not once for each of the nine that read it
         return [self.at(plane, dx, dy) for dx, dy in _OFFSETS]
 
     def weighted_sum(self, plane: Any, weights: Sequence[float]) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -71,6 +71,29 @@ class Grid:
         """Return column and row of pixels given by their index."""
         row = index // self.width
         return index - row * self.width, row
+
+    def table(self, values: Sequence[float]) -> Any:
+        """Return numbers to be looked up in a loop."""
+        return self.Float(list(values))
+
+    def accumulate(
+        self, count: int, totals: Sequence[Any], add: Callable[[Any, Sequence[Any]], Sequence[Any]]
+    ) -> Sequence[Any]:
+        """Return ``totals`` after ``totals = add(j, totals)`` for j from 0 to ``count − 1``.
+
+        One loop inside the kernel, so that its length makes no new kernel and its text stays short;
+        ``drjit.scalar`` has no kernels and loops here.
+        """
+        if not dr.is_jit_v(self.Float):
+            for j in range(count):
+                totals = add(j, totals)
+            return totals
+        end = dr.opaque(self.Int, count)
+        return dr.while_loop(
+            (self.Int(0), *totals),
+            lambda j, *_: j < end,
+            lambda j, *totals: (j + 1, *add(j, totals)),
+        )[1:]
 
     def output(self, planes: Sequence[Any], channels: Sequence[int] = ()) -> Any:
         """Return planes as one array [rows, columns, *channels] of the kind that the filter was given.

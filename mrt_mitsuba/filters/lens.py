@@ -61,7 +61,7 @@ def _offsets(max_radius: float) -> list[tuple[int, int]]:
     return [(dx, dy) for dy in steps for dx in steps if math.hypot(dx, dy) < max_radius + 1]
 
 
-def _coverage(radius: Any, distance: float) -> Any:
+def _coverage(radius: Any, distance: Any) -> Any:
     return dr.clip(radius + (1 - distance), 0, 1)
 
 
@@ -71,14 +71,13 @@ def _spread(radius: Any, offsets: Sequence[tuple[int, int]]) -> Any:
     return sum(number * _coverage(radius, distance) for distance, number in sorted(distances.items()))
 
 
-def _clamped(grid: Grid, column: Any, row: Any, dx: int, dy: int) -> Any:
+def _clamped(grid: Grid, column: Any, row: Any, dx: Any, dy: Any) -> Any:
     """Return the index of a neighbour, with the border pixels repeated outside."""
     return dr.clip(row + dy, 0, grid.height - 1) * grid.width + dr.clip(column + dx, 0, grid.width - 1)
 
 
 def _near_any(grid: Grid, mask: Any, reach: int) -> Any:
-    """Return where the mask is set within ``reach`` columns and rows: a pass along rows and one along
-    columns."""
+    """Return where the mask is set within ``reach`` columns and rows, in a pass along either."""
     column, row = grid.coordinates(grid.index)
     steps = range(-reach, reach + 1)
 
@@ -100,16 +99,18 @@ def _gather_layers(
     share: Any,
     pixels: Any,
     offsets: Sequence[tuple[int, int]],
-) -> tuple[list[Any], list[Any], list[Any]]:
-    """Return the weighted sums of red, green, blue and 1 for what is in front, in the same layer and
-    behind."""
+) -> tuple[Sequence[Any], Sequence[Any], Sequence[Any]]:
+    """Return the weighted sums of red, green, blue and 1: in front, in the same layer, behind."""
     column, row = grid.coordinates(pixels)
     own_radius = dr.gather(grid.Float, radius, pixels)
     own_share = dr.gather(grid.Float, share, pixels)
-    layers: list[list[Any]] = [[grid.Float(0)] * 4 for _ in range(3)]
-    for dx, dy in offsets:
-        distance = math.hypot(dx, dy)
-        index = _clamped(grid, column, row, dx, dy)
+    steps = [
+        grid.table(step) for step in zip(*((dx, dy, math.hypot(dx, dy)) for dx, dy in offsets), strict=True)
+    ]
+
+    def add(j: Any, totals: Sequence[Any]) -> list[Any]:
+        dx, dy, distance = (dr.gather(grid.Float, table, j) for table in steps)
+        index = _clamped(grid, column, row, grid.Int(dx), grid.Int(dy))
         their_radius = dr.gather(grid.Float, radius, index)
         light = dr.gather(grid.Float, share, index)
         order = their_radius - own_radius
@@ -122,11 +123,11 @@ def _gather_layers(
             seen * dr.clip(order, 0, 1),
         )
         values = [dr.gather(grid.Float, colour, index) for colour in colours] + [1]
-        layers = [
-            [total + weight * value for total, value in zip(layer, values, strict=True)]
-            for layer, weight in zip(layers, weights, strict=True)
-        ]
-    return layers[0], layers[1], layers[2]
+        terms = [weight * value for weight in weights for value in values]
+        return [total + term for total, term in zip(totals, terms, strict=True)]
+
+    totals = grid.accumulate(len(offsets), [dr.zeros(grid.Float, dr.width(pixels))] * 12, add)
+    return totals[:4], totals[4:8], totals[8:]
 
 
 def _composite(front: Sequence[Any], same: Sequence[Any], behind: Sequence[Any]) -> list[Any]:
