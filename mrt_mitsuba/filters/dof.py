@@ -51,9 +51,10 @@ def blur_amount(depth: Any, *, focal_distance: float | None, focal_range: float 
     """
     grid = Grid(depth)
     distance = grid.plane(depth, "depth")
-    if not _enabled(focal_distance, focal_range):
+    focus = _focus(focal_distance, focal_range)
+    if focus == 0:
         return grid.output([dr.zeros(grid.Float, grid.count)])
-    return grid.output([_amount(grid, distance, focal_distance, focal_range)])
+    return grid.output([_amount(grid, distance, focus, focal_range)])
 
 
 def gaussian_dof(
@@ -81,30 +82,32 @@ def gaussian_dof(
     """
     if mode not in MODES:
         raise UsageError(f"unknown depth-of-field mode {mode!r}; use one of {', '.join(MODES)}")
-    if not _enabled(focal_distance, focal_range):
+    focus = _focus(focal_distance, focal_range)
+    if focus == 0:
         return image
     grid = Grid(image)
     planes = grid.planes(image, "image")
     distance = grid.plane(depth, "depth")
-    amount = _amount(grid, distance, focal_distance, focal_range)
+    amount = _amount(grid, distance, focus, focal_range)
     if mode == "report":
         blurred = _report(grid, planes, amount)
     else:
-        near = (distance > 0) & (distance < grid.opaque(focal_distance))
+        near = (distance > 0) & (distance < grid.opaque(focus))
         radius = _radius(amount)
         blurred = gather_discs(grid, planes, dr.select(near, -radius, radius), max_radius=_radius(MAX_AMOUNT))
     return grid.output(blurred, (3,))
 
 
-def _enabled(focal_distance: float | None, focal_range: float) -> bool:
+def _focus(focal_distance: float | None, focal_range: float) -> float:
+    """Return the focal distance, or 0 for a filter that is off."""
     for name, value in (("focal_distance", focal_distance), ("focal_range", focal_range)):
         if value is not None and math.isnan(value):
             raise UsageError(f"{name} is not a number; give one")
-    return focal_distance is not None and focal_distance > 0
+    return max(focal_distance or 0.0, 0.0)
 
 
-def _amount(grid: Grid, distance: Any, focal_distance: float, focal_range: float) -> Any:
-    amount = dr.abs(grid.opaque(focal_distance) - distance) - grid.opaque(focal_range)
+def _amount(grid: Grid, distance: Any, focus: float, focal_range: float) -> Any:
+    amount = dr.abs(grid.opaque(focus) - distance) - grid.opaque(focal_range)
     amount = dr.select(amount > 0, dr.minimum(amount, MAX_AMOUNT), 0)  # NaN > 0 is false
     return dr.select((distance <= 0) | (distance == math.inf), MAX_AMOUNT, amount)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -72,7 +72,7 @@ class Grid:
         row = index // self.width
         return index - row * self.width, row
 
-    def table(self, values: Sequence[float]) -> Any:
+    def table(self, values: Iterable[float]) -> Any:
         """Return numbers to be looked up in a loop."""
         return self.Float(list(values))
 
@@ -109,10 +109,9 @@ class Grid:
         if self._kind is np.ndarray:
             return np.array(flat).reshape(shape)
         dr.eval(flat)
-        wanted = dr.float32_array_t(self._kind)
-        if dr.is_mask_v(flat):
-            return dr.mask_t(wanted)(dr.mask_t(self._tensor)(flat, shape))
-        return wanted(self._tensor(flat, shape))
+        kinds: tuple[Any, Any] = (self._tensor, dr.float32_array_t(self._kind))  # ours, the caller's
+        ours, theirs = map(dr.mask_t, kinds) if dr.is_mask_v(flat) else kinds
+        return theirs(ours(flat, shape))
 
 
 def finite(planes: Sequence[Any]) -> Any:
