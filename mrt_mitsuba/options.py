@@ -214,7 +214,11 @@ class Options:
     motion: tuple[float, float, float] | None = option(
         None, vector(), "motion blur: how far the camera moves", "none"
     )
-    motionsamples: int = option(16, integer(1, 65536), "renders averaged for motion blur")
+    motionsamples: int = option(16, integer(1, 65536), "moments at which motion blur sees the scene")
+    motionmode: str = option(
+        "frames", choice("frames", "stratified"), "motion blur: a render for each moment, or one for all"
+    )
+    spp: int = option(1, integer(1, 65536), "rays for each sample, where the integrator is random")
     memory: int | None = option(
         None, size(), "memory to stay within: a number, with K, M, G or T for a unit", "half of what is free"
     )
@@ -267,8 +271,9 @@ def parse(arguments: Sequence[str]) -> Options:
         values[name] = _value(name, text)
     if "scene" in values and "scene_number" in values:
         raise UsageError(f"both SCENE {values['scene_number']} and scene={values['scene']}: give one of them")
-    if "motionsamples" in values and "motion" not in values:
-        raise UsageError("motionsamples is of use only with motion=dx,dy,dz")
+    for name in ("motionsamples", "motionmode"):
+        if name in values and "motion" not in values:
+            raise UsageError(f"{name} is of use only with motion=dx,dy,dz")
     if "scene" in values:
         values = dict.fromkeys(DECIDED_BY_FILE) | values
     if "layers=all" in rest and values.get("aamode") == "none":

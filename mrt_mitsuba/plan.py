@@ -31,7 +31,8 @@ class Plan:
     detector: str | None  # edge detector, or None: every pixel gets all samples at once
     blur: str | None  # depth-of-field mode
     repeats: int  # rays for each sample
-    motion_samples: int  # frames averaged
+    motion: str | None  # "frames", "stratified", or None where the camera stands still
+    motion_samples: int  # moments while the shutter is open
     count_rays: bool
     layers: frozenset[str]  # asked for
     traced_layers: frozenset[str]  # what the tracing kernels return beside the picture
@@ -75,7 +76,9 @@ def make_plan(
     layers: frozenset[str],
     count_rays: bool,
     repeats: int,
+    motion: str | None,
     motion_samples: int,
+    random: bool,
     features: Features,
 ) -> Plan:
     """Decide what to trace and what to leave out. ``layers``: asked for; ``features``: of scene and integrator."""
@@ -105,9 +108,11 @@ def make_plan(
         left_out.append(Omission(f"layers {', '.join(skipped)}", "not asked for"))
     return Plan(
         scene=scene, variant=variant, integrator=integrator, width=width, height=height, lattice=lattice,
-        detector=detector, blur=blur, repeats=repeats, motion_samples=motion_samples, count_rays=count_rays, layers=layers,
+        detector=detector, blur=blur, repeats=repeats, motion=motion, motion_samples=motion_samples if motion else 1,
+        count_rays=count_rays, layers=layers,
         traced_layers=frozenset(traced), kernel=features.kernel,
-        passes=tuple(_passes(lattice, detector, blur, repeats, motion_samples)), left_out=tuple(left_out))
+        passes=(*_motion_pass(motion, motion_samples), *_passes(lattice, detector, blur, repeats, random)),
+        left_out=tuple(left_out))
 
 
 def _check_layers(layers: frozenset[str], features: Features, aamode: str, integrator: str) -> None:
@@ -118,13 +123,21 @@ def _check_layers(layers: frozenset[str], features: Features, aamode: str, integ
         raise UsageError(f"layers={','.join(missing)}: {integrator} does not tell; mrt_whitted does")
 
 
-def _passes(lattice: Lattice, detector: str | None, blur: str | None, repeats: int, frames: int) -> list[str]:
+def _motion_pass(motion: str | None, moments: int) -> list[str]:
+    if motion is None:
+        return []
+    return [f"motion blur: {moments} frames" if motion == "frames" else f"motion blur: at least {moments} moments in a pixel"]
+
+
+def _passes(lattice: Lattice, detector: str | None, blur: str | None, repeats: int, random: bool) -> list[str]:
     times = f", {repeats} rays each" if repeats > 1 else ""
-    passes = [f"motion blur: {frames} times"] if frames > 1 else []
+    passes = []
     if detector is None:
         passes += [f"{lattice.count} samples a pixel{times}"]
     else:
-        passes += [f"1 sample a pixel{times}", f"edges: {detector}"]
+        blind = random and repeats == 1 and detector in ("luma", "sobel")
+        doubt = ", in which noise counts as edges: one random ray tells no noise, spp=2 does" if blind else ""
+        passes += [f"1 sample a pixel{times}", f"edges: {detector}{doubt}"]
     if detector is not None and lattice.count > 1:
         further = lattice.count - 1 if lattice.holds_centre else lattice.count
         passes += [f"{further} further samples in edge pixels{times}"]

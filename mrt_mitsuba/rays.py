@@ -1,7 +1,8 @@
-"""Where in a pixel the samples lie, and the camera rays through them."""
+"""Where in a pixel, and when, the samples lie."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -45,6 +46,35 @@ class Lattice:
 
 
 @dataclass(frozen=True)
+class Shutter:
+    """When the rays of a pixel are traced, the shutter being open from time 0 to 1.
+
+    The time is divided into ``moments`` equal parts, and successive rays of a pixel go to different parts, far from each
+    other, so that place and time do not go together. ``phase``: where in its part a ray is, 0 to 1; None: at a random
+    place, the same for all rays of a pixel and another for the next pixel, which turns steps into noise.
+    """
+
+    moments: int
+    phase: float | None = None
+    seed: int = 0
+
+    @property
+    def stride(self) -> int:
+        """Parts from one ray to the next: without a common divisor, near the golden section of all."""
+        golden = round(self.moments * (math.sqrt(5) - 1) / 2)
+        return next(s for s in range(max(golden, 1), self.moments + 2) if math.gcd(s, self.moments) == 1)
+
+    def time(self, rest: Any, pixel: Any, moments: Any, stride: Any, phase: Any) -> Any:
+        """Of ray number ``rest`` of a pixel; the last three are the shutter's own, ``phase`` the seed where it is None."""
+        import mitsuba as mi
+
+        part = mi.UInt64(rest) * stride % moments
+        if self.phase is None:
+            phase = mi.sample_tea_float32(pixel, phase)
+        return (mi.Float(part) + phase) / mi.Float(moments)
+
+
+@dataclass(frozen=True)
 class Bundle:
     """Samples ``first`` to ``first + count - 1`` of some pixels, each traced ``repeats`` times.
 
@@ -57,6 +87,7 @@ class Bundle:
     first: int = 0
     count: int = 1
     repeats: int = 1
+    shutter: Shutter | None = None  # None: all at time 0
 
     @property
     def rays_per_pixel(self) -> int:
@@ -85,23 +116,34 @@ class Bundle:
         # Sizes are data, not constants: another picture size needs no other kernel
         width, height, repeats, first, aa = (
             dr.opaque(mi.UInt32, n) for n in (width, height, self.repeats, self.first, self.lattice.aa))
-        return self._samples(lane, order, pixel, lane - order * per_pixel, width, height, repeats, first, aa)
+        shutter = self._shutter_numbers(dr.opaque) if self.shutter else ()
+        return self._samples(lane, order, pixel, lane - order * per_pixel, width, height, repeats, first, aa, shutter)
 
     def each_sample(self, width: int, height: int) -> Iterator[Samples]:
         """The same, one ray at a time, for scalar variants."""
+        shutter = self._shutter_numbers(lambda kind, value: kind(value)) if self.shutter else ()
         for lane in range(self.ray_count):
             order, rest = divmod(lane, self.rays_per_pixel)
             yield self._samples(lane, order, int(self.pixels[order]), rest, width, height, self.repeats, self.first,
-                                self.lattice.aa)
+                                self.lattice.aa, shutter)
 
-    def _samples(self, lane, order, pixel, rest, width, height, repeats, first, aa) -> Samples:
+    def _shutter_numbers(self, number: Any) -> tuple[Any, Any, Any]:
+        """What ``Shutter.time`` needs, each made by ``number(type, value)``."""
+        import mitsuba as mi
+
+        shutter = self.shutter
+        phase = number(mi.UInt32, shutter.seed) if shutter.phase is None else number(mi.Float, shutter.phase)
+        return number(mi.UInt64, shutter.moments), number(mi.UInt64, shutter.stride), phase
+
+    def _samples(self, lane, order, pixel, rest, width, height, repeats, first, aa, shutter) -> Samples:
         import mitsuba as mi
 
         row = pixel // width
         x, y = self.lattice.offset(rest // repeats + first, aa)
         place = mi.Point2f((mi.Float(pixel - row * width) + x) / mi.Float(width),
                            (mi.Float(row) + y) / mi.Float(height))
-        return Samples(lane=lane, order=order, is_first=rest == 0, place=place)
+        time = self.shutter.time(rest, pixel, *shutter) if self.shutter else mi.Float(0)
+        return Samples(lane=lane, order=order, is_first=rest == 0, place=place, time=time)
 
 
 @dataclass(frozen=True)
@@ -109,10 +151,11 @@ class Samples:
     """Rays of a bundle before they are rays.
 
     ``lane``: the ray's number; ``order``: its pixel's place in the bundle; ``is_first``: is it its pixel's first; ``place``:
-    on the film, x to the right, y down, the picture being [0, 1]².
+    on the film, x to the right, y down, the picture being [0, 1]²; ``time``: from 0, when the shutter opens, to 1.
     """
 
     lane: Any
     order: Any
     is_first: Any
     place: Any
+    time: Any

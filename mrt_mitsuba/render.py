@@ -5,6 +5,7 @@ scene → plan → rays → integrator → filters → result; each step is a mo
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,16 +15,18 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba import options, runtime
-from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.memory import MOST_RAYS, rays_at_once
 from mrt_mitsuba.plan import Features, Plan, make_plan, stock_features, whitted_features
 from mrt_mitsuba.progress import Progress
-from mrt_mitsuba.rays import Bundle, Lattice
+from mrt_mitsuba.rays import Bundle, Lattice, Shutter
 from mrt_mitsuba.result import Result, Timings
 from mrt_mitsuba.source import Source, open_scene
 from mrt_mitsuba.trace import AVERAGED, FIRST_HIT, Camera, Tracer, WhittedTracer, trace_bundle
 
 CENTRE = Lattice("report", 1)
+
+# Layers that count rays, by the kind of ray
+SECONDARY_RAYS = {"mirror": "bounces", "shadow": "shadow_rays"}
 
 
 def render(
@@ -41,6 +44,7 @@ def render(
     layers: Sequence[str] = (),
     motion: Sequence[float] | None = None,
     motionsamples: int = 16,
+    motionmode: str = "frames",
     convention: str = "report",
     variant: str | None = None,
     memory: int | str | None = None,
@@ -63,13 +67,18 @@ def render(
         focaldist, focalrange: scene units; by default the scene's own; a distance of 0 turns the blur off.
         dof: "report" or "corrected", see ``filters.dof``.
         layers: names from ``output.LAYERS`` to return beside those that are free.
-        motion, motionsamples: the camera's way while the shutter is open, and the number of renders averaged.
+        motion, motionsamples: the camera's way while the shutter is open, and the number of moments at which it is seen.
+        motionmode: "frames" averages so many whole renders, as the report does; "stratified" is one render whose rays are
+            spread over the time the shutter is open: at least so many to a pixel, and no more than that where the lattice
+            has as many samples.
         convention: meaning of MTL files, "report" or "standard".
         variant: Mitsuba variant; by default the current one, else ``llvm_ad_rgb``.
         memory: bytes (or text such as "4G") to stay within.
         seed: for whatever is random.
         integrator: name, dict or instance of a sampling integrator; by default the scene's own.
-        spp: rays for each sample, for integrators that draw random numbers.
+        spp: rays for each sample, for integrators that draw random numbers. From 2 on, "luma" and "sobel" know the
+            variance of every pixel and take only for an edge what noise does not explain; with one random ray they take
+            noise for edges, and refine it ("geometry" does not).
         count_rays: count mirror and shadow rays.
         progress: told of plan, stages and progress.
 
@@ -93,15 +102,15 @@ def render(
             scene=source.name, variant=variant, integrator=_name(source.integrator), width=source.width,
             height=source.height, lattice=Lattice(given["lattice"], given["aa"]), aamode=given["aamode"],
             focal_distance=focus.distance, dof=given["dof"], layers=frozenset(given["layers"]),
-            count_rays=count_rays, repeats=_repeats(spp), motion_samples=given["motionsamples"] if motion else 1,
-            features=features)
+            count_rays=count_rays, repeats=given["spp"], motion=given["motionmode"] if given["motion"] else None,
+            motion_samples=given["motionsamples"], random=tracer.random, features=features)
         job.rays_at_once = rays_at_once(plan.width * plan.height, plan.channels, given["memory"])
         job.progress.plan(plan)
         load = time.perf_counter() - start
+        camera = Camera(source.sensor, source.width, source.height, given["motion"])
         frames = _Frames()
-        for offset in _offsets(given["motion"], plan.motion_samples):
-            camera = Camera(source.sensor, source.width, source.height, offset)
-            frames.add(_frame(job, tracer, camera, plan, focus, given["seed"]))
+        for exposure in _exposures(plan, given["seed"]):
+            frames.add(_frame(job, tracer, camera, plan, focus, exposure))
     timings = Timings(time.perf_counter() - start, load, job.compile, job.kernels, job.passes)
     shown = {name: value for name, value in given.items() if value is not None and name not in ("memory", "quiet")}
     return frames.result(plan, timings, job, shown)
@@ -118,12 +127,6 @@ class _Focus:
         return cls(distance or None, source.focal_range if reach is None else reach)
 
 
-def _repeats(spp: Any) -> int:
-    if isinstance(spp, bool) or not isinstance(spp, int) or spp < 1:
-        raise UsageError(f"spp={spp!r}: must be a whole number, 1 or more")
-    return spp
-
-
 def _tracer(source: Source) -> tuple[Tracer, Features]:
     if hasattr(source.integrator, "trace"):
         tracer = WhittedTracer(source.scene, source.integrator)
@@ -136,67 +139,113 @@ def _name(integrator: Any) -> str:
     return "mrt_whitted" if hasattr(integrator, "trace") else integrator.class_name()
 
 
-def _offsets(motion: Sequence[float] | None, count: int) -> list[tuple[float, ...]]:
-    """Where the camera is in each of the renders, relative to its own place."""
-    if motion is None:
-        return [(0.0, 0.0, 0.0)]
-    return [tuple(component * k / count for component in motion) for k in range(count)]
+# ----------------------------------------------- Motion blur -----------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Exposure:
+    """One picture while the shutter is open. ``frame``: which of the plan's frames, or None for all of the time."""
+
+    plan: Plan
+    seed: int
+    frame: int | None = None
+
+    def lattice(self, pixels: Any, *, first: int = 0) -> Bundle:
+        """The lattice's samples from ``first`` on."""
+        plan, count = self.plan, self.plan.lattice.count - first
+        if plan.motion == "stratified":
+            # every ray of a pixel in a part of its own
+            repeats = plan.repeats * math.ceil(plan.motion_samples / (count * plan.repeats))
+            return Bundle(pixels, plan.lattice, first, count, repeats, Shutter(count * repeats, seed=self.seed))
+        return Bundle(pixels, plan.lattice, first, count, plan.repeats * self._moments, self._shutter)
+
+    def centre(self, pixels: Any) -> Bundle:
+        """The pixel's centre alone, at the same times in every pixel: a detector must see no noise."""
+        return Bundle(pixels, CENTRE, repeats=self.plan.repeats * self._moments, shutter=self._shutter)
+
+    def first_hit(self, pixels: Any) -> Bundle:
+        """The pixel's centre when the shutter opens, or at the moment of the frame."""
+        still = self.plan.motion is None
+        return Bundle(pixels, CENTRE, shutter=None if still else Shutter(1, (self.frame or 0) / self.plan.motion_samples))
+
+    @property
+    def _moments(self) -> int:
+        return self.plan.motion_samples if self.frame is None else 1
+
+    @property
+    def _shutter(self) -> Shutter | None:
+        if self.plan.motion is None:
+            return None
+        if self.frame is not None:
+            return Shutter(1, self.frame / self.plan.motion_samples)
+        return Shutter(self._moments, 0.0 if self.plan.motion == "frames" else 0.5)
+
+
+def _exposures(plan: Plan, seed: int) -> list[_Exposure]:
+    """What to average: one picture, or the frames of a camera's way where each needs filters of its own."""
+    if plan.motion == "frames" and (plan.detector or plan.blur):
+        # two passes in a frame, each with random numbers of its own
+        return [_Exposure(plan, seed + 2 * frame, frame) for frame in range(plan.motion_samples)]
+    return [_Exposure(plan, seed)]
 
 
 # ------------------------------------------------ One frame ------------------------------------------------
 
 
-def _frame(job: _Job, tracer: Tracer, camera: Camera, plan: Plan, focus: _Focus, seed: int) -> dict[str, np.ndarray]:
+def _frame(job: _Job, tracer: Tracer, camera: Camera, plan: Plan, focus: _Focus,
+           exposure: _Exposure) -> dict[str, np.ndarray]:
     """One picture and its layers: name to [H W] or [H W, channels], before they get their shape."""
     pixels = range(camera.width * camera.height)
     wanted = plan.traced_layers | {"image"}
     if plan.detector is None:
-        layers = _all_samples(job, tracer, camera, plan, pixels, wanted, seed)
+        layers = _all_samples(job, tracer, camera, exposure, pixels, wanted)
         layers["samples"] = np.full(len(pixels), plan.lattice.count, np.float32)
     else:
-        layers = job.trace("Rendering", "", tracer, camera, Bundle(pixels, CENTRE, repeats=plan.repeats), wanted, seed)
-        edges = _detect(job, plan, layers)
+        bundle = exposure.centre(pixels)
+        layers = job.trace("Rendering", "", tracer, camera, bundle, wanted, exposure.seed)
+        edges = _detect(job, plan, layers, bundle.rays_per_pixel)
         layers["edges"] = edges.value.ravel()
         layers["samples"] = np.ones(len(pixels), np.float32)
         if plan.lattice.count > 1:
-            _refine(job, tracer, camera, plan, np.flatnonzero(edges.mask).astype(np.uint32), layers, seed)
+            _refine(job, tracer, camera, exposure, np.flatnonzero(edges.mask).astype(np.uint32), layers)
     if plan.blur:
         _blur(job, plan, focus, layers)
     return layers
 
 
-def _all_samples(job, tracer, camera, plan, pixels, wanted, seed) -> dict[str, np.ndarray]:
+def _all_samples(job, tracer, camera, exposure, pixels, wanted) -> dict[str, np.ndarray]:
     """Every sample of every pixel; layers of the first hit belong to the pixel's centre."""
-    bundle = Bundle(pixels, plan.lattice, count=plan.lattice.count, repeats=plan.repeats)
+    bundle, seed = exposure.lattice(pixels), exposure.seed
     at_centre = wanted & FIRST_HIT.keys()
-    if plan.lattice.holds_centre or not at_centre:
+    if exposure.plan.lattice.holds_centre or not at_centre:
         return job.trace("Rendering", "", tracer, camera, bundle, wanted, seed)
-    layers = job.trace("First hits", "", tracer, camera, Bundle(pixels, CENTRE), at_centre, seed)
+    layers = job.trace("First hits", "", tracer, camera, exposure.first_hit(pixels), at_centre, seed)
     return layers | job.trace("Rendering", "", tracer, camera, bundle, wanted - at_centre, seed)
 
 
-def _detect(job: _Job, plan: Plan, layers: dict[str, np.ndarray]) -> Any:
+def _detect(job: _Job, plan: Plan, layers: dict[str, np.ndarray], rays: int) -> Any:
+    """Look for edges in a picture of so many rays a pixel."""
     from mrt_mitsuba import filters
 
     shape = (plan.height, plan.width)
-    with job.timed("edges"):
+    with job.timed("edges"), job.progress.stage("Edges", plan.width * plan.height):
         if plan.detector == "geometry":
             return filters.geometry_edges(layers["normal"].reshape(*shape, 3), layers["depth"].reshape(shape))
         variance = None
         if "square" in layers:
-            spread = np.maximum(layers["square"] - layers["image"] ** 2, 0) / (plan.repeats - 1)
+            spread = np.maximum(layers["square"] - layers["image"] ** 2, 0) / (rays - 1)
             variance = spread.reshape(*shape, 3)
         detect = {"luma": filters.luma_edges, "sobel": filters.sobel_edges}[plan.detector]
         return detect(layers["image"].reshape(*shape, 3), variance=variance)
 
 
-def _refine(job, tracer, camera, plan, pixels, layers, seed) -> None:
+def _refine(job, tracer, camera, exposure, pixels, layers) -> None:
     """Add the lattice's other samples in the pixels given; the first sample is not traced again."""
-    lattice = plan.lattice
+    lattice = exposure.plan.lattice
     first = 1 if lattice.holds_centre else 0
-    bundle = Bundle(pixels, lattice, first=first, count=lattice.count - first, repeats=plan.repeats)
+    bundle = exposure.lattice(pixels, first=first)
     wanted = frozenset(name for name in layers if name in AVERAGED and name != "square")
-    more = job.trace("Anti-aliasing", "Computing Anti aliasing..", tracer, camera, bundle, wanted, seed + 1)
+    more = job.trace("Anti-aliasing", "Computing Anti aliasing..", tracer, camera, bundle, wanted, exposure.seed + 1)
     for name, values in more.items():
         layers[name][pixels] = (first * layers[name][pixels] + bundle.count * values) / np.float32(lattice.count)
     layers["samples"][pixels] = lattice.count
@@ -228,17 +277,23 @@ class _Job:
     progress: Progress
     rays_at_once: int = MOST_RAYS
     passes: dict[str, float] = field(default_factory=dict)
-    primary_rays: int = 0
+    rays: dict[str, int] = field(default_factory=lambda: {"primary": 0})
     launches: int = 0
     compile: float = 0.0
     kernels: float = 0.0
 
     def trace(self, title: str, message: str, tracer: Tracer, camera: Camera, bundle: Bundle, wanted: Any,
               seed: int) -> dict[str, np.ndarray]:
-        self.primary_rays += bundle.ray_count
         with self.timed(title.lower()), self.progress.stage(title, len(bundle.pixels), message) as advance:
-            return trace_bundle(tracer, camera, bundle, wanted, seed=seed, advance=advance,
-                                rays_at_once=self.rays_at_once)
+            layers = trace_bundle(tracer, camera, bundle, wanted, seed=seed, advance=advance,
+                                  rays_at_once=self.rays_at_once)
+        self.rays["primary"] += bundle.ray_count
+        for kind, name in SECONDARY_RAYS.items():
+            if name in layers:
+                # means over the pixel's rays, counted in float32 ones: exact to 2^24 for each pixel
+                count = round(bundle.rays_per_pixel * float(np.sum(layers[name], dtype=np.float64)))
+                self.rays[kind] = self.rays.get(kind, 0) + count
+        return layers
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
@@ -279,15 +334,8 @@ class _Frames:
     def result(self, plan: Plan, timings: Timings, job: _Job, given: Mapping[str, Any]) -> Result:
         layers = {name: values / np.float32(self.count) if name in AVERAGED and self.count > 1 else values
                   for name, values in self.sum.items()}
-        rays = {"primary": job.primary_rays}
-        if plan.count_rays:
-            # means over the pixel's rays, counted in float32 ones: exact to 2^24 for each pixel
-            samples = np.float64(plan.repeats) * layers["samples"].astype(np.float64)
-            for kind, name in (("mirror", "bounces"), ("shadow", "shadow_rays")):
-                if name in layers:
-                    rays[kind] = round(self.count * float(np.sum(layers[name] * samples)))
         image = layers.pop("image").reshape(plan.height, plan.width, 3)
-        return Result(image, _channels(plan, layers), plan, timings, rays, job.launches, given)
+        return Result(image, _channels(plan, layers), plan, timings, job.rays, job.launches, given)
 
 
 def _channels(plan: Plan, layers: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -28,7 +28,7 @@ class Camera:
     sensor: Any
     width: int
     height: int
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the camera's way since the shutter opened
+    motion: tuple[float, float, float] | None = None  # the camera's way from time 0 to 1
 
     def rays(self, samples: Samples, sampler: Any) -> tuple[Any, Any]:
         """Rays through some places on the film, and their weights."""
@@ -36,10 +36,16 @@ class Camera:
 
         aperture = sampler.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
         wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
-        ray, weight = self.sensor.sample_ray(mi.Float(0), wavelength, samples.place, aperture)
+        ray, weight = self.sensor.sample_ray(mi.Float(samples.time), wavelength, samples.place, aperture)
         ray = mi.Ray3f(ray)
-        ray.o += mi.Vector3f(_opaque(mi.Vector3f, self.offset))
+        if self.motion is not None:
+            ray.o += self._way(samples.time)
         return ray, weight
+
+    def _way(self, time: Any) -> Any:
+        import mitsuba as mi
+
+        return mi.Vector3f(_opaque(mi.Vector3f, self.motion)) * time
 
     def distance(self, si: Any) -> Any:
         """Distance of a hit from the eye; along the ray where the sensor has no single eye."""
@@ -49,7 +55,9 @@ class Camera:
         if self.sensor.class_name() not in ("PerspectiveCamera", "ThinLensCamera"):
             return si.t
         # not si.t: rays start at the near plane
-        eye = self.sensor.world_transform().translation() + mi.Vector3f(_opaque(mi.Vector3f, self.offset))
+        eye = mi.Point3f(self.sensor.world_transform().translation())
+        if self.motion is not None:
+            eye += self._way(si.time)
         return dr.norm(si.p - eye)
 
 
@@ -63,15 +71,14 @@ def trace_bundle(
     advance: Callable[[int], object] = lambda pixels: None,
     rays_at_once: int = MOST_RAYS,
 ) -> dict[str, np.ndarray]:
-    """Trace a bundle; return ``image`` [pixels, 3] and each wanted layer [pixels] or [pixels, 3], float32.
+    """Trace a bundle; return each wanted layer, [pixels] or [pixels, 3], float32.
 
-    ``wanted``: names from ``FIRST_HIT`` and ``AVERAGED``. ``advance`` is called with the number of pixels just done.
+    ``wanted``: names from ``FIRST_HIT`` and ``AVERAGED``; nothing else is computed. ``advance`` is called with the number of pixels just done.
     The result does not depend on ``rays_at_once``, but for integrators that draw random numbers.
     """
     import mitsuba as mi
 
-    names = {"image", *wanted}
-    sizes = {name: size for name, size in (FIRST_HIT | AVERAGED).items() if name in names}
+    sizes = {name: size for name, size in (FIRST_HIT | AVERAGED).items() if name in wanted}
     result = {name: np.zeros((len(bundle.pixels), size), np.float32) for name, size in sizes.items()}
     run = _trace_scalar if mi.variant().startswith("scalar") else _trace_wavefront
     step = max(1, rays_at_once // bundle.rays_per_pixel)
@@ -130,7 +137,8 @@ def _trace_scalar(tracer, camera, bundle, sizes, seed) -> dict[str, np.ndarray]:
 
 def _shade(tracer, camera, samples, sampler, sizes) -> dict[str, Any]:
     ray, weight = camera.rays(samples, sampler)
-    return tracer.trace(camera, ray, weight, sampler, sizes.keys())
+    values = tracer.trace(camera, ray, weight, sampler, sizes.keys())
+    return {name: values[name] for name in sizes}
 
 
 def _planes(value: Any) -> list[Any]:

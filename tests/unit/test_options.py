@@ -128,6 +128,9 @@ BAD = [
     ("width=3 1", "unexpected argument '1'"),
     ("1 scene=a.xml", "both SCENE 1 and scene=a.xml"),
     ("motionsamples=4", "only with motion"),
+    ("motionmode=stratified", "only with motion"),
+    ("motion=1,0,0 motionmode=both", "frames or stratified"),
+    ("spp=0", "whole number"),
     ("-1", "SCENE -1: must be 0, 1,"),
     ("99", "SCENE 99: must be 0, 1, 2, 3, 4"),
     ("1.0", "must be 0, 1,"),
@@ -165,7 +168,7 @@ def test_refused_file_names(arguments: list[str], text: str) -> None:
 @given(st.sampled_from(sorted(options.TABLE)), st.text(max_size=20))
 def test_any_text_is_taken_or_refused_in_one_line(name: str, text: str) -> None:
     """Whatever is typed, the answer is a value that the table's own check accepts, or a UsageError."""
-    extra = ["motion=1,0,0"] if name == "motionsamples" else []
+    extra = ["motion=1,0,0"] if name.startswith("motion") and name != "motion" else []
     try:
         value = getattr(parse(["out", f"{name}={text}", *extra]), name)
     except UsageError as error:

@@ -1,0 +1,200 @@
+"""Motion blur: frames averaged, and rays spread over the time the shutter is open."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.rays import Bundle, Lattice, Shutter
+from mrt_mitsuba.scenes import report_scene
+
+SMALL = {"width": 96, "height": 72, "focaldist": 0}
+WAY = (0.3, 0.1, 0.4)
+
+
+@pytest.fixture(autouse=True)
+def llvm():
+    mrt.register()
+    mi.set_variant("llvm_ad_rgb")
+
+
+def _shifted(number: int, way: tuple[float, ...]):
+    scene = report_scene(number)
+    camera = scene.camera
+    position, target = (tuple(np.add(point, way)) for point in (camera.position, camera.target))
+    return dataclasses.replace(scene, camera=dataclasses.replace(camera, position=position, target=target))
+
+
+def _times(shutter: Shutter, pixels: int = 64, lattice: int = 4, repeats: int = 1) -> np.ndarray:
+    """Times of all rays, [pixels, rays of a pixel]."""
+    bundle = Bundle(range(pixels), Lattice("report", lattice), count=lattice**2, repeats=repeats, shutter=shutter)
+    return np.array(bundle.samples(8, pixels // 8).time).reshape(pixels, -1)
+
+
+# ------------------------------------------------- Times -------------------------------------------------
+
+
+@settings(max_examples=40)
+@given(lattice=st.integers(1, 9), repeats=st.integers(1, 5), seed=st.integers(0, 2**32 - 1))
+def test_every_ray_of_a_pixel_has_a_part_of_the_time_of_its_own(lattice, repeats, seed):
+    moments = lattice**2 * repeats
+    times = _times(Shutter(moments, seed=seed), lattice=lattice, repeats=repeats)
+    assert times.min() >= 0 and times.max() <= 1
+    parts = np.sort(np.floor(times * moments - (times * moments % 1).mean(axis=1, keepdims=True) + 0.5), axis=1)
+    np.testing.assert_array_equal(parts - parts[:, :1], np.tile(np.arange(moments), (64, 1)))
+
+
+@pytest.mark.parametrize("aa", [3, 4, 5, 8])
+def test_place_and_time_do_not_go_together(aa):
+    """A moving edge needs all places at all times; the diagonal order would correlate by 0.97 (rows) or so."""
+    times = _times(Shutter(aa**2, 0.5), lattice=aa)[0]
+    i, j = np.divmod(np.arange(aa**2), aa)
+    for places in (i, j, i + j, i - j):
+        assert abs(np.corrcoef(places, times)[0, 1]) < 0.35
+
+
+def test_pixels_have_other_times_than_their_neighbours_and_others_with_another_seed():
+    first, second = _times(Shutter(16, seed=1)), _times(Shutter(16, seed=2))
+    assert len(np.unique(first[:, 0])) == 64
+    assert (first != second).all()
+    # the mean of 1024 stratified times: 1/16 / sqrt(12 * 64 pixels) = 0.0023 of deviation
+    assert first.mean() == pytest.approx(0.5, abs=0.01)
+
+
+def test_frames_are_at_multiples_and_start_when_the_shutter_opens():
+    times = _times(Shutter(5, 0.0), repeats=5)
+    assert (times[:, 0] == 0).all()
+    for sample in times.reshape(-1, 5):
+        np.testing.assert_allclose(np.sort(sample), [0, 0.2, 0.4, 0.6, 0.8], atol=1e-7)
+
+
+def test_scalar_variants_have_the_same_times():
+    fast = _times(Shutter(16, seed=3), pixels=8)
+    mi.set_variant("scalar_rgb")
+    bundle = Bundle(range(8), Lattice("report", 4), count=16, shutter=Shutter(16, seed=3))
+    slow = np.array([sample.time for sample in bundle.each_sample(8, 1)]).reshape(8, 16)
+    # float32 against double of the same integers
+    np.testing.assert_allclose(slow, fast, atol=1e-6)
+
+
+# ------------------------------------------------- Frames -------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [
+    {"aa": 2, "aamode": "none"},
+    {"aa": 2, "aamode": "sobel"},
+    {"aa": 2, "aamode": "none", "focaldist": 2.0, "focalrange": 0.5},
+    {"aa": 2, "aamode": "luma", "lattice": "centered"},
+])
+def test_frames_are_the_mean_of_renders_from_shifted_cameras(options):
+    """One wavefront, frame after frame, with filters: always what the report does."""
+    blurred = mrt.render(0, **{**SMALL, **options}, motion=WAY, motionsamples=3)
+    frames = [mrt.render(_shifted(0, np.multiply(WAY, k / 3)), **{**SMALL, **options}) for k in range(3)]
+    difference = np.abs(blurred.image - np.mean([frame.image for frame in frames], axis=0))
+    # the same rays up to float32 rounding of their origins; edges may flip in single pixels
+    assert np.median(difference) < 1e-6 and difference.mean() < 1e-3
+    assert blurred.rays["primary"] == pytest.approx(sum(frame.rays["primary"] for frame in frames), rel=1e-3)
+
+
+def test_frames_without_filters_are_one_wavefront():
+    still = {**SMALL, "aa": 2, "aamode": "none"}
+    mrt.render(0, **still, motion=WAY)
+    many = mrt.render(0, **still, motion=WAY)
+    # one kernel for all rays, one or two for the means; loading a scene may fill small tables
+    assert many.kernel_launches <= 6
+    assert many.rays["primary"] == 16 * 4 * 96 * 72
+
+
+def test_random_frames_draw_numbers_of_their_own():
+    """A camera that stands still: n frames are n times the rays, and the noise falls by √n."""
+    scene = mi.load_dict(mrt.scene_dict(0, width=48, height=36, flavor="stock"))
+    light = {"type": "path", "max_depth": 4}
+
+    def noise(frames: int, aamode: str) -> float:
+        options = {"integrator": light, "aa": 1, "aamode": aamode, "layers": ["edges"] if aamode != "none" else []}
+        moving = {"motion": (0, 0, 0), "motionsamples": frames}
+        first, second = (mrt.render(scene, **options, **moving, seed=seed).image for seed in (11, 5000))
+        return float(np.sqrt(np.mean((first - second) ** 2)))
+
+    for aamode in ("none", "luma"):
+        # a quarter of the noise; the ratio of two deviations over 5184 values is good to 3 %
+        assert noise(16, aamode) == pytest.approx(noise(1, aamode) / 4, rel=0.15)
+
+
+# ----------------------------------------------- Stratified -----------------------------------------------
+
+
+def test_stratified_rays_cost_no_more_than_a_still_picture():
+    still = mrt.render(0, **SMALL, aa=4, aamode="none")
+    moving = mrt.render(0, **SMALL, aa=4, aamode="none", motion=WAY, motionsamples=16, motionmode="stratified")
+    assert moving.rays["primary"] == still.rays["primary"]
+    more = mrt.render(0, **SMALL, aa=4, aamode="none", motion=WAY, motionsamples=17, motionmode="stratified")
+    assert more.rays["primary"] == 2 * still.rays["primary"]
+
+
+@pytest.mark.parametrize(("aamode", "lattice", "moments"), [
+    ("none", "report", 64), ("none", "centered", 64), ("sobel", "report", 16)])
+def test_stratified_and_frames_agree(aamode, lattice, moments):
+    """Both integrate over the same time; frames are half a step behind. What is left is noise."""
+    options = {**SMALL, "aa": 4, "aamode": aamode, "lattice": lattice, "motion": WAY, "motionsamples": moments}
+    frames = mrt.render(1, **options, motionmode="frames")
+    stratified = mrt.render(1, **options, motionmode="stratified")
+    still = mrt.render(1, **{**options, "motion": None})
+    difference = stratified.image - frames.image
+    blur = np.abs(still.image - frames.image).mean()
+    # half a step of the way, and stratification noise of the same order; measured 1.3 to 2.4 over moments
+    assert np.abs(difference).mean() < 4 / moments * blur
+    # no bias but the lag, which moves features and hardly the mean
+    assert abs(difference.mean()) < 0.5 / moments * blur
+    assert stratified.rays["primary"] < 0.3 * frames.rays["primary"]
+
+
+def test_stratified_error_falls_faster_than_random_times_would():
+    """Strata: between 1/n (smooth) and 1/n^0.75 (edges) in the error; independent times would give 1/√n."""
+    options = {**SMALL, "aa": 1, "aamode": "none", "motion": WAY}
+    truth = mrt.render(0, **options, motionsamples=512, motionmode="stratified", seed=99).image
+    counts = np.array([4, 16, 64])
+    errors = [np.sqrt(np.mean((mrt.render(0, **options, motionsamples=int(n), motionmode="stratified").image - truth) ** 2))
+              for n in counts]
+    slope = np.polyfit(np.log(counts), np.log(errors), 1)[0]
+    assert -1.2 < slope < -0.6
+
+
+def test_a_detector_sees_no_noise_in_a_stratified_picture():
+    """Unrefined pixels are the centre at n moments, the same in every pixel."""
+    options = {**SMALL, "aa": 2, "motion": WAY, "motionsamples": 8, "motionmode": "stratified"}
+    result = mrt.render(0, **options, aamode="luma")
+    refined = result.layers["samples.Y"] > 1
+    assert 0 < refined.sum() < refined.size
+    assert result.rays["primary"] == 8 * 96 * 72 + refined.sum() * 3 * 3  # three samples, at nine moments
+    other_seed = mrt.render(0, **options, aamode="luma", seed=5)
+    np.testing.assert_array_equal(result.layers["edges.Y"], other_seed.layers["edges.Y"])
+
+
+def test_depth_is_that_of_the_moment_when_the_shutter_opens():
+    options = {**SMALL, "aa": 2, "aamode": "none", "layers": ["depth"], "motion": WAY, "motionsamples": 4}
+    cases = (("frames", "report", 1e-4), ("frames", "centered", 1e-4), ("stratified", "centered", 1e-4),
+             ("stratified", "report", 0.15))  # somewhere in the first quarter of the way, 0.5 long
+    for mode, lattice, atol in cases:
+        depth = mrt.render(0, **options, motionmode=mode, lattice=lattice).layers["depth.Z"]
+        still = mrt.render(0, **{**options, "motion": None}).layers["depth.Z"]
+        near = np.isfinite(depth) & np.isfinite(still) & (still < 5)
+        assert np.median(np.abs(depth[near] - still[near])) <= atol, (mode, lattice)
+
+
+def test_motion_is_not_in_the_kernel_of_a_still_picture():
+    still, moving = (mrt.render(0, **SMALL, aa=1, aamode="none", motion=motion).plan for motion in (None, WAY))
+    assert "motion" not in str(still) and "motion blur: 16 frames" in str(moving)
+
+
+def test_secondary_rays_are_counted_over_all_moments():
+    options = {**SMALL, "aa": 2, "aamode": "sobel", "count_rays": True}
+    still = mrt.render(3, **options)
+    frames = mrt.render(3, **options, motion=(0, 0, 0), motionsamples=4)
+    assert frames.rays == {kind: 4 * count for kind, count in still.rays.items()}
