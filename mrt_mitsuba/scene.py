@@ -5,6 +5,7 @@ Lengths are in scene units, colours are linear RGB. ``Scene.to_dict()`` gives th
 """
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -109,17 +110,15 @@ class Scene:
         """The scene as a Mitsuba dict of this project's plugins, materials shared by reference."""
         materials = _Materials(lambda m: _mrt_bsdf(m, fresnel, self.texturing))
         shapes: dict[str, Any] = {}
-        for i, s in enumerate(self.spheres):
-            shapes[f"sphere_{i}"] = _sphere(s, materials)
+        for kind, objects in (("sphere", self.spheres), ("cone", self.cones), ("cylinder", self.cylinders)):
+            single, grouped = _split(objects)
+            for i, thing in enumerate(single):
+                shapes[f"{kind}_{i}"] = {**_OBJECTS[kind](thing), "bsdf": materials.reference(thing.material)}
+            if grouped:
+                shapes[f"{kind}s"] = _group(kind, grouped, materials, fresnel)
         for i, p in enumerate(self.planes):
             shapes[f"plane_{i}"] = {"type": "mrt_plane", "normal": list(p.normal), "distance": float(p.distance),
                                     "bsdf": materials.reference(p.material)}
-        for i, c in enumerate(self.cones):
-            shapes[f"cone_{i}"] = {"type": "mrt_cone", "apex": list(c.apex), "base_center": list(c.base_center),
-                                   "radius": float(c.radius), "bsdf": materials.reference(c.material)}
-        for i, y in enumerate(self.cylinders):
-            shapes[f"cylinder_{i}"] = {"type": "mrt_cylinder", "p0": list(y.p0), "p1": list(y.p1),
-                                       "radius": float(y.radius), "bsdf": materials.reference(y.material)}
         for i, m in enumerate(self.meshes):
             shapes[f"mesh_{i}"] = {**_mesh(m), "bsdf": materials.reference(m.material)}
         lights = {f"light_{i}": {"type": "mrt_light", "position": list(light.position),
@@ -160,8 +159,52 @@ def _rgb(color: Color) -> dict[str, Any]:
     return {"type": "rgb", "value": list(color)}
 
 
-def _sphere(s: Sphere, materials: _Materials) -> dict[str, Any]:
-    return {"type": "sphere", "center": list(s.center), "radius": float(s.radius), "bsdf": materials.reference(s.material)}
+_OBJECTS: dict[str, Callable[[Any], dict[str, Any]]] = {
+    "sphere": lambda s: {"type": "sphere", "center": list(s.center), "radius": float(s.radius)},
+    "cone": lambda c: {"type": "mrt_cone", "apex": list(c.apex), "base_center": list(c.base_center),
+                       "radius": float(c.radius)},
+    "cylinder": lambda y: {"type": "mrt_cylinder", "p0": list(y.p0), "p1": list(y.p1), "radius": float(y.radius)},
+}
+_NUMBERS: dict[str, Callable[[Any], tuple[float, ...]]] = {
+    "sphere": lambda s: (*s.center, s.radius),
+    "cone": lambda c: (*c.apex, *c.base_center, c.radius),
+    "cylinder": lambda y: (*y.p0, *y.p1, y.radius),
+}
+
+# More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape and
+# more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of recursion
+_MOST_SINGLE = {Sphere: 1000, Cone: 100, Cylinder: 100}
+
+
+def _split(objects: tuple) -> tuple[tuple, tuple]:
+    """What becomes a shape of its own, and what goes into a group; textures need the former."""
+    if not objects or len(objects) <= _MOST_SINGLE[type(objects[0])]:
+        return objects, ()
+    return (tuple(o for o in objects if o.material.texture is not None),
+            tuple(o for o in objects if o.material.texture is None))
+
+
+def _group(kind: str, objects: tuple, materials: _Materials, fresnel: str) -> dict[str, Any]:
+    """One shape of many objects. Where their materials differ, one BSDF looks their values up by object."""
+    import mitsuba as mi
+    import numpy as np
+
+    shape = {"type": "mrt_group", "kind": kind,
+             "numbers": mi.Bitmap(np.array([_NUMBERS[kind](o) for o in objects], np.float32))}
+    own = [o.material for o in objects]
+    if len(set(own)) == 1:
+        return {**shape, "bsdf": materials.reference(own[0])}
+    columns = {
+        "alpha": [(m.alpha,) for m in own],
+        "int_ior": [(max(m.ior, _SMALLEST_IOR),) for m in own],
+        "diffuse_reflectance": [m.diffuse for m in own],
+        "specular_reflectance": [m.specular for m in own],
+    }
+    bsdf: dict[str, Any] = {"type": "mrt_bsdf", "fresnel": fresnel}
+    for name, values in columns.items():
+        shape[f"face_{name}"] = mi.Bitmap(np.array(values, np.float32))
+        bsdf[name] = {"type": "mesh_attribute", "name": f"face_{name}"}
+    return {**shape, "bsdf": bsdf}
 
 
 def _mesh(m: Mesh) -> dict[str, Any]:

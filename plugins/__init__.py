@@ -1,7 +1,7 @@
 """Mitsuba plugins in Dr.Jit, and the maths they share.
 
-``register()`` makes ``mrt_bsdf``, ``mrt_cone``, ``mrt_cylinder``, ``mrt_light``, ``mrt_mesh``, ``mrt_plane``,
-``mrt_texture`` and ``mrt_whitted`` known to Mitsuba.
+``register()`` makes ``mrt_bsdf``, ``mrt_cone``, ``mrt_cylinder``, ``mrt_group``, ``mrt_light``, ``mrt_mesh``,
+``mrt_plane``, ``mrt_texture`` and ``mrt_whitted`` known to Mitsuba.
 """
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import importlib.util
 import sys
 from types import ModuleType
 
-MODULES = ("bsdf", "cone", "cylinder", "light", "mesh", "plane", "texture", "whitted")
+MODULES = ("bsdf", "cone", "cylinder", "group", "light", "mesh", "plane", "texture", "whitted")
 
 _loaded: dict[tuple[str, str], ModuleType] = {}
 _watching = False
@@ -47,8 +47,8 @@ def _load_all(variant: str) -> None:
 def _load(variant: str, name: str) -> ModuleType:
     """Execute a plugin module anew: its class derives from a Mitsuba class, and each variant has its own.
 
-    Mitsuba keeps registrations by variant, so once per variant is enough. Each copy gets a module name of its own;
-    relative imports still resolve, because the package is the same.
+    Mitsuba keeps registrations by variant, so once per variant is enough. Each copy gets a module name of its
+    own; relative imports still resolve, because the package is the same.
     """
     source = importlib.util.find_spec(f"{__name__}.{name}").origin
     spec = importlib.util.spec_from_file_location(f"{__name__}.{name}_{variant}", source)

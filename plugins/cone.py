@@ -8,7 +8,7 @@ import mitsuba as mi
 
 from .intersect import Frame, cone_frame
 from .parameters import flag, integer, number, vector
-from .revolution import Placement, check_axis, fill, refill, unit_cone_mesh, vector64
+from .revolution import Placement, QuadricTable, check_axis, fill, refill, table_of, unit_cone_mesh, vector64
 from .variants import first, is_jit, updatable
 
 
@@ -73,6 +73,10 @@ class MrtCone(mi.Mesh):
     def frame(self) -> Frame:
         """The shape's unit frame in world space, in double precision (see ``intersect``)."""
         return self.exact_frame
+
+    def quadrics(self) -> QuadricTable:
+        """What ``mrt_whitted`` intersects in place of the mesh."""
+        return table_of(self.quadric, self.capped, self.exact_frame)
 
     def traverse(self, callback: Any) -> None:
         mi.Mesh.traverse(self, callback)

@@ -235,6 +235,30 @@ def cylinder_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
     return _surface_point(p, q, dr.select(on_side, r - 1, off_disc), gradient, on_side, frame)
 
 
+def intersect_unit_sphere(o: Any, d: Any, frame: Frame) -> SurfaceHit:
+    """First intersection at t > 0 of a ray with the sphere of radius 1 around the origin of ``frame``."""
+    o = frame.point(o)
+    t = intersect_sphere(o, frame.vector(d), type(o)([0.0, 0.0, 0.0]), 1.0)
+    return SurfaceHit(t, LATERAL)
+
+
+def sphere_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
+    """Put a point near the sphere of ``frame`` onto it, along the normal.
+
+    u = azimuth / 2π in [0, 1), v = angle to +z over π, as in Mitsuba's ``sphere``.
+    """
+    q = frame.point(p)
+    r = dr.norm(q)
+    at_center = r == 0
+    gradient = q * (1 / dr.select(at_center, 1, r))
+    g = frame.gradient(gradient)
+    inverse = 1 / dr.select(at_center, 1, dr.norm(g))
+    n = g * inverse
+    azimuth = dr.atan2(q.y, q.x) / (2 * dr.pi)
+    v = dr.acos(dr.clip(gradient.z, -1, 1)) / dr.pi
+    return SurfacePoint(p - n * ((r - 1) * inverse), n, dr.select(azimuth < 0, azimuth + 1, azimuth), v)
+
+
 @dataclass
 class _Line:
     """A ray's line in the unit frame: s ↦ p + s u with |u| = 1, p · u = 0, and s = t length − start."""

@@ -17,7 +17,10 @@ from .intersect import (
     cylinder_surface,
     intersect_cone,
     intersect_cylinder,
+    intersect_unit_sphere,
+    sphere_surface,
 )
+from .revolution import QuadricTable
 from .tree import Tree
 from .variants import is_jit, pointer
 
@@ -26,6 +29,7 @@ _KINDS = {
     "cone": (lambda o, d, f: intersect_cone(o, d, f), cone_surface),
     "open cone": (lambda o, d, f: intersect_cone(o, d, f, capped=False), cone_surface),
     "cylinder": (lambda o, d, f: intersect_cylinder(o, d, f), cylinder_surface),
+    "sphere": (lambda o, d, f: intersect_unit_sphere(o, d, f), sphere_surface),
     "open cylinder": (lambda o, d, f: intersect_cylinder(o, d, f, capped=False), cylinder_surface),
 }
 
@@ -33,28 +37,32 @@ _KINDS = {
 class Quadrics:
     """Tables of the numbers of all quadrics, in the order of the leaves of a tree over their boxes.
 
-    A shape takes part by its ``quadric`` (a kind), ``capped`` and ``frame()``.
+    A shape takes part if it has ``quadrics()``, a ``QuadricTable``.
     """
 
     def __init__(self, shapes: list) -> None:
-        kinds = [s.quadric if s.capped else f"open {s.quadric}" for s in shapes]
-        self.kinds = sorted(set(kinds))  # the kernel holds these only
-        frames = [s.frame() for s in shapes]
-        origins = np.array([list(f.origin) for f in frames])  # [n, 3]
-        rows = np.array([[list(f.x), list(f.y), list(f.z)] for f in frames])  # [n, 3, 3]
-        boxes = _boxes(kinds, origins, np.linalg.inv(rows))
+        tables = [s.quadrics() for s in shapes]
+        counts = [len(t.rows) for t in tables]
+        self.count = sum(counts)
+        self.kinds = sorted({t.kind for t in tables})  # the kernel holds these only
+        kinds = np.repeat([self.kinds.index(t.kind) for t in tables], counts)
+        origins = np.concatenate([t.origins for t in tables])  # [n, 3]
+        rows = np.concatenate([t.rows for t in tables])  # [n, 3, 3]
+        boxes = _boxes(np.array(self.kinds)[kinds], origins, np.linalg.inv(rows))
         tree = self.tree = Tree(boxes)
         # Four numbers at a time: a row and a coordinate of the origin, three times; kind; size of coordinates
         table = np.zeros((tree.leaves, 4, 4), np.float32)
         table[tree.leaf_of, :3, :3] = rows
         table[tree.leaf_of, :3, 3] = origins
-        table[tree.leaf_of, 3, 0] = [self.kinds.index(k) for k in kinds]
+        table[tree.leaf_of, 3, 0] = kinds
         table[tree.leaf_of, 3, 1] = np.abs(boxes).max(axis=(1, 2))
         self.table = mi.Float(table.ravel())
-        owner = np.zeros(tree.leaves, np.uint32)
-        owner[tree.leaf_of] = np.arange(len(shapes))
+        owner, faces = np.zeros((2, tree.leaves), np.uint32)
+        owner[tree.leaf_of] = np.repeat(np.arange(len(shapes)), counts)
+        faces[tree.leaf_of] = np.concatenate([t.first_faces for t in tables])
         self.shapes = dr.gather(mi.ShapePtr, pointer("Shape", shapes), mi.UInt32(owner))
-        dr.eval(self.table, self.shapes)
+        self.faces = mi.UInt32(faces)
+        dr.eval(self.table, self.shapes, self.faces)
 
     def intersect(self, ray: Any, active: Any) -> tuple[Any, Any, Any]:
         """Distance, place in the tables and part of the nearest quadric; distance ``ray.maxt`` for none."""
@@ -100,6 +108,7 @@ class Quadrics:
                 *(dr.select(own, a, b) for a, b in zip(_members(other), _members(surface), strict=True))
             )
         _put_surface(si, t, surface, dr.gather(mi.ShapePtr, self.shapes, leaf, where), where)
+        si.prim_index = dr.select(where, dr.gather(mi.UInt32, self.faces, leaf, where), si.prim_index)
 
     def scale(self, leaf: Any, active: Any) -> Any:
         """Size of the coordinates of a quadric: the largest number in its box."""
@@ -110,15 +119,16 @@ class ScalarQuadrics:
     """The same for scalar variants, where a loop in Python over all quadrics is one cost among many."""
 
     def __init__(self, shapes: list) -> None:
-        self.shapes = shapes
-        self.kinds = [s.quadric if s.capped else f"open {s.quadric}" for s in shapes]
-        self.frames = [Frame(mi.Point3f(f.origin), *(mi.Vector3f(row) for row in (f.x, f.y, f.z)))
-                       for f in (s.frame() for s in shapes)]  # fmt: skip
+        self.objects = [
+            _ScalarObject(s, t, k) for s in shapes for t in (s.quadrics(),) for k in range(len(t.rows))
+        ]
+        self.kinds = sorted({o.kind for o in self.objects})
+        self.count = len(self.objects)
 
     def intersect(self, ray: Any, active: bool) -> tuple[float, int, int]:
         best = (ray.maxt, 0, LATERAL)
-        for k, (kind, frame) in enumerate(zip(self.kinds, self.frames, strict=True) if active else ()):
-            hit = _KINDS[kind][0](ray.o, ray.d, frame)
+        for k, thing in enumerate(self.objects if active else ()):
+            hit = _KINDS[thing.kind][0](ray.o, ray.d, thing.frame)
             if hit.t < best[0]:
                 best = hit.t, k, hit.part
         return best
@@ -129,17 +139,36 @@ class ScalarQuadrics:
     def put_into(self, si: Any, ray: Any, hit: tuple[float, int, int], where: bool) -> None:
         t, k, part = hit
         if where:
-            surface = _KINDS[self.kinds[k]][1](ray(t), part, self.frames[k])
-            _put_surface(si, t, surface, self.shapes[k], where)
+            thing = self.objects[k]
+            _put_surface(si, t, _KINDS[thing.kind][1](ray(t), part, thing.frame), thing.shape, where)
+            si.prim_index = thing.first_face
 
     def scale(self, k: int, active: bool) -> float:
-        box = self.shapes[k].bbox()
-        return max(abs(c) for corner in (box.min, box.max) for c in corner)
+        return self.objects[k].scale
+
+
+class _ScalarObject:
+    """One quadric of a table."""
+
+    def __init__(self, shape: Any, table: QuadricTable, k: int) -> None:
+        self.shape, self.kind, self.first_face = shape, table.kind, int(table.first_faces[k])
+        rows = table.rows[k]
+        self.frame = Frame(
+            mi.Point3f(table.origins[k].tolist()), *(mi.Vector3f(row.tolist()) for row in rows)
+        )
+        self.scale = float(
+            np.abs(_boxes(np.array([table.kind]), table.origins[k : k + 1], np.linalg.inv(rows)[None])).max()
+        )
+
+
+def is_quadric(shape: Any) -> bool:
+    """Does ``mrt_whitted`` trace this shape itself?"""
+    return hasattr(shape, "quadrics")
 
 
 def quadrics_of(shapes: list) -> Quadrics | ScalarQuadrics | None:
     """What traces the shapes that are quadrics; None where there is none."""
-    found = [s for s in shapes if hasattr(s, "quadric")]
+    found = [s for s in shapes if is_quadric(s)]
     if not found:
         return None
     return Quadrics(found) if is_jit() else ScalarQuadrics(found)
@@ -158,11 +187,15 @@ def _put_surface(si: Any, t: Any, surface: SurfacePoint, shape: Any, where: Any)
     si.shape = dr.select(where, shape, si.shape)
 
 
-def _boxes(kinds: list[str], origins: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def _boxes(kinds: np.ndarray, origins: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Bounding boxes [n, 2, 3] of quadrics with these origins and unit-to-world matrices [n, 3, 3]."""
-    axis = columns[:, :, 2]
-    disc = np.sqrt(columns[:, :, 0] ** 2 + columns[:, :, 1] ** 2)  # half extent of the disc x² + y² <= 1
-    at_origin = disc * np.array([not k.endswith("cone") for k in kinds])[:, None]
-    low = np.minimum(origins - at_origin, origins + axis - disc)
-    high = np.maximum(origins + at_origin, origins + axis + disc)
+    round_ = np.char.endswith(kinds, "sphere")[:, None]
+    tip = np.char.endswith(kinds, "cone")[:, None]
+    # Half extents of the disc x² + y² <= 1, and of the ball
+    disc = np.sqrt((columns[:, :, :2] ** 2).sum(axis=2))
+    ball = np.sqrt((columns**2).sum(axis=2))
+    axis = np.where(round_, 0, columns[:, :, 2])
+    at_origin, at_end = np.where(tip, 0, np.where(round_, ball, disc)), np.where(round_, ball, disc)
+    low = np.minimum(origins - at_origin, origins + axis - at_end)
+    high = np.maximum(origins + at_origin, origins + axis + at_end)
     return np.stack([low, high], axis=1)

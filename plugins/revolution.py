@@ -26,6 +26,33 @@ class UnitMesh:
     faces: np.ndarray  # uint32 [M, 3], counter-clockwise seen from outside in a right-handed frame
 
 
+@dataclass(frozen=True)
+class QuadricTable:
+    """Objects of one kind, by their unit frames: what ``mrt_whitted`` needs to know of a shape."""
+
+    kind: str  # a key of quadrics.KINDS
+    origins: np.ndarray  # float64 [n, 3]
+    rows: np.ndarray  # float64 [n, 3, 3]
+    first_faces: np.ndarray  # int [n], of the stand-in of each, for textures that are looked up by face
+
+
+def table_of(kind: str, capped: bool, frame: Frame) -> QuadricTable:
+    """The table of a shape that is one object."""
+    rows = np.array([[list(frame.x), list(frame.y), list(frame.z)]])
+    return QuadricTable(
+        kind if capped else f"open {kind}", np.array([list(frame.origin)]), rows, np.zeros(1, int)
+    )
+
+
+def unit_sphere_mesh() -> UnitMesh:
+    """An octahedron."""
+    points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+    octants = [(x, y, z) for x in (0, 1) for y in (2, 3) for z in (4, 5)]
+    turned = [(sum(octant) % 2) == 1 for octant in octants]  # an odd number of mirrored axes
+    faces = [octant[::-1] if turn else octant for octant, turn in zip(octants, turned, strict=True)]
+    return UnitMesh(points, points, np.zeros((6, 2)), np.array(faces, np.uint32))
+
+
 def unit_cone_mesh(segments: int, capped: bool) -> UnitMesh:
     """A fan from the apex, which has a vertex and a normal for each triangle, and the base disc."""
     azimuth = 2 * np.pi * np.arange(segments + 1) / segments

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from .intersect import intersect_plane
 from .parameters import choice, flag, integer, number
-from .quadrics import quadrics_of
+from .quadrics import is_quadric, quadrics_of
 from .variants import but_not, is_jit, pointer
 
 BUDGETS = ("report", "plain")
@@ -79,7 +79,7 @@ class MrtWhitted(mi.SamplingIntegrator):
     with r the mirror direction, and the sky where a ray meets nothing. Shading goes through ``si.bsdf()``: k_s F is
     the attribute ``mirror_reflectance`` of an ``mrt_bsdf``, and the delta reflection of any other BSDF. Lights are
     all emitters of the scene; those without a delta position take one random sample each. ``mrt_plane``,
-    ``mrt_cone`` and ``mrt_cylinder`` shapes are intersected analytically.
+    ``mrt_cone``, ``mrt_cylinder`` and ``mrt_group`` shapes are intersected analytically.
 
     ==================== =========== ============ ============================================================
     name                 type        default      unit or range
@@ -300,8 +300,7 @@ class Prepared:
         shapes = scene.shapes()
         self.planes = [_Plane(s) for s in shapes if hasattr(s, "unit_normal")]
         self.quadrics = quadrics_of(shapes)
-        self.quadric_count = sum(hasattr(s, "quadric") for s in shapes)
-        others = [s for s in shapes if not (hasattr(s, "unit_normal") or hasattr(s, "quadric"))]
+        others = [s for s in shapes if not (hasattr(s, "unit_normal") or is_quadric(s))]
         # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the other shapes only
         self.bvh = _scene_of(others) if len(others) < len(shapes) else None
         self.shape_count = len(others)

@@ -1,0 +1,147 @@
+"""``mrt_group``: the same pictures as single shapes, materials by object, and large scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mrt_mitsuba import runtime, scene
+from mrt_mitsuba.scene import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
+
+
+@pytest.fixture(autouse=True)
+def _vectorised() -> Iterator[None]:
+    runtime.use("llvm_ad_rgb")
+    yield
+    runtime.use("llvm_ad_rgb")
+
+
+def crowd(kind: str, count: int, materials: int) -> Scene:
+    """Objects of one kind over a glossy plane, of as many materials."""
+    rng = np.random.default_rng(1)
+    table = [
+        Material(
+            float(rng.uniform(1, 2)),
+            float(rng.uniform(0.05, 0.5)),
+            tuple(rng.random(3)),
+            tuple(rng.random(3)),
+        )
+        for _ in range(materials)
+    ]
+    places = rng.uniform(-2, 2, (count, 3)) + np.array([0, 2.2, 0])
+    radii = rng.uniform(0.1, 0.3, count).tolist()
+    objects = []
+    for k, (place, radius) in enumerate(zip(places, radii, strict=True)):
+        end, material = tuple((place + rng.normal(size=3) * 0.3).tolist()), table[k % materials]
+        place = tuple(place.tolist())
+        if kind == "sphere":
+            objects.append(Sphere(place, radius, material))
+        else:
+            objects.append((Cone if kind == "cone" else Cylinder)(place, end, radius, material))
+    return Scene(
+        camera=Camera((6, 4, 5), (0, 1.5, 0)),
+        sky=(0.2, 0.3, 0.7),
+        lights=(Light((3, 8, 1), (1.5, 1.5, 1.5)), Light((-2, 7, 8), (1, 1, 1))),
+        planes=(Plane((0, 1, 0), 0, table[0]),),
+        **{f"{kind}s": tuple(objects)},
+    )
+
+
+def picture(content: Scene, width: int = 120, height: int = 90) -> np.ndarray:
+    loaded = mi.load_dict(content.to_dict(width=width, height=height))
+    return np.array(mi.render(loaded, spp=1, seed=0))
+
+
+@pytest.mark.parametrize("materials", [1, 7])
+@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder"])
+def test_a_group_looks_like_its_members(monkeypatch, kind: str, materials: int) -> None:
+    """The same rays: but for roundings that move a silhouette or a shadow's edge, the same picture."""
+    content = crowd(kind, 40, materials)
+    single = picture(content)
+    monkeypatch.setattr(scene, "_MOST_SINGLE", {Sphere: 0, Cone: 0, Cylinder: 0})
+    nodes = content.to_dict()
+    assert nodes[f"{kind}s"]["type"] == "mrt_group" and f"{kind}_0" not in nodes
+    grouped = picture(content)
+    difference = np.abs(single - grouped).max(axis=2)
+    assert np.mean(difference > 1e-4) < 2e-3
+    assert single.std() > 0.05
+
+
+def test_textured_members_stay_single(monkeypatch, tmp_path) -> None:
+    from PIL import Image
+
+    Image.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "red.png")
+    content = crowd("sphere", 3, 3)
+    red = Material(1.5, 0.1, (0, 0, 0), (1, 1, 1), str(tmp_path / "red.png"))
+    spheres = (*content.spheres, Sphere((0, 1, 0), 0.5, red))
+    monkeypatch.setitem(scene._MOST_SINGLE, Sphere, 2)
+    nodes = Scene(camera=content.camera, sky=(0, 0, 0), lights=content.lights, spheres=spheres).to_dict()
+    assert nodes["sphere_0"]["center"] == [0, 1, 0] and len(np.array(nodes["spheres"]["numbers"])) == 3
+
+
+def test_scalar_variant(monkeypatch) -> None:
+    content = crowd("sphere", 12, 5)
+    monkeypatch.setattr(scene, "_MOST_SINGLE", {Sphere: 0})
+    vector = picture(content, 40, 30)
+    runtime.use("scalar_rgb")
+    scalar = picture(content, 40, 30)
+    # mi.render draws other places in the pixels in another variant; so compare means, of 1200 pixels
+    assert scalar.mean() == pytest.approx(vector.mean(), rel=0.02)
+
+
+def test_ten_thousand_materials_take_one_bsdf() -> None:
+    content = crowd("sphere", 10_000, 10_000)
+    loaded = mi.load_dict(content.to_dict())
+    assert len(loaded.shapes()) == 2
+    assert len({id(s.bsdf()) for s in loaded.shapes()}) == 2
+    assert loaded.integrator().prepare(loaded).quadrics.count == 10_000
+
+
+def test_reflections_are_not_left_out() -> None:
+    """What a BSDF looks up by object is not known beforehand: the bounce loop stays."""
+    content = crowd("sphere", 1001, 7)
+    loaded = mi.load_dict(
+        Scene(
+            camera=content.camera, sky=content.sky, lights=content.lights, spheres=content.spheres
+        ).to_dict()
+    )
+    integrator = loaded.integrator()
+    integrator.prepare(loaded)
+    deep = np.array(mi.render(loaded, spp=1, seed=0))
+    shallow = np.array(
+        mi.render(loaded, spp=1, seed=0, integrator=mi.load_dict({"type": "mrt_whitted", "max_depth": 1}))
+    )
+    assert (deep - shallow).max() > 0.05
+
+
+def test_stand_in_encloses_the_right_volume() -> None:
+    numbers = np.array([[0, 0, 0, 1, 0, 0, 0.5], [3, 1, 0, 3, 0, 0, 0.2]], np.float32)
+    cones = mi.load_dict({"type": "mrt_group", "kind": "cone", "numbers": mi.Bitmap(numbers), "segments": 64})
+    buffers = mi.traverse(cones)
+    vertices = buffers["vertex_positions"].numpy().reshape(-1, 3)[buffers["faces"].numpy().reshape(-1, 3)]
+    volume = np.einsum("ij,ij->i", vertices[:, 0], np.cross(vertices[:, 1], vertices[:, 2])).sum() / 6
+    assert volume == pytest.approx(np.pi / 3 * (0.25 + 0.04), rel=2e-3)  # 64 sides for a circle: 1.6e-3
+
+
+ONE = np.array([[0, 0, 0, 1]], np.float32)
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({}, '"numbers" must be a mi.Bitmap'),
+        ({"numbers": ONE[:, :3]}, "3 numbers for an object, but must have 4"),
+        ({"numbers": -ONE}, "row 0 of .*radius"),
+        ({"numbers": ONE * np.float32("nan")}, "row 0 of .*not finite"),
+        ({"numbers": np.ones((1, 7), np.float32), "kind": "cone"}, "axis of no length"),
+        ({"numbers": ONE, "face_x": np.ones((2, 1), np.float32)}, "has 2 rows for 1 objects"),
+        ({"numbers": ONE, "kind": "cube"}, "sphere, cone, cylinder"),
+    ],
+)
+def test_wrong_parameters_are_named(keys: dict, words: str) -> None:
+    bitmaps = {name: mi.Bitmap(v) if isinstance(v, np.ndarray) else v for name, v in keys.items()}
+    with pytest.raises(RuntimeError, match=f"mrt_group.*{words}"):
+        mi.load_dict({"type": "mrt_group", **bitmaps})
