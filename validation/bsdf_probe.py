@@ -1,0 +1,123 @@
+"""Questions put to a BSDF in its local frame: values, densities, samples and albedos, as numpy arrays.
+
+Directions are float32 unit vectors [N, 3] or [3], the normal is +z. Everything works on the current variant;
+what draws samples needs a vectorised one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+def rgb(values: Sequence[float]) -> dict[str, Any]:
+    """A colour as a Mitsuba dict."""
+    return {"type": "rgb", "value": list(values)}
+
+
+def is_scalar() -> bool:
+    """Does the current variant take one direction at a time?"""
+    import mitsuba as mi
+
+    return mi.variant().startswith("scalar")
+
+
+def at_angle(degrees: float) -> Array:
+    """A direction at an angle to the normal, away from every axis and plane of symmetry."""
+    theta = np.radians(degrees)
+    return np.array([np.sin(theta) * 0.8, np.sin(theta) * 0.6, np.cos(theta)], np.float32)
+
+
+def unit(v: Array) -> Array:
+    """Vectors [N, 3] made one unit long, in float32."""
+    return (v / np.linalg.norm(v, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def lobe_pairs(count: int, alpha: float, *, least_cos: float = 0.02, seed: int = 1) -> tuple[Array, Array]:
+    """Pairs of random directions above the surface whose half vector lies within a slope of 4 alpha.
+
+    Both cosines are at least ``least_cos``. Beyond that slope the lobe is below e^-16 of its peak.
+    """
+    rng = np.random.default_rng(seed)
+    wi, wo = np.empty((0, 3)), np.empty((0, 3))
+    while len(wi) < count:
+        c, phi = rng.uniform(least_cos, 1, 4 * count), rng.uniform(0, 2 * np.pi, 4 * count)
+        s = np.sqrt(1 - c**2)
+        i = np.stack([s * np.cos(phi), s * np.sin(phi), c], axis=-1)
+        slope = alpha * 4 * np.sqrt(rng.random(4 * count))
+        psi = rng.uniform(0, 2 * np.pi, 4 * count)
+        m = np.stack([slope * np.cos(psi), slope * np.sin(psi), np.ones(4 * count)], axis=-1)
+        m /= np.linalg.norm(m, axis=-1, keepdims=True)
+        o = 2 * (i * m).sum(axis=-1, keepdims=True) * m - i
+        up = o[:, 2] > least_cos
+        wi, wo = np.concatenate([wi, i[up]]), np.concatenate([wo, o[up]])
+    return unit(wi[:count]), unit(wo[:count])
+
+
+def interaction(wi: Array) -> Any:
+    """A surface interaction seen from directions [N, 3] or [3]."""
+    import drjit as dr
+    import mitsuba as mi
+
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(np.ascontiguousarray(np.transpose(wi), np.float32))
+    if mi.is_spectral:
+        si.wavelengths = type(si.wavelengths)(450, 500, 550, 600)
+    return si
+
+
+def evaluate(bsdf: Any, wi: Array, wo: Array, ctx: Any = None) -> tuple[Array, Array]:
+    """f cos θo [N, channels] and density [N] of pairs of directions [N, 3]."""
+    import mitsuba as mi
+
+    ctx = ctx or mi.BSDFContext()
+    if is_scalar():
+        pairs = [bsdf.eval_pdf(ctx, interaction(i), mi.Vector3f(o)) for i, o in zip(wi, wo, strict=True)]
+        return np.array([mi.unpolarized_spectrum(v) for v, _ in pairs]), np.array([p for _, p in pairs])
+    value, pdf = bsdf.eval_pdf(ctx, interaction(wi), mi.Vector3f(np.ascontiguousarray(np.transpose(wo))))
+    value = np.array(mi.unpolarized_spectrum(value)).T
+    return np.broadcast_to(value, (len(wi), value.shape[-1])), np.broadcast_to(np.array(pdf), len(wi))
+
+
+def evaluate_from(bsdf: Any, wi: Array, wo: Array, ctx: Any = None) -> tuple[Array, Array]:
+    """As ``evaluate``, of one direction [3] to many [N, 3]."""
+    return evaluate(bsdf, np.broadcast_to(wi, wo.shape), wo, ctx)
+
+
+def draw(bsdf: Any, wi: Array, count: int, *, seed: int = 0) -> tuple[Array, Array, Array]:
+    """``count`` samples for one direction [3]: directions [N, 3], densities [N], weights [N, channels]."""
+    import mitsuba as mi
+
+    rng = mi.PCG32(count, initstate=seed)
+    u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+    found, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), u, v)
+    weight = np.array(mi.unpolarized_spectrum(weight)).T
+    return np.array(found.wo).T, np.array(found.pdf), np.broadcast_to(weight, (count, weight.shape[-1]))
+
+
+def albedo(bsdf: Any, wi: Array, *, resolution: int = 700) -> Array:
+    """∫ f cos θo dωo [channels] by the midpoint rule in (cos θo, φo), refined around the mirror azimuth.
+
+    With 700² points the error is below 1e-4 for alpha >= 0.1.
+    """
+    middles = (np.arange(resolution) + 0.5) / resolution
+    cos = middles[:, None] * np.ones(resolution)
+    s = 2 * middles - 1
+    phi = np.arctan2(-wi[1], -wi[0]) + np.pi * s * np.abs(s)
+    sin = np.sqrt(1 - cos**2)
+    wo = np.stack([sin * np.cos(phi), sin * np.sin(phi), cos], axis=-1).reshape(-1, 3).astype(np.float32)
+    value, _ = evaluate_from(bsdf, wi, wo)
+    # dω = d cos dφ, dφ = 2π |s| ds, ds = 2 dv
+    weight = np.broadcast_to(4 * np.pi * np.abs(s), (resolution, resolution)).ravel() / resolution**2
+    return (value.astype(np.float64) * weight[:, None]).sum(axis=0)
+
+
+def relative_error(found: Array, expected: Array) -> Array:
+    """|found / expected − 1| where the expected value is above 1e-7 of the largest, else 0."""
+    counts = expected > 1e-7 * expected.max()
+    return np.abs(np.where(counts, found, 1) / np.where(counts, expected, 1) - 1)
