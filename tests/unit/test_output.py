@@ -243,6 +243,22 @@ def test_disk_full_as_the_kernel_reports_it(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("ending", ["png", "exr"])
+def test_file_is_on_the_disk_before_it_takes_the_place_of_the_old(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image: np.ndarray, ending: str
+) -> None:
+    path = tmp_path / f"a.{ending}"
+    path.write_bytes(b"old")
+    synced: list[int] = []
+    fsync = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda fd: (fsync(fd), synced.append(os.fstat(fd).st_size)))
+    with path.open("rb") as reader:  # of the old file, which is replaced and not written over
+        output.save(path, image)
+        assert reader.read() == b"old"
+    assert synced == [path.stat().st_size]
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_link_stays_and_its_target_is_replaced(tmp_path: Path, image: np.ndarray) -> None:
     (tmp_path / "real").mkdir()
     target = tmp_path / "real" / "b.png"
