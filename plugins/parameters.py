@@ -1,37 +1,38 @@
 """Reading and checking plugin parameters: the one place where their error messages are made."""
+
 from __future__ import annotations
 
 import math
-from typing import Sequence
+from collections.abc import Sequence
+from typing import NoReturn
 
 
 class ParameterError(ValueError):
     """A plugin parameter has a wrong value. The text names plugin, key, value and what is allowed."""
 
 
-def _fail(props, name: str, value, allowed: str) -> None:
+def _fail(props, name: str, value, allowed: str) -> NoReturn:
     raise ParameterError(f'{props.plugin_name()}: "{name}" is {value!r}, but must be {allowed}')
 
 
 def number(props, name: str, default: float, *, above: float = -math.inf, least: float = -math.inf) -> float:
     """A finite float parameter, > ``above`` and >= ``least``."""
     value = props.get(name, default)
-    limits = "".join(f" {sign} {bound:g}" for sign, bound in ((">", above), (">=", least)) if bound > -math.inf)
-    try:
-        value = float(value)
-    except (TypeError, ValueError):
+    bounds = ((">", above), (">=", least))
+    limits = "".join(f" {sign} {bound:g}" for sign, bound in bounds if bound > -math.inf)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
         _fail(props, name, value, f"a number{limits}")
     if not (math.isfinite(value) and value > above and value >= least):
         _fail(props, name, value, f"a finite number{limits}")
-    return value
+    return float(value)
 
 
 def integer(props, name: str, default: int, *, least: int) -> int:
     """An integer parameter >= ``least``."""
     value = props.get(name, default)
-    if isinstance(value, bool) or value != int(value) or value < least:
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
         _fail(props, name, value, f"an integer >= {least}")
-    return int(value)
+    return value
 
 
 def flag(props, name: str, default: bool) -> bool:
@@ -54,9 +55,13 @@ def vector(props, name: str, default: Sequence[float] | None = None, *, nonzero:
     """Three finite numbers; ``nonzero`` refuses the null vector. Without a default the key is required."""
     if name not in props and default is None:
         raise ParameterError(f'{props.plugin_name()}: "{name}" is missing; give three numbers')
-    value = [float(x) for x in (props[name] if name in props else default)]
-    if len(value) != 3 or not all(map(math.isfinite, value)):
+    value = props.get(name, default)
+    try:
+        numbers = [float(x) for x in value]
+    except (TypeError, ValueError):
         _fail(props, name, value, "three finite numbers")
-    if nonzero and not any(value):
+    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
+        _fail(props, name, value, "three finite numbers")
+    if nonzero and not any(numbers):
         _fail(props, name, value, "a vector of non-zero length")
-    return value
+    return numbers

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
-import mrt_mitsuba  # noqa: F401 - before anything imports mitsuba or drjit: it chooses the LLVM library
+from mrt_mitsuba import runtime  # before anything imports mitsuba or drjit: it chooses the LLVM library
 
 # --hypothesis-profile=long for the thorough run. No deadline: a busy machine is not a failure. Without a
 # database and with fixed seeds, a run neither depends on an earlier one nor leaves anything behind.
@@ -52,3 +52,21 @@ def original_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no data of the original program: set MRT_REFERENCE to its folder")
     return folder
+
+
+@pytest.fixture
+def variant(request: pytest.FixtureRequest) -> Iterator[str]:
+    """A Mitsuba variant with the plugins: ``llvm_ad_rgb``, or what a test asks for by an indirect parameter.
+
+    Skips where it cannot run here. Afterwards the variant before is back.
+    """
+    import mitsuba as mi
+
+    name = getattr(request, "param", runtime.FAST)
+    problem = runtime.obstacle(name)
+    if problem:
+        pytest.skip(problem)
+    before = mi.variant()
+    yield runtime.use(name)
+    if before is not None:
+        runtime.use(before)

@@ -370,7 +370,8 @@ class _Tracer:
         cos_theta, sin2_theta = map(numbers, half_vector_angles(i, o))
         lobe = lobe * self._fresnel(cos_theta, sin2_theta, surface.index)
         diffuse = self.world.diffuse[surface.index] * (wo[:, 2:] / math.pi)
-        return diffuse + self.world.specular[surface.index] * lobe[:, None]
+        # The G₁ of a negative roughness can be negative; light cannot
+        return np.maximum(diffuse + self.world.specular[surface.index] * lobe[:, None], 0)
 
     def _fresnel(self, cos_theta: np.ndarray, sin2_theta: np.ndarray, index: np.ndarray) -> np.ndarray:
         """F [N] of the objects ``index``, whose surroundings have index 1."""

@@ -73,6 +73,31 @@ def test_mirror_shows_the_sky_by_fresnel() -> None:
     np.testing.assert_allclose(pixel(scene(sky=sky)), sky, **EXACT)
 
 
+def test_mirror_image_is_the_mirrored_scene() -> None:
+    """What a perfect mirror shows is what the scene behind it, mirrored, would show."""
+
+    def mirrored(p):
+        n = np.array(mirror.normal) / np.linalg.norm(mirror.normal)
+        return tuple(np.array(p) - 2 * (n @ p + mirror.distance) * n)
+
+    mirror = Plane((1, 0.2, -0.1), 1, Material(1.5, 1e-4, (1, 1, 1), (0, 0, 0)))
+    ball, light = Sphere((4.5, 1.2, -0.5), 1.2, WOOD), Light((2, 3, 1), (0.8, 0.7, 0.6))
+    settings = {"width": 24, "height": 18, "fresnel": "unity", "device": "scalar"}
+    shown = reference_render(
+        scene(mirror, ball, lights=[light], sky=(0.1, 0.2, 0.3)), max_depth=2, **settings
+    )
+    behind = scene(
+        replace(ball, center=mirrored(ball.center)),
+        lights=[replace(light, position=mirrored(light.position))],
+        sky=(0.1, 0.2, 0.3),
+    )
+    expected = reference_render(behind, max_depth=1, **settings)
+    assert (shown.object_id == 1).all()  # only the mirror is in direct view: spheres come first, planes after
+    assert 20 < (expected.object_id == 0).sum() < 300
+    # the robust offset is 1e-10 of the size of the coordinates
+    np.testing.assert_allclose(shown.image, expected.image, rtol=1e-7, atol=1e-9)
+
+
 def test_each_light_is_clamped_by_itself() -> None:
     plane = Plane((1, 0, 0), 0, replace(WOOD, specular=(0, 0, 0), diffuse=(0.5, 5, 50)))
     # both lights at 60 degrees: f cos = Kd / 2π
