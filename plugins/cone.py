@@ -26,10 +26,9 @@ class MrtCone(mi.Mesh):
     ``apex``        point     required   scene units
     ``base_center`` point     required   scene units, not the apex
     ``radius``      float     1          > 0, of the base disc, scene units
-    ``capped``      boolean   true       with the base disc; without, the cone is open and lit on its outside
-    only ``segments``    integer   256        >= 3, sides of the mesh
-    ``to_world``    transform identity   any invertible affine transform; under a skew one the cone is
-    elliptic
+    ``capped``      boolean   true       with the base disc; without, open and lit on its outside only
+    ``segments``    integer   256        >= 3, sides of the mesh
+    ``to_world``    transform identity   any invertible affine transform; a skew one makes it elliptic
     =============== ========= ========== ==============================================================
 
     ``apex``, ``base_center`` and ``radius`` are differentiable scene parameters: the vertices follow them.
