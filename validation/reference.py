@@ -15,18 +15,23 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.plugins.fresnel import f0_from_ior, fresnel_dielectric, fresnel_schlick
 from mrt_mitsuba.plugins.intersect import (
     Frame,
+    SurfaceHit,
+    SurfacePoint,
     cone_frame,
     cone_surface,
+    cylinder_frame,
+    cylinder_surface,
     intersect_cone,
+    intersect_cylinder,
     intersect_plane,
     intersect_sphere,
 )
 from mrt_mitsuba.plugins.microfacet import half_vector_angles, microfacet_specular, tan2_theta
-from mrt_mitsuba.scene import Camera, Cone, Light, Plane, Scene, Sphere
+from mrt_mitsuba.scene import Camera, Cone, Cylinder, Light, Plane, Scene, Sphere, Vector
 
 from .arrays import Backend, Vector3, backend, numbers
 
@@ -63,7 +68,7 @@ class ReferenceResult:
 
     image: np.ndarray  # float64 [H, W, 3]
     depth: np.ndarray  # float64 [H, W], distance from the camera; inf where nothing was hit
-    object_id: np.ndarray  # int32 [H, W], index in (*spheres, *planes, *cones); -1 where nothing was hit
+    object_id: np.ndarray  # int32 [H, W], index in (*spheres, *planes, *cones, *cylinders); -1: nothing
     normal: np.ndarray  # float64 [H, W, 3], unit; 0 where nothing was hit
     bounces: np.ndarray  # int32 [H, W], mirror rays that met something
     path: np.ndarray  # uint64 [H, W]
@@ -112,7 +117,8 @@ def reference_render(
     ``displacement`` (moves all samples, in pixels, y upwards). ``device`` is "llvm" or "scalar", by default
     the faster one that works here; both give the same picture.
 
-    Raises ``UsageError`` for a setting that does not exist.
+    Raises ``UsageError`` for a setting that does not exist, and ``SceneError`` for a scene with meshes or
+    textures.
     """
     try:
         chosen = Settings(**settings)
@@ -120,6 +126,8 @@ def reference_render(
         raise UsageError(f"no such setting: {error}") from error
     if width < 1 or height < 1:
         raise UsageError(f"width={width} and height={height} must be at least 1")
+    if scene.meshes or any(thing.material.texture for thing in _objects(scene)):
+        raise SceneError("the float64 reference draws no meshes and no textures: leave them out of the scene")
     return _Tracer(scene, chosen, backend(device)).render(width, height)
 
 
@@ -144,12 +152,16 @@ def _unit(v: np.ndarray) -> np.ndarray:
 # ------------------------------------------------- Objects --------------------------------------------------
 
 
+def _objects(scene: Scene) -> list[Any]:
+    return [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders]
+
+
 class _World:
     """All objects of a scene: distances along rays, and tables of what a hit needs to know."""
 
     def __init__(self, scene: Scene, arrays: Backend):
         self.arrays = arrays
-        self.objects: list[Any] = [*scene.spheres, *scene.planes, *scene.cones]
+        self.objects = _objects(scene)
         self.distances = [self._distance(thing) for thing in self.objects]
         self.extent = np.array([_extent(thing) for thing in self.objects])
         materials = [thing.material for thing in self.objects]
@@ -167,12 +179,12 @@ class _World:
         if isinstance(thing, Plane):
             normal, distance = vector(_unit(np.array(thing.normal))), parameter(thing.distance)
             return lambda o, d: intersect_plane(o, d, normal, distance)
-        frame = self._frame(thing)
-        return lambda o, d: intersect_cone(o, d, frame).t
+        frame, intersect = self._frame(thing), _QUADRICS[type(thing)].intersect
+        return lambda o, d: intersect(o, d, frame).t
 
-    def _frame(self, cone: Cone) -> Frame:
-        vector = self.arrays.vector_parameter
-        return cone_frame(vector(cone.apex), vector(cone.base_center), self.arrays.parameter(cone.radius))
+    def _frame(self, thing: Cone | Cylinder) -> Frame:
+        start, end = map(self.arrays.vector_parameter, _axis(thing))
+        return _QUADRICS[type(thing)].frame(start, end, self.arrays.parameter(thing.radius))
 
     def nearest(self, o: np.ndarray, d: np.ndarray, reach: Any) -> tuple[np.ndarray, np.ndarray]:
         """(distance [N], index [N]) of each ray's first object within ``reach``; (reach, -1) for none."""
@@ -197,21 +209,42 @@ class _World:
             elif isinstance(thing, Plane):
                 n[here] = thing.normal
             else:
-                n[here] = self._cone_normals(thing, o[here], d[here], p[here])
+                n[here] = self._quadric_normals(thing, o[here], d[here], p[here])
         return _unit(n)
 
-    def _cone_normals(self, cone: Cone, o: np.ndarray, d: np.ndarray, p: np.ndarray) -> np.ndarray:
-        frame, vectors = self._frame(cone), self.arrays.vectors
-        part = intersect_cone(vectors(o), vectors(d), frame).part
-        return numbers(cone_surface(vectors(p), part, frame).n)
+    def _quadric_normals(
+        self, thing: Cone | Cylinder, o: np.ndarray, d: np.ndarray, p: np.ndarray
+    ) -> np.ndarray:
+        frame, quadric, vectors = self._frame(thing), _QUADRICS[type(thing)], self.arrays.vectors
+        part = quadric.intersect(vectors(o), vectors(d), frame).part
+        return numbers(quadric.surface(vectors(p), part, frame).n)
+
+
+@dataclass(frozen=True)
+class _Quadric:
+    """The functions of ``plugins/intersect.py`` for one kind of object."""
+
+    frame: Callable[..., Frame]
+    intersect: Callable[..., SurfaceHit]
+    surface: Callable[..., SurfacePoint]
+
+
+_QUADRICS = {
+    Cone: _Quadric(cone_frame, intersect_cone, cone_surface),
+    Cylinder: _Quadric(cylinder_frame, intersect_cylinder, cylinder_surface),
+}
+
+
+def _axis(thing: Cone | Cylinder) -> tuple[Vector, Vector]:
+    return (thing.apex, thing.base_center) if isinstance(thing, Cone) else (thing.p0, thing.p1)
 
 
 def _extent(thing: Any) -> float:
     """Size of the numbers that say where an object is."""
     if isinstance(thing, Plane):
         return abs(thing.distance)
-    place = thing.center if isinstance(thing, Sphere) else (*thing.apex, *thing.base_center)
-    return max(map(abs, place)) + thing.radius
+    places = (thing.center,) if isinstance(thing, Sphere) else _axis(thing)
+    return max(abs(x) for place in places for x in place) + thing.radius
 
 
 # ------------------------------------------------- Tracing --------------------------------------------------

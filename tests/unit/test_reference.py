@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrt_mitsuba import UsageError, runtime
-from mrt_mitsuba.scene import Camera, Cone, Light, Material, Plane, Scene, Sphere
+from mrt_mitsuba import SceneError, UsageError, runtime
+from mrt_mitsuba.scene import Camera, Cone, Cylinder, Light, Material, Mesh, Plane, Scene, Sphere
 from mrt_mitsuba.scenes import report_scene
 from mrt_mitsuba.validation import exact
 from mrt_mitsuba.validation.reference import CHOICES, camera_directions, reference_render
@@ -25,10 +25,12 @@ ALONG_X = Camera((3, 0, 0), (0, 0, 0))
 EXACT = {"rtol": 1e-13, "atol": 1e-15}
 
 
-def scene(*things: Sphere | Plane | Cone, camera: Camera = ALONG_X, lights=(), sky=(0.0, 0.0, 0.0)) -> Scene:
+def scene(
+    *things: Sphere | Plane | Cone | Cylinder, camera: Camera = ALONG_X, lights=(), sky=(0.0, 0.0, 0.0)
+) -> Scene:
     kinds = {
         name: tuple(t for t in things if isinstance(t, kind))
-        for name, kind in (("spheres", Sphere), ("planes", Plane), ("cones", Cone))
+        for name, kind in (("spheres", Sphere), ("planes", Plane), ("cones", Cone), ("cylinders", Cylinder))
     }
     return Scene(camera=camera, sky=sky, lights=tuple(lights), **kinds)
 
@@ -213,6 +215,31 @@ def test_cone_has_a_base_and_casts_a_shadow() -> None:
     shadowed = scene(floor, cone, camera=camera, lights=[light])
     assert (pixel(shadowed, max_depth=1) == 0).all()
     assert (pixel(scene(floor, camera=camera, lights=[light])) > 0).all()
+
+
+def test_cylinder_is_closed() -> None:
+    def hit(position, target):
+        result = reference_render(scene(cylinder, camera=Camera(position, target, up=(0, 0, 1))), **ONE_PIXEL)
+        return result.depth[0, 0], result.normal[0, 0]
+
+    cylinder = Cylinder((0, -1, 0), (0, 2, 0), 0.5, WOOD)
+    for position, target, depth, normal in [
+        ((3, 0, 0), (0, 0, 0), 2.5, (1, 0, 0)),
+        ((0.2, 5, 0), (0.2, 0, 0), 3, (0, 1, 0)),
+        ((0.2, -5, 0), (0.2, 0, 0), 4, (0, -1, 0)),
+    ]:
+        found = hit(position, target)
+        assert found[0] == pytest.approx(depth, abs=1e-14)
+        np.testing.assert_allclose(found[1], normal, atol=1e-14, rtol=0)
+    assert hit((0.6, 5, 0), (0.6, 0, 0))[0] == np.inf
+
+
+def test_what_it_cannot_draw_is_refused() -> None:
+    textured = replace(WOOD, texture="wood.png")
+    mesh = Mesh(np.zeros((3, 3), np.float32), np.zeros((1, 3), np.uint32), WOOD)
+    for wrong in (scene(Sphere((0, 0, 0), 1, textured)), replace(scene(), meshes=(mesh,))):
+        with pytest.raises(SceneError, match="no meshes and no textures"):
+            pixel(wrong)
 
 
 @needs_llvm
