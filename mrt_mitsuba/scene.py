@@ -3,8 +3,10 @@
 Lengths are in scene units, colours are linear RGB. ``Scene.to_dict()`` gives the plugins of this project,
 ``Scene.to_stock_dict()`` the nearest equivalents among Mitsuba's own.
 """
+
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -14,6 +16,9 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 Color = tuple[float, float, float]
+
+# The sky of most scenes of the report
+BLUE_SKY: Color = (0.2, 0.2, 0.7)
 
 
 @dataclass(frozen=True)
@@ -28,7 +33,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Material:
-    """Index of refraction, roughness alpha, specular Ks, diffuse Kd; a picture, given as a path, replaces Kd."""
+    """Index of refraction, roughness alpha, specular Ks, diffuse Kd; a picture (its path) replaces Kd."""
 
     ior: float
     alpha: float
@@ -117,26 +122,58 @@ class Scene:
             if grouped:
                 shapes[f"{kind}s"] = _group(kind, grouped, materials, fresnel)
         for i, p in enumerate(self.planes):
-            shapes[f"plane_{i}"] = {"type": "mrt_plane", "normal": list(p.normal), "distance": float(p.distance),
-                                    "bsdf": materials.reference(p.material)}
+            shapes[f"plane_{i}"] = {
+                "type": "mrt_plane",
+                "normal": list(p.normal),
+                "distance": float(p.distance),
+                "bsdf": materials.reference(p.material),
+            }
         for i, m in enumerate(self.meshes):
             shapes[f"mesh_{i}"] = {**_mesh(m), "bsdf": materials.reference(m.material)}
-        lights = {f"light_{i}": {"type": "mrt_light", "position": list(light.position),
-                                 "intensity": _rgb(light.color)} for i, light in enumerate(self.lights)}
-        return {"type": "scene", "integrator": {"type": "mrt_whitted"}, "sensor": self._sensor(width, height),
-                "sky": {"type": "constant", "radiance": _rgb(self.sky)}, **lights, **materials.definitions, **shapes}
+        lights = {
+            f"light_{i}": {
+                "type": "mrt_light",
+                "position": list(light.position),
+                "intensity": _rgb(light.color),
+            }
+            for i, light in enumerate(self.lights)
+        }
+        return {
+            "type": "scene",
+            "integrator": {"type": "mrt_whitted"},
+            "sensor": self._sensor(width, height),
+            "sky": {"type": "constant", "radiance": _rgb(self.sky)},
+            **lights,
+            **materials.definitions,
+            **shapes,
+        }
 
     def _sensor(self, width: int, height: int) -> dict[str, Any]:
         import mitsuba as mi
 
         camera = self.camera
+        reach = math.dist(camera.position, camera.target)  # of scenes far smaller or larger than the report's
         # The original's picture is mirrored left to right against a right-handed camera
         to_world = mi.ScalarTransform4f().look_at(list(camera.position), list(camera.target), list(camera.up))
         to_world = to_world @ mi.ScalarTransform4f().scale([-1, 1, 1])
-        film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb",
-                "component_format": "float32", "rfilter": {"type": "box"}}
-        return {"type": "perspective", "fov": camera.hfov, "fov_axis": "x", "near_clip": 0.01, "far_clip": 1e5,
-                "to_world": to_world, "film": film, "sampler": {"type": "independent", "sample_count": 16}}
+        film = {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        }
+        return {
+            "type": "perspective",
+            "fov": camera.hfov,
+            "fov_axis": "x",
+            "near_clip": 0.01 * min(1.0, reach),
+            "far_clip": 1e5 * max(1.0, reach / 1e3),
+            "to_world": to_world,
+            "film": film,
+            "sampler": {"type": "independent", "sample_count": 16},
+        }
 
 
 class _Materials:
@@ -161,9 +198,18 @@ def _rgb(color: Color) -> dict[str, Any]:
 
 _OBJECTS: dict[str, Callable[[Any], dict[str, Any]]] = {
     "sphere": lambda s: {"type": "sphere", "center": list(s.center), "radius": float(s.radius)},
-    "cone": lambda c: {"type": "mrt_cone", "apex": list(c.apex), "base_center": list(c.base_center),
-                       "radius": float(c.radius)},
-    "cylinder": lambda y: {"type": "mrt_cylinder", "p0": list(y.p0), "p1": list(y.p1), "radius": float(y.radius)},
+    "cone": lambda c: {
+        "type": "mrt_cone",
+        "apex": list(c.apex),
+        "base_center": list(c.base_center),
+        "radius": float(c.radius),
+    },
+    "cylinder": lambda y: {
+        "type": "mrt_cylinder",
+        "p0": list(y.p0),
+        "p1": list(y.p1),
+        "radius": float(y.radius),
+    },
 }
 _NUMBERS: dict[str, Callable[[Any], tuple[float, ...]]] = {
     "sphere": lambda s: (*s.center, s.radius),
@@ -171,8 +217,9 @@ _NUMBERS: dict[str, Callable[[Any], tuple[float, ...]]] = {
     "cylinder": lambda y: (*y.p0, *y.p1, y.radius),
 }
 
-# More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape and
-# more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of recursion
+# More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape
+# and more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of
+# recursion
 _MOST_SINGLE = {Sphere: 1000, Cone: 100, Cylinder: 100}
 
 
@@ -180,8 +227,10 @@ def _split(objects: tuple) -> tuple[tuple, tuple]:
     """What becomes a shape of its own, and what goes into a group; textures need the former."""
     if not objects or len(objects) <= _MOST_SINGLE[type(objects[0])]:
         return objects, ()
-    return (tuple(o for o in objects if o.material.texture is not None),
-            tuple(o for o in objects if o.material.texture is None))
+    return (
+        tuple(o for o in objects if o.material.texture is not None),
+        tuple(o for o in objects if o.material.texture is None),
+    )
 
 
 def _group(kind: str, objects: tuple, materials: _Materials, fresnel: str) -> dict[str, Any]:
@@ -189,8 +238,11 @@ def _group(kind: str, objects: tuple, materials: _Materials, fresnel: str) -> di
     import mitsuba as mi
     import numpy as np
 
-    shape = {"type": "mrt_group", "kind": kind,
-             "numbers": mi.Bitmap(np.array([_NUMBERS[kind](o) for o in objects], np.float32))}
+    shape = {
+        "type": "mrt_group",
+        "kind": kind,
+        "numbers": mi.Bitmap(np.array([_NUMBERS[kind](o) for o in objects], np.float32)),
+    }
     own = [o.material for o in objects]
     if len(set(own)) == 1:
         return {**shape, "bsdf": materials.reference(own[0])}
@@ -218,15 +270,21 @@ def _mesh(m: Mesh) -> dict[str, Any]:
     return {"type": "mrt_mesh", **{name: mi.Bitmap(array[np.newaxis]) for name, array in arrays.items()}}
 
 
-# An index of zero switches reflection off in the report's files. The formulas reflect everything there, as they do, to
-# float32, at this index, of which a BSDF can make sense
+# An index of zero switches reflection off in the report's files. The formulas reflect everything there, as
+# they do, to float32, at this index, of which a BSDF can make sense
 _SMALLEST_IOR = 1e-8
 
 
 def _mrt_bsdf(m: Material, fresnel: str, texturing: str) -> dict[str, Any]:
     diffuse = _rgb(m.diffuse) if m.texture is None else _texture(m.texture, texturing)
-    return {"type": "mrt_bsdf", "alpha": float(m.alpha), "int_ior": max(float(m.ior), _SMALLEST_IOR),
-            "fresnel": fresnel, "diffuse_reflectance": diffuse, "specular_reflectance": _rgb(m.specular)}
+    return {
+        "type": "mrt_bsdf",
+        "alpha": float(m.alpha),
+        "int_ior": max(float(m.ior), _SMALLEST_IOR),
+        "fresnel": fresnel,
+        "diffuse_reflectance": diffuse,
+        "specular_reflectance": _rgb(m.specular),
+    }
 
 
 def _texture(path: str, texturing: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The report's scenes 0 to 4 and its cone scene 9, as data."""
+"""The report's scenes 0 to 4 and its cone scene 9, as data, and the way to the others."""
 from __future__ import annotations
 
 from collections.abc import Iterator
@@ -6,9 +6,7 @@ from functools import lru_cache
 from itertools import product
 
 from .errors import UsageError
-from .scene import Camera, Cone, Light, Material, Plane, Scene, Sphere
-
-BLUE_SKY = (0.2, 0.2, 0.7)
+from .scene import BLUE_SKY, Camera, Cone, Light, Material, Plane, Scene, Sphere
 
 # The ten materials that scene 4 draws from, in the order of its random numbers
 SCENE_4_MATERIALS = (
@@ -157,12 +155,20 @@ def c_rand(seed: int = 1) -> Iterator[int]:
 
 
 _BUILDERS = {0: _scene_0, 1: _scene_1, 2: _scene_2, 3: _scene_3, 4: _scene_4, 9: _scene_9}
-NUMBERS = tuple(_BUILDERS)
+_DEMOS = (5, 6, 7, 8)
+NUMBERS = tuple(sorted({*_BUILDERS, *_DEMOS}))
+
+# Those made of analytic surfaces only, without meshes and textures: what the float64 reference draws
+ANALYTIC = tuple(_BUILDERS)
 
 
 @lru_cache(maxsize=None)
 def report_scene(number: int) -> Scene:
-    """One of the report's scenes. Raises ``UsageError`` for a number that is none of them."""
+    """One of the report's scenes; 5 to 8 are of our own models. Raises ``UsageError`` for any other number."""
+    if number in _DEMOS:
+        from mrt_mitsuba import demos  # models in numpy, which the other scenes do without
+
+        return getattr(demos, f"scene_{number}")()
     if number not in _BUILDERS:
         raise UsageError(f"there is no scene {number}: choose one of {', '.join(map(str, NUMBERS))}")
     return _BUILDERS[number]()

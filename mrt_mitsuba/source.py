@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.obj import obj_scene
 from mrt_mitsuba.scene import Scene
 from mrt_mitsuba.scenes import report_scene
 
@@ -45,6 +46,9 @@ def open_scene(
     if hasattr(scene, "__index__"):
         number = operator.index(scene)
         return _report_source(str(number), report_scene(number), width, height, fresnel, integrator)
+    if isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".obj"):
+        model = obj_scene(scene, convention=convention)
+        return _report_source(model.title, model, width, height, fresnel, integrator)
     if fresnel is not None:
         raise UsageError("fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf")
     if isinstance(scene, dict):
@@ -98,7 +102,7 @@ def _load_file(path: str) -> Any:
     if not os.path.isfile(path):
         raise SceneError(f"cannot read {path}: there is no such file")
     if not path.lower().endswith(".xml"):
-        raise UsageError(f"cannot read {path}: a scene file ends in .xml")
+        raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
     return _load(mi.load_file, path, path)
 
 
