@@ -249,13 +249,16 @@ def test_signal_leaves_the_old_file_and_ends_within_two_seconds(
     with subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
-        while "working" not in process.stdout.readline():
-            assert process.poll() is None, process.stderr.read()
-        time.sleep(0.3)  # into the kernel
-        start = time.monotonic()
-        process.send_signal(number)
-        process.wait(timeout=30)
-        seconds = time.monotonic() - start
+        try:
+            while "working" not in process.stdout.readline():
+                assert process.poll() is None, process.stderr.read()
+            time.sleep(0.3)  # into the kernel
+            start = time.monotonic()
+            process.send_signal(number)
+            process.wait(timeout=10)
+            seconds = time.monotonic() - start
+        finally:
+            process.kill()
         errors = process.stderr.read()
     assert process.returncode == code, errors
     assert errors.startswith("mrt: ") and errors.count("\n") == 1
