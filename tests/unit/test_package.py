@@ -43,6 +43,25 @@ def test_submodule_imports_from_any_folder(run_python, name: str) -> None:
     assert done.stdout == f"mrt_mitsuba.{name}\n", done.stderr
 
 
+def test_checkout_works_without_installation(run_python) -> None:
+    """As where the installed package is a copy, and Python is started in the checkout."""
+    code = """
+import sys
+sys.meta_path = [finder for finder in sys.meta_path if "editable" not in getattr(finder, "__module__", "")]
+sys.path.insert(0, sys.argv[1])
+import importlib, mrt_mitsuba
+for name in ("plugins", "validation", "scenes_xml"):
+    print(importlib.import_module(f"mrt_mitsuba.{name}").__file__)
+try:
+    import mrt_mitsuba.tests
+except ModuleNotFoundError:
+    print("no tests")
+"""
+    done = run_python(code, str(ROOT))
+    files = [str(ROOT / name / "__init__.py") for name in ("plugins", "validation", "scenes_xml")]
+    assert done.stdout.splitlines() == [*files, "no tests"], done.stderr
+
+
 def test_import_loads_nothing_heavy(run_python) -> None:
     """Importing the package starts neither Mitsuba nor anything that takes as long."""
     heavy = "drjit mitsuba numpy OpenEXR PIL tqdm matplotlib scipy importlib.metadata dataclasses"
