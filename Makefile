@@ -1,5 +1,6 @@
 # make render [SCENE=3] [ARGS="aa=2"]   render a scene to out/sceneN.png and .exr
 # make test   [ARGS="-k llvm"]          run the tests
+# make docs                            the documentation as a site: docs/_build/index.html
 # make setup                            the environment alone: .venv with the commands mrt and mrt-validate
 # make lint, make types, make package   style, types, wheel and sdist
 PYTHON ?= python3
@@ -12,7 +13,7 @@ BIN  := $(VENV)/bin
 # One stamp per set of extras: installing one leaves the others as they are.
 STAMP := $(VENV)/.mrt
 
-.PHONY: setup render test lint types package clean
+.PHONY: setup render test docs lint types package clean
 setup: $(STAMP)-base
 
 render: $(STAMP)-base
@@ -33,6 +34,10 @@ types: $(STAMP)-dev
 	$(BIN)/pip install --quiet --no-deps --target build/types .
 	cd build/types && $(abspath $(BIN))/mypy --config-file $(CURDIR)/pyproject.toml -p mrt_mitsuba
 
+# The site, with its pictures and numbers made on the way: docs/_build/index.html
+docs: $(STAMP)-docs
+	$(BIN)/python -m sphinx -W -q -b html docs docs/_build
+
 package: $(STAMP)-dev
 	$(BIN)/python -m build
 
@@ -51,6 +56,10 @@ $(STAMP)-base: pyproject.toml | $(BIN)/python
 
 $(STAMP)-test: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable '.[test,validation]'
+	@touch $@ $(STAMP)-base
+
+$(STAMP)-docs: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable '.[docs,validation]'
 	@touch $@ $(STAMP)-base
 
 $(STAMP)-dev: pyproject.toml | $(BIN)/python

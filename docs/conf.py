@@ -1,0 +1,60 @@
+"""Sphinx configuration: ``make docs`` builds the site, with its pictures and numbers computed on the way."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import mrt_mitsuba  # before mitsuba: it chooses the LLVM library
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+project = "mrt-mitsuba"
+author = "mrt-mitsuba contributors"
+copyright = author
+release = mrt_mitsuba.__version__
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+html_math_renderer = "mathml"
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+exclude_patterns = ["_build", "_generated/*.inc.md"]
+html_theme = "furo"
+html_title = "mrt-mitsuba"
+html_static_path: list[str] = []
+autodoc_typehints = "description"
+autodoc_member_order = "bysource"
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+nb_merge_streams = True
+
+
+def generate(app: object) -> None:
+    """Make the pages that hold computed things."""
+    import gallery
+    import ledger
+    from mrt_mitsuba import options
+
+    mrt_mitsuba.register()  # plugin classes derive from a variant's classes, so autodoc needs one
+    folder = HERE / "_generated"
+    folder.mkdir(exist_ok=True)
+    (folder / "usage.txt").write_text(options.usage())
+    gallery.build(folder)
+    ledger.build(folder)
+
+
+def mathml(display: bool):  # type: ignore[no-untyped-def]
+    """Write formulas as MathML, which browsers draw by themselves: the site needs no script from elsewhere."""
+    from docutils.nodes import SkipNode
+    from latex2mathml.converter import convert
+
+    def visit(translator, node):  # type: ignore[no-untyped-def]
+        translator.body.append(convert(node.astext(), display="block" if display else "inline"))
+        raise SkipNode
+
+    return visit
+
+
+def setup(app: object) -> None:
+    app.add_html_math_renderer("mathml", (mathml(False), None), (mathml(True), None))  # type: ignore[attr-defined]
+    app.connect("builder-inited", generate)  # type: ignore[attr-defined]
