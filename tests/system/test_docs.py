@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import re
 import shlex
 from pathlib import Path
@@ -29,13 +29,11 @@ def test_the_scene_of_the_tutorial_renders(run_python, tmp_path):
     assert (tmp_path / "mine.png").stat().st_size > 10_000
 
 
-def test_commands_of_the_gallery_are_understood():
+def test_commands_of_the_gallery_are_understood(monkeypatch):
     from mrt_mitsuba import options
 
-    spec = importlib.util.spec_from_file_location("gallery", DOCS / "gallery.py")
-    gallery = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(gallery)
-    entries = gallery.entries()
+    monkeypatch.syspath_prepend(str(DOCS))
+    entries = importlib.import_module("gallery").entries()
     assert len({entry.name for entry in entries}) == len(entries) > 12
     for entry in entries:
         command, *arguments = shlex.split(entry.command)
