@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from mrt_mitsuba.filters.contours import contours, save_contours
 from mrt_mitsuba.filters.dof import blur_amount, gaussian_dof
 from mrt_mitsuba.filters.edges import EdgeMap, edges_image, geometry_edges, luma_edges, sobel_edges
 
 __all__ = [
     "EdgeMap",
     "blur_amount",
+    "contours",
     "edges_image",
     "gaussian_dof",
     "geometry_edges",
     "luma_edges",
+    "save_contours",
     "sobel_edges",
 ]

@@ -33,7 +33,9 @@ def _shifted(number: int, way: tuple[float, ...]):
 
 def _times(shutter: Shutter, pixels: int = 64, lattice: int = 4, repeats: int = 1) -> np.ndarray:
     """Times of all rays, [pixels, rays of a pixel]."""
-    bundle = Bundle(range(pixels), Lattice("report", lattice), count=lattice**2, repeats=repeats, shutter=shutter)
+    bundle = Bundle(
+        range(pixels), Lattice("report", lattice), count=lattice**2, repeats=repeats, shutter=shutter
+    )
     return np.array(bundle.samples(8, pixels // 8).time).reshape(pixels, -1)
 
 
@@ -46,7 +48,9 @@ def test_every_ray_of_a_pixel_has_a_part_of_the_time_of_its_own(lattice, repeats
     moments = lattice**2 * repeats
     times = _times(Shutter(moments, seed=seed), lattice=lattice, repeats=repeats)
     assert times.min() >= 0 and times.max() <= 1
-    parts = np.sort(np.floor(times * moments - (times * moments % 1).mean(axis=1, keepdims=True) + 0.5), axis=1)
+    parts = np.sort(
+        np.floor(times * moments - (times * moments % 1).mean(axis=1, keepdims=True) + 0.5), axis=1
+    )
     np.testing.assert_array_equal(parts - parts[:, :1], np.tile(np.arange(moments), (64, 1)))
 
 
@@ -86,12 +90,15 @@ def test_scalar_variants_have_the_same_times():
 # ------------------------------------------------- Frames -------------------------------------------------
 
 
-@pytest.mark.parametrize("options", [
-    {"aa": 2, "aamode": "none"},
-    {"aa": 2, "aamode": "sobel"},
-    {"aa": 2, "aamode": "none", "focaldist": 2.0, "focalrange": 0.5},
-    {"aa": 2, "aamode": "luma", "lattice": "centered"},
-])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"aa": 2, "aamode": "none"},
+        {"aa": 2, "aamode": "sobel"},
+        {"aa": 2, "aamode": "none", "focaldist": 2.0, "focalrange": 0.5},
+        {"aa": 2, "aamode": "luma", "lattice": "centered"},
+    ],
+)
 def test_frames_are_the_mean_of_renders_from_shifted_cameras(options):
     """One wavefront, frame after frame, with filters: always what the report does."""
     blurred = mrt.render(0, **{**SMALL, **options}, motion=WAY, motionsamples=3)
@@ -117,7 +124,12 @@ def test_random_frames_draw_numbers_of_their_own():
     light = {"type": "path", "max_depth": 4}
 
     def noise(frames: int, aamode: str) -> float:
-        options = {"integrator": light, "aa": 1, "aamode": aamode, "layers": ["edges"] if aamode != "none" else []}
+        options = {
+            "integrator": light,
+            "aa": 1,
+            "aamode": aamode,
+            "layers": ["edges"] if aamode != "none" else [],
+        }
         moving = {"motion": (0, 0, 0), "motionsamples": frames}
         first, second = (mrt.render(scene, **options, **moving, seed=seed).image for seed in (11, 5000))
         return float(np.sqrt(np.mean((first - second) ** 2)))
@@ -132,17 +144,28 @@ def test_random_frames_draw_numbers_of_their_own():
 
 def test_stratified_rays_cost_no_more_than_a_still_picture():
     still = mrt.render(0, **SMALL, aa=4, aamode="none")
-    moving = mrt.render(0, **SMALL, aa=4, aamode="none", motion=WAY, motionsamples=16, motionmode="stratified")
+    moving = mrt.render(
+        0, **SMALL, aa=4, aamode="none", motion=WAY, motionsamples=16, motionmode="stratified"
+    )
     assert moving.rays["primary"] == still.rays["primary"]
     more = mrt.render(0, **SMALL, aa=4, aamode="none", motion=WAY, motionsamples=17, motionmode="stratified")
     assert more.rays["primary"] == 2 * still.rays["primary"]
 
 
-@pytest.mark.parametrize(("aamode", "lattice", "moments"), [
-    ("none", "report", 64), ("none", "centered", 64), ("sobel", "report", 16)])
+@pytest.mark.parametrize(
+    ("aamode", "lattice", "moments"),
+    [("none", "report", 64), ("none", "centered", 64), ("sobel", "report", 16)],
+)
 def test_stratified_and_frames_agree(aamode, lattice, moments):
     """Both integrate over the same time; frames are half a step behind. What is left is noise."""
-    options = {**SMALL, "aa": 4, "aamode": aamode, "lattice": lattice, "motion": WAY, "motionsamples": moments}
+    options = {
+        **SMALL,
+        "aa": 4,
+        "aamode": aamode,
+        "lattice": lattice,
+        "motion": WAY,
+        "motionsamples": moments,
+    }
     frames = mrt.render(1, **options, motionmode="frames")
     stratified = mrt.render(1, **options, motionmode="stratified")
     still = mrt.render(1, **{**options, "motion": None})
@@ -160,8 +183,14 @@ def test_stratified_error_falls_faster_than_random_times_would():
     options = {**SMALL, "aa": 1, "aamode": "none", "motion": WAY}
     truth = mrt.render(0, **options, motionsamples=512, motionmode="stratified", seed=99).image
     counts = np.array([4, 16, 64])
-    errors = [np.sqrt(np.mean((mrt.render(0, **options, motionsamples=int(n), motionmode="stratified").image - truth) ** 2))
-              for n in counts]
+    errors = [
+        np.sqrt(
+            np.mean(
+                (mrt.render(0, **options, motionsamples=int(n), motionmode="stratified").image - truth) ** 2
+            )
+        )
+        for n in counts
+    ]
     slope = np.polyfit(np.log(counts), np.log(errors), 1)[0]
     assert -1.2 < slope < -0.6
 
@@ -179,8 +208,12 @@ def test_a_detector_sees_no_noise_in_a_stratified_picture():
 
 def test_depth_is_that_of_the_moment_when_the_shutter_opens():
     options = {**SMALL, "aa": 2, "aamode": "none", "layers": ["depth"], "motion": WAY, "motionsamples": 4}
-    cases = (("frames", "report", 1e-4), ("frames", "centered", 1e-4), ("stratified", "centered", 1e-4),
-             ("stratified", "report", 0.15))  # somewhere in the first quarter of the way, 0.5 long
+    cases = (
+        ("frames", "report", 1e-4),
+        ("frames", "centered", 1e-4),
+        ("stratified", "centered", 1e-4),
+        ("stratified", "report", 0.15),
+    )  # somewhere in the first quarter of the way, 0.5 long
     for mode, lattice, atol in cases:
         depth = mrt.render(0, **options, motionmode=mode, lattice=lattice).layers["depth.Z"]
         still = mrt.render(0, **{**options, "motion": None}).layers["depth.Z"]
@@ -189,7 +222,9 @@ def test_depth_is_that_of_the_moment_when_the_shutter_opens():
 
 
 def test_motion_is_not_in_the_kernel_of_a_still_picture():
-    still, moving = (mrt.render(0, **SMALL, aa=1, aamode="none", motion=motion).plan for motion in (None, WAY))
+    still, moving = (
+        mrt.render(0, **SMALL, aa=1, aamode="none", motion=motion).plan for motion in (None, WAY)
+    )
     assert "motion" not in str(still) and "motion blur: 16 frames" in str(moving)
 
 
