@@ -26,7 +26,7 @@ def test_every_package_is_listed() -> None:
     for package, folder in places.items():
         for init in (ROOT / folder).rglob("__init__.py"):
             found.add(".".join([package, *init.parent.relative_to(ROOT / folder).parts]))
-    assert found == set(settings["packages"])
+    assert found == set(settings["packages"]), "packages of [tool.setuptools] in pyproject.toml"
 
 
 def test_modules_come_from_one_place() -> None:
