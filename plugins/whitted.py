@@ -6,6 +6,7 @@ from functools import partial
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .intersect import intersect_plane
 from .parameters import choice, flag, integer, number
@@ -304,7 +305,7 @@ class Prepared:
         # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the other shapes only
         self.bvh = _scene_of(others) if len(others) < len(shapes) else None
         self.shape_count = len(others)
-        self.scales = _Scales(others)
+        self.scales, self.spheres = _Scales(others), _Spheres(others)
         self._read_emitters(scene)
         self._read_bsdfs({id(b): b for b in (s.bsdf() for s in shapes)}.values())
         if any(s.is_mesh() for s in others):
@@ -371,7 +372,9 @@ class Prepared:
             return dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False)
         pi = (self.bvh or scene).ray_intersect_preliminary(ray, coherent, active)
         found = active & pi.is_valid()
-        return pi.compute_surface_interaction(ray, self.ray_flags, found), found
+        si = pi.compute_surface_interaction(ray, self.ray_flags, found)
+        self.spheres.put_back(si, found)
+        return si, found
 
     def occluded(self, scene, hit, ds, active):
         """Does anything block the segment from ``hit`` to the light sample ``ds``?"""
@@ -448,25 +451,71 @@ class _Scales:
     """Size of the coordinates of the shape that was hit: the largest number in its bounding box."""
 
     def __init__(self, shapes):
-        self.by_shape = [_coordinate_size(s.bbox()) for s in shapes]
-        largest = max(self.by_shape, default=0.0)
-        if is_jit() and shapes:
-            ids = dr.reinterpret_array(mi.UInt32, pointer("Shape", shapes))
-            self.table = dr.full(mi.Float, largest, dr.max(ids)[0] + 1)
-            dr.scatter(self.table, mi.Float(self.by_shape), ids)
-            self.fallback = dr.opaque(mi.Float, largest)
-            self.table_size = dr.opaque(mi.UInt32, dr.width(self.table))
-            dr.eval(self.table)
+        sizes = [_coordinate_size(s.bbox()) for s in shapes]
+        # The shapes inside an instance are not of the scene's own: the largest for them
+        self.by_shape = _ByShape(mi.Float, shapes, sizes, max(sizes, default=0.0)) if shapes else None
 
     def __call__(self, si, found):
-        if not self.by_shape:
-            return mi.Float(0)
+        return mi.Float(0) if self.by_shape is None else self.by_shape(si, found)
+
+
+class _Spheres:
+    """Centres and radii of Mitsuba's spheres.
+
+    Mitsuba takes a hit from the distance along the ray. From a hundred radii away that is further off the sphere than
+    secondary rays start, and the sphere would lie in its own shadow.
+    """
+
+    def __init__(self, shapes):
+        rows = [_center_and_radius(s) for s in shapes]
+        self.by_shape = _ByShape(mi.Vector4f, shapes, rows, [0.0] * 4) if any(any(row) for row in rows) else None
+
+    def put_back(self, si, found) -> None:
+        """Move hits of spheres onto them, along the radius."""
+        if self.by_shape is None:
+            return
+        row = self.by_shape(si, found)
+        center, radius = mi.Point3f(row.x, row.y, row.z), row.w
+        v = si.p - center
+        length = dr.norm(v)
+        on_sphere = found & (radius > 0) & (length > 0)
+        si.p = dr.select(on_sphere, center + v * (radius / dr.select(on_sphere, length, 1)), si.p)
+
+
+class _ByShape:
+    """Numbers for each of some shapes, looked up for the one that was hit; ``fallback`` for others."""
+
+    def __init__(self, kind, shapes, rows, fallback):
+        self.kind = kind
+        self.fallback = kind(fallback)
         if not is_jit():
-            return _coordinate_size(si.shape.bbox()) if found else 0.0
+            self.shapes = shapes  # alive, or their ids could pass to others
+            self.rows = {id(s): kind(row) for s, row in zip(shapes, rows, strict=True)}
+            return
+        ids = dr.reinterpret_array(mi.UInt32, pointer("Shape", shapes))
+        size = dr.max(ids)[0] + 1
+        width = 1 if kind is mi.Float else dr.size_v(kind)
+        table = np.tile(np.float32(fallback), size).reshape(size, width)
+        table[np.array(ids)] = np.reshape(rows, (-1, width))
+        self.table = mi.Float(table.ravel())
+        self.size = dr.opaque(mi.UInt32, size)
+        dr.make_opaque(self.fallback)
+        dr.eval(self.table)
+
+    def __call__(self, si, found):
+        if not is_jit():
+            return self.rows.get(id(si.shape), self.fallback) if found else self.fallback
         ids = dr.reinterpret_array(mi.UInt32, si.shape)
-        # The shapes inside an instance are not of the scene's own: take the largest for them
-        known = found & (ids < self.table_size)
-        return dr.select(known, dr.gather(mi.Float, self.table, ids, known), self.fallback)
+        known = found & (ids < self.size)
+        return dr.select(known, dr.gather(self.kind, self.table, ids, known), self.fallback)
+
+
+def _center_and_radius(shape) -> list[float]:
+    """Of a sphere; zeros for another shape."""
+    if shape.shape_type() != +mi.ShapeType.Sphere:
+        return [0.0] * 4
+    low, high = ([float(c) for c in corner] for corner in (shape.bbox().min, shape.bbox().max))
+    return [0.5 * (a + b) for a, b in zip(low, high, strict=True)] + [0.5 * (high[0] - low[0])]
 
 
 def _construct(integrator, props) -> None:
