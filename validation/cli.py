@@ -30,6 +30,7 @@ STUDIES = {
     "depth-of-field": "depth_of_field",
     "stability": "stability",
     "error-vs-time": "error_vs_time",
+    "acceleration": "acceleration",
 }
 EXTRAS = ("matplotlib", "jinja2", "scipy", "mpmath", "flip_evaluator")
 FOLDER = "validation-report"
