@@ -123,8 +123,11 @@ def compare(
     each = 1 - (1 - level) ** (1 / 3)
     cells = {"pixel": 1, "tile": tile, "image": max(ours.mean.shape[:2])}
     answers = {name: _welch(ours, theirs, size, rounding) for name, size in cells.items()}
-    verdicts = [_verdict(name, t, dof, each) for name, (t, dof) in answers.items()]
-    return Comparison(*verdicts, rel_rmse(ours.mean, theirs.mean), answers["pixel"][0])
+    verdicts = {name: _verdict(name, t, dof, each) for name, (t, dof) in answers.items()}
+    distance = rel_rmse(ours.mean, theirs.mean)
+    return Comparison(
+        verdicts["pixel"], verdicts["tile"], verdicts["image"], rel_rmse=distance, z=answers["pixel"][0]
+    )
 
 
 def sidak(p: float, count: int) -> float:

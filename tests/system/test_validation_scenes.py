@@ -1,0 +1,83 @@
+"""The study of our renders against the float64 tracer: quick on one scene, and that it sees mistakes."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.output import read_exr
+from mrt_mitsuba.scenes import report_scene
+from mrt_mitsuba.validation import scenes
+from mrt_mitsuba.validation.reference import reference_render
+from mrt_mitsuba.validation.study import Picture, Plot, Study, Table
+
+pytestmark = pytest.mark.skipif(
+    runtime.obstacle(runtime.FAST) is not None, reason="scalar variants take minutes"
+)
+
+SIZE = (48, 36)
+
+
+def judged(number: int = 0, **changes) -> tuple[scenes.Judgement, Study]:
+    """Judge a scene, some of it changed, by the truth of the unchanged one."""
+    scene = report_scene(number)
+    found = scenes.judge(scenes.draw(dataclasses.replace(scene, **changes), SIZE), scene)
+    study = Study("scenes", scenes.TITLE)
+    scenes._bounds(study, number, found)
+    return found, study
+
+
+def test_our_render_passes() -> None:
+    found, study = judged()
+    assert study.passed and len(study.bounds) == 3
+    assert found.count("unexplained") == 0
+
+
+@pytest.mark.parametrize("name", ["light", "sphere", "sky"])
+def test_a_mistake_is_seen(name: str) -> None:
+    scene = report_scene(0)
+    moved = dataclasses.replace(scene.spheres[2], center=(0, 1.02, 0))  # by a pixel
+    changes = {
+        "light": {"lights": scene.lights[:1]},
+        "sphere": {"spheres": (*scene.spheres[:2], moved, *scene.spheres[3:])},
+        "sky": {"sky": tuple(1.02 * c for c in scene.sky)},
+    }
+    found, study = judged(**changes[name])
+    assert not study.passed
+    assert found.count("unexplained") > 0
+
+
+def test_every_pixel_that_is_off_has_one_reason() -> None:
+    """A picture shifted by half a displacement is off at silhouettes and shadows only, and judged so."""
+    size = {"width": 64, "height": 48}
+    scene = report_scene(1)
+    shifted = reference_render(scene, displacement=(2e-2, 0), **size).image
+    found = scenes.judge(shifted, scene, displacement=2e-2)
+    counts = {reason: found.count(reason) for reason in scenes.REASONS}
+    assert sum(counts.values()) == np.sum(found.error > scenes.STEP) > 5
+    assert counts["silhouette"] > 0 and counts["unexplained"] == 0
+
+
+def test_the_study_tells_all_it_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("MRT_REFERENCE", str(tmp_path))  # nothing there
+    monkeypatch.setattr(scenes, "LIMITS", {n: scenes.LIMITS[n] for n in (0, 3)})
+    monkeypatch.setattr(scenes, "_size", lambda number, quick: SIZE)
+    study = Study("scenes", scenes.TITLE)
+    scenes.run(study, quick=True)
+    assert study.passed, [str(b) for b in study.bounds if not b.holds]
+    assert [row[0] for part in study.parts if isinstance(part, Table) for row in part.rows] == [0, 3]
+    assert any(isinstance(part, Plot | Picture) for part in study.parts)
+    assert any(isinstance(part, str) and "MRT_REFERENCE" in part for part in study.parts)
+
+
+def test_the_originals_renders_are_judged_where_they_are_at_hand(original_data: Path) -> None:
+    """Ours is nearer to the truth than the original in scene 0."""
+    theirs = read_exr(original_data / "renders" / "s0_none_aa1.exr").image
+    height, width, _ = theirs.shape
+    truth = reference_render(report_scene(0), width=width, height=height).image
+    ours = scenes.draw(0, (width, height))
+    assert np.abs(ours - truth).mean() < np.abs(theirs - truth).mean()
