@@ -1,4 +1,5 @@
 """``mrt_light``: the report's point light, as bright far away as near by."""
+
 from __future__ import annotations
 
 import drjit as dr
@@ -11,8 +12,8 @@ from .variants import first, pointer
 class MrtLight(mi.Emitter):
     r"""Point light without distance falloff.
 
-    A surface point receives ``intensity`` from the direction of ``position``, whatever the distance d; a physical point
-    light would give intensity/d².
+    A surface point receives ``intensity`` from the direction of ``position``, whatever the distance d; a
+    physical point light would give intensity/d².
 
     ============= ========== ========== ==========================================================
     name          type       default    unit or range
@@ -32,8 +33,8 @@ class MrtLight(mi.Emitter):
             <rgb name="intensity" value="2"/>
         </emitter>
 
-    Nearest stock plugin: ``point``, which falls off with the squared distance. Light tracing (``ptracer``) is refused: a
-    light without falloff emits no finite power.
+    Nearest stock plugin: ``point``, which falls off with the squared distance. Light tracing (``ptracer``) is
+    refused: a light without falloff emits no finite power.
     """
 
     def __init__(self, props: mi.Properties):
@@ -85,7 +86,9 @@ class MrtLight(mi.Emitter):
         return mi.Spectrum(0)
 
     def sample_ray(self, time, sample1, sample2, sample3, active=True):
-        raise NotImplementedError("mrt_light: light tracing needs a finite emitted power; use a stock 'point' light")
+        raise NotImplementedError(
+            "mrt_light: light tracing needs a finite emitted power; use a stock 'point' light"
+        )
 
     def bbox(self):
         p = mi.ScalarPoint3f(list(map(first, self.position)))

@@ -5,6 +5,7 @@ so: ratios of components carry the full precision of their inputs, cosines of ne
 not. Everything works on Python floats and on Dr.Jit arrays of any precision. ``alpha`` is the roughness
 (RMS slope × √2), unitless; a negative value is allowed, as in the original program: D sees α², G₁ its sign.
 """
+
 from __future__ import annotations
 
 import drjit as dr
@@ -48,7 +49,8 @@ def smith_g1(v, alpha):
     """Smith shadowing of the Beckmann distribution towards ``v`` (any length, v.z > 0), by rational fit.
 
     b < 1.6: (3.535 b + 2.181 b²)/(1 + 2.276 b + 2.577 b²) with b = 1/(α tan θ), else 1 (relative error of the
-    fit 0.35 %). The factor χ⁺((v·h)/(v·n)) is the caller's: it is 1 wherever both directions are above the surface.
+    fit 0.35 %). The factor χ⁺((v·h)/(v·n)) is the caller's: it is 1 wherever both directions are above the
+    surface. Just below b = 1.6 the fit is up to 1.00006.
     Source: Walter et al. 2007, eq. 27 and below.
     """
     numerator, denominator, fitted = _smith_fit(v, alpha)
@@ -64,8 +66,8 @@ def smith_g1_over_cos(v, alpha):
 def half_vector_angles(wi, wo):
     """(cos θd, sin²θd) between ``wi`` and the half vector of two unit vectors.
 
-    Taken from |wi + wo| and |wi − wo| instead of a dot product with a normalised half vector, so that each stays
-    accurate where it is small: |wi ± wo|² = 2 ± 2 cos 2θd.
+    Taken from |wi + wo| and |wi − wo| instead of a dot product with a normalised half vector, so that each
+    stays accurate where it is small: |wi ± wo|² = 2 ± 2 cos 2θd.
     """
     return 0.5 * dr.norm(wi + wo), 0.25 * dr.squared_norm(wi - wo)
 
@@ -93,7 +95,7 @@ def sample_beckmann(alpha, u1, u2, like):
 def sample_beckmann_visible(wi, alpha, u, slopes, like):
     """Local microfacet normal distributed as the normals visible from ``wi`` (unit, wi.z > 0).
 
-    ``slopes(cos_theta, u)`` draws a visible slope for α = 1 (``mi.MicrofacetDistribution.sample_visible_11``).
+    ``slopes(cos_theta, u)`` draws a visible slope for α = 1: ``mi.MicrofacetDistribution.sample_visible_11``.
     Source: Heitz and d'Eon, "Importance Sampling Microfacet-Based BSDFs using the Distribution of Visible
     Normals", 2014, §4: stretch, draw for unit roughness, rotate, unstretch.
     """

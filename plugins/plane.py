@@ -1,4 +1,5 @@
 """``mrt_plane``: an infinite plane, with a finite stand-in for stock integrators."""
+
 from __future__ import annotations
 
 import mitsuba as mi
@@ -11,9 +12,9 @@ from .parameters import ParameterError, number, vector
 class MrtPlane(mi.Mesh):
     r"""The plane of all points P with normal · P + distance = 0, lit on the side its normal points to.
 
-    ``mrt_whitted`` intersects the plane itself, analytically and without bound. To every other integrator the shape is a
-    square mesh of side ``extent`` around the foot of the origin: large squares lose precision in float32 (the
-    intersection error grows with the side), so it should be as small as the picture allows.
+    ``mrt_whitted`` intersects the plane itself, analytically and without bound. To every other integrator the
+    shape is a square mesh of side ``extent`` around the foot of the origin: large squares lose precision in
+    float32 (the intersection error grows with the side), so it should be as small as the picture allows.
 
     ============ ======== ========= ==============================================================
     name         type     default   unit or range
@@ -37,13 +38,15 @@ class MrtPlane(mi.Mesh):
             <bsdf type="mrt_bsdf"/>
         </shape>
 
-    Nearest stock plugin: ``rectangle`` with a ``to_world``; here the plane's own equation places it, so ``to_world`` is
-    refused.
+    Nearest stock plugin: ``rectangle`` with a ``to_world``; here the plane's own equation places it, so
+    ``to_world`` is refused.
     """
 
     def __init__(self, props: mi.Properties):
         if "to_world" in props:
-            raise ParameterError('mrt_plane: "to_world" is not accepted; give "normal" and "distance" in world space')
+            raise ParameterError(
+                'mrt_plane: "to_world" is not accepted; give "normal" and "distance" in world space'
+            )
         normal = np.array(vector(props, "normal", nonzero=True))
         self.unit_normal = normal / np.linalg.norm(normal)  # [3], float64
         self.distance = number(props, "distance", 0.0)
@@ -52,10 +55,13 @@ class MrtPlane(mi.Mesh):
         mi.Mesh.__init__(self, "mrt_plane", 4, 2, props, has_vertex_normals=False, has_vertex_texcoords=True)
         corners = 0.5 * extent * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # [4, 2]
         positions = corners @ self.tangents - self.distance * self.unit_normal  # [4, 3]
-        write_buffers(self, vertex_positions=positions.astype(np.float32).ravel(),
-                      vertex_texcoords=corners.astype(np.float32).ravel(),
-                      faces=np.array([0, 1, 2, 0, 2, 3], dtype=np.uint32))
-        # Mitsuba merges meshes that share a BSDF when it loads a scene, but leaves those with attributes alone
+        write_buffers(
+            self,
+            vertex_positions=positions.astype(np.float32).ravel(),
+            vertex_texcoords=corners.astype(np.float32).ravel(),
+            faces=np.array([0, 1, 2, 0, 2, 3], dtype=np.uint32),
+        )
+        # Mitsuba merges meshes that share a BSDF when it loads a scene, but not those with attributes
         self.add_attribute("face_mrt_plane", 1, [0.0, 0.0])
 
 

@@ -1,0 +1,214 @@
+"""``mrt_light``: the same light at any distance, in every variant and under stock integrators."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+VARIANTS = ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized", "scalar_rgb"]
+in_variants = pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+
+POSITION = (1.0, -2.0, 3.0)
+
+
+def light(**parameters: Any) -> mi.Emitter:
+    return mi.load_dict({"type": "mrt_light", "position": list(POSITION), **parameters})
+
+
+def point_at(p: Any) -> mi.SurfaceInteraction3f:
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.p = mi.Point3f(*map(float, p))
+    si.time = 0.25
+    if mi.is_spectral:
+        si.wavelengths = type(si.wavelengths)(450, 500, 550, 600)
+    return si
+
+
+def entries(vector: Any) -> np.ndarray:
+    return np.array(vector).ravel()
+
+
+def spectrum(value: Any) -> np.ndarray:
+    return entries(mi.unpolarized_spectrum(value))
+
+
+def stock_spectrum(intensity: Any) -> np.ndarray:
+    """What a stock point light of that intensity sends over unit distance, in the current colour mode."""
+    stock = mi.load_dict({"type": "point", "position": [0, 0, 1], "intensity": intensity})
+    return spectrum(stock.sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))[1])
+
+
+@in_variants
+def test_colour_does_not_depend_on_the_distance(variant: str) -> None:
+    towards = np.array([2, 3, 6]) / 7
+    for distance in (1e-6, 1, 1e6):
+        ds, weight = light(position=[0, 0, 0], intensity=2.5).sample_direction(
+            point_at(-distance * towards), mi.Point2f(0.5)
+        )
+        np.testing.assert_allclose(spectrum(weight), stock_spectrum(2.5), rtol=1e-6)
+        np.testing.assert_allclose(entries(ds.d), towards, rtol=1e-6)
+        np.testing.assert_allclose(entries(ds.n), -towards, rtol=1e-6)
+        assert np.array(ds.dist) == pytest.approx(distance, rel=1e-6)
+        assert np.array(ds.pdf) == 1 and dr.all(ds.delta)
+        assert np.array(ds.time) == 0.25
+    ds, _ = light().sample_direction(point_at(np.array(POSITION) - towards), mi.Point2f(0.5))
+    np.testing.assert_array_equal(entries(ds.p), POSITION)
+    np.testing.assert_allclose(entries(ds.d), towards, rtol=1e-6)
+
+
+@in_variants
+def test_is_a_delta_light(variant: str) -> None:
+    """It cannot be met by chance: no density, nothing to see of it, and a box that is one point."""
+    it, one = light(intensity=2.0), point_at((0, 0, 0))
+    ds, _ = it.sample_direction(one, mi.Point2f(0.5))
+    assert mi.has_flag(it.flags(), mi.EmitterFlags.DeltaPosition)
+    assert not it.is_environment()
+    assert np.array(it.pdf_direction(one, ds)) == 0
+    assert (spectrum(it.eval(one)) == 0).all()
+    np.testing.assert_allclose(spectrum(it.eval_direction(one, ds)), stock_spectrum(2.0), rtol=1e-6)
+    assert list(it.bbox().min) == list(it.bbox().max) == list(POSITION)
+
+
+@in_variants
+def test_at_its_own_place_it_has_some_direction(variant: str) -> None:
+    ds, weight = light().sample_direction(point_at(POSITION), mi.Point2f(0.5))
+    assert np.linalg.norm(entries(ds.d)) == pytest.approx(1)
+    np.testing.assert_allclose(spectrum(weight), stock_spectrum(1.0), rtol=1e-6)
+
+
+def test_colour() -> None:
+    color = {"type": "rgb", "value": [3.0, 0.5, 0.0]}
+    _, weight = light(intensity=color).sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
+    np.testing.assert_allclose(spectrum(weight), [3, 0.5, 0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"], indirect=True)
+def test_light_is_unpolarised(variant: str) -> None:
+    _, weight = light().sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
+    entries = np.array([[dr.max(weight[i, j], axis=None) for j in range(4)] for i in range(4)]).reshape(4, 4)
+    assert entries[0, 0] > 0 and (entries.ravel()[1:] == 0).all()
+
+
+# ---------------------------------------------- In scenes ----------------------------------------------
+
+
+def lit_floor(emitter: dict[str, Any], integrator: str, *more: dict[str, Any]) -> np.ndarray:
+    """A white diffuse floor seen from above at one point, the origin."""
+    transform = mi.ScalarTransform4f()
+    scene = {
+        "type": "scene",
+        "integrator": {"type": integrator},
+        "sensor": {
+            "type": "perspective",
+            "fov": 0.01,
+            "to_world": transform.look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 1, "height": 1, "component_format": "float32"},
+        },
+        "floor": {
+            "type": "rectangle",
+            "to_world": transform.scale(4),
+            "bsdf": {"type": "diffuse", "reflectance": 1.0},
+        },
+        "emitter": emitter,
+    }
+    scene |= {f"more_{i}": thing for i, thing in enumerate(more)}
+    image = np.array(mi.render(mi.load_dict(scene), spp=4))
+    return image[0, 0]
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
+@pytest.mark.parametrize("integrator", ["direct", "path"])
+def test_stock_integrators_see_no_falloff(variant: str, integrator: str) -> None:
+    """Radiance of a white diffuse floor: intensity cos θ / π, near and far; a stock point light falls off."""
+    for distance in (0.5, 50):
+        position = [0, 0.6 * distance, 0.8 * distance]
+        ours = lit_floor({"type": "mrt_light", "position": position, "intensity": 3.0}, integrator)
+        assert ours == pytest.approx(3 * 0.8 / np.pi, rel=1e-3)  # the pixel is 9e-4 wide
+        stock = {"type": "point", "position": position, "intensity": 3.0 * distance**2}
+        assert lit_floor(stock, integrator) == pytest.approx(ours, rel=4e-3)  # which its falloff squares
+
+
+def test_things_in_between_cast_a_shadow() -> None:
+    emitter = {"type": "mrt_light", "position": [0, 0.6, 0.8], "intensity": 3.0}
+    ball = {"type": "sphere", "center": [0, 0.3, 0.4], "radius": 0.1}
+    beyond = {"type": "sphere", "center": [0, 0.9, 1.2], "radius": 0.1}
+    assert (lit_floor(emitter, "direct", ball) == 0).all()
+    assert (lit_floor(emitter, "direct", beyond) > 0.5).all()
+
+
+def test_light_tracing_is_refused() -> None:
+    with pytest.raises(NotImplementedError, match="light tracing needs a finite emitted power"):
+        light().sample_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
+    with pytest.raises(RuntimeError):
+        lit_floor({"type": "mrt_light"}, "ptracer")
+
+
+# --------------------------------------------- Parameters ----------------------------------------------
+
+
+@in_variants
+def test_parameters_can_be_updated(variant: str) -> None:
+    it = light()
+    parameters = mi.traverse(it)
+    parameters["position"] = [0, 0, 2]
+    if not mi.is_spectral:  # there the default is a lamp, D65, with tables of its own
+        assert set(parameters.keys()) == {"position", "intensity.value"}
+        parameters["intensity.value"] = 4.0
+    parameters.update()
+    ds, weight = it.sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
+    np.testing.assert_allclose(entries(ds.d), [0, 0, 1])
+    np.testing.assert_allclose(spectrum(weight), stock_spectrum(1.0 if mi.is_spectral else 4.0), rtol=1e-6)
+    assert list(it.bbox().min) == [0, 0, 2]
+
+
+def test_gradients() -> None:
+    """Of the cosine at a floor by the light's height, and of its light by the intensity."""
+    it = light(position=[3, 0, 4], intensity=2.0)
+    parameters = mi.traverse(it)
+    position = mi.Point3f(3, 0, 4)
+    intensity = mi.Float(2)
+    dr.enable_grad(position, intensity)
+    parameters["position"], parameters["intensity.value"] = position, intensity
+    parameters.update()
+    ds, weight = it.sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
+    dr.backward(ds.d.z * weight.x)
+    # cos = z / √(x² + z²): ∂/∂x = −x z / r³, ∂/∂z = x² / r³; times 2
+    np.testing.assert_allclose(
+        np.array(dr.grad(position)).ravel(), [2 * -12 / 125, 0, 2 * 9 / 125], rtol=1e-5
+    )
+    np.testing.assert_allclose(np.array(dr.grad(intensity)), 0.8, rtol=1e-6)
+
+
+@in_variants
+def test_loads_from_xml(variant: str) -> None:
+    it = mi.load_string("""
+        <emitter version="3.0.0" type="mrt_light">
+            <point name="position" x="1" y="-2" z="3"/>
+            <rgb name="intensity" value="2"/>
+        </emitter>""")
+    assert list(it.bbox().min) == list(POSITION)
+    _, weight = it.sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
+    np.testing.assert_allclose(spectrum(weight), stock_spectrum({"type": "rgb", "value": 2.0}), rtol=1e-6)
+    assert "position" in str(it)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"position": [0, float("nan"), 0]}, '"position" is'),
+        ({"position": [0, float("inf"), 0]}, '"position" is'),
+        ({"position": 3.0}, '"position" is 3.0, but must be three finite numbers'),
+        ({"to_world": 1.0}, '"to_world"'),
+        ({"falloff": True}, '"falloff"'),
+    ],
+)
+def test_wrong_parameters_are_named(parameters: dict, message: str) -> None:
+    with pytest.raises(RuntimeError) as raised:
+        light(**parameters)
+    assert message in str(raised.value) and "mrt_light" in str(raised.value)

@@ -1,0 +1,163 @@
+"""``mrt_plane``: its equation, and its stand-in for stock integrators."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+VARIANTS = ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized", "scalar_rgb"]
+in_variants = pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+
+PLANES = [((0, 1, 0), 0.2), ((3, 0, -3), 2.0), ((0.3, -0.2, 1), 4.0), ((0, 0, -1), -5.0), ((0, 2, 0), 0.0)]
+
+
+def plane(normal: Any = (0, 1, 0), distance: float = 0.0, **parameters: Any) -> mi.Mesh:
+    return mi.load_dict({"type": "mrt_plane", "normal": list(normal), "distance": distance, **parameters})
+
+
+def unit(v: Any) -> np.ndarray:
+    return np.asarray(v, dtype=float) / np.linalg.norm(v)
+
+
+def ray(origin: np.ndarray, direction: np.ndarray) -> mi.Ray3f:
+    return mi.Ray3f(mi.Point3f(*map(float, origin)), mi.Vector3f(*map(float, direction)))
+
+
+def corners(mesh: mi.Mesh) -> np.ndarray:
+    return np.array(mi.traverse(mesh)["vertex_positions"]).reshape(-1, 3)
+
+
+@in_variants
+def test_corners_are_a_square_on_the_plane(variant: str) -> None:
+    """n · P + distance = 0 with the normal made one unit long and the distance as given."""
+    for normal, distance in PLANES:
+        mesh = plane(normal, distance, extent=10.0)
+        points = corners(mesh)
+        heights = points @ unit(normal) + distance
+        np.testing.assert_allclose(heights, 0, atol=1e-5)  # float32 numbers of up to 10
+        np.testing.assert_allclose(points.mean(axis=0), -distance * unit(normal), atol=1e-5)
+        sides = np.roll(points, -1, axis=0) - points
+        np.testing.assert_allclose(np.linalg.norm(sides, axis=-1), 10, rtol=1e-6)
+        assert abs(sides[0] @ sides[1]) < 1e-4
+        np.testing.assert_allclose(mesh.unit_normal, unit(normal), rtol=1e-15)
+        assert mesh.distance == distance
+
+
+@in_variants
+def test_stock_rays_meet_it(variant: str) -> None:
+    for (normal, distance), side in product(PLANES, (1, -1)):
+        scene = mi.load_dict({"type": "scene", "plane": plane(normal, distance)})
+        n = unit(normal)
+        tangent = unit(np.cross(n, (0.3, 0.5, 0.7)))
+        si = scene.ray_intersect(ray(-distance * n + side * 3 * n + 0.7 * tangent, -side * n))
+        assert dr.all(si.is_valid())
+        assert np.array(si.t) == pytest.approx(3, abs=1e-5)
+        np.testing.assert_allclose(np.array(si.n).ravel(), n, atol=1e-6)  # from both sides the same
+
+
+def test_texture_coordinates_are_lengths_from_the_foot() -> None:
+    mesh = plane((0.3, -0.2, 1), 4.0)
+    scene = mi.load_dict({"type": "scene", "plane": mesh})
+    n = unit((0.3, -0.2, 1))
+    s, t = mesh.tangents
+    np.testing.assert_allclose([n @ s, n @ t, s @ t], 0, atol=1e-15)
+    np.testing.assert_allclose(np.cross(s, t), n, atol=1e-15)
+    for u, v in ((0, 0), (1.5, -2.5), (-30, 20)):
+        point = -4 * n + u * s + v * t
+        si = scene.ray_intersect(ray(point + n, -n))
+        np.testing.assert_allclose(np.array(si.uv).ravel(), (u, v), atol=2e-5)
+
+
+@pytest.mark.parametrize("normal", [(1, 0, 0), (0, -1, 0), (0, 0, 1)])
+def test_axis_aligned_planes_stay_so(normal: Any) -> None:
+    points = corners(plane(normal, 0.3))
+    axis = int(np.argmax(np.abs(normal)))
+    assert (points[:, axis] == np.float32(-0.3 * np.sum(normal))).all()
+
+
+@pytest.mark.parametrize("integrator", ["direct", "path"])
+def test_stock_integrators_draw_a_rectangle(integrator: str) -> None:
+    """The same picture as with a stock rectangle in the same place: both are two triangles."""
+    transform = mi.ScalarTransform4f()
+
+    def image(shape: dict[str, Any]) -> np.ndarray:
+        scene = {
+            "type": "scene",
+            "integrator": {"type": integrator},
+            "sensor": {
+                "type": "perspective",
+                "to_world": transform.look_at([2, -6, 3], [0, 0, 0], [0, 0, 1]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 16,
+                    "height": 12,
+                    "component_format": "float32",
+                    "rfilter": {"type": "box"},
+                },
+            },
+            "light": {"type": "point", "position": [0, 0, 3], "intensity": 10.0},
+            "shape": {**shape, "bsdf": {"type": "diffuse", "reflectance": 0.6}},
+        }
+        return np.array(mi.render(mi.load_dict(scene), spp=1, seed=1))
+
+    ours = image({"type": "mrt_plane", "normal": [0, 0, 1], "distance": 0.5, "extent": 6.0})
+    theirs = image({"type": "rectangle", "to_world": transform.translate([0, 0, -0.5]).scale(3)})
+    assert 0.1 < (theirs > 0).mean() < 0.95  # the rim is in the picture
+    np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-6)
+
+
+def test_planes_of_one_material_stay_shapes_of_their_own() -> None:
+    """Mitsuba merges meshes that share a BSDF; the integrator needs each plane's equation."""
+    material = {"type": "ref", "id": "material"}
+    scene = mi.load_dict(
+        {"type": "scene", "material": {"type": "diffuse"}}
+        | {
+            f"plane_{i}": {"type": "mrt_plane", "normal": [0, 1, 0], "distance": float(i), "bsdf": material}
+            for i in range(3)
+        }
+    )
+    assert sorted(s.distance for s in scene.shapes()) == [0, 1, 2]
+
+
+@in_variants
+def test_loads_from_xml(variant: str) -> None:
+    mesh = mi.load_string("""
+        <shape version="3.0.0" type="mrt_plane">
+            <vector name="normal" x="0" y="2" z="0"/>
+            <float name="distance" value="0.2"/>
+            <float name="extent" value="8"/>
+            <bsdf type="mrt_bsdf"/>
+        </shape>""")
+    np.testing.assert_array_equal(mesh.unit_normal, [0, 1, 0])
+    np.testing.assert_array_equal(corners(mesh)[:, 1], np.float32(-0.2))
+    assert np.ptp(corners(mesh)[:, 0]) == 8
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({}, '"normal" is missing; give three numbers'),
+        ({"normal": [0, 0, 0]}, '"normal" is [0, 0, 0], but must be a vector of non-zero length'),
+        ({"normal": [0, float("nan"), 0]}, '"normal" is'),
+        ({"normal": [0, 1, 0], "distance": float("inf")}, '"distance" is inf, but must be a finite number'),
+        ({"normal": [0, 1, 0], "extent": 0.0}, '"extent" is 0.0, but must be a finite number > 0'),
+        ({"normal": [0, 1, 0], "radius": 2.0}, '"radius"'),
+    ],
+)
+def test_wrong_parameters_are_named(variant: str, parameters: dict, message: str) -> None:
+    with pytest.raises(RuntimeError) as raised:
+        mi.load_dict({"type": "mrt_plane", **parameters})
+    assert message in str(raised.value) and "mrt_plane" in str(raised.value)
+
+
+def test_to_world_is_refused() -> None:
+    with pytest.raises(RuntimeError, match=r'mrt_plane: "to_world" is not accepted'):
+        plane(to_world=mi.ScalarTransform4f().scale(2))
