@@ -225,18 +225,25 @@ def _all_samples(job, tracer, camera, exposure, pixels, wanted) -> dict[str, np.
 
 def _detect(job: _Job, plan: Plan, layers: dict[str, np.ndarray], rays: int) -> Any:
     """Look for edges in a picture of so many rays a pixel."""
+    pixels = plan.width * plan.height
+    with job.timed("edges"), job.progress.stage("Edges", pixels) as advance:
+        edges = _find_edges(plan, layers, rays)
+        advance(pixels)
+    return edges
+
+
+def _find_edges(plan: Plan, layers: dict[str, np.ndarray], rays: int) -> Any:
     from mrt_mitsuba import filters
 
     shape = (plan.height, plan.width)
-    with job.timed("edges"), job.progress.stage("Edges", plan.width * plan.height):
-        if plan.detector == "geometry":
-            return filters.geometry_edges(layers["normal"].reshape(*shape, 3), layers["depth"].reshape(shape))
-        variance = None
-        if "square" in layers:
-            spread = np.maximum(layers["square"] - layers["image"] ** 2, 0) / (rays - 1)
-            variance = spread.reshape(*shape, 3)
-        detect = {"luma": filters.luma_edges, "sobel": filters.sobel_edges}[plan.detector]
-        return detect(layers["image"].reshape(*shape, 3), variance=variance)
+    if plan.detector == "geometry":
+        return filters.geometry_edges(layers["normal"].reshape(*shape, 3), layers["depth"].reshape(shape))
+    variance = None
+    if "square" in layers:
+        spread = np.maximum(layers["square"] - layers["image"] ** 2, 0) / (rays - 1)
+        variance = spread.reshape(*shape, 3)
+    detect = {"luma": filters.luma_edges, "sobel": filters.sobel_edges}[plan.detector]
+    return detect(layers["image"].reshape(*shape, 3), variance=variance)
 
 
 def _refine(job, tracer, camera, exposure, pixels, layers) -> None:
