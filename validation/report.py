@@ -20,6 +20,7 @@ from mrt_mitsuba.validation.study import Bound, Picture, Plot, Study, Table
 
 LONG_TABLE = 12  # rows from which on a table of the page is folded
 DOTS_PER_INCH = 110
+BROAD = 2  # width over height from which on a picture has a row of the page to itself
 
 
 @dataclass(frozen=True)
@@ -124,8 +125,14 @@ def _section(folder: Path, outcome: Outcome) -> dict[str, Any]:
         _write(folder / f"{stem}.png", png)
         if isinstance(part, Picture) and part.exr:
             write_exr(folder / f"{stem}.exr", part.image)
-        data = base64.b64encode(png).decode()
-        section["images"].append({"part": part, "data": data, "kind": type(part).__name__.lower()})
+        section["images"].append(
+            {
+                "part": part,
+                "data": base64.b64encode(png).decode(),
+                "kind": type(part).__name__.lower(),
+                "broad": isinstance(part, Picture) and part.image.shape[1] > BROAD * part.image.shape[0],
+            }
+        )
     return section
 
 
