@@ -1,0 +1,140 @@
+"""``register()``: once and for all variants, whatever the order of the switches between them.
+
+Each test has a process of its own, since what is registered stays so until a process ends.
+"""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import pytest
+
+from mrt_mitsuba import runtime
+
+pytestmark = pytest.mark.skipif(
+    runtime.obstacle(runtime.FAST) is not None, reason="no second kind of variant without LLVM"
+)
+
+# Draws one lit pixel of an mrt_plane with an mrt_bsdf under an mrt_light; what each variant should see of it
+DRAW = """
+import mrt_mitsuba
+import mitsuba as mi
+
+def scene(integrator):
+    look = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    return {
+        "type": "scene", "integrator": {"type": integrator},
+        "sensor": {"type": "perspective", "fov": 0.1, "to_world": look, "film": {
+            "type": "hdrfilm", "width": 1, "height": 1, "pixel_format": "luminance",
+            "component_format": "float32", "rfilter": {"type": "box"}}},
+        "light": {"type": "mrt_light", "position": [0, 3, 4], "intensity": {"type": "rgb", "value": 1.0}},
+        "plane": {"type": "mrt_plane", "normal": [0, 0, 1], "bsdf": {
+            "type": "mrt_bsdf", "alpha": 0.01, "diffuse_reflectance": {"type": "rgb", "value": 0.5}}},
+    }
+
+def pixel(made):
+    return float(mi.TensorXf(mi.render(made, spp=1)).array[0])
+
+def draws(*integrators):
+    # 0.5 / pi * 0.8, diffuse only: the lobe is too narrow. The pixel is 9e-3 wide; spectral variants sample
+    tolerance = 0.1 if mi.is_spectral else 2e-3
+    for integrator in integrators:
+        value = pixel(mi.load_dict(scene(integrator)))
+        assert abs(value / 0.127324 - 1) < tolerance, (mi.variant(), integrator, value)
+"""
+
+
+def lines(run_python, code: str, *arguments: str) -> list[str]:
+    done = run_python(DRAW + code, *arguments)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+def test_is_idempotent_and_needs_a_variant(run_python) -> None:
+    code = """
+from mrt_mitsuba import plugins
+try:
+    plugins.register()
+except RuntimeError as error:
+    print("no-variant" if "no Mitsuba variant is set" in str(error) else error)
+mi.set_variant("llvm_ad_rgb")
+for _ in range(3):
+    mrt_mitsuba.register()
+    plugins.register()
+first = plugins.plugin("bsdf").MrtBSDF
+plugins.register()
+assert plugins.plugin("bsdf").MrtBSDF is first
+assert isinstance(mi.load_dict({"type": "mrt_bsdf"}), first)
+draws("direct", "mrt_whitted")
+print("done")
+"""
+    assert lines(run_python, code) == ["no-variant", "done"]
+
+
+@pytest.mark.parametrize("order", list(permutations(("scalar_rgb", "llvm_ad_rgb", "llvm_ad_spectral"))))
+def test_plugins_follow_every_order_of_switches(run_python, order: tuple[str, ...]) -> None:
+    """Registered in the first; there after each switch, also back, under stock integrators and ours."""
+    code = """
+import sys
+variants = sys.argv[1:]
+mi.set_variant(variants[0])
+mrt_mitsuba.register()
+for variant in [*variants, *variants]:
+    mi.set_variant(variant)
+    draws("direct", "path", "mrt_whitted")
+print("done")
+"""
+    assert lines(run_python, code, *order) == ["done"]
+
+
+def test_classes_of_several_variants_live_side_by_side(run_python) -> None:
+    """A scene of one variant renders while others have been loaded since, with the plugins of its own."""
+    code = """
+from mrt_mitsuba import plugins
+made = {}
+for variant in ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_mono"):
+    mi.set_variant(variant)
+    mrt_mitsuba.register()
+    made[variant] = plugins.plugin("bsdf").MrtBSDF, mi.load_dict(scene("mrt_whitted"))
+assert len({kind for kind, _ in made.values()}) == 3
+for variant, (kind, one) in made.items():
+    mi.set_variant(variant)
+    assert abs(pixel(one) / 0.127324 - 1) < 2e-3, variant
+    assert isinstance(one.shapes()[0].bsdf(), kind) and issubclass(kind, mi.BSDF)
+print("done")
+"""
+    assert lines(run_python, code) == ["done"]
+
+
+def test_plugins_are_known_from_xml_and_to_the_writer(run_python) -> None:
+    """A text with the plugins loads, and Mitsuba's own writer, which works in scalar_rgb, writes it."""
+    code = """
+mi.set_variant("llvm_ad_rgb")
+mrt_mitsuba.register()
+text = '''<scene version="3.0.0">
+    <integrator type="direct"/>
+    <sensor type="perspective">
+        <float name="fov" value="0.1"/>
+        <transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="1"/><integer name="height" value="1"/>
+            <string name="pixel_format" value="luminance"/>
+            <string name="component_format" value="float32"/><rfilter type="box"/>
+        </film>
+    </sensor>
+    <emitter type="mrt_light">
+        <point name="position" value="0,3,4"/><rgb name="intensity" value="1"/>
+    </emitter>
+    <shape type="mrt_plane">
+        <vector name="normal" value="0,0,1"/>
+        <bsdf type="mrt_bsdf"><float name="alpha" value="0.01"/>
+            <rgb name="diffuse_reflectance" value="0.5"/></bsdf>
+    </shape>
+</scene>'''
+for integrator in ("direct", "path", "mrt_whitted"):
+    value = pixel(mi.load_string(text.replace('"direct"', f'"{integrator}"')))
+    assert abs(value / 0.127324 - 1) < 2e-3, (integrator, value)
+parsed = mi.parser.parse_string(mi.parser.ParserConfig("llvm_ad_rgb"), text)
+print("written" if "mrt_plane" in mi.parser.write_string(parsed) else "lost")
+"""
+    assert lines(run_python, code) == ["written"]
