@@ -95,7 +95,7 @@ def trials(counts: Sequence[int], *, width: int, height: int) -> list[Trial]:
     return result
 
 
-def _without_clamp(spp: int, size: dict[str, int]) -> Comparison:
+def _without_clamp(spp: int, size: dict[str, Any]) -> Comparison:
     """``mrt_whitted`` with and without clamp, in Mitsuba's own render loop: at random places in the
     pixels."""
     import mitsuba as mi

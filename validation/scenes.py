@@ -59,7 +59,8 @@ class Judgement:
     """A picture against the truth.
 
     ``error`` [H, W]: the largest difference in a channel. ``reason`` [H, W]: an index in ``REASONS`` where it
-    exceeds a step of an 8-bit picture, else -1. ``delicate``: share of all pixels that stand on a silhouette
+    exceeds a step of an 8-bit picture, else -1. ``delicate``: share of all
+    pixels that stand on a silhouette
     or a shadow's edge.
     """
 
@@ -67,7 +68,7 @@ class Judgement:
     truth: np.ndarray
     error: np.ndarray
     reason: np.ndarray
-    delicate: float
+    delicate: float | None
 
     @property
     def mean(self) -> float:
@@ -87,18 +88,19 @@ class Judgement:
 def judge(
     image: np.ndarray, scene: Scene, *, displacement: float = DISPLACEMENT, **settings: Any
 ) -> Judgement:
-    """Judge a linear picture [H, W, 3] of one sample per pixel; ``settings`` are those of
-    ``reference_render``.
+    """Judge a linear picture [H, W, 3], one sample a pixel; ``settings``: those of ``reference_render``.
 
     A pixel that is off by more than a step is on a silhouette or a shadow's edge if a ray moved by
     ``displacement`` pixels meets other things or other lights, on steep shading if that changes its colour by
     as much, or unexplained.
     """
     height, width, _ = image.shape
-    found = sensitivity(scene, width=width, height=height, displacement=displacement, **settings)
-    truth = found.reference.image
+    truth = reference_render(scene, width=width, height=height, **settings).image
     error = np.abs(image - truth).max(axis=-1)
     off = error > STEP
+    if not off.any():
+        return Judgement(image, truth, error, np.full(off.shape, -1), None)
+    found = sensitivity(scene, width=width, height=height, displacement=displacement, **settings)
     steep = off & (error <= found.spread)
     reason = np.select([~off, found.silhouette, found.shadow, steep], [-1, 0, 1, 2], 3)
     return Judgement(image, truth, error, reason, float(np.mean(found.silhouette | found.shadow)))
@@ -119,8 +121,7 @@ def draw(scene: int | Scene, size: tuple[int, int], *, whole: bool = False) -> n
 
 
 def original_renders() -> Path | None:
-    """The folder of the original program's renders, if it is at hand: beside the checkout, or in
-    MRT_REFERENCE."""
+    """The folder of the original program's renders, if at hand: in MRT_REFERENCE or beside the checkout."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "reference"
     folder = Path(os.environ.get("MRT_REFERENCE", beside)) / "renders"
     return folder if folder.is_dir() else None
@@ -143,46 +144,34 @@ def _ours(study: Study, quick: bool) -> dict[int, Judgement]:
             size = _size(number, quick)
             judgement = judged[number] = judge(draw(number, size), report_scene(number))
             _bounds(study, number, judgement)
-            uncut = np.abs(draw(number, size, whole=True) - judgement.truth)
-            rows.append(
-                [
-                    number,
-                    "{}x{}".format(*size),
-                    judgement.mean,
-                    judgement.error.max(),
-                    float(uncut.mean()),
-                    100 * judgement.share,
-                    *map(judgement.count, REASONS),
-                    100 * judgement.delicate,
-                ]
-            )
+            rounding = float(np.abs(draw(number, size, whole=True) - judgement.truth).mean())
+            rows.append([number, "{}x{}".format(*size), *_row(judgement, rounding)])
             advance(1)
+    figures = ["mean difference", "mean, no path cut", "largest", "% off by > 1/255"]
     study.table(
         "scenes",
         "Our renders against the float64 tracer",
-        [
-            "scene",
-            "size",
-            "mean difference",
-            "largest",
-            "mean, no path cut",
-            "% off by > 1/255",
-            *REASONS,
-            "% delicate pixels",
-        ],
+        ["scene", "size", *figures, *REASONS, "% delicate pixels"],
         rows,
-        note="One sample per pixel, exact Fresnel. Pixels off by more than 1/255 are counted by reason; "
-        f"delicate pixels change what they meet, or a light, when their ray is moved by "
-        f"{DISPLACEMENT:g} pixels.",
+        note="One sample per pixel, exact Fresnel. Pixels off by more than 1/255 are counted by reason. "
+        "Delicate pixels would change what they meet, or a light, if their ray moved by "
+        f"{DISPLACEMENT:g} pixels; they are looked for where something must be explained.",
     )
     return judged
+
+
+def _row(judgement: Judgement, rounding: float) -> list[Any]:
+    delicate = "-" if judgement.delicate is None else 100 * judgement.delicate
+    largest = float(judgement.error.max())
+    counts = map(judgement.count, REASONS)
+    return [judgement.mean, rounding, largest, 100 * judgement.share, *counts, delicate]
 
 
 def _size(number: int, quick: bool) -> tuple[int, int]:
     """Brute force over 600 spheres takes ten times as long as any other scene."""
     if number == 4:
-        return (64, 48) if quick else (320, 240)
-    return (96, 72) if quick else (320, 240)
+        return (80, 60) if quick else (320, 240)
+    return (120, 90) if quick else (320, 240)
 
 
 def _bounds(study: Study, number: int, judgement: Judgement) -> None:
@@ -217,8 +206,8 @@ def _pictures(study: Study, judged: dict[int, Judgement]) -> None:
         "differences",
         "Where float32 and float64 differ",
         figure,
-        "Left: our render. Right: the largest difference in a channel, on a logarithmic scale; circles "
-        "are pixels off by more than 1/255, by reason.",
+        "Left: our render. Right: the largest difference in a channel, on a logarithmic scale, most of it from "
+        "the paths that are cut where they no longer matter; circles are pixels off by more than 1/255, by reason.",
     )
     study.plot(
         "distribution",

@@ -1,4 +1,4 @@
-"""Renders by Mitsuba against ours: direct light, gloss and mirrors, anti-aliasing, approximations, mistakes."""
+"""Mitsuba against ours: direct light, gloss and mirrors, anti-aliasing, approximations, mistakes."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from mrt_mitsuba.scene import Scene
 from mrt_mitsuba.scenes import report_scene
 
 from . import approximations, mutations
+from .gallery import gallery
 from .image_tests import estimate
 from .reference import camera_directions
 from .sensitivity import sensitivity
@@ -249,12 +250,9 @@ def _gloss(study: Study, quick: bool) -> None:
         _curve(found.alphas, {f"slope {found.slope:.2f}": found.errors}, "alpha", "mean relative difference"),
         "Difference between path with mrt_bsdf and the mirror rays of mrt_whitted.",
     )
-    study.picture(
-        "gloss",
-        "Gloss, and the mirror",
-        np.concatenate([*found.pictures[1:], found.pictures[0]], axis=1),
-        f"alpha {', '.join(f'{a:g}' for a in alphas)} by path; last: mrt_whitted.",
-    )
+    names = ["mirror of mrt_whitted", *(f"path, alpha {alpha:g}" for alpha in alphas)]
+    figure = gallery(dict(zip(names, found.pictures, strict=True)), columns=3)
+    study.plot("gloss_pictures", "Gloss, and the mirror", figure)
 
 
 # ------------------------------------------------ Anti-aliasing
@@ -341,6 +339,8 @@ def _curve(
         axis.loglog(x, y, marker="o", label=label)
     if floor is not None:
         axis.axhline(floor, color="gray", linestyle="--")
+    axis.set_xticks(x, [f"{value:g}" for value in x])
+    axis.minorticks_off()
     axis.set_xlabel(xlabel)
     axis.set_ylabel(ylabel)
     axis.legend()
