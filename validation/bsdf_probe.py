@@ -6,7 +6,7 @@ what draws samples needs a vectorised one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -115,6 +115,12 @@ def albedo(bsdf: Any, wi: Array, *, resolution: int = 700) -> Array:
     # dω = d cos dφ, dφ = 2π |s| ds, ds = 2 dv
     weight = np.broadcast_to(4 * np.pi * np.abs(s), (resolution, resolution)).ravel() / resolution**2
     return (value.astype(np.float64) * weight[:, None]).sum(axis=0)
+
+
+def largest(values: Iterable[float]) -> float:
+    """The largest number; NaN if there is none, or if one is NaN, which Python's ``max`` would overlook."""
+    found = np.fromiter(values, float)
+    return float(found.max()) if len(found) else float("nan")
 
 
 def relative_error(found: Array, expected: Array) -> Array:

@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation import exact, image_tests, metals
-from mrt_mitsuba.validation.bsdf_probe import Array, evaluate, is_scalar, lobe_pairs, relative_error, rgb
+from mrt_mitsuba.validation.bsdf_probe import (
+    Array,
+    evaluate,
+    is_scalar,
+    largest,
+    lobe_pairs,
+    relative_error,
+    rgb,
+)
 from mrt_mitsuba.validation.image_tests import Comparison
 from mrt_mitsuba.validation.study import Study
 
@@ -104,7 +112,7 @@ def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> Pointwise:
     apart = np.flatnonzero(short & (plain_error > POINTWISE))
     worst = apart[np.argsort(-plain_error[apart])[:JUDGED]]
     return Pointwise(
-        float(max(values)),
+        largest(values),
         float(visible_error.max()),
         float(plain_error[~short].max()),
         tuple(_judge(wi[i], wo[i], alpha, plain[0][i], plain[1][i]) for i in worst),
@@ -162,7 +170,10 @@ def pointwise(study: Study, *, quick: bool) -> None:
     names = ("value", "density of visible normals", "density of plain D sampling")
     for column, name in enumerate(names, start=3):
         study.at_most(
-            f"{name}, relative, {len(variants)} variants", max(row[column] for row in rows), POINTWISE, why
+            f"{name}, relative, {len(variants)} variants",
+            largest(row[column] for row in rows),
+            POINTWISE,
+            why,
         )
     _hold_judged(study, judged)
 
@@ -468,7 +479,7 @@ def efficiency(study: Study, *, quick: bool) -> None:
     )
     study.at_most(
         "variance at equal sample count, ours over theirs",
-        max(ratios),
+        largest(ratios),
         1.1,
         "the same sampling; the variances of a thousand pixels are known to a few percent",
     )

@@ -1,0 +1,227 @@
+"""The comparison with ``roughconductor`` and the laws of the BSDF: they pass, and mistakes make them fail."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba import plugins
+from mrt_mitsuba.output import read_exr
+from mrt_mitsuba.validation import bsdf_laws, cli, metals, roughconductor
+from mrt_mitsuba.validation.study import Study
+
+for needed in cli.EXTRAS:
+    pytest.importorskip(needed)
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+Break = Callable[[pytest.MonkeyPatch], None]
+SMALL: dict[str, Any] = {"size": 32, "spp": 8, "renders": 32, "pairs": 2000}
+
+
+# ------------------------------ Mistakes made on purpose ------------------------------
+
+
+def radiance(patch: pytest.MonkeyPatch) -> None:
+    """× 1.02 of every value."""
+    kind = plugins.plugin("bsdf").MrtBSDF
+    value = kind._value
+    patch.setattr(kind, "_value", lambda *arguments: 1.02 * value(*arguments))
+
+
+def roughness(patch: pytest.MonkeyPatch) -> None:
+    """× 1.05."""
+    _after_construction(patch, lambda bsdf: setattr(bsdf, "alpha", 1.05 * bsdf.alpha))
+
+
+def fresnel(patch: pytest.MonkeyPatch) -> None:
+    """Schlick where the exact form was asked for."""
+
+    def replace(bsdf: Any) -> None:
+        bsdf.fresnel = {"dielectric": "schlick"}.get(bsdf.fresnel, bsdf.fresnel)
+
+    _after_construction(patch, replace)
+
+
+def flipped(patch: pytest.MonkeyPatch) -> None:
+    """The normal points to the other side."""
+    kind = plugins.plugin("bsdf").MrtBSDF
+    for name in ("eval", "pdf", "eval_pdf"):
+        method = getattr(kind, name)
+
+        @functools.wraps(method)
+        def other(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True, method: Any = method) -> Any:
+            turned = type(si)(si)
+            turned.wi = -si.wi
+            return method(self, ctx, turned, -wo, active)
+
+        patch.setattr(kind, name, other)
+
+
+def clamp(patch: pytest.MonkeyPatch) -> None:
+    """Values of a negative roughness are left negative."""
+
+    class WithoutMaximum:
+        maximum = staticmethod(lambda value, least: value)
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(dr, name)
+
+    patch.setattr(plugins.plugin("bsdf"), "dr", WithoutMaximum())
+
+
+def _after_construction(patch: pytest.MonkeyPatch, change: Callable[[Any], object]) -> None:
+    kind = plugins.plugin("bsdf").MrtBSDF
+    construct = kind.__init__
+
+    def constructed(self: Any, props: Any) -> None:
+        construct(self, props)
+        change(self)
+
+    patch.setattr(kind, "__init__", constructed)
+
+
+MISTAKES = (radiance, roughness, fresnel, flipped, clamp)
+
+
+def findings(*parts: Callable[..., None]) -> Study:
+    study = Study("test", "test")
+    for part in parts:
+        part(study, quick=True)
+    return study
+
+
+def missed(study: Study) -> set[str]:
+    return {bound.name for bound in study.bounds if not bound.holds}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_command_fails_where_the_bsdf_is_broken(mistake: Break, monkeypatch, tmp_path: Path, capsys) -> None:
+    mistake(monkeypatch)
+    # what divides by a density of zero is the mistake's doing, and shall not break off the study
+    with np.errstate(all="ignore"):
+        assert cli.main(["laws", "--quick", "--out", str(tmp_path)]) == 1
+    laws = json.loads((tmp_path / "summary.json").read_text())["studies"]["laws"]
+    assert laws["verdict"] == "missed", laws["failure"]
+    assert "MISSED" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_command_passes(tmp_path: Path) -> None:
+    assert cli.main(["laws", "roughconductor", "--quick", "--out", str(tmp_path)]) == 0
+
+
+@pytest.mark.parametrize("mistake", [radiance, roughness, flipped])
+def test_values_are_not_roughconductors_where_the_bsdf_is_broken(mistake: Break, monkeypatch) -> None:
+    monkeypatch.setattr(roughconductor.runtime, "usable_variants", lambda: ["llvm_ad_rgb"])
+    assert not missed(findings(roughconductor.pointwise))
+    mistake(monkeypatch)
+    assert any(name.startswith("value") for name in missed(findings(roughconductor.pointwise)))
+
+
+@pytest.mark.parametrize(
+    ("mistake", "part", "names"),
+    [
+        (
+            fresnel,
+            bsdf_laws.dielectric_terms,
+            {"F against Mitsuba's, relative", "reflection against Mitsuba's, relative"},
+        ),
+        (fresnel, bsdf_laws.published, {"published albedos, relative"}),
+        (radiance, bsdf_laws.published, {"published albedos, relative"}),
+        (clamp, bsdf_laws.never_negative, {"least value of any lobe, negative roughness included"}),
+    ],
+)
+def test_the_law_that_is_broken_is_named(mistake: Break, part, names: set[str], monkeypatch) -> None:
+    mistake(monkeypatch)
+    assert missed(findings(part)) == names
+
+
+# ------------------------------ compare_roughconductor ------------------------------
+
+
+def test_comparison_finds_them_equal(tmp_path: Path) -> None:
+    found = mrt.compare_roughconductor(alpha=0.2, **SMALL)
+    assert found.equal and not found.test.rejects
+    assert 0 < found.errors["value"] < 2e-5
+    assert found.errors["pixels that differ, with the same random numbers"] < 5e-3
+    assert found.timings["ratio"] == pytest.approx(found.timings["ours"] / found.timings["theirs"])
+    assert {image.shape for image in found.images.values()} == {(24, 32, 3)}
+    found.save(tmp_path / "both.exr")
+    exr = read_exr(tmp_path / "both.exr")
+    np.testing.assert_array_equal(exr.image, found.images["ours"])
+    difference = exr.image - np.stack([exr.layers[f"theirs.{c}"] for c in "RGB"], axis=-1)
+    # the difference was taken in float64
+    np.testing.assert_allclose(difference, found.images["difference"], atol=1e-6 * exr.image.max())
+    assert "alpha = 0.2: equal" in str(found) and "alpha = 0.2: equal" in found._repr_html_()
+
+
+@pytest.mark.parametrize("mistake", [radiance, roughness])
+def test_comparison_sees_a_broken_bsdf(mistake: Break, monkeypatch) -> None:
+    mistake(monkeypatch)
+    found = mrt.compare_roughconductor(alpha=0.3, **SMALL)
+    assert not found.equal
+    assert found.errors["value"] > 0.01
+    # the ball is a third of the picture
+    assert found.errors["pixels that differ, with the same random numbers"] > 0.1
+
+
+@pytest.mark.parametrize("alpha", [0, -0.1, 1.5, float("nan")])
+def test_roughness_out_of_range_is_refused(alpha: float) -> None:
+    with pytest.raises(mrt.UsageError, match="alpha="):
+        mrt.compare_roughconductor(alpha)
+
+
+def test_fifty_digits_judge_where_densities_differ() -> None:
+    """Mitsuba's density of plain D sampling is off at grazing angles; ours is not."""
+    found = roughconductor.compare_pointwise(0.001, count=20_000)
+    ours, theirs = np.array(found.judged).T
+    assert len(ours) == roughconductor.JUDGED
+    assert ours.max() < 5e-6 < 2e-5 < theirs.max()
+
+
+# ------------------------------ Metals ------------------------------
+
+
+def test_every_preset_is_measured() -> None:
+    names = metals.preset_names()
+    assert {"Ag", "Al", "Au", "Cu", "Cr", "W"} <= set(names) and len(names) > 40
+    assert names == sorted(set(names))
+
+
+def test_exact_reflectance_of_metals() -> None:
+    """Against the textbook's form with complex indices, in float64."""
+    gold = metals.measure("Au")
+    cos = np.cos(np.radians(metals.ANGLES))[:, None]
+    index = gold.eta - 1j * gold.k
+    inside = np.sqrt(1 - (1 - cos**2) / index**2)  # cosine of the refracted wave
+    s, p = (cos - index * inside) / (cos + index * inside), (index * cos - inside) / (index * cos + inside)
+    np.testing.assert_allclose(gold.exact, (abs(s) ** 2 + abs(p) ** 2) / 2, rtol=1e-5)  # float32
+    np.testing.assert_allclose(gold.schlick, gold.f0 + (1 - gold.f0) * (1 - cos) ** 5, rtol=1e-5)
+    assert gold.f0[0] > 0.9 > 0.4 > gold.f0[2]  # it is yellow
+
+
+def test_undefined_reflectance_is_that_of_the_limit() -> None:
+    """A channel without index and extinction, as RGB gives one to AlSb, reflects everything."""
+    compound = metals.measure("AlSb")
+    assert (compound.eta[0], compound.k[0]) == (0, 0)
+    np.testing.assert_allclose(compound.exact[:, 0], 1)
+    assert np.isfinite(compound.error).all()
+
+
+def test_wrong_fresnel_of_metals_is_seen(monkeypatch) -> None:
+    monkeypatch.setattr(metals, "f0_of_conductor", lambda eta, k: ((eta - 1) / (eta + 1)) ** 2)
+    monkeypatch.setattr(metals, "preset_names", lambda: ["Au"])
+    monkeypatch.setattr(metals, "_picture", lambda *arguments: None)
+    assert missed(findings(metals.run)) == {
+        "F₀ of 1 metals against the exact value, relative",
+        "Schlick against exact under even light, worst metal",
+    }
