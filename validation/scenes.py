@@ -206,8 +206,8 @@ def _pictures(study: Study, judged: dict[int, Judgement]) -> None:
         "differences",
         "Where float32 and float64 differ",
         figure,
-        "Left: our render. Right: the largest difference in a channel, on a logarithmic scale, most of it from "
-        "the paths that are cut where they no longer matter; circles are pixels off by more than 1/255, by reason.",
+        "Left: our render. Right: the largest difference in a channel, on a logarithmic scale, most of it "
+        "from paths cut where they no longer matter. Circles: pixels off by more than 1/255, by reason.",
     )
     study.plot(
         "distribution",

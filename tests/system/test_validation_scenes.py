@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.output import read_exr
+from mrt_mitsuba.plugins import plugin
+from mrt_mitsuba.plugins.fresnel import f0_from_ior, fresnel_schlick
 from mrt_mitsuba.scenes import report_scene
 from mrt_mitsuba.validation import scenes
 from mrt_mitsuba.validation.reference import reference_render
@@ -20,6 +23,11 @@ pytestmark = pytest.mark.skipif(
 )
 
 SIZE = (48, 36)
+
+
+@pytest.fixture(autouse=True)
+def fast() -> None:
+    runtime.use(runtime.FAST)
 
 
 def judged(number: int = 0, **changes) -> tuple[scenes.Judgement, Study]:
@@ -47,6 +55,73 @@ def test_a_mistake_is_seen(name: str) -> None:
         "sky": {"sky": tuple(1.02 * c for c in scene.sky)},
     }
     found, study = judged(**changes[name])
+    assert not study.passed
+    assert found.count("unexplained") > 0
+
+
+# ------------------------------------ Plugins broken on purpose ------------------------------------
+
+
+def brighter(patch: pytest.MonkeyPatch) -> None:
+    bsdf = plugin("bsdf").MrtBSDF
+    value = bsdf._value
+    patch.setattr(bsdf, "_value", lambda *arguments: 1.02 * value(*arguments))
+
+
+def rougher(patch: pytest.MonkeyPatch) -> None:
+    point = plugin("bsdf")._Point
+    read = point._read
+    patch.setattr(point, "_read", lambda self, name: (1.05 if name == "alpha" else 1) * read(self, name))
+
+
+def flipped(patch: pytest.MonkeyPatch) -> None:
+    prepared = plugin("whitted").Prepared
+    intersect = prepared.intersect
+
+    def inside_out(*arguments, **options):
+        hit = intersect(*arguments, **options)
+        hit.si.sh_frame.n, hit.si.wi.z = -hit.si.sh_frame.n, -hit.si.wi.z
+        return hit
+
+    patch.setattr(prepared, "intersect", inside_out)
+
+
+def unclamped(patch: pytest.MonkeyPatch) -> None:
+    visible_part = plugin("whitted").MrtWhitted._visible_part
+
+    def without(self, *arguments):
+        self.clamp = False
+        return visible_part(self, *arguments)
+
+    patch.setattr(plugin("whitted").MrtWhitted, "_visible_part", without)
+
+
+def darker(patch: pytest.MonkeyPatch) -> None:
+    prepared = plugin("whitted").Prepared
+    read_emitters = prepared._read_emitters
+
+    def without_the_last(self, scene):
+        read_emitters(self, scene)
+        self.lights = self.lights[:-1]
+
+    patch.setattr(prepared, "_read_emitters", without_the_last)
+
+
+def approximated(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(
+        plugin("bsdf"),
+        "fresnel_dielectric",
+        lambda c, ext_ior, int_ior, s2: fresnel_schlick(c, f0_from_ior(ext_ior, int_ior), s2),
+    )
+
+
+@pytest.mark.parametrize("break_it", [brighter, rougher, flipped, unclamped, darker, approximated])
+def test_a_broken_plugin_is_seen(
+    break_it: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Scene 1 has every roughness, and lights that need the clamp."""
+    break_it(monkeypatch)
+    found, study = judged(1)
     assert not study.passed
     assert found.count("unexplained") > 0
 

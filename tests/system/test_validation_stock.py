@@ -10,6 +10,7 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
+from mrt_mitsuba.plugins import plugin
 from mrt_mitsuba.scenes import report_scene
 from mrt_mitsuba.validation import approximations, mutations, stock
 from mrt_mitsuba.validation.image_tests import compare
@@ -94,6 +95,19 @@ def test_each_approximation_changes_what_it_says() -> None:
 
 def test_without_what_differs_the_rest_agrees() -> None:
     assert not approximations.compare_rest(3, **SMALL, spp=8).rejects
+
+
+@pytest.mark.parametrize("name", ["radiance", "alpha"])
+def test_a_broken_bsdf_does_not_agree(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    bsdf = plugin("bsdf")
+    if name == "radiance":
+        value = bsdf.MrtBSDF._value
+        monkeypatch.setattr(bsdf.MrtBSDF, "_value", lambda *arguments: 1.02 * value(*arguments))
+    else:
+        read = bsdf._Point._read
+        factor = {"alpha": 1.05}
+        monkeypatch.setattr(bsdf._Point, "_read", lambda self, key: factor.get(key, 1) * read(self, key))
+    assert approximations.compare_rest(0, **SMALL, spp=16).rejects
 
 
 def test_with_diffuse_parts_the_materials_differ() -> None:
