@@ -310,6 +310,8 @@ class Prepared:
         self._read_bsdfs({id(b): b for b in (s.bsdf() for s in shapes)}.values())
         if any(s.is_mesh() for s in others):
             self.ray_flags |= +mi.RayFlags.ShadingFrame
+        # Then a table of centres and radii does the work of a call to every shape
+        self.only_spheres = is_jit() and not self.textured and all(map(_is_plain_sphere, others))
 
     def _read_emitters(self, scene) -> None:
         self.environment = scene.environment()
@@ -372,6 +374,8 @@ class Prepared:
             return dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False)
         pi = (self.bvh or scene).ray_intersect_preliminary(ray, coherent, active)
         found = active & pi.is_valid()
+        if self.only_spheres and not (scene.shapes_grad_enabled() or dr.grad_enabled(ray)):
+            return self.spheres.interaction(pi, ray, found), found
         si = pi.compute_surface_interaction(ray, self.ray_flags, found)
         self.spheres.put_back(si, found)
         return si, found
@@ -470,12 +474,25 @@ class _Spheres:
         rows = [_center_and_radius(s) for s in shapes]
         self.by_shape = _ByShape(mi.Vector4f, shapes, rows, [0.0] * 4) if any(any(row) for row in rows) else None
 
+    def interaction(self, pi, ray, found):
+        """What ``compute_surface_interaction`` gives, but for derivatives and texture coordinates: spheres only."""
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.t, si.shape = dr.select(found, pi.t, dr.inf), dr.select(found, pi.shape, None)
+        center, radius = self._center_and_radius(si, found)
+        n = dr.normalize(dr.fma(ray.d, pi.t, ray.o) - center)
+        si.p = dr.fma(n, radius, center)
+        si.n = si.sh_frame.n = mi.Normal3f(n)
+        return si
+
+    def _center_and_radius(self, si, found):
+        row = self.by_shape(si, found)
+        return mi.Point3f(row.x, row.y, row.z), row.w
+
     def put_back(self, si, found) -> None:
         """Move hits of spheres onto them, along the radius."""
         if self.by_shape is None:
             return
-        row = self.by_shape(si, found)
-        center, radius = mi.Point3f(row.x, row.y, row.z), row.w
+        center, radius = self._center_and_radius(si, found)
         v = si.p - center
         length = dr.norm(v)
         on_sphere = found & (radius > 0) & (length > 0)
@@ -516,6 +533,10 @@ def _center_and_radius(shape) -> list[float]:
         return [0.0] * 4
     low, high = ([float(c) for c in corner] for corner in (shape.bbox().min, shape.bbox().max))
     return [0.5 * (a + b) for a, b in zip(low, high, strict=True)] + [0.5 * (high[0] - low[0])]
+
+
+def _is_plain_sphere(shape) -> bool:
+    return shape.shape_type() == +mi.ShapeType.Sphere and not (shape.has_flipped_normals() or shape.is_emitter())
 
 
 def _construct(integrator, props) -> None:
