@@ -140,6 +140,7 @@ class Scene:
         }
         return {
             "type": "scene",
+            **_ray_options(self.meshes),
             "integrator": {"type": "mrt_whitted"},
             "sensor": self._sensor(width, height),
             "sky": {"type": "constant", "radiance": _rgb(self.sky)},
@@ -190,6 +191,11 @@ class _Materials:
             name = self._names[material] = f"material_{len(self._names)}"
             self.definitions[name] = self._to_bsdf(material)
         return {"type": "ref", "id": name}
+
+
+def _ray_options(meshes: tuple[Mesh, ...]) -> dict[str, bool]:
+    """Embree lets rays through between slivers unless asked not to; what has no mesh needs no care."""
+    return {"embree_use_robust_intersections": True} if meshes else {}
 
 
 def _rgb(color: Color) -> dict[str, Any]:

@@ -17,8 +17,9 @@ class MrtCone(mi.Mesh):
 
     ``mrt_whitted`` intersects the quadric and the disc themselves. To every other integrator the shape is a
     mesh of ``segments`` sides with smooth normals, inscribed in the cone; its distance error falls with
-    segments⁻². Thousands of segments need ``embree_use_robust_intersections`` in the scene: without it,
-    Embree lets rays through between slivers (about 1e-8 of them per segment).
+    segments⁻². Under them, thousands of segments need ``'embree_use_robust_intersections': True`` beside the
+    scene's ``'type'`` (in XML, a ``boolean`` of this name): without it, Embree lets rays through between
+    slivers (about 1e-8 of them per segment). It has no effect on the exact surface.
 
     =============== ========= ========== ==============================================================
     name            type      default    unit or range

@@ -88,6 +88,13 @@ def test_what_the_scenes_hold() -> None:
     assert Path(report_scene(8).meshes[0].material.texture).is_file()
 
 
+@pytest.mark.parametrize("number", range(10))
+def test_watertight_triangles_are_asked_for_where_there_are_any(number: int) -> None:
+    """The report's own scenes hold none, and their pictures shall not change by a bit."""
+    flag = mrt.scene_dict(number).get("embree_use_robust_intersections", False)
+    assert flag is (number in (5, 6, 7, 8))
+
+
 @pytest.mark.parametrize("number", [5, 6, 7, 8])
 def test_scenes_render_and_repeat(number: int) -> None:
     result = mrt.render(number, **SIZE)
