@@ -19,11 +19,17 @@ def test_a_lit_sphere_has_no_dark_spots(variant: str, distance: float) -> None:
     scene = {
         "type": "scene",
         "integrator": {"type": "mrt_whitted"},
-        "sensor": {"type": "perspective", "fov": np.degrees(2 * np.arctan(0.8 / distance)), "near_clip": 0.1,
-                   "far_clip": 1e4, "to_world": to_world, "film": film},
+        "sensor": {
+            "type": "perspective",
+            "fov": np.degrees(2 * np.arctan(0.8 / distance)),
+            "near_clip": 0.1,
+            "far_clip": 1e4,
+            "to_world": to_world,
+            "film": film,
+        },
         "light": {"type": "mrt_light", "position": [0, 0, distance]},
         "sphere": {"type": "sphere", "bsdf": {"type": "mrt_bsdf"}},
-    }  # fmt: skip
+    }
     image = render(scene, aa=1).image
     y, x = np.mgrid[:size, :size] - (size - 1) / 2
     on_sphere = np.hypot(x, y) < 0.5 * size  # well inside of its outline, which is at 0.6
