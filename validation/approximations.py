@@ -64,8 +64,7 @@ def without_approximations(number: int, *, width: int, height: int, spp: int) ->
 
 
 def physical(scene: Scene, *, least_alpha: float = 1e-4, diffuse: bool = True) -> Scene:
-    """A scene within what Mitsuba's plugins take: colours up to 1, positive roughness; ``diffuse``: keep
-    Kd?"""
+    """A scene within what Mitsuba's plugins take: colours up to 1, positive roughness; Kd if ``diffuse``."""
 
     def material(m: Material) -> Material:
         clipped: dict[str, Any] = {

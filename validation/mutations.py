@@ -112,35 +112,52 @@ def _without_clamp(spp: int, size: dict[str, Any]) -> Comparison:
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Every mistake must be found at the largest count, and no other."""
+    """Every mistake must be found at the largest count, and none where there is none."""
     counts = (4, 16) if quick else (4, 16, 64, 256)
     size: dict[str, Any] = {"width": 64, "height": 48} if quick else {"width": 120, "height": 90}
     with study.stage("Mutations", 1) as advance:
         found = trials(counts, **size)
         advance(1)
-    for name in dict.fromkeys(trial.mistake for trial in found):
-        last = [trial for trial in found if trial.mistake == name][-1]
+    by_mistake = {trial.mistake: [t for t in found if t.mistake == trial.mistake] for trial in found}
+    for name, series in by_mistake.items():
         if name == NONE:
-            study.at_least("p of equality without a mistake", last.found.p, LEVEL)
+            study.at_least("p of equality without a mistake", series[-1].found.p, LEVEL)
         else:
-            study.at_most(f"p of equality with {name}", last.found.p, LEVEL)
-    rows = [
-        [
-            t.mistake,
-            t.samples,
-            ", ".join(t.found.detected_by) or "-",
-            t.found.pixel.p,
-            t.found.tile.p,
-            t.found.image.p,
-            t.found.rel_rmse,
-        ]
-        for t in found
-    ]
+            study.at_most(f"p of equality with {name}", series[-1].found.p, LEVEL)
+    caption = (
+        "Probability of such a difference between equal pictures; below the dashed line they are rejected."
+    )
+    study.plot("mutations", "How soon a mistake is found", _plot(by_mistake), caption)
     study.table(
         "mutations",
         "Which test finds which mistake, at how many samples",
         ["mistake", "samples a pixel", "found by", "p pixel", "p tile", "p image", "relRMSE"],
-        sorted(rows, key=lambda row: row[0] != NONE),
+        [_row(trial) for series in by_mistake.values() for trial in series],
         f"mrt_bsdf with the mistake against roughplastic, under path, {RENDERS} renders each; the clamp: "
         f"mrt_whitted against itself. Equal pictures are rejected once in {1 / LEVEL:g} times.",
     )
+
+
+def _row(trial: Trial) -> list[Any]:
+    found = trial.found
+    questions = ", ".join(found.detected_by) or "-"
+    values = (found.pixel.p, found.tile.p, found.image.p, found.rel_rmse)
+    return [trial.mistake, trial.samples, questions, *values]
+
+
+def _plot(by_mistake: dict[str, list[Trial]]) -> Any:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axis = figure.subplots()
+    for name, series in by_mistake.items():
+        p = [max(trial.found.p, 1e-40) for trial in series]  # what is less is as certain
+        axis.loglog([trial.samples for trial in series], p, marker="o", label=name)
+    samples = [trial.samples for trial in by_mistake[NONE]]
+    axis.set_xticks(samples, [str(count) for count in samples])
+    axis.minorticks_off()
+    axis.axhline(LEVEL, color="gray", linestyle="--")
+    axis.set_xlabel("samples a pixel")
+    axis.set_ylabel("p of equality")
+    axis.legend(fontsize="small")
+    return figure
