@@ -1,0 +1,119 @@
+"""The floor under a render: its own rays, recorded, through Mitsuba's ray queries and nothing else.
+
+What a picture costs beyond it goes into shading, planes, the bounce loop, means over pixels and Python.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import mrt_mitsuba as mrt
+
+
+@dataclass
+class Recorder:
+    """Stands before a Mitsuba scene and keeps the rays that it is asked about."""
+
+    scene: Any
+    kinds: list[str] = field(default_factory=list)  # of each wavefront: camera, mirror, shadow
+    rays: list[Any] = field(default_factory=list)
+    single: list[tuple[int, Any, Any]] = field(default_factory=list)
+
+    def ray_intersect_preliminary(self, ray: Any, coherent: Any, active: Any) -> Any:
+        self._keep("camera" if coherent else "mirror", ray, active)
+        return self.scene.ray_intersect_preliminary(ray, coherent, active)
+
+    def ray_test(self, ray: Any, coherent: Any, active: Any) -> Any:
+        self._keep("shadow", ray, active)
+        return self.scene.ray_test(ray, coherent, active)
+
+    def _keep(self, kind: str, ray: Any, active: Any) -> None:
+        """Keep the rays that are asked about, one after the other."""
+        import drjit as dr
+        import mitsuba as mi
+
+        active = mi.Bool(active) & dr.full(mi.Bool, True, dr.width(ray.o))
+        index = dr.compress(active)
+        if dr.width(index) == 0:
+            return
+        if dr.width(index) == 1:
+            # inside a loop, its mask would widen a single ray to all lanes
+            dr.eval(ray, index)
+            self.single.append((len(self.rays), ray, index))
+            kept = None
+        else:
+            kept = dr.gather(mi.Ray3f, ray, index)
+            dr.eval(kept)
+        self.kinds.append(kind)
+        self.rays.append(kept)
+
+    def finish(self) -> None:
+        """Take out single rays, which had to wait for the end of the loop."""
+        import drjit as dr
+        import mitsuba as mi
+
+        for place, ray, index in self.single:
+            self.rays[place] = dr.gather(mi.Ray3f, ray, index)
+            dr.eval(self.rays[place])
+        self.single.clear()
+
+    def counts(self) -> dict[str, int]:
+        """Rays of each kind."""
+        import drjit as dr
+
+        counts: Counter[str] = Counter()
+        for kind, rays in zip(self.kinds, self.rays, strict=True):
+            counts[kind] += dr.width(rays)
+        return dict(counts)
+
+    def replay(self) -> float:
+        """Ask again about all rays; return the seconds that takes."""
+        import drjit as dr
+
+        start = time.perf_counter()
+        for kind, rays in zip(self.kinds, self.rays, strict=True):
+            if kind == "shadow":
+                dr.eval(self.scene.ray_test(rays, False))
+            else:
+                hit = self.scene.ray_intersect_preliminary(rays, kind == "camera")
+                dr.eval(hit.t, hit.shape)
+        dr.sync_thread()
+        return time.perf_counter() - start
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Seconds of the ray queries alone, and rays by kind."""
+
+    seconds: float
+    rays: dict[str, int]
+
+
+def record(scene: Any, **options: Any) -> Recorder:
+    """The rays that a render of a loaded Mitsuba scene by ``mrt_whitted`` asks Mitsuba about."""
+    import drjit as dr
+
+    integrator = scene.integrator()
+    prepared = integrator.prepare(scene)
+    before = prepared.bvh
+    recorder = Recorder(before or scene)
+    prepared.bvh = recorder
+    try:
+        # loops in Python, so that the rays of every bounce pass by here
+        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
+            mrt.render(scene, **options)
+    finally:
+        prepared.bvh = before
+    recorder.finish()
+    return recorder
+
+
+def floor(scene: Any, *, repeats: int = 3, **options: Any) -> Floor:
+    """Record a render of a scene and replay it: the median of some replays, after one that compiles."""
+    recorder = record(scene, **options)
+    recorder.replay()
+    return Floor(statistics.median(recorder.replay() for _ in range(repeats)), recorder.counts())
