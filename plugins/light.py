@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .parameters import vector
-from .variants import first, pointer
+from .variants import first, is_jit, pointer
 
 
 class MrtLight(mi.Emitter):
@@ -92,7 +92,8 @@ class MrtLight(mi.Emitter):
 
     def bbox(self):
         p = mi.ScalarPoint3f(list(map(first, self.position)))
-        return mi.ScalarBoundingBox3f(p, p)
+        # Scalar variants have no second name for it
+        return mi.ScalarBoundingBox3f(p, p) if is_jit() else mi.BoundingBox3f(p, p)
 
     def to_string(self) -> str:
         return f"MrtLight[position={self.position}, intensity={self.intensity}]"
