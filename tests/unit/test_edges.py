@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -386,6 +388,31 @@ def test_tensors_give_tensors_of_their_backend(backend: str) -> None:
     assert type(edges.mask) is module.TensorXb and edges.mask.shape == (6, 7)
     assert type(edges.value) is module.TensorXf and edges.value.shape == (6, 7)
     np.testing.assert_array_equal(np.array(edges.mask), luma_edges(image).mask)
+
+
+@pytest.mark.parametrize(
+    ("variant", "backend"), [("scalar_rgb", "scalar"), pytest.param("llvm_ad_rgb", "llvm", marks=needs_llvm)]
+)
+def test_numpy_is_computed_in_the_backend_of_the_variant(
+    run_python: Callable[..., subprocess.CompletedProcess[str]], variant: str, backend: str
+) -> None:
+    code = """
+import sys
+import mrt_mitsuba
+import mitsuba as mi
+import numpy as np
+from mrt_mitsuba import filters
+from mrt_mitsuba.filters.grid import Grid
+
+mi.set_variant(sys.argv[1])
+image = np.random.default_rng(0).random((6, 7, 3)).astype(np.float32)
+plain, tensor = filters.luma_edges(image), filters.luma_edges(mi.TensorXf(image))
+assert isinstance(plain.mask, np.ndarray) and isinstance(tensor.value, mi.TensorXf)
+assert (plain.mask == np.array(tensor.mask)).all() and plain.mask.any()
+print(Grid(image).Float.__module__)
+"""
+    done = run_python(code, variant)
+    assert done.stdout.split() == [f"drjit.{backend}"], done.stderr
 
 
 def test_edges_image_is_white_on_black() -> None:
