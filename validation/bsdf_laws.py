@@ -91,7 +91,7 @@ def chi_square(study: Study, *, quick: bool) -> None:
     """``sample`` against ``pdf`` by Mitsuba's own test, over roughness, angle, Fresnel form and sampling."""
     alphas, angles = ((0.1, 0.5), (0, 75)) if quick else ((0.05, 0.1, 0.3, 0.6, 1.0), (0, 30, 60, 80))
     forms = ("dielectric", "unity") if quick else FORMS
-    rows = []
+    rows: list[list[Any]] = []
     with _scratch_folder():
         for alpha, degrees, form, visible in product(alphas, angles, forms, (True, False)):
             parameters = {"type": "mrt_bsdf", "alpha": alpha, "fresnel": form, "sample_visible": visible}
@@ -139,7 +139,8 @@ def weights(study: Study, *, quick: bool) -> None:
     density, weight, apart = [], [], []
     for form, visible, alpha in product(FORMS, (True, False), (0.02, 0.1, 0.5)):
         bsdf = colored(alpha=alpha, fresnel=form, sample_visible=visible)
-        wo, pdf, found = draw(bsdf, wi, count)
+        samples, found = draw(bsdf, wi, count)
+        wo, pdf = np.array(samples.wo).T, np.array(samples.pdf)
         up = pdf > 0
         value, expected = evaluate_from(bsdf, wi, wo)
         density.append(alpha * np.abs(pdf[up] / expected[up] - 1).max())
@@ -178,10 +179,10 @@ def reciprocity(study: Study, *, quick: bool) -> None:
 def albedos(study: Study, *, quick: bool) -> None:
     """The mean weight of samples against the integral of the values, which ``sample`` has no part in."""
     count = 200_000 if quick else 1_000_000
-    rows = []
+    rows: list[list[Any]] = []
     for form, visible, degrees in product(FORMS, (True, False), (10, 75)):
         bsdf, wi = colored(alpha=0.3, fresnel=form, sample_visible=visible), at_angle(degrees)
-        weight = draw(bsdf, wi, count)[2]
+        weight = draw(bsdf, wi, count)[1]
         error, expected = weight.std(axis=0) / np.sqrt(count), albedo(bsdf, wi)
         z = (weight.mean(axis=0) - expected) / (error + 2e-5)
         rows.append(
@@ -280,7 +281,7 @@ def dielectric_terms(study: Study, *, quick: bool) -> None:
         }
         errors |= {name: largest((errors[name], error)) for name, error in found.items()}
     wi, wo = lobe_pairs(2_000, 1.0)
-    diffuse = [
+    diffuse: list[dict[str, Any]] = [
         {"type": "mrt_bsdf", "diffuse_reflectance": rgb(KD), "specular_reflectance": 0.0},
         {"type": "diffuse", "reflectance": rgb(KD)},
     ]
@@ -358,7 +359,7 @@ def gradients(study: Study, *, quick: bool) -> None:
         "specular_reflectance.value": 0.9,
     }
     pairs = lobe_pairs(1_000, 0.3)
-    rows = []
+    rows: list[list[Any]] = []
     for form, (name, value) in product(("schlick", "dielectric"), start.items()):
         bsdf = load(fresnel=form, **{key.removesuffix(".value"): number for key, number in start.items()})
         parameters = mi.traverse(bsdf)

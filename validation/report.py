@@ -54,7 +54,7 @@ def header(*, quick: bool) -> dict[str, Any]:
 
     return {
         "version": mrt_mitsuba.__version__,
-        "mitsuba": mi.__version__,
+        "mitsuba": mi.MI_VERSION,
         "drjit": dr.__version__,
         "python": platform.python_version(),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -142,7 +142,7 @@ def _page(sections: Sequence[Mapping[str, Any]], result: Mapping[str, Any]) -> s
 
     import jinja2
 
-    template = files("mrt_mitsuba.validation").joinpath("templates", "report.html").read_text("utf-8")
+    template = (files("mrt_mitsuba.validation") / "templates" / "report.html").read_text("utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters["cell"] = cell
     return environment.from_string(template).render(sections=sections, **result)

@@ -126,7 +126,7 @@ def _judge(wi: Array, wo: Array, alpha: float, one: float, other: float) -> tupl
     of length 1.
     """
     given = exact.unit([float(a) + float(b) for a, b in zip(wi, wo, strict=True)])
-    cos_d = sum(a * b for a, b in zip(exact.unit(wo), exact.half_vector(wi, wo), strict=True))
+    cos_d = sum(a * b for a, b in zip(exact.unit(list(wo)), exact.half_vector(wi, wo), strict=True))
     alpha_used = alpha if is_scalar() else np.float32(alpha)
     true = exact.beckmann_d(given[2], alpha_used) * given[2] / (4 * cos_d)
     return abs(float(one / true) - 1), abs(float(other / true) - 1)
@@ -137,7 +137,9 @@ def pointwise(study: Study, *, quick: bool) -> None:
     variants = runtime.usable_variants()
     if quick:  # every colour mode once, and one scalar variant
         variants = [name for name in variants if not name.startswith("scalar") or name == runtime.SLOW]
-    rows, judged, before = [], [], runtime.use()
+    before = runtime.use()
+    rows: list[list[Any]] = []
+    judged: list[tuple[float, float]] = []
     with study.stage("points", len(variants) * len(ALPHAS)) as advance:
         for variant in variants:
             runtime.use(variant)
@@ -411,7 +413,7 @@ def _hold_pictures(study: Study, found: RoughconductorComparison) -> None:
 
 def _hold_power(study: Study, name: str, change: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
     """The same test of pictures must reject a small error of ours."""
-    broken = ours(POWER_ALPHA) | change
+    broken = {**ours(POWER_ALPHA), **change}
     stacks, _ = _render_both([broken, theirs(POWER_ALPHA)], seed=100, **settings)
     test = image_tests.compare(*(image_tests.estimate(stack) for stack in stacks), level=LEVEL)
     study.at_most(
@@ -453,7 +455,8 @@ def efficiency(study: Study, *, quick: bool) -> None:
     """Noise at equal sample counts, which is held; at equal time, which depends on the machine, recorded."""
     settings = {"size": 64, "spp": 16, "renders": 12} if quick else {"size": 128, "spp": 64, "renders": 32}
     alphas = (0.1, 0.5) if quick else (0.02, 0.1, 0.3, 0.6)
-    rows, ratios = [], []
+    rows: list[list[Any]] = []
+    ratios = []
     with study.stage("noise", len(alphas)) as advance:
         for alpha in alphas:
             found = measure_efficiency(alpha, **settings)
