@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.scene import Scene
 from mrt_mitsuba.scenes import report_scene
 
@@ -29,9 +29,10 @@ def scene_dict(
 
     ``flavor``: "mrt" for this project's plugins; "stock" for the nearest equivalents among Mitsuba's, which any Mitsuba
     program opens: ``roughplastic`` for the material, ``point`` lights as bright at the camera's target, finite squares
-    for planes, and ``path`` with few bounces for the integrator.
+    for planes, ``cylinder`` and two ``disk`` for a cylinder, ``bitmap`` for a texture, and ``path`` with few bounces for
+    the integrator. Cones and meshes have none but in a file of their own, which ``write_xml`` writes.
 
-    Raises ``UsageError`` for an unknown scene or flavor.
+    Raises ``UsageError`` for an unknown scene or flavor, ``SceneError`` for a stock flavor that cannot be had.
     """
     if flavor not in FLAVORS:
         raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
@@ -41,36 +42,100 @@ def scene_dict(
     return result if flavor == "mrt" else _stock(result, scene)
 
 
-def write_xml(scene: int | Scene, path: str | os.PathLike[str], *, flavor: str = "mrt", fresnel: str = "schlick") -> None:
-    """Write a scene as XML through Mitsuba's own writer; raise ``OutputError`` if the file cannot be written."""
+def write_xml(
+    scene: int | Scene, path: str | os.PathLike[str], *, flavor: str = "mrt", fresnel: str = "schlick"
+) -> None:
+    """Write a scene as XML through Mitsuba's own writer.
+
+    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file beside it, named after the
+    XML file and the shape. Raises ``OutputError`` if a file cannot be written, ``SceneError`` for groups of objects
+    (``mrt_group``), which have neither an XML form nor a stock counterpart.
+    """
     from mrt_mitsuba.output import replacing
 
-    text = xml_text(scene, flavor=flavor, fresnel=fresnel)
+    mine = scene_dict(scene, fresnel=fresnel)
+    models = {
+        name: node
+        for name, node in mine.items()
+        if isinstance(node, dict) and node["type"] in _IN_FILES[flavor]
+    }
+    files = {name: f"{os.path.splitext(os.fspath(path))[0]}_{name}.ply" for name in models}
+    for name, node in models.items():
+        mine[name] = _ply_node(node, os.path.basename(files[name]))
+    text = _text_of(mine, scene, flavor)
+    for name, node in models.items():
+        with replacing(files[name]) as file:
+            file.write(_ply(node))
     with replacing(path) as file:
         file.write(text.encode())
 
 
 def xml_text(scene: int | Scene, *, flavor: str = "mrt", fresnel: str = "schlick") -> str:
-    """Return the XML of a scene."""
+    """Return the XML of a scene. Raises ``SceneError`` for what needs files beside it; see ``write_xml``."""
+    if flavor not in FLAVORS:
+        raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
+    return _text_of(scene_dict(scene, fresnel=fresnel), scene, flavor)
+
+
+def _text_of(mine: dict[str, Any], scene: int | Scene, flavor: str) -> str:
+    """The XML of a dict of this project's plugins."""
     import mitsuba as mi
 
-    scene_as_dict = scene_dict(scene, flavor=flavor, fresnel=fresnel)
+    for name, node in mine.items():
+        kind = node["type"] if isinstance(node, dict) else ""
+        if kind in _WITHOUT_XML:
+            raise SceneError(
+                f"{name} cannot be written as XML: {kind} is made of arrays; {_WITHOUT_XML[kind]}"
+            )
+    mine = {name: _with_whole_path(node) for name, node in mine.items()}
+    if flavor == "stock":
+        mine = _stock(mine, scene if isinstance(scene, Scene) else report_scene(scene))
     variant = mi.variant()
     # The writer looks plugins up in scalar_rgb, whatever the current variant
     runtime.use("scalar_rgb")
     runtime.use(variant)
-    state = mi.parser.parse_dict(mi.parser.ParserConfig(variant), scene_as_dict)
+    state = mi.parser.parse_dict(mi.parser.ParserConfig(variant), mine)
     return mi.parser.write_string(state) + "\n"
 
 
+def _with_whole_path(node: Any) -> Any:
+    """A material whose picture is found from wherever the XML lies."""
+    picture = node.get("diffuse_reflectance", {}) if isinstance(node, dict) else {}
+    if "filename" not in picture:
+        return node
+    return {**node, "diffuse_reflectance": {**picture, "filename": os.path.abspath(picture["filename"])}}
+
+
+def _ply_node(node: dict[str, Any], filename: str) -> dict[str, Any]:
+    """A shape that reads the file; triangles of ``mrt_mesh`` are flat."""
+    flat = {"face_normals": True} if node["type"] == "mrt_mesh" else {}
+    return {"type": "ply", "filename": filename, **flat, "bsdf": node["bsdf"]}
+
+
+def _ply(node: dict[str, Any]) -> bytes:
+    """The mesh of a shape as a binary PLY file."""
+    import mitsuba as mi
+
+    stream = mi.MemoryStream()
+    mi.load_dict({name: value for name, value in node.items() if name != "bsdf"}).write_ply(stream)
+    stream.seek(0)
+    return bytes(stream.read(stream.size()))
+
+
 def _stock(scene_as_dict: dict[str, Any], scene: Scene) -> dict[str, Any]:
-    """Replace every plugin of this project by its nearest stock equivalent."""
-    return {name: _stock_node(node, scene) if isinstance(node, dict) else node for name, node in scene_as_dict.items()}
-
-
-def _stock_node(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
-    replace = _REPLACEMENTS.get(node["type"])
-    return replace(node, scene) if replace else node
+    """Replace every plugin of this project by its nearest stock equivalent, which may take several nodes."""
+    result: dict[str, Any] = {}
+    for name, node in scene_as_dict.items():
+        kind = node["type"] if isinstance(node, dict) else ""
+        if kind in _WITHOUT_STOCK:
+            raise SceneError(
+                f"{name} has no counterpart among Mitsuba's plugins: {kind} {_WITHOUT_STOCK[kind]}"
+            )
+        if kind == "mrt_cylinder":
+            result |= {f"{name}_{part}": child for part, child in _stock_cylinder(node).items()}
+        else:
+            result[name] = _REPLACEMENTS[kind](node, scene) if kind in _REPLACEMENTS else node
+    return result
 
 
 def _stock_integrator(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
@@ -81,8 +146,12 @@ def _stock_bsdf(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
     """The same lobes over a diffuse base; colours above one and negative roughness have no stock counterpart."""
 
     def clipped(color: dict[str, Any]) -> dict[str, Any]:
+        if color["type"] == "mrt_texture":
+            return _stock_texture(color)
         return {**color, "value": [min(c, 1.0) for c in color["value"]]} if color["type"] == "rgb" else color
 
+    if node["specular_reflectance"].get("value") == [0.0, 0.0, 0.0]:
+        return {"type": "diffuse", "reflectance": clipped(node["diffuse_reflectance"])}
     return {
         "type": "roughplastic",
         "distribution": "beckmann",
@@ -102,16 +171,40 @@ def _stock_light(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
 
 
 def _stock_plane(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
-    import mitsuba as mi
-
     length = sum(c * c for c in node["normal"]) ** 0.5
     normal = [c / length for c in node["normal"]]
     foot = [-node["distance"] * c for c in normal]
+    return {"type": "rectangle", "to_world": _facing(foot, normal, STOCK_EXTENT / 2), "bsdf": node["bsdf"]}
+
+
+def _stock_cylinder(node: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """An open tube and a disc at each end that faces away from the other."""
+    p0, p1, radius = node["p0"], node["p1"], node["radius"]
+
+    def disc(center: list[float], opposite: list[float]) -> dict[str, Any]:
+        away = [c - o for c, o in zip(center, opposite, strict=True)]
+        return {"type": "disk", "to_world": _facing(center, away, radius), "bsdf": node["bsdf"]}
+
+    tube = {"type": "cylinder", "p0": p0, "p1": p1, "radius": radius, "bsdf": node["bsdf"]}
+    return {"tube": tube, "disc0": disc(p0, p1), "disc1": disc(p1, p0)}
+
+
+def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
+    """What takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
+    import mitsuba as mi
+
+    length = sum(c * c for c in normal) ** 0.5
+    normal = [c / length for c in normal]
     up = [0, 0, 1] if abs(normal[2]) < 0.9 else [1, 0, 0]
-    to_world = mi.ScalarTransform4f().look_at(foot, [p + n for p, n in zip(foot, normal, strict=True)], up)
-    # Mitsuba's rectangle is [-1, 1]², facing +z
-    to_world = to_world @ mi.ScalarTransform4f().scale([STOCK_EXTENT / 2, STOCK_EXTENT / 2, 1])
-    return {"type": "rectangle", "to_world": to_world, "bsdf": node["bsdf"]}
+    target = [c + n for c, n in zip(center, normal, strict=True)]
+    to_world = mi.ScalarTransform4f().look_at(center, target, up)
+    return to_world @ mi.ScalarTransform4f().scale([half_size, half_size, 1])
+
+
+def _stock_texture(node: dict[str, Any]) -> dict[str, Any]:
+    """The nearest texel as stored; half a texel off the report's look-up, which shrinks the picture so far."""
+    stored = {"raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+    return {"type": "bitmap", "filename": os.path.abspath(node["filename"]), **stored}
 
 
 _REPLACEMENTS: dict[str, Callable[[dict[str, Any], Scene], dict[str, Any]]] = {
@@ -119,4 +212,16 @@ _REPLACEMENTS: dict[str, Callable[[dict[str, Any], Scene], dict[str, Any]]] = {
     "mrt_bsdf": _stock_bsdf,
     "mrt_light": _stock_light,
     "mrt_plane": _stock_plane,
+}
+
+# Shapes that are written as files beside the XML
+_IN_FILES = {"mrt": ("mrt_mesh",), "stock": ("mrt_mesh", "mrt_cone")}
+_WITHOUT_XML = {
+    "mrt_mesh": "write_xml, or mrt export, puts it into a file beside the XML",
+    "mrt_group": "render it from Python, or write at most 1000 spheres, 100 cones and 100 cylinders",
+}
+_WITHOUT_STOCK = {
+    "mrt_mesh": "is made of arrays, and ply reads a file; write_xml, or mrt export, puts it beside the XML",
+    "mrt_cone": "is a mesh to them; write_xml, or mrt export, puts it into a file beside the XML",
+    "mrt_group": "is one shape of many objects; use the flavor mrt",
 }

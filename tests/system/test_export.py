@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -10,6 +11,9 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.export import FLAVORS, write_xml, xml_text
+from mrt_mitsuba.plugins.intersect import Frame, intersect_cylinder
+from mrt_mitsuba.scene import Cylinder
+from mrt_mitsuba.scenes import report_scene
 from mrt_mitsuba.scenes_xml import NUMBERS, path
 
 
@@ -41,8 +45,12 @@ def test_xml_renders_the_same_picture_as_the_dict(number):
 
 def test_dicts_are_plain_and_share_materials():
     scene = mrt.scene_dict(4)
-    materials = {name for name, node in scene.items() if isinstance(node, dict) and node["type"] == "mrt_bsdf"}
-    shapes = [node for node in scene.values() if isinstance(node, dict) and node["type"] in ("sphere", "mrt_plane")]
+    materials = {
+        name for name, node in scene.items() if isinstance(node, dict) and node["type"] == "mrt_bsdf"
+    }
+    shapes = [
+        node for node in scene.values() if isinstance(node, dict) and node["type"] in ("sphere", "mrt_plane")
+    ]
     assert len(shapes) == 603 and len(materials) == 13
     assert all(shape["bsdf"] == {"type": "ref", "id": shape["bsdf"]["id"]} for shape in shapes)
     assert {shape["bsdf"]["id"] for shape in shapes} == materials
@@ -72,6 +80,85 @@ def test_stock_lights_are_as_bright_at_the_target():
         squared = sum((a - b) ** 2 for a, b in zip(ours[name]["position"], (0, 0.3, 0), strict=True))
         for a, b in zip(ours[name]["intensity"]["value"], stock[name]["intensity"]["value"], strict=True):
             assert b / squared == pytest.approx(a, rel=1e-12)
+
+
+SMALL = {"width": 64, "height": 48}
+
+
+@pytest.mark.parametrize("number", [5, 6, 7, 8, 9])
+def test_every_scene_goes_into_files_and_back(number, tmp_path):
+    """Meshes take the way of binary PLY, which keeps float32 as it is: not a bit of the picture changes."""
+    write_xml(number, tmp_path / "scene.xml")
+    meshes = len(report_scene(number).meshes)
+    assert len(list(tmp_path.iterdir())) == 1 + meshes
+    from_xml = mi.load_file(str(tmp_path / "scene.xml"), resx=64, resy=48)
+    images = [mrt.render(s, aa=1).image for s in (mi.load_dict(mrt.scene_dict(number, **SMALL)), from_xml)]
+    assert np.array_equal(*images)
+
+
+@pytest.mark.parametrize("number", [5, 6, 7, 8, 9])
+def test_stock_flavour_of_every_scene_shows_the_same_shapes(number, tmp_path, run_python):
+    """Opened without our plugins registered; depth says whether each shape is where it was, whatever its material."""
+    write_xml(number, tmp_path / "scene.xml", flavor="stock")
+    assert 'type="mrt_' not in (tmp_path / "scene.xml").read_text()
+    code = """
+import sys
+import mitsuba as mi
+import numpy as np
+mi.set_variant("llvm_ad_rgb")
+scene = mi.load_file(sys.argv[1], resx=64, resy=48)
+depth = {"type": "aov", "aovs": "d:depth"}
+np.save("depth.npy", np.array(mi.render(scene, integrator=mi.load_dict(depth), spp=1, seed=1))[..., -1])
+image = np.array(mi.render(scene, spp=2))
+assert np.isfinite(image).all() and 0.01 < image.mean() < 5, image.mean()
+"""
+    # The package only chooses LLVM here: without register(), Mitsuba knows none of its plugins
+    done = run_python("import mrt_mitsuba\n" + code, str(tmp_path / "scene.xml"))
+    assert done.returncode == 0, done.stderr
+    stock = np.load(tmp_path / "depth.npy")
+    ours = mrt.render(number, **SMALL, aa=1, layers=["depth"]).layers["depth.Z"]
+    # A stock ray goes through a random point of the pixel, and stock planes end; a shape that is missing or
+    # misplaced shows over more of the picture than edges do
+    near = np.isfinite(ours) & (ours < 20)
+    off = np.abs(stock[near] - ours[near]) > 0.1 * ours[near]
+    assert off.mean() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("number", "flavor", "text"),
+    [(9, "stock", "cone_0.*mrt_cone"), (8, "stock", "mesh_0.*mrt_mesh"), (7, "mrt", "mesh_0")],
+)
+def test_what_needs_a_file_is_named(number, flavor, text):
+    with pytest.raises(mrt.SceneError, match=text):
+        xml_text(number, flavor=flavor)
+
+
+def test_group_cannot_be_written(tmp_path):
+    scene = report_scene(0)
+    many = replace(scene, spheres=scene.spheres[:1] * 1001)
+    for flavor in FLAVORS:
+        with pytest.raises(mrt.SceneError, match="spheres cannot be written as XML.*mrt_group"):
+            write_xml(many, tmp_path / "many.xml", flavor=flavor)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_stock_cylinder_is_closed():
+    """Rays from all around meet the tube and its discs at the distances of the exact cylinder."""
+    cylinder = Cylinder((0.2, 1.5, -0.1), (0.5, 0.4, 0.3), 0.65, report_scene(0).spheres[0].material)
+    scene = replace(report_scene(0), spheres=(), planes=(), cylinders=(cylinder,))
+    rng = np.random.default_rng(5)
+    o = rng.normal(size=(20_000, 3))
+    o = 4 * o / np.linalg.norm(o, axis=1, keepdims=True) + np.array([0.35, 0.95, 0.1])
+    d = np.array([0.35, 0.95, 0.1]) + rng.uniform(-0.4, 0.4, o.shape) - o
+    ray = mi.Ray3f(mi.Point3f(o.T), mi.Vector3f((d / np.linalg.norm(d, axis=1, keepdims=True)).T))
+    stock = mi.load_dict(mrt.scene_dict(scene, flavor="stock"))  # lives until its rays are traced
+    found = np.array(stock.ray_intersect_preliminary(ray).t)
+    frame = mi.load_dict(scene.to_dict()["cylinder_0"] | {"bsdf": {"type": "diffuse"}}).frame()
+    frame = Frame(mi.Point3f(frame.origin), *(mi.Vector3f(row) for row in (frame.x, frame.y, frame.z)))
+    exact = np.array(intersect_cylinder(ray.o, ray.d, frame).t)
+    assert np.isfinite(exact).mean() > 0.5
+    # float32 at distances of four; a grazing ray may go either way
+    assert np.isclose(found, exact, rtol=1e-5).mean() > 0.999
 
 
 def test_writing_xml_is_checked_and_atomic(tmp_path):
