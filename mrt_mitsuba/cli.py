@@ -8,6 +8,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from mrt_mitsuba.errors import MrtError, MrtWarning, UsageError
 from mrt_mitsuba.interrupt import Terminated, ending_soon, leave_now
@@ -82,7 +83,11 @@ def render(options: Options) -> int:
         print(banner(options), flush=True)
     progress = Progress() if options.quiet else TerminalProgress(show_plan=options.plan == "show")
     start = time.perf_counter()
-    scene = options.scene if options.scene is not None else options.scene_number
+    scene: Any = options.scene if options.scene is not None else options.scene_number
+    if options.shows_model():
+        from mrt_mitsuba.obj import obj_view
+
+        scene = obj_view(scene, convention=options.convention, **options.model_arguments())
     result = render_scene(scene, progress=progress, **options.render_arguments())
     seconds = time.perf_counter() - start
     for path in options.outputs():

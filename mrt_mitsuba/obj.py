@@ -18,7 +18,7 @@ import numpy as np
 
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
 from mrt_mitsuba.mtl import CONVENTIONS, DEFAULT_MATERIAL, decode, find, numbers, read_bytes, read_mtl
-from mrt_mitsuba.scene import BLUE_SKY, Camera, Color, Light, Material, Mesh, Scene
+from mrt_mitsuba.scene import BLUE_SKY, Camera, Color, Light, Material, Mesh, Scene, Vector
 
 # Statements about names, groups, smoothing, curves and display: nothing that is rendered here
 _IGNORED = frozenset(
@@ -147,6 +147,35 @@ def obj_scene(
         meshes=meshes,
         texturing=texturing or convention,
     )
+
+
+def obj_view(
+    path: str | os.PathLike[str],
+    *,
+    convention: str = "report",
+    texturing: str | None = None,
+    camera: Vector | None = None,
+    target: Vector | None = None,
+    up: Vector | None = None,
+    fov: float | None = None,
+    light: Vector | None = None,
+) -> Scene:
+    """``obj_scene`` seen as the options of the command say; what is None stays as ``obj_scene`` places it.
+
+    ``fov`` is horizontal, in degrees; ``light`` is a white light's place. Raises ``UsageError`` for a camera
+    that looks nowhere, and what ``obj_scene`` raises.
+    """
+    lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
+    scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)
+    given = {"position": camera, "target": target, "up": up, "hfov": fov}
+    view = replace(scene.camera, **{name: value for name, value in given.items() if value is not None})
+    forward = np.subtract(view.target, view.position)
+    if not forward.any():
+        raise UsageError(f"camera and target are the same point, {list(view.position)}: move one of them")
+    # Their angle, as a share of its largest sine
+    if np.linalg.norm(np.cross(forward, view.up)) <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(view.up):
+        raise UsageError(f"the camera looks along up={list(view.up)}: choose another up, such as up=0,0,1")
+    return replace(scene, camera=view)
 
 
 @dataclass

@@ -24,6 +24,8 @@ LARGEST_SIDE = 65536  # pixels; whether the memory suffices is checked where it 
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
 # A scene file has its own, unless these are given
 DECIDED_BY_FILE = ("width", "height", "fresnel")
+# An OBJ file has neither camera nor lights; other scenes have their own
+FOR_MODELS = ("texturing", "camera", "target", "up", "fov", "light")
 HELP_WIDTH = 100  # characters
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 SMALLEST_MEMORY = 64 * 2**20  # bytes; about what one tile with all layers takes
@@ -105,7 +107,18 @@ def subset(known: Iterable[str]) -> Kind:
     return Kind("A,B,..", f"a comma list out of {', '.join(known)}, each once, or all", from_text, check)
 
 
-def vector() -> Kind:
+def angle() -> Kind:
+    """Degrees between 0 and 180, without these."""
+
+    def check(value: Any) -> float:
+        if isinstance(value, bool) or not 0 < value < 180:
+            raise ValueError
+        return float(value)
+
+    return Kind("DEGREES", "degrees, more than 0 and less than 180", lambda text: float(_plain(text)), check)
+
+
+def vector(form: str = "X,Y,Z") -> Kind:
     """Three finite numbers."""
 
     def check(value: Any) -> tuple[float, float, float]:
@@ -117,7 +130,7 @@ def vector() -> Kind:
     def from_text(text: str) -> list[float]:
         return [float(_plain(part)) for part in text.split(",")]
 
-    return Kind("DX,DY,DZ", "three finite numbers separated by commas", from_text, check)
+    return Kind(form, "three finite numbers separated by commas", from_text, check)
 
 
 def size() -> Kind:
@@ -212,7 +225,7 @@ class Options:
         "report", choice("report", "srgb"), "values in the PNG: linear as in the report, or sRGB"
     )
     motion: tuple[float, float, float] | None = option(
-        None, vector(), "motion blur: how far the camera moves", "none"
+        None, vector("DX,DY,DZ"), "motion blur: how far the camera moves", "none"
     )
     motionsamples: int = option(16, integer(1, 65536), "moments at which motion blur sees the scene")
     motionmode: str = option(
@@ -233,13 +246,38 @@ class Options:
     convention: str = option(
         "report", choice("report", "standard"), "MTL files: Ni is the roughness, or the IOR"
     )
+    texturing: str | None = option(
+        None,
+        choice("report", "standard"),
+        "textures of an OBJ file: nearest texel, or bilinear from sRGB",
+        "as convention",
+    )
+    camera: tuple[float, float, float] | None = option(
+        None, vector(), "OBJ file: where the camera is", "by the model's size"
+    )
+    target: tuple[float, float, float] | None = option(
+        None, vector(), "OBJ file: what the camera looks at", "the model's centre"
+    )
+    up: tuple[float, float, float] | None = option(None, vector(), "OBJ file: what is up", "0,1,0")
+    fov: float | None = option(None, angle(), "OBJ file: horizontal field of view", "60")
+    light: tuple[float, float, float] | None = option(
+        None, vector(), "OBJ file: where a white light is, in place of the two", "two, by the model's size"
+    )
     plan: str = option("hide", choice("show", "hide"), "print what will run and what is left out, and why")
     quiet: bool = option(False, switch(), "print errors only", "0")
 
     def render_arguments(self) -> dict[str, Any]:
         """Return the options that say how to render, by name, without those about files and messages."""
-        others = {"filename", "scene_number", "scene", "format", "tonemap", "plan", "quiet"}
+        others = {"filename", "scene_number", "scene", "format", "tonemap", "plan", "quiet", *FOR_MODELS}
         return {name: getattr(self, name) for name in TABLE if name not in others}
+
+    def shows_model(self) -> bool:
+        """Whether the scene is an OBJ file, which has neither camera nor lights."""
+        return self.scene is not None and self.scene.lower().endswith(".obj")
+
+    def model_arguments(self) -> dict[str, Any]:
+        """Return what was given about the view of an OBJ file, by name."""
+        return {name: getattr(self, name) for name in FOR_MODELS if getattr(self, name) is not None}
 
     def outputs(self) -> tuple[str, ...]:
         """Return the paths of the pictures to write."""
@@ -274,6 +312,13 @@ def parse(arguments: Sequence[str]) -> Options:
     for name in ("motionsamples", "motionmode"):
         if name in values and "motion" not in values:
             raise UsageError(f"{name} is of use only with motion=dx,dy,dz")
+    of_models = [name for name in FOR_MODELS if name in values]
+    if of_models and not str(values.get("scene", "")).lower().endswith(".obj"):
+        raise UsageError(f"{of_models[0]} is of use only with an OBJ file: scene=PATH.obj")
+    if "camera" in values and values["camera"] == values.get("target"):
+        raise UsageError("camera and target are the same point: move one of them")
+    if values.get("up") == (0, 0, 0):
+        raise UsageError("up=0,0,0: up must have a length, such as up=0,1,0")
     if "scene" in values:
         values = dict.fromkeys(DECIDED_BY_FILE) | values
     if "layers=all" in rest and values.get("aamode") == "none":

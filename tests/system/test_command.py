@@ -82,6 +82,21 @@ def test_scene_file_keeps_its_size(mrt: Mrt, tmp_path: Path) -> None:
     np.testing.assert_array_equal(picture.image[-1, 0], np.float32([0.25, 0.5, 0.75]))  # the sky, as given
 
 
+def test_model_is_seen_from_where_the_camera_is_put(mrt: Mrt, tmp_path: Path) -> None:
+    """A triangle that covers the right half of the picture from in front, and lies behind from the back."""
+    (tmp_path / "t.obj").write_text("v 0 -9 0\nv 9 -9 0\nv 9 9 0\nv 0 9 0\nf 1 2 3 4\n")
+    common = (*SMALL, "scene=t.obj", "aa=1", "format=exr", "target=0,0,0", "light=0,0,3", "quiet=1")
+    for name, z in (("front", 4), ("back", -4)):
+        done = mrt(name, *common, f"camera=0,0,{z}", "fov=40")
+        assert (done.returncode, done.stderr) == (0, "")
+    front, back = (read_exr(tmp_path / f"{name}.exr").image for name in ("front", "back"))
+    covered = np.abs(front - front[0, 0]).max(axis=2) > 0.02
+    half = covered[:, :32].all(), covered[:, 33:].all()
+    assert sorted(half) == [False, True] and not np.array_equal(front, back)
+    done = mrt("along", *common, "camera=0,5,0")
+    assert done.returncode == 2 and "looks along up" in done.stderr and done.stderr.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("content", "text"),
     [

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
 from mrt_mitsuba.mtl import DEFAULT_MATERIAL, read_mtl
-from mrt_mitsuba.obj import read_obj
-from mrt_mitsuba.scene import Mesh
+from mrt_mitsuba.obj import obj_scene, obj_view, read_obj
+from mrt_mitsuba.scene import Camera, Mesh
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 UVS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -392,3 +392,31 @@ def test_one_wrong_byte_is_read_or_refused(model, position: int, change: bytes) 
             assert "model.obj:" in str(error)
             return
     assert sum(len(mesh.faces) for mesh in meshes) >= 4
+
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+
+def test_view_as_asked_for(tmp_path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text(TRIANGLE)
+    placed = obj_scene(path)
+    assert obj_view(path).camera == placed.camera and obj_view(path).lights == placed.lights
+    view = obj_view(path, camera=(0, 0, 5), fov=30, light=(1, 2, 3), texturing="standard")
+    assert view.camera == Camera((0, 0, 5), placed.camera.target, hfov=30)
+    assert [light.position for light in view.lights] == [(1, 2, 3)] and view.texturing == "standard"
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"camera": (0.5, 0.5, 0)}, "same point"),  # the model's centre
+        ({"camera": (0.5, 9, 0)}, "looks along up"),
+        ({"camera": (0, 0, 2), "target": (0, 0, 1), "up": (0, 0, 3)}, "looks along up"),
+    ],
+)
+def test_view_of_nothing_is_refused(tmp_path, given: dict, text: str) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text(TRIANGLE)
+    with pytest.raises(UsageError, match=text):
+        obj_view(path, **given)

@@ -53,6 +53,24 @@ def test_defaults_of_the_report() -> None:
         (["o", "memory=100000000"], {"memory": 10**8}),
         (["o", "scene=a=b.xml"], {"scene": "a=b.xml", "width": None, "height": None, "fresnel": None}),
         (["o", "scene=a.xml", "width=3"], {"scene": "a.xml", "width": 3, "height": None, "fresnel": None}),
+        (
+            ["o", "scene=a.OBJ", "camera=1,2,3", "target=0,0,.5", "up=0,0,1", "fov=45", "light=0,9,0"],
+            {
+                "scene": "a.OBJ",
+                "camera": (1, 2, 3),
+                "target": (0, 0, 0.5),
+                "up": (0, 0, 1),
+                "fov": 45.0,
+                "light": (0, 9, 0),
+                "width": None,
+                "height": None,
+                "fresnel": None,
+            },
+        ),
+        (
+            ["o", "scene=a.obj", "texturing=standard"],
+            {"scene": "a.obj", "texturing": "standard", "width": None, "height": None, "fresnel": None},
+        ),
         (["o", "quiet=1", "plan=show"], {"quiet": True, "plan": "show"}),
         (["o", "quiet=no"], {"quiet": False}),
         (["dir.v1/o.v2"], {"filename": "dir.v1/o.v2"}),
@@ -131,6 +149,18 @@ BAD = [
     ("motionmode=stratified", "only with motion"),
     ("motion=1,0,0 motionmode=both", "frames or stratified"),
     ("spp=0", "whole number"),
+    ("camera=1,2,3", "camera is of use only with an OBJ file: scene=PATH.obj"),
+    ("3 light=1,2,3", "light is of use only with an OBJ file"),
+    ("scene=a.xml texturing=standard", "texturing is of use only with an OBJ file"),
+    ("scene=a.obj texturing=bilinear", "report or standard"),
+    ("scene=a.obj camera=1,2", "camera must be three finite numbers"),
+    ("scene=a.obj target=nan,0,0", "target must be three finite numbers"),
+    ("scene=a.obj light=1,2,inf", "light must be three finite numbers"),
+    ("scene=a.obj fov=0", "fov must be degrees, more than 0 and less than 180"),
+    ("scene=a.obj fov=180", "less than 180"),
+    ("scene=a.obj fov=nan", "less than 180"),
+    ("scene=a.obj up=0,0,0", "up must have a length"),
+    ("scene=a.obj camera=1,2,3 target=1,2,3", "camera and target are the same point"),
     ("-1", "SCENE -1: must be 0, 1,"),
     ("99", "SCENE 99: must be 0, 1, 2, 3, 4"),
     ("1.0", "must be 0, 1,"),
@@ -169,6 +199,7 @@ def test_refused_file_names(arguments: list[str], text: str) -> None:
 def test_any_text_is_taken_or_refused_in_one_line(name: str, text: str) -> None:
     """Whatever is typed, the answer is a value that the table's own check accepts, or a UsageError."""
     extra = ["motion=1,0,0"] if name.startswith("motion") and name != "motion" else []
+    extra += ["scene=a.obj"] if name in options.FOR_MODELS else []
     try:
         value = getattr(parse(["out", f"{name}={text}", *extra]), name)
     except UsageError as error:
