@@ -1,6 +1,7 @@
 # make render [SCENE=3] [ARGS="aa=2"]   render a scene to out/sceneN.png and .exr
 # make test   [ARGS="-k llvm"]          run the tests
 # make docs                            the documentation as a site: docs/_build/index.html
+# make bench  [ARGS="--compare F"]      time scenes 0-4 into out/bench.json
 # make setup                            the environment alone: .venv with the commands mrt and mrt-validate
 # make lint, make types, make package   style, types, wheel and sdist
 PYTHON ?= python3
@@ -13,7 +14,7 @@ BIN  := $(VENV)/bin
 # One stamp per set of extras: installing one leaves the others as they are.
 STAMP := $(VENV)/.mrt
 
-.PHONY: setup render test docs lint types package clean
+.PHONY: setup render test bench docs lint types package clean
 setup: $(STAMP)-base
 
 render: $(STAMP)-base
@@ -23,6 +24,9 @@ render: $(STAMP)-base
 
 test: $(STAMP)-test
 	$(BIN)/python -m pytest $(ARGS)
+
+bench: $(STAMP)-test
+	$(BIN)/python -m mrt_mitsuba.validation.bench --out $(OUT)/bench.json $(ARGS)
 
 lint: $(STAMP)-dev
 	$(BIN)/ruff check .

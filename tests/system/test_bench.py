@@ -1,0 +1,68 @@
+"""The benchmark: its file, its schema, its comparison."""
+
+from __future__ import annotations
+
+import copy
+import json
+
+import pytest
+
+from mrt_mitsuba.validation import bench
+
+
+def _fits(value, schema) -> bool:
+    """As much of JSON schema as the benchmark uses."""
+    if "const" in schema:
+        return value == schema["const"]
+    kinds = {"object": dict, "number": (int, float), "integer": int, "string": str}
+    if not isinstance(value, kinds[schema["type"]]):
+        return False
+    if schema["type"] != "object":
+        return True
+    known, others = schema.get("properties", {}), schema.get("additionalProperties", None)
+    return set(schema.get("required", ())) <= value.keys() and all(
+        _fits(item, known[key]) if key in known else others is None or _fits(item, others)
+        for key, item in value.items()
+    )
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bench") / "new" / "bench.json"
+    assert bench.main(["--quick", "--out", str(path)]) == 0
+    return path
+
+
+def test_file_follows_the_schema_and_a_broken_one_does_not(found):
+    run = json.loads(found.read_text())
+    assert _fits(run, bench.SCHEMA)
+    broken = copy.deepcopy(run)
+    del broken["scenes"]["0"]["floor"]
+    assert not _fits(broken, bench.SCHEMA)
+    assert set(run["scenes"]) == {"0", "3"}
+    assert run["scenes"]["0"]["rays"]["camera"] == 80 * 60 * 4
+    assert all(run["scenes"]["3"][name] > 0 for name in bench.COMPARED)
+
+
+def test_comparison_prints_ratios(found):
+    before = bench.read(found)
+    now = copy.deepcopy(before)
+    now["scenes"]["3"]["render"] *= 2
+    line = bench.table(now, before).splitlines()[-1]
+    assert line.startswith("3") and "(2.00x)" in line and line.count("(1.00x)") == 4
+    assert "x)" not in bench.table(now)
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path, capsys):
+    other = tmp_path / "other.json"
+    for text in ("{}", "[1]", "no json", '{"schema": 2, "scenes": {}}'):
+        other.write_text(text)
+        with pytest.raises(SystemExit):
+            bench.main(["--compare", str(other), "--out", str(tmp_path / "b.json")])
+        assert "cannot compare" in capsys.readouterr().err
+    assert not (tmp_path / "b.json").exists()
+
+
+def test_schema_is_printed(capsys):
+    assert bench.main(["--schema"]) == 0
+    assert json.loads(capsys.readouterr().out) == bench.SCHEMA
