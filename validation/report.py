@@ -19,6 +19,7 @@ from mrt_mitsuba.output import replacing, to_8bit, write_exr
 from mrt_mitsuba.validation.study import Bound, Picture, Plot, Study, Table
 
 LONG_TABLE = 12  # rows from which on a table of the page is folded
+LONG_LIST = 30  # bounds from which on they are folded if all hold
 DOTS_PER_INCH = 110
 BROAD = 2  # width over height from which on a picture has a row of the page to itself
 
@@ -145,7 +146,7 @@ def _page(sections: Sequence[Mapping[str, Any]], result: Mapping[str, Any]) -> s
     template = (files("mrt_mitsuba.validation") / "templates" / "report.html").read_text("utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters["cell"] = cell
-    return environment.from_string(template).render(sections=sections, **result)
+    return environment.from_string(template).render(sections=sections, long_list=LONG_LIST, **result)
 
 
 def cell(value: Any) -> str:

@@ -16,7 +16,7 @@ import pytest
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.output import read_exr
 from mrt_mitsuba.validation import cli
-from mrt_mitsuba.validation.report import cell
+from mrt_mitsuba.validation.report import LONG_LIST, cell
 from mrt_mitsuba.validation.study import Study
 
 for needed in cli.EXTRAS:
@@ -200,6 +200,27 @@ def test_interrupt_leaves_the_report_as_it_was(studies, tmp_path: Path, capsys) 
     assert cli.main(["all", "--out", str(tmp_path)]) == cli.INTERRUPTED
     assert [path.name for path in tmp_path.iterdir()] == ["summary.json"]
     assert (tmp_path / "summary.json").read_text() == "before"
+
+
+def test_every_study_has_a_module_with_a_title() -> None:
+    from importlib import import_module
+
+    for name in cli.STUDIES.values():
+        module = import_module(f"mrt_mitsuba.validation.{name}")
+        assert module.TITLE and callable(module.run)
+
+
+@pytest.mark.parametrize("missed", [False, True])
+def test_many_bounds_are_folded_unless_one_is_missed(studies, tmp_path: Path, missed: bool) -> None:
+    def many(study: Study, *, quick: bool) -> None:
+        for i in range(LONG_LIST):
+            study.at_most(f"bound {i}", float(missed and i == 3), 0)
+
+    studies(many=many)
+    cli.main(["many", "--out", str(tmp_path)])
+    page = Page((tmp_path / "index.html").read_text("utf-8"))
+    assert page.tags.count("details") == (0 if missed else 1)
+    assert page.text.count("✗ missed") == (3 if missed else 0)  # in the list, the title and the row
 
 
 @pytest.mark.parametrize(
