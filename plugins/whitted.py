@@ -493,10 +493,12 @@ class _Spheres:
         if self.by_shape is None:
             return
         center, radius = self._center_and_radius(si, found)
-        v = si.p - center
+        p = dr.detach(si.p)
+        v = p - center
         length = dr.norm(v)
         on_sphere = found & (radius > 0) & (length > 0)
-        si.p = dr.select(on_sphere, center + v * (radius / dr.select(on_sphere, length, 1)), si.p)
+        # A shift without a derivative: how the hit moves with the sphere is for Mitsuba to say
+        si.p += dr.select(on_sphere, center + v * (radius / dr.select(on_sphere, length, 1)) - p, 0)
 
 
 class _ByShape:
