@@ -35,11 +35,13 @@ COLUMNS = (
     "error in the others",
 )
 
-# An error counts as that of full supersampling up to here; a twentieth is less than doubling aa changes by a factor of 2
+# An error counts as that of full supersampling up to here; a twentieth is less than doubling aa changes by a
+# factor of 2
 SAME_ERROR = 1.05
 THIRD = 1 / 3
 
-# Luma contrast of a 3x3 neighbourhood in the converged picture: below, nothing is worth refining; above, it is an edge
+# Luma contrast of a 3x3 neighbourhood in the converged picture: below, nothing is worth refining; above, it
+# is an edge
 FLAT, EDGE = 0.02, 0.2
 
 
@@ -92,7 +94,7 @@ def run(study: Study, *, quick: bool) -> None:
     _chase_noise(study, extent)
 
 
-# ----------------------------------------------- The report's scenes -----------------------------------------------
+# ----------------------------------------- The report's scenes ------------------------------------------
 
 
 def _compare_modes(study: Study, extent: Extent) -> None:
@@ -188,8 +190,8 @@ def _hold(study: Study, name: str, rows: Sequence[Row]) -> None:
     )
     least = max(full)
     sobel = next(row for row in rows if (row.mode, row.aa) == ("sobel", least))
-    # scene 4 leaves a fifth of its pixels alone and twice the error, scene 2 the outlines of its dark spheres; a detector
-    # that finds nothing has four times the error or more
+    # scene 4 leaves a fifth of its pixels alone and twice the error, scene 2 the outlines of its dark
+    # spheres; a detector that finds nothing has four times the error or more
     study.at_most(f"{name}: error of sobel / full at aa={least}", sobel.error / full[least].error, 2.2)
 
 
@@ -210,17 +212,23 @@ def _read(study: Study, number: int, rows: Sequence[Row]) -> bool:
         share = best.warm.seconds / target.warm.seconds
         study.record(f"scene {number}: time of the cheapest equal error / full", share)
         text = (
-            f"{name}: {best.mode} at aa={best.aa} reaches its error ({best.error:.2g} to {target.error:.2g}) with "
+            f"{name}: {best.mode} at aa={best.aa} reaches its error ({best.error:.2g} to "
+            f"{target.error:.2g}) with "
             f"{best.rays / target.rays:.0%} of the rays, in {share:.0%} of the time."
         )
         if share > THIRD:
-            text += f" Not in a third: the detector refines {best.refined:.0%} of all pixels, and looking for them costs a pass."
+            text += (
+                f" Not in a third: the detector refines {best.refined:.0%} of all pixels, "
+                f"and looking for them costs a pass."
+            )
         study.text(text)
         return share <= THIRD
     near = min((row for row in rows if row.mode in ("sobel", "geometry")), key=lambda row: row.error)
     study.text(
-        f"{name}: neither sobel nor geometry reaches its error of {target.error:.2g}. The nearest is {near.mode} at "
-        f"aa={near.aa} with {near.error:.2g}, and {near.unrefined_share:.0%} of its squared error lies in pixels "
+        f"{name}: neither sobel nor geometry reaches its error of {target.error:.2g}. The nearest is "
+        f"{near.mode} at "
+        f"aa={near.aa} with {near.error:.2g}, and {near.unrefined_share:.0%} of its squared error lies in "
+        f"pixels "
         f"that it left alone: faint or unseen by it."
     )
     return False
@@ -239,7 +247,7 @@ def _show_contours(study: Study, number: int, rows: Sequence[Row]) -> None:
     )
 
 
-# --------------------------------------------------- Monte Carlo ---------------------------------------------------
+# --------------------------------------------- Monte Carlo ----------------------------------------------
 
 
 def lit_by_a_sphere(width: int, height: int) -> dict[str, Any]:
@@ -261,8 +269,10 @@ def _compare_modes_over_path(study: Study, extent: Extent) -> None:
         f"Mitsuba's path under an area light, 8 rays for each sample, {width}x{height}",
         COLUMNS,
         _cells("0, area light", "report", rows),
-        f"Error to aa=8 with {extent.light_spp} rays for each sample. Most of it is noise, which falls with every "
-        f"ray, wherever it goes; so the error follows the number of rays, and adaptive sampling only spares those that "
+        f"Error to aa=8 with {extent.light_spp} rays for each sample. Most of it is noise, which falls with "
+        f"every "
+        f"ray, wherever it goes; so the error follows the number of rays, and adaptive sampling only spares "
+        f"those that "
         f"sharp edges do not need.",
     )
 
@@ -293,7 +303,8 @@ def _chase_noise(study: Study, extent: Extent) -> None:
         max(r[2] for r in rows if r[1] >= 4),
         0.03,
     )
-    # noise of 0.03 in a picture whose edges begin at a contrast of 0.2: at three deviations either way, most of them
+    # noise of 0.03 in a picture whose edges begin at a contrast of 0.2: at three deviations either way, most
+    # of them
     study.at_least(
         "noise: share of edges found with 16 rays a pixel", min(r[3] for r in rows if r[1] == 16), 0.55
     )

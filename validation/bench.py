@@ -1,8 +1,8 @@
 """``make bench``: the times that matter to a user, as JSON, compared with an earlier file.
 
-For scenes 0 to 4 at 800x600, aa=4, every pixel supersampled: a warm render, its compilation, the floor of its rays
-alone, and the whole command with its default options. Seconds of two machines, or of one under another load, do not
-compare; ratios to the floor of the same run do.
+For scenes 0 to 4 at 800x600, aa=4, every pixel supersampled: a warm render, its compilation, the floor of
+its rays alone, and the whole command with its default options. Seconds of two machines, or of one under
+another load, do not compare; ratios to the floor of the same run do.
 """
 
 from __future__ import annotations

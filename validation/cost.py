@@ -1,4 +1,4 @@
-"""Where the time of a render goes: passes and kernels, the floor of its rays, what the plan saves, and how it grows."""
+"""Where the time of a render goes: kernels, the floor of its rays, what the plan saves, how it grows."""
 
 from __future__ import annotations
 
@@ -57,74 +57,99 @@ def run(study: Study, extent: Extent) -> None:
     _growth(study, extent)
 
 
-# ------------------------------------------------- Passes and floor -------------------------------------------------
+# ------------------------------------------- Passes and floor -------------------------------------------
+
+
+FLOOR_COLUMNS = (
+    "scene",
+    "seconds",
+    "in kernels",
+    "launches",
+    "compile, first run",
+    "camera rays",
+    "mirror rays",
+    "shadow rays",
+    "rays / s",
+    "floor",
+    "seconds / floor",
+    "kernels / floor",
+)
+RAYS = {"primary": "camera", "mirror": "mirror", "shadow": "shadow"}  # as counted: as recorded
 
 
 def _where_it_goes(study: Study, extent: Extent) -> None:
     width, height = extent.size
-    options = {"aa": extent.aa, "aamode": "none"}
-    rows = []
+    rows, passes = [], []
     with study.stage("Where the time goes", len(extent.scenes)) as advance:
         for number in extent.scenes:
-            scene = load(mrt.scene_dict(number, width=width, height=height))
-            under = floor(scene, repeats=max(3, extent.repeats), **options)
-            warm = measure({"render": partial(mrt.render, scene, **options)}, repeats=max(3, extent.repeats))[
-                "render"
-            ]
-            again = mrt.render(scene, **options)
-            counted = mrt.render(scene, **options, count_rays=True).rays
-            rows.append(
-                (
-                    number,
-                    warm.seconds,
-                    again.timings.kernels,
-                    again.kernel_launches,
-                    warm.result.timings.compile,
-                    *(counted.get(kind, 0) for kind in ("primary", "mirror", "shadow")),
-                    sum(counted.values()) / warm.seconds,
-                    under.seconds,
-                    warm.seconds / under.seconds,
-                    again.timings.kernels / under.seconds,
-                )
-            )
-            recorded = [under.rays.get(kind, 0) for kind in ("camera", "mirror", "shadow")]
-            off = np.abs(
-                np.subtract(recorded, [counted[kind] for kind in ("primary", "mirror", "shadow")])
-            ).max()
-            study.at_most(f"scene {number}: recorded rays of a kind other than those counted", off, 0)
-            study.record(f"scene {number}: seconds / floor", warm.seconds / under.seconds)
-            del scene
+            rows.append(_floor_row(study, number, extent))
+            passes += _pass_rows(number, extent)
             gc.collect()
             advance(1)
     study.table(
+        "passes",
+        f"Passes of the default render, {width}x{height}, aa={extent.aa}",
+        ("scene", "pass", "seconds", "share"),
+        passes,
+    )
+    study.table(
         "floor",
-        f"Where the time goes, {width}x{height}, aa={extent.aa}",
-        (
-            "scene",
-            "seconds",
-            "in kernels",
-            "launches",
-            "compile, first run",
-            "camera rays",
-            "mirror rays",
-            "shadow rays",
-            "rays / s",
-            "floor",
-            "seconds / floor",
-            "kernels / floor",
-        ),
+        f"Every pixel supersampled, {width}x{height}, aa={extent.aa}",
+        FLOOR_COLUMNS,
         rows,
-        "Floor: the same rays, recorded, through Mitsuba's ray queries alone. What is not in kernels is Python and Dr.Jit "
-        "tracing the code, which does not grow with the picture: the larger the picture, the nearer the ratio of the kernels.",
+        "Floor: the same rays, recorded, through Mitsuba's ray queries alone. What is not in kernels is "
+        "Python "
+        "and Dr.Jit tracing the code, which does not grow with the picture: the larger the picture, the "
+        "nearer "
+        "the ratio of the kernels.",
     )
     best, worst = (pick(rows, key=lambda row: row[-2]) for pick in (min, max))
+    least, most = (pick(row[-1] for row in rows) for pick in (min, max))
     study.text(
-        f"A render takes {best[-2]:.2g} (scene {best[0]}) to {worst[-2]:.2g} (scene {worst[0]}) times as long as its rays "
-        f"alone, its kernels {min(r[-1] for r in rows):.2g} to {max(r[-1] for r in rows):.2g} times."
+        f"A render takes {best[-2]:.2g} (scene {best[0]}) to {worst[-2]:.2g} (scene {worst[0]}) times as "
+        f"long "
+        f"as its rays alone, its kernels {least:.2g} to {most:.2g} times."
     )
 
 
-# -------------------------------------------------- What the plan saves --------------------------------------------------
+def _floor_row(study: Study, number: int, extent: Extent) -> tuple[Any, ...]:
+    """What ``FLOOR_COLUMNS`` name; the recorded rays are held to those that the integrator counts."""
+    width, height = extent.size
+    options = {"aa": extent.aa, "aamode": "none"}
+    scene = load(mrt.scene_dict(number, width=width, height=height))
+    repeats = max(3, extent.repeats)
+    under = floor(scene, repeats=repeats, **options)
+    warm = measure({"": partial(mrt.render, scene, **options)}, repeats=repeats)[""]
+    again = mrt.render(scene, **options)
+    counted = mrt.render(scene, **options, count_rays=True).rays
+    off = max(abs(under.rays.get(recorded, 0) - counted[kind]) for kind, recorded in RAYS.items())
+    study.at_most(f"scene {number}: recorded rays of a kind other than those counted", off, 0)
+    study.record(f"scene {number}: seconds / floor", warm.seconds / under.seconds)
+    kernels = again.timings.kernels
+    return (
+        number,
+        warm.seconds,
+        kernels,
+        again.kernel_launches,
+        warm.result.timings.compile,
+        *(counted[kind] for kind in RAYS),
+        sum(counted.values()) / warm.seconds,
+        under.seconds,
+        warm.seconds / under.seconds,
+        kernels / under.seconds,
+    )
+
+
+def _pass_rows(number: int, extent: Extent) -> list[tuple[Any, ...]]:
+    """Every pass of a warm render with the default options."""
+    width, height = extent.size
+    for _ in range(2):
+        timings = mrt.render(number, width=width, height=height, aa=extent.aa).timings
+    parts = {"scene and plan": timings.load, **timings.passes}
+    return [(number, name, seconds, seconds / timings.total) for name, seconds in parts.items()]
+
+
+# ----------------------------------------- What the plan saves ------------------------------------------
 
 
 def _what_the_plan_saves(study: Study, extent: Extent) -> None:
@@ -173,7 +198,7 @@ _Change = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 def _forced_in(plain: Scene) -> dict[str, tuple[Scene, Scene, _Change, dict[str, Any]]]:
-    """By what is left out: a scene that does without, one that holds it, a change of its dict, and options."""
+    """By what is left out: a scene without, one that holds it, a change of its dict, and options."""
     dull, stuff = _without_reflection(plain), plain.spheres[0].material
     far_cone = dataclasses.replace(plain, cones=(Cone((1e3, 1, 0), (1e3, 0, 0), 0.1, stuff),))
     far_plane = dataclasses.replace(plain, planes=(*plain.planes, Plane((0, 1, 0), 1e4, stuff)))
@@ -218,11 +243,11 @@ def _textured(description: dict[str, Any]) -> dict[str, Any]:
     return description
 
 
-# ------------------------------------------------------- Growth -------------------------------------------------------
+# ------------------------------------------------ Growth ------------------------------------------------
 
 
 def _growth(study: Study, extent: Extent) -> None:
-    """Time against the size of the task, and the exponent of its upper half, where fixed costs matter least."""
+    """Time against the size of the task, and the exponent of the upper half, where fixed costs are least."""
     three = report_scene(3)
     series: dict[str, dict[int, Callable[[], Any]]] = {
         "pixels": {w * (w * 3 // 4): partial(_ready, three, aa=1, width=w) for w in extent.widths},

@@ -2,15 +2,17 @@
 
 The lens is Mitsuba's ``thinlens`` in front of the same ``mrt_whitted``, so that nothing but the lens differs.
 
-Which lens? The report gives an amount of blur a(d) for a hit at distance d, which no lens has: it knows no aperture,
-and grows with d without end up to 8. With R the radius of the aperture, f the distance in focus, W the picture's
-width and φ its horizontal field of view, a thin lens shows a point at distance d as a disc of the radius
+Which lens? The report gives an amount of blur a(d) for a hit at distance d, which no lens has: it knows no
+aperture, and grows with d without end up to 8. With R the radius of the aperture, f the distance in focus,
+W the picture's width and φ its horizontal field of view, a thin lens shows a point at distance d as a disc
+of the radius
 
     r(d) = B (1/f − 1/d) pixels,  B = R W / (2 tan(φ/2)),
 
-negative in front of the focus. (The aperture seen through the point is R |d − f| / f wide at distance d, and a pixel
-there 2 d tan(φ/2) / W.) That is linear in A = B/f and B, so the lens nearest to the report's blur is a least-squares
-fit of A − B/d to the disc that has the variance of the report's Pascal line, over the picture's pixels.
+negative in front of the focus. (The aperture seen through the point is R |d − f| / f wide at distance d, and
+a pixel there 2 d tan(φ/2) / W.) That is linear in A = B/f and B, so the lens nearest to the report's blur is
+a least-squares fit of A − B/d to the disc that has the variance of the report's Pascal line, over the
+picture's pixels.
 """
 
 from __future__ import annotations
@@ -129,8 +131,8 @@ def fit_lens(scene: Scene, depth: np.ndarray) -> Lens:
 def disc_radius(amount: np.ndarray) -> np.ndarray:
     """Radius of the disc as wide as the report's blur, pixels.
 
-    The Pascal line of 2k entries has the variance (2k − 1)/4 on each axis, a disc of radius r one of r²/4. The whole
-    amount k is continued to all numbers, and by a² below 1, where the report does not blur.
+    The Pascal line of 2k entries has the variance (2k − 1)/4 on each axis, a disc of radius r one of r²/4.
+    The whole amount k is continued to all numbers, and by a² below 1, where the report does not blur.
     """
     return np.where(amount < 1, amount, np.sqrt(np.maximum(2 * amount - 1, 0)))
 
@@ -200,9 +202,12 @@ def _hold(study: Study, number: int, found: Comparison) -> None:
     }
     best = min(by_region, key=by_region.__getitem__)
     study.text(
-        f"Scene {number}: the lens nearest to the report's blur has an aperture of radius {found.lens.radius:.3g} and "
-        f"is focused at {found.lens.focus:.3g}. The corrected filter has {by_region['all']:.0%} of the report's error, "
-        f"and gains most {best} ({by_region[best]:.0%}). Both keep what no filter over one picture can know: what "
+        f"Scene {number}: the lens nearest to the report's blur has an aperture of radius "
+        f"{found.lens.radius:.3g} and "
+        f"is focused at {found.lens.focus:.3g}. The corrected filter has {by_region['all']:.0%} of the "
+        f"report's error, "
+        f"and gains most {best} ({by_region[best]:.0%}). Both keep what no filter over one picture can "
+        f"know: what "
         f"blurred things hide, and that the report's amounts do not follow a lens."
     )
 

@@ -1,4 +1,4 @@
-"""Error against run time, for every setting that trades one for the other; where the time goes; and what the plan saves."""
+"""Error against run time, for every setting that trades one for the other; and where the time goes."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def front(points: Sequence[Point]) -> list[Point]:
     return best
 
 
-# ------------------------------------------------- What it says -------------------------------------------------
+# --------------------------------------------- What it says ---------------------------------------------
 
 
 def _report(study: Study, trade: knobs.Trade, points: Sequence[Point], own_error: float) -> None:
@@ -178,7 +178,8 @@ def _report(study: Study, trade: knobs.Trade, points: Sequence[Point], own_error
         f"Scene {trade.scene}: {trade.title}",
         COLUMNS,
         rows,
-        f"The reference's own error is about {own_error:.2g}. Seconds: median of warm runs, all settings in turn.",
+        f"The reference's own error is about {own_error:.2g}. Seconds: median of warm runs, all settings in "
+        f"turn.",
     )
     reading = _reading(trade, points, ahead, own_error)
     study.plot(name, f"Scene {trade.scene}: {trade.title}", _figure(points, ahead, own_error), reading)
@@ -190,7 +191,8 @@ def _reading(trade: knobs.Trade, points: Sequence[Point], ahead: Sequence[Point]
     """Two sentences that follow from the points."""
     fast, good = ahead[0], ahead[-1]
     first = (
-        f"The fastest setting is {fast.name} ({1000 * fast.seconds:.3g} ms, RMSE {fast.rmse:.2g}), the one of least error "
+        f"The fastest setting is {fast.name} ({1000 * fast.seconds:.3g} ms, RMSE {fast.rmse:.2g}), the one "
+        f"of least error "
         f"{good.name} ({1000 * good.seconds:.3g} ms, {good.rmse:.2g})"
     )
     slope = _slope(ahead)
@@ -272,7 +274,7 @@ def _kind(name: str) -> str:
     )
 
 
-# -------------------------------------------------- What must hold --------------------------------------------------
+# -------------------------------------------- What must hold --------------------------------------------
 
 
 def _hold(study: Study, trade: knobs.Trade, points: Sequence[Point], own_error: float) -> None:

@@ -29,8 +29,8 @@ SEGMENTS = (8, 32, 128, 512)
 class Trade:
     """Settings of one kind on one scene, and the picture they strive for.
 
-    ``reference`` and ``check``: two renders of the truth, the better one first; what they differ by bounds the
-    error of the first.
+    ``reference`` and ``check``: two renders of the truth, the better one first; what they differ by bounds
+    the error of the first.
     """
 
     scene: str
@@ -178,7 +178,7 @@ def cone(extent: Extent) -> Trade:
 
 
 def meshed(scene: Scene, segments: int) -> Scene:
-    """The scene with its cones as flat triangles, ``segments`` around; they stand on a base that is closed."""
+    """The scene with its cones as flat triangles, ``segments`` around, and closed below."""
     return dataclasses.replace(scene, cones=(), meshes=tuple(_cone_mesh(c, segments) for c in scene.cones))
 
 

@@ -56,7 +56,7 @@ def test_every_ray_of_a_pixel_has_a_part_of_the_time_of_its_own(lattice, repeats
 
 @pytest.mark.parametrize("aa", [3, 4, 5, 8])
 def test_place_and_time_do_not_go_together(aa):
-    """A moving edge needs all places at all times; the diagonal order would correlate by 0.97 (rows) or so."""
+    """A moving edge needs all places at all times; in the order of the lattice, rows correlate by 0.97."""
     times = _times(Shutter(aa**2, 0.5), lattice=aa)[0]
     i, j = np.divmod(np.arange(aa**2), aa)
     for places in (i, j, i + j, i - j):
