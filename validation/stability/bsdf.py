@@ -43,6 +43,8 @@ FRESNEL_IORS = np.array(
     np.float32,
 )
 
+DECADES = 7  # of the cosines of the Fresnel term
+
 
 @dataclass(frozen=True)
 class Errors:
@@ -161,7 +163,7 @@ def _compare(cases: Cases, lobes: Lobes, angles: FresnelGrid, found: Sequence[Er
     """Cell by cell of the grid, our largest error against that of Mitsuba's formula."""
     mitsuba, ours = found[1], found[2]
     cell = np.ravel_multi_index(lobes.cell.T, (len(ALPHAS), len(COSINES), len(STEEPNESS)))
-    fresnel_cell = np.unique(angles.iors, return_inverse=True)[1] * 8 + _decade(angles.cosines)
+    fresnel_cell = np.unique(angles.iors, return_inverse=True)[1] * DECADES + _decade(angles.cosines)
     for name in ("d", "g", "f", "value", "pdf"):
         cells = fresnel_cell if name == "f" else cell
         steepest = 0 if name == "f" else STEEPNESS[lobes.cell[:, 2] + 1]
@@ -192,7 +194,7 @@ def _largest(cell: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def _decade(cosines: np.ndarray) -> np.ndarray:
-    return np.clip(np.floor(-np.log10(np.float64(cosines))), 0, 7).astype(int)
+    return np.clip(np.floor(-np.log10(np.float64(cosines))), 0, DECADES - 1).astype(int)
 
 
 def _conditioning(cases: Cases, lobes: Lobes) -> None:
@@ -304,32 +306,33 @@ def _worst_cases(study: Study, lobes: Lobes, angles: FresnelGrid, ours: Errors) 
 
 
 def _heat_maps(study: Study, lobes: Lobes, angles: FresnelGrid, found: Sequence[Errors]) -> None:
-    errors = [e.of["value"] for e in found]
+    errors = [e.of["pdf"] for e in found]
     titles = [e.formula for e in found]
     alphas = [f"{a:g}" for a in ALPHAS]
     cosines = [f"{c:g}" for c in COSINES]
     ends = [f"{t:.3g}" for t in STEEPNESS[1:]]
+    title = "Largest relative error of the lobe without its Fresnel term, D G₁ / (4 cos θi)"
     maps = [_grid(lobes.cell[:, 1], lobes.cell[:, 0], e, (len(COSINES), len(ALPHAS))) for e in errors]
     study.plot(
         "stability-bsdf-cosine",
-        "Largest relative error of BSDF cos",
+        title,
         _figure(maps, titles, ("alpha", alphas), ("cos θi", cosines)),
         "By roughness and angle, over all angles off the mirror direction down to D at 1e-20 of its peak.",
     )
     maps = [_grid(lobes.cell[:, 2], lobes.cell[:, 0], e, (len(ends), len(ALPHAS))) for e in errors]
     study.plot(
         "stability-bsdf-steepness",
-        "Largest relative error of BSDF cos",
+        title,
         _figure(maps, titles, ("alpha", alphas), ("tan²θh/alpha² below", ends)),
         "By roughness and angle off the mirror direction. Blank: no pair of float32 directions lies there.",
     )
     values, index = np.unique(angles.iors, return_inverse=True)
-    maps = [_grid(_decade(angles.cosines), index, e.of["f"], (8, len(values))) for e in found]
+    maps = [_grid(_decade(angles.cosines), index, e.of["f"], (DECADES, len(values))) for e in found]
     iors = [f"1{n - 1:+.0e}" if 0 < abs(n - 1) < 1e-3 else f"{n:g}" for n in np.float64(values)]
     study.plot(
         "stability-fresnel",
         "Largest relative error of F",
-        _figure(maps, titles, ("IOR", iors), ("cos θ down to", [f"1e-{k + 1}" for k in range(8)])),
+        _figure(maps, titles, ("IOR", iors), ("cos θ down to", [f"1e-{k + 1}" for k in range(DECADES)])),
         "By index of refraction and angle.",
     )
 
