@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from mrt_mitsuba.errors import SceneError as SceneError
     from mrt_mitsuba.errors import UsageError as UsageError
     from mrt_mitsuba.errors import VariantError as VariantError
+    from mrt_mitsuba.export import scene_dict as scene_dict
     from mrt_mitsuba.render import Result as Result
     from mrt_mitsuba.render import render as render
     from mrt_mitsuba.runtime import register as register
-    from mrt_mitsuba.export import scene_dict as scene_dict
     from mrt_mitsuba.validation.roughconductor import compare_roughconductor as compare_roughconductor
 
 # Where each public name lives; the module is imported when the name is first used.

@@ -76,7 +76,7 @@ def warn_if_slow() -> None:
     variant = mi.variant()
     if variant.startswith("scalar") and not _warned:
         _warned.add(variant)
-        message = f"{variant} traces one ray at a time in Python: use it for small pictures, {FAST} for others"
+        message = f"{variant} traces one ray at a time in Python: use it for small pictures only, else {FAST}"
         warnings.warn(message, MrtWarning, stacklevel=3)
 
 

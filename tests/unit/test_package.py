@@ -111,7 +111,7 @@ def test_unknown_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "pattern"), [("CITATION.cff", r"^version: (.+)$"), ("CHANGELOG.md", r"^## (.+)$")]
+    ("name", "pattern"), [("CITATION.cff", r"^version: (.+)$"), ("CHANGELOG.md", r"^## (\S+)")]
 )
 def test_version_is_told_everywhere(name: str, pattern: str) -> None:
     """The package holds the version; the citation repeats it, the changelog may be ahead of it."""
