@@ -30,6 +30,7 @@ STUDIES = {
     "depth-of-field": "depth_of_field",
     "stability": "stability",
     "error-vs-time": "error_vs_time",
+    "objects": "objects",
     "acceleration": "acceleration",
 }
 EXTRAS = ("matplotlib", "jinja2", "scipy", "mpmath", "flip_evaluator")
