@@ -92,6 +92,7 @@ class MrtBSDF(mi.BSDF):
         self.specular_reflectance = props.get_unbounded_texture("specular_reflectance", 1.0)
         self.f0 = self._read_f0(props)
         self.sample_visible = flag(props, "sample_visible", True)
+        self.version = 0
         self._update()
 
     @staticmethod
@@ -136,6 +137,7 @@ class MrtBSDF(mi.BSDF):
 
     def parameters_changed(self, keys=()) -> None:
         self._update()
+        self.version += 1  # what others have derived from the parameters is out of date
 
     # -------------------------------------- Value and density ------------------------------------------
 

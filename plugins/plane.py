@@ -64,6 +64,9 @@ class MrtPlane(mi.Mesh):
         # Mitsuba merges meshes that share a BSDF when it loads a scene, but not those with attributes
         self.add_attribute("face_mrt_plane", 1, [0.0, 0.0])
 
+    def to_string(self) -> str:
+        return f"MrtPlane[normal={self.unit_normal.tolist()}, distance={self.distance:g}]"
+
 
 def _tangents(n: np.ndarray) -> np.ndarray:
     """Two unit vectors [2, 3] that make a right-handed frame with the unit vector ``n`` [3].

@@ -308,6 +308,7 @@ class Prepared:
         self.scales, self.spheres = _Scales(others), _Spheres(others)
         self._read_emitters(scene)
         self._read_bsdfs({id(b): b for b in (s.bsdf() for s in shapes)}.values())
+        self.versions = self._versions()
         if any(s.is_mesh() for s in others):
             self.ray_flags |= +mi.RayFlags.ShadingFrame
         # Then a table of centres and radii does the work of a call to every shape
@@ -324,7 +325,7 @@ class Prepared:
         self.emissive = any(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in self.lights)
 
     def _read_bsdfs(self, bsdfs) -> None:
-        bsdfs = list(bsdfs)
+        self.bsdfs = bsdfs = list(bsdfs)
         self.mirrors = any(_has_mirror(b) for b in bsdfs)
         self.mirror_bounds = [b.mirror_bound() if hasattr(b, "mirror_bound") else (1.0, 1.0)
                               for b in bsdfs if _has_mirror(b)]
@@ -335,7 +336,12 @@ class Prepared:
             self.ray_flags |= +mi.RayFlags.UV
 
     def is_stale(self, scene) -> bool:
-        return id(scene) != self.scene_id or _fingerprint(scene) != self.fingerprint
+        return (id(scene) != self.scene_id or self._versions() != self.versions
+                or _fingerprint(scene) != self.fingerprint)
+
+    def _versions(self) -> list[int]:
+        """Change when the parameters of an ``mrt_bsdf`` do, of which bounds are kept."""
+        return [getattr(b, "version", 0) for b in self.bsdfs]
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 

@@ -127,6 +127,13 @@ def test_planes_of_one_material_stay_shapes_of_their_own() -> None:
 
 
 @in_variants
+def test_can_be_printed(variant: str) -> None:
+    mesh = plane((0, 0, 2), 1.5)
+    assert str(mesh) == "MrtPlane[normal=[0.0, 0.0, 1.0], distance=1.5]"
+    assert "MrtPlane" in str(mi.load_dict({"type": "scene", "plane": mesh}))
+
+
+@in_variants
 def test_loads_from_xml(variant: str) -> None:
     mesh = mi.load_string("""
         <shape version="3.0.0" type="mrt_plane">

@@ -1,0 +1,61 @@
+"""``mrt_whitted`` after ``mi.traverse``: a scene that was drawn before is drawn anew, as it is now."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def mirror(**bsdf: Any) -> mi.Scene:
+    """A plane seen from above, under a sky of 0.7: what it reflects is its specular reflectance of that."""
+    look = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 1, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 4, "height": 3, "component_format": "float32"}
+    material = {"type": "mrt_bsdf", "fresnel": "unity", "diffuse_reflectance": 0.0, "alpha": 0.01}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "mrt_whitted"},
+            "sensor": {"type": "perspective", "to_world": look, "film": film},
+            "sky": {"type": "constant", "radiance": 0.7},
+            "light": {"type": "mrt_light", "position": [0, 3, 4]},
+            "plane": {"type": "mrt_plane", "normal": [0, 0, 1], "bsdf": {**material, **bsdf}},
+        }
+    )
+
+
+def drawn(scene: mi.Scene) -> float:
+    return float(np.median(np.array(mi.render(scene, spp=1))))
+
+
+def update(scene: mi.Scene, name: str, value: Any) -> None:
+    parameters = mi.traverse(scene)
+    parameters[name] = value
+    parameters.update()
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
+def test_reflections_come_and_go_with_the_material(variant: str) -> None:
+    """A first picture without reflections must not leave them out of the next."""
+    scene = mirror(specular_reflectance=0.0)
+    assert drawn(scene) == 0
+    update(scene, "plane.bsdf.specular_reflectance.value", 0.5)
+    assert drawn(scene) == pytest.approx(0.35, rel=1e-4)
+    update(scene, "plane.bsdf.int_ior", 0.05)  # a bounce then costs the whole budget
+    assert drawn(scene) == pytest.approx(0, abs=1e-6)  # the lobe's direct light
+    update(scene, "plane.bsdf.int_ior", 1.5)
+    assert drawn(scene) == pytest.approx(0.35, rel=1e-4)
+
+
+def test_light_follows_its_parameters() -> None:
+    scene = mirror(specular_reflectance=0.0, diffuse_reflectance=0.5)
+    before = drawn(scene)
+    assert 0.05 < before < 0.2
+    update(scene, "light.intensity.value", 0.5)
+    assert drawn(scene) == pytest.approx(0.5 * before, rel=1e-5)
+    update(scene, "light.position", [0, 3, -4])
+    assert drawn(scene) == 0
