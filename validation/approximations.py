@@ -112,8 +112,8 @@ def compare_rest(number: int, *, width: int, height: int, spp: int) -> Compariso
 def run(study: Study, *, quick: bool) -> None:
     """Where the report's pictures and those of the stock flavour differ, and by what."""
     numbers = (0, 1, 3) if quick else (0, 1, 2, 3, 4)
-    size: dict[str, Any] = {"width": 64, "height": 48} if quick else {"width": 200, "height": 150}
-    spp = 64 if quick else 512
+    size: dict[str, Any] = {"width": 64, "height": 48} if quick else {"width": 160, "height": 120}
+    spp = 64 if quick else 256
     rows, rest = [], []
     with study.stage("Approximations", len(numbers)) as advance:
         for number in numbers:
