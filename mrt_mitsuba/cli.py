@@ -152,6 +152,8 @@ def _export(arguments: list[str]) -> int:
     if len(words) != 3 or words[1] != "--xml":
         raise UsageError("write mrt export SCENE --xml PATH [--stock]")
     number, path = parse(["export", words[0]]).scene_number, words[2]
+    if not path:
+        raise UsageError("PATH is empty: write mrt export SCENE --xml PATH [--stock]")
     from mrt_mitsuba.output import check_target
 
     check_target(path)

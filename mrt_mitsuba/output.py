@@ -238,6 +238,8 @@ def _target(path: str | os.PathLike[str]) -> str:
     name = os.fspath(path)
     target = os.path.realpath(name)
     folder = os.path.dirname(target)
+    if os.path.exists(folder) and not os.path.isdir(folder):
+        raise OutputError(f"cannot write {name}: {folder} is a file, not a folder; choose another place")
     if not os.path.isdir(folder):
         raise OutputError(f"cannot write {name}: the folder {folder} does not exist; create it first")
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 import os
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,11 @@ from mrt_mitsuba.scene import Scene
 from mrt_mitsuba.scenes import report_scene
 
 SIZE = (800, 600)
+
+# The lines of a traceback, which are indented but for the first, and the type of this project's error
+_TRACEBACK = re.compile(
+    r"Traceback \(most recent call last\):\n(?:[ \t][^\n]*\n|\n)*(?:\w*ParameterError: )?"
+)
 
 
 @dataclass(frozen=True)
@@ -99,6 +105,8 @@ def _integrator(integrator: Any, scene: Any) -> Any:
 def _load_file(path: str) -> Any:
     import mitsuba as mi
 
+    if os.path.isdir(path):
+        raise SceneError(f"cannot read {path}: it is a folder; name the scene's file in it")
     if not os.path.isfile(path):
         raise SceneError(f"cannot read {path}: there is no such file")
     if not path.lower().endswith(".xml"):
@@ -110,4 +118,6 @@ def _load(loader: Any, what: Any, name: str) -> Any:
     try:
         return loader(what)
     except RuntimeError as error:
-        raise SceneError(f"cannot load {name}: {error}") from error
+        # Of an error in a plugin written in Python, Mitsuba quotes the way there, too
+        text = _TRACEBACK.sub("", str(error))
+        raise SceneError(f"cannot load {name}: {text}") from error

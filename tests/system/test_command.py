@@ -20,10 +20,15 @@ SMALL = ("width=64", "height=48")
 
 
 @pytest.fixture
-def mrt(tmp_path: Path) -> Mrt:
+def environ() -> dict[str, str]:
+    """The environment in which ``mrt`` runs; a test may change it."""
+    return {name: value for name, value in os.environ.items() if name != "DRJIT_LIBLLVM_PATH"}
+
+
+@pytest.fixture
+def mrt(tmp_path: Path, environ: dict[str, str]) -> Mrt:
     """Run ``mrt`` with arguments in an empty folder, as after installation: LLVM is found by the package."""
     command = Path(sys.executable).with_name("mrt")
-    environ = {name: value for name, value in os.environ.items() if name != "DRJIT_LIBLLVM_PATH"}
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
@@ -114,6 +119,117 @@ def test_broken_scene_file(mrt: Mrt, tmp_path: Path, content: str | None, text: 
     assert done.returncode == 1 and done.stdout == ""
     assert text in done.stderr and done.stderr.startswith("mrt: ") and done.stderr.count("\n") == 1
     assert sorted(tmp_path.iterdir()) == before
+
+
+XML = "<scene version='3.0.0'>{}</scene>"
+TRIANGLE = "{}v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
+PICTURE = "newmtl m\nKd 1 1 1\nmap_Kd p.png\n"
+# Files (None: a folder) and arguments, then the exit code and what the one line must hold
+BAD: list[tuple[dict[str, str | bytes | None], str, int, str]] = [
+    ({"d.xml": None}, "out scene=d.xml", 1, "d.xml: it is a folder"),
+    ({"d.obj": None}, "out scene=d.obj", 1, "d.obj: cannot be read: Is a directory"),
+    ({}, "out scene=a.obj", 1, "a.obj: cannot be read: No such file"),
+    ({"a.ply": ""}, "out scene=a.ply", 2, "a scene file ends in .xml or .obj"),
+    ({"a.xml": b"\xff\xfe\0"}, "out scene=a.xml", 1, "cannot load a.xml"),
+    ({"a.xml": XML.format("<shape type='sphere'/>")}, "out scene=a.xml", 1, "a.xml has no sensor"),
+    (
+        {"a.xml": XML.format("<shape type='mrt_cone'/>")},
+        "out scene=a.xml",
+        1,
+        '"mrt_cone": mrt_cone: "apex" is missing; give three numbers',
+    ),
+    (
+        {"a.xml": XML.format("<bsdf type='mrt_bsdf'><float name='alpha' value='nan'/></bsdf>")},
+        "out scene=a.xml",
+        1,
+        "alpha",
+    ),
+    ({"a.obj": "v 0 0 0\nv 1 0\n"}, "out scene=a.obj", 1, "a.obj:2: v has 2 numbers"),
+    ({"a.obj": "f 1 2 3\n"}, "out scene=a.obj", 1, "a.obj:1: f has the v index"),
+    ({"a.obj": ""}, "out scene=a.obj", 1, "a.obj: has no faces"),
+    (
+        {"a.obj": TRIANGLE.format("mtllib a.mtl\n"), "a.mtl": "newmtl m\nKd 1 x 3\n"},
+        "out scene=a.obj",
+        1,
+        "a.mtl:2: Kd holds 'x'",
+    ),
+    (
+        {"a.obj": TRIANGLE.format("mtllib a.mtl\n"), "a.mtl": PICTURE, "p.png": "no picture"},
+        "out scene=a.obj",
+        1,
+        "p.png', which cannot be read",
+    ),
+    (
+        {"a.obj": TRIANGLE.format("mtllib a.mtl\n"), "a.mtl": PICTURE, "p.png": b"\x89PNG\r\n\x1a\n\0\0"},
+        "out scene=a.obj",
+        1,
+        "p.png', which cannot be read",
+    ),
+    ({"out.png": None}, "out 0", 1, "out.png: it is a folder"),
+    ({"file": ""}, "file/out 0", 1, "is a file, not a folder"),
+    ({}, "none/out 0", 1, "does not exist; create it first"),
+    ({"out_mesh_0.ply": None}, "export 8 --xml out.xml", 1, "out_mesh_0.ply: it is a folder"),
+    ({}, "out 0 width=16384 height=16384 aa=1 memory=512M", 2, "needs about 9.0 GiB of memory, and 512 MiB"),
+    ({}, "out 0 width=65536 height=65536 aa=1 memory=16G", 2, "choose a smaller width and height"),
+    ({}, "out 0 width=65537", 2, "from 1 to 65536"),
+]
+
+
+@pytest.mark.parametrize(("files", "arguments", "code", "text"), BAD, ids=range(len(BAD)))
+def test_bad_input(
+    mrt: Mrt, tmp_path: Path, files: dict[str, str | bytes | None], arguments: str, code: int, text: str
+) -> None:
+    """One line that names the thing, the right exit code, and nothing left behind."""
+    for name, content in files.items():
+        if content is None:
+            (tmp_path / name).mkdir()
+        else:
+            (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    quiet = [] if arguments.startswith("export") else ["quiet=1"]
+    done = mrt(*arguments.split(), *quiet)
+    assert (done.returncode, done.stdout) == (code, ""), done.stderr
+    assert text in done.stderr and done.stderr.startswith("mrt: ") and done.stderr.count("\n") == 1
+    assert "Traceback" not in done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == files.keys()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_read_only_target(mrt: Mrt, tmp_path: Path) -> None:
+    (tmp_path / "closed").mkdir(mode=0o500)
+    done = mrt("closed/out", "0", "quiet=1")
+    assert done.returncode == 1 and done.stderr.startswith("mrt: cannot write closed/out.png")
+    assert done.stderr.count("\n") == 1
+
+
+def corrupt(folder: Path) -> None:
+    """Make every second kernel of the cache rubbish and cut the others short."""
+    kernels = sorted(folder.iterdir())
+    assert kernels
+    for k, kernel in enumerate(kernels):
+        kernel.write_bytes(b"rubbish" * 999 if k % 2 else kernel.read_bytes()[:10])
+
+
+def test_corrupt_kernel_cache_is_made_anew(mrt: Mrt, tmp_path: Path, environ: dict[str, str]) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    environ["HOME"] = str(home)
+    arguments = ("0", "width=16", "height=12", "quiet=1", "format=exr")
+    assert mrt("good", *arguments).returncode == 0
+    corrupt(home / ".drjit")
+    done = mrt("after", *arguments)
+    assert (done.returncode, done.stderr) == (0, "")
+    np.testing.assert_array_equal(
+        read_exr(tmp_path / "good.exr").image, read_exr(tmp_path / "after.exr").image
+    )
+
+
+def test_home_that_holds_no_kernel_cache(mrt: Mrt, tmp_path: Path, environ: dict[str, str]) -> None:
+    """Dr.Jit says so in one line, and the picture is made."""
+    (tmp_path / "home").write_text("a file")
+    environ["HOME"] = str(tmp_path / "home")
+    done = mrt("out", "0", "width=16", "height=12", "quiet=1", "format=exr")
+    assert done.returncode == 0 and done.stderr.count("\n") <= 1
+    assert read_exr(tmp_path / "out.exr").image.shape == (12, 16, 3)
 
 
 @pytest.mark.parametrize(

@@ -131,6 +131,13 @@ def test_scenes(capsys) -> None:
         ["export", "3", "--xml"],
         ["export", "17", "--xml", "a.xml"],
         ["export", "3", "--obj", "a.xml"],
+        ["export", "3", "--xml", ""],
+        ["export", "3", "--xml", "a.xml", "b.xml"],
+        ["out", "aa=nan"],
+        ["out", "focaldist=nan"],
+        ["out", "aa=2", "aa=3"],
+        ["out", "camera=0,0,1"],
+        ["out", "scene=a.obj", "fov=nan"],
     ],
 )
 def test_wrong_usage(renderer: Recorder, tmp_path: Path, monkeypatch, capsys, arguments: list[str]) -> None:

@@ -142,7 +142,7 @@ def make_bad_target(kind: str, folder: Path) -> Path:
     ("kind", "reason"),
     [
         ("missing folder", "does not exist; create it first"),
-        ("file as folder", "does not exist; create it first"),
+        ("file as folder", "is a file, not a folder"),
         ("folder", "is a folder"),
         ("link loop", "in a circle"),
         ("read-only", "is read-only"),
