@@ -33,8 +33,7 @@ class MrtGroup(mi.Mesh):
     ``face_NAME``   ``Bitmap``            float32 [n, 1 or 3], values of the objects that a ``mesh_attribute``
                                           texture of this name looks up
     ``segments``    integer    8          >= 3, sides of the stand-in of a cone or cylinder; that of a sphere
-    is an
-                                          octahedron
+                                          is an octahedron
     =============== ========== ========== ==============================================================
 
     .. code-block:: python
@@ -52,6 +51,7 @@ class MrtGroup(mi.Mesh):
         numbers = _table(props, "numbers", _WIDTH[kind]).astype(np.float64)
         _check(numbers)
         attributes = {name: _table(props, name) for name in props if name.startswith("face_")}
+        self.content = f"kind={kind}, objects={len(numbers)}"
         unit = _unit_mesh(kind, integer(props, "segments", 8, least=3))
         faces = len(unit.faces)
         self.table = QuadricTable(kind, *_frames(kind, numbers), faces * np.arange(len(numbers)))
@@ -67,6 +67,9 @@ class MrtGroup(mi.Mesh):
     def quadrics(self) -> QuadricTable:
         """What ``mrt_whitted`` intersects in place of the mesh."""
         return self.table
+
+    def to_string(self) -> str:
+        return f"MrtGroup[{self.content}]"
 
 
 def _table(props: mi.Properties, name: str, width: int | None = None) -> np.ndarray:

@@ -41,6 +41,10 @@ class MrtMesh(mi.Mesh):
         if texcoords is not None:
             buffers["vertex_texcoords"] = texcoords.astype(np.float32)
         write_buffers(self, **{name: values.ravel() for name, values in buffers.items()})
+        self.content = f"positions={len(positions)}, faces={len(faces)}"
+
+    def to_string(self) -> str:
+        return f"MrtMesh[{self.content}]"
 
 
 def _array(props: mi.Properties, name: str) -> np.ndarray:
