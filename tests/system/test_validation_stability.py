@@ -76,9 +76,9 @@ def test_every_case_is_a_row_with_a_mark(whole: Study) -> None:
 def test_there_are_heat_maps_of_three_formulas(whole: Study) -> None:
     plots = [p for p in whole.parts if isinstance(p, Plot)]
     assert {p.name for p in plots} == {
-        "stability-bsdf-cosine",
-        "stability-bsdf-steepness",
-        "stability-fresnel",
+        "bsdf-cosine",
+        "bsdf-steepness",
+        "fresnel",
     }
     for plot in plots:
         titles = [panel.get_title() for panel in plot.figure.axes[:3]]
@@ -87,7 +87,7 @@ def test_there_are_heat_maps_of_three_formulas(whole: Study) -> None:
 
 def test_worst_cases_can_be_read_back(whole: Study) -> None:
     """The hexadecimal inputs of the worst D give the error of the table."""
-    table = next(p for p in whole.parts if isinstance(p, Table) and p.name == "stability-bsdf-worst")
+    table = next(p for p in whole.parts if isinstance(p, Table) and p.name == "bsdf-worst")
     title, error, steepness, inputs = table.rows[0]
     numbers = [float.fromhex(word) for word in re.findall(r"-?0x[0-9a-f.]+p[+-]\d+", inputs)]
     assert title == "D" and len(numbers) == 8

@@ -56,7 +56,7 @@ class Errors:
 
 def run(study: Study, *, quick: bool) -> None:
     """Errors of D, G, F, the whole, its density and gradient; heat maps; worst cases."""
-    cases = Cases(study, "stability-bsdf", "Reflectance")
+    cases = Cases(study, "bsdf", "Reflectance")
     lobes, truth = lobes_with_truth(2 if quick else 12)
     angles = FresnelGrid.make(60 if quick else 600)
     study.record("pairs of directions", len(lobes))
@@ -275,7 +275,7 @@ def _table_by_alpha(study: Study, lobes: Lobes, found: Sequence[Errors]) -> None
             rows.append((f"{alpha:g}", int(here.sum()), *(f(e) for e in errors for f in (np.median, np.max))))
     columns = ("alpha", "pairs", *(f"{e.formula}, {what}" for e in found for what in ("median", "largest")))
     study.table(
-        "stability-bsdf-by-alpha",
+        "bsdf-by-alpha",
         "Relative error of BSDF cos where D is at least 1e-7 of its peak",
         columns,
         rows,
@@ -295,7 +295,7 @@ def _worst_cases(study: Study, lobes: Lobes, angles: FresnelGrid, ours: Errors) 
         steepness = "" if name == "f" else float(lobes.steepness[i])
         rows.append((title, float(ours.of[name][i]), steepness, inputs))
     study.table(
-        "stability-bsdf-worst",
+        "bsdf-worst",
         "The worst of the whole grid, with their inputs",
         ("quantity", "relative error", "tan²θh/alpha²", "inputs"),
         rows,
@@ -314,14 +314,14 @@ def _heat_maps(study: Study, lobes: Lobes, angles: FresnelGrid, found: Sequence[
     title = "Largest relative error of the lobe without its Fresnel term, D G₁ / (4 cos θi)"
     maps = [_grid(lobes.cell[:, 1], lobes.cell[:, 0], e, (len(COSINES), len(ALPHAS))) for e in errors]
     study.plot(
-        "stability-bsdf-cosine",
+        "bsdf-cosine",
         title,
         _figure(maps, titles, ("alpha", alphas), ("cos θi", cosines)),
         "By roughness and angle, over all angles off the mirror direction down to D at 1e-20 of its peak.",
     )
     maps = [_grid(lobes.cell[:, 2], lobes.cell[:, 0], e, (len(ends), len(ALPHAS))) for e in errors]
     study.plot(
-        "stability-bsdf-steepness",
+        "bsdf-steepness",
         title,
         _figure(maps, titles, ("alpha", alphas), ("tan²θh/alpha² below", ends)),
         "By roughness and angle off the mirror direction. Blank: no pair of float32 directions lies there.",
@@ -330,7 +330,7 @@ def _heat_maps(study: Study, lobes: Lobes, angles: FresnelGrid, found: Sequence[
     maps = [_grid(_decade(angles.cosines), index, e.of["f"], (DECADES, len(values))) for e in found]
     iors = [f"1{n - 1:+.0e}" if 0 < abs(n - 1) < 1e-3 else f"{n:g}" for n in np.float64(values)]
     study.plot(
-        "stability-fresnel",
+        "fresnel",
         "Largest relative error of F",
         _figure(maps, titles, ("IOR", iors), ("cos θ down to", [f"1e-{k + 1}" for k in range(DECADES)])),
         "By index of refraction and angle.",

@@ -32,7 +32,7 @@ EDGES: dict[str, Edges] = {
 def run(study: Study, *, quick: bool) -> None:
     """The table of cases, in both kinds of variants."""
     del quick  # all of it is quick
-    cases = Cases(study, "stability-filters", "Filters")
+    cases = Cases(study, "filters", "Filters")
     import mitsuba as mi
 
     before = mi.variant()
@@ -67,7 +67,7 @@ def _constant(shape: Sequence[int], value: float) -> np.ndarray:
 
 
 def _flat_normals(image: np.ndarray) -> np.ndarray:
-    return np.broadcast_to(np.float32([0, 0, 1]), image.shape)
+    return np.broadcast_to(np.array([0, 0, 1], np.float32), image.shape)
 
 
 def _blurred(image: np.ndarray, depth: np.ndarray, mode: str, **changes: Any) -> np.ndarray:

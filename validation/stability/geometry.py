@@ -32,14 +32,14 @@ HOLDS_TO = 100.0  # scene sizes
 
 def run(study: Study, *, quick: bool) -> None:
     """Single objects, then the report's scenes scaled and moved."""
-    cases = Cases(study, "stability-geometry", "Geometry")
+    cases = Cases(study, "geometry", "Geometry")
     worst: list[tuple[str, str, float, str]] = []
     shape_cases(cases, worst, quick=quick)
     start_cases(cases, quick=quick)
     _scenes(study, cases, quick=quick)
     cases.close("A rounding is 2⁻²⁴ = 6e-8. Truth: the same rays in float64.")
     study.table(
-        "stability-geometry-worst",
+        "geometry-worst",
         "The rays with the largest errors",
         ("object", "figure", "roundings", "inputs"),
         worst,
@@ -75,7 +75,7 @@ def _scenes(study: Study, cases: Cases, *, quick: bool) -> None:
                 why = f"coordinates have steps of {step} there: normals, highlights and outlines move"
                 cases.beyond_float32(title, what, share, why)
     study.table(
-        "stability-translation",
+        "translation",
         "Share of pixels that differ after the scene was moved by so many scene sizes",
         ("scene", "size", *(f"{n:g}" for n in TRANSLATIONS)),
         rows,

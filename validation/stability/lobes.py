@@ -120,7 +120,10 @@ def _exact(wi: np.ndarray, wo: np.ndarray, alpha: float, ior: float) -> tuple[fl
     g_i, slope_i = _g1_and_slope(wi, a)
     g_o, slope_o = _g1_and_slope(wo, a)
     # Components are not rounded again: the cosine between the directions is that of them made one unit long
-    cos_d = mp.sqrt(sum((p + q) ** 2 for p, q in zip(exact.unit(wi), exact.unit(wo), strict=True))) / 2
+    cos_d = (
+        mp.sqrt(sum((p + q) ** 2 for p, q in zip(exact.unit(list(wi)), exact.unit(list(wo)), strict=True)))
+        / 2
+    )
     f = exact.fresnel("dielectric", cos_d, 1, ior)
     z_i = exact.number(wi[2])
     value = d * f * g_i * g_o / (4 * z_i)

@@ -101,16 +101,16 @@ def _triangle_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth
 
 
 def _cone_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth:
-    ends = (arrays.vector_parameter(np.multiply(end, size)) for end in (APEX, BASE))
-    frame = cone_frame(*ends, arrays.parameter(CONE_RADIUS * size))
+    apex, base = (arrays.vector_parameter(np.multiply(end, size)) for end in (APEX, BASE))
+    frame = cone_frame(apex, base, arrays.parameter(CONE_RADIUS * size))
     found = intersect_cone(o, d, frame)
     t = numbers(found.t)
     return Truth(t, numbers(cone_surface(arrays.vectors(_at(o, d, t)), found.part, frame).n))
 
 
 def _cylinder_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth:
-    ends = (arrays.vector_parameter(np.multiply(end, size)) for end in (APEX, BASE))
-    frame = cylinder_frame(*ends, arrays.parameter(CONE_RADIUS * size))
+    p0, p1 = (arrays.vector_parameter(np.multiply(end, size)) for end in (APEX, BASE))
+    frame = cylinder_frame(p0, p1, arrays.parameter(CONE_RADIUS * size))
     found = intersect_cylinder(o, d, frame)
     t = numbers(found.t)
     return Truth(t, numbers(cylinder_surface(arrays.vectors(_at(o, d, t)), found.part, frame).n))
@@ -229,7 +229,7 @@ def start_cases(cases: Cases, *, quick: bool) -> None:
 
 def _apex_cases(cases: Cases, count: int, rng: np.random.Generator) -> None:
     cone = next(s for s in SOLIDS if s.name == "cone")
-    apex, base = np.float32(APEX), np.float32(BASE)
+    apex, base = (np.array(end, np.float32) for end in (APEX, BASE))
     axis = np.float64(base) - apex
     height = np.linalg.norm(axis)
     aside = np.cross(axis / height, _units(rng, count))

@@ -114,7 +114,7 @@ PATHS: Sequence[Path] = (
 
 def run(study: Study, *, quick: bool) -> None:
     """Every case against the float64 tracer, sums over bounces in closed form, whole renders."""
-    cases = Cases(study, "stability-transport", "Light transport")
+    cases = Cases(study, "transport", "Light transport")
     rows = [_case(cases, path) for path in PATHS]
     _bounces(cases, (1, 3, 10) if quick else range(1, 11))
     _scalar_variant(cases)
@@ -133,7 +133,7 @@ def run(study: Study, *, quick: bool) -> None:
         "not finite",
         "negative",
     )
-    study.table("stability-paths", "Pictures of the cases, one ray per pixel", columns, rows)
+    study.table("paths", "Pictures of the cases, one ray per pixel", columns, rows)
 
 
 def _case(cases: Cases, path: Path) -> tuple[Any, ...]:
