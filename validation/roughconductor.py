@@ -374,7 +374,7 @@ def same_numbers(alpha: float, *, size: int = 96, visible: bool = True, spp: int
 def rendered(study: Study, *, quick: bool) -> None:
     """Pictures: equal with equal random numbers, not told apart with others, while small errors are."""
     settings: dict[str, Any] = (
-        {"size": 64, "spp": 8, "renders": 64} if quick else {"size": 192, "spp": 16, "renders": 128}
+        {"size": 64, "spp": 8, "renders": 64} if quick else {"size": 128, "spp": 8, "renders": 96}
     )
     alphas = (POWER_ALPHA,) if quick else (0.03, 0.1, POWER_ALPHA)
     with study.stage("pictures", len(alphas) + len(MUTATIONS)) as advance:
@@ -453,7 +453,7 @@ def measure_efficiency(
 
 def efficiency(study: Study, *, quick: bool) -> None:
     """Noise at equal sample counts, which is held; at equal time, which depends on the machine, recorded."""
-    settings = {"size": 64, "spp": 16, "renders": 12} if quick else {"size": 128, "spp": 64, "renders": 32}
+    settings = {"size": 64, "spp": 16, "renders": 12} if quick else {"size": 96, "spp": 16, "renders": 32}
     alphas = (0.1, 0.5) if quick else (0.02, 0.1, 0.3, 0.6)
     rows: list[list[Any]] = []
     ratios = []
