@@ -170,7 +170,7 @@ class Scene:
             "fov": camera.hfov,
             "fov_axis": "x",
             "near_clip": 0.01 * min(1.0, reach),
-            "far_clip": 1e5 * max(1.0, reach / 1e3),
+            "far_clip": 1e5 * max(1.0, reach / 10),
             "to_world": to_world,
             "film": film,
             "sampler": {"type": "independent", "sample_count": 16},
