@@ -70,7 +70,7 @@ def _scene(alpha: float, kd: tuple[float, float, float]) -> Any:
                 "fov": 32,
                 "to_world": look,
                 "film": film,
-                "sampler": {"type": "stratified"},
+                "sampler": sampler,
             },
             "lamp": {"type": "point", "position": [-2, -4, 2], "intensity": 60.0},
             "ball": {"type": "sphere", "bsdf": ball},
