@@ -48,7 +48,7 @@ def run(study: Study, *, quick: bool) -> None:
 
 def _scenes(study: Study, cases: Cases, *, quick: bool) -> None:
     rows = []
-    numbers = (0, 2, 3) if quick else range(5)  # scene 2 shows the horizon, where the far plane would
+    numbers = (0, 2, 3) if quick else range(5)  # scene 2 shows the horizon, which a far plane can cut off
     for number in numbers:
         scene = report_scene(number)
         base = picture(scene)
