@@ -90,7 +90,7 @@ def _text_of(mine: dict[str, Any], scene: int | Scene, flavor: str) -> str:
     mine = {name: _with_whole_path(node) for name, node in mine.items()}
     if flavor == "stock":
         mine = _stock(mine, scene if isinstance(scene, Scene) else report_scene(scene))
-    variant = mi.variant()
+    variant = runtime.use()
     # The writer looks plugins up in scalar_rgb, whatever the current variant
     runtime.use("scalar_rgb")
     runtime.use(variant)

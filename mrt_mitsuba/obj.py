@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -167,7 +168,7 @@ def obj_view(
     """
     lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
     scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)
-    given = {"position": camera, "target": target, "up": up, "hfov": fov}
+    given: dict[str, Any] = {"position": camera, "target": target, "up": up, "hfov": fov}
     view = replace(scene.camera, **{name: value for name, value in given.items() if value is not None})
     forward = np.subtract(view.target, view.position)
     if not forward.any():

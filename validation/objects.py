@@ -21,7 +21,12 @@ from mrt_mitsuba.validation.warm import measure
 TITLE = "Objects: mesh cones of more and more sides, and the exact cone of scene 9"
 
 SEGMENTS = (64, 128, 256, 512, 1024)
-CONE = {"type": "mrt_cone", "apex": [0.2, 1.5, -0.1], "base_center": [0.5, 0.4, 0.3], "radius": 0.65}
+CONE: dict[str, Any] = {
+    "type": "mrt_cone",
+    "apex": [0.2, 1.5, -0.1],
+    "base_center": [0.5, 0.4, 0.3],
+    "radius": 0.65,
+}
 MIDDLE = np.array([0.35, 0.95, 0.1])  # of the cone
 
 # The mean takes in rays near rims and the apex, where the error is not that of a smooth surface, and at 1024
