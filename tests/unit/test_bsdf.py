@@ -159,11 +159,12 @@ def test_nothing_below_the_horizon(variant: str) -> None:
     assert dr.all(b.eval_attribute("mirror_reflectance", interaction(down[0])) == 0, axis=None)
 
 
-@pytest.mark.parametrize("variant", VECTORISED, indirect=True)
-def test_vectorised_equals_scalar(variant: str) -> None:
-    scalar = {"llvm_ad_rgb": "scalar_rgb", "llvm_ad_spectral": "scalar_spectral"}.get(variant)
-    if scalar is None:
-        pytest.skip("no scalar variant of this colour mode")
+@pytest.mark.parametrize(
+    ("variant", "scalar"),
+    [("llvm_ad_rgb", "scalar_rgb"), ("llvm_ad_spectral", "scalar_spectral")],
+    indirect=["variant"],
+)
+def test_vectorised_equals_scalar(variant: str, scalar: str) -> None:
     wi, wo = lobe_pairs(100, 0.2)
     fast = evaluate(colored(alpha=0.2, fresnel="dielectric"), wi, wo)
     runtime.use(scalar)
@@ -549,8 +550,8 @@ def adversarial_directions(count: int, rng: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("visible", [True, False])
 def test_never_negative_nor_infinite(form: str, visible: bool) -> None:
-    """A million evaluations and samples: any roughness and index that a texture can hold, any direction."""
-    rng, count = np.random.default_rng(5), 1_000_000
+    """Any roughness and index that a texture can hold, and any direction, 400 000 times."""
+    rng, count = np.random.default_rng(5), 400_000
     odd = [0, -0.0, 1e-45, 1e-38, -1e-38, 3e38, -3e38, np.inf, -np.inf, np.nan, 1e-8, 1e-10, 1e10, 1e19, 1e20]
     alphas = np.concatenate([10 ** rng.uniform(-9, 3, 900), -(10 ** rng.uniform(-9, 3, 300)), odd])
     iors = np.concatenate([10 ** rng.uniform(-9, 9, 900), 1 + 10 ** rng.uniform(-7, 0, 300), odd])
