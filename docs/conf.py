@@ -33,6 +33,7 @@ def generate(app: object) -> None:
     """Make the pages that hold computed things."""
     import gallery
     import ledger
+
     from mrt_mitsuba import options
 
     mrt_mitsuba.register()  # plugin classes derive from a variant's classes, so autodoc needs one
@@ -44,7 +45,8 @@ def generate(app: object) -> None:
 
 
 def mathml(display: bool):  # type: ignore[no-untyped-def]
-    """Write formulas as MathML, which browsers draw by themselves: the site needs no script from elsewhere."""
+    """Write formulas as MathML, which browsers draw by themselves: the site needs no script from
+    elsewhere."""
     from docutils.nodes import SkipNode
     from latex2mathml.converter import convert
 

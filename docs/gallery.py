@@ -27,27 +27,63 @@ class Entry:
 
 def entries() -> list[Entry]:
     """Scenes first, then what the filters see and do."""
-    scenes = [Entry(f"scene{n}", f"mrt scene{n} {n} {SIZE}", f"Scene {n}: {report_scene(n).title}.") for n in NUMBERS]
+    scenes = [
+        Entry(f"scene{n}", f"mrt scene{n} {n} {SIZE}", f"Scene {n}: {report_scene(n).title}.")
+        for n in NUMBERS
+    ]
     return [
         *scenes,
-        Entry("contours_luma", f"mrt contours_luma 3 {SIZE} aamode=luma layers=edges,samples focaldist=0",
-              "What the luma detector refines in scene 3, dark places above all.", "samples.Y"),
-        Entry("contours_sobel", f"mrt contours_sobel 3 {SIZE} aamode=sobel layers=edges,samples focaldist=0",
-              "What the Sobel detector refines: every change of an 8-bit grey.", "samples.Y"),
-        Entry("contours_geometry", f"mrt contours_geometry 3 {SIZE} aamode=geometry layers=edges,samples focaldist=0",
-              "What the geometry detector refines: outlines and creases, and no shading.", "samples.Y"),
-        Entry("height_map", f"mrt height_map 3 {SIZE} focaldist=3 focalrange=0.5 layers=blur",
-              "The amount of blur in each pixel, 0 to 8: the report's height map.", "blur.Y"),
-        Entry("blur_report", f"mrt blur_report 3 {SIZE} focaldist=3 focalrange=0.5",
-              "Depth of field as in the report: seams where the depth jumps."),
-        Entry("blur_corrected", f"mrt blur_corrected 3 {SIZE} focaldist=3 focalrange=0.5 dof=corrected",
-              "The same without its flaws."),
-        Entry("motion", f"mrt motion 3 {SIZE} focaldist=0 motion=0.25,0,-0.25 motionsamples=16",
-              "Motion blur: the camera moves while the shutter is open."),
-        Entry("direct", f"mrt direct 3 {SIZE} aamode=none aa=2 layers=direct focaldist=0",
-              "Direct light only, a layer of the EXR.", "direct"),
-        Entry("reflection", f"mrt reflection 3 {SIZE} aamode=none aa=2 layers=reflection focaldist=0",
-              "What the mirror rays add, another layer.", "reflection"),
+        Entry(
+            "contours_luma",
+            f"mrt contours_luma 3 {SIZE} aamode=luma layers=edges,samples focaldist=0",
+            "What the luma detector refines in scene 3, dark places above all.",
+            "samples.Y",
+        ),
+        Entry(
+            "contours_sobel",
+            f"mrt contours_sobel 3 {SIZE} aamode=sobel layers=edges,samples focaldist=0",
+            "What the Sobel detector refines: every change of an 8-bit grey.",
+            "samples.Y",
+        ),
+        Entry(
+            "contours_geometry",
+            f"mrt contours_geometry 3 {SIZE} aamode=geometry layers=edges,samples focaldist=0",
+            "What the geometry detector refines: outlines and creases, and no shading.",
+            "samples.Y",
+        ),
+        Entry(
+            "height_map",
+            f"mrt height_map 3 {SIZE} focaldist=3 focalrange=0.5 layers=blur",
+            "The amount of blur in each pixel, 0 to 8: the report's height map.",
+            "blur.Y",
+        ),
+        Entry(
+            "blur_report",
+            f"mrt blur_report 3 {SIZE} focaldist=3 focalrange=0.5",
+            "Depth of field as in the report: seams where the depth jumps.",
+        ),
+        Entry(
+            "blur_corrected",
+            f"mrt blur_corrected 3 {SIZE} focaldist=3 focalrange=0.5 dof=corrected",
+            "The same without its flaws.",
+        ),
+        Entry(
+            "motion",
+            f"mrt motion 3 {SIZE} focaldist=0 motion=0.25,0,-0.25 motionsamples=16",
+            "Motion blur: the camera moves while the shutter is open.",
+        ),
+        Entry(
+            "direct",
+            f"mrt direct 3 {SIZE} aamode=none aa=2 layers=direct focaldist=0",
+            "Direct light only, a layer of the EXR.",
+            "direct",
+        ),
+        Entry(
+            "reflection",
+            f"mrt reflection 3 {SIZE} aamode=none aa=2 layers=reflection focaldist=0",
+            "What the mirror rays add, another layer.",
+            "reflection",
+        ),
     ]
 
 
@@ -56,8 +92,11 @@ def build(folder: Path) -> None:
     page = []
     for entry in entries():
         write_png(folder / f"{entry.name}.png", _picture(entry))
-        page.append(f"## {entry.caption.split(':')[0].rstrip('.')}\n\n{entry.caption}\n\n```sh\n{entry.command}\n```\n\n"
-                    f"```{{image}} _generated/{entry.name}.png\n:alt: {entry.caption}\n```\n")
+        page.append(
+            f"## {entry.caption.split(':')[0].rstrip('.')}\n\n{entry.caption}\n\n"
+            f"```sh\n{entry.command}\n```\n\n"
+            f"```{{image}} _generated/{entry.name}.png\n:alt: {entry.caption}\n```\n"
+        )
     (folder / "gallery.inc.md").write_text("\n".join(page))
 
 

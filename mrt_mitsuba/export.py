@@ -27,12 +27,14 @@ def scene_dict(
 ) -> dict[str, Any]:
     """Return a scene as a plain Mitsuba dict; ``mi.load_dict`` takes it (after ``mrt.register()``).
 
-    ``flavor``: "mrt" for this project's plugins; "stock" for the nearest equivalents among Mitsuba's, which any Mitsuba
-    program opens: ``roughplastic`` for the material, ``point`` lights as bright at the camera's target, finite squares
-    for planes, ``cylinder`` and two ``disk`` for a cylinder, ``bitmap`` for a texture, and ``path`` with few bounces for
-    the integrator. Cones and meshes have none but in a file of their own, which ``write_xml`` writes.
+    ``flavor``: "mrt" for this project's plugins; "stock" for the nearest equivalents among Mitsuba's, which
+    any Mitsuba program opens: ``roughplastic`` for the material, ``point`` lights as bright at the camera's
+    target, finite squares for planes, ``cylinder`` and two ``disk`` for a cylinder, ``bitmap`` for a texture,
+    and ``path`` with few bounces for the integrator. Cones and meshes have none but in a file of their own,
+    which ``write_xml`` writes.
 
-    Raises ``UsageError`` for an unknown scene or flavor, ``SceneError`` for a stock flavor that cannot be had.
+    Raises ``UsageError`` for an unknown scene or flavor, ``SceneError`` for a stock flavor that cannot be
+    had.
     """
     if flavor not in FLAVORS:
         raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
@@ -47,9 +49,9 @@ def write_xml(
 ) -> None:
     """Write a scene as XML through Mitsuba's own writer.
 
-    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file beside it, named after the
-    XML file and the shape. Raises ``OutputError`` if a file cannot be written, ``SceneError`` for groups of objects
-    (``mrt_group``), which have neither an XML form nor a stock counterpart.
+    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file beside it,
+    named after the XML file and the shape. Raises ``OutputError`` if a file cannot be written, ``SceneError``
+    for groups of objects (``mrt_group``), which have neither an XML form nor a stock counterpart.
     """
     from mrt_mitsuba.output import replacing
 
@@ -143,7 +145,8 @@ def _stock_integrator(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
 
 
 def _stock_bsdf(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
-    """The same lobes over a diffuse base; colours above one and negative roughness have no stock counterpart."""
+    """The same lobes over a diffuse base; colours above one and negative roughness have no stock
+    counterpart."""
 
     def clipped(color: dict[str, Any]) -> dict[str, Any]:
         if color["type"] == "mrt_texture":
@@ -202,7 +205,8 @@ def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
 
 
 def _stock_texture(node: dict[str, Any]) -> dict[str, Any]:
-    """The nearest texel as stored; half a texel off the report's look-up, which shrinks the picture so far."""
+    """The nearest texel as stored; half a texel off the report's look-up, which shrinks the picture so
+    far."""
     stored = {"raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
     return {"type": "bitmap", "filename": os.path.abspath(node["filename"]), **stored}
 

@@ -6,12 +6,12 @@ import os
 
 from mrt_mitsuba.errors import UsageError
 
-# A wavefront's arrays, per ray and channel: what the kernel writes and the mean reads, in float32, and as much again for
-# what Dr.Jit keeps for reuse
+# A wavefront's arrays, per ray and channel: what the kernel writes and the mean reads, in float32, and as
+# much again for what Dr.Jit keeps for reuse
 BYTES_PER_CHANNEL_OF_RAY = 8
 
-# Whole pictures, per pixel and channel: the result, its copy in Dr.Jit's arrays while a filter reads it, and what the
-# filter writes
+# Whole pictures, per pixel and channel: the result, its copy in Dr.Jit's arrays while a filter reads it, and
+# what the filter writes
 BYTES_PER_CHANNEL_OF_PIXEL = 12
 
 # Rays of one wavefront at most: more gain no speed, and progress is told by the wavefront
@@ -23,17 +23,21 @@ LEAST_RAYS = 2**16
 def rays_at_once(pixels: int, channels: int, memory: int | None = None) -> int:
     """Rays of one wavefront, for a picture of so many pixels and float32 channels.
 
-    ``memory``: bytes to stay within; by default half of what is free. Raises ``UsageError`` where the finished picture alone
-    would not fit.
+    ``memory``: bytes to stay within; by default half of what is free. Raises ``UsageError`` where the
+    finished picture alone would not fit.
     """
     budget = memory if memory is not None else free_memory() // 2
     left = budget - pixels * channels * BYTES_PER_CHANNEL_OF_PIXEL
     rays = min(left // (channels * BYTES_PER_CHANNEL_OF_RAY), MOST_RAYS)
     if rays < min(LEAST_RAYS, pixels):
-        needed = pixels * channels * BYTES_PER_CHANNEL_OF_PIXEL + LEAST_RAYS * channels * BYTES_PER_CHANNEL_OF_RAY
+        needed = (
+            pixels * channels * BYTES_PER_CHANNEL_OF_PIXEL + LEAST_RAYS * channels * BYTES_PER_CHANNEL_OF_RAY
+        )
         raise UsageError(
-            f"a picture of {pixels} pixels needs about {_text(needed)} of memory, and {_text(budget)} may be used: choose a "
-            f"smaller width and height, fewer layers, or a larger memory=")
+            f"a picture of {pixels} pixels needs about {_text(needed)} of memory, "
+            f"and {_text(budget)} may be used: choose a "
+            f"smaller width and height, fewer layers, or a larger memory="
+        )
     return int(rays)
 
 

@@ -81,7 +81,8 @@ def make_plan(
     random: bool,
     features: Features,
 ) -> Plan:
-    """Decide what to trace and what to leave out. ``layers``: asked for; ``features``: of scene and integrator."""
+    """Decide what to trace and what to leave out. ``layers``: asked for; ``features``: of scene and
+    integrator."""
     _check_layers(layers, features, aamode, integrator)
     detector = aamode if aamode != "none" and (lattice.aa > 1 or "edges" in layers) else None
     blur = dof if focal_distance else None
@@ -107,12 +108,24 @@ def make_plan(
     if skipped:
         left_out.append(Omission(f"layers {', '.join(skipped)}", "not asked for"))
     return Plan(
-        scene=scene, variant=variant, integrator=integrator, width=width, height=height, lattice=lattice,
-        detector=detector, blur=blur, repeats=repeats, motion=motion, motion_samples=motion_samples if motion else 1,
-        count_rays=count_rays, layers=layers,
-        traced_layers=frozenset(traced), kernel=features.kernel,
+        scene=scene,
+        variant=variant,
+        integrator=integrator,
+        width=width,
+        height=height,
+        lattice=lattice,
+        detector=detector,
+        blur=blur,
+        repeats=repeats,
+        motion=motion,
+        motion_samples=motion_samples if motion else 1,
+        count_rays=count_rays,
+        layers=layers,
+        traced_layers=frozenset(traced),
+        kernel=features.kernel,
         passes=(*_motion_pass(motion, motion_samples), *_passes(lattice, detector, blur, repeats, random)),
-        left_out=tuple(left_out))
+        left_out=tuple(left_out),
+    )
 
 
 def _check_layers(layers: frozenset[str], features: Features, aamode: str, integrator: str) -> None:
@@ -126,10 +139,16 @@ def _check_layers(layers: frozenset[str], features: Features, aamode: str, integ
 def _motion_pass(motion: str | None, moments: int) -> list[str]:
     if motion is None:
         return []
-    return [f"motion blur: {moments} frames" if motion == "frames" else f"motion blur: at least {moments} moments in a pixel"]
+    return [
+        f"motion blur: {moments} frames"
+        if motion == "frames"
+        else f"motion blur: at least {moments} moments in a pixel"
+    ]
 
 
-def _passes(lattice: Lattice, detector: str | None, blur: str | None, repeats: int, random: bool) -> list[str]:
+def _passes(
+    lattice: Lattice, detector: str | None, blur: str | None, repeats: int, random: bool
+) -> list[str]:
     times = f", {repeats} rays each" if repeats > 1 else ""
     passes = []
     if detector is None:
@@ -163,7 +182,12 @@ def whitted_features(integrator: Any, prepared: Any) -> Features:
         else:
             left_out.append(Omission(what, why))
 
-    decide(prepared.shape_count > 0, f"{prepared.shape_count} shapes in Mitsuba's BVH", "BVH", "no shapes but analytic ones")
+    decide(
+        prepared.shape_count > 0,
+        f"{prepared.shape_count} shapes in Mitsuba's BVH",
+        "BVH",
+        "no shapes but analytic ones",
+    )
     quadrics = prepared.quadrics
     text = f"{quadrics.count} exact objects in a tree: {', '.join(quadrics.kinds)}" if quadrics else ""
     decide(quadrics is not None, text, "cones and cylinders", "none in the scene")
@@ -171,8 +195,12 @@ def whitted_features(integrator: Any, prepared: Any) -> Features:
     lights = len(prepared.lights)
     decide(lights > 0, f"{lights} lights, {prepared.light_handling}", "shadow rays", "no light")
     decide(prepared.emissive, "emission of surfaces", "emission", "no surface emits")
-    decide(integrator.bounces(prepared), f"mirror bounces, budget {integrator.max_depth}", "bounce loop",
-           "max_depth is 1" if integrator.max_depth == 1 else "no material reflects visibly")
+    decide(
+        integrator.bounces(prepared),
+        f"mirror bounces, budget {integrator.max_depth}",
+        "bounce loop",
+        "max_depth is 1" if integrator.max_depth == 1 else "no material reflects visibly",
+    )
     decide(prepared.textured, "textures and their coordinates", "textures", "every material is uniform")
     decide(prepared.random, "random numbers", "random numbers", "every light is a point or a direction")
     layers = frozenset({"depth", "normal", "albedo", "direct", "reflection", "bounces", "shadow_rays"})

@@ -14,9 +14,9 @@ LATTICES = ("report", "centered")
 class Lattice:
     """A grid of aa × aa samples in a pixel.
 
-    ``report``: sample (i, j) at (0.5 + i/aa, 0.5 + j/aa), y upwards, as in the original: sample 0 is the pixel's centre
-    and the others reach into the next pixels, which shifts the picture by up to half a pixel. ``centered``: the middles
-    of aa × aa equal cells.
+    ``report``: sample (i, j) at (0.5 + i/aa, 0.5 + j/aa), y upwards, as in the original: sample 0 is the
+    pixel's centre and the others reach into the next pixels, which shifts the picture by up to half a pixel.
+    ``centered``: the middles of aa × aa equal cells.
     """
 
     kind: str
@@ -33,7 +33,8 @@ class Lattice:
         return self.kind == "report" or self.aa % 2 == 1
 
     def offset(self, sample: Any, aa: Any) -> tuple[Any, Any]:
-        """Place of sample number ``sample`` in its pixel as (x, y), y downwards; ``aa`` as the same type of integer."""
+        """Place of sample number ``sample`` in its pixel as (x, y), y downwards; ``aa`` as the same type of
+        integer."""
         import mitsuba as mi
 
         if self.kind == "centered" and self.holds_centre:
@@ -49,9 +50,10 @@ class Lattice:
 class Shutter:
     """When the rays of a pixel are traced, the shutter being open from time 0 to 1.
 
-    The time is divided into ``moments`` equal parts, and successive rays of a pixel go to different parts, far from each
-    other, so that place and time do not go together. ``phase``: where in its part a ray is, 0 to 1; None: at a random
-    place, the same for all rays of a pixel and another for the next pixel, which turns steps into noise.
+    The time is divided into ``moments`` equal parts, and successive rays of a pixel go to different parts,
+    far from each other, so that place and time do not go together. ``phase``: where in its part a ray is, 0
+    to 1; None: at a random place, the same for all rays of a pixel and another for the next pixel, which
+    turns steps into noise.
     """
 
     moments: int
@@ -65,7 +67,8 @@ class Shutter:
         return next(s for s in range(max(golden, 1), self.moments + 2) if math.gcd(s, self.moments) == 1)
 
     def time(self, rest: Any, pixel: Any, moments: Any, stride: Any, phase: Any) -> Any:
-        """Of ray number ``rest`` of a pixel; the last three are the shutter's own, ``phase`` the seed where it is None."""
+        """Of ray number ``rest`` of a pixel; the last three are the shutter's own, ``phase`` the seed where
+        it is None."""
         import mitsuba as mi
 
         part = mi.UInt64(rest) * stride % moments
@@ -78,8 +81,8 @@ class Shutter:
 class Bundle:
     """Samples ``first`` to ``first + count - 1`` of some pixels, each traced ``repeats`` times.
 
-    ``pixels``: indices into the picture, row by row from the top, as an array; or a range, for which no indices are
-    stored. The rays of a pixel lie side by side.
+    ``pixels``: indices into the picture, row by row from the top, as an array; or a range, for which no
+    indices are stored. The rays of a pixel lie side by side.
     """
 
     pixels: Any
@@ -115,17 +118,30 @@ class Bundle:
             pixel = dr.gather(mi.UInt32, mi.UInt32(self.pixels), order)
         # Sizes are data, not constants: another picture size needs no other kernel
         width, height, repeats, first, aa = (
-            dr.opaque(mi.UInt32, n) for n in (width, height, self.repeats, self.first, self.lattice.aa))
+            dr.opaque(mi.UInt32, n) for n in (width, height, self.repeats, self.first, self.lattice.aa)
+        )
         shutter = self._shutter_numbers(dr.opaque) if self.shutter else ()
-        return self._samples(lane, order, pixel, lane - order * per_pixel, width, height, repeats, first, aa, shutter)
+        return self._samples(
+            lane, order, pixel, lane - order * per_pixel, width, height, repeats, first, aa, shutter
+        )
 
     def each_sample(self, width: int, height: int) -> Iterator[Samples]:
         """The same, one ray at a time, for scalar variants."""
         shutter = self._shutter_numbers(lambda kind, value: kind(value)) if self.shutter else ()
         for lane in range(self.ray_count):
             order, rest = divmod(lane, self.rays_per_pixel)
-            yield self._samples(lane, order, int(self.pixels[order]), rest, width, height, self.repeats, self.first,
-                                self.lattice.aa, shutter)
+            yield self._samples(
+                lane,
+                order,
+                int(self.pixels[order]),
+                rest,
+                width,
+                height,
+                self.repeats,
+                self.first,
+                self.lattice.aa,
+                shutter,
+            )
 
     def _shutter_numbers(self, number: Any) -> tuple[Any, Any, Any]:
         """What ``Shutter.time`` needs, each made by ``number(type, value)``."""
@@ -140,8 +156,9 @@ class Bundle:
 
         row = pixel // width
         x, y = self.lattice.offset(rest // repeats + first, aa)
-        place = mi.Point2f((mi.Float(pixel - row * width) + x) / mi.Float(width),
-                           (mi.Float(row) + y) / mi.Float(height))
+        place = mi.Point2f(
+            (mi.Float(pixel - row * width) + x) / mi.Float(width), (mi.Float(row) + y) / mi.Float(height)
+        )
         time = self.shutter.time(rest, pixel, *shutter) if self.shutter else mi.Float(0)
         return Samples(lane=lane, order=order, is_first=rest == 0, place=place, time=time)
 
@@ -150,8 +167,9 @@ class Bundle:
 class Samples:
     """Rays of a bundle before they are rays.
 
-    ``lane``: the ray's number; ``order``: its pixel's place in the bundle; ``is_first``: is it its pixel's first; ``place``:
-    on the film, x to the right, y down, the picture being [0, 1]²; ``time``: from 0, when the shutter opens, to 1.
+    ``lane``: the ray's number; ``order``: its pixel's place in the bundle; ``is_first``: is it its pixel's
+    first; ``place``: on the film, x to the right, y down, the picture being [0, 1]²; ``time``: from 0, when
+    the shutter opens, to 1.
     """
 
     lane: Any

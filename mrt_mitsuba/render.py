@@ -57,7 +57,8 @@ def render(
     """Render a scene.
 
     Args:
-        scene: number of a scene of the report, a ``Scene``, a Mitsuba dict, a Mitsuba scene, or the path of an .xml or
+        scene: number of a scene of the report, a ``Scene``, a Mitsuba dict, a Mitsuba scene, or the path of
+        an .xml or
             .obj file.
         width, height: pixels; 800 and 600, or the film's own where the scene brings a film.
         aa: aa × aa samples in a pixel.
@@ -67,18 +68,20 @@ def render(
         focaldist, focalrange: scene units; by default the scene's own; a distance of 0 turns the blur off.
         dof: "report" or "corrected", see ``filters.dof``.
         layers: names from ``output.LAYERS`` to return beside those that are free.
-        motion, motionsamples: the camera's way while the shutter is open, and the number of moments at which it is seen.
-        motionmode: "frames" averages so many whole renders, as the report does; "stratified" is one render whose rays are
-            spread over the time the shutter is open: at least so many to a pixel, and no more than that where the lattice
-            has as many samples.
+        motion, motionsamples: the camera's way while the shutter is open, and the number of moments at which
+        it is seen. motionmode: "frames" averages so many whole renders, as the report does; "stratified" is
+        one render whose rays are
+            spread over the time the shutter is open: at least so many to a pixel, and no more than that where
+            the lattice has as many samples.
         convention: meaning of MTL files, "report" or "standard".
         variant: Mitsuba variant; by default the current one, else ``llvm_ad_rgb``.
         memory: bytes (or text such as "4G") to stay within.
         seed: for whatever is random.
         integrator: name, dict or instance of a sampling integrator; by default the scene's own.
-        spp: rays for each sample, for integrators that draw random numbers. From 2 on, "luma" and "sobel" know the
-            variance of every pixel and take only for an edge what noise does not explain; with one random ray they take
-            noise for edges, and refine it ("geometry" does not).
+        spp: rays for each sample, for integrators that draw random numbers. From 2 on, "luma" and "sobel"
+        know the
+            variance of every pixel and take only for an edge what noise does not explain; with one random ray
+            they take noise for edges, and refine it ("geometry" does not).
         count_rays: count mirror and shadow rays.
         progress: told of plan, stages and progress.
 
@@ -89,21 +92,41 @@ def render(
     """
     start = time.perf_counter()
     arguments = {name: value for name, value in locals().items() if name in options.TABLE and name != "scene"}
-    given = {name: options.check(name, value) if value is not None else None for name, value in arguments.items()}
+    given = {
+        name: options.check(name, value) if value is not None else None for name, value in arguments.items()
+    }
     job = _Job(Progress() if progress is None else progress)
     with job.counting_kernels():
         variant = runtime.use(variant)
         runtime.warn_if_slow()
-        source = open_scene(scene, width=given["width"], height=given["height"], fresnel=given["fresnel"],
-                            convention=given["convention"], integrator=integrator)
+        source = open_scene(
+            scene,
+            width=given["width"],
+            height=given["height"],
+            fresnel=given["fresnel"],
+            convention=given["convention"],
+            integrator=integrator,
+        )
         tracer, features = _tracer(source)
         focus = _Focus.of(source, given["focaldist"], given["focalrange"])
         plan = make_plan(
-            scene=source.name, variant=variant, integrator=_name(source.integrator), width=source.width,
-            height=source.height, lattice=Lattice(given["lattice"], given["aa"]), aamode=given["aamode"],
-            focal_distance=focus.distance, dof=given["dof"], layers=frozenset(given["layers"]),
-            count_rays=count_rays, repeats=given["spp"], motion=given["motionmode"] if given["motion"] else None,
-            motion_samples=given["motionsamples"], random=tracer.random, features=features)
+            scene=source.name,
+            variant=variant,
+            integrator=_name(source.integrator),
+            width=source.width,
+            height=source.height,
+            lattice=Lattice(given["lattice"], given["aa"]),
+            aamode=given["aamode"],
+            focal_distance=focus.distance,
+            dof=given["dof"],
+            layers=frozenset(given["layers"]),
+            count_rays=count_rays,
+            repeats=given["spp"],
+            motion=given["motionmode"] if given["motion"] else None,
+            motion_samples=given["motionsamples"],
+            random=tracer.random,
+            features=features,
+        )
         job.rays_at_once = rays_at_once(plan.width * plan.height, plan.channels, given["memory"])
         job.progress.plan(plan)
         load = time.perf_counter() - start
@@ -112,7 +135,9 @@ def render(
         for exposure in _exposures(plan, given["seed"]):
             frames.add(_frame(job, tracer, camera, plan, focus, exposure))
     timings = Timings(time.perf_counter() - start, load, job.compile, job.kernels, job.passes)
-    shown = {name: value for name, value in given.items() if value is not None and name not in ("memory", "quiet")}
+    shown = {
+        name: value for name, value in given.items() if value is not None and name not in ("memory", "quiet")
+    }
     return frames.result(plan, timings, job, shown)
 
 
@@ -144,7 +169,8 @@ def _name(integrator: Any) -> str:
 
 @dataclass(frozen=True)
 class _Exposure:
-    """One picture while the shutter is open. ``frame``: which of the plan's frames, or None for all of the time."""
+    """One picture while the shutter is open. ``frame``: which of the plan's frames, or None for all of the
+    time."""
 
     plan: Plan
     seed: int
@@ -156,7 +182,9 @@ class _Exposure:
         if plan.motion == "stratified":
             # every ray of a pixel in a part of its own
             repeats = plan.repeats * math.ceil(plan.motion_samples / (count * plan.repeats))
-            return Bundle(pixels, plan.lattice, first, count, repeats, Shutter(count * repeats, seed=self.seed))
+            return Bundle(
+                pixels, plan.lattice, first, count, repeats, Shutter(count * repeats, seed=self.seed)
+            )
         return Bundle(pixels, plan.lattice, first, count, plan.repeats * self._moments, self._shutter)
 
     def centre(self, pixels: Any) -> Bundle:
@@ -166,7 +194,11 @@ class _Exposure:
     def first_hit(self, pixels: Any) -> Bundle:
         """The pixel's centre when the shutter opens, or at the moment of the frame."""
         still = self.plan.motion is None
-        return Bundle(pixels, CENTRE, shutter=None if still else Shutter(1, (self.frame or 0) / self.plan.motion_samples))
+        return Bundle(
+            pixels,
+            CENTRE,
+            shutter=None if still else Shutter(1, (self.frame or 0) / self.plan.motion_samples),
+        )
 
     @property
     def _moments(self) -> int:
@@ -192,8 +224,9 @@ def _exposures(plan: Plan, seed: int) -> list[_Exposure]:
 # ------------------------------------------------ One frame ------------------------------------------------
 
 
-def _frame(job: _Job, tracer: Tracer, camera: Camera, plan: Plan, focus: _Focus,
-           exposure: _Exposure) -> dict[str, np.ndarray]:
+def _frame(
+    job: _Job, tracer: Tracer, camera: Camera, plan: Plan, focus: _Focus, exposure: _Exposure
+) -> dict[str, np.ndarray]:
     """One picture and its layers: name to [H W] or [H W, channels], before they get their shape."""
     pixels = range(camera.width * camera.height)
     wanted = plan.traced_layers | {"image"}
@@ -252,9 +285,13 @@ def _refine(job, tracer, camera, exposure, pixels, layers) -> None:
     first = 1 if lattice.holds_centre else 0
     bundle = exposure.lattice(pixels, first=first)
     wanted = frozenset(name for name in layers if name in AVERAGED and name != "square")
-    more = job.trace("Anti-aliasing", "Computing Anti aliasing..", tracer, camera, bundle, wanted, exposure.seed + 1)
+    more = job.trace(
+        "Anti-aliasing", "Computing Anti aliasing..", tracer, camera, bundle, wanted, exposure.seed + 1
+    )
     for name, values in more.items():
-        layers[name][pixels] = (first * layers[name][pixels] + bundle.count * values) / np.float32(lattice.count)
+        layers[name][pixels] = (first * layers[name][pixels] + bundle.count * values) / np.float32(
+            lattice.count
+        )
     layers["samples"][pixels] = lattice.count
 
 
@@ -264,9 +301,13 @@ def _blur(job: _Job, plan: Plan, focus: _Focus, layers: dict[str, np.ndarray]) -
     shape = (plan.height, plan.width)
     depth, image = layers["depth"].reshape(shape), layers["image"].reshape(*shape, 3)
     message = "Computing depth of field.."
-    with job.timed("depth of field"), job.progress.stage("Depth of field", len(layers["depth"]), message) as advance:
-        blurred = filters.gaussian_dof(image, depth, focal_distance=focus.distance, focal_range=focus.range,
-                                       mode=plan.blur)
+    with (
+        job.timed("depth of field"),
+        job.progress.stage("Depth of field", len(layers["depth"]), message) as advance,
+    ):
+        blurred = filters.gaussian_dof(
+            image, depth, focal_distance=focus.distance, focal_range=focus.range, mode=plan.blur
+        )
         layers["image"] = blurred.reshape(-1, 3)
         if "blur" in plan.layers:
             amount = filters.blur_amount(depth, focal_distance=focus.distance, focal_range=focus.range)
@@ -274,7 +315,8 @@ def _blur(job: _Job, plan: Plan, focus: _Focus, layers: dict[str, np.ndarray]) -
         advance(len(layers["depth"]))
 
 
-# ------------------------------------------------ Bookkeeping ------------------------------------------------
+# ------------------------------------------------ Bookkeeping
+# ------------------------------------------------
 
 
 @dataclass
@@ -289,11 +331,13 @@ class _Job:
     compile: float = 0.0
     kernels: float = 0.0
 
-    def trace(self, title: str, message: str, tracer: Tracer, camera: Camera, bundle: Bundle, wanted: Any,
-              seed: int) -> dict[str, np.ndarray]:
+    def trace(
+        self, title: str, message: str, tracer: Tracer, camera: Camera, bundle: Bundle, wanted: Any, seed: int
+    ) -> dict[str, np.ndarray]:
         with self.timed(title.lower()), self.progress.stage(title, len(bundle.pixels), message) as advance:
-            layers = trace_bundle(tracer, camera, bundle, wanted, seed=seed, advance=advance,
-                                  rays_at_once=self.rays_at_once)
+            layers = trace_bundle(
+                tracer, camera, bundle, wanted, seed=seed, advance=advance, rays_at_once=self.rays_at_once
+            )
         self.rays["primary"] += bundle.ray_count
         for kind, name in SECONDARY_RAYS.items():
             if name in layers:
@@ -339,14 +383,17 @@ class _Frames:
         self.count += 1
 
     def result(self, plan: Plan, timings: Timings, job: _Job, given: Mapping[str, Any]) -> Result:
-        layers = {name: values / np.float32(self.count) if name in AVERAGED and self.count > 1 else values
-                  for name, values in self.sum.items()}
+        layers = {
+            name: values / np.float32(self.count) if name in AVERAGED and self.count > 1 else values
+            for name, values in self.sum.items()
+        }
         image = layers.pop("image").reshape(plan.height, plan.width, 3)
         return Result(image, _channels(plan, layers), plan, timings, job.rays, job.launches, given)
 
 
 def _channels(plan: Plan, layers: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Layers [H W] or [H W, channels] by EXR channel name, [H, W] each; those that nobody asked for only if free."""
+    """Layers [H W] or [H W, channels] by EXR channel name, [H, W] each; those that nobody asked for only if
+    free."""
     from mrt_mitsuba.output import LAYERS
 
     result = {}

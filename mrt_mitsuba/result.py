@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Timings:
-    """Seconds of one render. ``passes`` adds up to about ``total``; ``compile`` and ``kernels`` are parts of it."""
+    """Seconds of one render. ``passes`` adds up to about ``total``; ``compile`` and ``kernels`` are parts of
+    it."""
 
     total: float
     load: float  # scene and plan
@@ -41,7 +42,8 @@ class Result:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def save(self, path: str | os.PathLike[str], *, tonemap: str = "report") -> None:
-        """Write a .png or .exr; raise ``OutputError``. ``tonemap`` ("report" or "srgb") concerns a PNG only."""
+        """Write a .png or .exr; raise ``OutputError``. ``tonemap`` ("report" or "srgb") concerns a PNG
+        only."""
         from mrt_mitsuba import output
 
         output.save(path, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)

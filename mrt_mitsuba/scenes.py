@@ -1,8 +1,9 @@
 """The report's scenes 0 to 4 and its cone scene 9, as data, and the way to the others."""
+
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import cache
 from itertools import product
 
 from .errors import UsageError
@@ -42,10 +43,16 @@ def _row(i: int) -> float:
 
 
 def _scene_1() -> Scene:
-    lower = [Sphere((0, 0, _row(i)), 0.15, Material(1.1382, (10 - i) / 90, (1, 0.992, 0.98), (0.301, 0.034, 0.039)))
-             for i in range(10)]
-    upper = [Sphere((0, 1, _row(i)), 0.15, Material(1.1153, (i + 1) / 10, (1, 0.965, 1.07), (0.012, 0.036, 0.106)))
-             for i in range(10)]
+    lower = [
+        Sphere(
+            (0, 0, _row(i)), 0.15, Material(1.1382, (10 - i) / 90, (1, 0.992, 0.98), (0.301, 0.034, 0.039))
+        )
+        for i in range(10)
+    ]
+    upper = [
+        Sphere((0, 1, _row(i)), 0.15, Material(1.1153, (i + 1) / 10, (1, 0.965, 1.07), (0.012, 0.036, 0.106)))
+        for i in range(10)
+    ]
     mirror = Sphere((-3, 1, 0), 2, SCENE_4_MATERIALS[0])
     return Scene(
         title="roughness along two rows of spheres, before a large mirror",
@@ -60,16 +67,23 @@ def _scene_1() -> Scene:
 def _scene_2() -> Scene:
     def material(column: int, row: int) -> Material:
         # The two leftmost columns have a negative roughness, as in the original
-        return Material(1.0051 + 0.4 * row / 3, -0.0432 + 0.1 * column / 3, (1, 0.748, 0.718), (0.005, 0.013, 0.032))
+        return Material(
+            1.0051 + 0.4 * row / 3, -0.0432 + 0.1 * column / 3, (1, 0.748, 0.718), (0.005, 0.013, 0.032)
+        )
 
     return Scene(
         title="roughness against index of refraction",
         camera=Camera((0.5, 3, 1), (0, 0, 0.6), (0, 0, 1)),
         sky=BLUE_SKY,
-        lights=(Light((-20, 5, 10), (30, 30, 30)), Light((10, 10, 10), (30, 30, 30)),
-                Light((50, -100, 10), (1, 0.7, 2))),
-        spheres=tuple(Sphere((_row(column), 0, 0.4 * (row + 1)), 0.15, material(column, row))
-                      for row, column in product(range(4), range(10))),
+        lights=(
+            Light((-20, 5, 10), (30, 30, 30)),
+            Light((10, 10, 10), (30, 30, 30)),
+            Light((50, -100, 10), (1, 0.7, 2)),
+        ),
+        spheres=tuple(
+            Sphere((_row(column), 0, 0.4 * (row + 1)), 0.15, material(column, row))
+            for row, column in product(range(4), range(10))
+        ),
         planes=(Plane((0, 0, 1), 0, Material(1.1022, 0.0579, (0.95, 0.95, 0.95), (0.05, 0.05, 0.05))),),
     )
 
@@ -80,12 +94,18 @@ def _scene_3() -> Scene:
         title="six spheres in the corner of three planes",
         camera=Camera((4.5, 0.8, 4.5), (0, 0.3, 0)),
         sky=BLUE_SKY,
-        lights=(Light((0, 1.7, 1), (1.5, 1.5, 1.5)), Light((3, 2, 3), (2, 2, 2)), Light((4, 3, -1), (2.5, 2.5, 2.5))),
+        lights=(
+            Light((0, 1.7, 1), (1.5, 1.5, 1.5)),
+            Light((3, 2, 3), (2, 2, 2)),
+            Light((4, 3, -1), (2.5, 2.5, 2.5)),
+        ),
         spheres=(
             Sphere((0, 0.1, 0), 0.3, Material(6, 0.0181, (0.7, 0.882, 0.786), dark)),
             Sphere((1, -0.05, 0), 0.15, Material(1.3771, 0.01589, (1, 0.852, 1.172), (0.26, 0.036, 0.014))),
             Sphere((3, 0.05, 2), 0.25, Material(3, 0.00181, (0.7, 0.882, 0.786), dark)),
-            Sphere((1.3, 0, 2.6), 0.215, Material(1.5771, 0.01589, (0.8, 0.852, 0.8172), (0.46, 0.136, 0.114))),
+            Sphere(
+                (1.3, 0, 2.6), 0.215, Material(1.5771, 0.01589, (0.8, 0.852, 0.8172), (0.46, 0.136, 0.114))
+            ),
             Sphere((1.9, 0.05, 2.2), 0.25, Material(1.3051, 0.567, (0.7, 0.739, 0.721), (0.06, 0.26, 0.22))),
             Sphere((0, 0, 1), 0.2, Material(1.1153, 0.18, (1, 0.965, 1.07), (0.012, 0.036, 0.406))),
         ),
@@ -110,8 +130,11 @@ def _scene_4(count: int = 600) -> Scene:
         title="600 spheres in the corner of three planes",
         camera=Camera((6, 4, 6), (0, 1, 0), hfov=90),
         sky=BLUE_SKY,
-        lights=(Light((10, 10.7, 1), (1.5, 1.5, 1.5)), Light((8, 20, 3), (2, 2, 2)),
-                Light((4, 30, -1), (2.5, 2.5, 2.5))),
+        lights=(
+            Light((10, 10.7, 1), (1.5, 1.5, 1.5)),
+            Light((8, 20, 3), (2, 2, 2)),
+            Light((4, 30, -1), (2.5, 2.5, 2.5)),
+        ),
         spheres=tuple(spheres),
         planes=(
             Plane((0, 1, 0), 0.2, Material(2.382, 0.005886, (0.2, 0.2, 0.2), (0.2, 0.4, 0.3))),
@@ -129,8 +152,10 @@ def _scene_9() -> Scene:
         title="a cone above a plane",
         camera=Camera((3, 3, 0), (0, 0, 0)),
         sky=BLUE_SKY,
-        lights=(Light((2.8, -28.34, 4.33), (0.3764705882352941, 0.11176470588235295, 0.08431372549019608)),
-                Light((3, 3, 3), (2.5, 2.5, 2.5))),
+        lights=(
+            Light((2.8, -28.34, 4.33), (0.3764705882352941, 0.11176470588235295, 0.08431372549019608)),
+            Light((3, 3, 3), (2.5, 2.5, 2.5)),
+        ),
         planes=(Plane((0, 1, 0), 0, wood),),
         cones=(Cone((0, 1.5, 0), (0, 0.5, 0), 0.648361, wood),),
     )
@@ -139,8 +164,8 @@ def _scene_9() -> Scene:
 def c_rand(seed: int = 1) -> Iterator[int]:
     """The numbers of the GNU C library's ``rand()``: an additive feedback generator over 31 words.
 
-    Source: the polynomial x³¹ + x³ + 1 of its manual page, started by a Lehmer generator (multiplier 16807), the
-    first 310 numbers thrown away.
+    Source: the polynomial x³¹ + x³ + 1 of its manual page, started by a Lehmer generator (multiplier 16807),
+    the first 310 numbers thrown away.
     """
     words = [seed]
     for _ in range(30):
@@ -162,9 +187,10 @@ NUMBERS = tuple(sorted({*_BUILDERS, *_DEMOS}))
 ANALYTIC = tuple(_BUILDERS)
 
 
-@lru_cache(maxsize=None)
+@cache
 def report_scene(number: int) -> Scene:
-    """One of the report's scenes; 5 to 8 are of our own models. Raises ``UsageError`` for any other number."""
+    """One of the report's scenes; 5 to 8 are of our own models. Raises ``UsageError`` for any other
+    number."""
     if number in _DEMOS:
         from mrt_mitsuba import demos  # models in numpy, which the other scenes do without
 

@@ -56,7 +56,9 @@ def open_scene(
         model = obj_scene(scene, convention=convention)
         return _report_source(model.title, model, width, height, fresnel, integrator)
     if fresnel is not None:
-        raise UsageError("fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf")
+        raise UsageError(
+            "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
+        )
     if isinstance(scene, dict):
         return _own_source("a dict", _load(mi.load_dict, scene, "the dict"), width, height, integrator)
     if isinstance(scene, str | os.PathLike):
@@ -71,9 +73,19 @@ def _report_source(name, scene: Scene, width, height, fresnel, integrator) -> So
     import mitsuba as mi
 
     width, height = width or SIZE[0], height or SIZE[1]
-    loaded = _load(mi.load_dict, scene.to_dict(width=width, height=height, fresnel=fresnel or "schlick"), name)
-    return Source(name, loaded, loaded.sensors()[0], _integrator(integrator, loaded), width, height,
-                  scene.focal_distance, scene.focal_range)
+    loaded = _load(
+        mi.load_dict, scene.to_dict(width=width, height=height, fresnel=fresnel or "schlick"), name
+    )
+    return Source(
+        name,
+        loaded,
+        loaded.sensors()[0],
+        _integrator(integrator, loaded),
+        width,
+        height,
+        scene.focal_distance,
+        scene.focal_range,
+    )
 
 
 def _own_source(name, scene, width, height, integrator) -> Source:
@@ -82,7 +94,9 @@ def _own_source(name, scene, width, height, integrator) -> Source:
     sensor = scene.sensors()[0]
     size = tuple(int(n) for n in sensor.film().crop_size())
     if (width or size[0], height or size[1]) != size:
-        raise UsageError(f"{name} brings a film of {size[0]}x{size[1]}: change it there, or leave out width and height")
+        raise UsageError(
+            f"{name} brings a film of {size[0]}x{size[1]}: change it there, or leave out width and height"
+        )
     return Source(name, scene, sensor, _integrator(integrator, scene), *size)
 
 
@@ -98,7 +112,9 @@ def _integrator(integrator: Any, scene: Any) -> Any:
     if isinstance(integrator, dict):
         integrator = _load(mi.load_dict, integrator, f"the integrator {integrator.get('type')!r}")
     if not isinstance(integrator, mi.SamplingIntegrator):
-        raise UsageError(f"the integrator is {integrator!r}: it must be a sampling integrator, such as path or direct")
+        raise UsageError(
+            f"the integrator is {integrator!r}: it must be a sampling integrator, such as path or direct"
+        )
     return integrator
 
 

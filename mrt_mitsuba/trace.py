@@ -1,7 +1,8 @@
-"""Tracing bundles of camera rays: per-pixel means of what an integrator returns, and the layers of the first hit.
+"""Tracing bundles of camera rays: per-pixel means of what an integrator returns, and the layers of the first
+hit.
 
-One function, ``trace_bundle``, for any Mitsuba scene and sampling integrator. In vectorised variants a bundle is one
-wavefront, split where it would not fit in memory; in scalar variants a Python loop.
+One function, ``trace_bundle``, for any Mitsuba scene and sampling integrator. In vectorised variants a bundle
+is one wavefront, split where it would not fit in memory; in scalar variants a Python loop.
 """
 
 from __future__ import annotations
@@ -73,8 +74,9 @@ def trace_bundle(
 ) -> dict[str, np.ndarray]:
     """Trace a bundle; return each wanted layer, [pixels] or [pixels, 3], float32.
 
-    ``wanted``: names from ``FIRST_HIT`` and ``AVERAGED``; nothing else is computed. ``advance`` is called with the number of pixels just done.
-    The result does not depend on ``rays_at_once``, but for integrators that draw random numbers.
+    ``wanted``: names from ``FIRST_HIT`` and ``AVERAGED``; nothing else is computed. ``advance`` is called
+    with the number of pixels just done. The result does not depend on ``rays_at_once``, but for integrators
+    that draw random numbers.
     """
     import mitsuba as mi
 
@@ -86,7 +88,7 @@ def trace_bundle(
         part = bundle.part(start, min(start + step, len(bundle.pixels)))
         # Sub-wavefronts of random integrators must not repeat each other's numbers
         for name, values in run(tracer, camera, part, sizes, seed + start).items():
-            result[name][start:start + len(part.pixels)] = values
+            result[name][start : start + len(part.pixels)] = values
         advance(len(part.pixels))
     return {name: values[:, 0] if sizes[name] == 1 else values for name, values in result.items()}
 
@@ -107,8 +109,10 @@ def _trace_wavefront(tracer, camera, bundle, sizes, seed) -> dict[str, np.ndarra
     dr.eval(values, pixels)  # block_reduce would evaluate each channel by itself, in a kernel of its own
     scale = dr.opaque(mi.Float, 1 / bundle.rays_per_pixel)
     for name, value in values.items():
-        pixels[name] = [dr.block_reduce(dr.ReduceOp.Add, mi.Float(plane), bundle.rays_per_pixel) * scale
-                        for plane in _planes(value)]
+        pixels[name] = [
+            dr.block_reduce(dr.ReduceOp.Add, mi.Float(plane), bundle.rays_per_pixel) * scale
+            for plane in _planes(value)
+        ]
     dr.eval(pixels)
     return {name: _to_numpy(planes) for name, planes in pixels.items()}
 
@@ -149,8 +153,13 @@ def _planes(value: Any) -> list[Any]:
 
 def _to_numpy(value: Any) -> np.ndarray:
     """[n, channels] of one or several Dr.Jit arrays."""
-    return np.stack([np.array(plane, dtype=np.float32) for plane in (value if isinstance(value, list) else
-                                                                       _planes(value))], axis=-1)
+    return np.stack(
+        [
+            np.array(plane, dtype=np.float32)
+            for plane in (value if isinstance(value, list) else _planes(value))
+        ],
+        axis=-1,
+    )
 
 
 def _opaque(kind: Any, value: Any) -> Any:
@@ -247,7 +256,10 @@ def to_rgb(spectrum: Any, ray: Any) -> Any:
     import mitsuba as mi
 
     if mi.is_spectral:
-        xyz = sum(mi.cie1931_xyz(wavelength) * value for wavelength, value in zip(ray.wavelengths, spectrum, strict=True))
+        xyz = sum(
+            mi.cie1931_xyz(wavelength) * value
+            for wavelength, value in zip(ray.wavelengths, spectrum, strict=True)
+        )
         return mi.xyz_to_srgb(xyz * (mi.MI_CIE_Y_NORMALIZATION / len(spectrum)))
     if mi.is_monochromatic:
         return mi.Color3f(spectrum[0])

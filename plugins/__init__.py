@@ -3,6 +3,7 @@
 ``register()`` makes ``mrt_bsdf``, ``mrt_cone``, ``mrt_cylinder``, ``mrt_group``, ``mrt_light``, ``mrt_mesh``,
 ``mrt_plane``, ``mrt_texture`` and ``mrt_whitted`` known to Mitsuba.
 """
+
 from __future__ import annotations
 
 import importlib.util

@@ -1,4 +1,5 @@
 """What differs between Mitsuba's scalar and vectorised variants."""
+
 from __future__ import annotations
 
 import drjit.scalar
@@ -11,7 +12,8 @@ def is_jit() -> bool:
 
 
 def pointer(kind: str, objects):
-    """A Dr.Jit pointer array (``kind`` "Shape", "Emitter", ...) to objects; scalar variants have none: the objects."""
+    """A Dr.Jit pointer array (``kind`` "Shape", "Emitter", ...) to objects; scalar variants have none: the
+    objects."""
     return getattr(mi, kind + "Ptr")(objects) if is_jit() else objects
 
 
@@ -21,7 +23,8 @@ def first(value) -> float:
 
 
 def updatable(number: float):
-    """A plugin parameter in a form that ``mi.traverse`` can update; scalar variants cannot update Python floats."""
+    """A plugin parameter in a form that ``mi.traverse`` can update; scalar variants cannot update Python
+    floats."""
     return mi.Float(number) if is_jit() else drjit.scalar.Array1f64(number)
 
 

@@ -1,4 +1,5 @@
 """``mrt_whitted``: the report's recursive ray tracer as a Mitsuba integrator."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -15,12 +16,12 @@ from .variants import but_not, is_jit, pointer
 
 BUDGETS = ("report", "plain")
 
-# A sixteenth of a step of an 8-bit picture: what many cut paths add up to stays below half a step, and on average over the
-# report's scenes below 1e-5
+# A sixteenth of a step of an 8-bit picture: what many cut paths add up to stays below half a step, and on
+# average over the report's scenes below 1e-5
 MIN_CONTRIBUTION = 1 / 16 / 255
 
-# A secondary ray starts this far off its surface, relative to the size of the coordinates involved: 32 float32
-# roundings, a few times what intersection, projection and ray test lose together
+# A secondary ray starts this far off its surface, relative to the size of the coordinates involved: 32
+# float32 roundings, a few times what intersection, projection and ray test lose together
 OFFSET = 32 * 2.0**-24
 
 # Reach of a mirror ray: any number that float32 holds
@@ -77,23 +78,24 @@ class MrtWhitted(mi.SamplingIntegrator):
         L(x, d) = \sum_i \mathrm{clamp}_{[0,1]}\bigl(E_i f(x, \omega_i, -d) \cos\theta_i\bigr) V_i
                   + k_s F(\theta)\, L(x', r)
 
-    with r the mirror direction, and the sky where a ray meets nothing. Shading goes through ``si.bsdf()``: k_s F is
-    the attribute ``mirror_reflectance`` of an ``mrt_bsdf``, and the delta reflection of any other BSDF. Lights are
-    all emitters of the scene; those without a delta position take one random sample each. ``mrt_plane``,
-    ``mrt_cone``, ``mrt_cylinder`` and ``mrt_group`` shapes are intersected analytically.
+    with r the mirror direction, and the sky where a ray meets nothing. Shading goes through ``si.bsdf()``:
+    k_s F is the attribute ``mirror_reflectance`` of an ``mrt_bsdf``, and the delta reflection of any other BSDF.
+    Lights are all emitters of the scene; those without a delta position take one random sample each.
+    ``mrt_plane``, ``mrt_cone``, ``mrt_cylinder`` and ``mrt_group`` shapes are intersected analytically.
 
-    ==================== =========== ============ ============================================================
-    name                 type        default      unit or range
-    ==================== =========== ============ ============================================================
-    ``max_depth``        integer     10           >= 1, bounce budget: a ray at this depth is black
-    ``sky``              spectrum    (from scene) radiance of a miss; default the environment emitter, else 0
-    ``clamp``            boolean     true         clamp each light's contribution to [0, 1], as the report does
-    ``min_contribution`` float       1/16/255     >= 0; a path ends when its throughput times the number of lights
-                                                  plus one (the sky) is below, and a light is taken as visible
-                                                  when what it adds, times the number of lights, is below
-    ``bounce_budget``    string      report       ``report``: a bounce costs max(1, 10 - int(10 int_ior));
-                                                  ``plain``: 1
-    ==================== =========== ============ ============================================================
+    ==================== ======== ============ ===========================================================
+    name                 type     default      unit or range
+    ==================== ======== ============ ===========================================================
+    ``max_depth``        integer  10           >= 1, bounce budget: a ray at this depth is black
+    ``sky``              spectrum (from scene) radiance of a miss; default the environment emitter, else 0
+    ``clamp``            boolean  true         clamp each light's contribution to [0, 1], as the report does
+    ``min_contribution`` float    1/16/255     >= 0; a path ends when its throughput times the number of
+                                               lights plus one (the sky) is below, and a light is taken as
+                                               visible when what it adds, times the number of lights, is
+                                               below
+    ``bounce_budget``    string   report       ``report``: a bounce costs max(1, 10 - int(10 int_ior));
+                                               ``plain``: 1
+    ==================== ======== ============ ===========================================================
 
     .. code-block:: python
 
@@ -106,8 +108,9 @@ class MrtWhitted(mi.SamplingIntegrator):
         </integrator>
 
     Nearest stock plugin: ``direct``, which it equals at ``max_depth`` 1 without clamp. Differentiable at
-    ``max_depth`` 1 only (the bounces are a loop of unknown length). The equation of an ``mrt_plane`` is fixed when it is
-    made; moving its vertices changes only its stand-in for other integrators. Polarisation is ignored.
+    ``max_depth`` 1 only (the bounces are a loop of unknown length). The equation of an ``mrt_plane`` is fixed
+    when it is made; moving its vertices changes only its stand-in for other integrators. Polarisation is
+    ignored.
     """
 
     def __init__(self, props: mi.Properties):
@@ -133,8 +136,10 @@ class MrtWhitted(mi.SamplingIntegrator):
         return []
 
     def to_string(self) -> str:
-        return (f"MrtWhitted[max_depth={self.max_depth}, clamp={self.clamp}, "
-                f"min_contribution={self.min_contribution:g}, bounce_budget={self.bounce_budget}, sky={self.sky}]")
+        return (
+            f"MrtWhitted[max_depth={self.max_depth}, clamp={self.clamp}, "
+            f"min_contribution={self.min_contribution:g}, bounce_budget={self.bounce_budget}, sky={self.sky}]"
+        )
 
     # ------------------------------------------- Scene -------------------------------------------------
 
@@ -152,7 +157,8 @@ class MrtWhitted(mi.SamplingIntegrator):
         if prepared is None or prepared.scene_id != id(scene):
             prepared = self.prepare(scene)
 
-        # ------------------------- The camera ray: coherent, and first of a peeled loop -------------------------
+        # ------------------------- The camera ray: coherent, and first of a peeled loop
+        # -------------------------
         active = mi.Bool(active)
         hit = prepared.intersect(scene, ray, active, coherent=True)
         shading = self._shade(prepared, scene, sampler, ray, hit, mi.UnpolarizedSpectrum(1), active)
@@ -170,31 +176,36 @@ class MrtWhitted(mi.SamplingIntegrator):
             "sampler": sampler if prepared.random else None,
         }
 
-        # ------------------------------------------ Mirror bounces ----------------------------------------------
+        # ------------------------------------------ Mirror bounces
+        # ----------------------------------------------
         def bounce(s: dict) -> tuple[dict]:
             ray, active = s["ray"], s["active"]
             hit = prepared.intersect(scene, ray, active, coherent=False)
             shading = self._shade(prepared, scene, s["sampler"], ray, hit, s["throughput"], active)
             throughput = s["throughput"] * shading.reflectance
             depth = s["depth"] + shading.cost
-            return ({
-                "radiance": s["radiance"] + dr.select(active, s["throughput"] * shading.radiance, 0),
-                "throughput": throughput,
-                "ray": prepared.mirror_ray(ray, hit),
-                "depth": depth,
-                "bounces": s["bounces"] + 1,
-                "shadow_rays": s["shadow_rays"] + shading.shadow_rays,
-                "active": active & hit.found & self._continues(prepared, throughput, depth),
-                "sampler": s["sampler"],
-            },)
+            return (
+                {
+                    "radiance": s["radiance"] + dr.select(active, s["throughput"] * shading.radiance, 0),
+                    "throughput": throughput,
+                    "ray": prepared.mirror_ray(ray, hit),
+                    "depth": depth,
+                    "bounces": s["bounces"] + 1,
+                    "shadow_rays": s["shadow_rays"] + shading.shadow_rays,
+                    "active": active & hit.found & self._continues(prepared, throughput, depth),
+                    "sampler": s["sampler"],
+                },
+            )
 
-        final, = dr.while_loop((state,), lambda s: s["active"], bounce, label="mirror bounces")
+        (final,) = dr.while_loop((state,), lambda s: s["active"], bounce, label="mirror bounces")
         return Trace(final["radiance"], shading.radiance, hit, final["bounces"], final["shadow_rays"])
 
     def bounces(self, prepared) -> bool:
         """Can any mirror ray of the scene matter: is one bright enough, and within the bounce budget?"""
-        continues = [self._continues(prepared, mi.UnpolarizedSpectrum(reflectance), self._cost(mi.Float(int_ior)))
-                     for reflectance, int_ior in prepared.mirror_bounds]
+        continues = [
+            self._continues(prepared, mi.UnpolarizedSpectrum(reflectance), self._cost(mi.Float(int_ior)))
+            for reflectance, int_ior in prepared.mirror_bounds
+        ]
         return any(c if isinstance(c, bool) else c[0] for c in continues)
 
     def _continues(self, prepared, throughput, depth):
@@ -205,7 +216,8 @@ class MrtWhitted(mi.SamplingIntegrator):
     # ------------------------------------------- Shading -----------------------------------------------
 
     def _shade(self, prepared, scene, sampler, ray, hit, throughput, active) -> Shading:
-        """Light that leaves ``hit`` back along ``ray``, and its mirror reflection; ``throughput`` is the path's."""
+        """Light that leaves ``hit`` back along ``ray``, and its mirror reflection; ``throughput`` is the
+        path's."""
         si = hit.si
         radiance = self._sky(prepared, ray, but_not(active, hit.found))
         if prepared.emissive:
@@ -214,12 +226,14 @@ class MrtWhitted(mi.SamplingIntegrator):
         samples = [self._light_sample(prepared, light, sampler, hit) for light in unrolled]
         values, reflectance, int_ior = prepared.eval_bsdf(hit, samples, mirror=self.bounces(prepared))
         shadow_rays = mi.UInt32(0)
-        for sample, value in zip(samples, values):
+        for sample, value in zip(samples, values, strict=True):
             lit, traced = self._visible_part(prepared, scene, hit, throughput, sample, value)
             radiance += lit
             shadow_rays += traced
         if not prepared.unrolled:
-            radiance, shadow_rays = self._loop_over_lights(prepared, scene, sampler, hit, throughput, radiance)
+            radiance, shadow_rays = self._loop_over_lights(
+                prepared, scene, sampler, hit, throughput, radiance
+            )
         return Shading(radiance, shadow_rays, reflectance, self._cost(int_ior))
 
     def _cost(self, int_ior):
@@ -274,13 +288,17 @@ class MrtWhitted(mi.SamplingIntegrator):
 
 
 def _eval_bsdf(mirror: bool, bsdf, si, wos, facing, active):
-    """Of one BSDF: its values f cos θo towards ``wos``, its mirror reflectance and its index of refraction."""
+    """Of one BSDF: its values f cos θo towards ``wos``, its mirror reflectance and its index of
+    refraction."""
     values = [mi.UnpolarizedSpectrum(0) for _ in wos]
     reflectance, int_ior = mi.UnpolarizedSpectrum(0), mi.Float(1)
     if bsdf is None:
         return values, reflectance, int_ior
     context = mi.BSDFContext()
-    values = [mi.unpolarized_spectrum(bsdf.eval(context, si, wo, seen)) for wo, seen in zip(wos, facing)]
+    values = [
+        mi.unpolarized_spectrum(bsdf.eval(context, si, wo, seen))
+        for wo, seen in zip(wos, facing, strict=True)
+    ]
     if mirror and bsdf.has_attribute("mirror_reflectance"):
         reflectance = bsdf.eval_attribute("mirror_reflectance", si, active)
         int_ior = bsdf.eval_attribute_1("int_ior", si, active)
@@ -294,15 +312,16 @@ class Prepared:
     """What the integrator reads from a scene once, before it traces anything, and its ray queries."""
 
     def __init__(self, scene):
-        # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed. The fingerprint
-        # holds the shapes, so that no later scene can be taken for this one
+        # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed. The
+        # fingerprint holds the shapes, so that no later scene can be taken for this one
         self.scene_id = id(scene)
         self.fingerprint = _fingerprint(scene)
         shapes = scene.shapes()
         self.planes = [_Plane(s) for s in shapes if hasattr(s, "unit_normal")]
         self.quadrics = quadrics_of(shapes)
         others = [s for s in shapes if not (hasattr(s, "unit_normal") or is_quadric(s))]
-        # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the other shapes only
+        # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the other shapes
+        # only
         self.bvh = _scene_of(others) if len(others) < len(shapes) else None
         self.shape_count = len(others)
         self.scales, self.spheres = _Scales(others), _Spheres(others)
@@ -327,8 +346,9 @@ class Prepared:
     def _read_bsdfs(self, bsdfs) -> None:
         self.bsdfs = bsdfs = list(bsdfs)
         self.mirrors = any(_has_mirror(b) for b in bsdfs)
-        self.mirror_bounds = [b.mirror_bound() if hasattr(b, "mirror_bound") else (1.0, 1.0)
-                              for b in bsdfs if _has_mirror(b)]
+        self.mirror_bounds = [
+            b.mirror_bound() if hasattr(b, "mirror_bound") else (1.0, 1.0) for b in bsdfs if _has_mirror(b)
+        ]
         self.one_sided = not any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in bsdfs)
         self.textured = any(mi.has_flag(b.flags(), mi.BSDFFlags.SpatiallyVarying) for b in bsdfs)
         self.ray_flags = +mi.RayFlags.Minimal
@@ -336,8 +356,11 @@ class Prepared:
             self.ray_flags |= +mi.RayFlags.UV
 
     def is_stale(self, scene) -> bool:
-        return (id(scene) != self.scene_id or self._versions() != self.versions
-                or _fingerprint(scene) != self.fingerprint)
+        return (
+            id(scene) != self.scene_id
+            or self._versions() != self.versions
+            or _fingerprint(scene) != self.fingerprint
+        )
 
     def _versions(self) -> list[int]:
         """Change when the parameters of an ``mrt_bsdf`` do, of which bounds are kept."""
@@ -358,13 +381,15 @@ class Prepared:
         scale = self.scales(si, found)
         if self.quadrics is not None:
             reach = dr.select(found, si.t, ray.maxt)
-            quadric = self.quadrics.intersect(mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths), active)
+            quadric = self.quadrics.intersect(
+                mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths), active
+            )
             closer = active & (quadric[0] < reach)
             self.quadrics.put_into(si, ray, quadric, closer)
             scale = dr.select(closer, self.quadrics.scale(quadric[1], closer), scale)
             found = found | closer
         # A later plane overrides an earlier one, as it was closer
-        for plane, closer in zip(self.planes, on_plane):
+        for plane, closer in zip(self.planes, on_plane, strict=True):
             closer = but_not(closer, found)
             plane.put_into(si, ray, closer)
             scale = dr.select(closer, plane.scale, scale)
@@ -406,7 +431,8 @@ class Prepared:
         return blocked
 
     def eval_bsdf(self, hit, samples, mirror: bool):
-        """Values of the BSDF at ``hit`` towards light samples, and its mirror reflection: all of it in one call."""
+        """Values of the BSDF at ``hit`` towards light samples, and its mirror reflection: all of it in one
+        call."""
         arguments = (hit.si, [s.wo for s in samples], [s.facing for s in samples], hit.found)
         evaluate = partial(_eval_bsdf, mirror)  # dispatch would take a bool among the arguments for its mask
         if is_jit():
@@ -421,7 +447,8 @@ class Prepared:
 
     @staticmethod
     def _off_surface(hit, d):
-        """The point of ``hit`` moved to the side of its surface that ``d`` points to, clear of rounding errors."""
+        """The point of ``hit`` moved to the side of its surface that ``d`` points to, clear of rounding
+        errors."""
         distance = OFFSET * hit.scale
         n = hit.si.n
         return hit.si.p + n * dr.select(dr.dot(n, d) >= 0, distance, -distance)
@@ -448,7 +475,9 @@ class _Plane:
     def put_into(self, si, ray, where) -> None:
         """Make ``si`` the interaction of ``ray`` with this plane, at t = ray.maxt."""
         p = dr.fma(ray.d, ray.maxt, ray.o)
-        p -= self.normal * self.height(p)  # along a grazing ray the error of t is far larger than that of the plane
+        p -= self.normal * self.height(
+            p
+        )  # along a grazing ray the error of t is far larger than that of the plane
         si.t = dr.select(where, ray.maxt, si.t)
         si.p = dr.select(where, p, si.p)
         si.n = dr.select(where, mi.Normal3f(self.normal), si.n)
@@ -472,16 +501,19 @@ class _Scales:
 class _Spheres:
     """Centres and radii of Mitsuba's spheres.
 
-    Mitsuba takes a hit from the distance along the ray. From a hundred radii away that is further off the sphere than
-    secondary rays start, and the sphere would lie in its own shadow.
+    Mitsuba takes a hit from the distance along the ray. From a hundred radii away that is further off the
+    sphere than secondary rays start, and the sphere would lie in its own shadow.
     """
 
     def __init__(self, shapes):
         rows = [_center_and_radius(s) for s in shapes]
-        self.by_shape = _ByShape(mi.Vector4f, shapes, rows, [0.0] * 4) if any(any(row) for row in rows) else None
+        self.by_shape = (
+            _ByShape(mi.Vector4f, shapes, rows, [0.0] * 4) if any(any(row) for row in rows) else None
+        )
 
     def interaction(self, pi, ray, found):
-        """What ``compute_surface_interaction`` gives, but for derivatives and texture coordinates: spheres only."""
+        """What ``compute_surface_interaction`` gives, but for derivatives and texture coordinates: spheres
+        only."""
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.t, si.shape = dr.select(found, pi.t, dr.inf), dr.select(found, pi.shape, None)
         center, radius = self._center_and_radius(si, found)
@@ -544,11 +576,14 @@ def _center_and_radius(shape) -> list[float]:
 
 
 def _is_plain_sphere(shape) -> bool:
-    return shape.shape_type() == +mi.ShapeType.Sphere and not (shape.has_flipped_normals() or shape.is_emitter())
+    return shape.shape_type() == +mi.ShapeType.Sphere and not (
+        shape.has_flipped_normals() or shape.is_emitter()
+    )
 
 
 def _construct(integrator, props) -> None:
-    """Mitsuba logs a warning about every Python integrator in a scalar variant; ``mrt.render`` gives its own."""
+    """Mitsuba logs a warning about every Python integrator in a scalar variant; ``mrt.render`` gives its
+    own."""
     level = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)
     try:
@@ -576,7 +611,8 @@ def _coordinate_size(bbox) -> float:
 
 
 def _fingerprint(scene) -> tuple:
-    """Changes whenever a shape was moved or a mesh edited: what ``Prepared`` holds would then be out of date."""
+    """Changes whenever a shape was moved or a mesh edited: what ``Prepared`` holds would then be out of
+    date."""
     return tuple(_shape_fingerprint(s) for s in scene.shapes())
 
 

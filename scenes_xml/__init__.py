@@ -1,4 +1,5 @@
-"""The report's scenes as Mitsuba XML: ``sceneN.xml`` with this project's plugins, ``sceneN_stock.xml`` without.
+"""The report's scenes as Mitsuba XML: ``sceneN.xml`` with this project's plugins, ``sceneN_stock.xml``
+without.
 
 The files are written from the dicts of ``mrt_mitsuba.scene_dict`` by ``python -m mrt_mitsuba.scenes_xml``.
 """

@@ -1,7 +1,7 @@
 """What a validation study produces: bounds, tables, plots and pictures, collected while it runs.
 
-A study is a module with ``TITLE`` and ``run(study, *, quick)``. It says what it finds through the ``Study`` it is given;
-``report`` turns the result into a table on the terminal, ``summary.json``, CSV files and a page.
+A study is a module with ``TITLE`` and ``run(study, *, quick)``. It says what it finds through the ``Study``
+it is given; ``report`` turns the result into a table on the terminal, ``summary.json``, CSV files and a page.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ class Bound:
 
     def __str__(self) -> str:
         sign = "<=" if self.at_most else ">="
-        return f"{'ok    ' if self.holds else 'MISSED'} {self.name}: {self.measured:.4g} {sign} {self.limit:.4g}"
+        return (
+            f"{'ok    ' if self.holds else 'MISSED'} {self.name}: {self.measured:.4g} {sign} {self.limit:.4g}"
+        )
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,9 @@ class Study:
         """Keep a number in the summary."""
         self.figures[name] = float(value)
 
-    def table(self, name: str, title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], note: str = "") -> None:
+    def table(
+        self, name: str, title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], note: str = ""
+    ) -> None:
         """Add a table."""
         wrong = [row for row in rows if len(row) != len(columns)]
         if wrong:
@@ -111,7 +115,9 @@ class Study:
         """Add a matplotlib figure."""
         self.parts.append(Plot(name, title, figure, caption))
 
-    def picture(self, name: str, title: str, image: np.ndarray, caption: str = "", *, exr: bool = False) -> None:
+    def picture(
+        self, name: str, title: str, image: np.ndarray, caption: str = "", *, exr: bool = False
+    ) -> None:
         """Add a linear picture [H, W, 3]."""
         self.parts.append(Picture(name, title, np.asarray(image, np.float32), caption, exr))
 
@@ -130,8 +136,17 @@ class Study:
         return {
             "title": self.title,
             "passed": self.passed,
-            "bounds": [{"name": b.name, "measured": _number(b.measured), "limit": _number(b.limit),
-                        "sense": "<=" if b.at_most else ">=", "holds": b.holds, "note": b.note} for b in self.bounds],
+            "bounds": [
+                {
+                    "name": b.name,
+                    "measured": _number(b.measured),
+                    "limit": _number(b.limit),
+                    "sense": "<=" if b.at_most else ">=",
+                    "holds": b.holds,
+                    "note": b.note,
+                }
+                for b in self.bounds
+            ],
             "figures": {name: _number(value) for name, value in self.figures.items()},
         }
 

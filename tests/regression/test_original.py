@@ -1,4 +1,5 @@
-"""``mrt.render`` against the original program's own pictures, where those are at hand: every mode, odd sizes apart."""
+"""``mrt.render`` against the original program's own pictures, where those are at hand: every mode, odd sizes
+apart."""
 
 from __future__ import annotations
 
@@ -12,13 +13,16 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba.output import read_exr
 
-# Mean absolute difference and share of pixels off by more than 1/255 without detector or blur. What is left lies at
-# shadow borders, where the original's rays start a fixed distance off the surface and speckle
+# Mean absolute difference and share of pixels off by more than 1/255 without detector or blur. What is left
+# lies at shadow borders, where the original's rays start a fixed distance off the surface and speckle
 LIMITS = {0: (1e-5, 0.001), 1: (6e-5, 0.005), 2: (6e-5, 0.005), 3: (2e-5, 0.005), 4: (3e-4, 0.025)}
 
-NAMES = [f"s{number}_{mode}" for number in LIMITS
-         for mode in ("none_aa1", "none_aa4", "luma_aa4", "sobel_aa4", "sobel_aa4_dof", "default")
-         if mode != "default" or number in (3, 4)]
+NAMES = [
+    f"s{number}_{mode}"
+    for number in LIMITS
+    for mode in ("none_aa1", "none_aa4", "luma_aa4", "sobel_aa4", "sobel_aa4_dof", "default")
+    if mode != "default" or number in (3, 4)
+]
 
 
 @pytest.fixture(autouse=True)

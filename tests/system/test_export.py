@@ -1,4 +1,5 @@
-"""Scenes as dicts and XML: the files are up to date, mean the same, and the stock flavour needs no plugin of ours."""
+"""Scenes as dicts and XML: the files are up to date, mean the same, and the stock flavour needs no plugin of
+ours."""
 
 from __future__ import annotations
 
@@ -98,7 +99,8 @@ def test_every_scene_goes_into_files_and_back(number, tmp_path):
 
 @pytest.mark.parametrize("number", [5, 6, 7, 8, 9])
 def test_stock_flavour_of_every_scene_shows_the_same_shapes(number, tmp_path, run_python):
-    """Opened without our plugins registered; depth says whether each shape is where it was, whatever its material."""
+    """Opened without our plugins registered; depth says whether each shape is where it was, whatever its
+    material."""
     write_xml(number, tmp_path / "scene.xml", flavor="stock")
     assert 'type="mrt_' not in (tmp_path / "scene.xml").read_text()
     code = """
@@ -137,7 +139,7 @@ def test_group_cannot_be_written(tmp_path):
     scene = report_scene(0)
     many = replace(scene, spheres=scene.spheres[:1] * 1001)
     for flavor in FLAVORS:
-        with pytest.raises(mrt.SceneError, match="spheres cannot be written as XML.*mrt_group"):
+        with pytest.raises(mrt.SceneError, match=r"spheres cannot be written as XML.*mrt_group"):
             write_xml(many, tmp_path / "many.xml", flavor=flavor)
     assert list(tmp_path.iterdir()) == []
 

@@ -13,8 +13,13 @@ import pytest
 README = Path(__file__).parents[2] / "README.md"
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README.read_text(), flags=re.DOTALL)
 PYTHON = [code for language, code in BLOCKS if language == "python"]
-COMMANDS = [line.split("#")[0].strip() for language, code in BLOCKS if language == "sh"
-            for line in code.splitlines() if line.startswith("mrt ")]
+COMMANDS = [
+    line.split("#")[0].strip()
+    for language, code in BLOCKS
+    if language == "sh"
+    for line in code.splitlines()
+    if line.startswith("mrt ")
+]
 
 
 def test_the_readme_has_examples():
@@ -31,8 +36,14 @@ def test_python_examples_run(code, run_python):
 def test_commands_run(command, tmp_path):
     _, *arguments = shlex.split(command)
     code = "import sys; from mrt_mitsuba.cli import main; sys.exit(main(sys.argv[1:]))"
-    done = subprocess.run([sys.executable, "-c", code, *arguments], cwd=tmp_path, capture_output=True, text=True,
-                          timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     written = {path.name for path in tmp_path.iterdir()}
     if arguments[0] == "picture":
@@ -42,5 +53,10 @@ def test_commands_run(command, tmp_path):
 def test_every_option_named_exists():
     from mrt_mitsuba.options import TABLE
 
-    named = {name for _, code in BLOCKS for name in re.findall(r"\b(\w+)=", code.split("```")[0]) if "mrt picture" in code}
+    named = {
+        name
+        for _, code in BLOCKS
+        for name in re.findall(r"\b(\w+)=", code.split("```")[0])
+        if "mrt picture" in code
+    }
     assert named and named <= set(TABLE)

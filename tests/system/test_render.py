@@ -1,4 +1,5 @@
-"""``mrt.render`` end to end: what it traces, what it leaves out, and that the picture does not depend on how."""
+"""``mrt.render`` end to end: what it traces, what it leaves out, and that the picture does not depend on
+how."""
 
 from __future__ import annotations
 
@@ -62,7 +63,9 @@ def test_refined_pixels_equal_full_supersampling_and_the_others_one_sample(aamod
 def test_rays_are_counted_as_the_scene_tells():
     """One sphere, one light, nothing reflective: shadow rays only where the light is in front."""
     scene = dataclasses.replace(report_scene(0), planes=(), lights=report_scene(0).lights[:1])
-    result = mrt.render(_without_reflection(scene), **SMALL, aa=1, aamode="none", count_rays=True, layers=["depth"])
+    result = mrt.render(
+        _without_reflection(scene), **SMALL, aa=1, aamode="none", count_rays=True, layers=["depth"]
+    )
     hits = np.isfinite(result.layers["depth.Z"]).sum()
     assert result.rays["mirror"] == 0
     assert 0 < result.rays["shadow"] < hits
@@ -81,7 +84,9 @@ def _without_reflection(scene):
     def dull(thing):
         return dataclasses.replace(thing, material=dataclasses.replace(thing.material, ior=1e-4))
 
-    return dataclasses.replace(scene, spheres=tuple(map(dull, scene.spheres)), planes=tuple(map(dull, scene.planes)))
+    return dataclasses.replace(
+        scene, spheres=tuple(map(dull, scene.spheres)), planes=tuple(map(dull, scene.planes))
+    )
 
 
 def test_nothing_reflective_means_no_bounce_loop():
@@ -136,8 +141,14 @@ def test_splitting_the_wavefront_changes_nothing():
 @pytest.mark.parametrize("number", SCENES)
 def test_cutting_off_paths_costs_less_than_half_a_step(number):
     cut = mrt.render(number, **SMALL, aa=1, aamode="none", focaldist=0)
-    whole = mrt.render(number, **SMALL, aa=1, aamode="none", focaldist=0,
-                       integrator={"type": "mrt_whitted", "min_contribution": 0.0})
+    whole = mrt.render(
+        number,
+        **SMALL,
+        aa=1,
+        aamode="none",
+        focaldist=0,
+        integrator={"type": "mrt_whitted", "min_contribution": 0.0},
+    )
     error = np.abs(cut.image - whole.image)
     assert 0 < error.max() < 0.5 / 255
     assert error.mean() < 2e-5
@@ -145,7 +156,8 @@ def test_cutting_off_paths_costs_less_than_half_a_step(number):
 
 @pytest.mark.parametrize("number", SCENES)
 def test_scalar_variant_draws_the_same_picture(number):
-    """Sums in another order and fused operations differ in the last digits; a flipped shadow decision is a whole light."""
+    """Sums in another order and fused operations differ in the last digits; a flipped shadow decision is a
+    whole light."""
     size = {"width": 32, "height": 24, "aa": 1, "aamode": "none", "focaldist": 0}
     fast = mrt.render(number, **size, variant="llvm_ad_rgb")
     with pytest.warns(mrt.MrtWarning, match="one ray at a time") if number == 0 else _nothing():
@@ -215,12 +227,16 @@ def test_direct_light_equals_mitsubas_direct(kind):
     light = {
         "point": {"position": [2, 3, 1], "intensity": 20.0},
         "directional": {"direction": [-1, -2, -0.5], "irradiance": 2.0},
-        "spot": {"to_world": mi.ScalarTransform4f().look_at([2, 3, 1], [0, 0, 0], [0, 1, 0]), "intensity": 20.0},
+        "spot": {
+            "to_world": mi.ScalarTransform4f().look_at([2, 3, 1], [0, 0, 0], [0, 1, 0]),
+            "intensity": 20.0,
+        },
         "mrt_light": {"position": [2, 3, 1], "intensity": 2.0},
     }[kind]
     scene = mi.load_dict(_lit_scene({"type": kind, **light}))
-    ours = mrt.render(scene, aa=1, aamode="none",
-                      integrator={"type": "mrt_whitted", "max_depth": 1, "clamp": False}).image
+    ours = mrt.render(
+        scene, aa=1, aamode="none", integrator={"type": "mrt_whitted", "max_depth": 1, "clamp": False}
+    ).image
     stock = mrt.render(scene, aa=1, aamode="none", integrator="direct").image
     assert stock.max() > 0.1
     depth = mrt.render(scene, aa=1, aamode="none", layers=["depth"]).layers["depth.Z"]
@@ -233,12 +249,18 @@ def test_direct_light_equals_mitsubas_direct(kind):
 
 def test_area_light_agrees_with_path_in_the_mean():
     """Both are unbiased without bounces; 64 samples in 48 x 36 pixels leave 0.3 % of noise in the mean."""
-    light = {"type": "sphere", "center": [1, 2, 0.5], "radius": 0.3,
-             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 8.0}}}
+    light = {
+        "type": "sphere",
+        "center": [1, 2, 0.5],
+        "radius": 0.3,
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 8.0}},
+    }
     scene = mi.load_dict(_lit_scene(light))
     whitted = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
     ours = mrt.render(scene, aa=1, aamode="none", spp=64, integrator=whitted, seed=1).image
-    stock = mrt.render(scene, aa=1, aamode="none", spp=64, integrator={"type": "path", "max_depth": 2}, seed=2).image
+    stock = mrt.render(
+        scene, aa=1, aamode="none", spp=64, integrator={"type": "path", "max_depth": 2}, seed=2
+    ).image
     assert ours.mean() == pytest.approx(stock.mean(), rel=0.02)
 
 
@@ -262,7 +284,8 @@ def test_whitted_works_in_mi_render():
 
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
 def test_other_variants_show_the_same_scene(variant):
-    """Spectral rendering upsamples colours and draws wavelengths; its luminance must agree to a few percent."""
+    """Spectral rendering upsamples colours and draws wavelengths; its luminance must agree to a few
+    percent."""
     options = {"width": 32, "height": 24, "aa": 4, "aamode": "none", "focaldist": 0}
     rgb = mrt.render(0, **options, variant="llvm_ad_rgb").image @ [0.2126, 0.7152, 0.0722]
     other = mrt.render(0, **options, variant=variant).image @ [0.2126, 0.7152, 0.0722]
@@ -273,9 +296,13 @@ def test_other_variants_show_the_same_scene(variant):
 
 
 def test_layers_belong_together():
-    result = mrt.render(3, **SMALL, aa=2, aamode="none", layers=["direct", "reflection", "bounces", "normal", "albedo"])
+    result = mrt.render(
+        3, **SMALL, aa=2, aamode="none", layers=["direct", "reflection", "bounces", "normal", "albedo"]
+    )
     channels = result.layers
-    total = sum(np.stack([channels[f"{part}.{c}"] for c in "RGB"], axis=-1) for part in ("direct", "reflection"))
+    total = sum(
+        np.stack([channels[f"{part}.{c}"] for c in "RGB"], axis=-1) for part in ("direct", "reflection")
+    )
     unblurred = mrt.render(3, **SMALL, aa=2, aamode="none", focaldist=0).image
     np.testing.assert_allclose(total, unblurred, atol=1e-6)
     length = np.sqrt(sum(channels[f"normal.{c}"] ** 2 for c in "XYZ"))
@@ -286,7 +313,8 @@ def test_layers_belong_together():
 
 
 def test_depth_is_the_distance_from_the_eye():
-    """The pixel in the middle of scene 0 looks from (3, 1, 0) at (0, 0.3, 0), over the spheres, and meets y = 0."""
+    """The pixel in the middle of scene 0 looks from (3, 1, 0) at (0, 0.3, 0), over the spheres, and meets y =
+    0."""
     result = mrt.render(0, width=101, height=75, aa=1, aamode="none", layers=["depth"])
     descent = 0.7 / np.hypot(3, 0.7)  # for each unit along the ray
     # the eye is one unit up; float32 camera rays are good to a few 1e-7
@@ -300,23 +328,29 @@ def test_motion_blur_averages_shifted_cameras():
     frames = []
     for k in range(4):
         shift = np.array([0, 0, 0.4]) * k / 4
-        camera = dataclasses.replace(scene.camera, position=tuple(np.array(scene.camera.position) + shift),
-                                     target=tuple(np.array(scene.camera.target) + shift))
+        camera = dataclasses.replace(
+            scene.camera,
+            position=tuple(np.array(scene.camera.position) + shift),
+            target=tuple(np.array(scene.camera.target) + shift),
+        )
         frames.append(mrt.render(dataclasses.replace(scene, camera=camera), **options).image)
     difference = np.abs(blurred.image - np.mean(frames, axis=0))
     # the same rays up to float32 rounding of their origins; edges may flip in single pixels
     assert np.median(difference) < 1e-6 and difference.mean() < 1e-3
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    ({"aamode": "none", "layers": ["edges"]}, "edges"),
-    ({"aa": 0}, "aa=0"),
-    ({"width": 0}, "width"),
-    ({"aamode": "fxaa"}, "aamode"),
-    ({"focaldist": float("nan")}, "focaldist"),
-    ({"spp": 0}, "spp"),
-    ({"integrator": "ptracer"}, "sampling integrator"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"aamode": "none", "layers": ["edges"]}, "edges"),
+        ({"aa": 0}, "aa=0"),
+        ({"width": 0}, "width"),
+        ({"aamode": "fxaa"}, "aamode"),
+        ({"focaldist": float("nan")}, "focaldist"),
+        ({"spp": 0}, "spp"),
+        ({"integrator": "ptracer"}, "sampling integrator"),
+    ],
+)
 def test_wrong_arguments_are_named(arguments, message):
     with pytest.raises(mrt.UsageError, match=message):
         mrt.render(0, **{**SMALL, **arguments})

@@ -85,8 +85,8 @@ def test_error_falls_with_the_square_of_segments(name: str) -> None:
 @pytest.mark.parametrize("name", SHAPES)
 def test_normals_and_uv_are_those_of_the_exact_surface(name: str) -> None:
     _, normal, uv = errors_of(name, 256)
-    # A normal turns by 2π/256 across a side of the mesh. On a cylinder its interpolation is off by the square of
-    # half of that; a triangle of a cone has one normal at its tip, wrong by up to half the turn there
+    # A normal turns by 2π/256 across a side of the mesh. On a cylinder its interpolation is off by the square
+    # of half of that; a triangle of a cone has one normal at its tip, wrong by up to half the turn there
     assert np.median(normal) < (5e-4 if name == "cylinder" else np.pi / 256 / 4)
     assert normal.max() < 2 * np.pi / 256
     assert np.median(uv) < 5e-4
