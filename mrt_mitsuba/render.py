@@ -58,8 +58,7 @@ def render(
 
     Args:
         scene: number of a scene of the report, a ``Scene``, a Mitsuba dict, a Mitsuba scene, or the path of
-        an .xml or
-            .obj file.
+            an .xml or .obj file.
         width, height: pixels; 800 and 600, or the film's own where the scene brings a film.
         aa: aa × aa samples in a pixel.
         aamode: "none", "luma", "sobel" or "geometry": which pixels get more than one sample.
@@ -69,19 +68,18 @@ def render(
         dof: "report" or "corrected", see ``filters.dof``.
         layers: names from ``output.LAYERS`` to return beside those that are free.
         motion, motionsamples: the camera's way while the shutter is open, and the number of moments at which
-        it is seen. motionmode: "frames" averages so many whole renders, as the report does; "stratified" is
-        one render whose rays are
-            spread over the time the shutter is open: at least so many to a pixel, and no more than that where
-            the lattice has as many samples.
+            it is seen.
+        motionmode: "frames" averages so many whole renders, as the report does; "stratified" is one render
+            whose rays are spread over the time the shutter is open: at least so many to a pixel, and no more
+            than that where the lattice has as many samples.
         convention: meaning of MTL files, "report" or "standard".
         variant: Mitsuba variant; by default the current one, else ``llvm_ad_rgb``.
         memory: bytes (or text such as "4G") to stay within.
         seed: for whatever is random.
         integrator: name, dict or instance of a sampling integrator; by default the scene's own.
         spp: rays for each sample, for integrators that draw random numbers. From 2 on, "luma" and "sobel"
-        know the
-            variance of every pixel and take only for an edge what noise does not explain; with one random ray
-            they take noise for edges, and refine it ("geometry" does not).
+            know the variance of every pixel and take only for an edge what noise does not explain; with one
+            random ray they take noise for edges, and refine it ("geometry" does not).
         count_rays: count mirror and shadow rays.
         progress: told of plan, stages and progress.
 
@@ -315,8 +313,7 @@ def _blur(job: _Job, plan: Plan, focus: _Focus, layers: dict[str, np.ndarray]) -
         advance(len(layers["depth"]))
 
 
-# ------------------------------------------------ Bookkeeping
-# ------------------------------------------------
+# ----------------------------------------------- Bookkeeping ------------------------------------------------
 
 
 @dataclass

@@ -157,8 +157,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         if prepared is None or prepared.scene_id != id(scene):
             prepared = self.prepare(scene)
 
-        # ------------------------- The camera ray: coherent, and first of a peeled loop
-        # -------------------------
+        # ----------------------- The camera ray: coherent, and first of a peeled loop -----------------------
         active = mi.Bool(active)
         hit = prepared.intersect(scene, ray, active, coherent=True)
         shading = self._shade(prepared, scene, sampler, ray, hit, mi.UnpolarizedSpectrum(1), active)
@@ -176,8 +175,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             "sampler": sampler if prepared.random else None,
         }
 
-        # ------------------------------------------ Mirror bounces
-        # ----------------------------------------------
+        # ------------------------------------------ Mirror bounces ------------------------------------------
         def bounce(s: dict) -> tuple[dict]:
             ray, active = s["ray"], s["active"]
             hit = prepared.intersect(scene, ray, active, coherent=False)
@@ -320,8 +318,7 @@ class Prepared:
         self.planes = [_Plane(s) for s in shapes if hasattr(s, "unit_normal")]
         self.quadrics = quadrics_of(shapes)
         others = [s for s in shapes if not (hasattr(s, "unit_normal") or is_quadric(s))]
-        # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the other shapes
-        # only
+        # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the others only
         self.bvh = _scene_of(others) if len(others) < len(shapes) else None
         self.shape_count = len(others)
         self.scales, self.spheres = _Scales(others), _Spheres(others)
@@ -345,7 +342,6 @@ class Prepared:
 
     def _read_bsdfs(self, bsdfs) -> None:
         self.bsdfs = bsdfs = list(bsdfs)
-        self.mirrors = any(_has_mirror(b) for b in bsdfs)
         self.mirror_bounds = [
             b.mirror_bound() if hasattr(b, "mirror_bound") else (1.0, 1.0) for b in bsdfs if _has_mirror(b)
         ]

@@ -233,8 +233,7 @@ def _distribution(judged: dict[int, Judgement]) -> Any:
     return figure
 
 
-# ------------------------------------------------ The original
-# ------------------------------------------------
+# ----------------------------------------------- The original -----------------------------------------------
 
 
 def _original(study: Study, quick: bool) -> None:

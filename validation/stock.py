@@ -43,8 +43,7 @@ def run(study: Study, *, quick: bool) -> None:
     mutations.run(study, quick=quick)
 
 
-# --------------------------------------------- Direct light only
-# ---------------------------------------------
+# -------------------------------------------- Direct light only ---------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -175,8 +174,7 @@ def _direct_row(number: int, light: int, c: DirectComparison) -> list[Any]:
     return [number, light, float(np.median(near)), float(np.quantile(near, 0.999)), *map(int, counts)]
 
 
-# --------------------------------------- The mirror as the limit of gloss
-# ---------------------------------------
+# ------------------------------------- The mirror as the limit of gloss -------------------------------------
 
 
 @dataclass(frozen=True)
@@ -259,8 +257,7 @@ def _gloss(study: Study, quick: bool) -> None:
     study.plot("gloss_pictures", "Gloss, and the mirror", figure)
 
 
-# ------------------------------------------------ Anti-aliasing
-# ------------------------------------------------
+# ---------------------------------------------- Anti-aliasing -----------------------------------------------
 
 
 @dataclass(frozen=True)
