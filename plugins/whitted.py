@@ -160,8 +160,9 @@ class MrtWhitted(mi.SamplingIntegrator):
         # ----------------------- The camera ray: coherent, and first of a peeled loop -----------------------
         active = mi.Bool(active)
         hit = prepared.intersect(scene, ray, active, coherent=True)
-        shading = self._shade(prepared, scene, sampler, ray, hit, mi.UnpolarizedSpectrum(1), active)
-        if not self.bounces(prepared):
+        mirror = self.bounces(prepared)
+        shading = self._shade(prepared, scene, sampler, ray, hit, mi.UnpolarizedSpectrum(1), active, mirror)
+        if not mirror:
             return Trace(shading.radiance, shading.radiance, hit, mi.UInt32(0), shading.shadow_rays)
         throughput, depth = shading.reflectance, shading.cost
         state = {
@@ -179,7 +180,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         def bounce(s: dict) -> tuple[dict]:
             ray, active = s["ray"], s["active"]
             hit = prepared.intersect(scene, ray, active, coherent=False)
-            shading = self._shade(prepared, scene, s["sampler"], ray, hit, s["throughput"], active)
+            shading = self._shade(prepared, scene, s["sampler"], ray, hit, s["throughput"], active, mirror)
             throughput = s["throughput"] * shading.reflectance
             depth = s["depth"] + shading.cost
             return (
@@ -213,16 +214,18 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     # ------------------------------------------- Shading -----------------------------------------------
 
-    def _shade(self, prepared, scene, sampler, ray, hit, throughput, active) -> Shading:
-        """Light that leaves ``hit`` back along ``ray``, and its mirror reflection; ``throughput`` is the
-        path's."""
+    def _shade(self, prepared, scene, sampler, ray, hit, throughput, active, mirror: bool) -> Shading:
+        """Light that leaves ``hit`` back along ``ray``, and its mirror reflection if ``mirror``.
+
+        ``throughput`` is that of the path up to ``hit``.
+        """
         si = hit.si
         radiance = self._sky(prepared, ray, but_not(active, hit.found))
         if prepared.emissive:
             radiance += mi.unpolarized_spectrum(si.emitter(scene, hit.found).eval(si, hit.found))
         unrolled = prepared.lights if prepared.unrolled else []
         samples = [self._light_sample(prepared, light, sampler, hit) for light in unrolled]
-        values, reflectance, int_ior = prepared.eval_bsdf(hit, samples, mirror=self.bounces(prepared))
+        values, reflectance, int_ior = prepared.eval_bsdf(hit, samples, mirror)
         shadow_rays = mi.UInt32(0)
         for sample, value in zip(samples, values, strict=True):
             lit, traced = self._visible_part(prepared, scene, hit, throughput, sample, value)
