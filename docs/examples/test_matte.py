@@ -1,0 +1,118 @@
+"""What a BSDF has to prove: values, samples, energy, derivatives, variants and messages."""
+
+from __future__ import annotations
+
+import mrt_mitsuba as mrt  # first: it chooses the LLVM library
+import drjit as dr
+import matte
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mrt_mitsuba.validation.bsdf_probe import albedo, at_angle, draw, evaluate, unit
+
+
+@pytest.fixture(autouse=True)
+def plugins():
+    mi.set_variant("llvm_ad_rgb")
+    mrt.register()
+    matte.register()
+
+
+def bsdf(**parameters):
+    return mi.load_dict({"type": "matte", "reflectance": 1.0, **parameters})
+
+
+def textbook(wi, wo, sigma):
+    """f cos θo as the paper writes it, with angles, in float64."""
+    a = 1 - 0.5 * sigma**2 / (sigma**2 + 0.33)
+    b = 0.45 * sigma**2 / (sigma**2 + 0.09)
+    theta_i, theta_o = np.arccos(wi[:, 2]), np.arccos(wo[:, 2])
+    phi = np.arctan2(wi[:, 1], wi[:, 0]) - np.arctan2(wo[:, 1], wo[:, 0])
+    large, small = np.maximum(theta_i, theta_o), np.minimum(theta_i, theta_o)
+    shape = a + b * np.maximum(0, np.cos(phi)) * np.sin(large) * np.tan(small)
+    return shape * wo[:, 2] / np.pi
+
+
+def test_values_are_those_of_the_paper():
+    pairs = np.random.default_rng(1).normal(size=(2, 10_000, 3))
+    pairs[:, :, 2] = np.abs(pairs[:, :, 2]) + 1e-3  # arccos, in the expected value, fails below
+    wi, wo = map(unit, pairs)
+    value, _ = evaluate(bsdf(sigma=0.4), wi, wo)
+    expected = textbook(wi.astype(float), wo.astype(float), 0.4)
+    np.testing.assert_allclose(value[:, 0], expected, rtol=2e-6)  # 16 float32 roundings
+
+
+@pytest.mark.parametrize("degrees", [0, 60, 89])
+def test_samples_follow_the_density(degrees, tmp_path, monkeypatch):
+    from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
+
+    monkeypatch.chdir(tmp_path)  # Mitsuba writes its tables there if the test fails
+    sample, pdf = BSDFAdapter("matte", {"type": "matte", "sigma": 0.4}, wi=at_angle(degrees).tolist())
+    test = ChiSquareTest(
+        domain=SphericalDomain(), sample_func=sample, pdf_func=pdf, sample_dim=3, sample_count=100_000
+    )
+    assert test.run(significance_level=0.01, quiet=True), test.messages
+
+
+@pytest.mark.parametrize("degrees", [10, 80])
+def test_weights_average_to_the_albedo(degrees):
+    """Chi-square compares ``sample`` with ``pdf`` and never looks at ``eval``: this does."""
+    wi = at_angle(degrees)
+    _, weight = draw(bsdf(sigma=0.4), wi, 200_000)
+    error = weight.std() / np.sqrt(weight.size)
+    assert abs(weight.mean() - albedo(bsdf(sigma=0.4), wi)[0]) < 5 * error + 1e-4  # the grid's own error
+    assert error < 1e-3  # else a brightness off by 1 % could pass
+
+
+def test_nothing_gives_back_more_than_the_model_admits():
+    """At the horizon the albedo is A + B / 2, which is largest, 1.015, between 0.1 and 0.3."""
+    assert max(albedo(bsdf(sigma=s), at_angle(89))[0] for s in (0, 0.1, 0.2, 0.5, 2)) < 1.016
+
+
+def test_sigma_is_differentiable():
+    made = bsdf()
+    parameters = mi.traverse(made)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi, wo = mi.Vector3f(0.6, 0, 0.8), mi.Vector3f(0.28, 0, 0.96)
+
+    def value(sigma):
+        parameters["sigma"] = mi.Float(sigma)
+        parameters.update()
+        return made.eval(mi.BSDFContext(), si, wo).x
+
+    sigma = mi.Float(0.3)
+    dr.enable_grad(sigma)
+    parameters["sigma"] = sigma
+    parameters.update()
+    dr.backward(made.eval(mi.BSDFContext(), si, wo).x)
+    difference = (value(0.31)[0] - value(0.29)[0]) / 0.02
+    assert dr.grad(sigma)[0] == pytest.approx(difference, rel=1e-2)  # second order in the step, and float32
+
+
+def scene():
+    look = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 8, "height": 6, "rfilter": {"type": "box"}}
+    return {
+        "type": "scene",
+        "integrator": {"type": "mrt_whitted"},
+        "sensor": {"type": "perspective", "fov": 40, "to_world": look, "film": film},
+        "lamp": {"type": "mrt_light", "position": [2, 3, 4]},
+        "ball": {"type": "sphere", "bsdf": {"type": "matte", "sigma": 0.5}},
+    }
+
+
+@pytest.mark.filterwarnings("ignore:scalar_rgb traces one ray at a time")
+def test_all_variants_draw_the_same():
+    pictures = []
+    for variant in ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_rgb"):
+        mi.set_variant(variant)
+        pictures.append(mrt.render(scene(), aa=1).image)
+    assert pictures[0].max() > 0.1
+    np.testing.assert_allclose(pictures[1], pictures[0], atol=1e-6)  # the order of float32 operations
+    np.testing.assert_array_equal(pictures[2], pictures[0])
+
+
+def test_a_wrong_value_is_named():
+    with pytest.raises(RuntimeError, match='matte: "sigma" is -1.0, but must be a finite number >= 0'):
+        bsdf(sigma=-1.0)
