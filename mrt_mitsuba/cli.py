@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -16,6 +17,8 @@ from mrt_mitsuba.options import Options, parse, usage
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
+# What printing fails with where the output goes to a full disk; pictures have errors of their own
+FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 # An environment variable; set to anything, unexpected errors show where they came from
 TRACEBACK = "MRT_TRACEBACK"
 
@@ -26,12 +29,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Without arguments, those of the process are taken, and an interrupt ends the process at once.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    _open_closed_streams()
     with warnings.catch_warnings(), ending_soon(_end_by_force):
         warnings.showwarning = _show_warning
         code = _guarded(words)
         if code in (INTERRUPTED, TERMINATED) and arguments is None:
             leave_now(code)  # the interpreter would wait for the kernels that run
         return code
+
+
+def _open_closed_streams() -> None:
+    """Let nothing that is opened later be taken for standard output or error, where a caller closed these."""
+    for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            mode = "r" if name == "stdin" else "w"
+            stream = open(os.devnull, mode)  # noqa: SIM115 - it stays open
+            if stream.fileno() != descriptor:
+                os.dup2(stream.fileno(), descriptor)
+            setattr(sys, name, stream)
 
 
 def _guarded(arguments: list[str]) -> int:
@@ -50,12 +65,21 @@ def _guarded(arguments: list[str]) -> int:
         # whoever read the output has gone; keep Python from complaining about it once more at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:
+        if error.errno not in FULL or error.filename is not None:
+            return _unexpected(error)
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - or Python complains once more at exit
+        return _fail(f"cannot print: {error.strerror}; send the output elsewhere", 1)
     except MemoryError:
         return _fail("out of memory: choose a smaller width, height or aa", 1)
     except Exception as error:
-        if os.environ.get(TRACEBACK):
-            raise
-        return _fail(f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)", 1)
+        return _unexpected(error)
+
+
+def _unexpected(error: Exception) -> int:
+    if os.environ.get(TRACEBACK):
+        raise error
+    return _fail(f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)", 1)
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -119,11 +143,13 @@ def banner(options: Options) -> str:
 
 
 def _help(arguments: list[str]) -> int:
+    _no_arguments("help", arguments)
     sys.stdout.write(usage())
     return 0
 
 
 def _version(arguments: list[str]) -> int:
+    _no_arguments("--version", arguments)
     from mrt_mitsuba import __version__
 
     print(f"mrt-mitsuba {__version__}")
@@ -148,7 +174,9 @@ def _scenes(arguments: list[str]) -> int:
 
 def _export(arguments: list[str]) -> int:
     flavor = "stock" if "--stock" in arguments else "mrt"
-    words = [argument for argument in arguments if argument != "--stock"]
+    words = list(arguments)
+    if flavor == "stock":
+        words.remove("--stock")
     if len(words) != 3 or words[1] != "--xml":
         raise UsageError("write mrt export SCENE --xml PATH [--stock]")
     number, path = parse(["export", words[0]]).scene_number, words[2]

@@ -8,6 +8,7 @@ from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.options import check
 from mrt_mitsuba.scene import Scene
 from mrt_mitsuba.scenes import report_scene
 
@@ -33,14 +34,16 @@ def scene_dict(
     and ``path`` with few bounces for the integrator. Cones and meshes have none but in a file of their own,
     which ``write_xml`` writes.
 
-    Raises ``UsageError`` for an unknown scene or flavor, ``SceneError`` for a stock flavor that cannot be
-    had.
+    Raises ``UsageError`` for a scene, flavor, size or formula that there is not, ``SceneError`` for a stock
+    flavor that cannot be had.
     """
     if flavor not in FLAVORS:
         raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
+    given = {"width": width, "height": height, "fresnel": fresnel}
+    given = {name: check(name, value) for name, value in given.items() if value is not None}
     runtime.use()
     scene = scene if isinstance(scene, Scene) else report_scene(scene)
-    result = scene.to_dict(width=width, height=height, fresnel=fresnel)
+    result = scene.to_dict(**given)
     return result if flavor == "mrt" else _stock(result, scene)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
+import stat
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -93,12 +95,36 @@ def read_lines(path: Path) -> list[str]:
     return lines
 
 
+def require_file(path: str | os.PathLike[str]) -> None:
+    """Raise ``SceneError`` unless ``path`` is a file that may be read. Pipes and devices have no end to wait
+    for."""
+    name, problem = os.fspath(path), ""
+    try:
+        mode = os.stat(path).st_mode
+        if stat.S_ISDIR(mode):
+            problem = "it is a folder; name a file in it"
+        elif not stat.S_ISREG(mode):
+            problem = "it is not a regular file; copy its content into one"
+        elif not os.access(path, os.R_OK):
+            problem = f"permission denied; try chmod +r {name}"
+    except (FileNotFoundError, NotADirectoryError):
+        problem = f"there is no such file in {os.path.dirname(os.path.abspath(name))}"
+    except ValueError as error:  # a zero byte in the name
+        problem = str(error)
+    except OSError as error:
+        circle = error.errno == errno.ELOOP
+        problem = "its symbolic links lead in a circle" if circle else error.strerror or str(error)
+    if problem:
+        raise SceneError(f"cannot read {name or repr(name)}: {problem}")
+
+
 def read_bytes(path: Path) -> bytes:
     """The bytes of a text file, with Unix line ends. Raises ``SceneError`` if it cannot be read as text."""
+    require_file(path)
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror or error}") from None
+        raise SceneError(f"cannot read {path}: {error.strerror or error}") from None
     if b"\0" in data:
         raise SceneError(f"{path}: is not a text file (it holds a zero byte); export it as OBJ or MTL text")
     if b"\r" in data:

@@ -19,7 +19,7 @@ import numpy as np
 
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
 from mrt_mitsuba.mtl import CONVENTIONS, DEFAULT_MATERIAL, decode, find, numbers, read_bytes, read_mtl
-from mrt_mitsuba.scene import BLUE_SKY, Camera, Color, Light, Material, Mesh, Scene, Vector
+from mrt_mitsuba.scene import BLUE_SKY, Camera, Color, Light, Material, Mesh, Scene, Vector, view_problem
 
 # Statements about names, groups, smoothing, curves and display: nothing that is rendered here
 _IGNORED = frozenset(
@@ -170,12 +170,9 @@ def obj_view(
     scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)
     given: dict[str, Any] = {"position": camera, "target": target, "up": up, "hfov": fov}
     view = replace(scene.camera, **{name: value for name, value in given.items() if value is not None})
-    forward = np.subtract(view.target, view.position)
-    if not forward.any():
-        raise UsageError(f"camera and target are the same point, {list(view.position)}: move one of them")
-    # Their angle, as a share of its largest sine
-    if np.linalg.norm(np.cross(forward, view.up)) <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(view.up):
-        raise UsageError(f"the camera looks along up={list(view.up)}: choose another up, such as up=0,0,1")
+    problem = view_problem(view)
+    if problem:
+        raise UsageError(problem)
     return replace(scene, camera=view)
 
 

@@ -329,12 +329,12 @@ def parse(arguments: Sequence[str]) -> Options:
 def check(name: str, value: Any) -> Any:
     """Return a value from Python as the option ``name`` holds it; raise ``UsageError`` if it is not allowed.
 
-    None passes where it is the default.
+    None passes where it is the default, or where a scene file decides.
     """
     if name not in TABLE:
         raise UsageError(_unknown(name))
     field = TABLE[name]
-    if value is None and field.default is None:
+    if value is None and (field.default is None or name in DECIDED_BY_FILE):
         return None
     try:
         return field.metadata["kind"].check(value)

@@ -90,9 +90,7 @@ def render(
     """
     start = time.perf_counter()
     arguments = {name: value for name, value in locals().items() if name in options.TABLE and name != "scene"}
-    given = {
-        name: options.check(name, value) if value is not None else None for name, value in arguments.items()
-    }
+    given = {name: options.check(name, value) for name, value in arguments.items()}
     job = _Job(Progress() if progress is None else progress)
     with job.counting_kernels():
         variant = runtime.use(variant)

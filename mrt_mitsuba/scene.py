@@ -7,9 +7,11 @@ Lengths are in scene units, colours are linear RGB. ``Scene.to_dict()`` gives th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+from mrt_mitsuba.errors import SceneError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -112,7 +114,11 @@ class Scene:
     title: str = field(default="", compare=False)
 
     def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> dict[str, Any]:
-        """The scene as a Mitsuba dict of this project's plugins, materials shared by reference."""
+        """The scene as a Mitsuba dict of this project's plugins, materials shared by reference.
+
+        Raises ``SceneError`` for a camera, a sky or an object of numbers that make no sense.
+        """
+        _check(self)
         materials = _Materials(lambda m: _mrt_bsdf(m, fresnel, self.texturing))
         shapes: dict[str, Any] = {}
         for kind, objects in (("sphere", self.spheres), ("cone", self.cones), ("cylinder", self.cylinders)):
@@ -177,6 +183,49 @@ class Scene:
         }
 
 
+def _check(scene: Scene) -> None:
+    """Refuse what Mitsuba would draw as nothing, or as noise, without a word. Materials, lights, planes and
+    meshes are checked by their plugins."""
+    problem = view_problem(scene.camera)
+    if problem:
+        raise SceneError(problem)
+    if not _all_finite(scene.sky, 3):
+        raise SceneError(f"sky is {scene.sky!r}, but must be three finite numbers: red, green and blue")
+    if scene.texturing not in ("report", "standard"):
+        raise SceneError(f"texturing is {scene.texturing!r}, but must be report or standard")
+    for kind, objects in (("sphere", scene.spheres), ("cone", scene.cones), ("cylinder", scene.cylinders)):
+        for i, thing in enumerate(objects):
+            if not _all_finite(_NUMBERS[kind](thing), _WIDTHS[kind]) or not thing.radius > 0:
+                raise SceneError(f"{kind}s[{i}] is {thing!r}, but must have finite places and a radius > 0")
+
+
+def view_problem(camera: Camera) -> str | None:
+    """What keeps a camera from seeing anything, or None."""
+    import numpy as np
+
+    for name in ("position", "target", "up"):
+        if not _all_finite(getattr(camera, name), 3):
+            return f"the camera's {name} is {getattr(camera, name)!r}, but must be three finite numbers"
+    if not 0 < camera.hfov < 180:
+        return f"the camera's hfov is {camera.hfov!r}, but must be more than 0 and less than 180 degrees"
+    forward = np.subtract(camera.target, camera.position)
+    if not forward.any():
+        return f"camera and target are the same point, {list(camera.position)}: move one of them"
+    # Their angle, as a share of its largest sine
+    along = np.linalg.norm(np.cross(forward, camera.up))
+    if along <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(camera.up):
+        return f"the camera looks along up={list(camera.up)}: choose another up, such as up=0,0,1"
+    return None
+
+
+def _all_finite(values: Sequence[float], count: int) -> bool:
+    """Whether these are so many finite numbers."""
+    try:
+        return len(values) == count and all(map(math.isfinite, values))
+    except TypeError:
+        return False
+
+
 class _Materials:
     """BSDF definitions by material: one for each that differs, referred to by the shapes."""
 
@@ -222,6 +271,7 @@ _NUMBERS: dict[str, Callable[[Any], tuple[float, ...]]] = {
     "cone": lambda c: (*c.apex, *c.base_center, c.radius),
     "cylinder": lambda y: (*y.p0, *y.p1, y.radius),
 }
+_WIDTHS = {"sphere": 4, "cone": 7, "cylinder": 7}
 
 # More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape
 # and more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of

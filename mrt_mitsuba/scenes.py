@@ -196,5 +196,5 @@ def report_scene(number: int) -> Scene:
 
         return getattr(demos, f"scene_{number}")()
     if number not in _BUILDERS:
-        raise UsageError(f"there is no scene {number}: choose one of {', '.join(map(str, NUMBERS))}")
+        raise UsageError(f"there is no scene {number!r}: choose one of {', '.join(map(str, NUMBERS))}")
     return _BUILDERS[number]()

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.mtl import require_file
 from mrt_mitsuba.obj import obj_scene
 from mrt_mitsuba.scene import Scene
 from mrt_mitsuba.scenes import report_scene
@@ -19,6 +20,8 @@ SIZE = (800, 600)
 _TRACEBACK = re.compile(
     r"Traceback \(most recent call last\):\n(?:[ \t][^\n]*\n|\n)*(?:\w*ParameterError: )?"
 )
+# Where in Mitsuba's own sources an error was raised
+_CODE_PLACE = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ def open_scene(
             "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
         )
     if isinstance(scene, dict):
+        _refuse_none(scene)
         return _own_source("a dict", _load(mi.load_dict, scene, "the dict"), width, height, integrator)
     if isinstance(scene, str | os.PathLike):
         path = os.fspath(scene)
@@ -110,6 +114,7 @@ def _integrator(integrator: Any, scene: Any) -> Any:
     if isinstance(integrator, str):
         integrator = {"type": integrator}
     if isinstance(integrator, dict):
+        _refuse_none(integrator)
         integrator = _load(mi.load_dict, integrator, f"the integrator {integrator.get('type')!r}")
     if not isinstance(integrator, mi.SamplingIntegrator):
         raise UsageError(
@@ -121,13 +126,19 @@ def _integrator(integrator: Any, scene: Any) -> Any:
 def _load_file(path: str) -> Any:
     import mitsuba as mi
 
-    if os.path.isdir(path):
-        raise SceneError(f"cannot read {path}: it is a folder; name the scene's file in it")
-    if not os.path.isfile(path):
-        raise SceneError(f"cannot read {path}: there is no such file")
+    require_file(path)
     if not path.lower().endswith(".xml"):
         raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
     return _load(mi.load_file, path, path)
+
+
+def _refuse_none(node: dict[str, Any], place: str = "") -> None:
+    """Mitsuba ends the process where a dict holds None."""
+    for name, value in node.items():
+        if value is None:
+            raise SceneError(f"cannot load the dict: {place}{name} is None; give it a value, or leave it out")
+        if isinstance(value, dict):
+            _refuse_none(value, f"{place}{name}.")
 
 
 def _load(loader: Any, what: Any, name: str) -> Any:
@@ -135,5 +146,5 @@ def _load(loader: Any, what: Any, name: str) -> Any:
         return loader(what)
     except RuntimeError as error:
         # Of an error in a plugin written in Python, Mitsuba quotes the way there, too
-        text = _TRACEBACK.sub("", str(error))
+        text = _CODE_PLACE.sub("", _TRACEBACK.sub("", str(error)))
         raise SceneError(f"cannot load {name}: {text}") from error
