@@ -11,6 +11,36 @@ LATTICES = ("report", "centered")
 
 
 @dataclass(frozen=True)
+class Divisor:
+    """A number to divide lane numbers by. As data of a kernel: another number needs no other kernel.
+
+    A processor divides integers of a packet one after the other, which takes as long as tracing the ray; so
+    vectorised variants multiply by the inverse in double precision. The half added keeps n/d away from whole
+    numbers by 1/(2 d), and rounding moves it by less than n/d / 2⁵² < 1/(2 d) for all n < 2³².
+    """
+
+    number: Any
+    inverse: Any = None
+
+    @classmethod
+    def opaque(cls, number: int) -> Divisor:
+        """For vectorised variants."""
+        import drjit as dr
+        import mitsuba as mi
+
+        return cls(dr.opaque(mi.UInt32, number), dr.opaque(mi.Float64, 1 / number))
+
+    def divide(self, n: Any) -> tuple[Any, Any]:
+        """Quotient and remainder."""
+        import mitsuba as mi
+
+        if self.inverse is None:
+            return divmod(n, self.number)
+        quotient = mi.UInt32((mi.Float64(n) + 0.5) * self.inverse)
+        return quotient, n - quotient * self.number
+
+
+@dataclass(frozen=True)
 class Lattice:
     """A grid of aa × aa samples in a pixel.
 
@@ -32,18 +62,18 @@ class Lattice:
         """Is the pixel's centre one of the samples? It then comes first."""
         return self.kind == "report" or self.aa % 2 == 1
 
-    def offset(self, sample: Any, aa: Any) -> tuple[Any, Any]:
-        """Place of sample number ``sample`` in its pixel as (x, y), y downwards; ``aa`` as the same type of
-        integer."""
+    def offset(self, sample: Any, aa: Divisor) -> tuple[Any, Any]:
+        """Place of sample number ``sample`` in its pixel as (x, y), y downwards."""
         import mitsuba as mi
 
         if self.kind == "centered" and self.holds_centre:
             # start from the middle one, so that sample 0 is the centre
             sample = (sample + self.count // 2) % self.count
-        i, j = sample // aa, sample % aa
+        i, j = aa.divide(sample)
+        n = mi.Float(aa.number)
         if self.kind == "report":
-            return 0.5 + mi.Float(i) / mi.Float(aa), 0.5 - mi.Float(j) / mi.Float(aa)
-        return (mi.Float(i) + 0.5) / mi.Float(aa), (mi.Float(j) + 0.5) / mi.Float(aa)
+            return 0.5 + mi.Float(i) / n, 0.5 - mi.Float(j) / n
+        return (mi.Float(i) + 0.5) / n, (mi.Float(j) + 0.5) / n
 
 
 @dataclass(frozen=True)
@@ -109,21 +139,17 @@ class Bundle:
         import drjit as dr
         import mitsuba as mi
 
-        per_pixel = dr.opaque(mi.UInt32, self.rays_per_pixel)
         lane = dr.arange(mi.UInt32, self.ray_count)
-        order = lane // per_pixel
+        order, rest = Divisor.opaque(self.rays_per_pixel).divide(lane)
         if isinstance(self.pixels, range):
             pixel = order + dr.opaque(mi.UInt32, self.pixels.start)
         else:
             pixel = dr.gather(mi.UInt32, mi.UInt32(self.pixels), order)
         # Sizes are data, not constants: another picture size needs no other kernel
-        width, height, repeats, first, aa = (
-            dr.opaque(mi.UInt32, n) for n in (width, height, self.repeats, self.first, self.lattice.aa)
-        )
+        width, repeats, aa = (Divisor.opaque(n) for n in (width, self.repeats, self.lattice.aa))
+        height, first = (dr.opaque(mi.UInt32, n) for n in (height, self.first))
         shutter = self._shutter_numbers(dr.opaque) if self.shutter else ()
-        return self._samples(
-            lane, order, pixel, lane - order * per_pixel, width, height, repeats, first, aa, shutter
-        )
+        return self._samples(lane, order, pixel, rest, width, height, repeats, first, aa, shutter)
 
     def each_sample(self, width: int, height: int) -> Iterator[Samples]:
         """The same, one ray at a time, for scalar variants."""
@@ -135,11 +161,11 @@ class Bundle:
                 order,
                 int(self.pixels[order]),
                 rest,
-                width,
+                Divisor(width),
                 height,
-                self.repeats,
+                Divisor(self.repeats),
                 self.first,
-                self.lattice.aa,
+                Divisor(self.lattice.aa),
                 shutter,
             )
 
@@ -154,10 +180,10 @@ class Bundle:
     def _samples(self, lane, order, pixel, rest, width, height, repeats, first, aa, shutter) -> Samples:
         import mitsuba as mi
 
-        row = pixel // width
-        x, y = self.lattice.offset(rest // repeats + first, aa)
+        row, column = width.divide(pixel)
+        x, y = self.lattice.offset(repeats.divide(rest)[0] + first, aa)
         place = mi.Point2f(
-            (mi.Float(pixel - row * width) + x) / mi.Float(width), (mi.Float(row) + y) / mi.Float(height)
+            (mi.Float(column) + x) / mi.Float(width.number), (mi.Float(row) + y) / mi.Float(height)
         )
         time = self.shutter.time(rest, pixel, *shutter) if self.shutter else mi.Float(0)
         return Samples(lane=lane, order=order, is_first=rest == 0, place=place, time=time)
