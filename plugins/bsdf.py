@@ -18,7 +18,7 @@ from .microfacet import (
     smith_g1_over_cos,
     tan2_theta,
 )
-from .parameters import ParameterError, choice, flag, number
+from .parameters import ParameterError, choice, flag, number, spectrum
 from .variants import first, is_jit, updatable
 
 FRESNEL_FORMS = ("schlick", "dielectric", "unity")
@@ -88,8 +88,8 @@ class MrtBSDF(mi.BSDF):
         self.int_ior = self._number_or_texture(props, "int_ior", 1.5, above=0)
         self.ext_ior = self._number_or_texture(props, "ext_ior", 1.0, above=0)
         self.alpha = self._number_or_texture(props, "alpha", 0.1)
-        self.diffuse_reflectance = props.get_unbounded_texture("diffuse_reflectance", 0.5)
-        self.specular_reflectance = props.get_unbounded_texture("specular_reflectance", 1.0)
+        self.diffuse_reflectance = spectrum(props, "diffuse_reflectance", 0.5)
+        self.specular_reflectance = spectrum(props, "specular_reflectance", 1.0)
         self.f0 = self._read_f0(props)
         self.sample_visible = flag(props, "sample_visible", True)
         self.version = 0
@@ -98,7 +98,7 @@ class MrtBSDF(mi.BSDF):
     @staticmethod
     def _number_or_texture(props, name, default, **limits):
         if name in props and props.type(name) == mi.Properties.Type.Object:
-            return props.get_unbounded_texture(name)
+            return spectrum(props, name)
         return updatable(number(props, name, default, **limits))
 
     def _read_f0(self, props):
@@ -108,7 +108,7 @@ class MrtBSDF(mi.BSDF):
             raise ParameterError(
                 f'mrt_bsdf: "f0" has no meaning with fresnel="{self.fresnel}"; leave one of them out'
             )
-        return props.get_unbounded_texture("f0")
+        return spectrum(props, "f0")
 
     def _update(self) -> None:
         # Opaque numbers travel as data: instances share one compiled function, new values need no new kernel

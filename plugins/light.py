@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .parameters import vector
+from .parameters import spectrum, vector
 from .variants import first, is_jit, pointer
 
 
@@ -40,7 +40,7 @@ class MrtLight(mi.Emitter):
     def __init__(self, props: mi.Properties):
         mi.Emitter.__init__(self, props)
         self.position = mi.Point3f(vector(props, "position", (0, 0, 0)))
-        self.intensity = props.get_emissive_texture("intensity", 1.0)
+        self.intensity = spectrum(props, "intensity", 1.0, emissive=True)
         self.m_flags = +mi.EmitterFlags.DeltaPosition
         self._update()
 

@@ -29,11 +29,14 @@ class MrtMesh(mi.Mesh):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        positions, faces = _array(props, "positions"), _array(props, "faces")
-        texcoords = _array(props, "texcoords")[:, :2] if "texcoords" in props else None
-        if len(faces) and faces.max() >= len(positions):
+        positions, faces = _array(props, "positions", 3), _array(props, "faces", 3)
+        texcoords = _array(props, "texcoords", 2, 3)[:, :2] if "texcoords" in props else None
+        if len(faces) and not (faces.min() >= 0 and faces.max() < len(positions)):
+            wrong = faces.max() if faces.max() >= len(positions) else faces.min()
+            raise ParameterError(f'mrt_mesh: "faces" holds {wrong}, but there are {len(positions)} positions')
+        if texcoords is not None and len(texcoords) != len(positions):
             raise ParameterError(
-                f'mrt_mesh: "faces" holds {faces.max()}, but there are {len(positions)} positions'
+                f'mrt_mesh: "texcoords" has {len(texcoords)} entries for {len(positions)} positions'
             )
         sizes = len(positions), len(faces)
         mi.Mesh.__init__(self, "mrt_mesh", *sizes, props, has_vertex_texcoords=texcoords is not None)
@@ -47,14 +50,17 @@ class MrtMesh(mi.Mesh):
         return f"MrtMesh[{self.content}]"
 
 
-def _array(props: mi.Properties, name: str) -> np.ndarray:
+def _array(props: mi.Properties, name: str, *widths: int) -> np.ndarray:
     if name not in props or not isinstance(props[name], mi.Bitmap):
         raise ParameterError(
             f'mrt_mesh: "{name}" must be a mi.Bitmap of one row; write mi.Bitmap(array[np.newaxis])'
         )
     array = np.array(props[name])
-    if array.ndim != 3 or array.shape[0] != 1 or array.shape[2] not in (2, 3):
-        raise ParameterError(f'mrt_mesh: "{name}" has the shape {array.shape}, but must have [1, N, 3]')
+    if array.ndim != 3 or array.shape[0] != 1 or array.shape[2] not in widths:
+        wanted = " or ".join(f"[1, N, {width}]" for width in widths)
+        raise ParameterError(f'mrt_mesh: "{name}" has the shape {array.shape}, but must have {wanted}')
+    if not np.isfinite(array).all():
+        raise ParameterError(f'mrt_mesh: "{name}" holds a number that is not finite')
     return array[0]
 
 

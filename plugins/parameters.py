@@ -6,6 +6,11 @@ import math
 from collections.abc import Sequence
 from typing import NoReturn
 
+import drjit as dr
+
+# Mitsuba computes in float32; what is larger would become infinite there
+LARGEST = 3.4e38
+
 
 class ParameterError(ValueError):
     """A plugin parameter has a wrong value. The text names plugin, key, value and what is allowed."""
@@ -22,16 +27,18 @@ def number(props, name: str, default: float, *, above: float = -math.inf, least:
     limits = "".join(f" {sign} {bound:g}" for sign, bound in bounds if bound > -math.inf)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         _fail(props, name, value, f"a number{limits}")
-    if not (math.isfinite(value) and value > above and value >= least):
+    if not (abs(value) <= LARGEST and value > above and value >= least):
         _fail(props, name, value, f"a finite number{limits}")
     return float(value)
 
 
-def integer(props, name: str, default: int, *, least: int) -> int:
-    """An integer parameter >= ``least``."""
+def integer(props, name: str, default: int, *, least: int, most: int | None = None) -> int:
+    """An integer parameter >= ``least`` and, if given, <= ``most``."""
     value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        _fail(props, name, value, f"an integer >= {least}")
+    limits = f">= {least}" if most is None else f"from {least} to {most}"
+    right = isinstance(value, int) and not isinstance(value, bool)
+    if not right or value < least or (most is not None and value > most):
+        _fail(props, name, value, f"an integer {limits}")
     return value
 
 
@@ -60,8 +67,33 @@ def vector(props, name: str, default: Sequence[float] | None = None, *, nonzero:
         numbers = [float(x) for x in value]
     except (TypeError, ValueError):
         _fail(props, name, value, "three finite numbers")
-    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
+    if len(numbers) != 3 or not all(abs(x) <= LARGEST for x in numbers):
         _fail(props, name, value, "three finite numbers")
     if nonzero and not any(numbers):
         _fail(props, name, value, "a vector of non-zero length")
     return numbers
+
+
+def spectrum(props, name: str, default: float | None = None, *, emissive: bool = False):
+    """A spectrum or texture as a Mitsuba texture; numbers and colours have to be finite and not negative.
+
+    ``emissive``: one for lights, with the spectrum of daylight where a variant renders spectra.
+    """
+    value = props.get(name, default)
+    if isinstance(value, (int, float)) or dr.is_array_v(value):
+        levels = [float(x) for x in value] if dr.is_array_v(value) else [value]
+        if isinstance(value, bool) or not all(0 <= x <= LARGEST for x in levels):
+            _fail(props, name, levels if len(levels) > 1 else value, "finite and not negative")
+    read = props.get_emissive_texture if emissive else props.get_unbounded_texture
+    try:
+        return read(name) if default is None else read(name, default)
+    except RuntimeError:
+        _fail(props, name, value, "a number, a colour, a spectrum or a texture")
+
+
+def text(props, name: str) -> str:
+    """A string parameter."""
+    value = props[name]
+    if not isinstance(value, str) or not value:
+        _fail(props, name, value, "a text that is not empty")
+    return value

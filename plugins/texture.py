@@ -6,7 +6,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from .parameters import ParameterError
+from .parameters import ParameterError, text
 
 
 class MrtTexture(mi.Texture):
@@ -77,8 +77,10 @@ def _read(props: mi.Properties) -> mi.Bitmap:
         raise ParameterError('mrt_texture: give one of "filename" and "bitmap"')
     if "bitmap" in props:
         bitmap = props["bitmap"]
+        if not isinstance(bitmap, mi.Bitmap):
+            raise ParameterError(f'mrt_texture: "bitmap" is {bitmap!r}, but must be a mi.Bitmap')
     else:
-        path = mi.file_resolver().resolve(props["filename"])
+        path = mi.file_resolver().resolve(text(props, "filename"))
         try:
             bitmap = mi.Bitmap(str(path))
         except RuntimeError as error:
