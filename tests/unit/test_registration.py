@@ -5,11 +5,20 @@ Each test has a process of its own, since what is registered stays so until a pr
 
 from __future__ import annotations
 
+import sys
 from itertools import permutations
+from pathlib import Path
 
 import pytest
 
 from mrt_mitsuba import runtime
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    tomllib = pytest.importorskip("tomli")
+
+ROOT = Path(__file__).parents[2]
 
 pytestmark = pytest.mark.skipif(
     runtime.obstacle(runtime.FAST) is not None, reason="no second kind of variant without LLVM"
@@ -138,3 +147,20 @@ parsed = mi.parser.parse_string(mi.parser.ParserConfig("llvm_ad_rgb"), text)
 print("written" if "mrt_plane" in mi.parser.write_string(parsed) else "lost")
 """
     assert lines(run_python, code) == ["written"]
+
+
+def test_entry_points_register_as_mitsuba_loads_them(run_python) -> None:
+    """Mitsuba 3.10 imports each module once a variant is set, and reloads it after every switch."""
+    modules = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["mitsuba"]
+    code = """
+import importlib, sys
+variants = ["scalar_rgb", "llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral"]
+loaded = []
+for variant in variants:
+    mi.set_variant(variant)
+    loaded = [importlib.reload(module) for module in loaded] or [
+        importlib.import_module(name) for name in sys.argv[1:]]
+    draws("direct", "mrt_whitted")
+print("done")
+"""
+    assert lines(run_python, code, *modules.values()) == ["done"]
