@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -9,6 +10,9 @@ import mrt_mitsuba  # before mitsuba: it chooses the LLVM library
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
+os.environ["PYTHONPATH"] = os.pathsep.join(  # of the pages' kernels, which import the worked example
+    path for path in (str(HERE / "examples"), os.environ.get("PYTHONPATH")) if path
+)
 
 project = "mrt-mitsuba"
 author = "mrt-mitsuba contributors"
@@ -17,10 +21,11 @@ release = mrt_mitsuba.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "colon_fence"]
-exclude_patterns = ["_build", "_generated/*.inc.md"]
+exclude_patterns = ["_build", "_generated/*.inc.md", "examples"]
 html_theme = "furo"
 html_title = "mrt-mitsuba"
-html_static_path: list[str] = []
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
 nb_execution_mode = "force"

@@ -11,7 +11,7 @@ _watching = False
 
 
 def register() -> None:
-    """Register the plugin in the current variant, and in every one that is switched to later. Idempotent."""
+    """Register in the current variant, and in every one switched to later. Idempotent."""
     global _watching
     import mitsuba as mi
 
@@ -22,7 +22,7 @@ def register() -> None:
 
 
 def _load(variant: str) -> None:
-    """Run the module of the plugin anew, under a name of its own: its base class is the variant's."""
+    """Run the plugin's module anew, by a name of its own: its base class is the variant's."""
     if variant in _known:
         return
     _known.add(variant)

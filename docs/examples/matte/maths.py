@@ -11,7 +11,7 @@ import drjit as dr
 
 
 def oren_nayar_weights(sigma: Any) -> tuple[Any, Any]:
-    """A and B of the model, unitless, for slopes of standard deviation ``sigma`` >= 0, in radians."""
+    """A and B of the model, unitless; ``sigma`` >= 0: deviation of the slopes in radians."""
     sigma2 = dr.square(sigma)
     return 1 - 0.5 * sigma2 / (sigma2 + 0.33), 0.45 * sigma2 / (sigma2 + 0.09)
 
@@ -19,11 +19,12 @@ def oren_nayar_weights(sigma: Any) -> tuple[Any, Any]:
 def oren_nayar_cos(wi: Any, wo: Any, sigma: Any) -> Any:
     """f cos θo of a white surface, in 1/sr.
 
-    The paper has A + B max(0, cos Δφ) sin θ> tan θ<, of the larger and the smaller angle. The product of the
-    sines and the cosine is x x' + y y', and tan θ< divides by the larger cosine: no angle, and nothing to go
-    wrong where an azimuth is undefined. That cosine is at least cos θo, so the ratio is at most one.
-    Source: Oren and Nayar, "Generalization of Lambert's Reflectance Model", SIGGRAPH 1994, the qualitative
-    model.
+    The paper has A + B max(0, cos Δφ) sin θ> tan θ<, of the larger and the smaller angle.
+    The product of the sines and the cosine is x x' + y y', and tan θ< divides by the larger
+    cosine: no angle, and nothing to go wrong where an azimuth is undefined. That cosine is
+    at least cos θo, so the ratio is at most one.
+    Source: Oren and Nayar, "Generalization of Lambert's Reflectance Model", SIGGRAPH 1994,
+    the qualitative model.
     """
     a, b = oren_nayar_weights(sigma)
     towards = dr.maximum(wi.x * wo.x + wi.y * wo.y, 0)
