@@ -7,7 +7,7 @@ from typing import Any
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.rays import Lattice
-from mrt_mitsuba.trace import AVERAGED, FIRST_HIT
+from mrt_mitsuba.trace import CHANNELS
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Plan:
     @property
     def channels(self) -> int:
         """Float32 channels kept for every pixel: the picture, its layers, and the detector's."""
-        sizes = FIRST_HIT | AVERAGED | {"edges": 1, "samples": 1, "blur": 1}
+        sizes = CHANNELS | {"edges": 1, "samples": 1, "blur": 1}
         return sum(sizes[name] for name in {"image", *self.traced_layers, *self.returned_layers})
 
     def __str__(self) -> str:

@@ -7,7 +7,7 @@ is one wavefront, split where it would not fit in memory; in scalar variants a P
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,9 @@ from mrt_mitsuba.rays import Bundle, Samples
 FIRST_HIT = {"depth": 1, "normal": 3, "albedo": 3}
 # Layers averaged as the picture is
 AVERAGED = {"image": 3, "direct": 3, "reflection": 3, "bounces": 1, "shadow_rays": 1, "square": 3}
+CHANNELS = FIRST_HIT | AVERAGED
+
+Planes = Mapping[str, Sequence[np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -69,31 +72,27 @@ def trace_bundle(
     wanted: frozenset[str],
     *,
     seed: int = 0,
-    advance: Callable[[int], object] = lambda pixels: None,
     rays_at_once: int = MOST_RAYS,
-) -> dict[str, np.ndarray]:
-    """Trace a bundle; return each wanted layer, [pixels] or [pixels, 3], float32.
+) -> Iterator[tuple[Any, Planes]]:
+    """Trace a bundle, in parts of at most so many rays or one pixel.
 
-    ``wanted``: names from ``FIRST_HIT`` and ``AVERAGED``; nothing else is computed. ``advance`` is called
-    with the number of pixels just done. The result does not depend on ``rays_at_once``, but for integrators
-    that draw random numbers.
+    Yields the pixels of each part and the wanted layers there: by name one plane for each channel, [pixels]
+    float32, to be read before the next part is asked for. ``wanted``: names from ``FIRST_HIT`` and
+    ``AVERAGED``; nothing else is computed. Values do not depend on ``rays_at_once``, but for integrators that
+    draw random numbers.
     """
     import mitsuba as mi
 
-    sizes = {name: size for name, size in (FIRST_HIT | AVERAGED).items() if name in wanted}
-    result = {name: np.zeros((len(bundle.pixels), size), np.float32) for name, size in sizes.items()}
+    sizes = {name: size for name, size in CHANNELS.items() if name in wanted}
     run = _trace_scalar if mi.variant().startswith("scalar") else _trace_wavefront
     step = max(1, rays_at_once // bundle.rays_per_pixel)
     for start in range(0, len(bundle.pixels), step):
         part = bundle.part(start, min(start + step, len(bundle.pixels)))
         # Sub-wavefronts of random integrators must not repeat each other's numbers
-        for name, values in run(tracer, camera, part, sizes, seed + start).items():
-            result[name][start : start + len(part.pixels)] = values
-        advance(len(part.pixels))
-    return {name: values[:, 0] if sizes[name] == 1 else values for name, values in result.items()}
+        yield part.pixels, run(tracer, camera, part, sizes, seed + start)
 
 
-def _trace_wavefront(tracer, camera, bundle, sizes, seed) -> dict[str, np.ndarray]:
+def _trace_wavefront(tracer, camera, bundle, sizes, seed) -> Planes:
     import drjit as dr
     import mitsuba as mi
 
@@ -102,7 +101,7 @@ def _trace_wavefront(tracer, camera, bundle, sizes, seed) -> dict[str, np.ndarra
     values = _shade(tracer, camera, samples, sampler, sizes)
     if bundle.rays_per_pixel == 1:
         dr.eval(values)
-        return {name: _to_numpy(value) for name, value in values.items()}
+        return {name: _to_numpy(_planes(value)) for name, value in values.items()}
     pixels = {}
     for name in sizes.keys() & FIRST_HIT.keys():
         pixels[name] = [_first_of(samples, plane, len(bundle.pixels)) for plane in _planes(values.pop(name))]
@@ -127,7 +126,7 @@ def _first_of(samples: Samples, plane: Any, count: int) -> Any:
     return target
 
 
-def _trace_scalar(tracer, camera, bundle, sizes, seed) -> dict[str, np.ndarray]:
+def _trace_scalar(tracer, camera, bundle, sizes, seed) -> Planes:
     pixels = {name: np.zeros((len(bundle.pixels), size), np.float64) for name, size in sizes.items()}
     sampler = tracer.sampler(seed, 1, camera)
     for samples in bundle.each_sample(camera.width, camera.height):
@@ -136,7 +135,7 @@ def _trace_scalar(tracer, camera, bundle, sizes, seed) -> dict[str, np.ndarray]:
                 pixels[name][samples.order] += np.array(value) / bundle.rays_per_pixel
             elif samples.is_first:
                 pixels[name][samples.order] = np.array(value)
-    return pixels
+    return {name: values.T.astype(np.float32) for name, values in pixels.items()}
 
 
 def _shade(tracer, camera, samples, sampler, sizes) -> dict[str, Any]:
@@ -151,15 +150,8 @@ def _planes(value: Any) -> list[Any]:
     return list(value) if dr.depth_v(value) > 1 else [value]
 
 
-def _to_numpy(value: Any) -> np.ndarray:
-    """[n, channels] of one or several Dr.Jit arrays."""
-    return np.stack(
-        [
-            np.array(plane, dtype=np.float32)
-            for plane in (value if isinstance(value, list) else _planes(value))
-        ],
-        axis=-1,
-    )
+def _to_numpy(planes: Sequence[Any]) -> list[np.ndarray]:
+    return [np.asarray(plane, dtype=np.float32) for plane in planes]  # LLVM's arrays are not copied
 
 
 def _opaque(kind: Any, value: Any) -> Any:

@@ -33,6 +33,7 @@ from mrt_mitsuba.filters.grid import Grid, finite
 from mrt_mitsuba.filters.lens import gather_discs
 
 MAX_AMOUNT = 8
+REACH = MAX_AMOUNT  # rows and columns of neighbours that a pixel may depend on, either way
 MODES = ("report", "corrected")
 
 

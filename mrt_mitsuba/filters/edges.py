@@ -35,6 +35,7 @@ from mrt_mitsuba.filters.grid import Grid, finite
 
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 GREY_WEIGHTS = (0.07, 0.72, 0.21)
+REACH = 1  # rows and columns of neighbours that a pixel depends on, either way
 
 _OFFSETS = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
 

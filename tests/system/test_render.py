@@ -131,11 +131,16 @@ def test_splitting_the_wavefront_changes_nothing():
     tracer, camera = WhittedTracer(source.scene, source.integrator), Camera(source.sensor, 40, 30)
     bundle = Bundle(range(40 * 30), Lattice("report", 2), count=4)
     wanted = frozenset({"image", "depth", "normal", "bounces"})
-    whole = trace_bundle(tracer, camera, bundle, wanted)
-    parts = trace_bundle(tracer, camera, bundle, wanted, rays_at_once=1000)
-    assert whole.keys() == parts.keys() == wanted
-    for name, values in whole.items():
-        assert np.array_equal(values, parts[name]), name
+    ((pixels, whole),) = trace_bundle(tracer, camera, bundle, wanted)
+    assert pixels == bundle.pixels and whole.keys() == wanted
+    start = 0
+    for pixels, part in trace_bundle(tracer, camera, bundle, wanted, rays_at_once=1000):
+        assert pixels == range(start, min(start + 250, len(bundle.pixels)))
+        for name, planes in part.items():
+            for values, expected in zip(planes, whole[name], strict=True):
+                assert np.array_equal(values, expected[pixels.start : pixels.stop]), name
+        start = pixels.stop
+    assert start == len(bundle.pixels)
 
 
 @pytest.mark.parametrize("number", SCENES)

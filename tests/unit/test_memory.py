@@ -4,29 +4,61 @@ from __future__ import annotations
 
 import pytest
 
+from mrt_mitsuba import memory
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.memory import LEAST_RAYS, MOST_RAYS, free_memory, rays_at_once
+from mrt_mitsuba.memory import LEAST_RAYS, MOST_PIXELS, MOST_RAYS, Workspace, free_memory
 
 GIB = 2**30
 
 
-def test_plenty_of_memory_gives_the_largest_wavefront():
-    assert rays_at_once(800 * 600, 4, 64 * GIB) == MOST_RAYS
+def test_plenty_of_memory_gives_the_largest_parts():
+    space = Workspace.beside(800, 600, 4, memory=64 * GIB)
+    assert space.rays_at_once(4) == MOST_RAYS
+    assert space.rows_at_once(1024) == MOST_PIXELS // 1024
 
 
-def test_less_memory_gives_fewer_rays():
-    pixels = 800 * 600
-    rays = [rays_at_once(pixels, 4, memory) for memory in (GIB // 8, GIB // 16, GIB // 32)]
+def test_less_memory_gives_smaller_parts():
+    spaces = [Workspace.beside(800, 600, 4, memory=memory) for memory in (GIB // 8, GIB // 16, GIB // 32)]
+    rays = [space.rays_at_once(4) for space in spaces]
     assert MOST_RAYS > rays[0] > rays[1] > rays[2] >= LEAST_RAYS
+    rows = [space.rows_at_once(800) for space in spaces]
+    assert MOST_PIXELS / 800 > rows[0] > rows[1] > rows[2]
 
 
-def test_a_picture_that_does_not_fit_is_refused_with_both_sizes():
-    with pytest.raises(UsageError, match=r"9\.0 GiB.*4\.0 GiB"):
-        rays_at_once(16384 * 16384, 3, 4 * GIB)
+@pytest.mark.parametrize(
+    ("more", "needed"),
+    [
+        # 2^28 pixels of three floats, four bytes to write them, and 24 rows under a filter: 4.06 GiB
+        ({}, "4.1 GiB"),
+        # twice the floats
+        ({"pictures": 2}, "7.1 GiB"),
+        # 2^26 rays of three floats each, twice
+        ({"rays_per_pixel": 2**26}, "5.5 GiB"),
+    ],
+)
+def test_a_picture_that_does_not_fit_is_refused_with_both_sizes(more, needed):
+    with pytest.raises(UsageError, match=f"16384x16384 pixels needs {needed} of memory, and 4.0 GiB may be"):
+        Workspace.beside(16384, 16384, 3, memory=4 * GIB, **more)
+
+
+def test_by_default_half_of_what_is_free(monkeypatch):
+    monkeypatch.setattr(memory, "free_memory", lambda: 8 * GIB)
+    assert Workspace.beside(100, 100, 3) == Workspace.beside(100, 100, 3, memory=4 * GIB)
 
 
 def test_tiny_pictures_need_no_full_wavefront():
-    assert rays_at_once(1, 3, 2**20) >= 1
+    space = Workspace.beside(1, 1, 3, memory=2**20)
+    assert space.rays_at_once(3) >= 1 and space.rows_at_once(1) >= 1
+
+
+@pytest.mark.parametrize(("filtered", "flushed"), [(GIB // 1024, False), (GIB // 160, True)])
+def test_what_a_large_pass_used_is_given_back(monkeypatch, filtered, flushed):
+    import drjit as dr
+
+    called = []
+    monkeypatch.setattr(dr, "flush_malloc_cache", lambda: called.append(True))
+    Workspace(GIB).after_filter(filtered)
+    assert bool(called) is flushed
 
 
 def test_free_memory_is_believable():
