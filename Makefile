@@ -1,5 +1,6 @@
 # make render [SCENE=3] [ARGS="aa=2"]   render a scene to out/sceneN.png and .exr
 # make test   [ARGS="-k llvm"]          run the tests
+# make fuzz                            random inputs, ten thousand for each reader: a few minutes
 # make docs                            the documentation as a site: docs/_build/index.html
 # make bench  [ARGS="--compare F"]      time scenes 0-4 into out/bench.json
 # make setup                            the environment alone: .venv with the commands mrt and mrt-validate
@@ -14,7 +15,7 @@ BIN  := $(VENV)/bin
 # One stamp per set of extras: installing one leaves the others as they are.
 STAMP := $(VENV)/.mrt
 
-.PHONY: setup render test bench docs lint types package clean
+.PHONY: setup render test fuzz bench docs lint types package clean
 setup: $(STAMP)-base
 
 render: $(STAMP)-base
@@ -24,6 +25,9 @@ render: $(STAMP)-base
 
 test: $(STAMP)-test
 	$(BIN)/python -m pytest $(ARGS)
+
+fuzz: $(STAMP)-test
+	$(BIN)/python -m pytest -m fuzz --hypothesis-profile=long --hypothesis-show-statistics $(ARGS)
 
 bench: $(STAMP)-test
 	$(BIN)/python -m mrt_mitsuba.validation.bench --out $(OUT)/bench.json $(ARGS)

@@ -8,8 +8,8 @@ from typing import NoReturn
 
 import drjit as dr
 
-# Mitsuba computes in float32; what is larger would become infinite there
-LARGEST = 3.4e38
+# Mitsuba computes in float32; what is larger would become infinite there, and what is smaller zero
+LARGEST, SMALLEST = 3.4e38, 1.2e-38
 
 
 class ParameterError(ValueError):
@@ -20,6 +20,10 @@ def _fail(props, name: str, value, allowed: str) -> NoReturn:
     raise ParameterError(f'{props.plugin_name()}: "{name}" is {value!r}, but must be {allowed}')
 
 
+def _without_tiny(value: float) -> float:
+    return 0.0 if abs(value) < SMALLEST else float(value)
+
+
 def number(props, name: str, default: float, *, above: float = -math.inf, least: float = -math.inf) -> float:
     """A finite float parameter, > ``above`` and >= ``least``."""
     value = props.get(name, default)
@@ -27,9 +31,10 @@ def number(props, name: str, default: float, *, above: float = -math.inf, least:
     limits = "".join(f" {sign} {bound:g}" for sign, bound in bounds if bound > -math.inf)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         _fail(props, name, value, f"a number{limits}")
-    if not (abs(value) <= LARGEST and value > above and value >= least):
+    rounded = _without_tiny(value)
+    if not (abs(rounded) <= LARGEST and rounded > above and rounded >= least):
         _fail(props, name, value, f"a finite number{limits}")
-    return float(value)
+    return rounded
 
 
 def integer(props, name: str, default: int, *, least: int, most: int | None = None) -> int:
@@ -53,7 +58,7 @@ def flag(props, name: str, default: bool) -> bool:
 def choice(props, name: str, allowed: Sequence[str]) -> str:
     """One of a few strings; the first is the default."""
     value = props.get(name, allowed[0])
-    if value not in allowed:
+    if not isinstance(value, str) or value not in allowed:
         _fail(props, name, value, "one of " + ", ".join(allowed))
     return value
 
@@ -64,7 +69,7 @@ def vector(props, name: str, default: Sequence[float] | None = None, *, nonzero:
         raise ParameterError(f'{props.plugin_name()}: "{name}" is missing; give three numbers')
     value = props.get(name, default)
     try:
-        numbers = [float(x) for x in value]
+        numbers = [_without_tiny(x) for x in value]
     except (TypeError, ValueError):
         _fail(props, name, value, "three finite numbers")
     if len(numbers) != 3 or not all(abs(x) <= LARGEST for x in numbers):

@@ -350,6 +350,7 @@ MTL_PIECES = [
 ]
 
 
+@pytest.mark.fuzz
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     obj=st.one_of(
@@ -375,6 +376,7 @@ def test_any_text_is_read_or_refused(model, obj: bytes, start: str, mtl: str) ->
         assert mesh.faces.max() < len(mesh.vertices)
 
 
+@pytest.mark.fuzz
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     position=st.integers(0, 10_000), change=st.sampled_from([b"", b" ", b"\n", b"x", b"-", b"9", b"/", b"."])

@@ -195,6 +195,7 @@ def test_refused_file_names(arguments: list[str], text: str) -> None:
         parse(arguments)
 
 
+@pytest.mark.fuzz
 @given(st.sampled_from(sorted(options.TABLE)), st.text(max_size=20))
 def test_any_text_is_taken_or_refused_in_one_line(name: str, text: str) -> None:
     """Whatever is typed, the answer is a value that the table's own check accepts, or a UsageError."""
@@ -208,6 +209,7 @@ def test_any_text_is_taken_or_refused_in_one_line(name: str, text: str) -> None:
         assert options.check(name, value) == value
 
 
+@pytest.mark.fuzz
 @given(st.lists(st.text(max_size=12), max_size=5))
 def test_any_command_line(arguments: list[str]) -> None:
     try:

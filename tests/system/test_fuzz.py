@@ -1,0 +1,221 @@
+"""Random scene files, pictures and plugin parameters: each is read, or refused with one clear error.
+
+With the parsers' own tests of this kind (``-m fuzz`` selects them all) these run a few hundred inputs each;
+``make fuzz`` runs ten thousand.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+import warnings
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
+from mrt_mitsuba.source import open_scene
+
+pytestmark = pytest.mark.fuzz
+# The folder of a test serves all of its inputs, and each writes the same files
+one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+
+# ------------------------------------------------- XML --------------------------------------------------
+
+WHOLE = """<scene version='3.0.0'>
+<integrator type='mrt_whitted'><integer name='max_depth' value='3'/><float name='min_contribution' value='0'/>
+</integrator>
+<sensor type='perspective'><float name='fov' value='40'/>
+<transform name='to_world'><lookat origin='0,0,5' target='0,0,0' up='0,1,0'/></transform>
+<film type='hdrfilm'><integer name='width' value='4'/><integer name='height' value='3'/></film></sensor>
+<emitter type='constant'><rgb name='radiance' value='0.2 0.2 0.7'/></emitter>
+<emitter type='mrt_light'><point name='position' value='0 3 4'/><rgb name='intensity' value='1'/></emitter>
+<bsdf type='mrt_bsdf' id='a'><float name='alpha' value='0.1'/><float name='int_ior' value='1.5'/>
+<string name='fresnel' value='schlick'/><rgb name='diffuse_reflectance' value='0.5 0.4 0.3'/></bsdf>
+<shape type='sphere'><ref id='a'/></shape>
+<shape type='mrt_cone'><point name='apex' value='0 0 1'/><point name='base_center' value='0 0 0'/>
+<float name='radius' value='1'/><integer name='segments' value='8'/><ref id='a'/></shape>
+<shape type='mrt_plane'><vector name='normal' value='0 1 0'/><float name='distance' value='1'/>
+<ref id='a'/></shape></scene>"""
+# Words that stand where others stood; sizes of what is allocated stay small enough to be tried
+WORDS = [
+    *(
+        "",
+        "0",
+        "-1",
+        "1",
+        "3",
+        "1e39",
+        "-1e-46",
+        "nan",
+        "inf",
+        "1 2",
+        "1,2,3",
+        "0 0 0",
+        "a",
+        "é",
+        "$x",
+        "true",
+    ),
+    *(
+        "schlick",
+        "unity",
+        "none",
+        "mrt_bsdf",
+        "mrt_cone",
+        "mrt_light",
+        "mrt_plane",
+        "mrt_whitted",
+        "mrt_mesh",
+    ),
+    *("sphere", "perspective", "hdrfilm", "path", "diffuse", "scene", "a.xml", "../..", "to_world", "alpha"),
+    *("float", "integer", "rgb", "string", "point", "vector", "bsdf", "shape", "sensor", "ref", "transform"),
+    *("include", "default", "alias", "texture", "spectrum", "boolean", "translate", "scale", "id", "name"),
+    *("<", ">", "&", "&amp;", "&b;", "'", '"', "<!--", "]]>", "<a/>", "<scene version='3.0.0'/>", "\0", "\n"),
+]
+WORD_ENDS = " <>=/'"
+
+
+def _words(text: str) -> list[str]:
+    """The text in words and what separates them."""
+    parts, word = [], ""
+    for letter in text:
+        if letter in WORD_ENDS:
+            parts += [word, letter] if word else [letter]
+            word = ""
+        else:
+            word += letter
+    return [*parts, word]
+
+
+PARTS = _words(WHOLE)
+
+
+@one_folder
+@given(
+    changes=st.dictionaries(
+        st.integers(0, len(PARTS) - 1), st.one_of(st.sampled_from(WORDS), st.text(max_size=8)), max_size=4
+    ),
+    cut=st.one_of(st.none(), st.integers(0, len(PARTS))),
+)
+def test_any_scene_file_is_read_or_refused(
+    tmp_path: Path, variant: str, changes: dict[int, str], cut: int | None
+) -> None:
+    parts = [changes.get(i, part) for i, part in enumerate(PARTS[:cut])]
+    path = tmp_path / "a.xml"
+    path.write_bytes("".join(parts).encode(errors="surrogatepass"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MrtWarning)
+        try:
+            source = open_scene(path)
+        except (SceneError, UsageError) as error:
+            assert "a.xml" in str(error) or "integrator" in str(error)
+            assert "Traceback" not in str(error)
+            return
+    assert source.width > 0 and source.height > 0 and source.sensor is not None
+
+
+# ------------------------------------------------- PNG --------------------------------------------------
+
+
+def _png() -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3) * 5).save(stream, "PNG")
+    return stream.getvalue()
+
+
+PNG = _png()
+
+
+def _mended(data: bytes) -> bytes:
+    """The same chunks with right checksums, so that what is wrong in them is looked at."""
+    result, at = data[:8], 8
+    while at + 12 <= len(data):
+        (length,) = struct.unpack(">I", data[at : at + 4])
+        body = data[at + 4 : at + 8 + min(length, len(data))]
+        result += struct.pack(">I", length) + body + struct.pack(">I", zlib.crc32(body))
+        at += 12 + length
+    return result
+
+
+@one_folder
+@given(
+    changes=st.dictionaries(st.integers(0, len(PNG) - 1), st.integers(0, 255), max_size=4),
+    cut=st.one_of(st.none(), st.integers(0, len(PNG))),
+    mend=st.booleans(),
+)
+def test_any_picture_is_read_or_refused(
+    tmp_path: Path, variant: str, changes: dict[int, int], cut: int | None, mend: bool
+) -> None:
+    import mitsuba as mi
+
+    data = bytes(changes.get(i, byte) for i, byte in enumerate(PNG[:cut]))
+    # Two of the four bytes of width and height: 65535 x 65535 would fit no memory, before anything is read
+    data = data[:16] + bytes(len(data[16:18])) + data[18:20] + bytes(len(data[20:22])) + data[22:]
+    path = tmp_path / "p.png"
+    path.write_bytes(_mended(data) if mend else data)
+    try:
+        texture = mi.load_dict({"type": "mrt_texture", "filename": str(path)})
+    except RuntimeError as error:
+        assert 'mrt_texture: "filename"' in str(error)
+    else:
+        assert min(texture.resolution()) > 0
+
+
+# ---------------------------------------------- Parameters ----------------------------------------------
+
+PARAMETERS: dict[str, dict[str, Any]] = {
+    "mrt_bsdf": {
+        "alpha": 0.1,
+        "int_ior": 1.5,
+        "ext_ior": 1.0,
+        "diffuse_reflectance": 0.5,
+        "specular_reflectance": 1.0,
+        "fresnel": "schlick",
+        "f0": 0.04,
+    },
+    "mrt_cone": {"apex": [0, 0, 1], "base_center": [0, 0, 0], "radius": 1.0, "capped": True, "segments": 8},
+    "mrt_cylinder": {"p0": [0, 0, 1], "p1": [0, 0, 0], "radius": 1.0, "capped": True, "segments": 8},
+    "mrt_light": {"position": [0, 0, 1], "intensity": 1.0},
+    "mrt_plane": {"normal": [0, 0, 1], "distance": 0.0, "extent": 1.0},
+    "mrt_texture": {"filename": "none.png"},
+    "mrt_whitted": {
+        "max_depth": 3,
+        "clamp": True,
+        "min_contribution": 0.0,
+        "bounce_budget": "plain",
+        "sky": 1.0,
+    },
+}
+numbers = st.one_of(st.floats(width=32), st.floats(), st.sampled_from([0.0, -1.0, 1e39, math.nan, math.inf]))
+values = st.one_of(
+    numbers,
+    st.booleans(),
+    st.integers(-3, 300),
+    st.text(max_size=6),
+    st.lists(numbers, min_size=3, max_size=3),
+    st.builds(lambda x: {"type": "rgb", "value": [x, 0.5, 0.5]}, numbers),
+)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_parameter_is_taken_or_refused_by_name(variant: str, data: st.DataObject) -> None:
+    import mitsuba as mi
+
+    plugin = data.draw(st.sampled_from(sorted(PARAMETERS)))
+    name = data.draw(st.sampled_from(sorted(PARAMETERS[plugin])))
+    parameters = {**PARAMETERS[plugin], name: data.draw(values)}
+    try:
+        mi.load_dict({"type": plugin, **parameters})
+    except (RuntimeError, TypeError) as error:
+        text = str(error)
+        assert plugin in text or name in text
+        assert f'"{name}"' in text or f"[{name}]" in text or plugin == "mrt_texture", text
