@@ -286,8 +286,12 @@ def make(entry: Entry, folder: Path) -> None:
         if entry.language == "python":
             exec(compile(entry.code, next(iter(entry.pictures)), "exec"), {})
         else:
-            command = options.parse(shlex.split(entry.code)[1:])
-            cli.render(replace(command, format="png", quiet=True))
+            cli.render(replace(command(entry), format="png", quiet=True))
+
+
+def command(entry: Entry) -> options.Options:
+    """The options of an entry's command."""
+    return options.parse(shlex.split(entry.code)[1:])
 
 
 @contextlib.contextmanager

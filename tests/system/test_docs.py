@@ -1,40 +1,148 @@
-"""The documentation's code runs: notebooks, the tutorial, and the commands of the gallery."""
+"""The documentation's code runs: pages, commands, the worked example, the gallery and the ledger."""
 
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import shlex
+import shutil
+import subprocess
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
+PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("notebooks/*.md")])
 
 
-def cells(path: Path, language: str) -> str:
-    """All code of a page, in order."""
-    return "\n".join(re.findall(rf"```{re.escape(language)}\n(.*?)```", path.read_text(), flags=re.DOTALL))
+def blocks(path: Path, language: str) -> list[str]:
+    """The code blocks of a page in a language, in order."""
+    return re.findall(rf"```{re.escape(language)}\n(.*?)```", path.read_text(), flags=re.DOTALL)
 
 
-@pytest.mark.parametrize("path", sorted((DOCS / "notebooks").glob("*.md")), ids=lambda path: path.stem)
-def test_notebooks_run(path, run_python):
-    done = run_python(cells(path, "{code-cell}"))
+def code(path: Path) -> str:
+    """All Python of a page: cells of pages that are run, and what is only shown."""
+    return "\n".join(blocks(path, "{code-cell}") + blocks(path, "python"))
+
+
+@pytest.fixture
+def examples(tmp_path: Path) -> Path:
+    """The folder of examples, as pages find it: beside them."""
+    return Path(shutil.copytree(DOCS / "examples", tmp_path / "examples"))
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in PAGES if code(p) and p.stem != "tutorial"], ids=lambda path: path.stem
+)
+def test_pages_run(path: Path, run_python, examples: Path) -> None:
+    done = run_python(code(path), PYTHONPATH=str(examples))
     assert done.returncode == 0, done.stderr
 
 
-def test_the_scene_of_the_tutorial_renders(run_python, tmp_path):
-    done = run_python(cells(DOCS / "tutorial.md", "python"))
+def test_the_scene_of_the_tutorial_is_written_and_is_that_of_the_file(run_python, examples: Path) -> None:
+    from mrt_mitsuba import render
+
+    done = run_python(code(DOCS / "tutorial.md"))
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "mine.png").stat().st_size > 10_000
+    from mrt_mitsuba.output import read_exr
+
+    written = read_exr(examples.parent / "mine.exr").image
+    same = render(examples / "mine.xml", aa=3, aamode="sobel", focaldist=4.5, focalrange=0.5).image
+    assert written.shape == (300, 400, 3)
+    assert abs(written - same).mean() < 1e-6  # the same scene, but for the rounding of its camera's matrix
 
 
-def test_commands_of_the_gallery_are_understood(monkeypatch):
+def test_the_worked_example_passes_its_tests(examples: Path) -> None:
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_matte.py"]
+    variables = {key: value for key, value in os.environ.items() if key != "PYTEST_ADDOPTS"}
+    done = subprocess.run(
+        command, cwd=examples, env=variables, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stdout
+    assert " passed" in done.stdout and "skipped" not in done.stdout
+
+
+COMMANDS = [
+    (path, line.split(" #")[0].strip())
+    for path in PAGES
+    for block in blocks(path, "sh")
+    for line in block.splitlines()
+    if line.startswith("mrt")
+]
+
+
+@pytest.mark.parametrize(("path", "command"), COMMANDS, ids=lambda value: getattr(value, "stem", value))
+def test_commands_of_the_pages_are_understood(path: Path, command: str) -> None:
     from mrt_mitsuba import options
+    from mrt_mitsuba.validation import cli
 
+    name, *arguments = shlex.split(command)
+    if name == "mrt-validate":
+        assert set(arguments) <= {*cli.STUDIES, "all", "--quick"}
+        return
+    parsed = options.parse(arguments)
+    assert name == "mrt" and (parsed.scene is None or (DOCS / parsed.scene).is_file())
+
+
+def test_every_study_of_the_validation_is_explained() -> None:
+    from mrt_mitsuba.validation import cli
+
+    explained = re.findall(r"^\| `([\w-]+)` \|", (DOCS / "validation.md").read_text(), flags=re.MULTILINE)
+    assert sorted(explained) == sorted(cli.STUDIES)
+
+
+def test_every_plugin_is_in_the_reference() -> None:
+    from mrt_mitsuba import plugins
+
+    named = re.findall(r"mrt_mitsuba\.plugins\.(\w+)\.", (DOCS / "plugins.rst").read_text())
+    assert sorted(named) == sorted(plugins.MODULES)
+
+
+@pytest.fixture
+def module(monkeypatch: pytest.MonkeyPatch):
+    """Imports a module of the documentation's own."""
     monkeypatch.syspath_prepend(str(DOCS))
-    entries = importlib.import_module("gallery").entries()
-    assert len({entry.name for entry in entries}) == len(entries) > 12
+
+    def load(name: str) -> ModuleType:
+        return importlib.import_module(name)
+
+    return load
+
+
+def test_the_gallery_is_made_by_what_it_shows(module, tmp_path: Path) -> None:
+    """Python as it stands, one of its commands, and the names of all the others."""
+    gallery = module("gallery")
+    entries = [entry for section in gallery.sections() for entry in section.entries]
+    names = [name for entry in entries for name in entry.pictures]
+    assert len(set(names)) == len(names) > 30
     for entry in entries:
-        command, *arguments = shlex.split(entry.command)
-        assert command == "mrt" and options.parse(arguments).filename == entry.name
+        if entry.language == "sh":
+            command = gallery.command(entry)
+            assert [command.filename] == list(entry.pictures)
+    for entry in (entries[0], gallery.CONTOURS, gallery.HEIGHT_MAP, gallery.TEXTURES, gallery.LAYERS):
+        gallery.make(entry, tmp_path)
+        for name in entry.pictures:
+            assert (tmp_path / f"{name}.png").stat().st_size > 500
+
+
+def rows() -> list[str]:
+    sys.path.insert(0, str(DOCS))
+    try:
+        return [row.what for row in importlib.import_module("ledger").ROWS]
+    finally:
+        sys.path.remove(str(DOCS))
+
+
+@pytest.mark.parametrize("what", rows())
+def test_every_deviation_has_a_number(module, monkeypatch, what: str) -> None:
+    """At a size at which it takes no time; the page measures at its own."""
+    ledger = module("ledger")
+    small = {"width": 40, "height": 30}
+    monkeypatch.setattr(ledger, "PLAIN", {**ledger.PLAIN, **small})
+    monkeypatch.setattr(ledger, "SIZE", small)
+    row = next(row for row in ledger.ROWS if row.what == what)
+    assert re.search(r"\d", re.sub(r"scene \d", "", row.measure()))
+    assert row.default.split()[0] in (ledger.FAITHFUL, ledger.CORRECTED)
