@@ -35,7 +35,7 @@ LAYERS = {
     "bounces": "Y",
 }
 _unfinished: set[str] = set()  # temporary files
-_ROWS = 256  # rows converted to 8 bit at a time, to bound the memory of intermediate arrays
+_PIXELS = 2**18  # converted to 8 bit at a time, to bound the memory of intermediate arrays
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,12 @@ def write_png(path: str | os.PathLike[str], image: Image, *, tonemap: str = "rep
     """Write a linear picture [H, W, 3] as PNG; ``tonemap`` as in ``to_8bit``. Raises ``OutputError``."""
     from PIL import Image as PilImage
 
-    pixels = to_8bit(image, tonemap)
+    height, width = image.shape[:2]
+    picture = PilImage.new("RGB", (width, height))
+    for row, block in _blocks(image, tonemap):
+        picture.paste(PilImage.fromarray(block), (0, row))
     with replacing(path) as file:
-        PilImage.fromarray(pixels).save(file, format="PNG")
+        picture.save(file, format="PNG")
 
 
 def write_exr(
@@ -83,18 +86,32 @@ def write_exr(
     layers: Mapping[str, Image] | None = None,
     header: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a linear picture [H, W, 3] as float32 EXR, with layers (see ``channels``) and header attributes.
+    """Write a linear picture [H, W, 3] as float32 EXR, with layers and header attributes.
 
-    Header values are text or numbers; anything else is written as JSON. Raises ``OutputError``.
+    A layer is named by one channel ("depth.Z", [H, W]) or as a whole ("depth", [H, W]; "normal", [H, W, 3]),
+    with the channels of ``LAYERS``, else R, G, B or Y. Header values are text or numbers; anything else is
+    written as JSON. Raises ``OutputError``.
     """
     import OpenEXR
 
     attributes = {name: _attribute(value) for name, value in (header or {}).items()}
     attributes |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     # The library does not report a full disk when it opens the file itself, so the file is ours.
-    picture = OpenEXR.File(attributes, channels(image, layers or {}))
+    picture = OpenEXR.File(attributes, _channels(image, layers or {}))
     with replacing(path) as file:
-        picture.write(file)
+        picture.write(_Stream(file))
+
+
+class _Stream:
+    """A file that the EXR library writes to, a few rows at a time, by code in Python: in its own code, and in
+    that of Python's files, a signal would wait until all is written."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.tell, self.seek = file.tell, file.seek
+        self._file = file
+
+    def write(self, data: bytes) -> int:
+        return self._file.write(data)
 
 
 def read_exr(path: str | os.PathLike[str]) -> Picture:
@@ -126,16 +143,24 @@ def to_8bit(image: Image, tonemap: str = "report") -> NDArray[np.uint8]:
     """
     import numpy as np
 
-    convert = {"report": _report_levels, "srgb": _srgb_levels}[tonemap]
     pixels = np.empty(image.shape, np.uint8)
-    lost = 0
-    for row in range(0, len(image), _ROWS):
-        block = np.asarray(image[row : row + _ROWS], np.float32)
-        lost += int(np.isnan(block).any(axis=-1).sum())
-        pixels[row : row + _ROWS] = convert(np.nan_to_num(np.clip(block, 0, 1), nan=0.0))
-    if lost:
-        warnings.warn(f"{lost} pixels are NaN; the PNG holds 0 there", MrtWarning, stacklevel=3)
+    for row, block in _blocks(image, tonemap):
+        pixels[row : row + len(block)] = block
     return pixels
+
+
+def _blocks(image: Image, tonemap: str) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Yield the picture in 8 bit as ``to_8bit`` has it, some rows at a time with the number of the first."""
+    import numpy as np
+
+    convert = {"report": _report_levels, "srgb": _srgb_levels}[tonemap]
+    rows, lost = max(1, _PIXELS // image.shape[1]), 0
+    for row in range(0, len(image), rows):
+        block = np.asarray(image[row : row + rows], np.float32)
+        lost += int(np.isnan(block).any(axis=-1).sum())
+        yield row, convert(np.nan_to_num(np.clip(block, 0, 1), nan=0.0))
+    if lost:
+        warnings.warn(f"{lost} pixels are NaN; the PNG holds 0 there", MrtWarning, stacklevel=4)
 
 
 def _report_levels(values: Image) -> NDArray[np.uint8]:
@@ -151,30 +176,28 @@ def _srgb_levels(values: Image) -> NDArray[np.uint8]:
     return (encoded * 255 + 0.5).astype(np.uint8)
 
 
-def channels(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
-    """Return the EXR channels, [H, W] each, of a picture [H, W, 3] and its layers.
+def _channels(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
+    """Return what the EXR library takes: the picture [H, W, 3], and its layers by channel, [H, W] each.
 
-    A layer is named by one channel ("depth.Z", [H, W]) or as a whole ("depth", [H, W]; "normal", [H, W, 3]),
-    with the channels of ``LAYERS``, else R, G, B or Y. Raises ``OutputError`` if a shape does not fit.
+    Arrays are copied only where the library would. Raises ``OutputError`` if a shape does not fit.
     """
     import numpy as np
 
-    planes: dict[str, Image] = {}
-    for name, array in {"": image, **layers}.items():
+    result: dict[str, Image] = {"RGB": np.ascontiguousarray(image, np.float32)}
+    if result["RGB"].ndim != 3 or result["RGB"].shape[2] != 3:
+        raise OutputError(f"the picture has shape {result['RGB'].shape}; expected [H, W, 3]")
+    for name, array in layers.items():
         array = np.asarray(array, np.float32)
         if array.shape[:2] != np.shape(image)[:2] or array.ndim not in (2, 3):
-            raise OutputError(f"layer {name or 'R,G,B'} of shape {array.shape} does not fit the picture")
-        prefix = f"{name}." if name else ""
+            raise OutputError(f"layer {name} of shape {array.shape} does not fit the picture")
         array = np.atleast_3d(array)
         letters = LAYERS.get(name, "RGB" if array.shape[2] == 3 else "Y")
-        names = [name] if "." in name else [prefix + letter for letter in letters]
+        names = [name] if "." in name else [f"{name}.{letter}" for letter in letters]
         if len(names) != array.shape[2]:
-            raise OutputError(
-                f"layer {name or 'R,G,B'} has {array.shape[2]} channels in place of {len(names)}"
-            )
+            raise OutputError(f"layer {name} has {array.shape[2]} channels in place of {len(names)}")
         for index, channel in enumerate(names):
-            planes[channel] = np.ascontiguousarray(array[:, :, index])
-    return planes
+            result[channel] = np.ascontiguousarray(array[:, :, index])
+    return result
 
 
 def _attribute(value: Any) -> str | int | float:
