@@ -27,6 +27,7 @@ html_title = "mrt-mitsuba"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented_params"
 autodoc_member_order = "bysource"
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True

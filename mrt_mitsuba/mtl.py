@@ -60,12 +60,10 @@ def read_mtl(
     ``convention``:
 
     * ``report``: ``Kd`` diffuse, ``Ks`` specular, ``Ni`` roughness, first value of ``Ka`` index of refraction
-    (0: no
-      reflection). What a block leaves out is taken from ``DEFAULT_MATERIAL``.
+      (0: no reflection). What a block leaves out is taken from ``DEFAULT_MATERIAL``.
     * ``standard``: ``Kd``, ``Ks``, ``Ni`` index of refraction, ``Ns`` the exponent of a Blinn–Phong lobe,
-    which is
-      nearest to a roughness of √(2 / (Ns + 2)) (Walter et al., "Microfacet Models for Refraction", 2007,
-      §5.2). Defaults of the format's description: Kd 0.8, Ks 0, Ni 1, Ns 0.
+      which is nearest to a roughness of √(2 / (Ns + 2)) (Walter et al., "Microfacet Models for Refraction",
+      2007, §5.2). Defaults of the format's description: Kd 0.8, Ks 0, Ni 1, Ns 0.
 
     ``map_Kd`` names a picture that replaces Kd; it is looked for relative to ``folder`` (that of the OBJ
     file), then to the MTL file. One that is missing is named in a warning and Kd is used. Values may exceed
