@@ -63,10 +63,10 @@ def scene_6() -> Scene:
         Cylinder((1.15, 0.1, 0.1), (0.9, 0.1, 0.85), 0.1, bark),
     )
     firs = [
-        (3.0 * np.cos(a) - 0.4, 0.0, 3.0 * np.sin(a) - 1.2)
+        (float(3.0 * np.cos(a) - 0.4), 0.0, float(3.0 * np.sin(a) - 1.2))
         for a in np.radians([172, 196, 214, 233, 255, 276, 297, 318, 345])
     ]
-    crowns, trunks = models.pines([tuple(map(float, p)) for p in firs], 2.0, green, bark)
+    crowns, trunks = models.pines(firs, 2.0, green, bark)
     return Scene(
         title="a camp: tents, firs and a fire",
         camera=Camera((1.6, 1.5, 4.2), (-0.1, 0.5, -0.3)),

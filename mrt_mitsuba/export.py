@@ -39,7 +39,7 @@ def scene_dict(
     """
     if flavor not in FLAVORS:
         raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
-    given = {"width": width, "height": height, "fresnel": fresnel}
+    given: dict[str, Any] = {"width": width, "height": height, "fresnel": fresnel}
     given = {name: check(name, value) for name, value in given.items() if value is not None}
     runtime.use()
     scene = scene if isinstance(scene, Scene) else report_scene(scene)

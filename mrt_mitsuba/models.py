@@ -78,7 +78,7 @@ def tent(
 def rock(center: Vector, radius: float, material: Material, *, seed: int) -> Mesh:
     """An icosahedron with its corners moved in and out, sunk a little into the ground."""
     golden = (1 + 5**0.5) / 2
-    points = [(0, s, t * golden) for s in (-1, 1) for t in (-1, 1)]
+    points: list[tuple[float, float, float]] = [(0, s, t * golden) for s in (-1, 1) for t in (-1, 1)]
     points += [(y, z, x) for x, y, z in points] + [(z, x, y) for x, y, z in points]
     corners = np.array(points) / np.hypot(1, golden)
     faces = []

@@ -195,7 +195,8 @@ def _check(scene: Scene) -> None:
         raise SceneError(f"texturing is {scene.texturing!r}, but must be report or standard")
     for kind, objects in (("sphere", scene.spheres), ("cone", scene.cones), ("cylinder", scene.cylinders)):
         for i, thing in enumerate(objects):
-            if not _all_finite(_NUMBERS[kind](thing), _WIDTHS[kind]) or not thing.radius > 0:
+            numbers = _NUMBERS[kind](thing)  # the radius last
+            if not _all_finite(numbers, _WIDTHS[kind]) or not numbers[-1] > 0:
                 raise SceneError(f"{kind}s[{i}] is {thing!r}, but must have finite places and a radius > 0")
 
 
@@ -229,7 +230,7 @@ def _all_finite(values: Sequence[float], count: int) -> bool:
 class _Materials:
     """BSDF definitions by material: one for each that differs, referred to by the shapes."""
 
-    def __init__(self, to_bsdf):
+    def __init__(self, to_bsdf: Callable[[Material], dict[str, Any]]) -> None:
         self._to_bsdf = to_bsdf
         self._names: dict[Material, str] = {}
         self.definitions: dict[str, Any] = {}

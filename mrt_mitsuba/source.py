@@ -73,7 +73,9 @@ def open_scene(
     raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")
 
 
-def _report_source(name, scene: Scene, width, height, fresnel, integrator) -> Source:
+def _report_source(
+    name: str, scene: Scene, width: int | None, height: int | None, fresnel: str | None, integrator: Any
+) -> Source:
     import mitsuba as mi
 
     width, height = width or SIZE[0], height or SIZE[1]
@@ -92,16 +94,17 @@ def _report_source(name, scene: Scene, width, height, fresnel, integrator) -> So
     )
 
 
-def _own_source(name, scene, width, height, integrator) -> Source:
+def _own_source(name: str, scene: Any, width: int | None, height: int | None, integrator: Any) -> Source:
     if not scene.sensors():
         raise SceneError(f"{name} has no sensor: add one, so that there is something to look through")
     sensor = scene.sensors()[0]
-    size = tuple(int(n) for n in sensor.film().crop_size())
-    if (width or size[0], height or size[1]) != size:
+    own_width, own_height = (int(n) for n in sensor.film().crop_size())
+    if width not in (None, own_width) or height not in (None, own_height):
         raise UsageError(
-            f"{name} brings a film of {size[0]}x{size[1]}: change it there, or leave out width and height"
+            f"{name} brings a film of {own_width}x{own_height}: "
+            "change it there, or leave out width and height"
         )
-    return Source(name, scene, sensor, _integrator(integrator, scene), *size)
+    return Source(name, scene, sensor, _integrator(integrator, scene), own_width, own_height)
 
 
 def _integrator(integrator: Any, scene: Any) -> Any:

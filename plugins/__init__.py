@@ -51,8 +51,11 @@ def _load(variant: str, name: str) -> ModuleType:
     Mitsuba keeps registrations by variant, so once per variant is enough. Each copy gets a module name of its
     own; relative imports still resolve, because the package is the same.
     """
-    source = importlib.util.find_spec(f"{__name__}.{name}").origin
+    found = importlib.util.find_spec(f"{__name__}.{name}")
+    source = found.origin if found else None
     spec = importlib.util.spec_from_file_location(f"{__name__}.{name}_{variant}", source)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"the plugin module {name} is missing in {__name__}: install the package anew")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)

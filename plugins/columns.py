@@ -36,7 +36,7 @@ class Columns(list):
     def __sub__(self, other: Sequence[Any]) -> Columns:
         return Columns(a - b for a, b in zip(self, other, strict=True))
 
-    def __mul__(self, factor: Any) -> Columns:  # type: ignore[override]
+    def __mul__(self, factor: Any) -> Columns:
         return Columns(a * factor for a in self)
 
     def __truediv__(self, divisor: Any) -> Columns:
