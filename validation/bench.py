@@ -1,8 +1,9 @@
 """``make bench``: the times that matter to a user, as JSON, compared with an earlier file.
 
-For scenes 0 to 4 at 800x600, aa=4, every pixel supersampled: a warm render, its compilation, the floor of
-its rays alone, and the whole command with its default options. Seconds of two machines, or of one under
-another load, do not compare; ratios to the floor of the same run do.
+For scenes 0 to 4 at 800x600, aa=4, every pixel supersampled: a warm render, its kernels one by one, the floor
+of its rays alone, and the whole command with its default options; and this project's plugins against
+Mitsuba's own. Seconds of two machines, or of one under another load, do not compare; ratios to the floor, and
+to Mitsuba's plugins, of the same run do. Takes some five minutes.
 """
 
 from __future__ import annotations
@@ -10,14 +11,13 @@ from __future__ import annotations
 import argparse
 import gc
 import json
-import os
-import platform
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,115 +25,137 @@ from typing import Any
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import UsageError
 
+from . import kernels, machine, rivals
 from .floor import floor
 from .knobs import load
 from .warm import measure
 
+
+def _object(properties: Mapping[str, Any]) -> dict[str, Any]:
+    """The schema of an object that has all of these."""
+    return {"type": "object", "required": list(properties), "properties": dict(properties)}
+
+
+def _number(description: str) -> dict[str, str]:
+    return {"type": "number", "description": description}
+
+
+_TEXT, _COUNT = {"type": "string"}, {"type": "integer"}
+KERNEL = _object(
+    {
+        "stage": {"type": "string", "description": "pass of the render"},
+        "kind": {"type": "string", "description": "traces rays, computes, or Dr.Jit's name"},
+        "hash": _TEXT,
+        "launches": _COUNT,
+        "size": {"type": "integer", "description": "threads of all launches"},
+        "operations": {"type": "integer", "description": "length of the code"},
+        "codegen": _number("seconds that Dr.Jit takes to write the code, every time"),
+        "compile": _number("seconds of the compiler, once"),
+        "seconds": _number("running, median"),
+    }
+)
+SCENE = _object(
+    {
+        "render": _number("seconds, median of warm renders"),
+        "spread": _number("(slowest - fastest) / median"),
+        "kernels": _number("seconds in kernels, of one warm render"),
+        "compile": _number("seconds of the compiler in a first render"),
+        "floor": _number("seconds of the same rays through Mitsuba's queries"),
+        "render_to_floor": _number("median of ratios of render and floor, in turn"),
+        "rays_per_second": _number("of all kinds"),
+        "command": _number("seconds of the whole command, median, kernels in the cache"),
+        "command_first": _number("seconds of the whole command, with an empty cache"),
+        "rays": {"type": "object", "additionalProperties": _COUNT},
+        "each_kernel": {"type": "array", "items": KERNEL},
+    }
+)
+RIVALS = _object(
+    {
+        "median": _number("of the ratios of seconds, ours over theirs, in turn"),
+        "low": _number("lower quartile"),
+        "high": _number("upper quartile"),
+        "seconds": _number("ours, median"),
+        "other_seconds": _number("theirs, median"),
+        "kernels": _number("ratio of the seconds in kernels"),
+    }
+)
 SCHEMA = {
     "$schema": "https://json-schema.org/draft/2020-12/schema",
     "title": "mrt-mitsuba benchmark",
-    "type": "object",
-    "required": ["schema", "machine", "versions", "options", "scenes"],
-    "properties": {
-        "schema": {"const": 1},
-        "machine": {
-            "type": "object",
-            "properties": {"cores": {"type": "integer"}, "system": {"type": "string"}},
-        },
-        "versions": {"type": "object", "additionalProperties": {"type": "string"}},
-        "options": {"type": "object"},
-        "scenes": {
-            "type": "object",
-            "additionalProperties": {
-                "type": "object",
-                "required": [
-                    "render",
-                    "spread",
-                    "kernels",
-                    "compile",
-                    "floor",
-                    "render_to_floor",
-                    "command",
-                    "rays",
-                ],
-                "properties": {
-                    "render": {"type": "number", "description": "seconds, median of warm renders"},
-                    "spread": {"type": "number", "description": "(slowest - fastest) / median"},
-                    "kernels": {"type": "number", "description": "seconds in kernels, of one warm render"},
-                    "compile": {
-                        "type": "number",
-                        "description": "seconds of compilation in the first render",
-                    },
-                    "floor": {
-                        "type": "number",
-                        "description": "seconds of the same rays through Mitsuba's queries",
-                    },
-                    "render_to_floor": {"type": "number"},
-                    "command": {"type": "number", "description": "seconds of the whole command, median"},
-                    "rays": {"type": "object", "additionalProperties": {"type": "integer"}},
-                },
-            },
-        },
-    },
+    **_object(
+        {
+            "schema": {"const": 2},
+            "machine": _object({"cores": _COUNT, "system": _TEXT}),
+            "versions": {"type": "object", "additionalProperties": _TEXT},
+            "options": {"type": "object"},
+            "scenes": {"type": "object", "additionalProperties": SCENE},
+            "rivals": {"type": "object", "additionalProperties": RIVALS},
+        }
+    ),
 }
-SCENES = (0, 1, 2, 3, 4)
 COMPARED = ("render", "kernels", "floor", "render_to_floor", "command")
 
 
-def bench(
-    *, width: int = 800, height: int = 600, aa: int = 4, scenes: Sequence[int] = SCENES, repeats: int = 5
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Extent:
+    """How much to measure."""
+
+    width: int
+    height: int
+    aa: int
+    scenes: Sequence[int]
+    repeats: int
+    rivals: rivals.Extent
+
+
+FULL = Extent(800, 600, 4, (0, 1, 2, 3, 4), 5, rivals.Extent((400, 300), 16, (0, 1, 2, 3, 4), 5))
+QUICK = Extent(80, 60, 2, (0, 3), 1, rivals.Extent((40, 30), 4, (0,), 1))
+
+
+def bench(extent: Extent = FULL) -> dict[str, Any]:
     """Measure; return what ``SCHEMA`` describes."""
     mrt.register()
-    options = {"width": width, "height": height, "aa": aa}
+    options = {**asdict(extent), "aamode": "none"}
     return {
-        "schema": 1,
-        "machine": {"cores": os.cpu_count(), "system": f"{platform.system()} {platform.machine()}"},
-        "versions": _versions(),
-        "options": {**options, "aamode": "none", "repeats": repeats},
-        "scenes": {str(number): _scene(number, options, repeats) for number in scenes},
+        "schema": 2,
+        "machine": machine.machine(),
+        "versions": machine.versions(),
+        "options": json.loads(json.dumps(options)),  # as it is read back
+        "scenes": {str(number): _scene(number, extent) for number in extent.scenes},
+        "rivals": {one.pair.name: one.as_dict() for one in rivals.compare(extent.rivals)},
     }
 
 
-def _versions() -> dict[str, str]:
-    import drjit as dr
-    import mitsuba as mi
-
-    llvm = ".".join(map(str, dr.detail.llvm_version()))
-    return {
-        "mrt-mitsuba": mrt.__version__,
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
-        "llvm": llvm,
-        "python": platform.python_version(),
-    }
-
-
-def _scene(number: int, options: Mapping[str, int], repeats: int) -> dict[str, Any]:
-    scene = load(mrt.scene_dict(number, width=options["width"], height=options["height"]))
-    how = {"aa": options["aa"], "aamode": "none"}
-    warm = measure({"render": partial(mrt.render, scene, **how)}, repeats=repeats)["render"]
-    kernels = mrt.render(scene, **how).timings.kernels
-    under = floor(scene, repeats=repeats, **how)
-    del scene
+def _scene(number: int, extent: Extent) -> dict[str, Any]:
+    scene = load(mrt.scene_dict(number, width=extent.width, height=extent.height))
+    how = {"aa": extent.aa, "aamode": "none"}
+    render = partial(mrt.render, scene, **how)
+    each = kernels.profile(render, repeats=extent.repeats)
+    warm = measure({"": render}, repeats=extent.repeats)[""]
+    under = floor(scene, repeats=extent.repeats, **how)
+    del scene, render
     gc.collect()  # scenes that stay alive slow down the kernels of later ones
-    command = statistics.median(_command(number, options) for _ in range(max(1, repeats // 2)))
+    kernels.forget()
+    first, *commands = (_command(number, extent) for _ in range(1 + max(1, extent.repeats // 2)))
     return {
         "render": warm.seconds,
         "spread": warm.spread,
-        "kernels": kernels,
-        "compile": warm.result.timings.compile,
-        "floor": under.seconds,
-        "render_to_floor": warm.seconds / under.seconds,
-        "command": command,
+        "kernels": sum(k.seconds for k in each),
+        "compile": sum(k.compile for k in each),
+        "floor": under.time.other_seconds,
+        "render_to_floor": under.time.median,
+        "rays_per_second": sum(under.rays.values()) / warm.seconds,
+        "command": statistics.median(commands),
+        "command_first": first,
         "rays": under.rays,
+        "each_kernel": [asdict(k) for k in each],
     }
 
 
-def _command(number: int, options: Mapping[str, int]) -> float:
+def _command(number: int, extent: Extent) -> float:
     """Seconds of the command with its default options but for the size."""
     with tempfile.TemporaryDirectory() as folder:
-        size = [f"{name}={options[name]}" for name in ("width", "height", "aa")]
+        size = [f"{name}={getattr(extent, name)}" for name in ("width", "height", "aa")]
         start = time.perf_counter()
         subprocess.run(
             [sys.executable, "-m", "mrt_mitsuba.cli", f"{folder}/out", str(number), *size],
@@ -145,15 +167,27 @@ def _command(number: int, options: Mapping[str, int]) -> float:
 
 def table(now: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> str:
     """The figures as text; with an earlier run, each followed by its ratio to then."""
+    earlier = before or {"scenes": {}, "rivals": {}}
     lines = ["scene " + "".join(f"{name:>20}" for name in COMPARED)]
     for number, found in now["scenes"].items():
-        earlier = (before or {"scenes": {}})["scenes"].get(number)
-        cells = [
-            f"{found[name]:.3f}" + (f" ({found[name] / earlier[name]:.2f}x)" if earlier else "")
-            for name in COMPARED
-        ]
+        then = earlier["scenes"].get(number, {})
+        cells = [_cell(found[name], then.get(name)) for name in COMPARED]
         lines.append(f"{number:<6}" + "".join(f"{cell:>20}" for cell in cells))
+    width = max(map(len, now["rivals"]), default=0)
+    lines += ["", f"{'ours / theirs':<{width}}{'ratio of seconds':>20}    quartiles      goal"]
+    for name, found in now["rivals"].items():
+        cell = _cell(found["median"], earlier["rivals"].get(name, {}).get("median"))
+        goal = "" if "goal" not in found else f"  {found['goal']:g} {_verdict(found)}"
+        lines.append(f"{name:<{width}}{cell:>20}    {found['low']:.2f} to {found['high']:.2f}{goal}")
     return "\n".join(lines)
+
+
+def _verdict(found: Mapping[str, float]) -> str:
+    return "met" if found["median"] <= found["goal"] else "missed"
+
+
+def _cell(value: float, earlier: float | None) -> str:
+    return f"{value:.3f}" + (f" ({value / earlier:.2f}x)" if earlier else "")
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -162,8 +196,8 @@ def read(path: Path) -> dict[str, Any]:
         found = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise UsageError(f"cannot compare with {path}: {error}") from error
-    if not isinstance(found, dict) or found.get("schema") != 1 or "scenes" not in found:
-        raise UsageError(f"cannot compare with {path}: it is no file of this benchmark (schema 1)")
+    if not isinstance(found, dict) or found.get("schema") != 2 or "scenes" not in found:
+        raise UsageError(f"cannot compare with {path}: it is no file of this benchmark (schema 2)")
     return found
 
 
@@ -186,7 +220,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         before = read(given.compare) if given.compare else None
     except UsageError as error:
         parser.error(str(error))
-    now = bench(width=80, height=60, aa=2, scenes=(0, 3), repeats=1) if given.quick else bench()
+    with kernels.own_cache():  # seconds of compilation are then the compiler's
+        now = bench(QUICK if given.quick else FULL)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_text(json.dumps(now, indent=2) + "\n")
     print(table(now, before))

@@ -10,6 +10,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 from importlib import import_module, util
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from mrt_mitsuba.errors import MrtError, OutputError
 from mrt_mitsuba.output import check_target
 from mrt_mitsuba.progress import Progress, TerminalProgress
 from mrt_mitsuba.validation import report
+from mrt_mitsuba.validation.kernels import own_cache
 from mrt_mitsuba.validation.study import Study
 
 # A study by its name on the command line: the module of this package that runs it, imported when it is run
@@ -30,9 +32,14 @@ STUDIES = {
     "depth-of-field": "depth_of_field",
     "stability": "stability",
     "error-vs-time": "error_vs_time",
+    "cost": "cost",
+    "growth": "growth",
+    "rivals": "rivals",
     "objects": "objects",
     "acceleration": "acceleration",
 }
+# All about speed; the first name stands for all of them
+SPEED = ("error-vs-time", "cost", "growth", "rivals")
 EXTRAS = ("matplotlib", "jinja2", "scipy", "mpmath", "flip_evaluator")
 FOLDER = "validation-report"
 INTERRUPTED = 128 + signal.SIGINT
@@ -65,7 +72,8 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         choices=[*STUDIES, "all"],
         metavar="STUDY",
-        help=f"one or more of: {', '.join(STUDIES)}; or all",
+        help=f"one or more of: {', '.join(STUDIES)}; or all. error-vs-time is all studies of speed: "
+        f"{', '.join(SPEED[1:])} as well",
     )
     parser.add_argument(
         "--quick", action="store_true", help="fewer samples and cases: under two minutes in all"
@@ -81,9 +89,22 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _validate(options: argparse.Namespace) -> int:
-    names = list(STUDIES) if "all" in options.study else list(dict.fromkeys(options.study))
+    names = _named(options.study)
     _check_extras()
     _prepare_folder(options.out)
+    # With a cache of their own, studies of speed can tell how long compilation takes
+    own = nullcontext() if options.quick or not set(names) & set(SPEED) else own_cache()
+    with own:
+        return _run(names, options)
+
+
+def _named(given: Sequence[str]) -> list[str]:
+    """The studies that the names given stand for, each once, in the order of ``STUDIES``."""
+    chosen = {*given, *(SPEED if SPEED[0] in given else ())}
+    return [name for name in STUDIES if name in chosen or "all" in chosen]
+
+
+def _run(names: Sequence[str], options: argparse.Namespace) -> int:
     import matplotlib
 
     matplotlib.use("Agg")  # no window, whatever the user's settings say

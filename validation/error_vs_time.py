@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from . import cost, knobs
+from . import kernels, knobs
 from .image_tests import flip, rel_rmse
+from .points import Point, amounts, fastest, front
+from .readings import DEFAULT_CUT_OFF, reading
 from .study import Study
-from .warm import Warm, measure
+from .warm import measure
 
-TITLE = "Error against run time, and where the time goes"
+TITLE = "Error against run time"
 
 COLUMNS = (
     "setting",
@@ -24,14 +25,16 @@ COLUMNS = (
     "spread",
     "compile",
     "camera rays",
+    "mirror rays",
+    "shadow rays",
     "RMSE",
     "relRMSE",
     "max",
     "FLIP",
     "front",
 )
-SAME = 0.02  # errors closer than this are the same: no reason to wait longer
 ANSWERS = (0.03, 0.01, 0.003, 0.001)  # RMSE that the page finds settings for
+ENOUGH_SECONDS = 3.0  # seconds of a setting's warm renders, after which three of them do
 
 
 @dataclass(frozen=True)
@@ -42,47 +45,31 @@ class Extent:
     sampling: Sequence[int]  # scenes
     whitted: Sequence[int]
     path: Sequence[int]
-    lens: Sequence[int]
+    lens: Sequence[int]  # those that have a distance in focus
     cone: bool
     repeats: int
-    cost: cost.Extent
 
 
+SCENES = (0, 1, 2, 3, 4, 7, 9)
 FULL = Extent(
-    knobs.Extent((320, 240), (1, 2, 4, 8), 32, (1, 4, 16, 64, 256), 1024),
-    (0, 1, 2, 3, 4, 7, 9),
-    (0, 1, 2, 3, 4, 7, 9),
-    (0, 1, 2, 3, 4, 7, 9),
+    knobs.Extent((240, 180), (1, 2, 4, 8), 32, (1, 4, 16, 64, 256), 1024),
+    SCENES,
+    SCENES,
+    SCENES,
     (3, 4),
     True,
     5,
-    cost.FULL,
 )
-QUICK = Extent(knobs.Extent((64, 48), (1, 4), 12, (1, 16), 64), (0,), (0,), (0,), (3,), True, 1, cost.QUICK)
-
-
-@dataclass(frozen=True)
-class Point:
-    """One setting: what it costs and how far off it is."""
-
-    name: str
-    warm: Warm
-    rmse: float
-    rel_rmse: float
-    largest: float
-    flip: float
-
-    @property
-    def seconds(self) -> float:
-        return self.warm.seconds
+QUICK = Extent(knobs.Extent((64, 48), (1, 4), 12, (1, 16), 256), (0,), (0,), (0,), (3,), True, 1)
 
 
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
     extent = QUICK if quick else FULL
+    settings = extent.settings
     jobs: list[Callable[[], knobs.Trade]] = [
         *(
-            partial(make, n, extent.settings)
+            partial(make, n, settings)
             for make, numbers in (
                 (knobs.sampling, extent.sampling),
                 (knobs.whitted, extent.whitted),
@@ -91,27 +78,25 @@ def run(study: Study, *, quick: bool) -> None:
             )
             for n in numbers
         ),
-        *([partial(knobs.cone, extent.settings)] if extent.cone else []),
+        *([partial(knobs.cone, settings)] if extent.cone else []),
     ]
-    answers = []
+    study.text(
+        f"Pictures of {settings.size[0]}x{settings.size[1]}; errors are those to a converged picture, whose "
+        f"own error is estimated; seconds are medians of warm renders, all settings in turn, with (slowest - "
+        f"fastest) / median as their spread. Settings that no other beats in both make the Pareto front."
+    )
+    samplings: dict[str, list[Point]] = {}
     with study.stage("Error against time", len(jobs)) as advance:
         for make in jobs:
             trade = make()
             points, own_error = _measure(trade, extent.repeats)
             _report(study, trade, points, own_error)
             if trade.name == "sampling":
-                answers += _answers(trade, points)
+                samplings[trade.scene] = points
             del trade
             gc.collect()  # scenes that stay alive slow down the kernels of later ones
             advance(1)
-    study.table(
-        "settings",
-        "Which settings for an error of x?",
-        ("scene", "RMSE at most", "fastest setting", "its RMSE", "seconds"),
-        answers,
-        "Out of anti-aliasing modes, amounts and lattices; the error is that to a converged picture.",
-    )
-    cost.run(study, extent.cost)
+    _answer(study, samplings)
 
 
 def _measure(trade: knobs.Trade, repeats: int) -> tuple[list[Point], float]:
@@ -120,7 +105,8 @@ def _measure(trade: knobs.Trade, repeats: int) -> tuple[list[Point], float]:
     own = 0.0 if trade.check is trade.reference else _rmse(trade.check().image, reference)
     seen = None
     points = []
-    for name, warm in measure(trade.cases, repeats=repeats).items():
+    kernels.forget()
+    for name, warm in measure(trade.cases, repeats=repeats, enough=ENOUGH_SECONDS).items():
         image = warm.result.image
         perceived = flip(
             np.maximum(reference, 0), np.maximum(image, 0), exposures=seen.exposures if seen else None
@@ -134,22 +120,19 @@ def _measure(trade: knobs.Trade, repeats: int) -> tuple[list[Point], float]:
                 rel_rmse(image, reference),
                 float(np.abs(image - reference).max()),
                 perceived.mean,
+                _rays(trade.cases[name], warm.result),
             )
         )
     return points, own
 
 
+def _rays(render: knobs.Render, result: Any) -> dict[str, int]:
+    """Rays by kind; of integrators other than ours only those of the camera can be told."""
+    return dict((render(count_rays=True) if result.plan.integrator == "mrt_whitted" else result).rays)
+
+
 def _rmse(image: np.ndarray, reference: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(image.astype(np.float64) - reference))))
-
-
-def front(points: Sequence[Point]) -> list[Point]:
-    """The settings that gain error over all faster ones, fastest first."""
-    best: list[Point] = []
-    for point in sorted(points, key=lambda p: (p.seconds, p.rmse)):
-        if not best or point.rmse < (1 - SAME) * best[-1].rmse:
-            best.append(point)
-    return best
 
 
 # --------------------------------------------- What it says ---------------------------------------------
@@ -158,111 +141,111 @@ def front(points: Sequence[Point]) -> list[Point]:
 def _report(study: Study, trade: knobs.Trade, points: Sequence[Point], own_error: float) -> None:
     name = f"{trade.name}-{trade.scene}"
     ahead = front(points)
-    rows = [
-        (
-            p.name,
-            p.seconds,
-            p.warm.spread,
-            p.warm.result.timings.compile,
-            p.warm.result.rays["primary"],
-            p.rmse,
-            p.rel_rmse,
-            p.largest,
-            p.flip,
-            "yes" if p in ahead else "",
-        )
-        for p in points
-    ]
+    known = (
+        f"Its own error is about {own_error:.2g}."
+        if own_error
+        else "It has no error of its own: the same rays, and nothing left out."
+    )
     study.table(
         name,
         f"Scene {trade.scene}: {trade.title}",
         COLUMNS,
-        rows,
-        f"The reference's own error is about {own_error:.2g}. Seconds: median of warm runs, all settings in "
-        f"turn.",
+        [_row(p, p in ahead) for p in points],
+        f"Reference: {trade.truth}. {known} Compile: kernels that no setting above needed.",
     )
-    reading = _reading(trade, points, ahead, own_error)
-    study.plot(name, f"Scene {trade.scene}: {trade.title}", _figure(points, ahead, own_error), reading)
-    study.text(f"Scene {trade.scene}, {trade.title}: {reading}")
+    figure = _figure(points, ahead, own_error)
+    study.plot(name, f"Scene {trade.scene}: {trade.title}", figure, reading(trade.name, points))
     _hold(study, trade, points, own_error)
 
 
-def _reading(trade: knobs.Trade, points: Sequence[Point], ahead: Sequence[Point], own_error: float) -> str:
-    """Two sentences that follow from the points."""
-    fast, good = ahead[0], ahead[-1]
-    first = (
-        f"The fastest setting is {fast.name} ({1000 * fast.seconds:.3g} ms, RMSE {fast.rmse:.2g}), the one "
-        f"of least error "
-        f"{good.name} ({1000 * good.seconds:.3g} ms, {good.rmse:.2g})"
+def _row(p: Point, ahead: bool) -> tuple[Any, ...]:
+    rays = (p.rays.get(kind, "–") for kind in ("primary", "mirror", "shadow"))
+    compiled = p.warm.result.timings.compile
+    errors = (p.rmse, p.rel_rmse, p.largest, p.flip)
+    return (p.name, p.seconds, p.warm.spread, compiled, *rays, *errors, "yes" if ahead else "")
+
+
+def _answer(study: Study, samplings: dict[str, list[Point]]) -> None:
+    """Which settings for which error: of each scene, and one that does for all of them."""
+    if not samplings:
+        return
+    choices = {
+        scene: {limit: fastest(points, limit) for limit in ANSWERS} for scene, points in samplings.items()
+    }
+    columns = ["scene", *(f"RMSE at most {limit:g}" for limit in ANSWERS)]
+    rows = [[scene, *map(_choice, found.values())] for scene, found in choices.items()]
+    if len(samplings) > 1:
+        rows.append(["all of these", *(_for_all(samplings, limit) for limit in ANSWERS)])
+    study.table(
+        "choose",
+        "Which settings for an error of x?",
+        columns,
+        rows,
+        "The fastest of all modes of anti-aliasing, amounts and lattices: aamode, aa, lattice.",
+        first=True,
     )
-    slope = _slope(ahead)
-    first += (
-        f"; between them the error falls with the time to the power {slope:.2g}."
-        if slope is not None
-        else "."
-    )
-    behind = [p for p in points if p not in ahead]
-    if not behind:
-        return f"{first} Every setting is on the front: each is right for some error."
-    worst = max(behind, key=lambda p: _waste(p, ahead))
-    waste = _waste(worst, ahead)
-    return (
-        f"{first} {len(behind)} of {len(points)} settings are beaten in both; the worst buy is {worst.name}, "
-        f"{waste:.2g} times as long as a setting with no more error."
+    study.table(
+        "settings",
+        "The fastest settings, by error",
+        ("scene", "RMSE at most", "fastest setting", "its RMSE", "seconds"),
+        [
+            (scene, limit, p.name, p.rmse, p.seconds) if p else (scene, limit, "none of these", "", "")
+            for scene, found in choices.items()
+            for limit, p in found.items()
+        ],
     )
 
 
-def _slope(ahead: Sequence[Point]) -> float | None:
-    """Exponent of the error over the time along the front; None where that says nothing."""
-    usable = [p for p in ahead if p.rmse > 0]
-    if len(usable) < 3 or usable[-1].seconds < 2 * usable[0].seconds:
-        return None
-    return float(np.polyfit(np.log([p.seconds for p in usable]), np.log([p.rmse for p in usable]), 1)[0])
+def _choice(p: Point | None) -> str:
+    return f"{p.name}: {1000 * p.seconds:.3g} ms" if p else "none of these"
 
 
-def _waste(point: Point, ahead: Sequence[Point]) -> float:
-    return max((point.seconds / p.seconds for p in ahead if p.rmse <= point.rmse), default=1.0)
-
-
-def _answers(trade: knobs.Trade, points: Sequence[Point]) -> list[tuple[Any, ...]]:
-    rows = []
-    for limit in ANSWERS:
-        good = [p for p in points if p.rmse <= limit]
-        best = min(good, key=lambda p: p.seconds, default=None)
-        rows.append(
-            (trade.scene, limit, best.name, best.rmse, best.seconds)
-            if best
-            else (trade.scene, limit, "none of these", math.nan, math.nan)
-        )
-    return rows
+def _for_all(samplings: dict[str, list[Point]], limit: float) -> str:
+    """The setting that stays within the limit in every scene and takes the least time for all together."""
+    tables = [{p.name: p for p in points} for points in samplings.values()]
+    good = [name for name in tables[0] if all(table[name].rmse <= limit for table in tables)]
+    seconds = {name: sum(table[name].seconds for table in tables) for name in good}
+    best = min(seconds, key=seconds.__getitem__, default=None)
+    return f"{best}: {1000 * seconds[best]:.3g} ms" if best else "none of these"
 
 
 def _figure(points: Sequence[Point], ahead: Sequence[Point], own_error: float) -> Any:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    figure = Figure(figsize=(6.4, 5), layout="constrained")
     axes = figure.subplots()
-    shown = [p for p in points if p.rmse > 0]
-    for kind in dict.fromkeys(_kind(p.name) for p in shown):
-        of_kind = [p for p in shown if _kind(p.name) == kind]
-        axes.plot([p.seconds for p in of_kind], [p.rmse for p in of_kind], "o", markersize=5, label=kind)
-    line = [p for p in ahead if p.rmse > 0]
-    axes.plot(
-        [p.seconds for p in line],
-        [p.rmse for p in line],
-        "-",
-        color="0.3",
-        linewidth=1,
-        zorder=0,
-        label="front",
-    )
-    for p in line:
-        axes.annotate(p.name, (p.seconds, p.rmse), textcoords="offset points", xytext=(4, 4), fontsize=6)
+    errors = [p.rmse for p in points if p.rmse > 0]
+    bottom = 0.5 * min([*errors, own_error or np.inf])  # where settings without error are drawn
+
+    def draw(chosen: Sequence[Point], **style: Any) -> None:
+        axes.plot([1000 * p.seconds for p in chosen], [max(p.rmse, bottom) for p in chosen], **style)
+
+    for kind in dict.fromkeys(_kind(p.name) for p in points):
+        marker = "s" if kind.endswith("centered") else "o"
+        draw([p for p in points if _kind(p.name) == kind], linestyle="none", marker=marker, label=kind)
+    draw(ahead, color="0.3", linewidth=1, marker="o", markersize=11, fillstyle="none", label="Pareto front")
+    for p in ahead:
+        place = (1000 * p.seconds, max(p.rmse, bottom))
+        axes.annotate(p.name, place, textcoords="offset points", xytext=(7, 6), fontsize=8)
     if own_error > 0:
         axes.axhline(own_error, color="0.6", linestyle=":", label="error of the reference")
-    axes.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="RMSE")
-    axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
+    if len(errors) < len(points):
+        axes.axhline(bottom, color="0.9", linewidth=8, zorder=0, label="no error")
+    axes.set(xscale="log", yscale="log", xlabel="milliseconds, warm", ylabel="RMSE")
+    axes.margins(x=0.15, y=0.1)
+    _label_between_decades(axes.xaxis)
+    figure.legend(fontsize=8, ncols=3, loc="outside lower center")
     return figure
+
+
+def _label_between_decades(axis: Any) -> None:
+    """A logarithmic axis of a decade or two, labelled 10, 20, 50, 100."""
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    axis.set_major_formatter(plain)
+    axis.set_minor_locator(LogLocator(subs=(2, 5)))
+    axis.set_minor_formatter(plain)
 
 
 def _kind(name: str) -> str:
@@ -282,17 +265,15 @@ def _hold(study: Study, trade: knobs.Trade, points: Sequence[Point], own_error: 
     by_name = {p.name: p for p in points}
     where = f"scene {trade.scene}, {trade.name}"
     if trade.name == "sampling":
-        amounts = sorted({int(p.name.split()[1][3:]) for p in points})
-        least, most = (by_name[f"none aa={aa} centered"].rmse for aa in (amounts[0], amounts[-1]))
+        aas = amounts(points, "aa=")
+        least, most = (by_name[f"none aa={aa} centered"].rmse for aa in (aas[0], aas[-1]))
         # the error of a lattice at edges falls at least by the root of the samples
-        study.at_most(
-            f"{where}: RMSE at aa={amounts[-1]} / aa={amounts[0]}", most / least, 2 * amounts[0] / amounts[-1]
-        )
+        study.at_most(f"{where}: RMSE at aa={aas[-1]} / aa={aas[0]}", most / least, 2 * aas[0] / aas[-1])
         study.at_most(f"{where}: error of the reference / least error measured", own_error / most, 1)
     elif trade.name == "whitted":
         study.at_most(
             f"{where}: max error of the default cut-off",
-            by_name[f"min_contribution={1 / 16:g}/255"].largest,
+            by_name[DEFAULT_CUT_OFF].largest,
             0.5 / 255,
         )
         study.at_least(
@@ -301,7 +282,7 @@ def _hold(study: Study, trade: knobs.Trade, points: Sequence[Point], own_error: 
             by_name["max_depth=10"].rmse,
         )
     elif trade.name == "path":
-        spp = sorted({int(p.name.split("=")[1]) for p in points if p.name.startswith("path")})
+        spp = amounts(points, "spp=")
         ratio = by_name[f"path spp={spp[-1]}"].rmse / by_name[f"path spp={spp[0]}"].rmse
         # 1/sqrt(n) where noise is tame; scene 4's small highlights make rare, very bright pixels, in the
         # reference as well, and leave 0.6

@@ -5,13 +5,14 @@ What a picture costs beyond it goes into shading, planes, the bounce loop, means
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import mrt_mitsuba as mrt
+
+from .warm import Ratio, ratio
 
 
 @dataclass
@@ -70,11 +71,10 @@ class Recorder:
             counts[kind] += dr.width(rays)
         return dict(counts)
 
-    def replay(self) -> float:
-        """Ask again about all rays; return the seconds that takes."""
+    def replay(self) -> None:
+        """Ask again about all rays."""
         import drjit as dr
 
-        start = time.perf_counter()
         for kind, rays in zip(self.kinds, self.rays, strict=True):
             if kind == "shadow":
                 dr.eval(self.scene.ray_test(rays, False))
@@ -82,14 +82,13 @@ class Recorder:
                 hit = self.scene.ray_intersect_preliminary(rays, kind == "camera")
                 dr.eval(hit.t, hit.shape)
         dr.sync_thread()
-        return time.perf_counter() - start
 
 
 @dataclass(frozen=True)
 class Floor:
-    """Seconds of the ray queries alone, and rays by kind."""
+    """A render over the ray queries alone, and its rays by kind."""
 
-    seconds: float
+    time: Ratio
     rays: dict[str, int]
 
 
@@ -113,7 +112,7 @@ def record(scene: Any, **options: Any) -> Recorder:
 
 
 def floor(scene: Any, *, repeats: int = 3, **options: Any) -> Floor:
-    """Record a render of a scene and replay it: the median of some replays, after one that compiles."""
+    """Record a render of a scene, then replay its rays and render again in turn."""
     recorder = record(scene, **options)
-    recorder.replay()
-    return Floor(statistics.median(recorder.replay() for _ in range(repeats)), recorder.counts())
+    time = ratio(partial(mrt.render, scene, **options), recorder.replay, repeats=repeats)
+    return Floor(time, recorder.counts())

@@ -36,6 +36,7 @@ class Trade:
     scene: str
     name: str
     title: str
+    truth: str  # what the reference is
     reference: Render
     check: Render
     cases: dict[str, Render]
@@ -75,6 +76,7 @@ def sampling(number: int, extent: Extent) -> Trade:
         str(number),
         "sampling",
         "anti-aliasing mode, aa and lattice",
+        f"{extent.reference_aa}x{extent.reference_aa} centered samples in every pixel",
         partial(truth, aa=extent.reference_aa),
         partial(truth, aa=extent.reference_aa * 3 // 4),
         cases,
@@ -101,7 +103,15 @@ def whitted(number: int, extent: Extent) -> Trade:
     }
     cases["fresnel=schlick"] = partial(mrt.render, scene, **shared)
     truth = partial(mrt.render, exact, **shared, integrator=integrator(min_contribution=0.0))
-    return Trade(str(number), "whitted", "cut-off, bounce limit, Fresnel form", truth, truth, cases)
+    return Trade(
+        str(number),
+        "whitted",
+        "cut-off, bounce limit, Fresnel form",
+        "no cut-off, max_depth=10, exact Fresnel",
+        truth,
+        truth,
+        cases,
+    )
 
 
 def path(number: int, extent: Extent) -> Trade:
@@ -122,6 +132,7 @@ def path(number: int, extent: Extent) -> Trade:
         str(number),
         "path",
         "Whitted, direct and path at rising spp, against converged path",
+        f"path with spp={extent.reference_spp}",
         partial(truth, spp=extent.reference_spp, seed=101),
         partial(truth, spp=extent.reference_spp, seed=202),
         cases,
@@ -149,11 +160,12 @@ def lens(number: int, extent: Extent) -> Trade:
     cases |= {
         f"thinlens spp={4 * spp}": partial(mrt.render, through, **shared, spp=spp) for spp in extent.spp
     }
-    truth = partial(mrt.render, through, **shared, spp=extent.reference_spp)
+    truth = partial(mrt.render, through, **shared, spp=extent.reference_spp // 4)  # of four samples
     return Trade(
         str(number),
         "lens",
         "depth of field as a filter and through a lens",
+        f"a lens fitted to the report's blur, {extent.reference_spp} rays a pixel",
         partial(truth, seed=101),
         partial(truth, seed=202),
         cases,
@@ -173,7 +185,13 @@ def cone(extent: Extent) -> Trade:
     }
     truth = partial(mrt.render, _scene(9, extent), **shared)
     return Trade(
-        "9", "cone", "cone segments against the analytic cone", truth, truth, cases | {"analytic": truth}
+        "9",
+        "cone",
+        "cone segments against the analytic cone",
+        "the analytic cone",
+        truth,
+        truth,
+        cases | {"analytic": truth},
     )
 
 

@@ -6,7 +6,6 @@ import base64
 import csv
 import io
 import json
-import platform
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mrt_mitsuba.output import replacing, to_8bit, write_exr
+from mrt_mitsuba.validation import machine
 from mrt_mitsuba.validation.study import Bound, Picture, Plot, Study, Table
 
 LONG_TABLE = 12  # rows from which on a table of the page is folded
@@ -48,16 +48,11 @@ class Outcome:
 
 def header(*, quick: bool) -> dict[str, Any]:
     """What the figures were made with."""
-    import drjit as dr
-    import mitsuba as mi
-
-    import mrt_mitsuba
-
+    found = machine.versions()
     return {
-        "version": mrt_mitsuba.__version__,
-        "mitsuba": mi.MI_VERSION,
-        "drjit": dr.__version__,
-        "python": platform.python_version(),
+        "version": found.pop("mrt-mitsuba"),
+        **found,
+        **machine.machine(),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "quick": quick,
     }
@@ -84,16 +79,17 @@ def terminal_table(outcomes: Sequence[Outcome]) -> str:
     for outcome in outcomes:
         study = outcome.study
         lines += ["", f"{study.name}: {study.title} - {outcome.verdict.upper()} in {outcome.seconds:.1f} s"]
-        width = max((len(bound.name) for bound in study.bounds), default=0)
-        lines += [_bound_line(bound, width) for bound in study.bounds]
+        width = max((len(bound.name) for bound in (*study.bounds, *study.goals)), default=0)
+        lines += [_bound_line(bound, width, "ok", "MISSED") for bound in study.bounds]
+        lines += [_bound_line(goal, width, "goal", "slower") for goal in study.goals]
         lines += [f"  FAILED {outcome.failure.splitlines()[-1]}"] if outcome.failure else []
     return "\n".join(lines[1:])
 
 
-def _bound_line(bound: Bound, width: int) -> str:
-    mark = "ok    " if bound.holds else "MISSED"
+def _bound_line(bound: Bound, width: int, holds: str, missed: str) -> str:
+    mark = holds if bound.holds else missed
     sign = "<=" if bound.at_most else ">="
-    return f"  {mark} {bound.name:<{width}}  {bound.measured:>10.4g} {sign} {bound.limit:.4g}"
+    return f"  {mark:<6} {bound.name:<{width}}  {bound.measured:>10.4g} {sign} {bound.limit:.4g}"
 
 
 def write(folder: Path, outcomes: Sequence[Outcome], about: Mapping[str, Any]) -> None:

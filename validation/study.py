@@ -48,6 +48,7 @@ class Table:
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]
     note: str = ""
+    first: bool = False  # an answer: shown before the pictures
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,7 @@ class Study:
     progress: Progress = field(default_factory=Progress)
     parts: list[Table | Plot | Picture | str] = field(default_factory=list)
     bounds: list[Bound] = field(default_factory=list)
+    goals: list[Bound] = field(default_factory=list)  # of speed: shown, but the verdict does not hang on them
     figures: dict[str, float] = field(default_factory=dict)  # single numbers worth keeping, without a bound
 
     @property
@@ -98,18 +100,29 @@ class Study:
         self.bounds.append(bound)
         return bound
 
+    def goal(self, name: str, measured: float, limit: float, note: str = "") -> None:
+        """Show whether a time or a ratio of times is at most so much; a busy machine must fail no study."""
+        self.goals.append(Bound(name, float(measured), float(limit), True, note))
+
     def record(self, name: str, value: float) -> None:
         """Keep a number in the summary."""
         self.figures[name] = float(value)
 
     def table(
-        self, name: str, title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], note: str = ""
+        self,
+        name: str,
+        title: str,
+        columns: Sequence[str],
+        rows: Sequence[Sequence[Any]],
+        note: str = "",
+        *,
+        first: bool = False,
     ) -> None:
-        """Add a table."""
+        """Add a table; ``first``: before the pictures."""
         wrong = [row for row in rows if len(row) != len(columns)]
         if wrong:
             raise ValueError(f"table {name}: {wrong[0]} does not fit the columns {columns}")
-        self.parts.append(Table(name, title, columns, rows, note))
+        self.parts.append(Table(name, title, columns, rows, note, first))
 
     def plot(self, name: str, title: str, figure: Any, caption: str = "") -> None:
         """Add a matplotlib figure."""
@@ -136,19 +149,39 @@ class Study:
         return {
             "title": self.title,
             "passed": self.passed,
-            "bounds": [
-                {
-                    "name": b.name,
-                    "measured": _number(b.measured),
-                    "limit": _number(b.limit),
-                    "sense": "<=" if b.at_most else ">=",
-                    "holds": b.holds,
-                    "note": b.note,
-                }
-                for b in self.bounds
-            ],
+            "bounds": [_bound(b) for b in self.bounds],
+            "goals": [_bound(b) for b in self.goals],
             "figures": {name: _number(value) for name, value in self.figures.items()},
+            "tables": {
+                part.name: {
+                    "title": part.title,
+                    "columns": list(part.columns),
+                    "rows": [[_plain(value) for value in row] for row in part.rows],
+                }
+                for part in self.parts
+                if isinstance(part, Table)
+            },
         }
+
+
+def _bound(b: Bound) -> dict[str, Any]:
+    return {
+        "name": b.name,
+        "measured": _number(b.measured),
+        "limit": _number(b.limit),
+        "sense": "<=" if b.at_most else ">=",
+        "holds": b.holds,
+        "note": b.note,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """A cell of a table as JSON has it."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return _number(value)
+    return value if isinstance(value, (bool, int, str)) else str(value)
 
 
 def _number(value: float) -> float | str:

@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 
 @dataclass(frozen=True)
 class Warm:
@@ -19,16 +21,54 @@ class Warm:
     first: float  # seconds of the first run, in which kernels are compiled or read from the cache
 
 
-def measure(runs: Mapping[str, Callable[[], Any]], *, repeats: int = 3) -> dict[str, Warm]:
-    """Run everything once, then ``repeats`` times in turn, so that a load on the machine meets all alike."""
+LEAST_REPEATS = 3  # for a median that one disturbance does not move
+
+
+def measure(
+    runs: Mapping[str, Callable[[], Any]], *, repeats: int = 3, enough: float = float("inf")
+) -> dict[str, Warm]:
+    """Run everything once, then ``repeats`` times in turn, so that a load on the machine meets all alike.
+
+    Runs that have taken ``enough`` seconds, three times at least, are left out of further turns.
+    """
     results, first = {}, {}
     for name, run in runs.items():
         results[name], first[name] = _timed(run)
     times: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in range(repeats):
+    for turn in range(repeats):
         for name, run in runs.items():
+            if turn >= LEAST_REPEATS and sum(times[name]) >= enough:
+                continue
             times[name].append(_timed(run)[1])
     return {name: _summary(results[name], times[name], first[name]) for name in runs}
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """Seconds of one run over those of another, of pairs taken one after the other."""
+
+    median: float
+    low: float  # the lower and the upper quartile
+    high: float
+    seconds: float  # medians of the one and of the other
+    other_seconds: float
+
+
+def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> Ratio:
+    """Compare two runs in pairs, so that a load on the machine meets both; the first goes second next time.
+
+    Both run once before, which compiles their kernels.
+    """
+    pair = (run, other)
+    times: list[list[float]] = [[], []]
+    for one in pair:
+        one()
+    for number in range(repeats):
+        for index in (0, 1) if number % 2 == 0 else (1, 0):
+            times[index].append(_timed(pair[index])[1])
+    ratios = [a / b for a, b in zip(*times, strict=True)]
+    low, median, high = (float(q) for q in np.quantile(ratios, (0.25, 0.5, 0.75)))
+    return Ratio(median, low, high, *(statistics.median(t) for t in times))
 
 
 def _timed(run: Callable[[], Any]) -> tuple[Any, float]:

@@ -7,16 +7,18 @@ import json
 
 import pytest
 
-from mrt_mitsuba.validation import bench
+from mrt_mitsuba.validation import bench, rivals
 
 
 def _fits(value, schema) -> bool:
     """As much of JSON schema as the benchmark uses."""
     if "const" in schema:
         return value == schema["const"]
-    kinds = {"object": dict, "number": (int, float), "integer": int, "string": str}
+    kinds = {"object": dict, "array": list, "number": (int, float), "integer": int, "string": str}
     if not isinstance(value, kinds[schema["type"]]):
         return False
+    if schema["type"] == "array":
+        return all(_fits(item, schema["items"]) for item in value)
     if schema["type"] != "object":
         return True
     known, others = schema.get("properties", {}), schema.get("additionalProperties", None)
@@ -36,26 +38,40 @@ def found(tmp_path_factory):
 def test_file_follows_the_schema_and_a_broken_one_does_not(found):
     run = json.loads(found.read_text())
     assert _fits(run, bench.SCHEMA)
-    broken = copy.deepcopy(run)
-    del broken["scenes"]["0"]["floor"]
-    assert not _fits(broken, bench.SCHEMA)
+    for where, name in (
+        (lambda run: run["scenes"]["0"], "floor"),
+        (lambda run: run["scenes"]["3"]["each_kernel"][0], "launches"),
+        (lambda run: next(iter(run["rivals"].values())), "median"),
+    ):
+        broken = copy.deepcopy(run)
+        del where(broken)[name]
+        assert not _fits(broken, bench.SCHEMA)
     assert set(run["scenes"]) == {"0", "3"}
     assert run["scenes"]["0"]["rays"]["camera"] == 80 * 60 * 4
     assert all(run["scenes"]["3"][name] > 0 for name in bench.COMPARED)
+    tracing = [k for k in run["scenes"]["3"]["each_kernel"] if k["kind"] == "traces rays"]
+    assert [k["size"] for k in tracing] == [80 * 60 * 4] and tracing[0]["seconds"] > 0
+    assert len(run["rivals"]) == rivals.PAIRS
 
 
 def test_comparison_prints_ratios(found):
     before = bench.read(found)
     now = copy.deepcopy(before)
     now["scenes"]["3"]["render"] *= 2
-    line = bench.table(now, before).splitlines()[-1]
+    name = next(iter(now["rivals"]))
+    now["rivals"][name] |= {"median": 3 * before["rivals"][name]["median"], "goal": 0.0}
+    lines = bench.table(now, before).splitlines()
+    line = lines[lines.index("") - 1]
     assert line.startswith("3") and "(2.00x)" in line and line.count("(1.00x)") == 4
+    assert [("(3.00x)" in line, "missed" in line) for line in lines if line.startswith(name)] == [
+        (True, True)
+    ]
     assert "x)" not in bench.table(now)
 
 
 def test_a_file_of_another_kind_is_refused(tmp_path, capsys):
     other = tmp_path / "other.json"
-    for text in ("{}", "[1]", "no json", '{"schema": 2, "scenes": {}}'):
+    for text in ("{}", "[1]", "no json", '{"schema": 1, "scenes": {}}'):
         other.write_text(text)
         with pytest.raises(SystemExit):
             bench.main(["--compare", str(other), "--out", str(tmp_path / "b.json")])

@@ -1,48 +1,26 @@
-"""The study of error against time: the rays it records, the front it draws, the sentences it writes."""
+"""The study of error against time: the front it draws, the sentences it writes, the settings it advises."""
 
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.scenes import report_scene
-from mrt_mitsuba.validation import cost, error_vs_time, knobs
-from mrt_mitsuba.validation.floor import record
+from mrt_mitsuba.validation import error_vs_time, knobs
+from mrt_mitsuba.validation.points import Point, amounts, fastest, front
+from mrt_mitsuba.validation.readings import reading
 from mrt_mitsuba.validation.study import Plot, Study, Table
-from mrt_mitsuba.validation.warm import Warm, measure
+from mrt_mitsuba.validation.warm import Warm, measure, ratio
 
 TINY = error_vs_time.Extent(
-    knobs.Extent((40, 30), (1, 4), 8, (1, 16), 64),
-    (0,),
-    (),
-    (0,),
-    (),
-    True,
-    1,
-    cost.Extent((40, 30), 1, (0,), 1, (32, 64), (), (), (), ()),
+    knobs.Extent((40, 30), (1, 4), 8, (1, 16), 64), (0,), (), (0,), (), cone=True, repeats=1
 )
 
 
-def _point(name: str, seconds: float, rmse: float) -> error_vs_time.Point:
-    return error_vs_time.Point(name, Warm(None, seconds, 0.1, seconds), rmse, rmse, rmse, rmse)
-
-
-@pytest.mark.parametrize("number", [0, 3])
-def test_recorded_rays_are_those_of_the_render(number, variant):
-    scene = knobs.load(mrt.scene_dict(number, width=48, height=36))
-    options = {"aa": 2, "aamode": "none"}
-    before = mrt.render(scene, **options, count_rays=True)
-    recorder = record(scene, **options)
-    counts = recorder.counts()
-    assert (counts["camera"], counts["mirror"]) == (before.rays["primary"], before.rays["mirror"])
-    assert counts["shadow"] == before.rays["shadow"]
-    assert recorder.replay() > 0
-    # the scene renders as before
-    np.testing.assert_array_equal(mrt.render(scene, **options).image, before.image)
+def _point(name: str, seconds: float, rmse: float) -> Point:
+    return Point(name, Warm(None, seconds, 0.1, seconds), rmse, rmse, rmse, rmse, {"primary": 1})
 
 
 def test_front_is_what_nothing_beats_in_both():
@@ -53,27 +31,96 @@ def test_front_is_what_nothing_beats_in_both():
         _point("d", 4, 0.1),
         _point("e", 0.5, 0.9),
     ]
-    assert [p.name for p in error_vs_time.front(points)] == ["e", "a", "c"]
+    assert [p.name for p in front(points)] == ["e", "a", "c"]
 
 
-def test_reading_names_the_best_and_the_worst_buy():
-    points = [_point(f"n={n}", n, n**-0.5) for n in (1, 4, 16)] + [_point("slow", 40, 0.5)]
-    text = error_vs_time._reading(None, points, error_vs_time.front(points), 0.0)
-    assert "to the power -0.5" in text and "1 of 4 settings are beaten" in text
-    assert "worst buy is slow, 10 times as long" in text
+def test_advice_is_the_fastest_that_is_good_enough():
+    rough, good, slow = _point("rough", 1, 0.02), _point("good", 3, 0.002), _point("slow", 9, 0.001)
+    points = [rough, good, slow]
+    assert [fastest(points, error) for error in error_vs_time.ANSWERS] == [rough, good, good, slow]
+    assert fastest(points, 1e-4) is None
+    # for several scenes: good enough in each, and the least time in all
+    other = [_point("rough", 1, 0.001), _point("good", 2, 0.02), _point("slow", 5, 0.001)]
+    samplings = {"0": points, "1": other}
+    assert error_vs_time._for_all(samplings, 0.02) == "rough: 2e+03 ms"
+    assert error_vs_time._for_all(samplings, 0.01) == "slow: 1.4e+04 ms"
+    assert error_vs_time._for_all(samplings, 1e-4) == "none of these"
 
 
-def test_answers_take_the_fastest_that_is_good_enough():
-    points = [_point("rough", 1, 0.02), _point("good", 3, 0.002), _point("slow", 9, 0.001)]
-    rows = error_vs_time._answers(SimpleNamespace(scene="0"), points)
-    assert [row[2] for row in rows] == ["rough", "good", "good", "slow"]
+def test_amounts_are_read_from_names():
+    points = [_point(name, 1, 1) for name in ("path spp=16", "path spp=4", "mrt_whitted", "luma aa=2 report")]
+    assert (amounts(points, "spp="), amounts(points, "aa=")) == ([4, 16], [2])
+
+
+def _sampling(default: tuple[float, float], report: float, centered: float) -> list[Point]:
+    points = [_point("none aa=1 centered", 1, 0.01), _point("none aa=4 report", 4, report)]
+    points += [_point("none aa=4 centered", 4, centered), _point("sobel aa=4 report", *default)]
+    modes = {"luma": 3, "sobel": 2, "geometry": 4}
+    return points + [_point(f"{mode} aa=4 centered", 2, k * centered) for mode, k in modes.items()]
+
+
+def test_reading_of_anti_aliasing_follows_the_points():
+    text = reading("sampling", _sampling((2, 0.02), 0.02, 0.002))
+    assert "is matched by none aa=1 centered (1e+03 ms, RMSE 0.01), in 50% of its time" in text
+    assert "shifts the picture" in text and "RMSE of 0.02 at aa=4, where the centered one has 0.002" in text
+    assert "sobel comes nearest to it, with 2 times the error in 50% of the time" in text
+    text = reading("sampling", _sampling((0.5, 0.001), 0.002, 0.002))
+    assert "has less error than every faster setting" in text and "Both lattices come to the same" in text
+
+
+def test_reading_of_whitted_follows_the_points():
+    points = [_point(f"min_contribution={255 * c:g}/255", 2, 0) for c in knobs.CUT_OFFS]
+    points[1] = _point(points[1].name, 1, 1e-5)
+    limits = dict(zip(knobs.DEPTHS, (0.1, 0.001, 1e-4, 1e-5, 1e-5), strict=True))
+    points += [_point(f"max_depth={d}", d / 10, error) for d, error in limits.items()]
+    text = reading("whitted", [*points, _point("fresnel=schlick", 0.9, 0.03)])
+    assert "takes 50% of the time of none, for an RMSE of 1e-05" in text
+    assert "max_depth=2 is the least limit" in text and "takes 20% of the time of max_depth=10" in text
+    assert "90% of the time of the exact one and is up to 0.03 off" in text
+    assert "not to be seen" in reading("whitted", [*points, _point("fresnel=schlick", 0.9, 1e-4)])
+
+
+def test_reading_of_path_follows_the_points():
+    def points(noise: float) -> list[Point]:
+        found = [_point(f"path spp={n}", n, noise * n**-0.5) for n in (1, 4, 16)]
+        found += [_point(f"direct spp={n}", n, 0.5) for n in (1, 4, 16)]
+        return [*found, _point("mrt_whitted", 2, 0.3), _point("mrt_whitted, no clamp", 2, 0.2)]
+
+    text = reading("path", points(0.6))
+    assert "RMSE of 0.3 in 2e+03 ms, 0.2 without its clamp; path spp=4 has less, and takes 2 times" in text
+    assert "to the power -0.50; direct, without bounces, is left with 0.5" in text
+    assert "no path up to spp=16 has less" in reading("path", points(9.0))
+    assert "direct does no worse" in reading("path", points(9.0))
+
+
+def test_readings_of_lens_and_cone_follow_the_points():
+    filters = [_point("filter report", 1, 0.3), _point("filter corrected", 2, 0.2)]
+    lenses = [_point("thinlens spp=4", 4, 0.4), _point("thinlens spp=16", 16, 0.1)]
+    text = reading("lens", filters + lenses)
+    assert "thinlens spp=16 is the fastest lens" in text and "takes 8 times as long" in text
+    assert "No lens up to thinlens spp=4" in reading("lens", [*filters, lenses[0]])
+    exact, coarse, fine = (
+        _point("analytic", 3, 0),
+        _point("8 segments", 1, 0.1),
+        _point("32 segments", 2, 1e-4),
+    )
+    text = reading("cone", [coarse, fine, exact])
+    assert "below half a step of 8 bits is 32 segments" in text and "takes 1.5 times as long" in text
+    assert "No mesh" in reading("cone", [coarse, exact])
 
 
 def test_times_are_medians_of_runs_in_turn():
-    order = []
-    found = measure({name: (lambda name=name: order.append(name) or name) for name in "ab"}, repeats=3)
+    order: list[str] = []
+    runs = {name: (lambda name=name: order.append(name) or name) for name in "ab"}
+    found = measure(runs, repeats=3)
     assert order == list("ab" * 4) and found["b"].result == "b"
     assert found["a"].seconds >= 0 and found["a"].spread >= 0
+    order.clear()
+    measure(runs, repeats=9, enough=0)  # a median needs three
+    assert order == list("ab" * 4)
+    order.clear()
+    assert ratio(runs["a"], runs["b"], repeats=3).median > 0
+    assert order == list("ab" + "ab" + "ba" + "ab")
 
 
 def test_meshed_cone_closes_on_the_analytic_one(variant):
@@ -94,17 +141,21 @@ def test_quick_study_holds(monkeypatch, variant):
     study = Study("error-vs-time", error_vs_time.TITLE)
     error_vs_time.run(study, quick=True)
     assert study.passed, [str(bound) for bound in study.bounds if not bound.holds]
-    assert {part.name for part in study.parts if isinstance(part, Plot)} == {"sampling-0", "path-0", "cone-9"}
+    plots = {part.name: part for part in study.parts if isinstance(part, Plot)}
+    assert plots.keys() == {"sampling-0", "path-0", "cone-9"} and all(p.caption for p in plots.values())
     tables = {part.name: part for part in study.parts if isinstance(part, Table)}
-    assert {"settings", "floor", "plan", "growth", "exponents"} <= tables.keys()
-    front = sorted((row[1], row[5]) for row in tables["sampling-0"].rows if row[-1] == "yes")
-    assert front and [error for _, error in front] == sorted((error for _, error in front), reverse=True)
+    assert {"choose", "settings"} <= tables.keys() and tables["choose"].first
+    rows = [dict(zip(error_vs_time.COLUMNS, row, strict=True)) for row in tables["sampling-0"].rows]
+    ahead = sorted((row["seconds"], row["RMSE"]) for row in rows if row["front"])
+    assert ahead and [error for _, error in ahead] == sorted((error for _, error in ahead), reverse=True)
+    assert rows[0]["camera rays"] == 40 * 30 and rows[0]["shadow rays"] > 0
+    by_path = {row[0]: row for row in tables["path-0"].rows}
+    assert by_path["path spp=16"][4:7] == (40 * 30 * 16, "–", "–")
 
 
 def test_samples_that_do_not_help_are_noticed(monkeypatch, variant):
     render = mrt.render
-    one = dataclasses.replace(TINY, path=(), cone=False)
-    monkeypatch.setattr(error_vs_time, "QUICK", one)
+    monkeypatch.setattr(error_vs_time, "QUICK", dataclasses.replace(TINY, path=(), cone=False))
 
     def stuck(scene, **options):
         """Four samples a side are one."""

@@ -1,0 +1,76 @@
+"""The study of growth: its exponents, and that it notices code that grows."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mrt_mitsuba.scenes import report_scene
+from mrt_mitsuba.validation import growth
+from mrt_mitsuba.validation.study import Plot, Study, Table
+
+
+def test_exponents_are_recovered_with_an_interval():
+    sizes = [10**k for k in range(6)]
+    found = growth.fit({n: 0.5 * n**0.7 for n in sizes})
+    assert (found.value, found.half_width) == (pytest.approx(0.7), pytest.approx(0, abs=1e-9))
+    assert found.sizes == sizes[-4:] and found.scale == pytest.approx(0.5)
+    noise = np.random.default_rng(0).normal(0, 0.1, (200, 6))
+    fits = [growth.fit({n: n**0.7 * np.exp(e) for n, e in zip(sizes, row, strict=True)}) for row in noise]
+    inside = np.mean([abs(f.value - 0.7) <= f.half_width for f in fits])
+    assert inside == pytest.approx(growth.LEVEL, abs=0.05)  # three standard deviations of 200 trials
+    assert growth.fit({1: 1.0, 10: 2.0}).half_width == np.inf  # two points tell no interval
+
+
+def test_readings_follow_the_interval():
+    def text(value: float, half_width: float) -> str:
+        return growth._reading(growth.Exponent(value, half_width, 1.0, (1, 10)))
+
+    assert "2 times as long: less than" in text(0.301, 0.1)
+    assert "more than in proportion" in text(1.3, 0.1)
+    assert "not told apart from in proportion" in text(0.95, 0.1)
+    assert "no growth" in text(0.1, 1.5)
+
+
+@pytest.mark.parametrize("what", growth.SERIES)
+def test_series_grow_in_what_they_are_named_after(what):
+    scene, (width, height), options = growth.SERIES[what](49)
+    sizes = {
+        "pixels": width * height,
+        "samples a pixel": options["aa"] ** 2,
+        "spheres": len(scene.spheres),
+        "triangles": sum(len(m.faces) for m in scene.meshes),
+        "lights": len(scene.lights),
+        "bounces": options.get("integrator", {}).get("max_depth"),
+    }
+    assert sizes[what] == pytest.approx(49, abs=1)  # two triangles fill a square
+
+
+def test_small_study_holds_and_draws(monkeypatch, variant):
+    extent = growth.Extent({"lights": (1, 9, 12)}, 1)
+    monkeypatch.setattr(growth, "QUICK", extent)
+    study = Study("growth", growth.TITLE)
+    growth.run(study, quick=True)
+    assert study.passed, [str(bound) for bound in study.bounds if not bound.holds]
+    assert [part.name for part in study.parts if isinstance(part, Plot)] == ["growth"]
+    rows = {part.name: part.rows for part in study.parts if isinstance(part, Table)}
+    assert [row[1] for row in rows["growth"]] == [1, 9, 12]
+    operations = [row[-1] for row in rows["growth"]]
+    assert operations[1] == pytest.approx(operations[2], rel=0.01)  # a loop over lights, however many
+    assert operations[1] > 0
+
+
+def test_code_that_grows_is_noticed(monkeypatch, variant):
+    """Planes are code of their own, each."""
+
+    def planes(count: int) -> growth.Job:
+        scene = report_scene(0)
+        return dataclasses.replace(scene, planes=scene.planes * count), (32, 24), {"aa": 1}
+
+    monkeypatch.setitem(growth.SERIES, "planes", planes)
+    monkeypatch.setattr(growth, "QUICK", growth.Extent({"planes": (1, 2, 6)}, 1))
+    study = Study("growth", growth.TITLE)
+    growth.run(study, quick=True)
+    assert [bound.holds for bound in study.bounds if "operations" in bound.name] == [False]

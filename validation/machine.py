@@ -1,0 +1,29 @@
+"""What figures were measured with: as much of the machine and the software as one needs to compare them."""
+
+from __future__ import annotations
+
+import os
+import platform
+from typing import Any
+
+
+def machine() -> dict[str, Any]:
+    """Cores and system, without a name."""
+    return {"cores": os.cpu_count() or 1, "system": f"{platform.system()} {platform.machine()}"}
+
+
+def versions() -> dict[str, str]:
+    """Of everything that bears on speed or accuracy, by name."""
+    import drjit as dr
+    import mitsuba as mi
+
+    import mrt_mitsuba
+
+    usable = dr.has_backend(dr.JitBackend.LLVM)
+    return {
+        "mrt-mitsuba": mrt_mitsuba.__version__,
+        "mitsuba": mi.MI_VERSION,
+        "drjit": dr.__version__,
+        "llvm": ".".join(map(str, dr.detail.llvm_version())) if usable else "none",
+        "python": platform.python_version(),
+    }
