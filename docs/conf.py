@@ -40,14 +40,24 @@ def generate(app: object) -> None:
     import gallery
     import ledger
 
-    from mrt_mitsuba import options
-
     mrt_mitsuba.register()  # plugin classes derive from a variant's classes, so autodoc needs one
     folder = HERE / "_generated"
     folder.mkdir(exist_ok=True)
-    (folder / "usage.txt").write_text(options.usage())
+    (folder / "options.inc.md").write_text(options_table())
     gallery.build(folder)
     ledger.build(folder)
+
+
+def options_table() -> str:
+    """The options of the command as a table."""
+    from mrt_mitsuba import options
+
+    lines = ["| option | meaning | default |", "|---|---|---|"]
+    for name, field in options.TABLE.items():
+        form = field.metadata["kind"].form.replace("|", "\\|")
+        default = field.metadata["shown"] or field.default
+        lines.append(f"| `{name}={form}` | {field.metadata['help']} | {default} |")
+    return "\n".join(lines) + "\n"
 
 
 def mathml(display: bool):  # type: ignore[no-untyped-def]
