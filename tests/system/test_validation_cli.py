@@ -48,6 +48,7 @@ def good(study: Study, *, quick: bool) -> None:
     study.text("What it does, in a <b>sentence</b>.")
     study.at_most("largest error", 1e-6, 1e-5, "a reason")
     study.at_least("power", 0.9, 0.5)
+    study.goal("ratio of seconds", 1.4, 1.3, "taken in turn")
     study.record("quick", quick)
     study.table("errors", "Errors", ["metal", "error"], [["Ag", 0.123456789], ["Au", np.float32(0.5)]])
     study.plot("curve", "A curve", figure, "rises")
@@ -106,7 +107,12 @@ def test_everything_a_study_finds_is_written(studies, tmp_path: Path, capsys) ->
     with open(folder / "good-errors.csv", newline="") as file:
         assert list(csv.reader(file)) == [["metal", "error"], ["Ag", "0.123456789"], ["Au", "0.5"]]
     np.testing.assert_array_equal(read_exr(folder / "good-ball.exr").image, np.float32(0.25))
-    assert "ok     largest error" in capsys.readouterr().out
+    table = found["tables"]["errors"]
+    assert (table["columns"], table["rows"]) == (["metal", "error"], [["Ag", 0.123456789], ["Au", 0.5]])
+    (goal,) = found["goals"]  # missed, and yet the study has passed
+    assert (goal["name"], goal["measured"], goal["holds"]) == ("ratio of seconds", 1.4, False)
+    shown = capsys.readouterr().out
+    assert "ok     largest error" in shown and "slower ratio of seconds" in shown
 
 
 def test_page_is_self_contained_with_pictures_before_tables(studies, tmp_path: Path) -> None:
@@ -119,8 +125,35 @@ def test_page_is_self_contained_with_pictures_before_tables(studies, tmp_path: P
     assert max(i for i, tag in enumerate(page.tags) if tag == "img") < page.tags.index("table")
     assert "script" not in page.tags and "b" not in page.tags  # texts are texts
     assert '<meta name="viewport" content="width=device-width' in text
-    for shown in (TITLE, "What it does, in a <b>sentence</b>.", "0.1235", "1e-06", "a reason", "✓ holds"):
+    for shown in (
+        TITLE,
+        "What it does, in a <b>sentence</b>.",
+        "0.1235",
+        "1e-06",
+        "a reason",
+        "✓ holds",
+        "✗ slower",
+        "cores",
+    ):
         assert shown in page.text, shown
+
+
+def test_a_table_that_answers_comes_before_the_pictures(studies, tmp_path: Path) -> None:
+    def answer(study: Study, *, quick: bool) -> None:
+        good(study, quick=quick)
+        study.table("answer", "What to do", ["setting"], [["aa=2"]], first=True)
+
+    studies(answer=answer)
+    cli.main(["answer", "--out", str(tmp_path)])
+    text = Page((tmp_path / "index.html").read_text("utf-8")).text
+    assert text.index("What to do") < text.index("A curve") < text.index("Errors")
+
+
+def test_names_stand_for_studies() -> None:
+    speed = list(cli.SPEED)
+    assert cli._named(["error-vs-time"]) == speed and cli._named(["growth"]) == ["growth"]
+    assert cli._named(["error-vs-time", "laws", "growth"]) == ["laws", *speed]
+    assert cli._named(["laws", "all"]) == list(cli.STUDIES)
 
 
 @pytest.mark.parametrize(
