@@ -46,7 +46,10 @@ types: $(STAMP)-dev
 docs: $(STAMP)-docs
 	$(BIN)/python -m sphinx -W -q -b html docs docs/_build
 
-package: $(STAMP)-dev
+# Both are tried, in an environment of their own, before they are left in dist/
+package: $(STAMP)-dev $(STAMP)-test
+	$(BIN)/python -m pytest -m package
+	rm -rf build/lib dist
 	$(BIN)/python -m build
 
 clean:

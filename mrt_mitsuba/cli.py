@@ -13,7 +13,7 @@ from typing import Any
 
 from mrt_mitsuba.errors import MrtError, MrtWarning, UsageError
 from mrt_mitsuba.interrupt import Terminated, ending_soon, leave_now
-from mrt_mitsuba.options import Options, parse, usage
+from mrt_mitsuba.options import TABLE, Options, parse, usage
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
@@ -132,14 +132,19 @@ def banner(options: Options) -> str:
         reach = scene.focal_range if reach is None else reach
     lines = {
         "Scene": options.scene if options.scene is not None else options.scene_number,
-        "Width": options.width or "from the file",
-        "Height": options.height or "from the file",
+        "Width": options.width or _from_file(options, "width"),
+        "Height": options.height or _from_file(options, "height"),
         "AA": options.aa,
         "AA mode": options.aamode,
         "F distance": distance or "off",
         "F range": reach if distance else "off",
     }
     return "\n".join(f"{name + ':':<12}{value}" for name, value in lines.items())
+
+
+def _from_file(options: Options, name: str) -> object:
+    """An OBJ file has no size, unlike other scenes in files."""
+    return TABLE[name].default if options.shows_model() else "from the file"
 
 
 def _help(arguments: list[str]) -> int:
