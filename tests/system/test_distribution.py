@@ -30,8 +30,6 @@ FOLDERS = {
 NOT_SOURCE = shutil.ignore_patterns(
     ".git", ".venv", "build", "dist", "out", "*.egg-info", "__pycache__", ".*_cache", "_build"
 )
-    ".git", ".venv", "build", "dist", "out", "*.egg-info", "__pycache__", ".*_cache"
-)
 
 
 def run(*command: str | Path, cwd: Path) -> str:
