@@ -318,6 +318,6 @@ def _chase_noise(study: Study, extent: Extent) -> None:
 
 def _contrast(image: np.ndarray) -> np.ndarray:
     """Largest less smallest luma of the 3x3 neighbourhood, the border left out, [H - 2, W - 2]."""
-    luma = np.sqrt(image @ np.float32(filters.edges.LUMA_WEIGHTS))
+    luma = np.sqrt(image @ np.array(filters.edges.LUMA_WEIGHTS, np.float32))
     windows = np.lib.stride_tricks.sliding_window_view(luma, (3, 3))
     return windows.max(axis=(2, 3)) - windows.min(axis=(2, 3))

@@ -128,7 +128,7 @@ def bench(extent: Extent = FULL) -> dict[str, Any]:
 
 def _scene(number: int, extent: Extent) -> dict[str, Any]:
     scene = load(mrt.scene_dict(number, width=extent.width, height=extent.height))
-    how = {"aa": extent.aa, "aamode": "none"}
+    how: dict[str, Any] = {"aa": extent.aa, "aamode": "none"}
     render = partial(mrt.render, scene, **how)
     each = kernels.profile(render, repeats=extent.repeats)
     warm = measure({"": render}, repeats=extent.repeats)[""]

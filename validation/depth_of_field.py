@@ -107,7 +107,7 @@ def compare(scene: Scene, extent: Extent) -> Comparison:
         layers=["depth", "normal"],
     )
     depth = sharp.layers["depth.Z"]
-    focus = {"focal_distance": scene.focal_distance, "focal_range": scene.focal_range}
+    focus: dict[str, Any] = {"focal_distance": scene.focal_distance, "focal_range": scene.focal_range}
     pictures = {"sharp": sharp.image}
     pictures |= {mode: filters.gaussian_dof(sharp.image, depth, **focus, mode=mode) for mode in MODES}
     lens = fit_lens(scene, depth)

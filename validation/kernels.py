@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mrt_mitsuba.progress import Progress
+from mrt_mitsuba.progress import Advance, Progress
 
 CACHE = "DRJIT_CACHE_DIR"
 PREFIX = "mrt-kernels-"
@@ -108,7 +108,7 @@ class _Watch(Progress):
     entries: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
 
     @contextmanager
-    def stage(self, title: str, total: int, message: str = "") -> Iterator[Callable[[int], None]]:
+    def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
         self._take(OUTSIDE)
         with super().stage(title, total, message) as advance:
             yield advance

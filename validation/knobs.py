@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -17,7 +17,7 @@ from mrt_mitsuba.scenes import report_scene
 
 from .depth_of_field import Lens, fit_lens
 
-Render = Callable[[], Any]  # returns a ``Result``
+Render = Callable[..., Any]  # returns a ``Result``
 
 MODES = ("none", "luma", "sobel", "geometry")
 CUT_OFFS = (0.0, 1 / 16 / 255, 1 / 255, 4 / 255, 16 / 255)
@@ -39,7 +39,7 @@ class Trade:
     truth: str  # what the reference is
     reference: Render
     check: Render
-    cases: dict[str, Render]
+    cases: Mapping[str, Render]
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def sampling(number: int, extent: Extent) -> Trade:
 def whitted(number: int, extent: Extent) -> Trade:
     """Cut-off, bounce limit and form of the Fresnel factor, at the same samples."""
     scene, exact = _scene(number, extent), _scene(number, extent, fresnel="dielectric")
-    shared = {"aa": 2, "aamode": "none"}
+    shared: dict[str, Any] = {"aa": 2, "aamode": "none"}
 
     def integrator(**parameters: Any) -> Any:
         return {"type": "mrt_whitted", **parameters}
@@ -117,7 +117,7 @@ def whitted(number: int, extent: Extent) -> Trade:
 def path(number: int, extent: Extent) -> Trade:
     """Mitsuba's path and direct at rising spp, and mrt_whitted, against converged path."""
     scene = _scene(number, extent)
-    shared = {"aa": 1, "aamode": "none"}
+    shared: dict[str, Any] = {"aa": 1, "aamode": "none"}
     cases = {
         f"{kind} spp={spp}": partial(mrt.render, scene, **shared, integrator=kind, spp=spp)
         for kind in ("path", "direct")
@@ -143,7 +143,7 @@ def lens(number: int, extent: Extent) -> Trade:
     """Both depth-of-field filters, and a thin lens at rising spp."""
     width, height = extent.size
     scene = report_scene(number)
-    shared = {"aa": 2, "aamode": "none", "lattice": "centered"}
+    shared: dict[str, Any] = {"aa": 2, "aamode": "none", "lattice": "centered"}
     sharp = mrt.render(_scene(number, extent), **shared, layers=["depth"])
     found: Lens = fit_lens(scene, sharp.layers["depth.Z"])
     description = scene.to_dict(width=width, height=height)
@@ -176,7 +176,7 @@ def cone(extent: Extent) -> Trade:
     """The cone of scene 9 as triangles, against the analytic one."""
     scene = report_scene(9)
     width, height = extent.size
-    shared = {"aa": 2, "aamode": "none"}
+    shared: dict[str, Any] = {"aa": 2, "aamode": "none"}
     cases = {
         f"{n} segments": partial(
             mrt.render, load(meshed(scene, n).to_dict(width=width, height=height)), **shared
@@ -191,7 +191,7 @@ def cone(extent: Extent) -> Trade:
         "the analytic cone",
         truth,
         truth,
-        cases | {"analytic": truth},
+        {**cases, "analytic": truth},
     )
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+Name = TypeVar("Name", bound=Hashable)  # by which a caller knows its runs
 
 
 @dataclass(frozen=True)
@@ -25,8 +27,8 @@ LEAST_REPEATS = 3  # for a median that one disturbance does not move
 
 
 def measure(
-    runs: Mapping[str, Callable[[], Any]], *, repeats: int = 3, enough: float = float("inf")
-) -> dict[str, Warm]:
+    runs: Mapping[Name, Callable[[], Any]], *, repeats: int = 3, enough: float = float("inf")
+) -> dict[Name, Warm]:
     """Run everything once, then ``repeats`` times in turn, so that a load on the machine meets all alike.
 
     Runs that have taken ``enough`` seconds, three times at least, are left out of further turns.
@@ -34,7 +36,7 @@ def measure(
     results, first = {}, {}
     for name, run in runs.items():
         results[name], first[name] = _timed(run)
-    times: dict[str, list[float]] = {name: [] for name in runs}
+    times: dict[Name, list[float]] = {name: [] for name in runs}
     for turn in range(repeats):
         for name, run in runs.items():
             if turn >= LEAST_REPEATS and sum(times[name]) >= enough:
