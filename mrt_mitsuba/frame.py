@@ -69,7 +69,8 @@ class Frame:
         for name in wanted:
             self._add(name, CHANNELS[name])
         with self._job.stage(title, len(bundle.pixels)) as advance:
-            for pixels, planes in self._parts(bundle, wanted, self._exposure.seed):
+            parts = self._job.trace(self._tracer, self._camera, bundle, wanted, seed=self._exposure.seed)
+            for pixels, planes in parts:
                 rows = slice(pixels.start, pixels.stop)
                 for name, channel, plane in _channels(planes):
                     self.layers[name][rows, channel] = plane
@@ -82,25 +83,25 @@ class Frame:
         first = 1 if lattice.holds_centre else 0
         wanted = frozenset(self.layers.keys() & AVERAGED.keys())
         with self._job.stage("Anti-aliasing", count, "Computing Anti aliasing..") as advance:
-            for edges in self._edges():
+            for before, edges in self._edges():
                 bundle = self._exposure.lattice(edges, first=first)
-                for pixels, planes in self._parts(bundle, wanted, self._exposure.seed + 1):
+                seed = self._exposure.seed + 1
+                parts = self._job.trace(self._tracer, self._camera, bundle, wanted, seed=seed, before=before)
+                for pixels, planes in parts:
                     for name, channel, plane in _channels(planes):
-                        before = first * self.layers[name][pixels, channel]
-                        mean = (before + bundle.count * plane) / np.float32(lattice.count)
-                        self.layers[name][pixels, channel] = mean
+                        total = first * self.layers[name][pixels, channel] + bundle.count * plane
+                        self.layers[name][pixels, channel] = total / np.float32(lattice.count)
                     advance(len(pixels))
 
-    def _edges(self) -> Iterator[np.ndarray]:
-        """The pixels at edges, by their index, some rows of the picture at a time."""
+    def _edges(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Some rows of the picture at a time: how many edge pixels came before, and the indices of these."""
         samples, step = self.layers["samples"][:, 0], self._rows_at_once * self._plan.width
+        before = 0
         for start in range(0, len(samples), step):
             edges = np.flatnonzero(samples[start : start + step] > 1)
             if len(edges):
-                yield edges.astype(np.uint32) + np.uint32(start)
-
-    def _parts(self, bundle: Any, wanted: frozenset[str], seed: int) -> Iterator[tuple[Any, Planes]]:
-        return self._job.trace(self._tracer, self._camera, bundle, wanted, seed)
+                yield before, edges.astype(np.uint32) + np.uint32(start)
+            before += len(edges)
 
     # -------------------------------------------- Filters --------------------------------------------
 

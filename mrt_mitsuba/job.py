@@ -38,12 +38,20 @@ class Job:
         self.passes[name] = self.passes.get(name, 0.0) + time.perf_counter() - start
 
     def trace(
-        self, tracer: Tracer, camera: Camera, bundle: Bundle, wanted: frozenset[str], seed: int
+        self,
+        tracer: Tracer,
+        camera: Camera,
+        bundle: Bundle,
+        wanted: frozenset[str],
+        *,
+        seed: int,
+        before: int = 0,
     ) -> Iterator[tuple[Any, Planes]]:
         """Trace a bundle in parts that fit into memory, see ``trace_bundle``, and count its rays."""
         channels = sum(CHANNELS[name] for name in wanted)
         rays = self.workspace.rays_at_once(channels)
-        for pixels, planes in trace_bundle(tracer, camera, bundle, wanted, seed=seed, rays_at_once=rays):
+        parts = trace_bundle(tracer, camera, bundle, wanted, seed=seed, before=before, rays_at_once=rays)
+        for pixels, planes in parts:
             self._count(len(pixels), bundle.rays_per_pixel, planes)
             yield pixels, planes
         self.workspace.after_rays(min(rays, bundle.ray_count), channels)

@@ -11,11 +11,14 @@ from mrt_mitsuba.errors import UsageError
 BYTES_PER_CHANNEL = 4
 BYTES_TO_WRITE = 4
 
-# A wavefront's arrays, per ray and channel: what the kernel writes, and as much again where a mean is formed
-BYTES_PER_CHANNEL_OF_RAY = 8
-# What filters need for every pixel under work; measured: 114 at most by the blur, 21 by the detectors, beside
-# a copy of what they read
-BYTES_PER_PIXEL_OF_FILTER = 160
+# A wavefront's arrays, per ray and channel: what the kernel writes, what is formed of it, and the part before
+BYTES_PER_CHANNEL_OF_RAY = 12
+# What filters need for every pixel under work; measured: 131 at most by the blur, 21 by the detectors, beside
+# copies of what they read
+BYTES_PER_PIXEL_OF_FILTER = 192
+
+# Kernels: what their compilation takes for a moment, and their code
+BYTES_OF_KERNELS = 2**25
 
 # Rays of one wavefront at most: more gain no speed, and progress is told by the wavefront
 MOST_RAYS = 2**23
@@ -50,7 +53,7 @@ class Workspace:
         """
         pixels = width * height
         budget = memory if memory is not None else free_memory() // 2
-        finished = pixels * (pictures * channels * BYTES_PER_CHANNEL + BYTES_TO_WRITE)
+        finished = pixels * (pictures * channels * BYTES_PER_CHANNEL + BYTES_TO_WRITE) + BYTES_OF_KERNELS
         least = max(
             max(min(LEAST_RAYS, pixels), rays_per_pixel) * channels * BYTES_PER_CHANNEL_OF_RAY,
             min(LEAST_ROWS, height) * width * BYTES_PER_PIXEL_OF_FILTER,

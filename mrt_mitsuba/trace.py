@@ -15,6 +15,7 @@ import numpy as np
 
 from mrt_mitsuba.memory import MOST_RAYS
 from mrt_mitsuba.rays import Bundle, Samples
+from mrt_mitsuba.sampler import ray_sampler
 
 # Layers taken from the first ray of a pixel, not averaged: they name a point, not a colour
 FIRST_HIT = {"depth": 1, "normal": 3, "albedo": 3}
@@ -72,14 +73,15 @@ def trace_bundle(
     wanted: frozenset[str],
     *,
     seed: int = 0,
+    before: int = 0,
     rays_at_once: int = MOST_RAYS,
 ) -> Iterator[tuple[Any, Planes]]:
     """Trace a bundle, in parts of at most so many rays or one pixel.
 
     Yields the pixels of each part and the wanted layers there: by name one plane for each channel, [pixels]
     float32, to be read before the next part is asked for. ``wanted``: names from ``FIRST_HIT`` and
-    ``AVERAGED``; nothing else is computed. Values do not depend on ``rays_at_once``, but for integrators that
-    draw random numbers.
+    ``AVERAGED``; nothing else is computed. ``before``: pixels already traced with this seed, whose random
+    numbers are not to be used again. Values do not depend on ``rays_at_once``.
     """
     import mitsuba as mi
 
@@ -88,16 +90,18 @@ def trace_bundle(
     step = max(1, rays_at_once // bundle.rays_per_pixel)
     for start in range(0, len(bundle.pixels), step):
         part = bundle.part(start, min(start + step, len(bundle.pixels)))
-        # Sub-wavefronts of random integrators must not repeat each other's numbers
-        yield part.pixels, run(tracer, camera, part, sizes, seed + start)
+        first_ray = (before + start) * bundle.rays_per_pixel
+        yield part.pixels, run(tracer, camera, part, sizes, seed, first_ray)
 
 
-def _trace_wavefront(tracer, camera, bundle, sizes, seed) -> Planes:
+def _trace_wavefront(tracer, camera, bundle, sizes, seed, first_ray) -> Planes:
     import drjit as dr
     import mitsuba as mi
 
     samples = bundle.samples(camera.width, camera.height)
-    sampler = tracer.sampler(seed, bundle.ray_count, camera)
+    sampler = tracer.sampler(camera)
+    if sampler is not None:
+        sampler.start(seed, first_ray, bundle.ray_count)
     values = _shade(tracer, camera, samples, sampler, sizes)
     if bundle.rays_per_pixel == 1:
         dr.eval(values)
@@ -126,10 +130,12 @@ def _first_of(samples: Samples, plane: Any, count: int) -> Any:
     return target
 
 
-def _trace_scalar(tracer, camera, bundle, sizes, seed) -> Planes:
+def _trace_scalar(tracer, camera, bundle, sizes, seed, first_ray) -> Planes:
     pixels = {name: np.zeros((len(bundle.pixels), size), np.float64) for name, size in sizes.items()}
-    sampler = tracer.sampler(seed, 1, camera)
+    sampler = tracer.sampler(camera)
     for samples in bundle.each_sample(camera.width, camera.height):
+        if sampler is not None:
+            sampler.start(seed, first_ray + samples.lane, 1)
         for name, value in _shade(tracer, camera, samples, sampler, sizes).items():
             if name in AVERAGED:
                 pixels[name][samples.order] += np.array(value) / bundle.rays_per_pixel
@@ -167,15 +173,13 @@ class Tracer:
     def __init__(self, scene: Any, integrator: Any) -> None:
         self.scene, self.integrator = scene, integrator
 
-    def sampler(self, seed: int, count: int, camera: Camera) -> Any:
-        """A random sampler for so many rays, or None where nothing is random."""
+    def sampler(self, camera: Camera) -> Any:
+        """A random sampler, see ``ray_sampler``, or None where nothing is random."""
         import mitsuba as mi
 
-        if not (self.random or mi.is_spectral or camera.sensor.needs_aperture_sample()):
-            return None
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed, count)
-        return sampler
+        if self.random or mi.is_spectral or camera.sensor.needs_aperture_sample():
+            return ray_sampler()
+        return None
 
     @property
     def random(self) -> bool:

@@ -1,0 +1,57 @@
+"""Random numbers that belong to a ray, whichever rays are traced along with it."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+# The golden ratio in 32 bits: seeds that follow each other must not meet those of later rays
+_STRIDE = 0x9E3779B9
+
+
+def ray_sampler() -> Any:
+    """A Mitsuba sampler for the current variant, to be told with ``start`` which rays it is for."""
+    import mitsuba as mi
+
+    return _sampler_class(mi.variant())(mi.Properties("ray_sampler"))
+
+
+@functools.cache
+def _sampler_class(variant: str) -> type:
+    import drjit as dr
+    import mitsuba as mi
+
+    class RaySampler(mi.Sampler):
+        """Mitsuba's ``independent``, number for number, where the rays begin with number 0.
+
+        ``independent`` numbers the rays of every wavefront from 0, so that pictures would depend on how they
+        are cut into wavefronts.
+        """
+
+        def __init__(self, props: Any) -> None:
+            mi.Sampler.__init__(self, props)
+            self.random = mi.PCG32()
+
+        def start(self, seed: int, first: int, count: int) -> None:
+            """Turn to the rays ``first`` to ``first + count - 1``."""
+            high, low = divmod(first, 2**32)
+            seed = (seed + high * _STRIDE) % 2**32
+            if mi.variant().startswith("scalar"):
+                state, sequence = mi.sample_tea_32(seed, low)
+            else:
+                mi.Sampler.seed(self, seed, count)
+                lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, low)
+                state, sequence = mi.sample_tea_32(dr.opaque(mi.UInt32, seed), lane)
+            self.random = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
+
+        def next_1d(self, active: Any = True) -> Any:
+            return self.random.next_float32(active)
+
+        def next_2d(self, active: Any = True) -> Any:
+            x = self.random.next_float32(active)
+            return mi.Point2f(x, self.random.next_float32(active))
+
+        def to_string(self) -> str:
+            return "RaySampler[]"
+
+    return RaySampler

@@ -1,0 +1,241 @@
+"""Pictures rendered in parts: within the memory allowed, the same bit for bit, and ended soon by a signal."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba import cli, memory
+from mrt_mitsuba.filters.bands import bands
+from mrt_mitsuba.output import read_exr
+
+# ---------------------------------------------- Bands ----------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("height", "rows", "halo"), list(itertools.product([1, 7, 100], [1, 8, 30, 200], [0, 1, 8]))
+)
+def test_bands_cover_every_row_once_and_see_their_neighbours(height: int, rows: int, halo: int) -> None:
+    image = np.arange(height)
+    found = list(bands(height, rows, halo))
+    np.testing.assert_array_equal(np.concatenate([image[band.seen][band.inner] for band in found]), image)
+    for band in found:
+        np.testing.assert_array_equal(image[band.rows], image[band.seen][band.inner])
+        assert band.top == max(band.start - halo, 0) and band.bottom == min(band.stop + halo, height)
+        assert band.bottom - band.top <= max(rows, 3 * halo, 1)
+    assert len(found) == 1 or height > rows
+
+
+# --------------------------------------------- The same bits ---------------------------------------------
+
+SIZE = {"width": 231, "height": 173}  # rows and columns that no part divides
+MODES = list(itertools.product(["none", "luma", "sobel", "geometry"], [None, "report", "corrected"]))
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = dr.thread_count()
+    yield
+    dr.set_thread_count(before)
+
+
+def in_parts(monkeypatch: pytest.MonkeyPatch, pixels: int, rays: int) -> None:
+    """Let the largest part of a filter have so many pixels, and that of a wavefront so many rays."""
+    monkeypatch.setattr(memory, "MOST_PIXELS", pixels)
+    monkeypatch.setattr(memory, "MOST_RAYS", rays)
+
+
+def assert_same(one: mrt.Result, other: mrt.Result) -> None:
+    assert one.layers.keys() == other.layers.keys() and dict(one.rays) == dict(other.rays)
+    for name, values in {"image": one.image, **one.layers}.items():
+        expected = other.image if name == "image" else other.layers[name]
+        assert values.tobytes() == expected.tobytes(), name
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize(("aamode", "dof"), MODES)
+def test_parts_and_threads_do_not_change_a_bit(
+    monkeypatch: pytest.MonkeyPatch, aamode: str, dof: str | None
+) -> None:
+    focus = {"dof": dof, "focaldist": 2.0, "focalrange": 0.5} if dof else {"focaldist": 0}
+    lattice = "centered" if dof == "corrected" else "report"
+    layers = ["normal", "reflection", "samples"] + ["edges"] * (aamode != "none") + ["blur"] * bool(dof)
+    options = {**SIZE, **focus, "aa": 2, "aamode": aamode, "lattice": lattice, "layers": layers}
+    dr.set_thread_count(2)
+    whole = mrt.render(3, **options, count_rays=True)
+    for count, pixels, rays in ((1, 41 * 231, 30_011), (2, 100 * 231, 2**23), (1, 2**22, 2**23)):
+        dr.set_thread_count(count)
+        in_parts(monkeypatch, pixels, rays)
+        assert_same(mrt.render(3, **options, count_rays=True), whole)
+
+
+def test_frames_in_parts_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    options = {**SIZE, "aa": 2, "motion": [0.2, 0.0, 0.1], "motionsamples": 3, "layers": ["albedo"]}
+    whole = mrt.render(3, **options)
+    in_parts(monkeypatch, 50 * 231, 50_000)
+    assert_same(mrt.render(3, **options), whole)
+
+
+@pytest.mark.parametrize("aamode", ["none", "sobel"])
+def test_random_numbers_do_not_depend_on_the_parts(monkeypatch: pytest.MonkeyPatch, aamode: str) -> None:
+    scene = mrt.scene_dict(3, **SIZE)
+    options = {"aa": 2, "aamode": aamode, "integrator": "path", "spp": 2, "focaldist": 2.0, "seed": 5}
+    whole = mrt.render(scene, **options)
+    in_parts(monkeypatch, 30 * 231, 50_000)
+    assert_same(mrt.render(scene, **options), whole)
+
+
+def test_the_same_command_twice_gives_the_same_pixels(tmp_path: Path, capsys) -> None:
+    words = ["3", "width=200", "height=150", "aa=2", "format=exr", "layers=depth,normal,edges"]
+    pictures = []
+    for name, room in (("a", "memory=64M"), ("b", "memory=1G")):
+        assert cli.main([str(tmp_path / name), *words, room]) == 0, capsys.readouterr().err
+        pictures.append(read_exr(tmp_path / f"{name}.exr"))
+    assert pictures[0].image.tobytes() == pictures[1].image.tobytes()
+    assert pictures[0].layers.keys() == pictures[1].layers.keys()
+    for name, values in pictures[0].layers.items():
+        assert values.tobytes() == pictures[1].layers[name].tobytes(), name
+
+
+# ------------------------------------------------ Memory ------------------------------------------------
+
+PEAK = """
+import hashlib, json
+import mrt_mitsuba as mrt
+import drjit as dr
+
+def status(name):
+    with open("/proc/self/status") as file:
+        return 1024 * int(dict(line.split(":", 1) for line in file)[name].split()[0])
+
+def render(size, memory):
+    result = mrt.render(3, width=size, height=size, aa=2, aamode="sobel", dof="report", memory=memory)
+    result.save("a.png")
+    result.save("a.exr")
+    return hashlib.sha256(result.image.tobytes()).hexdigest()
+
+render(64, "1G")  # what the program takes for itself, kernels included
+dr.flush_malloc_cache()
+start, found = status("VmRSS"), []
+for memory in ("160M", "4G"):
+    picture = render(1536, memory)
+    found.append([picture, status("VmHWM") - start])
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs Linux to tell the memory used")
+def test_peak_memory_stays_within_the_budget(run_python) -> None:
+    """With room for it, the same picture takes much more: the bound is kept by the parts, not by luck."""
+    done = run_python(PEAK)
+    assert done.returncode == 0, done.stderr
+    (tiled, least), (whole, most) = json.loads(done.stdout)
+    budget = 160 * 2**20
+    assert least < budget and most > 1.5 * budget
+    assert tiled == whole
+
+
+# ---------------------------------------- Full disks and signals ----------------------------------------
+
+
+def run(folder: Path, code: str, *words: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *words],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+# Only the picture's file may not grow: Dr.Jit keeps kernels in files, too
+LIMITED = """
+import resource, sys
+from mrt_mitsuba.result import Result
+save = Result.save
+def limited(self, *path, **options):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+    save(self, *path, **options)
+Result.save = limited
+"""
+COMMAND = "from mrt_mitsuba import cli\nsys.exit(cli.main())\n"
+
+
+@pytest.mark.parametrize("ending", ["png", "exr"])
+def test_a_file_that_may_not_grow_leaves_the_old_one(tmp_path: Path, ending: str) -> None:
+    """As on a full disk, the system refuses to write on half way."""
+    target = tmp_path / f"out.{ending}"
+    target.write_bytes(b"old")
+    words = ("out", "3", "width=160", "height=120", "aa=1", f"format={ending}", "quiet=1")
+    with run(tmp_path, LIMITED + COMMAND, *words) as process:
+        assert process.wait(timeout=60) == 1
+        errors = process.stderr.read()
+    assert errors.startswith(f"mrt: cannot write out.{ending}: File too large") and errors.count("\n") == 1
+    assert target.read_bytes() == b"old" and list(tmp_path.iterdir()) == [target]
+
+
+# A picture that does not compress takes seconds to write, and one in narrow bands as long to blur
+WRITING = """
+import sys, types
+import numpy as np
+from mrt_mitsuba import output
+class Result:
+    def save(self, path, tonemap):
+        image = np.random.default_rng(0).random((3000, 4000, 3), np.float32)
+        print("working", flush=True)
+        output.save(path, image)
+sys.modules["mrt_mitsuba.render"] = types.SimpleNamespace(render=lambda *scene, **options: Result())
+"""
+BLURRING = """
+import sys
+from mrt_mitsuba import memory
+from mrt_mitsuba.progress import TerminalProgress
+from contextlib import contextmanager
+memory.MOST_PIXELS = 1
+@contextmanager
+def stage(self, title, total, message=""):
+    if title == "Depth of field":
+        print("working", flush=True)
+    yield lambda steps: None
+TerminalProgress.stage = stage
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (WRITING, ("format=png",)),
+        (WRITING, ("format=exr",)),
+        (BLURRING, ("3", "width=300", "height=3000", "aa=1")),
+    ],
+    ids=["png", "exr", "blur"],
+)
+def test_a_signal_in_the_middle_ends_it_in_order(tmp_path: Path, code: str, words: tuple[str, ...]) -> None:
+    """In order, and not by force: Python comes to act on the signal while it writes and between bands."""
+    with run(tmp_path, code + COMMAND, "out", *words) as process:
+        try:
+            while "working" not in (line := process.stdout.readline()):
+                assert line, process.stderr.read()
+            time.sleep(0.3)
+            start = time.monotonic()
+            process.send_signal(signal.SIGTERM)
+            process.wait(timeout=10)
+            seconds = time.monotonic() - start
+        finally:
+            process.kill()
+        assert process.returncode == 143
+        assert process.stderr.read() == "mrt: terminated\n"  # by force, it would be "interrupted"
+    assert seconds < 2
+    assert list(tmp_path.iterdir()) == []
