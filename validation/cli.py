@@ -15,8 +15,7 @@ from importlib import import_module, util
 from pathlib import Path
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import MrtError, OutputError
-from mrt_mitsuba.output import check_target
+from mrt_mitsuba.errors import MrtError
 from mrt_mitsuba.progress import Progress, TerminalProgress
 from mrt_mitsuba.validation import report
 from mrt_mitsuba.validation.kernels import own_cache
@@ -91,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
 def _validate(options: argparse.Namespace) -> int:
     names = _named(options.study)
     _check_extras()
-    _prepare_folder(options.out)
+    report.prepare(options.out, "summary.json", "index.html")
     # With a cache of their own, studies of speed can tell how long compilation takes
     own = nullcontext() if options.quick or not set(names) & set(SPEED) else own_cache()
     with own:
@@ -129,26 +128,22 @@ def run_study(name: str, *, quick: bool, progress: Progress | None = None) -> re
     except Exception:
         failure = traceback.format_exc(limit=-4)
     seconds = time.perf_counter() - start
-    gc.collect()  # scenes that live on slow down the kernels of the next study
+    _tidy_up()
     return report.Outcome(study, seconds, failure)
+
+
+def _tidy_up() -> None:
+    """Scenes that live on, and memory that Dr.Jit keeps for reuse, slow down the next study."""
+    gc.collect()
+    if "drjit" in sys.modules:
+        sys.modules["drjit"].flush_malloc_cache()
 
 
 def _check_extras() -> None:
     missing = [name for name in EXTRAS if util.find_spec(name) is None]
     if missing:
-        raise MrtError(f"missing {', '.join(missing)}: pip install 'mrt-mitsuba[validation]'")
-
-
-def _prepare_folder(folder: Path) -> None:
-    """Make the folder, and find out now whether the report can be written there."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"cannot make the folder {folder}: {error.strerror}; choose another --out"
-        ) from error
-    for name in ("summary.json", "index.html"):
-        check_target(folder / name)
+        packages = " ".join(name.replace("_", "-") for name in missing)
+        raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
 
 
 def _fail(message: str, code: int) -> int:

@@ -25,6 +25,7 @@ TITLE = "How time grows with resolution, samples, objects, lights and bounces"
 
 MEMORY = "4G"  # of pictures as large as they come
 LEVEL = 0.95  # of the confidence in an exponent
+ENOUGH_SECONDS = 3.0  # of warm renders of one size, after which three of them do
 MOST_CODE = 1.05  # operations at the largest size over the most at smaller ones: the code must not grow
 
 Job = tuple[Scene, tuple[int, int], dict[str, Any]]  # a scene, its size in pixels, and options
@@ -123,7 +124,7 @@ def _measure(job: Job, repeats: int) -> Found:
     render = partial(mrt.render, loaded, aamode="none", memory=MEMORY, **options)
     found = kernels.profile(render, repeats=1)
     own = {k.hash: k for k in found if k.hash}
-    warm = measure({"": lambda: render().timings}, repeats=repeats)[""]
+    warm = measure({"": lambda: render().timings}, repeats=repeats, enough=ENOUGH_SECONDS)[""]
     return Found(
         warm, len(own), sum(k.operations for k in own.values()), sum(k.compile + k.codegen for k in found)
     )
