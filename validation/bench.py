@@ -23,11 +23,13 @@ from pathlib import Path
 from typing import Any
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.errors import OutputError, UsageError
+from mrt_mitsuba.output import replacing
 
 from . import kernels, machine, rivals
 from .floor import floor
 from .knobs import load
+from .report import prepare
 from .warm import measure
 
 
@@ -196,7 +198,8 @@ def read(path: Path) -> dict[str, Any]:
         found = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise UsageError(f"cannot compare with {path}: {error}") from error
-    if not isinstance(found, dict) or found.get("schema") != 2 or "scenes" not in found:
+    whole = isinstance(found, dict) and found.keys() >= set(SCHEMA["required"])
+    if not whole or found["schema"] != 2:
         raise UsageError(f"cannot compare with {path}: it is no file of this benchmark (schema 2)")
     return found
 
@@ -218,12 +221,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     try:
         before = read(given.compare) if given.compare else None
+        prepare(given.out.parent, given.out.name)
     except UsageError as error:
         parser.error(str(error))
+    except OutputError as error:
+        print(f"make bench: {error}", file=sys.stderr)
+        return OutputError.exit_code
     with kernels.own_cache():  # seconds of compilation are then the compiler's
         now = bench(QUICK if given.quick else FULL)
-    given.out.parent.mkdir(parents=True, exist_ok=True)
-    given.out.write_text(json.dumps(now, indent=2) + "\n")
+    with replacing(given.out) as file:
+        file.write(json.dumps(now, indent=2).encode() + b"\n")
     print(table(now, before))
     if before and before["options"] != now["options"]:
         print("The earlier file was measured with other options: its ratios mean little.")

@@ -14,7 +14,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from mrt_mitsuba.output import replacing, to_8bit, write_exr
+from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.output import check_target, replacing, to_8bit, write_exr
 from mrt_mitsuba.validation import machine
 from mrt_mitsuba.validation.study import Bound, Picture, Plot, Study, Table
 
@@ -90,6 +91,21 @@ def _bound_line(bound: Bound, width: int, holds: str, missed: str) -> str:
     mark = holds if bound.holds else missed
     sign = "<=" if bound.at_most else ">="
     return f"  {mark:<6} {bound.name:<{width}}  {bound.measured:>10.4g} {sign} {bound.limit:.4g}"
+
+
+def prepare(folder: Path, *names: str) -> None:
+    """Make the folder, and find out now whether files of these names can be written there, before the work.
+
+    Raises ``OutputError``.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the folder {folder}: {error.strerror}; choose another --out"
+        ) from error
+    for name in names:
+        check_target(folder / name)
 
 
 def write(folder: Path, outcomes: Sequence[Outcome], about: Mapping[str, Any]) -> None:

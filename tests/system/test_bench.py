@@ -71,12 +71,21 @@ def test_comparison_prints_ratios(found):
 
 def test_a_file_of_another_kind_is_refused(tmp_path, capsys):
     other = tmp_path / "other.json"
-    for text in ("{}", "[1]", "no json", '{"schema": 1, "scenes": {}}'):
+    for text in ("{}", "[1]", "no json", '{"schema": 1, "scenes": {}}', '{"schema": 2, "scenes": {}}'):
         other.write_text(text)
         with pytest.raises(SystemExit):
             bench.main(["--compare", str(other), "--out", str(tmp_path / "b.json")])
         assert "cannot compare" in capsys.readouterr().err
     assert not (tmp_path / "b.json").exists()
+
+
+def test_a_place_that_cannot_be_written_is_told_before_measuring(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.json").mkdir()
+    for out, reason in (("file/b.json", "cannot make the folder"), ("folder.json", "it is a folder")):
+        assert bench.main(["--out", str(tmp_path / out)]) == 1
+        text, errors = capsys.readouterr()
+        assert text == "" and errors.startswith("make bench: ") and reason in errors
 
 
 def test_schema_is_printed(capsys):
