@@ -87,6 +87,15 @@ def test_commands_of_the_pages_are_understood(path: Path, command: str) -> None:
     assert name == "mrt" and (parsed.scene is None or (DOCS / parsed.scene).is_file())
 
 
+def test_the_memory_that_a_picture_would_need_is_as_shown(capsys) -> None:
+    from mrt_mitsuba import cli
+
+    page = (DOCS / "performance.md").read_text()
+    command = next(block for block in blocks(DOCS / "performance.md", "sh") if "memory=" in block)
+    assert cli.main([*shlex.split(command)[1:], "quiet=1"]) == 2
+    assert capsys.readouterr().err.strip() in " ".join(page.split())
+
+
 def test_every_study_of_the_validation_is_explained() -> None:
     from mrt_mitsuba.validation import cli
 

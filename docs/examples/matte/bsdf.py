@@ -72,14 +72,7 @@ class Matte(mi.BSDF):
 
     # ----------------------------------- Sampling ------------------------------------
 
-    def sample(
-        self,
-        ctx: Any,
-        si: Any,
-        sample1: Any,
-        sample2: Any,
-        active: Any = True,
-    ) -> tuple[Any, Any]:
+    def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
         bs = mi.BSDFSample3f()
         bs.wo = mi.warp.square_to_cosine_hemisphere(sample2)
         bs.eta = mi.Float(1)
