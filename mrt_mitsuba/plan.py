@@ -22,23 +22,23 @@ class Omission:
 class Plan:
     """What a render consists of. ``str()`` shows it."""
 
-    scene: str
-    variant: str
-    integrator: str
-    width: int
-    height: int
-    lattice: Lattice
-    detector: str | None  # edge detector, or None: every pixel gets all samples at once
-    blur: str | None  # depth-of-field mode
-    repeats: int  # rays for each sample
-    motion: str | None  # "frames", "stratified", or None where the camera stands still
-    motion_samples: int  # moments while the shutter is open
-    count_rays: bool
-    layers: frozenset[str]  # asked for
-    traced_layers: frozenset[str]  # what the tracing kernels return beside the picture
-    kernel: tuple[str, ...]  # what the tracing kernels hold
-    passes: tuple[str, ...]
-    left_out: tuple[Omission, ...] = field(default=())
+    scene: str  #: its number or name
+    variant: str  #: of Mitsuba
+    integrator: str  #: name of its plugin
+    width: int  #: pixels
+    height: int  #: pixels
+    lattice: Lattice  #: where the samples of a pixel lie
+    detector: str | None  #: edge detector, or None: every pixel gets all samples at once
+    blur: str | None  #: depth-of-field mode
+    repeats: int  #: rays for each sample
+    motion: str | None  #: "frames", "stratified", or None where the camera stands still
+    motion_samples: int  #: moments while the shutter is open
+    count_rays: bool  #: were they asked for
+    layers: frozenset[str]  #: asked for
+    traced_layers: frozenset[str]  #: what the tracing kernels return beside the picture
+    kernel: tuple[str, ...]  #: what the tracing kernels hold
+    passes: tuple[str, ...]  #: over the picture, in their order
+    left_out: tuple[Omission, ...] = field(default=())  #: what, and why
 
     @property
     def returned_layers(self) -> frozenset[str]:

@@ -22,24 +22,24 @@ class Timings:
     """Seconds of one render. ``passes`` adds up to about ``total``; ``compile`` and ``kernels`` are parts of
     it."""
 
-    total: float
-    load: float  # scene and plan
-    compile: float  # kernels that were not in the cache
-    kernels: float  # kernels running
-    passes: Mapping[str, float]
+    total: float  #: all of the render
+    load: float  #: scene and plan
+    compile: float  #: kernels that were not in the cache
+    kernels: float  #: kernels running
+    passes: Mapping[str, float]  #: by the name of the pass
 
 
 @dataclass(frozen=True)
 class Result:
     """A finished picture and what became known on the way."""
 
-    image: Image  # [H, W, 3], linear, top row first
-    layers: Mapping[str, Image]  # [H, W] by EXR channel name, such as "depth.Z"
-    plan: Plan
-    timings: Timings
-    rays: Mapping[str, int]  # by kind; "mirror" and "shadow" only where they were counted
-    kernel_launches: int
-    options: Mapping[str, Any] = field(default_factory=dict)
+    image: Image  #: float32 [H, W, 3], linear, top row first
+    layers: Mapping[str, Image]  #: float32 [H, W] by EXR channel name, such as "depth.Z"
+    plan: Plan  #: what ran, what was left out and why
+    timings: Timings  #: seconds
+    rays: Mapping[str, int]  #: number by kind; "mirror" and "shadow" only where they were counted
+    kernel_launches: int  #: how many kernels ran
+    options: Mapping[str, Any] = field(default_factory=dict)  #: as they were given
 
     def save(self, path: str | os.PathLike[str], *, tonemap: str = "report") -> None:
         """Write a .png or .exr; raise ``OutputError``. ``tonemap`` ("report" or "srgb") concerns a PNG

@@ -1,7 +1,7 @@
 """A scene in the report's terms, and its translation to a Mitsuba dict.
 
 Lengths are in scene units, colours are linear RGB. ``Scene.to_dict()`` gives the plugins of this project,
-``Scene.to_stock_dict()`` the nearest equivalents among Mitsuba's own.
+``export.scene_dict`` also the nearest equivalents among Mitsuba's own.
 """
 
 from __future__ import annotations
@@ -54,6 +54,8 @@ class Light:
 
 @dataclass(frozen=True)
 class Sphere:
+    """A sphere around a point."""
+
     center: Vector
     radius: float
     material: Material
@@ -70,6 +72,8 @@ class Plane:
 
 @dataclass(frozen=True)
 class Cone:
+    """A closed cone, from the centre of its base to its apex; the radius is that of the base."""
+
     apex: Vector
     base_center: Vector
     radius: float

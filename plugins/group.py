@@ -38,8 +38,10 @@ class MrtGroup(mi.Mesh):
 
     .. code-block:: python
 
-        {'type': 'mrt_group', 'kind': 'sphere', 'numbers': mi.Bitmap(numbers), 'face_kd': mi.Bitmap(colors),
-         'bsdf': {'type': 'mrt_bsdf', 'diffuse_reflectance': {'type': 'mesh_attribute', 'name': 'face_kd'}}}
+        {'type': 'mrt_group', 'kind': 'sphere', 'numbers': mi.Bitmap(numbers),
+         'face_kd': mi.Bitmap(colors),
+         'bsdf': {'type': 'mrt_bsdf',
+                  'diffuse_reflectance': {'type': 'mesh_attribute', 'name': 'face_kd'}}}
 
     There is no XML form. Nearest stock plugin: ``ellipsoids``.
     """

@@ -22,8 +22,8 @@ class MrtMesh(mi.Mesh):
 
     .. code-block:: python
 
-        {'type': 'mrt_mesh', 'positions': mi.Bitmap(points[np.newaxis]), 'faces':
-        mi.Bitmap(faces[np.newaxis])}
+        {'type': 'mrt_mesh', 'positions': mi.Bitmap(points[np.newaxis]),
+         'faces': mi.Bitmap(faces[np.newaxis])}
 
     There is no XML form; write the mesh to a PLY file and use the nearest stock plugin, ``ply``, there.
     """
