@@ -146,14 +146,14 @@ class Bundle:
         else:
             pixel = dr.gather(mi.UInt32, mi.UInt32(self.pixels), order)
         # Sizes are data, not constants: another picture size needs no other kernel
-        width, repeats, aa = (Divisor.opaque(n) for n in (width, self.repeats, self.lattice.aa))
-        height, first = (dr.opaque(mi.UInt32, n) for n in (height, self.first))
-        shutter = self._shutter_numbers(dr.opaque) if self.shutter else ()
-        return self._samples(lane, order, pixel, rest, width, height, repeats, first, aa, shutter)
+        columns, repeats, aa = (Divisor.opaque(n) for n in (width, self.repeats, self.lattice.aa))
+        rows, first = (dr.opaque(mi.UInt32, n) for n in (height, self.first))
+        shutter = self._shutter_numbers(dr.opaque)
+        return self._samples(lane, order, pixel, rest, columns, rows, repeats, first, aa, shutter)
 
     def each_sample(self, width: int, height: int) -> Iterator[Samples]:
         """The same, one ray at a time, for scalar variants."""
-        shutter = self._shutter_numbers(lambda kind, value: kind(value)) if self.shutter else ()
+        shutter = self._shutter_numbers(lambda kind, value: kind(value))
         for lane in range(self.ray_count):
             order, rest = divmod(lane, self.rays_per_pixel)
             yield self._samples(
@@ -169,15 +169,29 @@ class Bundle:
                 shutter,
             )
 
-    def _shutter_numbers(self, number: Any) -> tuple[Any, Any, Any]:
-        """What ``Shutter.time`` needs, each made by ``number(type, value)``."""
+    def _shutter_numbers(self, number: Any) -> tuple[Any, ...]:
+        """What ``Shutter.time`` needs, each made by ``number(type, value)``; nothing without a shutter."""
         import mitsuba as mi
 
         shutter = self.shutter
+        if shutter is None:
+            return ()
         phase = number(mi.UInt32, shutter.seed) if shutter.phase is None else number(mi.Float, shutter.phase)
         return number(mi.UInt64, shutter.moments), number(mi.UInt64, shutter.stride), phase
 
-    def _samples(self, lane, order, pixel, rest, width, height, repeats, first, aa, shutter) -> Samples:
+    def _samples(
+        self,
+        lane: Any,
+        order: Any,
+        pixel: Any,
+        rest: Any,
+        width: Divisor,
+        height: Any,
+        repeats: Divisor,
+        first: Any,
+        aa: Divisor,
+        shutter: tuple[Any, ...],
+    ) -> Samples:
         import mitsuba as mi
 
         row, column = width.divide(pixel)

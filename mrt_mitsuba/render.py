@@ -131,8 +131,8 @@ def render(
     shown = {
         name: value for name, value in given.items() if value is not None and name not in ("memory", "quiet")
     }
-    image, layers = frames.mean(plan)
-    return Result(image, layers, plan, timings, job.rays, kernels.launches, shown)
+    image, planes = frames.mean(plan)
+    return Result(image, planes, plan, timings, job.rays, kernels.launches, shown)
 
 
 def _focus(source: Source, distance: float | None, reach: float | None) -> Focus:
