@@ -20,10 +20,11 @@ copyright = author
 release = mrt_mitsuba.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_math_renderer = "mathml"
-myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 exclude_patterns = ["_build", "_generated/*.inc.md", "examples"]
 html_theme = "furo"
 html_title = "mrt-mitsuba"
+html_use_index = html_domain_indices = False  # there is a search
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 autodoc_typehints = "description"
@@ -43,21 +44,21 @@ def generate(app: object) -> None:
     mrt_mitsuba.register()  # plugin classes derive from a variant's classes, so autodoc needs one
     folder = HERE / "_generated"
     folder.mkdir(exist_ok=True)
-    (folder / "options.inc.md").write_text(options_table())
+    (folder / "options.inc.md").write_text(options_list())
     gallery.build(folder)
     ledger.build(folder)
 
 
-def options_table() -> str:
-    """The options of the command as a table."""
+def options_list() -> str:
+    """The options of the command as a list."""
     from mrt_mitsuba import options
 
-    lines = ["| option | meaning | default |", "|---|---|---|"]
+    lines = []
     for name, field in options.TABLE.items():
-        form = field.metadata["kind"].form.replace("|", "\\|")
+        form, text = field.metadata["kind"].form, field.metadata["help"]
         default = field.metadata["shown"] or field.default
-        lines.append(f"| `{name}={form}` | {field.metadata['help']} | {default} |")
-    return "\n".join(lines) + "\n"
+        lines += [f"`{name}={form}`", f": {text[0].upper()}{text[1:]}. Default: {default}.", ""]
+    return "\n".join(lines)
 
 
 def mathml(display: bool):  # type: ignore[no-untyped-def]
