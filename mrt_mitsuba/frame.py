@@ -131,7 +131,7 @@ class Frame:
         if "square" in self.layers:
             rays = self._exposure.centre(self._pixels).rays_per_pixel
             variance = np.maximum(self._picture("square")[rows] - image**2, 0) / (rays - 1)
-        detect = {"luma": filters.luma_edges, "sobel": filters.sobel_edges}[self._plan.detector]
+        detect = filters.luma_edges if self._plan.detector == "luma" else filters.sobel_edges
         return detect(image, variance=variance)
 
     def _blur(self) -> None:
@@ -139,7 +139,7 @@ class Frame:
         from mrt_mitsuba import filters
         from mrt_mitsuba.filters.dof import REACH
 
-        focus = {"focal_distance": self._focus.distance, "focal_range": self._focus.range}
+        focus: dict[str, Any] = {"focal_distance": self._focus.distance, "focal_range": self._focus.range}
         image, depth = self._picture("image"), self._picture("depth")[:, :, 0]
         amount = self._add("blur", 1).reshape(self._shape) if "blur" in self._plan.layers else None
         above = image[:0]
@@ -148,7 +148,7 @@ class Frame:
                 sharp = image[band.start : band.bottom]
                 if len(above):
                     sharp = np.concatenate([above, sharp])
-                blurred = filters.gaussian_dof(sharp, depth[band.seen], **focus, mode=self._plan.blur)
+                blurred = filters.gaussian_dof(sharp, depth[band.seen], **focus, mode=str(self._plan.blur))
                 above = sharp[: band.stop - band.top][-REACH:].copy()
                 image[band.rows] = blurred[band.inner]
                 if amount is not None:
@@ -170,8 +170,8 @@ class Frame:
 
     def _add(self, name: str, channels: int) -> np.ndarray:
         """A new layer, 0 everywhere. All but the picture channel by channel, as an EXR wants them."""
-        order = "C" if name == "image" else "F"
-        self.layers[name] = np.zeros((len(self._pixels), channels), np.float32, order=order)
+        size = len(self._pixels), channels
+        self.layers[name] = np.zeros(size, np.float32, order="C" if name == "image" else "F")
         return self.layers[name]
 
     def _picture(self, name: str) -> np.ndarray:

@@ -8,6 +8,7 @@ is one wavefront, split where it would not fit in memory; in scalar variants a P
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,7 +95,9 @@ def trace_bundle(
         yield part.pixels, run(tracer, camera, part, sizes, seed, first_ray)
 
 
-def _trace_wavefront(tracer, camera, bundle, sizes, seed, first_ray) -> Planes:
+def _trace_wavefront(
+    tracer: Tracer, camera: Camera, bundle: Bundle, sizes: Mapping[str, int], seed: int, first_ray: int
+) -> Planes:
     import drjit as dr
     import mitsuba as mi
 
@@ -130,7 +133,9 @@ def _first_of(samples: Samples, plane: Any, count: int) -> Any:
     return target
 
 
-def _trace_scalar(tracer, camera, bundle, sizes, seed, first_ray) -> Planes:
+def _trace_scalar(
+    tracer: Tracer, camera: Camera, bundle: Bundle, sizes: Mapping[str, int], seed: int, first_ray: int
+) -> Planes:
     pixels = {name: np.zeros((len(bundle.pixels), size), np.float64) for name, size in sizes.items()}
     sampler = tracer.sampler(camera)
     for samples in bundle.each_sample(camera.width, camera.height):
@@ -144,7 +149,9 @@ def _trace_scalar(tracer, camera, bundle, sizes, seed, first_ray) -> Planes:
     return {name: values.T.astype(np.float32) for name, values in pixels.items()}
 
 
-def _shade(tracer, camera, samples, sampler, sizes) -> dict[str, Any]:
+def _shade(
+    tracer: Tracer, camera: Camera, samples: Samples, sampler: Any, sizes: Mapping[str, int]
+) -> dict[str, Any]:
     ray, weight = camera.rays(samples, sampler)
     values = tracer.trace(camera, ray, weight, sampler, sizes.keys())
     return {name: values[name] for name in sizes}
@@ -186,7 +193,9 @@ class Tracer:
         """Does the integrator draw random numbers?"""
         return True
 
-    def trace(self, camera, ray, weight, sampler, wanted) -> dict[str, Any]:
+    def trace(
+        self, camera: Camera, ray: Any, weight: Any, sampler: Any, wanted: AbstractSet[str]
+    ) -> dict[str, Any]:
         """Per-ray values of the wanted layers."""
         import mitsuba as mi
 
@@ -211,7 +220,9 @@ class WhittedTracer(Tracer):
     def random(self) -> bool:
         return self.prepared.random
 
-    def trace(self, camera, ray, weight, sampler, wanted) -> dict[str, Any]:
+    def trace(
+        self, camera: Camera, ray: Any, weight: Any, sampler: Any, wanted: AbstractSet[str]
+    ) -> dict[str, Any]:
         import mitsuba as mi
 
         trace = self.integrator.trace(self.scene, sampler, ray)
@@ -229,7 +240,9 @@ class WhittedTracer(Tracer):
         return result | first_hit_layers(camera, trace.hit.si, trace.hit.found, ray, wanted)
 
 
-def first_hit_layers(camera, si, found, ray, wanted) -> dict[str, Any]:
+def first_hit_layers(
+    camera: Camera, si: Any, found: Any, ray: Any, wanted: AbstractSet[str]
+) -> dict[str, Any]:
     """Distance (inf for a miss), geometric normal and diffuse reflectance (0 for a miss) of the first hit."""
     import drjit as dr
     import mitsuba as mi

@@ -173,5 +173,5 @@ def vector64(v: Any) -> Any:
 
 def check_axis(plugin: str, end0: str, p0: Sequence[float], end1: str, p1: Sequence[float]) -> None:
     """Refuse an axis of no length."""
-    if np.array_equal(np.float32(p0), np.float32(p1)):
+    if np.array_equal(np.asarray(p0, np.float32), np.asarray(p1, np.float32)):
         raise ParameterError(f'{plugin}: "{end0}" and "{end1}" are both {list(p0)}, but must be two points')
