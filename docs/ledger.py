@@ -35,8 +35,8 @@ def lattice_shift() -> str:
     """Both lattices against many centred samples."""
     truth = mrt.render(3, **PLAIN, aa=16, lattice="centered").image
     report, centered = (mrt.render(3, **PLAIN, aa=4, lattice=kind).image for kind in ("report", "centered"))
-    errors = [f"{_rms(image, truth):.2e}" for image in (report, centered)]
-    return f"scene 3, aa=4, RMSE to 256 centred samples: {errors[0]} and {errors[1]}"
+    errors = [f"{_rms(image, truth):.1e}" for image in (report, centered)]
+    return f"scene 3, aa=4, RMSE to 256 centred samples: {errors[0]}, centred {errors[1]}"
 
 
 def clamp() -> str:
@@ -57,12 +57,12 @@ def acne() -> str:
     original = reference_render(scene, **SIZE, self_intersection="original").image
     ours = mrt.render(3, **PLAIN, aa=1, fresnel="dielectric").image
     share = [100 * np.mean(np.abs(image - exact).max(axis=-1) > 1 / 255) for image in (original, ours)]
-    return f"scene 3, pixels off by more than 1/255 from float64: {share[0]:.3f} % and {share[1]:.3f} %"
+    return f"scene 3, pixels off by more than 1/255 from float64: original {share[0]:.3f} %, ours {share[1]:.3f} %"
 
 
 def fresnel() -> str:
     schlick, exact = (mrt.render(3, **PLAIN, aa=1, fresnel=form).image for form in ("schlick", "dielectric"))
-    return f"scene 3: mean difference {np.abs(schlick - exact).mean():.2e}"
+    return f"scene 3: the two differ by {np.abs(schlick - exact).mean():.1e} in the mean"
 
 
 def detectors() -> str:
@@ -97,7 +97,7 @@ def gamma() -> str:
 
     image = mrt.render(0, **PLAIN, aa=1).image
     report, srgb = (to_8bit(image, tonemap).mean() for tonemap in ("report", "srgb"))
-    return f"scene 0, mean 8-bit level: {report:.0f} and {srgb:.0f}"
+    return f"scene 0, mean 8-bit level: {report:.0f}, in sRGB {srgb:.0f}"
 
 
 def budget() -> str:

@@ -28,7 +28,7 @@ class Plan:
     width: int  #: pixels
     height: int  #: pixels
     lattice: Lattice  #: where the samples of a pixel lie
-    detector: str | None  #: edge detector, or None: every pixel gets all samples at once
+    detector: str | None  #: edge detector; None where every pixel gets all samples at once
     blur: str | None  #: depth-of-field mode
     repeats: int  #: rays for each sample
     motion: str | None  #: "frames", "stratified", or None where the camera stands still
