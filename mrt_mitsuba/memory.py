@@ -58,10 +58,11 @@ class Workspace:
             max(min(LEAST_RAYS, pixels), rays_per_pixel) * channels * BYTES_PER_CHANNEL_OF_RAY,
             min(LEAST_ROWS, height) * width * BYTES_PER_PIXEL_OF_FILTER,
         )
-        if finished + least > budget:
+        allowed = min(budget, all_memory())  # whatever was asked for
+        if finished + least > allowed:
             raise UsageError(
                 f"a picture of {width}x{height} pixels needs {_text(finished + least)} of memory, "
-                f"and {_text(budget)} may be used: choose a smaller width and height, "
+                f"and {_text(allowed)} may be used: choose a smaller width and height, "
                 f"fewer layers or samples, or a larger memory="
             )
         return cls(budget - finished)
@@ -100,7 +101,12 @@ def free_memory() -> int:
             fields = dict(line.split(":", 1) for line in file)
         return int(fields["MemAvailable"].split()[0]) * 1024
     except (OSError, KeyError, ValueError):
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        return all_memory()
+
+
+def all_memory() -> int:
+    """Bytes that the machine has."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _text(count: float) -> str:

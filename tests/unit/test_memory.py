@@ -61,5 +61,12 @@ def test_what_a_large_pass_used_is_given_back(monkeypatch, filtered, flushed):
     assert bool(called) is flushed
 
 
+def test_more_than_the_machine_has_is_never_used(monkeypatch):
+    monkeypatch.setattr(memory, "all_memory", lambda: 8 * GIB)
+    with pytest.raises(UsageError, match=r"and 8\.0 GiB may be used"):
+        Workspace.beside(65536, 65536, 3, memory=10**6 * GIB)
+    assert Workspace.beside(800, 600, 3, memory=64 * GIB).size > 60 * GIB
+
+
 def test_free_memory_is_believable():
     assert 2**26 < free_memory() < 2**46
