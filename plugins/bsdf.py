@@ -345,10 +345,11 @@ class _Pair:
 
     @classmethod
     def above(cls, wi, wo, active, tan2_theta_h=None) -> _Pair:
-        active = active & (wi.z > COS_MIN) & (wo.z > COS_MIN)
-        # Masked lanes get harmless directions: scalar variants raise on 0/0, and no NaN is born
+        above_i, above_o = wi.z > COS_MIN, active & (wo.z > COS_MIN)
+        # Masked lanes get harmless directions: scalar variants raise on 0/0, and no NaN is born. What depends
+        # on wi alone is computed once for all wo
         up = mi.Vector3f(0, 0, 1)
-        wi, wo = dr.select(active, wi, up), dr.select(active, wo, up)
+        wi, wo, active = dr.select(above_i, wi, up), dr.select(above_o, wo, up), above_i & above_o
         return cls(wi, wo, tan2_theta(wi + wo) if tan2_theta_h is None else tan2_theta_h, active)
 
 

@@ -61,7 +61,7 @@ class MrtLight(mi.Emitter):
         ds.dist = dr.norm(ds.d)
         # A point on the light itself has no direction to it; any will do, and scalar variants raise on 0/0
         away = ds.dist > 0
-        ds.d = dr.select(away, ds.d / dr.select(away, ds.dist, 1), mi.Vector3f(0, 0, 1))
+        ds.d = dr.select(away, ds.d * (1 / dr.select(away, ds.dist, 1)), mi.Vector3f(0, 0, 1))
         ds.n = mi.Normal3f(-ds.d)
         ds.uv = mi.Point2f(0)
         ds.time = it.time

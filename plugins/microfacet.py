@@ -28,8 +28,8 @@ def beckmann_d(tan2_theta_h, alpha):
     Takes tan²θ of the half vector, not cos θ: with cos⁻²θ = 1 + tan²θ the only subtraction is gone.
     Source: Beckmann and Spizzichino 1963; Walter et al., "Microfacet Models for Refraction", 2007, eq. 25.
     """
-    alpha2 = dr.square(alpha)
-    return dr.exp(-tan2_theta_h / alpha2) * dr.square(1 + tan2_theta_h) / (dr.pi * alpha2)
+    inv_alpha2 = 1 / dr.square(alpha)  # once for all directions at a point
+    return dr.exp(-tan2_theta_h * inv_alpha2) * dr.square(1 + tan2_theta_h) * (dr.inv_pi * inv_alpha2)
 
 
 def _smith_fit(v, alpha):
@@ -40,9 +40,9 @@ def _smith_fit(v, alpha):
     """
     a = alpha * dr.sqrt(dr.square(v.x) + dr.square(v.y))
     fitted = (v.z < 1.6 * a) | (a < 0)
-    numerator = 3.535 * a + 2.181 * v.z
-    denominator = dr.square(a) + 2.276 * a * v.z + 2.577 * dr.square(v.z)
-    return numerator, dr.select(fitted, denominator, 1), fitted
+    numerator = dr.fma(3.535, a, 2.181 * v.z)
+    denominator = dr.fma(a, a, v.z * dr.fma(2.276, a, 2.577 * v.z))
+    return numerator, denominator, fitted
 
 
 def smith_g1(v, alpha):
@@ -54,13 +54,13 @@ def smith_g1(v, alpha):
     Source: Walter et al. 2007, eq. 27 and below.
     """
     numerator, denominator, fitted = _smith_fit(v, alpha)
-    return dr.select(fitted, v.z * numerator / denominator, 1)
+    return dr.select(fitted, v.z * numerator, 1) / dr.select(fitted, denominator, 1)
 
 
 def smith_g1_over_cos(v, alpha):
     """``smith_g1(v) / cos θ`` for a unit vector ``v``, finite down to grazing directions."""
     numerator, denominator, fitted = _smith_fit(v, alpha)
-    return dr.select(fitted, numerator / denominator, 1 / dr.select(fitted, 1, v.z))
+    return dr.select(fitted, numerator, 1) / dr.select(fitted, denominator, v.z)
 
 
 def half_vector_angles(wi, wo):
