@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from .intersect import intersect_plane
-from .parameters import choice, flag, integer, number, spectrum
+from .parameters import choice, flag, integer, number
 from .quadrics import is_quadric, quadrics_of
 from .variants import but_not, is_jit, pointer
 
@@ -116,11 +116,11 @@ class MrtWhitted(mi.SamplingIntegrator):
     def __init__(self, props: mi.Properties):
         _construct(self, props)
         self.max_depth = integer(props, "max_depth", 10, least=1)
-        self.sky = spectrum(props, "sky", emissive=True) if "sky" in props else None
+        self.sky = props.get_emissive_texture("sky") if "sky" in props else None
         self.clamp = flag(props, "clamp", True)
         self.min_contribution = number(props, "min_contribution", MIN_CONTRIBUTION, least=0)
         self.bounce_budget = choice(props, "bounce_budget", BUDGETS)
-        self._prepared: Prepared | None = None
+        self._prepared = None
 
     # ------------------------------------- Mitsuba's interface ----------------------------------------
 
@@ -157,9 +157,9 @@ class MrtWhitted(mi.SamplingIntegrator):
         if prepared is None or prepared.scene_id != id(scene):
             prepared = self.prepare(scene)
 
-        # ----------------------- The camera ray: coherent, and first of a peeled loop -----------------------
+        # ------------------------------ The camera ray, first of a peeled loop ------------------------------
         active = mi.Bool(active)
-        hit = prepared.intersect(scene, ray, active, coherent=True)
+        hit = prepared.intersect(scene, ray, active)
         mirror = self.bounces(prepared)
         shading = self._shade(prepared, scene, sampler, ray, hit, mi.UnpolarizedSpectrum(1), active, mirror)
         if not mirror:
@@ -179,7 +179,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         # ------------------------------------------ Mirror bounces ------------------------------------------
         def bounce(s: dict) -> tuple[dict]:
             ray, active = s["ray"], s["active"]
-            hit = prepared.intersect(scene, ray, active, coherent=False)
+            hit = prepared.intersect(scene, ray, active)
             shading = self._shade(prepared, scene, s["sampler"], ray, hit, s["throughput"], active, mirror)
             throughput = s["throughput"] * shading.reflectance
             depth = s["depth"] + shading.cost
@@ -215,12 +215,26 @@ class MrtWhitted(mi.SamplingIntegrator):
     # ------------------------------------------- Shading -----------------------------------------------
 
     def _shade(self, prepared, scene, sampler, ray, hit, throughput, active, mirror: bool) -> Shading:
-        """Light that leaves ``hit`` back along ``ray``, and its mirror reflection if ``mirror``.
+        """Light that leaves ``hit`` back along ``ray``, and its mirror reflection if ``mirror``; or the sky.
 
         ``throughput`` is that of the path up to ``hit``.
         """
-        si = hit.si
-        radiance = self._sky(prepared, ray, but_not(active, hit.found))
+
+        def at_surface(hit, throughput, sampler):
+            return self._shade_surface(prepared, scene, sampler, hit, throughput, mirror), sampler
+
+        def nowhere(hit, throughput, sampler):
+            black = mi.UnpolarizedSpectrum(0)
+            return Shading(black, mi.UInt32(0), black, mi.UInt32(0)), sampler
+
+        # A branch, because packets whose rays all miss are many
+        state = hit, throughput, sampler if prepared.random else None
+        shading, _ = dr.if_stmt(state, hit.found, at_surface, nowhere, label="surface")
+        shading.radiance += self._sky(prepared, ray, but_not(active, hit.found))
+        return shading
+
+    def _shade_surface(self, prepared, scene, sampler, hit, throughput, mirror: bool) -> Shading:
+        si, radiance = hit.si, mi.UnpolarizedSpectrum(0)
         if prepared.emissive:
             radiance += mi.unpolarized_spectrum(si.emitter(scene, hit.found).eval(si, hit.found))
         unrolled = prepared.lights if prepared.unrolled else []
@@ -318,7 +332,7 @@ class Prepared:
         self.scene_id = id(scene)
         self.fingerprint = _fingerprint(scene)
         shapes = scene.shapes()
-        self.planes = [_Plane(s) for s in shapes if hasattr(s, "unit_normal")]
+        self.planes = _Planes([s for s in shapes if hasattr(s, "unit_normal")])
         self.quadrics = quadrics_of(shapes)
         others = [s for s in shapes if not (hasattr(s, "unit_normal") or is_quadric(s))]
         # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the others only
@@ -328,8 +342,11 @@ class Prepared:
         self._read_emitters(scene)
         self._read_bsdfs({id(b): b for b in (s.bsdf() for s in shapes)}.values())
         self.versions = self._versions()
-        if any(s.is_mesh() for s in others):
+        meshes = any(s.is_mesh() for s in others)
+        if meshes:
             self.ray_flags |= +mi.RayFlags.ShadingFrame
+        # Embree's treatment of packets of like rays pays where there are thousands of triangles to meet
+        self.coherent = meshes
         # Then a table of centres and radii does the work of a call to every shape
         self.only_spheres = is_jit() and not self.textured and all(map(_is_plain_sphere, others))
 
@@ -367,17 +384,12 @@ class Prepared:
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 
-    def intersect(self, scene, ray, active, coherent: bool) -> Hit:
+    def intersect(self, scene, ray, active) -> Hit:
         """The nearest of Mitsuba's shapes, the quadrics and the analytic planes."""
-        ray = mi.Ray3f(ray)
-        on_plane = []
-        for plane in self.planes:
-            t = intersect_plane(ray.o, ray.d, plane.normal, plane.distance)
-            closer = active & (t < ray.maxt)
-            on_plane.append(closer)
-            ray.maxt = dr.select(closer, t, ray.maxt)  # what lies behind the plane need not be looked for
-        si, found = self._intersect_shapes(scene, ray, active, coherent)
-        scale = self.scales(si, found)
+        t, plane, on_plane = self.planes.intersect(ray, active)
+        # What lies behind a plane need not be looked for
+        ray = mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths)
+        si, found, scale = self._intersect_shapes(scene, ray, active)
         if self.quadrics is not None:
             reach = dr.select(found, si.t, ray.maxt)
             quadric = self.quadrics.intersect(
@@ -387,36 +399,37 @@ class Prepared:
             self.quadrics.put_into(si, ray, quadric, closer)
             scale = dr.select(closer, self.quadrics.scale(quadric[1], closer), scale)
             found = found | closer
-        # A later plane overrides an earlier one, as it was closer
-        for plane, closer in zip(self.planes, on_plane, strict=True):
-            closer = but_not(closer, found)
-            plane.put_into(si, ray, closer)
-            scale = dr.select(closer, plane.scale, scale)
-        for closer in on_plane:
-            found = found | closer
+        if self.planes:
+            on_plane = but_not(on_plane, found)
+            scale = self.planes.put_into(si, ray, plane, on_plane, scale)
+            found = found | on_plane
         si.sh_frame = mi.Frame3f(si.sh_frame.n)
         si.wi = si.to_local(-ray.d)
         si.time, si.wavelengths = ray.time, ray.wavelengths
         return Hit(si, found, dr.maximum(scale, dr.max(dr.abs(si.p))))
 
-    def _intersect_shapes(self, scene, ray, active, coherent):
+    def _intersect_shapes(self, scene, ray, active):
+        """Interaction with the nearest of Mitsuba's shapes, where there is one, and the size of its
+        coordinates.
+        """
         if not self.shape_count:
-            return dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False)
-        pi = (self.bvh or scene).ray_intersect_preliminary(ray, coherent, active)
+            return dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False), mi.Float(0)
+        pi = (self.bvh or scene).ray_intersect_preliminary(ray, self.coherent, active)
         found = active & pi.is_valid()
         if self.only_spheres and not (scene.shapes_grad_enabled() or dr.grad_enabled(ray)):
-            return self.spheres.interaction(pi, ray, found), found
+            si, scale = self.spheres.interaction(pi, ray, found)
+            return si, found, scale
         si = pi.compute_surface_interaction(ray, self.ray_flags, found)
         self.spheres.put_back(si, found)
-        return si, found
+        return si, found, self.scales(si, found)
 
     def occluded(self, scene, hit, ds, active):
         """Does anything block the segment from ``hit`` to the light sample ``ds``?"""
         o = self._off_surface(hit, ds.d)
         blocked = mi.Bool(False)
-        for plane in self.planes:
+        for height in self.planes.heights:
             # Opposite sides: no distance is computed, so none can be wrong
-            blocked |= plane.height(o) * plane.height(ds.p) < 0
+            blocked |= height(o) * height(ds.p) < 0
         if not self.shape_count and self.quadrics is None:
             return blocked
         to_light = ds.p - o
@@ -424,7 +437,7 @@ class Prepared:
         reach = 1 - mi.math.ShadowEpsilon if self.emissive else 1
         ray = mi.Ray3f(o, to_light, reach, hit.si.time, hit.si.wavelengths)
         if self.shape_count:
-            blocked |= (self.bvh or scene).ray_test(ray, False, but_not(active, blocked))
+            blocked |= (self.bvh or scene).ray_test(ray, self.coherent, but_not(active, blocked))
         if self.quadrics is not None:
             blocked |= self.quadrics.occluded(ray, but_not(active, blocked))
         return blocked
@@ -453,36 +466,77 @@ class Prepared:
         return hit.si.p + n * dr.select(dr.dot(n, d) >= 0, distance, -distance)
 
 
-class _Plane:
-    """The analytic side of an ``mrt_plane``, as kernel data."""
+class _Planes:
+    """The analytic side of all ``mrt_plane`` shapes, as kernel data."""
 
-    def __init__(self, shape):
-        self.shape = pointer("Shape", shape)
-        self.normal = mi.Vector3f(shape.unit_normal.tolist())
-        self.tangents = [mi.Vector3f(t.tolist()) for t in shape.tangents]
-        self.distance = mi.Float(shape.distance)
-        self.scale = mi.Float(abs(shape.distance))
+    def __init__(self, shapes):
+        self.equations = [(mi.Vector3f(s.unit_normal.tolist()), mi.Float(s.distance)) for s in shapes]
         # The same kernel serves every plane of every scene: its numbers are data
-        dr.make_opaque(self.normal, self.distance, self.scale, self.tangents)
-        if is_jit():
-            dr.make_opaque(self.shape)
+        dr.make_opaque(self.equations)
+        self.tangents = [_Table(mi.Vector3f, [s.tangents[k] for s in shapes]) for k in range(2)]
+        self.shapes = _Table("Shape", shapes)
 
-    def height(self, p):
-        """Signed distance of a point from the plane."""
-        return dr.dot(self.normal, p) + self.distance
+    def __len__(self) -> int:
+        return len(self.equations)
 
-    def put_into(self, si, ray, where) -> None:
-        """Make ``si`` the interaction of ``ray`` with this plane, at t = ray.maxt."""
+    @property
+    def heights(self):
+        """For each plane, the function that gives the signed distance of a point from it."""
+        return [lambda p, n=n, d=d: dr.dot(n, p) + d for n, d in self.equations]
+
+    def intersect(self, ray, active):
+        """Distance of the nearest plane (else ``ray.maxt``), its number, and whether there is one."""
+        t, index, found = mi.Float(ray.maxt), mi.UInt32(0), mi.Bool(False)
+        for k, (normal, distance) in enumerate(self.equations):
+            t_plane = intersect_plane(ray.o, ray.d, normal, distance)
+            closer = active & (t_plane < t)
+            t = dr.select(closer, t_plane, t)
+            index = dr.select(closer, mi.UInt32(k), index)
+            found = found | closer
+        return t, index, found
+
+    def _equation(self, index):
+        """Normal and distance of plane ``index``: of few planes, quicker chosen than looked up."""
+        (normal, distance), *others = self.equations
+        for k, (n, d) in enumerate(others, start=1):
+            normal, distance = dr.select(index == k, n, normal), dr.select(index == k, d, distance)
+        return normal, distance
+
+    def put_into(self, si, ray, index, where, scale):
+        """Make ``si`` the interaction of ``ray`` with plane ``index`` at t = ray.maxt, and return the size of
+        its coordinates; ``scale`` elsewhere.
+        """
+        n, distance = self._equation(index)
         p = dr.fma(ray.d, ray.maxt, ray.o)
-        p -= self.normal * self.height(
-            p
-        )  # along a grazing ray the error of t is far larger than that of the plane
+        # Along a grazing ray the error of t is far larger than that of the plane
+        p -= n * (dr.dot(n, p) + distance)
         si.t = dr.select(where, ray.maxt, si.t)
         si.p = dr.select(where, p, si.p)
-        si.n = dr.select(where, mi.Normal3f(self.normal), si.n)
-        si.sh_frame.n = dr.select(where, mi.Normal3f(self.normal), si.sh_frame.n)
-        si.uv = dr.select(where, mi.Point2f(*(dr.dot(t, p) for t in self.tangents)), si.uv)
-        si.shape = dr.select(where, self.shape, si.shape)
+        si.n = dr.select(where, mi.Normal3f(n), si.n)
+        si.sh_frame.n = dr.select(where, mi.Normal3f(n), si.sh_frame.n)
+        uv = mi.Point2f(*(dr.dot(tangent(index, where), p) for tangent in self.tangents))
+        si.uv = dr.select(where, uv, si.uv)
+        si.shape = dr.select(where, self.shapes(index, where), si.shape)
+        return dr.select(where, dr.abs(distance), scale)
+
+
+class _Table:
+    """Rows of numbers, or pointers to objects of Mitsuba (``kind`` "Shape", ...), looked up by index."""
+
+    def __init__(self, kind, rows):
+        self.kind, self.rows = kind, rows
+        if not is_jit():
+            self.rows = rows if isinstance(kind, str) else [kind([float(x) for x in row]) for row in rows]
+        elif isinstance(kind, str):
+            self.kind, self.rows = getattr(mi, kind + "Ptr"), pointer(kind, rows)
+        else:
+            self.rows = mi.Float(np.asarray(rows, np.float32).ravel())
+        dr.eval(self.rows)
+
+    def __call__(self, index, active):
+        if is_jit():
+            return dr.gather(self.kind, self.rows, index, active)
+        return self.rows[index if active else 0]
 
 
 class _Scales:
@@ -511,15 +565,16 @@ class _Spheres:
         )
 
     def interaction(self, pi, ray, found):
-        """What ``compute_surface_interaction`` gives, but for derivatives and texture coordinates: spheres
-        only."""
+        """What ``compute_surface_interaction`` gives, but for derivatives and texture coordinates, and the
+        size of the coordinates: spheres only.
+        """
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.t, si.shape = dr.select(found, pi.t, dr.inf), dr.select(found, pi.shape, None)
         center, radius = self._center_and_radius(si, found)
         n = dr.normalize(dr.fma(ray.d, pi.t, ray.o) - center)
         si.p = dr.fma(n, radius, center)
         si.n = si.sh_frame.n = mi.Normal3f(n)
-        return si
+        return si, dr.max(dr.abs(center)) + radius
 
     def _center_and_radius(self, si, found):
         row = self.by_shape(si, found)

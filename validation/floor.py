@@ -21,18 +21,19 @@ class Recorder:
 
     scene: Any
     kinds: list[str] = field(default_factory=list)  # of each wavefront: camera, mirror, shadow
+    coherent: list[bool] = field(default_factory=list)  # the hint given with it
     rays: list[Any] = field(default_factory=list)
     single: list[tuple[int, Any, Any]] = field(default_factory=list)
 
     def ray_intersect_preliminary(self, ray: Any, coherent: Any, active: Any) -> Any:
-        self._keep("camera" if coherent else "mirror", ray, active)
+        self._keep("mirror" if self.kinds else "camera", ray, coherent, active)
         return self.scene.ray_intersect_preliminary(ray, coherent, active)
 
     def ray_test(self, ray: Any, coherent: Any, active: Any) -> Any:
-        self._keep("shadow", ray, active)
+        self._keep("shadow", ray, coherent, active)
         return self.scene.ray_test(ray, coherent, active)
 
-    def _keep(self, kind: str, ray: Any, active: Any) -> None:
+    def _keep(self, kind: str, ray: Any, coherent: bool, active: Any) -> None:
         """Keep the rays that are asked about, one after the other."""
         import drjit as dr
         import mitsuba as mi
@@ -50,6 +51,7 @@ class Recorder:
             kept = dr.gather(mi.Ray3f, ray, index)
             dr.eval(kept)
         self.kinds.append(kind)
+        self.coherent.append(coherent)
         self.rays.append(kept)
 
     def finish(self) -> None:
@@ -75,11 +77,11 @@ class Recorder:
         """Ask again about all rays."""
         import drjit as dr
 
-        for kind, rays in zip(self.kinds, self.rays, strict=True):
+        for kind, coherent, rays in zip(self.kinds, self.coherent, self.rays, strict=True):
             if kind == "shadow":
-                dr.eval(self.scene.ray_test(rays, False))
+                dr.eval(self.scene.ray_test(rays, coherent))
             else:
-                hit = self.scene.ray_intersect_preliminary(rays, kind == "camera")
+                hit = self.scene.ray_intersect_preliminary(rays, coherent)
                 dr.eval(hit.t, hit.shape)
         dr.sync_thread()
 
@@ -102,8 +104,11 @@ def record(scene: Any, **options: Any) -> Recorder:
     recorder = Recorder(before or scene)
     prepared.bvh = recorder
     try:
-        # loops in Python, so that the rays of every bounce pass by here
-        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
+        # Loops and branches in Python, so that the rays of every bounce pass by here
+        with (
+            dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False),
+            dr.scoped_set_flag(dr.JitFlag.SymbolicConditionals, False),
+        ):
             mrt.render(scene, **options)
     finally:
         prepared.bvh = before
