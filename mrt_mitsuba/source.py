@@ -121,7 +121,8 @@ def _integrator(integrator: Any, scene: Any) -> Any:
         integrator = _load(mi.load_dict, integrator, f"the integrator {integrator.get('type')!r}")
     if not isinstance(integrator, mi.SamplingIntegrator):
         raise UsageError(
-            f"the integrator is {integrator!r}: it must be a sampling integrator, such as path or direct"
+            f"the integrator is {' '.join(repr(integrator).split())}: "
+            "it must be a sampling integrator, such as path or direct"
         )
     return integrator
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from .intersect import intersect_plane
-from .parameters import choice, flag, integer, number
+from .parameters import choice, flag, integer, number, spectrum
 from .quadrics import is_quadric, quadrics_of
 from .variants import but_not, is_jit, pointer
 
@@ -116,11 +116,11 @@ class MrtWhitted(mi.SamplingIntegrator):
     def __init__(self, props: mi.Properties):
         _construct(self, props)
         self.max_depth = integer(props, "max_depth", 10, least=1)
-        self.sky = props.get_emissive_texture("sky") if "sky" in props else None
+        self.sky = spectrum(props, "sky", emissive=True) if "sky" in props else None
         self.clamp = flag(props, "clamp", True)
         self.min_contribution = number(props, "min_contribution", MIN_CONTRIBUTION, least=0)
         self.bounce_budget = choice(props, "bounce_budget", BUDGETS)
-        self._prepared = None
+        self._prepared: Prepared | None = None
 
     # ------------------------------------- Mitsuba's interface ----------------------------------------
 
