@@ -21,7 +21,7 @@ release = mrt_mitsuba.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
-exclude_patterns = ["_build", "_generated/*.inc.md", "examples"]
+exclude_patterns = ["_build", "_generated/*.inc.md", "examples", "jupyter_execute"]
 html_theme = "furo"
 html_title = "mrt-mitsuba"
 html_use_index = html_domain_indices = False  # there is a search
