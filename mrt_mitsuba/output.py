@@ -98,8 +98,22 @@ def write_exr(
     attributes |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     # The library does not report a full disk when it opens the file itself, so the file is ours.
     picture = OpenEXR.File(attributes, _channels(image, layers or {}))
-    with replacing(path) as file:
+    with replacing(path) as file, _compressing():
         picture.write(_Stream(file))
+
+
+@contextlib.contextmanager
+def _compressing() -> Iterator[None]:
+    """Let the EXR library compress in threads, to the same file. They are gone afterwards: a process that is
+    forked while it has some waits for them for ever."""
+    import OpenEXR
+
+    before = OpenEXR.global_thread_count()
+    OpenEXR.set_global_thread_count(os.cpu_count() or 1)
+    try:
+        yield
+    finally:
+        OpenEXR.set_global_thread_count(before)
 
 
 class _Stream:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -278,3 +279,17 @@ def test_permissions_follow_the_umask_and_the_old_file(tmp_path: Path, image: np
         assert path.stat().st_mode & 0o777 == 0o604
     finally:
         os.umask(old)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
+def test_a_forked_process_can_write_too(tmp_path: Path, image: np.ndarray) -> None:
+    """The threads that compress are not there in the child: it must not wait for them."""
+    output.write_exr(tmp_path / "a.exr", image)
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)  # end it, should it wait
+        output.write_exr(tmp_path / "b.exr", image)
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
