@@ -30,12 +30,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     _open_closed_streams()
-    with warnings.catch_warnings(), ending_soon(_end_by_force):
+    with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         code = _guarded(words)
-        if code in (INTERRUPTED, TERMINATED) and arguments is None:
-            leave_now(code)  # the interpreter would wait for the kernels that run
-        return code
+    if code in (INTERRUPTED, TERMINATED) and arguments is None:
+        leave_now(code)  # the interpreter would wait for the kernels that run
+    return code
 
 
 def _open_closed_streams() -> None:
@@ -52,8 +52,9 @@ def _open_closed_streams() -> None:
 def _guarded(arguments: list[str]) -> int:
     """Run the command; whatever goes wrong becomes one line and an exit code."""
     try:
-        code = _dispatch(arguments)
-        sys.stdout.flush()
+        with ending_soon(_end_by_force):
+            code = _dispatch(arguments)
+            sys.stdout.flush()
         return code
     except MrtError as error:
         return _fail(str(error), error.exit_code)

@@ -28,6 +28,9 @@ def ending_soon(clean_up: Callable[[], object]) -> Iterator[None]:
 
     ``clean_up`` is called before the process is ended by force; its exit code is 128 + the number of the
     signal. Without effect outside the main thread, where Python sets no handlers, and without POSIX signals.
+
+    What the program raises at last is what the signal raised at first, also where Dr.Jit or Mitsuba made an
+    error of their own of it on the way.
     """
     if os.name != "posix" or threading.current_thread() is not threading.main_thread():
         yield
@@ -36,19 +39,35 @@ def ending_soon(clean_up: Callable[[], object]) -> Iterator[None]:
     os.set_blocking(write_end, False)
     ended = threading.Event()
     threading.Thread(target=_watch, args=(read_end, ended, clean_up), daemon=True).start()
-    handler = signal.signal(signal.SIGTERM, _terminate)
+    raised: list[KeyboardInterrupt] = []
+    handlers = {signal.SIGTERM: signal.signal(signal.SIGTERM, _raising(raised, Terminated))}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where Ctrl-C is to be ignored
+        handlers[signal.SIGINT] = signal.signal(signal.SIGINT, _raising(raised, KeyboardInterrupt))
     wakeup = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
     try:
         yield
+    except Exception as error:
+        if raised:
+            raise raised[0] from error
+        raise
     finally:
         signal.set_wakeup_fd(wakeup)
-        signal.signal(signal.SIGTERM, handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
         ended.set()
         os.close(write_end)  # ends the thread
 
 
-def _terminate(number: int, frame: FrameType | None) -> None:
-    raise Terminated
+def _raising(
+    raised: list[KeyboardInterrupt], kind: type[KeyboardInterrupt]
+) -> Callable[[int, FrameType | None], None]:
+    """A handler that raises an exception and notes it."""
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        raised.append(kind())
+        raise raised[-1]
+
+    return handle
 
 
 def _watch(read_end: int, ended: threading.Event, clean_up: Callable[[], object]) -> None:

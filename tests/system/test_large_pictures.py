@@ -235,7 +235,7 @@ def test_a_signal_in_the_middle_ends_it_in_order(tmp_path: Path, code: str, word
             seconds = time.monotonic() - start
         finally:
             process.kill()
-        assert process.returncode == 143
+        assert process.returncode == 143, process.stderr.read()
         assert process.stderr.read() == "mrt: terminated\n"  # by force, it would be "interrupted"
     assert seconds < 2
     assert list(tmp_path.iterdir()) == []

@@ -34,6 +34,25 @@ def test_orderly_end_is_left_alone() -> None:
     assert called == []
 
 
+@pytest.mark.parametrize(
+    ("number", "kind"), [(signal.SIGTERM, Terminated), (signal.SIGINT, KeyboardInterrupt)]
+)
+def test_error_that_a_library_makes_of_it_is_undone(number: signal.Signals, kind: type) -> None:
+    """Dr.Jit raises ``RuntimeError`` where it is interrupted while it records a loop."""
+    with pytest.raises(KeyboardInterrupt) as found, ending_soon(lambda: None):
+        try:
+            os.kill(os.getpid(), number)
+            signal.pause()
+        except KeyboardInterrupt as error:
+            raise RuntimeError("encountered an exception") from error
+    assert found.type is kind
+
+
+def test_other_errors_stay_what_they_are() -> None:
+    with pytest.raises(RuntimeError, match="mine"), ending_soon(lambda: None):
+        raise RuntimeError("mine")
+
+
 def test_other_threads_may_use_it() -> None:
     """Python sets handlers in the main thread only; elsewhere the block just runs."""
     ran = []
