@@ -6,9 +6,20 @@ from typing import Any
 
 import mitsuba as mi
 
+from .adapter import construct, keep_apart
 from .intersect import Frame, cone_frame
-from .parameters import flag, integer, number, vector
-from .revolution import Placement, QuadricTable, check_axis, fill, refill, table_of, unit_cone_mesh, vector64
+from .parameters import flag, number, vector
+from .revolution import (
+    Placement,
+    QuadricTable,
+    check_axis,
+    fill,
+    refill,
+    side_count,
+    table_of,
+    unit_cone_mesh,
+    vector64,
+)
 from .variants import first, is_jit, updatable
 
 
@@ -28,7 +39,7 @@ class MrtCone(mi.Mesh):
     ``base_center`` point     required   scene units, not the apex
     ``radius``      float     1          > 0, of the base disc, scene units
     ``capped``      boolean   true       with the base disc; without, open and lit on its outside only
-    ``segments``    integer   256        >= 3, sides of the mesh
+    ``segments``    integer   256        3 to 65536, sides of the mesh
     ``to_world``    transform identity   any invertible affine transform; a skew one makes it elliptic
     =============== ========= ========== ==============================================================
 
@@ -59,16 +70,14 @@ class MrtCone(mi.Mesh):
         check_axis("mrt_cone", "apex", apex, "base_center", base_center)
         self.capped = flag(props, "capped", True)
         self.placement = Placement(props)
-        self.unit = unit_cone_mesh(integer(props, "segments", 256, least=3), self.capped)
+        self.unit = unit_cone_mesh(side_count(props, 256), self.capped)
         self.exact_frame = self.placement(cone_frame(vector64(apex), vector64(base_center), radius))
         sizes = len(self.unit.points), len(self.unit.faces)
-        mi.Mesh.__init__(self, "mrt_cone", *sizes, props, has_vertex_normals=True, has_vertex_texcoords=True)
+        construct(self, "mrt_cone", sizes, props, normals=True, texcoords=True)
         fill(self, self.unit, self.exact_frame)
         self.apex, self.base_center = mi.Point3f(apex), mi.Point3f(base_center)
         self.radius = updatable(radius)
-        # Mitsuba merges meshes that share a BSDF when it loads a scene, but leaves those with attributes
-        # alone
-        self.add_attribute("face_mrt_cone", 1, [0.0] * sizes[1])
+        keep_apart(self, "mrt_cone", sizes[1])
 
     def frame(self) -> Frame:
         """The shape's unit frame in world space, in double precision (see ``intersect``)."""

@@ -6,14 +6,16 @@ from typing import Any
 
 import mitsuba as mi
 
+from .adapter import construct, keep_apart
 from .intersect import Frame, cylinder_frame
-from .parameters import flag, integer, number, vector
+from .parameters import flag, number, vector
 from .revolution import (
     Placement,
     QuadricTable,
     check_axis,
     fill,
     refill,
+    side_count,
     table_of,
     unit_cylinder_mesh,
     vector64,
@@ -34,7 +36,7 @@ class MrtCylinder(mi.Mesh):
     ``p1``       point     required   the other end, scene units
     ``radius``   float     1          > 0, scene units
     ``capped``   boolean   true       with discs; without, the tube is open and lit on its outside only
-    ``segments`` integer   256        >= 3, sides of the mesh
+    ``segments`` integer   256        3 to 65536, sides of the mesh
     ``to_world`` transform identity   any invertible affine transform; under a skew one it is elliptic
     ============ ========= ========== ==============================================================
 
@@ -64,17 +66,13 @@ class MrtCylinder(mi.Mesh):
         check_axis("mrt_cylinder", "p0", p0, "p1", p1)
         self.capped = flag(props, "capped", True)
         self.placement = Placement(props)
-        self.unit = unit_cylinder_mesh(integer(props, "segments", 256, least=3), self.capped)
+        self.unit = unit_cylinder_mesh(side_count(props, 256), self.capped)
         self.exact_frame = self.placement(cylinder_frame(vector64(p0), vector64(p1), radius))
         sizes = len(self.unit.points), len(self.unit.faces)
-        mi.Mesh.__init__(
-            self, "mrt_cylinder", *sizes, props, has_vertex_normals=True, has_vertex_texcoords=True
-        )
+        construct(self, "mrt_cylinder", sizes, props, normals=True, texcoords=True)
         fill(self, self.unit, self.exact_frame)
         self.p0, self.p1, self.radius = mi.Point3f(p0), mi.Point3f(p1), updatable(radius)
-        # Mitsuba merges meshes that share a BSDF when it loads a scene, but leaves those with attributes
-        # alone
-        self.add_attribute("face_mrt_cylinder", 1, [0.0] * sizes[1])
+        keep_apart(self, "mrt_cylinder", sizes[1])
 
     def frame(self) -> Frame:
         """The shape's unit frame in world space, in double precision (see ``intersect``)."""

@@ -7,11 +7,18 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from .buffers import write_buffers
+from .adapter import construct, keep_apart, write_buffers
 from .columns import Columns, column
 from .intersect import cone_frame, cylinder_frame
-from .parameters import ParameterError, choice, integer
-from .revolution import QuadricTable, UnitMesh, unit_cone_mesh, unit_cylinder_mesh, unit_sphere_mesh
+from .parameters import ParameterError, choice
+from .revolution import (
+    QuadricTable,
+    UnitMesh,
+    side_count,
+    unit_cone_mesh,
+    unit_cylinder_mesh,
+    unit_sphere_mesh,
+)
 
 # Numbers of an object: those of two points, or one, and a radius
 _WIDTH = {"sphere": 4, "cone": 7, "cylinder": 7}
@@ -32,8 +39,8 @@ class MrtGroup(mi.Mesh):
                                           base centre, radius, and for cylinders: p0, p1, radius
     ``face_NAME``   ``Bitmap``            float32 [n, 1 or 3], values of the objects that a ``mesh_attribute``
                                           texture of this name looks up
-    ``segments``    integer    8          >= 3, sides of the stand-in of a cone or cylinder; that of a sphere
-                                          is an octahedron
+    ``segments``    integer    8          3 to 65536, sides of the stand-in of a cone or cylinder; that of a
+                                          sphere is an octahedron
     =============== ========== ========== ==============================================================
 
     .. code-block:: python
@@ -54,17 +61,17 @@ class MrtGroup(mi.Mesh):
         _check(numbers)
         attributes = {name: _table(props, name) for name in props if name.startswith("face_")}
         self.content = f"kind={kind}, objects={len(numbers)}"
-        unit = _unit_mesh(kind, integer(props, "segments", 8, least=3))
+        unit = _unit_mesh(kind, side_count(props, 8))
         faces = len(unit.faces)
         self.table = QuadricTable(kind, *_frames(kind, numbers), faces * np.arange(len(numbers)))
         sizes = len(numbers) * len(unit.points), len(numbers) * faces
-        mi.Mesh.__init__(self, "mrt_group", *sizes, props, has_vertex_normals=True)
+        construct(self, "mrt_group", sizes, props, normals=True)
         write_buffers(self, **_stand_in(unit, self.table))
         for name, values in attributes.items():
             if len(values) != len(numbers):
                 raise ParameterError(f'mrt_group: "{name}" has {len(values)} rows for {len(numbers)} objects')
             self.add_attribute(name, values.shape[1], np.repeat(values, faces, axis=0).ravel())
-        self.add_attribute("face_mrt_group", 1, np.zeros(sizes[1], np.float32))  # keeps it from being merged
+        keep_apart(self, "mrt_group", sizes[1])
 
     def quadrics(self) -> QuadricTable:
         """What ``mrt_whitted`` intersects in place of the mesh."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .buffers import write_buffers
+from .adapter import construct, write_buffers
 from .parameters import ParameterError
 
 
@@ -39,7 +39,7 @@ class MrtMesh(mi.Mesh):
                 f'mrt_mesh: "texcoords" has {len(texcoords)} entries for {len(positions)} positions'
             )
         sizes = len(positions), len(faces)
-        mi.Mesh.__init__(self, "mrt_mesh", *sizes, props, has_vertex_texcoords=texcoords is not None)
+        construct(self, "mrt_mesh", sizes, props, texcoords=texcoords is not None)
         buffers = {"vertex_positions": positions.astype(np.float32), "faces": faces.astype(np.uint32)}
         if texcoords is not None:
             buffers["vertex_texcoords"] = texcoords.astype(np.float32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .buffers import write_buffers
+from .adapter import construct, keep_apart, write_buffers
 from .parameters import ParameterError, number, vector
 
 
@@ -52,7 +52,7 @@ class MrtPlane(mi.Mesh):
         self.distance = number(props, "distance", 0.0)
         extent = number(props, "extent", 100.0, above=0)
         self.tangents = _tangents(self.unit_normal)  # [2, 3]
-        mi.Mesh.__init__(self, "mrt_plane", 4, 2, props, has_vertex_normals=False, has_vertex_texcoords=True)
+        construct(self, "mrt_plane", (4, 2), props, texcoords=True)
         corners = 0.5 * extent * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # [4, 2]
         positions = corners @ self.tangents - self.distance * self.unit_normal  # [4, 3]
         write_buffers(
@@ -61,8 +61,7 @@ class MrtPlane(mi.Mesh):
             vertex_texcoords=corners.astype(np.float32).ravel(),
             faces=np.array([0, 1, 2, 0, 2, 3], dtype=np.uint32),
         )
-        # Mitsuba merges meshes that share a BSDF when it loads a scene, but not those with attributes
-        self.add_attribute("face_mrt_plane", 1, [0.0, 0.0])
+        keep_apart(self, "mrt_plane", 2)
 
     def to_string(self) -> str:
         return f"MrtPlane[normal={self.unit_normal.tolist()}, distance={self.distance:g}]"

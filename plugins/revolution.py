@@ -10,10 +10,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .buffers import write_buffers
+from .adapter import write_buffers
 from .intersect import Frame
-from .parameters import ParameterError
+from .parameters import ParameterError, integer
 from .variants import first
+
+# From some thousand sides on the triangles are slivers, between which rays slip through; more help nobody
+MOST_SEGMENTS = 65536
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,11 @@ def unit_sphere_mesh() -> UnitMesh:
     turned = [(sum(octant) % 2) == 1 for octant in octants]  # an odd number of mirrored axes
     faces = [octant[::-1] if turn else octant for octant, turn in zip(octants, turned, strict=True)]
     return UnitMesh(points, points, np.zeros((6, 2)), np.array(faces, np.uint32))
+
+
+def side_count(props: mi.Properties, default: int) -> int:
+    """The parameter ``segments``: sides of a mesh."""
+    return integer(props, "segments", default, least=3, most=MOST_SEGMENTS)
 
 
 def unit_cone_mesh(segments: int, capped: bool) -> UnitMesh:

@@ -212,7 +212,8 @@ def test_scenes_keep_the_shapes_apart() -> None:
     [
         ({"radius": -1.0}, ["mrt_cone", "radius", "-1", "> 0"]),
         ({"radius": float("nan")}, ["radius", "nan", "> 0"]),
-        ({"segments": 2}, ["segments", "2", ">= 3"]),
+        ({"segments": 2}, ["segments", "2", "from 3 to 65536"]),
+        ({"segments": 10**8}, ["segments", "100000000", "from 3 to 65536"]),
         ({"apex": [0.5, 0.4, 0.3]}, ["apex", "base_center", "two points"]),
         ({"capped": 1}, ["capped", "true or false"]),
         ({"to_world": [0.0, 1.0, 1.0]}, ["to_world", "not invertible"]),
