@@ -99,6 +99,8 @@ def _own_source(name: str, scene: Any, width: int | None, height: int | None, in
         raise SceneError(f"{name} has no sensor: add one, so that there is something to look through")
     sensor = scene.sensors()[0]
     own_width, own_height = (int(n) for n in sensor.film().crop_size())
+    if own_width < 1 or own_height < 1:
+        raise SceneError(f"{name} brings a film of {own_width}x{own_height}: give it one pixel at least")
     if width not in (None, own_width) or height not in (None, own_height):
         raise UsageError(
             f"{name} brings a film of {own_width}x{own_height}: "

@@ -102,6 +102,12 @@ SCENES: list[Case] = [
         1,
         'mrt_whitted: "max_depth" is 0, but must be an integer >= 1',
     ),
+    (
+        xml("", SENSOR.format("<integer name='height' value='0'/>")),
+        "out scene=a.xml",
+        1,
+        "768x0: give it one",
+    ),
     (xml(""), "out scene=a.xml width=9", 2, "a.xml brings a film of 4x3: change it there"),
     (xml(""), "out scene=a.xml fresnel=schlick", 2, "it is a parameter of mrt_bsdf"),
 ]
