@@ -106,7 +106,7 @@ SCENES: list[Case] = [
         xml("", SENSOR.format("<integer name='height' value='0'/>")),
         "out scene=a.xml",
         1,
-        "768x0: give it one",
+        "768x0: give it",
     ),
     (xml(""), "out scene=a.xml width=9", 2, "a.xml brings a film of 4x3: change it there"),
     (xml(""), "out scene=a.xml fresnel=schlick", 2, "it is a parameter of mrt_bsdf"),
