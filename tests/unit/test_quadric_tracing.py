@@ -84,6 +84,109 @@ def test_tree_holds_every_box_once_and_halves_evenly(count: int) -> None:
     assert count == 1 or abs(sides[0] - sides[1]) <= 1
 
 
+def group_of(kind: str, ends: np.ndarray, radii: np.ndarray) -> Quadrics:
+    """Quadrics of cones or cylinders from arrays [n, 2, 3] and [n]."""
+    numbers = np.concatenate([ends.reshape(-1, 6), radii[:, None]], axis=1).astype(np.float32)
+    return Quadrics([mi.load_dict({"type": "mrt_group", "kind": kind, "numbers": mi.Bitmap(numbers)})])
+
+
+def nearest_of_all(kind: str, ends: np.ndarray, radii: np.ndarray, o: np.ndarray, d: np.ndarray):
+    """Distances [N] in float64 by a loop over all objects, and those with every object a fiftieth thinner."""
+    from drjit.llvm.ad import Array3f64, Float64
+
+    make, meet = (getattr(intersect, name) for name in (f"{kind}_frame", f"intersect_{kind}"))
+    o, d = Array3f64(o.T.astype(float)), Array3f64(d.T.astype(float))
+    found = []
+    for shrink in (1.0, 0.98):
+        best = dr.full(Float64, np.inf, dr.width(o))
+        for (p0, p1), radius in zip(ends.astype(np.float32).tolist(), radii.astype(np.float32), strict=True):
+            frame = make(Array3f64(*p0), Array3f64(*p1), dr.opaque(Float64, float(radius) * shrink))
+            dr.make_opaque(frame.origin, frame.x, frame.y, frame.z)
+            best = dr.minimum(best, meet(o, d, frame).t)
+            dr.eval(best)
+        found.append(best.numpy())
+    return found
+
+
+def disagreements(t: np.ndarray, exact: np.ndarray, thinner: np.ndarray) -> np.ndarray:
+    """Where float32 found another object, or none, [N].
+
+    It moves a ray sideways by some roundings of the way to the object: from 1e4 sizes away, by up to a
+    hundredth of the radius. So where a thinner object would be met elsewhere, it may go either way.
+    """
+    same = np.isclose(t, exact, rtol=1e-2) | (np.isinf(t) & np.isinf(exact))
+    grazing = ~(np.isclose(exact, thinner, rtol=0.1) | (np.isinf(exact) & np.isinf(thinner)))
+    return ~same & ~grazing
+
+
+@pytest.mark.parametrize("kind", ["cone", "cylinder"])
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("place", ["among", "inside", "at the surface", "far away"])
+def test_search_against_float64(kind: str, scale: float, place: str) -> None:
+    """120 overlapping objects of sizes over three decades; ``far away`` is 1e4 times the size of one."""
+    rng = np.random.default_rng(8)
+    count, rays = 120, 20_000
+    sizes = 10 ** rng.uniform(-2, 1, count)
+    start = rng.uniform(-3, 3, (count, 3))
+    ends = np.stack([start, start + rng.normal(size=(count, 3)) * sizes[:, None]], axis=1)
+    radii = sizes * rng.uniform(0.1, 1, count)
+    d = rng.normal(size=(rays, 3))
+    which = rng.integers(0, count, rays)
+    inner = ends[which].mean(axis=1)
+    if place == "among":
+        o = rng.uniform(-4, 4, (rays, 3))
+    elif place == "inside":
+        o = inner + rng.normal(size=(rays, 3)) * 0.05 * radii[which, None]
+    elif place == "at the surface":  # a hundredth of the radius off it
+        axis = np.diff(ends[which], axis=1)[:, 0]
+        out = np.cross(axis, rng.normal(size=(rays, 3)))
+        half = 0.5 if kind == "cone" else 1.0
+        o = inner + out / np.linalg.norm(out, axis=1, keepdims=True) * (radii[which] * half * 1.01)[:, None]
+    else:
+        o = inner + 1e4 * sizes[which, None] * d / np.linalg.norm(d, axis=1, keepdims=True)
+        d = inner + rng.normal(size=(rays, 3)) * 0.3 * radii[which, None] - o
+    o, d, ends, radii = (np.float32(x) for x in (o * scale, d, ends * scale, radii * scale))
+    quadrics = group_of(kind, ends, radii)
+    ray = mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T), dr.opaque(mi.Float, 2.0**127), 0, [])
+    t = np.array(quadrics.intersect(ray, mi.Bool(True))[0], float)
+    t[t > 1e38] = np.inf
+    exact, thinner = nearest_of_all(kind, ends, radii, o, d)
+    wrong = disagreements(t, exact, thinner)
+    assert np.isfinite(exact).mean() > 0.3
+    assert wrong.mean() < 2e-4
+    blocked = np.array(quadrics.occluded(ray, mi.Bool(True)))
+    assert (blocked == np.isfinite(t)).all()
+    # The comparison has power: an object that a search overlooks is seen
+    assert disagreements(np.where(np.arange(rays) % 1000 == 0, np.inf, t), exact, thinner).mean() > 2e-4
+
+
+def test_equal_objects_in_one_place_hide_nothing() -> None:
+    """An open tube around a cone of the same length and radius: their boxes are one and the same."""
+    tube = mi.load_dict({"type": "mrt_cylinder", "p0": [0, 0, 0], "p1": [0, 0, 1], "capped": False})
+    twins = [tube] * 3 + [mi.load_dict({"type": "mrt_cone", "apex": [0, 0, 0], "base_center": [0, 0, 1]})] * 2
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(-0.6, 0.6, (2, 10_000))
+    o, d = mi.Point3f(x, y, -2), mi.Vector3f(0, 0, 1)
+    ray = mi.Ray3f(o, d, dr.opaque(mi.Float, 1e30, 10_000), 0, [])
+    t = Quadrics(twins).intersect(ray, mi.Bool(True))[0].numpy()
+    np.testing.assert_allclose(t, 2 + np.hypot(x, y), rtol=1e-5)  # the side of the cone
+
+
+def test_a_large_object_among_small_ones() -> None:
+    """Before, behind and around the small ones, from outside and from within it."""
+    rng = np.random.default_rng(6)
+    start = rng.uniform(-1, 1, (50, 3))
+    ends = np.stack([start, start + rng.normal(size=(50, 3)) * 0.2], axis=1)
+    ends = np.concatenate([ends, [[[0, 0, -60], [0, 0, 0.5]]]])
+    radii = np.append(np.full(50, 0.1), 40.0)
+    o, d = (np.float32(rng.normal(size=(20_000, 3)) * size) for size in (3, 1))
+    quadrics = group_of("cylinder", ends, radii)
+    ray = mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T), dr.opaque(mi.Float, 1e30), 0, [])
+    t = np.array(quadrics.intersect(ray, mi.Bool(True))[0], float)
+    t[t > 1e29] = np.inf
+    assert disagreements(t, *nearest_of_all("cylinder", ends, radii, o, d)).mean() < 2e-4
+
+
 def scene_9_depths(width: int, height: int) -> np.ndarray:
     """Distances from the eye in scene 9, [H, W], by textbook formulas in float64; the cone is upright."""
     scene = report_scene(9)
