@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, Any
 
-from mrt_mitsuba.errors import MrtWarning, OutputError
+from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -167,7 +167,9 @@ def _blocks(image: Image, tonemap: str) -> Iterator[tuple[int, NDArray[np.uint8]
     """Yield the picture in 8 bit as ``to_8bit`` has it, some rows at a time with the number of the first."""
     import numpy as np
 
-    convert = {"report": _report_levels, "srgb": _srgb_levels}[tonemap]
+    if tonemap not in _LEVELS:
+        raise UsageError(f"tonemap={tonemap!r}: must be {' or '.join(_LEVELS)}")
+    convert = _LEVELS[tonemap]
     rows, lost = max(1, _PIXELS // image.shape[1]), 0
     for row in range(0, len(image), rows):
         block = np.asarray(image[row : row + rows], np.float32)
@@ -188,6 +190,9 @@ def _srgb_levels(values: Image) -> NDArray[np.uint8]:
 
     encoded = np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
     return (encoded * 255 + 0.5).astype(np.uint8)
+
+
+_LEVELS = {"report": _report_levels, "srgb": _srgb_levels}
 
 
 def _channels(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:

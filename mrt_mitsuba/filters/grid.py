@@ -30,13 +30,18 @@ class Grid:
     """
 
     def __init__(self, image: Any) -> None:
+        shape = _shape(image)
+        if len(shape) < 2:
+            raise UsageError(
+                f"image has shape {shape}; expected [rows, columns] or [rows, columns, channels]"
+            )
         module = _backend_module(image)
         self._tensor = module.TensorXf
         self._kind = type(image) if dr.is_tensor_v(image) else np.ndarray
         self.Float: Any = dr.array_t(module.TensorXf)
         self.Int: Any = dr.int32_array_t(self.Float)
         self.Bool: Any = dr.mask_t(self.Float)
-        self.rows, self.columns = _shape(image)[:2]
+        self.rows, self.columns = shape[:2]
         self.count = self.rows * self.columns
         self.height = dr.opaque(self.Int, self.rows)
         self.width = dr.opaque(self.Int, self.columns)

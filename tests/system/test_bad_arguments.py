@@ -104,6 +104,8 @@ def test_results_are_not_saved_under_other_endings(tmp_path: Path) -> None:
     ):
         with pytest.raises(mrt.OutputError, match=re.escape(text)):
             result.save(tmp_path / name)
+    with pytest.raises(mrt.UsageError, match="tonemap='neon': must be report or srgb"):
+        result.save(tmp_path / "a.png", tonemap="neon")
     assert list(tmp_path.iterdir()) == []
 
 

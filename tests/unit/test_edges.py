@@ -424,7 +424,9 @@ def test_edges_image_is_white_on_black() -> None:
 
 
 @pytest.mark.parametrize("detector", DETECTORS)
-@pytest.mark.parametrize("shape", [(4, 5), (4, 5, 4), (4, 5, 1), (3, 4, 5, 3), (0, 5, 3), (5, 0, 3)])
+@pytest.mark.parametrize(
+    "shape", [(), (4,), (4, 5), (4, 5, 4), (4, 5, 1), (3, 4, 5, 3), (0, 5, 3), (5, 0, 3)]
+)
 def test_a_wrong_shape_is_named(detector: Any, shape: tuple[int, ...]) -> None:
     with pytest.raises(UsageError, match="image has shape"):
         detector(np.zeros(shape))
