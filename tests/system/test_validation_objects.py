@@ -55,3 +55,20 @@ def test_wrong_depths_are_rejected(change, fault: str) -> None:
     assert objects.depth_errors(ours, ours.astype(float)) == objects.DepthErrors(1.0, 0.0)
     errors = objects.depth_errors(change(ours), ours.astype(float))
     assert errors.close < 0.995 if fault == "close" else errors.astray > 2e-4
+
+
+def test_crowds_differ_in_kind_only() -> None:
+    spheres, cones = objects.crowd(50)
+    assert (len(spheres.spheres), len(spheres.cones), len(cones.spheres), len(cones.cones)) == (50, 0, 0, 50)
+    for sphere, cone in zip(spheres.spheres, cones.cones, strict=True):
+        ends = np.array([cone.apex, cone.base_center])
+        np.testing.assert_allclose(ends.mean(axis=0), sphere.center)
+        assert np.linalg.norm(ends[0] - ends[1]) == pytest.approx(2 * sphere.radius)
+        assert (cone.radius, cone.material) == (sphere.radius, sphere.material)
+
+
+def test_cones_are_compared_with_spheres() -> None:
+    study = Study("objects", objects.TITLE)
+    objects.compare_with_spheres(study, width=40, height=30, samples=(1,))
+    (table,) = (part for part in study.parts if isinstance(part, Table))
+    assert len(table.rows) == 1 and study.figures["cones_over_spheres_aa_1"] > 0
