@@ -4,6 +4,12 @@ The tree is a complete binary one in heap order: node 1 is the root, 2 i and 2 i
 the last level holds one object or nothing in each leaf. All nodes of a level are split along the same axis,
 at the median. So a walk needs no stack and no links, and the nearer child comes first for each ray by its
 direction alone.
+
+Why not Mitsuba's tree, with something around each object that it can hold? It finds one thing at a time, so a
+ray that starts at an object, or passes near one, queries it two or three times. With triangles that is faster
+for rays that run side by side only, slower for mirror rays and for few objects, and takes 10⁵ objects twice
+as long to load. With the shape ``ellipsoids`` it is faster, but that computes in float32 with an error that
+grows with the square of the distance in sizes of the object: from 300 sizes away some rays are lost.
 """
 
 from __future__ import annotations
