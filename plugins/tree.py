@@ -8,8 +8,8 @@ direction alone.
 Why not Mitsuba's tree, with something around each object that it can hold? It finds one thing at a time, so a
 ray that starts at an object, or passes near one, queries it two or three times. With triangles that is faster
 for rays that run side by side only, slower for mirror rays and for few objects, and 10⁵ objects take half as
-long again to load. With the shape ``ellipsoids`` it is faster, but that computes in float32 with an error that
-grows with the square of the distance in sizes of the object: from hundreds of sizes away, rays are lost.
+long again to load. With the shape ``ellipsoids`` it is faster, but that computes in float32 with an error
+that grows with the square of the distance in sizes of the object: from hundreds of sizes away, rays are lost.
 """
 
 from __future__ import annotations
