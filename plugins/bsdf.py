@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .fresnel import f0_from_ior, fresnel_dielectric, fresnel_schlick
+from .lookup import ByShape
 from .microfacet import (
     beckmann_d,
     half_vector_angles,
@@ -139,16 +140,36 @@ class MrtBSDF(mi.BSDF):
         self._update()
         self.version += 1  # what others have derived from the parameters is out of date
 
+    def point(self, si, active) -> _Point:
+        """The parameters at a surface point."""
+        return _Point(self, si, active)
+
+    def constants(self) -> _Constants | None:
+        """The parameters as numbers; None where one varies, has derivatives, or has no place there."""
+        names = ("alpha", "int_ior", "ext_ior", "diffuse_reflectance", "specular_reflectance")
+        if self.f0 is not None or self._varies(*(getattr(self, name) for name in names)):
+            return None
+        point = self.point(dr.zeros(mi.SurfaceInteraction3f), True)
+        numbers, colors = [point.alpha_given, point.int_ior, point.ext_ior], [point.diffuse, point.specular]
+        if dr.grad_enabled(numbers, colors):
+            return None
+        return _Constants([first(x) for x in numbers], *([first(x) for x in color] for color in colors))
+
+    @staticmethod
+    def merged(shapes) -> MrtBSDF | None:
+        """One BSDF that is, at each of ``shapes``, what theirs are; None where that cannot be."""
+        return _Merged.of(shapes)
+
     # -------------------------------------- Value and density ------------------------------------------
 
     def eval(self, ctx, si, wo, active=True):
-        return mi.depolarizer(self._value(ctx, _Point(self, si, active), _Pair.above(si.wi, wo, active)))
+        return mi.depolarizer(self._value(ctx, self.point(si, active), _Pair.above(si.wi, wo, active)))
 
     def pdf(self, ctx, si, wo, active=True):
-        return self._density(ctx, _Point(self, si, active), _Pair.above(si.wi, wo, active))
+        return self._density(ctx, self.point(si, active), _Pair.above(si.wi, wo, active))
 
     def eval_pdf(self, ctx, si, wo, active=True):
-        point, pair = _Point(self, si, active), _Pair.above(si.wi, wo, active)
+        point, pair = self.point(si, active), _Pair.above(si.wi, wo, active)
         return mi.depolarizer(self._value(ctx, point, pair)), self._density(ctx, point, pair)
 
     def _value(self, ctx, point, pair):
@@ -203,7 +224,7 @@ class MrtBSDF(mi.BSDF):
     # ------------------------------------------- Sampling ----------------------------------------------
 
     def sample(self, ctx, si, sample1, sample2, active=True):
-        point = _Point(self, si, active)
+        point = self.point(si, active)
         above = active & (si.wi.z > COS_MIN)
         wi = dr.select(above, si.wi, mi.Vector3f(0, 0, 1))
         specular = sample1 < self._specular_probability(ctx, point)
@@ -239,19 +260,19 @@ class MrtBSDF(mi.BSDF):
     # ------------------------------------------ Attributes ---------------------------------------------
 
     def eval_diffuse_reflectance(self, si, active=True):
-        return mi.Spectrum(_Point(self, si, active).diffuse)
+        return mi.Spectrum(self.point(si, active).diffuse)
 
     def has_attribute(self, name, active=True):
         return name in ("mirror_reflectance", "int_ior")
 
     def eval_attribute(self, name, si, active=True):
         if name == "mirror_reflectance":
-            return _Point(self, si, active).mirror_reflectance
+            return self.point(si, active).mirror_reflectance
         raise ParameterError(f'mrt_bsdf: no spectrum attribute "{name}"; there is "mirror_reflectance"')
 
     def eval_attribute_1(self, name, si, active=True):
         if name == "int_ior":
-            return _Point(self, si, active).int_ior
+            return self.point(si, active).int_ior
         raise ParameterError(f'mrt_bsdf: no scalar attribute "{name}"; there is "int_ior"')
 
     def mirror_bound(self) -> tuple[float, float]:
@@ -291,14 +312,22 @@ class _Point:
         return parameter if is_jit() else first(parameter)
 
     @cached_property
+    def alpha_given(self):
+        return self._read("alpha")
+
+    @cached_property
     def alpha(self):
-        alpha = self._read("alpha")
+        alpha = self.alpha_given
         size = _within(dr.abs(alpha), ALPHA_MIN, ALPHA_MAX)
         return dr.select(alpha < 0, -size, size)
 
     @cached_property
     def int_ior(self):
         return self._read("int_ior")
+
+    @cached_property
+    def ext_ior(self):
+        return self._read("ext_ior")
 
     @cached_property
     def diffuse(self):
@@ -312,7 +341,7 @@ class _Point:
         """F at a microfacet: a float, or a spectrum where ``f0`` was given."""
         if self.bsdf.fresnel == "unity":
             return mi.Float(1)
-        ext_ior, int_ior = (_within(ior, IOR_MIN, IOR_MAX) for ior in (self._read("ext_ior"), self.int_ior))
+        ext_ior, int_ior = (_within(ior, IOR_MIN, IOR_MAX) for ior in (self.ext_ior, self.int_ior))
         if self.bsdf.fresnel == "dielectric":
             return fresnel_dielectric(cos_theta, ext_ior, int_ior, sin2_theta)
         given = self.bsdf.f0
@@ -351,6 +380,69 @@ class _Pair:
         up = mi.Vector3f(0, 0, 1)
         wi, wo, active = dr.select(above_i, wi, up), dr.select(above_o, wo, up), above_i & above_o
         return cls(wi, wo, tan2_theta(wi + wo) if tan2_theta_h is None else tan2_theta_h, active)
+
+
+# --------------------------------------------- Many as one ----------------------------------------------
+
+
+@dataclass
+class _Constants:
+    """Parameters that are the same everywhere."""
+
+    numbers: list[float]  # alpha, int_ior, ext_ior
+    diffuse: list[float]  # of each channel
+    specular: list[float]
+
+
+class _Merged(MrtBSDF):
+    """An ``mrt_bsdf`` whose parameters are those of the shape that was hit, looked up in tables.
+
+    Mitsuba calls each BSDF of a scene in turn, and the Python code of each runs to record the call: 1 ms for
+    an instance, at every render. This one is recorded once, for any number of materials.
+    """
+
+    def __init__(self, shapes, constants: list[_Constants]):
+        mi.BSDF.__init__(self, mi.Properties("mrt_bsdf"))
+        self.fresnel, self.f0 = shapes[0].bsdf().fresnel, None
+        self.numbers, self.diffuse, self.specular = (
+            ByShape(mi.Vector4f, shapes, [[*row, *[0] * (4 - len(row))] for row in rows], [1] * 4)
+            for rows in zip(*(vars(c).values() for c in constants), strict=True)
+        )
+
+    @classmethod
+    def of(cls, shapes) -> _Merged | None:
+        """None where a BSDF is of another kind, varies over a surface, or its derivatives are wanted."""
+        bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
+        # Inside an instance, shapes are not the scene's own
+        if not is_jit() or mi.is_spectral or any(s.class_name() == "Instance" for s in shapes):
+            return None
+        if (
+            not all(type(b) is MrtBSDF for b in bsdfs.values())
+            or len({b.fresnel for b in bsdfs.values()}) != 1
+        ):
+            return None
+        constants = {key: b.constants() for key, b in bsdfs.items()}
+        if None in constants.values():
+            return None
+        return cls(shapes, [constants[id(s.bsdf())] for s in shapes])
+
+    def point(self, si, active):
+        return _Row(self, si, active)
+
+
+class _Row(_Point):
+    """The parameters of the shape at a surface point."""
+
+    def __init__(self, merged: _Merged, si, active):
+        super().__init__(merged, si, active)
+        # One mask for all lights, or they would be looked up for each
+        everywhere = mi.Bool(True)
+        self.alpha_given, self.int_ior, self.ext_ior, _ = merged.numbers(si, everywhere)
+        channels = dr.size_v(mi.UnpolarizedSpectrum)
+        self.diffuse, self.specular = (
+            mi.UnpolarizedSpectrum(list(color(si, everywhere))[:channels])
+            for color in (merged.diffuse, merged.specular)
+        )
 
 
 mi.register_bsdf("mrt_bsdf", MrtBSDF)

@@ -7,9 +7,9 @@ from functools import partial
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from .intersect import intersect_plane
+from .lookup import ByShape, Table
 from .parameters import choice, flag, integer, number, spectrum
 from .quadrics import is_quadric, quadrics_of
 from .variants import but_not, is_jit, pointer
@@ -341,6 +341,8 @@ class Prepared:
         self.scales, self.spheres = _Scales(others), _Spheres(others)
         self._read_emitters(scene)
         self._read_bsdfs({id(b): b for b in (s.bsdf() for s in shapes)}.values())
+        mergeable = self.bsdfs and all(hasattr(b, "merged") for b in self.bsdfs)
+        self.merged = self.bsdfs[0].merged(shapes) if mergeable else None
         self.versions = self._versions()
         meshes = any(s.is_mesh() for s in others)
         if meshes:
@@ -447,9 +449,14 @@ class Prepared:
         call."""
         arguments = (hit.si, [s.wo for s in samples], [s.facing for s in samples], hit.found)
         evaluate = partial(_eval_bsdf, mirror)  # dispatch would take a bool among the arguments for its mask
-        if is_jit():
+        if not is_jit():
+            return evaluate(hit.si.bsdf() if hit.found else None, *arguments)
+        if self.merged is None:
             return dr.dispatch(hit.si.bsdf(), evaluate, *arguments)
-        return evaluate(hit.si.bsdf() if hit.found else None, *arguments)
+        # A branch only to keep the code together: mixed with that of shadow rays, it runs out of registers
+        return dr.if_stmt(
+            arguments, hit.found, partial(evaluate, self.merged), partial(evaluate, None), label="bsdf"
+        )
 
     def mirror_ray(self, ray, hit):
         """The ray reflected at ``hit``."""
@@ -473,8 +480,8 @@ class _Planes:
         self.equations = [(mi.Vector3f(s.unit_normal.tolist()), mi.Float(s.distance)) for s in shapes]
         # The same kernel serves every plane of every scene: its numbers are data
         dr.make_opaque(self.equations)
-        self.tangents = [_Table(mi.Vector3f, [s.tangents[k] for s in shapes]) for k in range(2)]
-        self.shapes = _Table("Shape", shapes)
+        self.tangents = [Table(mi.Vector3f, [s.tangents[k] for s in shapes]) for k in range(2)]
+        self.shapes = Table("Shape", shapes)
 
     def __len__(self) -> int:
         return len(self.equations)
@@ -520,32 +527,13 @@ class _Planes:
         return dr.select(where, dr.abs(distance), scale)
 
 
-class _Table:
-    """Rows of numbers, or pointers to objects of Mitsuba (``kind`` "Shape", ...), looked up by index."""
-
-    def __init__(self, kind, rows):
-        self.kind, self.rows = kind, rows
-        if not is_jit():
-            self.rows = rows if isinstance(kind, str) else [kind([float(x) for x in row]) for row in rows]
-        elif isinstance(kind, str):
-            self.kind, self.rows = getattr(mi, kind + "Ptr"), pointer(kind, rows)
-        else:
-            self.rows = mi.Float(np.asarray(rows, np.float32).ravel())
-        dr.eval(self.rows)
-
-    def __call__(self, index, active):
-        if is_jit():
-            return dr.gather(self.kind, self.rows, index, active)
-        return self.rows[index if active else 0]
-
-
 class _Scales:
     """Size of the coordinates of the shape that was hit: the largest number in its bounding box."""
 
     def __init__(self, shapes):
         sizes = [_coordinate_size(s.bbox()) for s in shapes]
         # The shapes inside an instance are not of the scene's own: the largest for them
-        self.by_shape = _ByShape(mi.Float, shapes, sizes, max(sizes, default=0.0)) if shapes else None
+        self.by_shape = ByShape(mi.Float, shapes, sizes, max(sizes, default=0.0)) if shapes else None
 
     def __call__(self, si, found):
         return mi.Float(0) if self.by_shape is None else self.by_shape(si, found)
@@ -561,7 +549,7 @@ class _Spheres:
     def __init__(self, shapes):
         rows = [_center_and_radius(s) for s in shapes]
         self.by_shape = (
-            _ByShape(mi.Vector4f, shapes, rows, [0.0] * 4) if any(any(row) for row in rows) else None
+            ByShape(mi.Vector4f, shapes, rows, [0.0] * 4) if any(any(row) for row in rows) else None
         )
 
     def interaction(self, pi, ray, found):
@@ -591,34 +579,6 @@ class _Spheres:
         on_sphere = found & (radius > 0) & (length > 0)
         # A shift without a derivative: how the hit moves with the sphere is for Mitsuba to say
         si.p += dr.select(on_sphere, center + v * (radius / dr.select(on_sphere, length, 1)) - p, 0)
-
-
-class _ByShape:
-    """Numbers for each of some shapes, looked up for the one that was hit; ``fallback`` for others."""
-
-    def __init__(self, kind, shapes, rows, fallback):
-        self.kind = kind
-        self.fallback = kind(fallback)
-        if not is_jit():
-            self.shapes = shapes  # alive, or their ids could pass to others
-            self.rows = {id(s): kind(row) for s, row in zip(shapes, rows, strict=True)}
-            return
-        ids = dr.reinterpret_array(mi.UInt32, pointer("Shape", shapes))
-        size = dr.max(ids)[0] + 1
-        width = 1 if kind is mi.Float else dr.size_v(kind)
-        table = np.tile(np.float32(fallback), size).reshape(size, width)
-        table[np.array(ids)] = np.reshape(rows, (-1, width))
-        self.table = mi.Float(table.ravel())
-        self.size = dr.opaque(mi.UInt32, size)
-        dr.make_opaque(self.fallback)
-        dr.eval(self.table)
-
-    def __call__(self, si, found):
-        if not is_jit():
-            return self.rows.get(id(si.shape), self.fallback) if found else self.fallback
-        ids = dr.reinterpret_array(mi.UInt32, si.shape)
-        known = found & (ids < self.size)
-        return dr.select(known, dr.gather(self.kind, self.table, ids, known), self.fallback)
 
 
 def _center_and_radius(shape) -> list[float]:

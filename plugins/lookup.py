@@ -1,0 +1,56 @@
+"""Numbers and objects by index or by shape, in vectorised kernels and in scalar variants alike."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .variants import is_jit, pointer
+
+
+class Table:
+    """Rows of numbers, or pointers to objects of Mitsuba (``kind`` "Shape", ...), looked up by index."""
+
+    def __init__(self, kind, rows):
+        self.kind, self.rows = kind, rows
+        if not is_jit():
+            self.rows = rows if isinstance(kind, str) else [kind([float(x) for x in row]) for row in rows]
+        elif isinstance(kind, str):
+            self.kind, self.rows = getattr(mi, kind + "Ptr"), pointer(kind, rows)
+        else:
+            self.rows = mi.Float(np.asarray(rows, np.float32).ravel())
+        dr.eval(self.rows)
+
+    def __call__(self, index, active):
+        if is_jit():
+            return dr.gather(self.kind, self.rows, index, active)
+        return self.rows[index if active else 0]
+
+
+class ByShape:
+    """Numbers for each of some shapes, looked up for the one that was hit; ``fallback`` for others."""
+
+    def __init__(self, kind, shapes, rows, fallback):
+        self.kind = kind
+        self.fallback = kind(fallback)
+        if not is_jit():
+            self.shapes = shapes  # alive, or their ids could pass to others
+            self.rows = {id(s): kind(row) for s, row in zip(shapes, rows, strict=True)}
+            return
+        ids = dr.reinterpret_array(mi.UInt32, pointer("Shape", shapes))
+        size = dr.max(ids)[0] + 1
+        width = 1 if kind is mi.Float else dr.size_v(kind)
+        table = np.tile(np.float32(fallback), size).reshape(size, width)
+        table[np.array(ids)] = np.reshape(rows, (-1, width))
+        self.table = mi.Float(table.ravel())
+        self.size = dr.opaque(mi.UInt32, size)
+        dr.make_opaque(self.fallback)
+        dr.eval(self.table)
+
+    def __call__(self, si, found):
+        if not is_jit():
+            return self.rows.get(id(si.shape), self.fallback) if found else self.fallback
+        ids = dr.reinterpret_array(mi.UInt32, si.shape)
+        known = found & (ids < self.size)
+        return dr.select(known, dr.gather(self.kind, self.table, ids, known), self.fallback)

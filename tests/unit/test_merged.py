@@ -1,0 +1,128 @@
+"""Many ``mrt_bsdf`` evaluated as one by ``mrt_whitted``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mrt_mitsuba.plugins import plugin
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def rgb(*values: float) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(values)}
+
+
+def spheres(count: int, **more: Any) -> dict[str, Any]:
+    """A row of spheres before a plane, no two materials alike: reflections of one in the other."""
+    look = mi.ScalarTransform4f().look_at([0, 3, 9], [0, 0.5, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 48, "height": 24, "component_format": "float32"}
+    scene: dict[str, Any] = {
+        "type": "scene",
+        "integrator": {"type": "mrt_whitted"},
+        "sensor": {"type": "perspective", "fov": 50, "to_world": look, "film": film},
+        "sky": {"type": "constant", "radiance": 0.3},
+        "light": {"type": "mrt_light", "position": [3, 6, 5]},
+        "floor": {"type": "mrt_plane", "normal": [0, 1, 0], "bsdf": {"type": "mrt_bsdf", "alpha": 0.3}},
+    }
+    for k in range(count):
+        x = (k + 0.5) / count
+        material = {
+            "type": "mrt_bsdf",
+            "alpha": 0.02 + 0.4 * x,
+            "int_ior": 1.2 + x,
+            "ext_ior": 1 + 0.1 * x,
+            "diffuse_reflectance": rgb(x, 0.5, 1 - x),
+            "specular_reflectance": rgb(1 - x, x, 0.7),
+        }
+        center = [8 * x - 4, 3 / count, 0]
+        scene[f"sphere{k}"] = {"type": "sphere", "center": center, "radius": 3 / count, "bsdf": material}
+    return scene | more
+
+
+def merged(scene: mi.Scene) -> Any:
+    return scene.integrator().prepare(scene).merged
+
+
+def picture(scene: mi.Scene) -> np.ndarray:
+    return np.array(mi.render(scene, spp=4, seed=1))
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono"], indirect=True)
+def test_picture_is_that_of_separate_calls(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the last bit: the same code on the same numbers, from a table or from each BSDF."""
+    scene = mi.load_dict(spheres(7))
+    assert merged(scene) is not None
+    together = picture(scene)
+    monkeypatch.setattr(plugin("bsdf").MrtBSDF, "merged", staticmethod(lambda shapes: None))
+    scene = mi.load_dict(spheres(7))
+    assert merged(scene) is None
+    assert together.std() > 0.02  # there is something to see
+    assert np.array_equal(together, picture(scene))
+
+
+def test_materials_are_recorded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+    value = plugin("bsdf").MrtBSDF._value
+
+    def counting(*arguments: Any) -> Any:
+        calls.append(1)
+        return value(*arguments)
+
+    monkeypatch.setattr(plugin("bsdf").MrtBSDF, "_value", counting)
+    counts = []
+    for count in (2, 30):
+        calls.clear()
+        picture(mi.load_dict(spheres(count)))
+        counts.append(len(calls))
+    assert counts[0] == counts[1] > 0
+
+
+TEXTURE = {"type": "checkerboard", "color0": rgb(0.1, 0.1, 0.1), "color1": rgb(0.9, 0.9, 0.9)}
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"type": "diffuse"},
+        {"type": "mrt_bsdf", "diffuse_reflectance": TEXTURE},
+        {"type": "mrt_bsdf", "alpha": TEXTURE},
+        {"type": "mrt_bsdf", "f0": 0.5},
+        {"type": "mrt_bsdf", "fresnel": "unity"},
+    ],
+)
+def test_other_materials_are_called(other: dict[str, Any]) -> None:
+    """One that does not fit into the table, and all are called as Mitsuba calls them."""
+    more = {"type": "sphere", "center": [0, 2, 0], "radius": 0.5, "bsdf": other}
+    assert merged(mi.load_dict(spheres(3, more=more))) is None
+
+
+def test_parameters_follow_updates_and_derivatives() -> None:
+    scene = mi.load_dict(spheres(3, integrator={"type": "mrt_whitted", "max_depth": 1}))
+    before = picture(scene)
+    parameters = mi.traverse(scene)
+    name = "sphere1.bsdf.alpha"
+    parameters[name] = mi.Float(0.9)
+    parameters.update()
+    assert merged(scene) is not None
+    assert np.abs(picture(scene) - before).max() > 0.01
+    alpha = mi.Float(0.4)
+    dr.enable_grad(alpha)
+    parameters[name] = alpha
+    parameters.update()
+    assert merged(scene) is None
+    loss = dr.mean(mi.render(scene, parameters, spp=4).array)
+    dr.backward(loss)
+    assert abs(dr.grad(alpha)[0]) > 1e-5
+
+
+def test_a_scene_without_shapes_is_the_sky() -> None:
+    scene = spheres(0)
+    del scene["floor"]
+    image = picture(mi.load_dict(scene))
+    assert image == pytest.approx(0.3, rel=1e-6)
