@@ -38,7 +38,8 @@ def ending_soon(clean_up: Callable[[], object]) -> Iterator[None]:
     read_end, write_end = os.pipe()
     os.set_blocking(write_end, False)
     ended = threading.Event()
-    threading.Thread(target=_watch, args=(read_end, ended, clean_up), daemon=True).start()
+    watcher = threading.Thread(target=_watch, args=(read_end, ended, clean_up), daemon=True)
+    watcher.start()
     raised: list[KeyboardInterrupt] = []
     handlers = {signal.SIGTERM: signal.signal(signal.SIGTERM, _raising(raised, Terminated))}
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where Ctrl-C is to be ignored
@@ -56,6 +57,7 @@ def ending_soon(clean_up: Callable[[], object]) -> Iterator[None]:
             signal.signal(number, handler)
         ended.set()
         os.close(write_end)  # ends the thread
+        watcher.join(GRACE)
 
 
 def _raising(

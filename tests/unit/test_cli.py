@@ -254,7 +254,12 @@ def test_signal_leaves_the_old_file_and_ends_within_two_seconds(
     (tmp_path / "out.png").write_bytes(b"old")
     command = [sys.executable, "-c", IN_A_RENDER.format(work=work), "out", "format=png"]
     with subprocess.Popen(
-        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # not as in a background
     ) as process:
         try:
             while "working" not in process.stdout.readline():
