@@ -7,6 +7,7 @@ costs no triangles and is as good as float32.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -107,9 +108,7 @@ def compare_with_spheres(study: Study, *, width: int, height: int, samples: tupl
         for aa in samples:
             for scene in (spheres, cones):  # kernels are compiled
                 mrt.render(scene, aa=aa)
-            found = ratio(
-                lambda aa=aa: mrt.render(cones, aa=aa), lambda aa=aa: mrt.render(spheres, aa=aa), repeats=3
-            )
+            found = ratio(partial(mrt.render, cones, aa=aa), partial(mrt.render, spheres, aa=aa), repeats=3)
             study.record(f"cones_over_spheres_aa_{aa}", found.median)
             seconds = f"{found.seconds:.3g}", f"{found.other_seconds:.3g}"
             rows.append([aa, *seconds, f"{found.median:.2f}", f"{found.low:.2f} to {found.high:.2f}"])
