@@ -402,7 +402,8 @@ class _Merged(MrtBSDF):
     """
 
     def __init__(self, shapes, constants: list[_Constants]):
-        mi.BSDF.__init__(self, mi.Properties("mrt_bsdf"))
+        # Without mi.BSDF.__init__, by which Dr.Jit would come to know one more BSDF and record its calls in
+        # the kernels of every scene: this one is called from Python only
         self.fresnel, self.f0 = shapes[0].bsdf().fresnel, None
         self.numbers, self.diffuse, self.specular = (
             ByShape(mi.Vector4f, shapes, [[*row, *[0] * (4 - len(row))] for row in rows], [1] * 4)

@@ -126,3 +126,15 @@ def test_a_scene_without_shapes_is_the_sky() -> None:
     del scene["floor"]
     image = picture(mi.load_dict(scene))
     assert image == pytest.approx(0.3, rel=1e-6)
+
+
+def test_other_integrators_do_not_meet_it(variant: str) -> None:
+    """Dr.Jit records the calls of every BSDF that it knows of, in whatever scene."""
+    scene = mi.load_dict(spheres(3))
+    kept = merged(scene)
+    assert kept is not None
+    path = mi.load_dict({"type": "path", "max_depth": 2})
+    calls: list[object] = []
+    kept.eval_pdf = lambda *arguments: calls.append(arguments)
+    assert np.isfinite(np.array(mi.render(scene, integrator=path, spp=1))).all()
+    assert not calls
