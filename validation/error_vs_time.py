@@ -224,9 +224,10 @@ def _figure(points: Sequence[Point], ahead: Sequence[Point], own_error: float) -
         marker = "s" if kind.endswith("centered") else "o"
         draw([p for p in points if _kind(p.name) == kind], linestyle="none", marker=marker, label=kind)
     draw(ahead, color="0.3", linewidth=1, marker="o", markersize=11, fillstyle="none", label="Pareto front")
-    for p in ahead:
+    for number, p in enumerate(ahead):
         place = (1000 * p.seconds, max(p.rmse, bottom))
-        axes.annotate(p.name, place, textcoords="offset points", xytext=(7, 6), fontsize=8)
+        above_or_below = (7, 6 if number % 2 == 0 else -12)
+        axes.annotate(p.name, place, textcoords="offset points", xytext=above_or_below, fontsize=8)
     if own_error > 0:
         axes.axhline(own_error, color="0.6", linestyle=":", label="error of the reference")
     if len(errors) < len(points):

@@ -160,7 +160,9 @@ def _reading(e: Exponent) -> str:
         return f"ten times as much takes {10**e.value:.2g} times as long: less than in proportion"
     if low > 1:
         return f"ten times as much takes {10**e.value:.2g} times as long: more than in proportion"
-    return "not told apart from in proportion" if low > 0 else "no growth is told apart from in proportion"
+    if low <= 0:
+        return "too uncertain to tell from no growth, or from growth in proportion"
+    return "not told apart from growth in proportion"
 
 
 def _caption(series: Mapping[str, Mapping[int, Found]]) -> str:

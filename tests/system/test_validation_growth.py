@@ -30,8 +30,8 @@ def test_readings_follow_the_interval():
 
     assert "2 times as long: less than" in text(0.301, 0.1)
     assert "more than in proportion" in text(1.3, 0.1)
-    assert "not told apart from in proportion" in text(0.95, 0.1)
-    assert "no growth" in text(0.1, 1.5)
+    assert "not told apart from growth in proportion" in text(0.95, 0.1)
+    assert "too uncertain" in text(0.1, 1.5)
 
 
 @pytest.mark.parametrize("what", growth.SERIES)
