@@ -20,6 +20,7 @@ from .intersect import (
     intersect_unit_sphere,
     sphere_surface,
 )
+from .lookup import own
 from .revolution import QuadricTable
 from .tree import Tree
 from .variants import is_jit, pointer
@@ -56,13 +57,13 @@ class Quadrics:
         table[tree.leaf_of, :3, 3] = origins
         table[tree.leaf_of, 3, 0] = kinds
         table[tree.leaf_of, 3, 1] = np.abs(boxes).max(axis=(1, 2))
-        self.table = mi.Float(table.ravel())
+        self.table = own(table)
         owner, faces = np.zeros((2, tree.leaves), np.uint32)
         owner[tree.leaf_of] = np.repeat(np.arange(len(shapes)), counts)
         faces[tree.leaf_of] = np.concatenate([t.first_faces for t in tables])
         self.shapes = dr.gather(mi.ShapePtr, pointer("Shape", shapes), mi.UInt32(owner))
         self.faces = mi.UInt32(faces)
-        dr.eval(self.table, self.shapes, self.faces)
+        dr.eval(self.shapes, self.faces)
 
     def intersect(self, ray: Any, active: Any) -> tuple[Any, Any, Any]:
         """Distance, place in the tables and part of the nearest quadric; distance ``ray.maxt`` for none."""

@@ -1,15 +1,14 @@
 """A tree of boxes over many small objects, built with numpy and walked in Dr.Jit.
 
 The tree is a complete binary one in heap order: node 1 is the root, 2 i and 2 i + 1 are the children of i,
-the last level holds one object or nothing in each leaf. All nodes of a level are split along the same axis,
-at the median. So a walk needs no stack and no links, and the nearer child comes first for each ray by its
-direction alone.
+the last level holds one object or nothing in each leaf; nodes are split at the median of their longest side.
+So a walk needs no links, and instead of a stack one bit for each level: does a child wait there whose sibling
+came first? A node holds the boxes of both children, so that one look decides where to go.
 
 Why not Mitsuba's tree, with something around each object that it can hold? It finds one thing at a time, so a
-ray that starts at an object, or passes near one, queries it two or three times. With triangles that is faster
-for rays that run side by side only, slower for mirror rays and for few objects, and 10⁵ objects take half as
-long again to load. With the shape ``ellipsoids`` it is faster, but that computes in float32 with an error
-that grows with the square of the distance in sizes of the object: from hundreds of sizes away, rays are lost.
+ray that starts at an object, or passes near one, queries it two or three times, and 10⁵ objects take half as
+long again to load. The shape ``ellipsoids`` computes in float32 with an error that grows with the square of
+the distance in sizes of the object: from hundreds of sizes away, rays are lost.
 """
 
 from __future__ import annotations
@@ -21,6 +20,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .lookup import own
+
 # Box tests are wider than exact by some float32 roundings, relative to distances and to coordinates
 _SLACK = 8 * 2.0**-24
 
@@ -28,27 +29,17 @@ _SLACK = 8 * 2.0**-24
 _LEAST_SLOPE = 1e-18
 
 
-_NO_LEAF = 0xFFFFFFFF
-
-
 class Tree:
     """Boxes [n, 2, 3] (lower and upper corner) in a tree; ``leaf_of`` [n] is where each object is, from 0."""
 
     def __init__(self, boxes: np.ndarray) -> None:
         count = len(boxes)
-        self.depth = max(count - 1, 0).bit_length()
-        self.leaves = 1 << self.depth
-        order, axes = _sort(boxes.mean(axis=1), self.depth)
+        depth = max(count - 1, 1).bit_length()  # the root has two children, if of nothing
+        self.leaves = 1 << depth
         self.leaf_of = np.empty(count, np.int64)
-        self.leaf_of[order] = np.arange(count) * self.leaves // count
-        self.boxes = mi.Float(_heap(boxes, self.leaf_of, self.leaves).ravel())
-        # For each axis, the bits of a leaf's number that say on which side it is along it. They, and the
-        # sizes, are data: one kernel serves all trees
-        bits = [sum(1 << (self.depth - 1 - k) for k, a in enumerate(axes) if a == axis) for axis in range(3)]
-        self.axis_bits = [dr.opaque(mi.UInt32, b) for b in bits]
-        self.first_leaf = dr.opaque(mi.UInt32, self.leaves)
-        self.last_level = dr.opaque(mi.UInt32, self.depth)
-        dr.eval(self.boxes)
+        self.leaf_of[_sort(boxes.mean(axis=1), depth)] = np.arange(count) * self.leaves // count
+        self.boxes = own(_heap(boxes, self.leaf_of, self.leaves))
+        self.first_leaf = dr.opaque(mi.UInt32, self.leaves)  # data: one kernel serves all trees
 
     def walk(self, ray: Any, active: Any, visit: Callable[[Any, tuple], tuple], state: tuple, *,
              any_hit: bool = False) -> tuple:  # fmt: skip
@@ -57,84 +48,100 @@ class Tree:
         The first of ``state`` is the reach of the ray; ``visit`` returns a new state, with the distance of a
         hit there if that is less. With ``any_hit``, a ray is done as soon as that has happened.
         """
-        backwards = [c < 0 for c in ray.d]
+        # Distance to a plane across an axis: plane * inverse + shift
         inverse = [1 / _off_zero(c) for c in ray.d]
-        flips = mi.UInt32(0)
-        for back, bits in zip(backwards, self.axis_bits, strict=True):
-            flips |= dr.select(back, bits, 0)
+        shift = [-c * i for c, i in zip(ray.o, inverse, strict=True)]
+        rows = [mi.UInt32(2 * axis) + dr.select(ray.d[axis] < 0, mi.UInt32(1), 0) for axis in range(3)]
         reach = state[0]
 
-        def to_next_box(node: Any, leaf: Any, reach: Any) -> tuple[Any, Any, Any]:
-            level = 31 - dr.lzcnt(node)
-            place = node ^ (flips >> (self.last_level - level))
-            enters = self._meets_box(place, ray.o, inverse, backwards, reach)
-            is_leaf = node >= self.first_leaf
-            after = node + 1
-            after >>= dr.tzcnt(after)  # up to where this was a first child, and on to the second
-            after = dr.select(after == 1, 0, after)
-            leaf = dr.select(enters & is_leaf, place - self.first_leaf, leaf)
-            return dr.select(enters & ~is_leaf, node << 1, after), leaf, reach
+        def down(node: Any, waiting: Any, reach: Any) -> tuple[Any, Any, Any]:
+            near, far = self._children(node, inverse, shift, rows)
+            meets = [n <= dr.minimum(f, reach) for n, f in zip(near, far, strict=True)]
+            second_first = meets[1] & (~meets[0] | (near[1] < near[0]))
+            child = (node << 1) | dr.select(second_first, mi.UInt32(1), 0)
+            waiting_below = (waiting << 1) | dr.select(meets[0] & meets[1], mi.UInt32(1), 0)
+            up = _to_next(node, waiting)
+            deeper = meets[0] | meets[1]
+            return dr.select(deeper, child, up[0]), dr.select(deeper, waiting_below, up[1]), reach
 
-        def to_next_leaf(node: Any, state: tuple) -> tuple[Any, tuple]:
+        def to_next_leaf(node: Any, waiting: Any, state: tuple) -> tuple[Any, Any, tuple]:
             # All rays of a packet go on to a leaf each before any is looked into: that costs ten times a box
-            node, leaf, _ = dr.while_loop(
-                (node, mi.UInt32(_NO_LEAF), state[0]),
-                lambda node, leaf, reach: (node != 0) & (leaf == _NO_LEAF),
-                to_next_box,
+            node, waiting, _ = dr.while_loop(
+                (node, waiting, state[0]),
+                lambda node, *_: (node != 0) & (node < self.first_leaf),
+                down,
                 label="boxes",
             )
-            found = leaf != _NO_LEAF
-            return node, dr.if_stmt((leaf, state), found, visit, lambda leaf, state: state, label="leaf")
+            found = node != 0
+            leaf = node - self.first_leaf
+            _, state = dr.if_stmt(
+                (leaf, state),
+                found,
+                lambda leaf, s: (leaf, visit(leaf, s)),
+                lambda leaf, s: (leaf, s),
+                label="leaf",
+            )
+            return *_to_next(node, waiting), state
 
-        def goes_on(node: Any, state: tuple) -> Any:
+        def goes_on(node: Any, waiting: Any, state: tuple) -> Any:
             going = node != 0
             return going & (state[0] >= reach) if any_hit else going
 
-        return dr.while_loop(
-            (dr.select(active, mi.UInt32(1), 0), state), goes_on, to_next_leaf, label="tree"
-        )[1]
+        start = dr.select(active, mi.UInt32(1), 0), mi.UInt32(0), state
+        return dr.while_loop(start, goes_on, to_next_leaf, label="tree")[2]
 
-    def _meets_box(self, place: Any, o: Any, inverse: list, backwards: list, reach: Any) -> Any:
-        low = dr.gather(mi.Vector4f, self.boxes, 2 * place)
-        high = dr.gather(mi.Vector4f, self.boxes, 2 * place + 1)
-        near, far = mi.Float(0), reach
-        for k in range(3):
-            first, last = dr.select(backwards[k], high[k], low[k]), dr.select(backwards[k], low[k], high[k])
-            near = dr.maximum(near, (first - o[k]) * inverse[k])
-            far = dr.minimum(far, (last - o[k]) * inverse[k] * (1 + _SLACK))
-        return near <= far
+    def _children(self, node: Any, inverse: list, shift: list, rows: list) -> tuple[list, list]:
+        """Where a ray enters and leaves the boxes of both children."""
+        near, far = [mi.Float(0), mi.Float(0)], [mi.Float(dr.inf), mi.Float(dr.inf)]
+        for axis in range(3):
+            first0, first1, last0, last1 = dr.gather(mi.Vector4f, self.boxes, 6 * node + rows[axis])
+            for child, (first, last) in enumerate(((first0, last0), (first1, last1))):
+                near[child] = dr.maximum(near[child], dr.fma(first, inverse[axis], shift[axis]))
+                far[child] = dr.minimum(far[child], dr.fma(last, inverse[axis], shift[axis]))
+        return near, [f * (1 + _SLACK) for f in far]
+
+
+def _to_next(node: Any, waiting: Any) -> tuple[Any, Any]:
+    """Up to the next child that waits; node 0 if none does."""
+    levels = dr.tzcnt(waiting)
+    done = waiting == 0
+    return dr.select(done, 0, (node >> levels) ^ 1), dr.select(done, 0, (waiting >> levels) ^ 1)
 
 
 def _off_zero(x: Any) -> Any:
     return dr.select(dr.abs(x) >= _LEAST_SLOPE, x, dr.select(x < 0, -_LEAST_SLOPE, _LEAST_SLOPE))
 
 
-def _sort(centers: np.ndarray, depth: int) -> tuple[np.ndarray, list[int]]:
-    """The objects in the order of the leaves, and the axis along which each level is split."""
-    order, axes = np.arange(len(centers)), []
+def _sort(centers: np.ndarray, depth: int) -> np.ndarray:
+    """The objects in the order of the leaves: segments of them, halved along their longest side."""
+    order = np.arange(len(centers))
     for level in range(depth):
         segment = (np.arange(len(centers)) << level) // len(centers)
         starts = np.flatnonzero(np.diff(segment, prepend=-1))
-        sorted_centers = centers[order]
-        extent = np.maximum.reduceat(sorted_centers, starts) - np.minimum.reduceat(sorted_centers, starts)
-        axis = int(np.argmax(extent.mean(axis=0)))
-        order = order[np.lexsort((sorted_centers[:, axis], segment))]
-        axes.append(axis)
-    return order, axes
+        inside = centers[order]
+        extent = np.maximum.reduceat(inside, starts) - np.minimum.reduceat(inside, starts)
+        axis = np.repeat(extent.argmax(axis=1), np.diff(starts, append=len(centers)))
+        order = order[np.lexsort((inside[np.arange(len(centers)), axis], segment))]
+    return order
 
 
 def _heap(boxes: np.ndarray, leaf_of: np.ndarray, leaves: int) -> np.ndarray:
-    """Boxes of all nodes, float32 [2 leaves, 2, 4]; empty ones are inside out, which no ray meets."""
-    low, high = np.full((2 * leaves, 4), np.inf), np.full((2 * leaves, 4), -np.inf)
+    """Boxes of the children of all nodes, float32 [leaves, 3, 2, 4]: along each axis both lower ends and both
+    upper ends; then, for rays that run backwards, the upper ends first. Empty boxes are inside out, which no
+    ray meets.
+    """
+    low, high = np.full((2 * leaves, 3), np.inf), np.full((2 * leaves, 3), -np.inf)
     margin = _SLACK * np.abs(boxes).max(axis=(1, 2))[:, None]
-    low[leaves + leaf_of, :3] = boxes[:, 0] - margin
-    high[leaves + leaf_of, :3] = boxes[:, 1] + margin
+    low[leaves + leaf_of] = boxes[:, 0] - margin
+    high[leaves + leaf_of] = boxes[:, 1] + margin
     size = leaves
     while size > 1:
         size //= 2
-        low[size : 2 * size] = low[2 * size : 4 * size].reshape(size, 2, 4).min(axis=1)
-        high[size : 2 * size] = high[2 * size : 4 * size].reshape(size, 2, 4).max(axis=1)
+        low[size : 2 * size] = low[2 * size : 4 * size].reshape(size, 2, 3).min(axis=1)
+        high[size : 2 * size] = high[2 * size : 4 * size].reshape(size, 2, 3).max(axis=1)
     largest = np.finfo(np.float32).max / 4
-    heap = np.clip(np.stack([low, high], axis=1), -largest, largest)
-    heap[:, :, 3] = 0
-    return heap.astype(np.float32)
+    ends = np.clip(np.stack([low, high]), -largest, largest).reshape(
+        2, leaves, 2, 3
+    )  # end, node, child, axis
+    forwards = ends.transpose(1, 3, 0, 2)  # node, axis, end, child
+    return np.stack([forwards, forwards[:, :, ::-1]], axis=2).reshape(leaves, 3, 2, 4).astype(np.float32)

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mrt_mitsuba.plugins import plugin
+from mrt_mitsuba.plugins import lookup, plugin
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -138,3 +138,18 @@ def test_other_integrators_do_not_meet_it(variant: str) -> None:
     kept.eval_pdf = lambda *arguments: calls.append(arguments)
     assert np.isfinite(np.array(mi.render(scene, integrator=path, spp=1))).all()
     assert not calls
+
+
+def test_tables_are_read_in_one_go() -> None:
+    """Whatever the address of the array that they are made from: else the kernel depends on it."""
+    index = dr.arange(mi.UInt32, 100) % 8
+    kernels = set()
+    for shift in range(16):  # one of them lies at a multiple of 64 bytes, the others do not
+        values = np.arange(48, dtype=np.float32)[shift : shift + 32]
+        row = dr.gather(mi.Vector4f, lookup.own(values), index)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            dr.eval(row)
+            kernels.update(entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT]))
+        assert np.array_equal(np.array(row)[:, :8], values.reshape(8, 4).T)
+    assert len(kernels) == 1
