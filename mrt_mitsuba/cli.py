@@ -106,6 +106,11 @@ def render(options: Options) -> int:
         warnings.simplefilter("ignore", MrtWarning)
     else:
         print(banner(options), flush=True)
+    if options.log != "warn":
+        from mrt_mitsuba import logs, runtime
+
+        runtime.use(options.variant)
+        logs.show(options.log)
     progress = Progress() if options.quiet else TerminalProgress(show_plan=options.plan == "show")
     start = time.perf_counter()
     scene: Any = options.scene if options.scene is not None else options.scene_number

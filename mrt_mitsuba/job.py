@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +15,8 @@ from mrt_mitsuba.memory import Workspace
 from mrt_mitsuba.progress import Advance, Progress
 from mrt_mitsuba.rays import Bundle
 from mrt_mitsuba.trace import CHANNELS, Camera, Planes, Tracer, trace_bundle
+
+log = logging.getLogger(__name__)
 
 # Layers that count rays, by the kind of ray
 SECONDARY_RAYS = {"mirror": "bounces", "shadow": "shadow_rays"}
@@ -34,8 +37,9 @@ class Job:
         start = time.perf_counter()
         with self.progress.stage(title, total, message) as advance:
             yield advance
-        name = title.lower()
-        self.passes[name] = self.passes.get(name, 0.0) + time.perf_counter() - start
+        name, seconds = title.lower(), time.perf_counter() - start
+        self.passes[name] = self.passes.get(name, 0.0) + seconds
+        log.info("%s: %d pixels in %.3f s", name, total, seconds)
 
     def trace(
         self,
@@ -50,6 +54,7 @@ class Job:
         """Trace a bundle in parts that fit into memory, see ``trace_bundle``, and count its rays."""
         channels = sum(CHANNELS[name] for name in wanted)
         rays = self.workspace.rays_at_once(channels)
+        log.debug("tracing %d rays, at most %d at once", bundle.ray_count, rays)
         parts = trace_bundle(tracer, camera, bundle, wanted, seed=seed, before=before, rays_at_once=rays)
         for pixels, planes in parts:
             self._count(len(pixels), bundle.rays_per_pixel, planes)

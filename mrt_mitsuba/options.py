@@ -265,10 +265,25 @@ class Options:
     )
     plan: str = option("hide", choice("show", "hide"), "print what will run and what is left out, and why")
     quiet: bool = option(False, switch(), "print errors only", "0")
+    log: str = option(
+        "warn",
+        choice("error", "warn", "info", "debug"),
+        "what to tell: warnings; times; every kernel",
+    )
 
     def render_arguments(self) -> dict[str, Any]:
         """Return the options that say how to render, by name, without those about files and messages."""
-        others = {"filename", "scene_number", "scene", "format", "tonemap", "plan", "quiet", *FOR_MODELS}
+        others = {
+            "filename",
+            "scene_number",
+            "scene",
+            "format",
+            "tonemap",
+            "plan",
+            "quiet",
+            "log",
+            *FOR_MODELS,
+        }
         return {name: getattr(self, name) for name in TABLE if name not in others}
 
     def shows_model(self) -> bool:

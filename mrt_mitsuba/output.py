@@ -7,6 +7,7 @@ under a temporary name, which also disappears if anything goes wrong.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import stat
 import warnings
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Image = NDArray[np.float32]
+
+log = logging.getLogger(__name__)
 
 # The layers of an EXR and their channels, in the order in which the last axis of an array holds them.
 LAYERS = {
@@ -252,6 +255,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
             if os.path.exists(target):
                 os.chmod(temporary, stat.S_IMODE(os.stat(target).st_mode))
             os.replace(temporary, target)
+            log.info("wrote %s", target)
         except BaseException:
             with contextlib.suppress(OSError):
                 os.unlink(temporary)

@@ -5,6 +5,7 @@ scene → plan → rays → integrator → filters → result; each step is a mo
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -23,6 +24,8 @@ from mrt_mitsuba.rays import Lattice
 from mrt_mitsuba.result import Result, Timings
 from mrt_mitsuba.source import Source, open_scene
 from mrt_mitsuba.trace import AVERAGED, Camera, Tracer, WhittedTracer
+
+log = logging.getLogger(__name__)
 
 
 def render(
@@ -123,10 +126,12 @@ def render(
         job = Job(progress, _workspace(plan, takes, given["memory"]))
         progress.plan(plan)
         load = time.perf_counter() - start
+        log.info("scene %s loaded in %.3f s for %s", source.name, load, variant)
         camera = Camera(source.sensor, source.width, source.height, given["motion"])
         frames = _Frames()
         for exposure in takes:
             frames.add(Frame(job, tracer, camera, plan, focus, exposure).render())
+    log.info("%d kernels: compiled in %.3f s, ran for %.3f s", kernels.launches, kernels.compile, kernels.run)
     timings = Timings(time.perf_counter() - start, load, kernels.compile, kernels.run, job.passes)
     shown = {
         name: value for name, value in given.items() if value is not None and name not in ("memory", "quiet")

@@ -1,0 +1,47 @@
+"""``log=``: what a render tells of itself on the error output."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mrt_mitsuba.logs import LEVELS
+from mrt_mitsuba.options import Options, parse
+
+
+def told(folder: Path, *options: str) -> list[str]:
+    command = [
+        sys.executable,
+        "-m",
+        "mrt_mitsuba.cli",
+        "a",
+        "0",
+        "width=16",
+        "height=12",
+        "quiet=1",
+        *options,
+    ]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    return done.stderr.splitlines()
+
+
+def test_levels_tell_more_and_more(tmp_path: Path) -> None:
+    silent, info, debug = (told(tmp_path, f"log={level}") for level in ("warn", "info", "debug"))
+    assert not silent
+    for what in ("scene 0 loaded in", "rendering: 192 pixels in", "kernels: compiled in", "wrote"):
+        assert sum(what in line for line in info) >= 1
+    assert sum("wrote" in line for line in info) == 2  # PNG and EXR
+    assert any("rays, at most" in line for line in debug)
+    assert not any("rays, at most" in line for line in info)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_every_level_is_an_option(level: str) -> None:
+    assert parse(["a", f"log={level}"]).log == level
+
+
+def test_default_is_a_level() -> None:
+    assert Options("a").log in LEVELS
