@@ -9,17 +9,18 @@ import numpy as np
 from .variants import is_jit, pointer
 
 
-def own(values: np.ndarray):
-    """Numbers as a flat float32 array in Dr.Jit's own memory.
+def aligned(values: np.ndarray):
+    """Numbers as a flat float32 array at a multiple of 64 bytes.
 
-    Arrays of numpy are used where they lie, and most do not lie at a multiple of 64 bytes. Only from those
-    that do does a kernel read several numbers in a row in one go, which makes one that searches a tree half
-    as fast again; and the two kernels would be compiled, and kept, one beside the other.
+    Dr.Jit uses arrays of numpy where they lie, and most lie elsewhere. Only from aligned ones does a kernel
+    read several numbers in a row in one go, which makes one that searches a tree half as fast again; and the
+    two kernels would be compiled, and kept, one beside the other.
     """
-    array = dr.zeros(mi.Float, np.size(values))
-    dr.scatter(array, mi.Float(np.ravel(values).astype(np.float32)), dr.arange(mi.UInt32, np.size(values)))
-    dr.eval(array)
-    return array
+    size = np.size(values)
+    room = np.empty(size + 16, np.float32)
+    first = -room.ctypes.data % 64 // 4
+    room[first : first + size] = np.ravel(values)
+    return mi.Float(room[first : first + size])
 
 
 class Table:
@@ -32,7 +33,7 @@ class Table:
         elif isinstance(kind, str):
             self.kind, self.rows = getattr(mi, kind + "Ptr"), pointer(kind, rows)
         else:
-            self.rows = own(np.array(rows))
+            self.rows = aligned(np.array(rows))
         dr.eval(self.rows)
 
     def __call__(self, index, active):
@@ -56,7 +57,7 @@ class ByShape:
         width = 1 if kind is mi.Float else dr.size_v(kind)
         table = np.tile(np.float32(fallback), size).reshape(size, width)
         table[np.array(ids)] = np.reshape(rows, (-1, width))
-        self.table = own(table)
+        self.table = aligned(table)
         self.size = dr.opaque(mi.UInt32, size)
         dr.make_opaque(self.fallback)
 

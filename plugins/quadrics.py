@@ -20,7 +20,7 @@ from .intersect import (
     intersect_unit_sphere,
     sphere_surface,
 )
-from .lookup import own
+from .lookup import aligned
 from .revolution import QuadricTable
 from .tree import Tree
 from .variants import is_jit, pointer
@@ -57,7 +57,7 @@ class Quadrics:
         table[tree.leaf_of, :3, 3] = origins
         table[tree.leaf_of, 3, 0] = kinds
         table[tree.leaf_of, 3, 1] = np.abs(boxes).max(axis=(1, 2))
-        self.table = own(table)
+        self.table = aligned(table)
         owner, faces = np.zeros((2, tree.leaves), np.uint32)
         owner[tree.leaf_of] = np.repeat(np.arange(len(shapes)), counts)
         faces[tree.leaf_of] = np.concatenate([t.first_faces for t in tables])

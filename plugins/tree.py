@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .lookup import own
+from .lookup import aligned
 
 # Box tests are wider than exact by some float32 roundings, relative to distances and to coordinates
 _SLACK = 8 * 2.0**-24
@@ -38,7 +38,7 @@ class Tree:
         self.leaves = 1 << depth
         self.leaf_of = np.empty(count, np.int64)
         self.leaf_of[_sort(boxes.mean(axis=1), depth)] = np.arange(count) * self.leaves // count
-        self.boxes = own(_heap(boxes, self.leaf_of, self.leaves))
+        self.boxes = aligned(_heap(boxes, self.leaf_of, self.leaves))
         self.first_leaf = dr.opaque(mi.UInt32, self.leaves)  # data: one kernel serves all trees
 
     def walk(self, ray: Any, active: Any, visit: Callable[[Any, tuple], tuple], state: tuple, *,
