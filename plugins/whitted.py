@@ -154,7 +154,7 @@ class MrtWhitted(mi.SamplingIntegrator):
     def trace(self, scene, sampler, ray, active=True) -> Trace:
         """Radiance along ``ray`` and its by-products; what is not read from the result is not computed."""
         prepared = self._prepared
-        if prepared is None or prepared.scene_id != id(scene):
+        if prepared is None or not prepared.is_of(scene):
             prepared = self.prepare(scene)
 
         # ------------------------------ The camera ray, first of a peeled loop ------------------------------
@@ -327,9 +327,8 @@ class Prepared:
     """What the integrator reads from a scene once, before it traces anything, and its ray queries."""
 
     def __init__(self, scene):
-        # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed. The
-        # fingerprint holds the shapes, so that no later scene can be taken for this one
-        self.scene_id = id(scene)
+        # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed
+        self.objects = _objects(scene)
         self.fingerprint = _fingerprint(scene)
         shapes = scene.shapes()
         self.planes = _Planes([s for s in shapes if hasattr(s, "unit_normal")])
@@ -373,9 +372,15 @@ class Prepared:
         if self.textured:
             self.ray_flags |= +mi.RayFlags.UV
 
+    def is_of(self, scene) -> bool:
+        """Is it this scene that was read? The id of a scene may have passed to another one, those of objects
+        held here cannot.
+        """
+        return _objects(scene) == self.objects
+
     def is_stale(self, scene) -> bool:
         return (
-            id(scene) != self.scene_id
+            not self.is_of(scene)
             or self._versions() != self.versions
             or _fingerprint(scene) != self.fingerprint
         )
@@ -622,6 +627,10 @@ def _scene_of(shapes):
 
 def _coordinate_size(bbox) -> float:
     return max(abs(float(x)) for corner in (bbox.min, bbox.max) for x in corner)
+
+
+def _objects(scene) -> list:
+    return [*scene.shapes(), *scene.emitters()]
 
 
 def _fingerprint(scene) -> tuple:

@@ -59,3 +59,19 @@ def test_light_follows_its_parameters() -> None:
     assert drawn(scene) == pytest.approx(0.5 * before, rel=1e-5)
     update(scene, "light.position", [0, 3, -4])
     assert drawn(scene) == 0
+
+
+def test_a_later_scene_is_not_taken_for_an_earlier_one() -> None:
+    """Python gives the id of a scene that is gone to the next; an integrator may have read the first."""
+    integrator = mi.load_dict({"type": "mrt_whitted", "max_depth": 1})
+    ray = mi.Ray3f(mi.Point3f(0, 0, 5), mi.Vector3f(0, 0, -1))
+    ids = set()
+    for k in range(40):
+        reflectance = 0.1 + 0.02 * (k % 7)
+        scene = mirror(specular_reflectance=0.0, diffuse_reflectance=reflectance)
+        ids.add(id(scene))
+        light = integrator.trace(scene, None, ray).radiance[0]
+        # Of a light of 1 at (0, 3, 4), over a white-grey plane: ρ/π cos θ
+        assert float(light[0]) == pytest.approx(reflectance / np.pi * 0.8, rel=1e-4)
+        del scene
+    assert len(ids) < 40
