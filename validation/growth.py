@@ -156,6 +156,8 @@ def _exponent_row(what: str, e: Exponent) -> tuple[Any, ...]:
 
 def _reading(e: Exponent) -> str:
     low, high = e.value - e.half_width, e.value + e.half_width
+    if high < 1 and low <= 0:
+        return "not told apart from no growth"
     if high < 1:
         return f"ten times as much takes {10**e.value:.2g} times as long: less than in proportion"
     if low > 1:

@@ -31,6 +31,7 @@ def test_readings_follow_the_interval():
     assert "2 times as long: less than" in text(0.301, 0.1)
     assert "more than in proportion" in text(1.3, 0.1)
     assert "not told apart from growth in proportion" in text(0.95, 0.1)
+    assert text(-0.3, 0.6) == text(0.1, 0.2) == "not told apart from no growth"
     assert "too uncertain" in text(0.1, 1.5)
 
 
