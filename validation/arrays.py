@@ -6,7 +6,7 @@ No Mitsuba variant computes in double precision, but Dr.Jit does: on one core wi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,38 +14,8 @@ import drjit as dr
 import numpy as np
 
 from mrt_mitsuba.errors import VariantError
+from mrt_mitsuba.plugins.columns import Vector3
 from mrt_mitsuba.runtime import FAST, obstacle
-
-
-class Vector3(list):
-    """Three components, each a float or an array; Dr.Jit's ``dot``, ``norm`` and ``normalize`` take it."""
-
-    @property
-    def x(self) -> Any:
-        return self[0]
-
-    @property
-    def y(self) -> Any:
-        return self[1]
-
-    @property
-    def z(self) -> Any:
-        return self[2]
-
-    def __add__(self, other: Sequence[Any]) -> Vector3:
-        return Vector3(a + b for a, b in zip(self, other, strict=True))
-
-    def __sub__(self, other: Sequence[Any]) -> Vector3:
-        return Vector3(a - b for a, b in zip(self, other, strict=True))
-
-    def __neg__(self) -> Vector3:
-        return Vector3(-a for a in self)
-
-    def __mul__(self, factor: Any) -> Vector3:
-        return Vector3(a * factor for a in self)
-
-    def __truediv__(self, divisor: Any) -> Vector3:
-        return self * (1 / divisor)
 
 
 @dataclass(frozen=True)
