@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.logs import LEVELS
 from mrt_mitsuba.output import LAYERS
 from mrt_mitsuba.scenes import NUMBERS
 
@@ -267,7 +268,7 @@ class Options:
     quiet: bool = option(False, switch(), "print errors only", "0")
     log: str = option(
         "warn",
-        choice("error", "warn", "info", "debug"),
+        choice(*LEVELS),
         "what to tell: warnings; times; every kernel",
     )
 

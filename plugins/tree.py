@@ -74,13 +74,7 @@ class Tree:
             )
             found = node != 0
             leaf = node - self.first_leaf
-            _, state = dr.if_stmt(
-                (leaf, state),
-                found,
-                lambda leaf, s: (leaf, visit(leaf, s)),
-                lambda leaf, s: (leaf, s),
-                label="leaf",
-            )
+            state = dr.if_stmt((leaf, state), found, visit, lambda leaf, state: state, label="leaf")
             return *_to_next(node, waiting), state
 
         def goes_on(node: Any, waiting: Any, state: tuple) -> Any:

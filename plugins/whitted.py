@@ -434,9 +434,9 @@ class Prepared:
         """Does anything block the segment from ``hit`` to the light sample ``ds``?"""
         o = self._off_surface(hit, ds.d)
         blocked = mi.Bool(False)
-        for height in self.planes.heights:
+        for equation in self.planes.equations:
             # Opposite sides: no distance is computed, so none can be wrong
-            blocked |= height(o) * height(ds.p) < 0
+            blocked |= _height(o, *equation) * _height(ds.p, *equation) < 0
         if not self.shape_count and self.quadrics is None:
             return blocked
         to_light = ds.p - o
@@ -491,11 +491,6 @@ class _Planes:
     def __len__(self) -> int:
         return len(self.equations)
 
-    @property
-    def heights(self):
-        """For each plane, the function that gives the signed distance of a point from it."""
-        return [lambda p, n=n, d=d: dr.dot(n, p) + d for n, d in self.equations]
-
     def intersect(self, ray, active):
         """Distance of the nearest plane (else ``ray.maxt``), its number, and whether there is one."""
         t, index, found = mi.Float(ray.maxt), mi.UInt32(0), mi.Bool(False)
@@ -521,7 +516,7 @@ class _Planes:
         n, distance = self._equation(index)
         p = dr.fma(ray.d, ray.maxt, ray.o)
         # Along a grazing ray the error of t is far larger than that of the plane
-        p -= n * (dr.dot(n, p) + distance)
+        p -= n * _height(p, n, distance)
         si.t = dr.select(where, ray.maxt, si.t)
         si.p = dr.select(where, p, si.p)
         si.n = dr.select(where, mi.Normal3f(n), si.n)
@@ -530,6 +525,11 @@ class _Planes:
         si.uv = dr.select(where, uv, si.uv)
         si.shape = dr.select(where, self.shapes(index, where), si.shape)
         return dr.select(where, dr.abs(distance), scale)
+
+
+def _height(p, normal, distance):
+    """Signed distance of a point from a plane."""
+    return dr.dot(normal, p) + distance
 
 
 class _Scales:
@@ -642,7 +642,7 @@ def _fingerprint(scene) -> tuple:
 def _shape_fingerprint(shape) -> tuple:
     bbox = shape.bbox()
     version = shape.vertex_positions_buffer().index if is_jit() and isinstance(shape, mi.Mesh) else 0
-    return (shape, version, *bbox.min, *bbox.max)
+    return (version, *bbox.min, *bbox.max)
 
 
 mi.register_integrator("mrt_whitted", MrtWhitted)
