@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mrt_mitsuba import cli, options
-from mrt_mitsuba.scenes import NUMBERS, report_scene
+from mrt_mitsuba.command import main as cli
+from mrt_mitsuba.rendering import options
+from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
 SIZE = "width=400 height=300"
 
@@ -138,7 +139,7 @@ filters.save_contours("contours_scene7.png", *edges)
 ANTIALIASING = Entry(
     """
 import mrt_mitsuba as mrt
-from mrt_mitsuba.output import write_png
+from mrt_mitsuba.output.files import write_png
 
 def enlarged(aamode, aa):
     image = mrt.render(3, width=400, height=300, focaldist=0, aamode=aamode, aa=aa).image
@@ -159,7 +160,7 @@ for aamode in ("none", "luma", "sobel", "geometry"):
 HEIGHT_MAP = Entry(
     """
 import mrt_mitsuba as mrt
-from mrt_mitsuba.output import write_png
+from mrt_mitsuba.output.files import write_png
 
 result = mrt.render(3, width=400, height=300, focaldist=2.8, focalrange=0.3,
                     layers=["blur"])
@@ -183,7 +184,7 @@ BLUR = tuple(
 BLUR_ENLARGED = Entry(
     """
 import mrt_mitsuba as mrt
-from mrt_mitsuba.output import write_png
+from mrt_mitsuba.output.files import write_png
 
 for dof in ("report", "corrected"):
     result = mrt.render(4, width=400, height=300, focaldist=6, focalrange=0.5, dof=dof)
@@ -208,7 +209,7 @@ TEXTURES = Entry(
 from dataclasses import replace
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.scenes import report_scene
+from mrt_mitsuba.scene.report import report_scene
 
 scene = report_scene(8)
 near = replace(scene.camera, position=(0.7, 0.75, 1.0), target=(0, 0.55, 0.2), hfov=30)
@@ -227,7 +228,7 @@ LAYERS = Entry(
 import numpy as np
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.output import write_png
+from mrt_mitsuba.output.files import write_png
 
 names = ["depth", "normal", "albedo", "direct", "reflection", "bounces"]
 result = mrt.render(3, width=400, height=300, aamode="none", aa=2, focaldist=0,

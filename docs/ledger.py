@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.scenes import report_scene
+from mrt_mitsuba.scene.report import report_scene
 
 SIZE = {"width": 320, "height": 240}
 PLAIN = {**SIZE, "aamode": "none", "focaldist": 0}
@@ -50,7 +50,7 @@ def clamp() -> str:
 
 def acne() -> str:
     """The original's rays start a fixed distance off; scaled down, that distance grows against the scene."""
-    from mrt_mitsuba.validation.reference import reference_render
+    from mrt_mitsuba.validation.oracles.reference import reference_render
 
     scene = report_scene(3)
     exact = reference_render(scene, **SIZE).image
@@ -94,7 +94,7 @@ def mirrored() -> str:
 
 
 def gamma() -> str:
-    from mrt_mitsuba.output import to_8bit
+    from mrt_mitsuba.output.files import to_8bit
 
     image = mrt.render(0, **PLAIN, aa=1).image
     report, srgb = (to_8bit(image, tonemap).mean() for tonemap in ("report", "srgb"))
@@ -189,7 +189,7 @@ def motion() -> str:
 
 
 def progress() -> str:
-    from mrt_mitsuba.progress import Progress
+    from mrt_mitsuba.rendering.progress import Progress
 
     class Titles(Progress):
         def __init__(self) -> None:

@@ -7,7 +7,6 @@ imported with the first name that needs it. Import it before ``mitsuba`` and ``d
 from __future__ import annotations
 
 import os as _os
-import sys as _sys
 
 __version__ = "0.1.0"
 
@@ -20,25 +19,25 @@ if TYPE_CHECKING:
     from mrt_mitsuba.errors import SceneError as SceneError
     from mrt_mitsuba.errors import UsageError as UsageError
     from mrt_mitsuba.errors import VariantError as VariantError
-    from mrt_mitsuba.export import scene_dict as scene_dict
-    from mrt_mitsuba.render import Result as Result
-    from mrt_mitsuba.render import render as render
+    from mrt_mitsuba.rendering.api import Result as Result
+    from mrt_mitsuba.rendering.api import render as render
     from mrt_mitsuba.runtime import register as register
-    from mrt_mitsuba.validation.roughconductor import compare_roughconductor as compare_roughconductor
+    from mrt_mitsuba.scene.export import scene_dict as scene_dict
+    from mrt_mitsuba.validation.studies.roughconductor import compare_roughconductor as compare_roughconductor
 
 # Where each public name lives; the module is imported when the name is first used.
 _HOME = {
     "MrtError": "mrt_mitsuba.errors",
     "MrtWarning": "mrt_mitsuba.errors",
     "OutputError": "mrt_mitsuba.errors",
-    "Result": "mrt_mitsuba.render",
+    "Result": "mrt_mitsuba.rendering.api",
     "SceneError": "mrt_mitsuba.errors",
     "UsageError": "mrt_mitsuba.errors",
     "VariantError": "mrt_mitsuba.errors",
-    "compare_roughconductor": "mrt_mitsuba.validation.roughconductor",
+    "compare_roughconductor": "mrt_mitsuba.validation.studies.roughconductor",
     "register": "mrt_mitsuba.runtime",
-    "render": "mrt_mitsuba.render",
-    "scene_dict": "mrt_mitsuba.export",
+    "render": "mrt_mitsuba.rendering.api",
+    "scene_dict": "mrt_mitsuba.scene.export",
 }
 _SUBMODULES = ("filters",)
 
@@ -47,21 +46,6 @@ __all__ = [
     *_HOME,
     *_SUBMODULES,
 ]
-
-
-class _Package(type(_sys)):  # type: ignore[misc]
-    """The module of this package: functions keep their names where their module has the same one.
-
-    Importing ``mrt_mitsuba.render`` would otherwise put the module in the place of the function
-    ``mrt.render``.
-    """
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if not (name in _HOME and isinstance(value, type(_sys))):
-            super().__setattr__(name, value)
-
-
-_sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str) -> object:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mrt_mitsuba.export import FLAVORS, write_xml
+from mrt_mitsuba.scene.export import FLAVORS, write_xml
 from mrt_mitsuba.scenes_xml import NUMBERS, path
 
 for number in NUMBERS:

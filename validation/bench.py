@@ -24,13 +24,13 @@ from typing import Any
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import OutputError, UsageError
-from mrt_mitsuba.output import replacing
-
-from . import kernels, machine, rivals
-from .floor import floor
-from .knobs import load
-from .report import prepare
-from .warm import measure
+from mrt_mitsuba.output.files import replacing
+from mrt_mitsuba.validation.studies import rivals
+from mrt_mitsuba.validation.tools import kernels, machine
+from mrt_mitsuba.validation.tools.floor import floor
+from mrt_mitsuba.validation.tools.knobs import load
+from mrt_mitsuba.validation.tools.report import prepare
+from mrt_mitsuba.validation.tools.warm import measure
 
 
 def _object(properties: Mapping[str, Any]) -> dict[str, Any]:
@@ -160,7 +160,7 @@ def _command(number: int, extent: Extent) -> float:
         size = [f"{name}={getattr(extent, name)}" for name in ("width", "height", "aa")]
         start = time.perf_counter()
         subprocess.run(
-            [sys.executable, "-m", "mrt_mitsuba.cli", f"{folder}/out", str(number), *size],
+            [sys.executable, "-m", "mrt_mitsuba.command.main", f"{folder}/out", str(number), *size],
             check=True,
             stdout=subprocess.DEVNULL,
         )

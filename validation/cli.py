@@ -16,10 +16,10 @@ from pathlib import Path
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError
-from mrt_mitsuba.progress import Progress, TerminalProgress
-from mrt_mitsuba.validation import report
-from mrt_mitsuba.validation.kernels import own_cache
-from mrt_mitsuba.validation.study import Study
+from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
+from mrt_mitsuba.validation.tools import report
+from mrt_mitsuba.validation.tools.kernels import own_cache
+from mrt_mitsuba.validation.tools.study import Study
 
 # A study by its name on the command line: the module of this package that runs it, imported when it is run
 STUDIES = {
@@ -121,7 +121,7 @@ def run_study(name: str, *, quick: bool, progress: Progress | None = None) -> re
     start, failure = time.perf_counter(), ""
     try:
         runtime.use(runtime.default_variant())
-        module = import_module(f"mrt_mitsuba.validation.{STUDIES[name]}")
+        module = import_module(f"mrt_mitsuba.validation.studies.{STUDIES[name]}")
         study.title = module.TITLE
         print(f"{name}: {study.title} ...", file=sys.stderr, flush=True)
         module.run(study, quick=quick)

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mrt_mitsuba.validation.bsdf_probe import albedo, at_angle, draw, evaluate, unit
+from mrt_mitsuba.validation.tools.bsdf_probe import albedo, at_angle, draw, evaluate, unit
 
 
 @pytest.fixture(autouse=True)

@@ -34,6 +34,6 @@ def contours(*edges: EdgeMap) -> np.ndarray:
 
 def save_contours(path: str | os.PathLike[str], *edges: EdgeMap) -> None:
     """Write ``contours(*edges)`` as .png or .exr; raise ``OutputError`` where that fails."""
-    from mrt_mitsuba import output
+    from mrt_mitsuba.output import files as output
 
     output.save(path, contours(*edges))

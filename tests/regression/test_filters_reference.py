@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba.filters import luma_edges, sobel_edges
-from mrt_mitsuba.output import read_exr
+from mrt_mitsuba.output.files import read_exr
 
 BESIDE = Path(__file__).resolve().parents[3] / "shared" / "reference"
 RENDERS = Path(os.environ.get("MRT_REFERENCE", BESIDE)) / "renders"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.output import read_exr
+from mrt_mitsuba.output.files import read_exr
 
 # Mean absolute difference and share of pixels off by more than 1/255 without detector or blur. What is left
 # lies at shadow borders, where the original's rays start a fixed distance off the surface and speckle

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrt_mitsuba.output import read_exr
-from mrt_mitsuba.scenes import report_scene
-from mrt_mitsuba.validation.reference import ReferenceResult, reference_render
+from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.oracles.reference import ReferenceResult, reference_render
 
 # Mean absolute difference, and share of pixels off by more than 1/255: what float64 leaves to the original's
 # own float32, nearly all of it shadow acne near terminators

@@ -17,10 +17,10 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
-from mrt_mitsuba.scene import Scene
-from mrt_mitsuba.scenes import report_scene
-from mrt_mitsuba.validation import filters_reference
-from mrt_mitsuba.validation.reference import reference_render
+from mrt_mitsuba.scene.model import Scene
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.oracles import filters_reference
+from mrt_mitsuba.validation.oracles.reference import reference_render
 
 pytestmark = pytest.mark.skipif(
     runtime.obstacle(runtime.FAST) is not None, reason="scalar variants take minutes"

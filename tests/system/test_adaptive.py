@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.progress import Progress
+from mrt_mitsuba.rendering.progress import Progress
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.scene import BLUE_SKY, Camera, Cone, Cylinder, Material, Mesh, Scene, Sphere
+from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Cone, Cylinder, Material, Mesh, Scene, Sphere
 
 SMALL: dict[str, Any] = {"width": 8, "height": 6, "aa": 1}
 MATTE = Material(1.5, 0.1, (0, 0, 0), (0.5, 0.5, 0.5))

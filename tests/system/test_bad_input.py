@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mrt_mitsuba import cli
+from mrt_mitsuba.command import main as cli
 
 SIZE = ("width=64", "height=48")
 PIPE = object()

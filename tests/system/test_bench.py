@@ -7,7 +7,8 @@ import json
 
 import pytest
 
-from mrt_mitsuba.validation import bench, rivals
+from mrt_mitsuba.validation import bench
+from mrt_mitsuba.validation.studies import rivals
 
 
 def _fits(value, schema) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mrt_mitsuba.output import read_exr
+from mrt_mitsuba.output.files import read_exr
 
 Mrt = Callable[..., subprocess.CompletedProcess[str]]
 SMALL = ("width=64", "height=48")

@@ -47,7 +47,7 @@ def test_the_scene_of_the_tutorial_is_written_and_is_that_of_the_file(run_python
 
     done = run_python(code(DOCS / "tutorial.md"))
     assert done.returncode == 0, done.stderr
-    from mrt_mitsuba.output import read_exr
+    from mrt_mitsuba.output.files import read_exr
 
     written = read_exr(examples.parent / "mine.exr").image
     same = render(examples / "mine.xml", aa=3, aamode="sobel", focaldist=4.5, focalrange=0.5).image
@@ -76,7 +76,7 @@ COMMANDS = [
 
 @pytest.mark.parametrize(("path", "command"), COMMANDS, ids=lambda value: getattr(value, "stem", value))
 def test_commands_of_the_pages_are_understood(path: Path, command: str) -> None:
-    from mrt_mitsuba import options
+    from mrt_mitsuba.rendering import options
     from mrt_mitsuba.validation import cli
 
     name, *arguments = shlex.split(command)
@@ -88,7 +88,7 @@ def test_commands_of_the_pages_are_understood(path: Path, command: str) -> None:
 
 
 def test_the_memory_that_a_picture_would_need_is_as_shown(capsys) -> None:
-    from mrt_mitsuba import cli
+    from mrt_mitsuba.command import main as cli
 
     page = (DOCS / "performance.md").read_text()
     command = next(block for block in blocks(DOCS / "performance.md", "sh") if "memory=" in block)

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.export import FLAVORS, write_xml, xml_text
 from mrt_mitsuba.plugins.intersect import Frame, intersect_cylinder
-from mrt_mitsuba.scene import Cylinder
-from mrt_mitsuba.scenes import report_scene
+from mrt_mitsuba.scene.export import FLAVORS, write_xml, xml_text
+from mrt_mitsuba.scene.model import Cylinder
+from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.scenes_xml import NUMBERS, path
 
 

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
-from mrt_mitsuba.source import open_scene
+from mrt_mitsuba.scene.open import open_scene
 
 pytestmark = pytest.mark.fuzz
 # The folder of a test serves all of its inputs, and each writes the same files

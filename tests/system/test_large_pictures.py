@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba import cli, memory
+from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.filters.bands import bands
-from mrt_mitsuba.output import read_exr
+from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.rendering import memory
 
 # ---------------------------------------------- Bands ----------------------------------------------
 
@@ -163,14 +164,14 @@ def run(folder: Path, code: str, *words: str) -> subprocess.Popen[str]:
 # Only the picture's file may not grow: Dr.Jit keeps kernels in files, too
 LIMITED = """
 import resource, sys
-from mrt_mitsuba.result import Result
+from mrt_mitsuba.output.result import Result
 save = Result.save
 def limited(self, *path, **options):
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
     save(self, *path, **options)
 Result.save = limited
 """
-COMMAND = "from mrt_mitsuba import cli\nsys.exit(cli.main())\n"
+COMMAND = "from mrt_mitsuba.command import main as cli\nsys.exit(cli.main())\n"
 
 
 @pytest.mark.parametrize("ending", ["png", "exr"])
@@ -190,18 +191,18 @@ def test_a_file_that_may_not_grow_leaves_the_old_one(tmp_path: Path, ending: str
 WRITING = """
 import sys, types
 import numpy as np
-from mrt_mitsuba import output
+from mrt_mitsuba.output import files as output
 class Result:
     def save(self, path, tonemap):
         image = np.random.default_rng(0).random((3000, 4000, 3), np.float32)
         print("working", flush=True)
         output.save(path, image)
-sys.modules["mrt_mitsuba.render"] = types.SimpleNamespace(render=lambda *scene, **options: Result())
+sys.modules["mrt_mitsuba.rendering.api"] = types.SimpleNamespace(render=lambda *scene, **options: Result())
 """
 BLURRING = """
 import sys
-from mrt_mitsuba import memory
-from mrt_mitsuba.progress import TerminalProgress
+from mrt_mitsuba.rendering import memory
+from mrt_mitsuba.rendering.progress import TerminalProgress
 from contextlib import contextmanager
 memory.MOST_PIXELS = 1
 @contextmanager

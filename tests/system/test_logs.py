@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from mrt_mitsuba.logs import LEVELS
-from mrt_mitsuba.options import Options, parse
+from mrt_mitsuba.command.logs import LEVELS
+from mrt_mitsuba.rendering.options import Options, parse
 
 
 def told(folder: Path, *options: str) -> list[str]:
     command = [
         sys.executable,
         "-m",
-        "mrt_mitsuba.cli",
+        "mrt_mitsuba.command.main",
         "a",
         "0",
         "width=16",

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rays import Bundle, Lattice, Shutter
-from mrt_mitsuba.scenes import report_scene
+from mrt_mitsuba.rays.bundle import Bundle, Lattice, Shutter
+from mrt_mitsuba.scene.report import report_scene
 
 SMALL = {"width": 96, "height": 72, "focaldist": 0}
 WAY = (0.3, 0.1, 0.4)

@@ -35,7 +35,7 @@ def test_python_examples_run(code, run_python):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_run(command, tmp_path):
     _, *arguments = shlex.split(command)
-    code = "import sys; from mrt_mitsuba.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from mrt_mitsuba.command.main import main; sys.exit(main(sys.argv[1:]))"
     done = subprocess.run(
         [sys.executable, "-c", code, *arguments],
         cwd=tmp_path,
@@ -51,7 +51,7 @@ def test_commands_run(command, tmp_path):
 
 
 def test_every_option_named_exists():
-    from mrt_mitsuba.options import TABLE
+    from mrt_mitsuba.rendering.options import TABLE
 
     named = {
         name

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rays import Bundle, Lattice
-from mrt_mitsuba.scenes import report_scene
-from mrt_mitsuba.source import open_scene
-from mrt_mitsuba.trace import Camera, WhittedTracer, trace_bundle
+from mrt_mitsuba.rays.bundle import Bundle, Lattice
+from mrt_mitsuba.rendering.trace import Camera, WhittedTracer, trace_bundle
+from mrt_mitsuba.scene.open import open_scene
+from mrt_mitsuba.scene.report import report_scene
 
 SMALL = {"width": 160, "height": 120}
 SCENES = (0, 1, 2, 3, 4)

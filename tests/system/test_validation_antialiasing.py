@@ -9,8 +9,8 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import filters
-from mrt_mitsuba.validation import antialiasing
-from mrt_mitsuba.validation.study import Picture, Study, Table
+from mrt_mitsuba.validation.studies import antialiasing
+from mrt_mitsuba.validation.tools.study import Picture, Study, Table
 
 TINY = antialiasing.Extent((0,), ("report",), (2, 4), 8, (80, 60), 1, (60, 45), 8, (4, 16))
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.output import read_exr
+from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.validation import cli
-from mrt_mitsuba.validation.report import LONG_LIST, cell
-from mrt_mitsuba.validation.study import Study
+from mrt_mitsuba.validation.tools.report import LONG_LIST, cell
+from mrt_mitsuba.validation.tools.study import Study
 
 for needed in cli.EXTRAS:
     pytest.importorskip(needed)
@@ -32,7 +32,7 @@ def studies(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
     def install(**runs: Run) -> None:
         for name, run in runs.items():
-            module = types.ModuleType(f"mrt_mitsuba.validation.{name}")
+            module = types.ModuleType(f"mrt_mitsuba.validation.studies.{name}")
             module.TITLE, module.run = TITLE, run  # type: ignore[attr-defined]
             monkeypatch.setitem(sys.modules, module.__name__, module)
         monkeypatch.setattr(cli, "STUDIES", {name: name for name in runs})
@@ -240,7 +240,7 @@ def test_every_study_has_a_module_with_a_title() -> None:
     from importlib import import_module
 
     for name in cli.STUDIES.values():
-        module = import_module(f"mrt_mitsuba.validation.{name}")
+        module = import_module(f"mrt_mitsuba.validation.studies.{name}")
         assert module.TITLE and callable(module.run)
 
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.scenes import report_scene
-from mrt_mitsuba.validation import cost, kernels, knobs, savings
-from mrt_mitsuba.validation.floor import record
-from mrt_mitsuba.validation.study import Study, Table
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.studies import cost, savings
+from mrt_mitsuba.validation.tools import kernels, knobs
+from mrt_mitsuba.validation.tools.floor import record
+from mrt_mitsuba.validation.tools.study import Study, Table
 
 TINY = cost.Extent((40, 30), 2, (0,), 1, (32, 24))
 

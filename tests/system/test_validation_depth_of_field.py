@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba import filters
-from mrt_mitsuba.scenes import report_scene
-from mrt_mitsuba.validation import depth_of_field as dof
-from mrt_mitsuba.validation.study import Study
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.studies import depth_of_field as dof
+from mrt_mitsuba.validation.tools.study import Study
 
 TINY = dof.Extent((96, 72), 2, 16)
 

@@ -7,12 +7,13 @@ import dataclasses
 import numpy as np
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.scenes import report_scene
-from mrt_mitsuba.validation import error_vs_time, knobs
-from mrt_mitsuba.validation.points import Point, amounts, fastest, front
-from mrt_mitsuba.validation.readings import reading
-from mrt_mitsuba.validation.study import Plot, Study, Table
-from mrt_mitsuba.validation.warm import Warm, measure, ratio
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.studies import error_vs_time
+from mrt_mitsuba.validation.tools import knobs
+from mrt_mitsuba.validation.tools.points import Point, amounts, fastest, front
+from mrt_mitsuba.validation.tools.readings import reading
+from mrt_mitsuba.validation.tools.study import Plot, Study, Table
+from mrt_mitsuba.validation.tools.warm import Warm, measure, ratio
 
 TINY = error_vs_time.Extent(
     knobs.Extent((40, 30), (1, 4), 8, (1, 16), 64), (0,), (), (0,), (), cone=True, repeats=1

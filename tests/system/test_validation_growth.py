@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mrt_mitsuba.scenes import report_scene
-from mrt_mitsuba.validation import growth
-from mrt_mitsuba.validation.study import Plot, Study, Table
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.studies import growth
+from mrt_mitsuba.validation.tools.study import Plot, Study, Table
 
 
 def test_exponents_are_recovered_with_an_interval():

@@ -7,8 +7,8 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation import objects
-from mrt_mitsuba.validation.study import Study, Table
+from mrt_mitsuba.validation.studies import objects
+from mrt_mitsuba.validation.tools.study import Study, Table
 
 
 @pytest.fixture(autouse=True)

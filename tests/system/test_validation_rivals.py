@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from mrt_mitsuba.validation import rivals, roughconductor
-from mrt_mitsuba.validation.study import Study, Table
+from mrt_mitsuba.validation.studies import rivals, roughconductor
+from mrt_mitsuba.validation.tools.study import Study, Table
 
 TINY = rivals.Extent((48, 36), 16, (0,), 2)
 

@@ -14,9 +14,10 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import plugins
-from mrt_mitsuba.output import read_exr
-from mrt_mitsuba.validation import bsdf_laws, cli, metals, roughconductor
-from mrt_mitsuba.validation.study import Study
+from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.validation import cli
+from mrt_mitsuba.validation.studies import bsdf_laws, metals, roughconductor
+from mrt_mitsuba.validation.tools.study import Study
 
 for needed in cli.EXTRAS:
     pytest.importorskip(needed)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.output import read_exr
+from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.plugins import plugin
 from mrt_mitsuba.plugins.fresnel import f0_from_ior, fresnel_schlick
-from mrt_mitsuba.scenes import report_scene
-from mrt_mitsuba.validation import scenes
-from mrt_mitsuba.validation.reference import reference_render
-from mrt_mitsuba.validation.study import Picture, Plot, Study, Table
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.oracles.reference import reference_render
+from mrt_mitsuba.validation.studies import scenes
+from mrt_mitsuba.validation.tools.study import Picture, Plot, Study, Table
 
 pytestmark = pytest.mark.skipif(
     runtime.obstacle(runtime.FAST) is not None, reason="scalar variants take minutes"

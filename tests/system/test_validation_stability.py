@@ -15,8 +15,8 @@ import pytest
 from mrt_mitsuba import filters as mrt_filters
 from mrt_mitsuba import plugins
 from mrt_mitsuba.plugins import fresnel, intersect, microfacet
-from mrt_mitsuba.validation import stability
-from mrt_mitsuba.validation.stability import (
+from mrt_mitsuba.validation.studies import stability
+from mrt_mitsuba.validation.studies.stability import (
     bsdf,
     cases,
     filters,
@@ -26,7 +26,7 @@ from mrt_mitsuba.validation.stability import (
     shapes,
     transport,
 )
-from mrt_mitsuba.validation.study import Plot, Study, Table
+from mrt_mitsuba.validation.tools.study import Plot, Study, Table
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -11,9 +11,10 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
 from mrt_mitsuba.plugins import plugin
-from mrt_mitsuba.scenes import report_scene
-from mrt_mitsuba.validation import approximations, mutations, stock
-from mrt_mitsuba.validation.image_tests import compare
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.studies import approximations, stock
+from mrt_mitsuba.validation.tools import mutations
+from mrt_mitsuba.validation.tools.image_tests import compare
 
 pytestmark = pytest.mark.skipif(
     runtime.obstacle(runtime.FAST) is not None, reason="scalar variants take minutes"

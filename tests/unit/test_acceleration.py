@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation import acceleration
+from mrt_mitsuba.validation.studies import acceleration
 
 
 @pytest.fixture(autouse=True)

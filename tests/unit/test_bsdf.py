@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation import exact
-from mrt_mitsuba.validation.bsdf_probe import (
+from mrt_mitsuba.validation.oracles import exact
+from mrt_mitsuba.validation.tools.bsdf_probe import (
     albedo,
     at_angle,
     draw,

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrt_mitsuba import cli, output
+from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.errors import MrtWarning, SceneError
+from mrt_mitsuba.output import files as output
 
 
 class Recorder:
@@ -44,7 +45,9 @@ class Recorder:
 @pytest.fixture
 def renderer(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     recorder = Recorder()
-    monkeypatch.setitem(sys.modules, "mrt_mitsuba.render", types.SimpleNamespace(render=recorder.render))
+    monkeypatch.setitem(
+        sys.modules, "mrt_mitsuba.rendering.api", types.SimpleNamespace(render=recorder.render)
+    )
     return recorder
 
 
@@ -193,7 +196,7 @@ def test_warnings_are_one_line(
         warnings.warn("slow\nhere", MrtWarning, stacklevel=2)
         return renderer
 
-    monkeypatch.setattr(sys.modules["mrt_mitsuba.render"], "render", render)
+    monkeypatch.setattr(sys.modules["mrt_mitsuba.rendering.api"], "render", render)
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         assert cli.main([str(tmp_path / "out"), f"quiet={quiet}"]) == 0
@@ -210,7 +213,7 @@ IN_A_RENDER = """
 import sys, time, types
 class Result:
     def save(self, path, tonemap):
-        from mrt_mitsuba.output import replacing
+        from mrt_mitsuba.output.files import replacing
         with replacing(path) as file:
             file.write(b"half")
             file.flush()
@@ -218,8 +221,8 @@ class Result:
 def render(*scene, **arguments):
     return Result()
 {work}
-sys.modules["mrt_mitsuba.render"] = types.SimpleNamespace(render=render)
-from mrt_mitsuba import cli
+sys.modules["mrt_mitsuba.rendering.api"] = types.SimpleNamespace(render=render)
+from mrt_mitsuba.command import main as cli
 sys.exit(cli.main())
 """
 # What the signal meets: Python code, or a Dr.Jit kernel that runs for minutes (a million steps per entry).
@@ -281,9 +284,8 @@ def test_signal_leaves_the_old_file_and_ends_within_two_seconds(
 
 def test_reader_that_goes_away(tmp_path: Path) -> None:
     """``mrt help | head -1`` ends without complaint."""
-    command = (
-        f"{sys.executable} -c 'import sys; from mrt_mitsuba import cli; sys.exit(cli.main())' help | head -1"
-    )
+    code = "import sys; from mrt_mitsuba.command.main import main; sys.exit(main())"
+    command = f"{sys.executable} -c '{code}' help | head -1"
     done = subprocess.run(
         command, shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True
     )
@@ -293,7 +295,7 @@ def test_reader_that_goes_away(tmp_path: Path) -> None:
 def test_wrong_usage_starts_nothing_heavy(run_python) -> None:
     code = """
 import sys
-from mrt_mitsuba import cli
+from mrt_mitsuba.command import main as cli
 code = cli.main(["out", "width=0"])
 print(code, [name for name in ("drjit", "mitsuba", "numpy", "OpenEXR", "PIL", "tqdm") if name in sys.modules])
 """
@@ -318,7 +320,7 @@ class Terminal:
 
 
 def test_bar_on_a_terminal_shows_the_time_left() -> None:
-    from mrt_mitsuba.progress import TerminalProgress
+    from mrt_mitsuba.rendering.progress import TerminalProgress
 
     messages, bars = Terminal(), Terminal()
     with TerminalProgress(file=messages, bar_file=bars).stage("Rendering", 1000, "message") as advance:
@@ -332,7 +334,7 @@ def test_bar_on_a_terminal_shows_the_time_left() -> None:
 
 def test_header_survives_json() -> None:
     """The options go into the EXR header as JSON."""
-    from mrt_mitsuba.options import parse
+    from mrt_mitsuba.rendering.options import parse
 
     arguments = parse(["o", "layers=depth", "motion=1,2,3", "memory=4G"]).render_arguments()
     assert json.loads(json.dumps(arguments))["motion"] == [1, 2, 3]

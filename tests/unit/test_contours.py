@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba import UsageError, filters
-from mrt_mitsuba.output import read_exr
+from mrt_mitsuba.output.files import read_exr
 
 
 def _step(width: int = 12, height: int = 8) -> np.ndarray:

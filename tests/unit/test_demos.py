@@ -9,11 +9,11 @@ import pytest
 from PIL import Image
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba import models
-from mrt_mitsuba.mtl import DEFAULT_MATERIAL
-from mrt_mitsuba.obj import obj_scene
-from mrt_mitsuba.scene import Mesh, Sphere
-from mrt_mitsuba.scenes import NUMBERS, report_scene
+from mrt_mitsuba.scene import shapes as models
+from mrt_mitsuba.scene.model import Mesh, Sphere
+from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL
+from mrt_mitsuba.scene.obj import obj_scene
+from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
 SIZE = {"width": 96, "height": 72, "aa": 1}
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from mrt_mitsuba import UsageError, runtime
 from mrt_mitsuba.filters import blur_amount, gaussian_dof
-from mrt_mitsuba.validation import filters_reference as reference
+from mrt_mitsuba.validation.oracles import filters_reference as reference
 
 needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, reason="no LLVM to run kernels")
 BACKENDS = [pytest.param("llvm", marks=needs_llvm), pytest.param("llvm.ad", marks=needs_llvm), "scalar"]

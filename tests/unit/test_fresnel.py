@@ -17,7 +17,7 @@ from mpmath import mp
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.plugins.fresnel import ETA_MAX, f0_from_ior, fresnel_dielectric, fresnel_schlick
-from mrt_mitsuba.validation import exact
+from mrt_mitsuba.validation.oracles import exact
 
 needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, reason="no LLVM to run kernels")
 

@@ -8,8 +8,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mrt_mitsuba import runtime, scene
-from mrt_mitsuba.scene import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
+from mrt_mitsuba import runtime
+from mrt_mitsuba.scene import model as scene
+from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 
 
 @pytest.fixture(autouse=True)

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from mrt_mitsuba import UsageError
-from mrt_mitsuba.validation.image_tests import (
+from mrt_mitsuba.validation.tools.image_tests import (
     Comparison,
     Estimate,
     compare,

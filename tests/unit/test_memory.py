@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from mrt_mitsuba import memory
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.memory import LEAST_RAYS, MOST_PIXELS, MOST_RAYS, Workspace, free_memory
+from mrt_mitsuba.rendering import memory
+from mrt_mitsuba.rendering.memory import LEAST_RAYS, MOST_PIXELS, MOST_RAYS, Workspace, free_memory
 
 GIB = 2**30
 

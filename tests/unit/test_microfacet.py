@@ -24,8 +24,8 @@ from mrt_mitsuba.plugins.microfacet import (
     smith_g1_over_cos,
     tan2_theta,
 )
-from mrt_mitsuba.validation import exact
-from mrt_mitsuba.validation.arrays import Vector3
+from mrt_mitsuba.validation.oracles import exact
+from mrt_mitsuba.validation.tools.arrays import Vector3
 
 Vector = drjit.scalar.Array3f64
 ALPHAS = st.floats(1e-3, 2)

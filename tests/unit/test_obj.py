@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
-from mrt_mitsuba.mtl import DEFAULT_MATERIAL, read_mtl
-from mrt_mitsuba.obj import obj_scene, obj_view, read_obj
-from mrt_mitsuba.scene import Camera, Mesh
+from mrt_mitsuba.scene.model import Camera, Mesh
+from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, read_mtl
+from mrt_mitsuba.scene.obj import obj_scene, obj_view, read_obj
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 UVS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"

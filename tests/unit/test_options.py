@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mrt_mitsuba import options
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.options import Options, parse
+from mrt_mitsuba.rendering import options
+from mrt_mitsuba.rendering.options import Options, parse
 
 
 def test_defaults_of_the_report() -> None:

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from mrt_mitsuba import output
 from mrt_mitsuba.errors import MrtWarning, OutputError
+from mrt_mitsuba.output import files as output
 
 
 @pytest.fixture

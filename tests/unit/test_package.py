@@ -79,12 +79,12 @@ def test_function_is_not_hidden_by_its_module(run_python) -> None:
     """``mrt.render`` stays the function when its module is imported by name, before or after."""
     code = """
 import sys, types
-fake = types.ModuleType("mrt_mitsuba.render")
+fake = types.ModuleType("mrt_mitsuba.rendering.api")
 fake.render = lambda: "called"
 class Finder:
     @staticmethod
     def find_spec(name, path=None, target=None):
-        if name == "mrt_mitsuba.render":
+        if name == "mrt_mitsuba.rendering.api":
             from importlib.machinery import ModuleSpec
             return ModuleSpec(name, Finder)
     @staticmethod
@@ -94,10 +94,10 @@ class Finder:
     def exec_module(module):
         pass
 sys.meta_path.insert(0, Finder)
-import mrt_mitsuba.render
+import mrt_mitsuba.rendering.api
 import mrt_mitsuba as mrt
 print(mrt.render())
-from mrt_mitsuba.render import render
+from mrt_mitsuba.rendering.api import render
 print(mrt.render(), render())
 """
     done = run_python(code)

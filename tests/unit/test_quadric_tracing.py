@@ -14,8 +14,8 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.plugins import intersect
 from mrt_mitsuba.plugins.quadrics import Quadrics
 from mrt_mitsuba.plugins.tree import Tree
-from mrt_mitsuba.scene import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
-from mrt_mitsuba.scenes import report_scene
+from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
+from mrt_mitsuba.scene.report import report_scene
 
 MATTE = Material(0.5, 0.5, (0, 0, 0), (0.8, 0.8, 0.8))
 GLOSSY = Material(1.5, 0.2, (0.5, 0.5, 0.5), (0.3, 0.4, 0.5))

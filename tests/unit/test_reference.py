@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba import SceneError, UsageError, runtime
-from mrt_mitsuba.scene import Camera, Cone, Cylinder, Light, Material, Mesh, Plane, Scene, Sphere
-from mrt_mitsuba.scenes import report_scene
-from mrt_mitsuba.validation import exact
-from mrt_mitsuba.validation.reference import CHOICES, camera_directions, reference_render
-from mrt_mitsuba.validation.sensitivity import sensitivity
+from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Mesh, Plane, Scene, Sphere
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.oracles import exact
+from mrt_mitsuba.validation.oracles.reference import CHOICES, camera_directions, reference_render
+from mrt_mitsuba.validation.tools.sensitivity import sensitivity
 
 needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, reason="no LLVM to run kernels")
 

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mrt_mitsuba.sampler import ray_sampler
+from mrt_mitsuba.rays.sampler import ray_sampler
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba import UsageError
-from mrt_mitsuba.scene import Material, Scene
-from mrt_mitsuba.scenes import NUMBERS, SCENE_4_MATERIALS, c_rand, report_scene
+from mrt_mitsuba.scene.model import Material, Scene
+from mrt_mitsuba.scene.report import NUMBERS, SCENE_4_MATERIALS, c_rand, report_scene
 
 REPORT = (0, 1, 2, 3, 4, 9)
 

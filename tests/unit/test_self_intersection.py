@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mrt_mitsuba.render import render
+from mrt_mitsuba.rendering.api import render
 
 
 @pytest.mark.parametrize("distance", [3.0, 300.0])

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.scene import Camera, Light, Material, Mesh, Scene
+from mrt_mitsuba.scene.model import Camera, Light, Material, Mesh, Scene
 
 
 @pytest.fixture(autouse=True)

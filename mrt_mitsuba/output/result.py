@@ -1,0 +1,71 @@
+"""What a render returns."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from mrt_mitsuba.rendering.plan import Plan
+
+    Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Seconds of one render. ``passes`` adds up to about ``total``; ``compile`` and ``kernels`` are parts of
+    it."""
+
+    total: float  #: all of the render
+    load: float  #: scene and plan
+    compile: float  #: kernels that were not in the cache
+    kernels: float  #: kernels running
+    passes: Mapping[str, float]  #: by the name of the pass
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished picture and what became known on the way."""
+
+    image: Image  #: float32 [H, W, 3], linear, top row first
+    layers: Mapping[str, Image]  #: float32 [H, W] by EXR channel name, such as "depth.Z"
+    plan: Plan  #: what ran, what was left out and why
+    timings: Timings  #: seconds
+    rays: Mapping[str, int]  #: number by kind; "mirror" and "shadow" only where they were counted
+    kernel_launches: int  #: how many kernels ran
+    options: Mapping[str, Any] = field(default_factory=dict)  #: as they were given
+
+    def save(self, path: str | os.PathLike[str], *, tonemap: str = "report") -> None:
+        """Write a .png or .exr; raise ``OutputError``. ``tonemap`` ("report" or "srgb") concerns a PNG
+        only."""
+        from mrt_mitsuba.output import files as output
+
+        output.save(path, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
+
+    def header(self) -> dict[str, Any]:
+        """The header attributes of an EXR."""
+        import mrt_mitsuba
+
+        return {
+            "mrt:version": mrt_mitsuba.__version__,
+            "mrt:scene": self.plan.scene,
+            "mrt:options": dict(self.options),
+            "mrt:variant": self.plan.variant,
+            "mrt:seconds": self.timings.total,
+        }
+
+    def _repr_png_(self) -> bytes:
+        """Show the picture in a notebook, in sRGB as screens expect it."""
+        from PIL import Image as PilImage
+
+        from mrt_mitsuba.output.files import to_8bit
+
+        buffer = io.BytesIO()
+        PilImage.fromarray(to_8bit(self.image, "srgb")).save(buffer, format="PNG")
+        return buffer.getvalue()

@@ -1,0 +1,1 @@
+"""A render: options, plan, passes, tracing, memory, progress."""

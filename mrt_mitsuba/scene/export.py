@@ -1,0 +1,234 @@
+"""Scenes as Mitsuba dicts and XML files: with this project's plugins, or with Mitsuba's own only."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.rendering.options import check
+from mrt_mitsuba.scene.model import Scene
+from mrt_mitsuba.scene.report import report_scene
+
+FLAVORS = ("mrt", "stock")
+
+# The finite stand-in of a plane, scene units: beyond, float32 makes its intersections visibly wrong
+STOCK_EXTENT = 100.0
+
+
+def scene_dict(
+    scene: int | Scene,
+    *,
+    width: int = 800,
+    height: int = 600,
+    fresnel: str = "schlick",
+    flavor: str = "mrt",
+) -> dict[str, Any]:
+    """Return a scene as a plain Mitsuba dict; ``mi.load_dict`` takes it (after ``mrt.register()``).
+
+    ``flavor``: "mrt" for this project's plugins; "stock" for the nearest equivalents among Mitsuba's, which
+    any Mitsuba program opens: ``roughplastic`` for the material, ``point`` lights as bright at the camera's
+    target, finite squares for planes, ``cylinder`` and two ``disk`` for a cylinder, ``bitmap`` for a texture,
+    and ``path`` with few bounces for the integrator. Cones and meshes have none but in a file of their own,
+    which ``write_xml`` writes.
+
+    Raises ``UsageError`` for a scene, flavor, size or formula that there is not, ``SceneError`` for a stock
+    flavor that cannot be had.
+    """
+    if flavor not in FLAVORS:
+        raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
+    given: dict[str, Any] = {"width": width, "height": height, "fresnel": fresnel}
+    given = {name: check(name, value) for name, value in given.items() if value is not None}
+    runtime.use()
+    scene = scene if isinstance(scene, Scene) else report_scene(scene)
+    result = scene.to_dict(**given)
+    return result if flavor == "mrt" else _stock(result, scene)
+
+
+def write_xml(
+    scene: int | Scene, path: str | os.PathLike[str], *, flavor: str = "mrt", fresnel: str = "schlick"
+) -> None:
+    """Write a scene as XML through Mitsuba's own writer.
+
+    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file beside it,
+    named after the XML file and the shape. Raises ``OutputError`` if a file cannot be written, ``SceneError``
+    for groups of objects (``mrt_group``), which have neither an XML form nor a stock counterpart.
+    """
+    from mrt_mitsuba.output.files import replacing
+
+    mine = scene_dict(scene, fresnel=fresnel)
+    models = {
+        name: node
+        for name, node in mine.items()
+        if isinstance(node, dict) and node["type"] in _IN_FILES[flavor]
+    }
+    files = {name: f"{os.path.splitext(os.fspath(path))[0]}_{name}.ply" for name in models}
+    for name, node in models.items():
+        mine[name] = _ply_node(node, os.path.basename(files[name]))
+    text = _text_of(mine, scene, flavor)
+    for name, node in models.items():
+        with replacing(files[name]) as file:
+            file.write(_ply(node))
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def xml_text(scene: int | Scene, *, flavor: str = "mrt", fresnel: str = "schlick") -> str:
+    """Return the XML of a scene. Raises ``SceneError`` for what needs files beside it; see ``write_xml``."""
+    if flavor not in FLAVORS:
+        raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
+    return _text_of(scene_dict(scene, fresnel=fresnel), scene, flavor)
+
+
+def _text_of(mine: dict[str, Any], scene: int | Scene, flavor: str) -> str:
+    """The XML of a dict of this project's plugins."""
+    import mitsuba as mi
+
+    for name, node in mine.items():
+        kind = node["type"] if isinstance(node, dict) else ""
+        if kind in _WITHOUT_XML:
+            raise SceneError(
+                f"{name} cannot be written as XML: {kind} is made of arrays; {_WITHOUT_XML[kind]}"
+            )
+    mine = {name: _with_whole_path(node) for name, node in mine.items()}
+    if flavor == "stock":
+        mine = _stock(mine, scene if isinstance(scene, Scene) else report_scene(scene))
+    variant = runtime.use()
+    # The writer looks plugins up in scalar_rgb, whatever the current variant
+    runtime.use("scalar_rgb")
+    runtime.use(variant)
+    state = mi.parser.parse_dict(mi.parser.ParserConfig(variant), mine)
+    return mi.parser.write_string(state) + "\n"
+
+
+def _with_whole_path(node: Any) -> Any:
+    """A material whose picture is found from wherever the XML lies."""
+    picture = node.get("diffuse_reflectance", {}) if isinstance(node, dict) else {}
+    if "filename" not in picture:
+        return node
+    return {**node, "diffuse_reflectance": {**picture, "filename": os.path.abspath(picture["filename"])}}
+
+
+def _ply_node(node: dict[str, Any], filename: str) -> dict[str, Any]:
+    """A shape that reads the file; triangles of ``mrt_mesh`` are flat."""
+    flat = {"face_normals": True} if node["type"] == "mrt_mesh" else {}
+    return {"type": "ply", "filename": filename, **flat, "bsdf": node["bsdf"]}
+
+
+def _ply(node: dict[str, Any]) -> bytes:
+    """The mesh of a shape as a binary PLY file."""
+    import mitsuba as mi
+
+    stream = mi.MemoryStream()
+    mi.load_dict({name: value for name, value in node.items() if name != "bsdf"}).write_ply(stream)
+    stream.seek(0)
+    return bytes(stream.read(stream.size()))
+
+
+def _stock(scene_as_dict: dict[str, Any], scene: Scene) -> dict[str, Any]:
+    """Replace every plugin of this project by its nearest stock equivalent, which may take several nodes."""
+    result: dict[str, Any] = {}
+    for name, node in scene_as_dict.items():
+        kind = node["type"] if isinstance(node, dict) else ""
+        if kind in _WITHOUT_STOCK:
+            raise SceneError(
+                f"{name} has no counterpart among Mitsuba's plugins: {kind} {_WITHOUT_STOCK[kind]}"
+            )
+        if kind == "mrt_cylinder":
+            result |= {f"{name}_{part}": child for part, child in _stock_cylinder(node).items()}
+        else:
+            result[name] = _REPLACEMENTS[kind](node, scene) if kind in _REPLACEMENTS else node
+    return result
+
+
+def _stock_integrator(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
+    return {"type": "path", "max_depth": 4}
+
+
+def _stock_bsdf(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
+    """The same lobes over a diffuse base; colours above one and negative roughness have no stock
+    counterpart."""
+
+    def clipped(color: dict[str, Any]) -> dict[str, Any]:
+        if color["type"] == "mrt_texture":
+            return _stock_texture(color)
+        return {**color, "value": [min(c, 1.0) for c in color["value"]]} if color["type"] == "rgb" else color
+
+    if node["specular_reflectance"].get("value") == [0.0, 0.0, 0.0]:
+        return {"type": "diffuse", "reflectance": clipped(node["diffuse_reflectance"])}
+    return {
+        "type": "roughplastic",
+        "distribution": "beckmann",
+        "alpha": max(abs(node["alpha"]), 1e-4),
+        "int_ior": node["int_ior"],
+        "ext_ior": 1.0,
+        "diffuse_reflectance": clipped(node["diffuse_reflectance"]),
+        "specular_reflectance": clipped(node["specular_reflectance"]),
+    }
+
+
+def _stock_light(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
+    """A light with falloff, of the same irradiance at the camera's target."""
+    squared = sum((a - b) ** 2 for a, b in zip(node["position"], scene.camera.target, strict=True))
+    color = {**node["intensity"], "value": [c * squared for c in node["intensity"]["value"]]}
+    return {"type": "point", "position": node["position"], "intensity": color}
+
+
+def _stock_plane(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
+    length = sum(c * c for c in node["normal"]) ** 0.5
+    normal = [c / length for c in node["normal"]]
+    foot = [-node["distance"] * c for c in normal]
+    return {"type": "rectangle", "to_world": _facing(foot, normal, STOCK_EXTENT / 2), "bsdf": node["bsdf"]}
+
+
+def _stock_cylinder(node: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """An open tube and a disc at each end that faces away from the other."""
+    p0, p1, radius = node["p0"], node["p1"], node["radius"]
+
+    def disc(center: list[float], opposite: list[float]) -> dict[str, Any]:
+        away = [c - o for c, o in zip(center, opposite, strict=True)]
+        return {"type": "disk", "to_world": _facing(center, away, radius), "bsdf": node["bsdf"]}
+
+    tube = {"type": "cylinder", "p0": p0, "p1": p1, "radius": radius, "bsdf": node["bsdf"]}
+    return {"tube": tube, "disc0": disc(p0, p1), "disc1": disc(p1, p0)}
+
+
+def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
+    """What takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
+    import mitsuba as mi
+
+    length = sum(c * c for c in normal) ** 0.5
+    normal = [c / length for c in normal]
+    up = [0, 0, 1] if abs(normal[2]) < 0.9 else [1, 0, 0]
+    target = [c + n for c, n in zip(center, normal, strict=True)]
+    to_world = mi.ScalarTransform4f().look_at(center, target, up)
+    return to_world @ mi.ScalarTransform4f().scale([half_size, half_size, 1])
+
+
+def _stock_texture(node: dict[str, Any]) -> dict[str, Any]:
+    """The nearest texel as stored; half a texel off the report's look-up, which shrinks the picture so
+    far."""
+    stored = {"raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+    return {"type": "bitmap", "filename": os.path.abspath(node["filename"]), **stored}
+
+
+_REPLACEMENTS: dict[str, Callable[[dict[str, Any], Scene], dict[str, Any]]] = {
+    "mrt_whitted": _stock_integrator,
+    "mrt_bsdf": _stock_bsdf,
+    "mrt_light": _stock_light,
+    "mrt_plane": _stock_plane,
+}
+
+# Shapes that are written as files beside the XML
+_IN_FILES = {"mrt": ("mrt_mesh",), "stock": ("mrt_mesh", "mrt_cone")}
+_WITHOUT_XML = {
+    "mrt_mesh": "write_xml, or mrt export, puts it into a file beside the XML",
+    "mrt_group": "render it from Python, or write at most 1000 spheres, 100 cones and 100 cylinders",
+}
+_WITHOUT_STOCK = {
+    "mrt_mesh": "is made of arrays, and ply reads a file; write_xml, or mrt export, puts it beside the XML",
+    "mrt_cone": "is a mesh to them; write_xml, or mrt export, puts it into a file beside the XML",
+    "mrt_group": "is one shape of many objects; use the flavor mrt",
+}

@@ -1,0 +1,281 @@
+"""MTL files: what a material library of an OBJ file says, in the report's reading and in the standard one."""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import stat
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from mrt_mitsuba.errors import MrtWarning, SceneError
+from mrt_mitsuba.scene.model import Color, Material
+
+CONVENTIONS = ("report", "standard")
+
+# The report's material of everything before the first usemtl
+DEFAULT_MATERIAL = Material(
+    ior=1.1022, alpha=0.0579, specular=(0.286, 0.235, 0.128), diffuse=(1.0, 0.766, 0.762)
+)
+
+# Options of a map_Kd statement, with the number of values that follow each
+_MAP_OPTIONS = {
+    "-blendu": (1, 1),
+    "-blendv": (1, 1),
+    "-cc": (1, 1),
+    "-clamp": (1, 1),
+    "-boost": (1, 1),
+    "-imfchan": (1, 1),
+    "-texres": (1, 1),
+    "-bm": (1, 1),
+    "-mm": (2, 2),
+    "-o": (1, 3),
+    "-s": (1, 3),
+    "-t": (1, 3),
+}
+
+
+@dataclass
+class _Entry:
+    """What one newmtl block states; None for what it does not."""
+
+    line: int
+    kd: Color | None = None
+    ks: Color | None = None
+    ka: Color | None = None
+    ni: float | None = None
+    ns: float | None = None
+    map_kd: tuple[int, str] | None = None  # line, rest of the statement
+    unknown: set[str] = field(default_factory=set)
+
+
+def read_mtl(
+    path: str | os.PathLike[str], *, convention: str = "report", folder: Path | None = None
+) -> dict[str, Material]:
+    """The materials of an MTL file by name.
+
+    ``convention``:
+
+    * ``report``: ``Kd`` diffuse, ``Ks`` specular, ``Ni`` roughness, first value of ``Ka`` index of refraction
+      (0: no reflection). What a block leaves out is taken from ``DEFAULT_MATERIAL``.
+    * ``standard``: ``Kd``, ``Ks``, ``Ni`` index of refraction, ``Ns`` the exponent of a Blinn–Phong lobe,
+      which is nearest to a roughness of √(2 / (Ns + 2)) (Walter et al., "Microfacet Models for Refraction",
+      2007, §5.2). Defaults of the format's description: Kd 0.8, Ks 0, Ni 1, Ns 0.
+
+    ``map_Kd`` names a picture that replaces Kd; it is looked for relative to ``folder`` (that of the OBJ
+    file), then to the MTL file. One that is missing is named in a warning and Kd is used. Values may exceed
+    1, as in the report.
+
+    Raises ``SceneError`` with file and line for what cannot be read.
+    """
+    path = Path(path)
+    entries = _parse(path, read_lines(path))
+    make = {"report": _report_material, "standard": _standard_material}[convention]
+    materials = {}
+    for name, entry in entries.items():
+        material = make(entry)
+        if entry.map_kd is not None:
+            line, rest = entry.map_kd
+            material = replace(material, texture=_texture(path, line, rest, folder))
+        materials[name] = material
+    return materials
+
+
+def read_lines(path: Path) -> list[str]:
+    """The logical lines of a text file; where one is continued with a backslash, empty ones follow it."""
+    lines = decode(read_bytes(path)).split("\n")
+    for i in range(len(lines) - 1, 0, -1):
+        if lines[i - 1].endswith("\\"):
+            lines[i - 1], lines[i] = lines[i - 1][:-1] + " " + lines[i], ""
+    return lines
+
+
+def require_file(path: str | os.PathLike[str]) -> None:
+    """Raise ``SceneError`` unless ``path`` is a file that may be read. Pipes and devices have no end to wait
+    for."""
+    name, problem = os.fspath(path), ""
+    try:
+        mode = os.stat(path).st_mode
+        if stat.S_ISDIR(mode):
+            problem = "it is a folder; name a file in it"
+        elif not stat.S_ISREG(mode):
+            problem = "it is not a regular file; copy its content into one"
+        elif not os.access(path, os.R_OK):
+            problem = f"permission denied; try chmod +r {name}"
+    except (FileNotFoundError, NotADirectoryError):
+        problem = f"there is no such file in {os.path.dirname(os.path.abspath(name))}"
+    except ValueError as error:  # a zero byte in the name
+        problem = str(error)
+    except OSError as error:
+        circle = error.errno == errno.ELOOP
+        problem = "its symbolic links lead in a circle" if circle else error.strerror or str(error)
+    if problem:
+        raise SceneError(f"cannot read {name or repr(name)}: {problem}")
+
+
+def read_bytes(path: Path) -> bytes:
+    """The bytes of a text file, with Unix line ends. Raises ``SceneError`` if it cannot be read as text."""
+    require_file(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"cannot read {path}: {error.strerror or error}") from None
+    if b"\0" in data:
+        raise SceneError(f"{path}: is not a text file (it holds a zero byte); export it as OBJ or MTL text")
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    return data.removeprefix(b"\xef\xbb\xbf")
+
+
+def decode(data: bytes) -> str:
+    """Text of unknown encoding: UTF-8, else the Latin letters that older exporters wrote."""
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def find(name: str, folders: list[Path]) -> Path | None:
+    """The file ``name`` relative to the first folder that has it; backslashes may separate folders."""
+    for form in (name, name.replace("\\", "/")):
+        for folder in folders:
+            candidate = folder / form
+            if candidate.is_file():
+                return candidate
+    return None
+
+
+def numbers(where: str, statement: str, words: list[str], least: int, most: int) -> list[float]:
+    """``least`` to ``most`` finite numbers. Raises ``SceneError`` that names the statement."""
+    if not least <= len(words) <= most:
+        wanted = f"{least}" if least == most else f"{least} to {most}"
+        raise SceneError(f"{where}: {statement} has {len(words)} numbers, but must have {wanted}")
+    values = []
+    for word in words:
+        try:
+            value = float(word) if word.isascii() and "_" not in word else math.nan
+        except ValueError:
+            value = math.nan
+        if not abs(value) <= 3.4e38:  # the largest float32; false for NaN, too
+            raise SceneError(f"{where}: {statement} holds {word!r}, which is not a finite number")
+        values.append(value)
+    return values
+
+
+def _parse(path: Path, lines: list[str]) -> dict[str, _Entry]:
+    entries: dict[str, _Entry] = {}
+    current: _Entry | None = None
+    for number, line in enumerate(lines, 1):
+        statement, _, rest = line.split("#", 1)[0].strip().partition(" ")
+        statement, _, tabbed = statement.partition("\t")
+        rest = f"{tabbed} {rest}".strip()
+        where = f"{path}:{number}"
+        if statement == "newmtl":
+            if not rest:
+                raise SceneError(f"{where}: newmtl has no name; write newmtl NAME")
+            current = entries[rest] = _Entry(number)
+        elif statement in _STATEMENTS:
+            if current is None:
+                raise SceneError(f"{where}: {statement} comes before any newmtl; write newmtl NAME before it")
+            _STATEMENTS[statement](current, where, number, rest)
+    return entries
+
+
+def _color(name: str) -> Callable[[_Entry, str, int, str], None]:
+    def read(entry: _Entry, where: str, line: int, rest: str) -> None:
+        words = rest.split()
+        if words and words[0] in ("spectral", "xyz"):
+            raise SceneError(f"{where}: {name} {words[0]} is not supported; give red, green and blue")
+        values = numbers(where, name, words, 1, 3)
+        if min(values) < 0:
+            raise SceneError(f"{where}: {name} is {rest}, but a colour must not be negative")
+        if len(values) == 2:
+            raise SceneError(f"{where}: {name} has 2 numbers, but must have 1 or 3")
+        setattr(entry, name.lower(), tuple(values * (3 if len(values) == 1 else 1)))
+
+    return read
+
+
+def _number(name: str) -> Callable[[_Entry, str, int, str], None]:
+    def read(entry: _Entry, where: str, line: int, rest: str) -> None:
+        (value,) = numbers(where, name, rest.split(), 1, 1)
+        if value < 0:
+            raise SceneError(f"{where}: {name} is {rest}, but must not be negative")
+        setattr(entry, name.lower(), value)
+
+    return read
+
+
+def _map(entry: _Entry, where: str, line: int, rest: str) -> None:
+    if not rest:
+        raise SceneError(f"{where}: map_Kd names no file")
+    entry.map_kd = line, rest
+
+
+_STATEMENTS: dict[str, Callable[[_Entry, str, int, str], None]] = {
+    "Kd": _color("Kd"),
+    "Ks": _color("Ks"),
+    "Ka": _color("Ka"),
+    "Ni": _number("Ni"),
+    "Ns": _number("Ns"),
+    "map_Kd": _map,
+}
+
+
+def _report_material(entry: _Entry) -> Material:
+    default = DEFAULT_MATERIAL
+    return Material(
+        ior=default.ior if entry.ka is None else entry.ka[0],
+        alpha=default.alpha if entry.ni is None else entry.ni,
+        specular=default.specular if entry.ks is None else entry.ks,
+        diffuse=default.diffuse if entry.kd is None else entry.kd,
+    )
+
+
+def _standard_material(entry: _Entry) -> Material:
+    return Material(
+        ior=1.0 if entry.ni is None else entry.ni,
+        alpha=math.sqrt(2 / ((entry.ns or 0.0) + 2)),
+        specular=entry.ks or (0.0, 0.0, 0.0),
+        diffuse=entry.kd or (0.8, 0.8, 0.8),
+    )
+
+
+def _texture(path: Path, line: int, rest: str, folder: Path | None) -> str | None:
+    """The picture that a map_Kd statement names, or None, with a warning, where there is none."""
+    folders = [path.parent] if folder is None else [folder, path.parent]
+    name = rest
+    found = find(name, folders)
+    if found is None:
+        name = _without_options(rest)
+        found = find(name, folders) if name else None
+    if found is None:
+        text = (
+            f"{path}:{line}: the texture {name or rest} is missing in {folders[0]}; Kd is used in its place"
+        )
+        warnings.warn(text, MrtWarning, stacklevel=2)
+        return None
+    return str(found)
+
+
+def _without_options(rest: str) -> str:
+    """The file name of a map statement behind its options."""
+    words = rest.split()
+    while words and words[0] in _MAP_OPTIONS:
+        least, most = _MAP_OPTIONS[words.pop(0)]
+        for taken in range(most):
+            if taken >= least and not _is_number(words[0] if words else ""):
+                break
+            words = words[1:]
+    return " ".join(words)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

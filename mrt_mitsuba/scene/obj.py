@@ -1,0 +1,419 @@
+"""OBJ files: meshes with shared materials, and errors that name file and line.
+
+Mitsuba's own ``obj`` plugin makes one mesh with one material of a whole file, so the reader is the project's
+own. Runs of lines of the usual forms are recognised by one regular expression and turned into arrays at once,
+a million triangles in two or three seconds; every other line is read by itself, with care.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
+from mrt_mitsuba.scene.model import (
+    BLUE_SKY,
+    Camera,
+    Color,
+    Light,
+    Material,
+    Mesh,
+    Scene,
+    Vector,
+    view_problem,
+)
+from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, decode, find, numbers, read_bytes, read_mtl
+
+# Statements about names, groups, smoothing, curves and display: nothing that is rendered here
+_IGNORED = frozenset(
+    {
+        "g",
+        "s",
+        "o",
+        "mg",
+        "l",
+        "p",
+        "vp",
+        "deg",
+        "bmat",
+        "step",
+        "cstype",
+        "curv",
+        "curv2",
+        "surf",
+        "parm",
+        "trim",
+        "hole",
+        "scrv",
+        "sp",
+        "end",
+        "con",
+        "bevel",
+        "c_interp",
+        "d_interp",
+        "lod",
+        "shadow_obj",
+        "trace_obj",
+        "ctech",
+        "stech",
+        "call",
+        "csh",
+        "maplib",
+        "usemap",
+    }
+)
+
+_LINES_AT_ONCE = 4096  # regular expressions keep a state for each repetition
+_GAP, _END = rb"[ \t]+", rb"[ \t]*\n"
+_REAL = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_INDEX = rb"-?\d{1,18}"  # what fits 64 bits
+# Forms of a corner: the pattern, and what its indices are of
+_CORNERS = {
+    "c": (_INDEX, ("v",)),
+    "t": (_INDEX + b"/" + _INDEX, ("v", "vt")),
+    "n": (_INDEX + b"//" + _INDEX, ("v", "vn")),
+    "tn": (_INDEX + b"/" + _INDEX + b"/" + _INDEX, ("v", "vt", "vn")),
+}
+
+
+def _run(keyword: bytes, word: bytes, count: int) -> bytes:
+    """Pattern of up to some thousand lines of a keyword and ``count`` words."""
+    return b"(?:%s%s%s){1,%d}" % (keyword, (_GAP + word) * count, _END, _LINES_AT_ONCE)
+
+
+# The usual numbers of numbers: positions may have a weight, a colour or both behind them, which are not used
+_RUNS = {f"v_{n}": _run(b"v", _REAL, n) for n in (3, 4, 6, 7)}
+_RUNS |= {f"vt_{n}": _run(b"vt", _REAL, n) for n in (2, 3)} | {"vn_3": _run(b"vn", _REAL, 3)}
+_RUNS |= {f"f_{n}_{form}": _run(b"f", word, n) for n in range(3, 7) for form, (word, _) in _CORNERS.items()}
+_USED = {"v": 3, "vt": 2, "vn": 3}
+_BLOCKS = re.compile(
+    b"|".join(b"(?P<%s>%s)" % (k.encode(), v) for k, v in _RUNS.items()) + rb"|(?P<line>[^\n]*\n)"
+)
+
+# Letters of keywords, slashes and line ends as blanks: what is left are the numbers
+_NUMBERS_ONLY = bytes(32 if chr(i) in "vtnf/\n" else i for i in range(256))
+
+
+def read_obj(path: str | os.PathLike[str], *, convention: str = "report") -> tuple[Mesh, ...]:
+    """The meshes of an OBJ file, one for each material that is used.
+
+    Faces are ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``, with positive or negative indices. One with more than
+    three corners is cut into a fan around its first corner, which is right for convex faces. Normals are not
+    used: triangles are flat, their normal follows from the winding. Material libraries are looked for beside
+    the file and read by ``convention`` (see ``read_mtl``); one that is missing is named in a warning. Faces
+    of no known material get ``DEFAULT_MATERIAL``.
+
+    Raises ``SceneError`` with file and line for what cannot be read, ``UsageError`` for an unknown
+    convention.
+    """
+    if convention not in CONVENTIONS:
+        raise UsageError(f"convention={convention!r}: must be {' or '.join(CONVENTIONS)}")
+    reader = _Reader(Path(path), convention)
+    reader.read()
+    return reader.meshes()
+
+
+def obj_scene(
+    path: str | os.PathLike[str],
+    *,
+    convention: str = "report",
+    texturing: str | None = None,
+    camera: Camera | None = None,
+    lights: Sequence[Light] | None = None,
+    sky: Color = BLUE_SKY,
+) -> Scene:
+    """A scene of an OBJ file, which has neither camera nor lights: what is not given is placed by the model's
+    size.
+
+    The camera stands in front, towards +z, a little above and to the right, and sees all of it; a light is up
+    on each side, the right one brighter. ``texturing`` follows ``convention`` unless given. Raises as
+    ``read_obj`` does.
+    """
+    meshes = read_obj(path, convention=convention)
+    low = np.min([m.vertices.min(axis=0) for m in meshes], axis=0).astype(float)
+    high = np.max([m.vertices.max(axis=0) for m in meshes], axis=0).astype(float)
+    center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
+
+    def place(x: float, y: float, z: float) -> tuple[float, float, float]:
+        """A point in radii from the centre."""
+        px, py, pz = (center + radius * np.array([x, y, z])).tolist()
+        return px, py, pz
+
+    # A ball of radius 1 fills a view of 45° height, that of 60° width in a 4:3 picture, from a distance of
+    # 2.6
+    return Scene(
+        title=os.path.basename(path),
+        camera=camera or Camera(place(1.0, 0.8, 2.4), place(0, 0, 0)),
+        sky=sky,
+        lights=tuple(lights)
+        if lights is not None
+        else (Light(place(4, 5, 4), (2.5, 2.5, 2.5)), Light(place(-4, 3, 5), (1.0, 1.0, 1.2))),
+        meshes=meshes,
+        texturing=texturing or convention,
+    )
+
+
+def obj_view(
+    path: str | os.PathLike[str],
+    *,
+    convention: str = "report",
+    texturing: str | None = None,
+    camera: Vector | None = None,
+    target: Vector | None = None,
+    up: Vector | None = None,
+    fov: float | None = None,
+    light: Vector | None = None,
+) -> Scene:
+    """``obj_scene`` seen as the options of the command say; what is None stays as ``obj_scene`` places it.
+
+    ``fov`` is horizontal, in degrees; ``light`` is a white light's place. Raises ``UsageError`` for a camera
+    that looks nowhere, and what ``obj_scene`` raises.
+    """
+    lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
+    scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)
+    given: dict[str, Any] = {"position": camera, "target": target, "up": up, "hfov": fov}
+    view = replace(scene.camera, **{name: value for name, value in given.items() if value is not None})
+    problem = view_problem(view)
+    if problem:
+        raise UsageError(problem)
+    return replace(scene, camera=view)
+
+
+@dataclass
+class _Faces:
+    """Faces of as many corners each: vertex and texture indices from 0, texture −1 for none."""
+
+    v: np.ndarray  # int64 [F, corners]
+    vt: np.ndarray  # int64 [F, corners]
+    material: str | None
+    lines: np.ndarray  # int64 [F]
+
+
+@dataclass
+class _Reader:
+    path: Path
+    convention: str
+    materials: dict[str, Material] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.arrays: dict[str, list[np.ndarray]] = {"v": [], "vt": [], "vn": []}
+        self.counts = {"v": 0, "vt": 0, "vn": 0}
+        self.faces: list[_Faces] = []
+        self.material: str | None = None
+        self.line = 1
+        self.unknown_materials: set[str] = set()
+        self.highest_normal = -1, 0  # index from 0, and the line that has it
+
+    def fail(self, text: str, line: int | None = None) -> None:
+        raise SceneError(f"{self.path}:{self.line if line is None else line}: {text}")
+
+    # ------------------------------------------ Statements ---------------------------------------------
+
+    def read(self) -> None:
+        data = _join_continued(read_bytes(self.path))
+        if not data.endswith(b"\n"):
+            data += b"\n"
+        for match in _BLOCKS.finditer(data):
+            kind, *form = str(match.lastgroup).split("_")
+            if kind == "line":
+                self._statement(match[0])
+                self.line += 1
+                continue
+            lines = match[0].count(b"\n")
+            words = match[0].translate(_NUMBERS_ONLY)
+            if kind == "f":
+                indices = np.fromstring(words, np.int64, sep=" ").reshape(lines, int(form[0]), -1)
+                self._add_faces(indices, _CORNERS[form[1]][1])
+            else:
+                values = np.fromstring(words, np.float64, sep=" ").reshape(lines, -1)
+                self._add_values(kind, values[:, : _USED[kind]])
+            self.line += lines
+
+    def _statement(self, text: bytes) -> None:
+        """One line of a form that is not covered by the runs."""
+        words = decode(text.split(b"#", 1)[0]).split()
+        if not words:
+            return
+        keyword = words.pop(0)
+        where = f"{self.path}:{self.line}"
+        if keyword == "v":
+            if len(words) == 5:
+                self.fail("v has 5 numbers, but must have 3, 4 (with w), 6 or 7 (with a colour)")
+            self._add_values("v", np.array([numbers(where, "v", words, 3, 7)[:3]]))
+        elif keyword == "vt":
+            self._add_values("vt", np.array([[*numbers(where, "vt", words, 1, 3), 0.0][:2]]))
+        elif keyword == "vn":
+            self._add_values("vn", np.array([numbers(where, "vn", words, 3, 3)]))
+        elif keyword == "f":
+            self._face(words)
+        elif keyword == "usemtl":
+            self._use(_rest(text, "usemtl"))
+        elif keyword == "mtllib":
+            self._library(_rest(text, "mtllib"))
+        elif keyword not in _IGNORED:
+            self.fail(
+                f"unknown statement {keyword[:40]!r}; expected v, vt, vn, f, usemtl, mtllib or the like"
+            )
+
+    def _add_values(self, kind: str, values: np.ndarray) -> None:
+        with np.errstate(over="ignore"):
+            narrow = values.astype(np.float32)
+        if not np.isfinite(narrow).all():
+            row = int(np.argmin(np.isfinite(narrow).all(axis=1)))
+            self.fail(f"{kind} holds a number that is too large for a float32", self.line + row)
+        self.arrays[kind].append(narrow)
+        self.counts[kind] += len(values)
+
+    # ------------------------------------------ Faces --------------------------------------------------
+
+    def _face(self, words: list[str]) -> None:
+        """A face of any number of corners, in any of the four forms."""
+        if len(words) < 3:
+            self.fail(f"f has {len(words)} corners, but must have 3 or more")
+        corners, forms = [], set()
+        for word in words:
+            parts = word.split("/")
+            well = len(parts) <= 3 and all(re.fullmatch(r"([-+]?[0-9]{1,18})?", part) for part in parts)
+            if not well or not parts[0]:
+                self.fail(f"f has the corner {word[:40]!r}, but must have v, v/vt, v//vn or v/vt/vn")
+            forms.add(tuple(kind for kind, part in zip(("v", "vt", "vn"), parts, strict=False) if part))
+            corners.append([int(part) for part in parts if part])
+        if len(forms) > 1:
+            self.fail(f"f has corners of different forms: {' '.join(words)[:80]}; give all the same indices")
+        self._add_faces(np.array([corners], np.int64), forms.pop())
+
+    def _add_faces(self, indices: np.ndarray, kinds: tuple[str, ...]) -> None:
+        """Faces [F, corners, kinds of index]; makes indices count from 0."""
+        resolved = {}
+        for k, kind in enumerate(kinds):
+            index = indices[:, :, k]
+            resolved[kind] = np.where(index > 0, index - 1, index + self.counts[kind])
+            wrong = (index == 0) | (resolved[kind] < 0)
+            if wrong.any():
+                row = int(np.argmax(wrong.any(axis=1)))
+                bad = int(index[row][wrong[row]][0])
+                reason = (
+                    f"only {self.counts[kind]} came before"
+                    if bad
+                    else "indices count from 1, or back from -1"
+                )
+                self.fail(f"f has the {kind} index {bad}: {reason}", self.line + row)
+        if "vn" in resolved:
+            self._note_highest_normal(resolved["vn"])
+        lines = np.arange(self.line, self.line + len(indices))
+        none = np.full_like(resolved["v"], -1)
+        self.faces.append(_Faces(resolved["v"], resolved.get("vt", none), self.material, lines))
+
+    def _note_highest_normal(self, index: np.ndarray) -> None:
+        """Normals are not used, but an index without one means a broken file. They may still follow."""
+        top = int(index.max())
+        if top > self.highest_normal[0]:
+            self.highest_normal = top, self.line + int(np.argmax((index == top).any(axis=1)))
+
+    # ---------------------------------------- Materials ------------------------------------------------
+
+    def _use(self, name: str) -> None:
+        if not name:
+            self.fail("usemtl has no name; write usemtl NAME")
+        if name not in self.materials and name not in self.unknown_materials:
+            self.unknown_materials.add(name)
+            text = f"{self.path}:{self.line}: no library has the material {name!r}; it gets the default"
+            warnings.warn(text, MrtWarning, stacklevel=2)
+        self.material = name
+
+    def _library(self, rest: str) -> None:
+        if not rest:
+            self.fail("mtllib has no name; write mtllib FILE")
+        folder = self.path.parent
+        for name in [rest] if find(rest, [folder]) else rest.split():
+            found = find(name, [folder])
+            if found is None:
+                text = f"{self.path}:{self.line}: the material library {name} is missing in {folder}"
+                warnings.warn(f"{text}; its materials get the default", MrtWarning, stacklevel=2)
+            else:
+                self.materials |= read_mtl(found, convention=self.convention, folder=folder)
+
+    # ------------------------------------------ Result -------------------------------------------------
+
+    def meshes(self) -> tuple[Mesh, ...]:
+        """One mesh for each material, in the order of their first use."""
+        self._check_ranges()
+        vertices = np.concatenate(self.arrays["v"]) if self.arrays["v"] else np.empty((0, 3), np.float32)
+        uvs = np.concatenate(self.arrays["vt"]) if self.arrays["vt"] else np.empty((0, 2), np.float32)
+        by_material: dict[Material, list[_Faces]] = {}
+        for faces in self.faces:
+            material = self.materials.get(faces.material or "", DEFAULT_MATERIAL)
+            if faces.vt[0, 0] < 0:
+                material = replace(material, texture=None)  # no coordinates to look it up
+            by_material.setdefault(material, []).append(faces)
+        if not by_material:
+            raise SceneError(f"{self.path}: has no faces; export the model with its geometry")
+        return tuple(_mesh(vertices, uvs, faces, material) for material, faces in by_material.items())
+
+    def _check_ranges(self) -> None:
+        for kind in ("v", "vt"):
+            for faces in self.faces:
+                index = getattr(faces, kind)
+                beyond = index >= self.counts[kind]
+                if beyond.any():
+                    row = int(np.argmax(beyond.any(axis=1)))
+                    bad = int(index[row][beyond[row]][0]) + 1
+                    text = f"f has the {kind} index {bad}, but the file has {self.counts[kind]}"
+                    self.fail(text, int(faces.lines[row]))
+        top, line = self.highest_normal
+        if top >= self.counts["vn"]:
+            self.fail(f"f has the vn index {top + 1}, but the file has {self.counts['vn']}", line)
+
+
+def _mesh(vertices: np.ndarray, uvs: np.ndarray, faces: list[_Faces], material: Material) -> Mesh:
+    """The mesh of some faces, with the vertices that they use."""
+    v = np.concatenate([_triangles(f.v) for f in faces])
+    vt = np.concatenate([_triangles(f.vt) for f in faces])
+    if material.texture is None:
+        used, index = _compact(v, len(vertices))
+        return Mesh(vertices[used], index, material)
+    # Each corner becomes a vertex: a point may have other texture coordinates in another triangle
+    corners = vt.ravel()
+    index = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+    return Mesh(vertices[v.ravel()], index, material, uvs[corners])
+
+
+def _triangles(index: np.ndarray) -> np.ndarray:
+    """Fans [F (n − 2), 3] around the first corners of faces [F, n]."""
+    corners = index.shape[1]
+    if corners == 3:
+        return index
+    fan = [index[:, [0, k, k + 1]] for k in range(1, corners - 1)]
+    return np.stack(fan, axis=1).reshape(-1, 3)
+
+
+def _compact(index: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices used, in their order, and the faces in terms of them."""
+    used = np.zeros(count, bool)
+    used[index] = True
+    new = np.cumsum(used, dtype=np.uint32) - np.uint32(1)
+    return np.flatnonzero(used), new[index]
+
+
+def _join_continued(data: bytes) -> bytes:
+    """Lines that end in a backslash joined with the next; empty ones after them keep line numbers right."""
+    if b"\\\n" not in data:
+        return data
+
+    def join(match: re.Match[bytes]) -> bytes:
+        text = match[0]
+        return text.replace(b"\\\n", b" ") + b"\n" * text.count(b"\\\n")
+
+    return re.sub(rb"(?:[^\n]*\\\n)+[^\n]*", join, data)
+
+
+def _rest(text: bytes, keyword: str) -> str:
+    """What follows a keyword, blanks inside it included."""
+    return decode(text).strip()[len(keyword) :].strip()

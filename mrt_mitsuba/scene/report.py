@@ -1,0 +1,200 @@
+"""The report's scenes 0 to 4 and its cone scene 9, as data, and the way to the others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from itertools import product
+
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Cone, Light, Material, Plane, Scene, Sphere
+
+# The ten materials that scene 4 draws from, in the order of its random numbers
+SCENE_4_MATERIALS = (
+    Material(2.4449, 0.0681, (1.0, 0.882, 0.786), (0.014, 0.012, 0.012)),
+    Material(1.0720, 0.0588, (1.0, 0.824, 0.945), (0.002, 0.002, 0.003)),
+    Material(1.1051, 0.0568, (0.005, 0.013, 0.032), (1.0, 0.748, 0.718)),
+    Material(1.1051, 0.0567, (0.006, 0.026, 0.022), (1.0, 0.739, 0.721)),
+    Material(1.1022, 0.0579, (0.286, 0.235, 0.128), (1.0, 0.766, 0.762)),
+    Material(1.0893, 0.0604, (0.202, 0.035, 0.033), (1.0, 0.857, 0.866)),
+    Material(1.1382, 0.0886, (0.301, 0.034, 0.039), (1.0, 0.992, 0.98)),
+    Material(1.0771, 0.0589, (0.26, 0.036, 0.014), (1.0, 0.852, 1.172)),
+    Material(1.1481, 0.0625, (0.016, 0.073, 0.04), (1.0, 1.056, 1.146)),
+    Material(1.1153, 0.0680, (0.012, 0.036, 0.106), (1.0, 0.965, 1.07)),
+)
+
+
+def _scene_0() -> Scene:
+    grey = (0.5, 0.5, 0.5)
+    colors = {(0, 0, 0): grey, (1, 0, 0): (0.5, 0, 0), (0, 1, 0): (0, 0.5, 0.5), (0, 0, 1): (0, 0, 0.5)}
+    return Scene(
+        title="four spheres on a plane",
+        camera=Camera((3, 1, 0), (0, 0.3, 0)),
+        sky=(0.1, 0.3, 0.5),
+        lights=(Light((10, 10, 10), (1, 1, 1)), Light((4, 10, -2), (1, 1, 1))),
+        spheres=tuple(Sphere(p, 0.25, Material(1.3, 0.1, grey, kd)) for p, kd in colors.items()),
+        planes=(Plane((0, 1, 0), 0, Material(1.3, 0.1, grey, (0.6, 0.6, 0.6))),),
+    )
+
+
+def _row(i: int) -> float:
+    """Place of the i-th of ten spheres between -1.5 and 1.5, to the nine digits of the original's file."""
+    return round(-1.5 + i / 3, 9)
+
+
+def _scene_1() -> Scene:
+    lower = [
+        Sphere(
+            (0, 0, _row(i)), 0.15, Material(1.1382, (10 - i) / 90, (1, 0.992, 0.98), (0.301, 0.034, 0.039))
+        )
+        for i in range(10)
+    ]
+    upper = [
+        Sphere((0, 1, _row(i)), 0.15, Material(1.1153, (i + 1) / 10, (1, 0.965, 1.07), (0.012, 0.036, 0.106)))
+        for i in range(10)
+    ]
+    mirror = Sphere((-3, 1, 0), 2, SCENE_4_MATERIALS[0])
+    return Scene(
+        title="roughness along two rows of spheres, before a large mirror",
+        camera=Camera((3, 0, 0), (0, 0.3, 0)),
+        sky=BLUE_SKY,
+        lights=(Light((10, 10, 10), (10, 10, 10)), Light((4, 10, -2), (5, 3, 10))),
+        spheres=(*lower, *upper, mirror),
+        planes=(Plane((0, 1, 0), 1, Material(1.1481, 0.0625, (1, 1.056, 1.146), (0.016, 0.073, 0.04))),),
+    )
+
+
+def _scene_2() -> Scene:
+    def material(column: int, row: int) -> Material:
+        # The two leftmost columns have a negative roughness, as in the original
+        return Material(
+            1.0051 + 0.4 * row / 3, -0.0432 + 0.1 * column / 3, (1, 0.748, 0.718), (0.005, 0.013, 0.032)
+        )
+
+    return Scene(
+        title="roughness against index of refraction",
+        camera=Camera((0.5, 3, 1), (0, 0, 0.6), (0, 0, 1)),
+        sky=BLUE_SKY,
+        lights=(
+            Light((-20, 5, 10), (30, 30, 30)),
+            Light((10, 10, 10), (30, 30, 30)),
+            Light((50, -100, 10), (1, 0.7, 2)),
+        ),
+        spheres=tuple(
+            Sphere((_row(column), 0, 0.4 * (row + 1)), 0.15, material(column, row))
+            for row, column in product(range(4), range(10))
+        ),
+        planes=(Plane((0, 0, 1), 0, Material(1.1022, 0.0579, (0.95, 0.95, 0.95), (0.05, 0.05, 0.05))),),
+    )
+
+
+def _scene_3() -> Scene:
+    dark = (0.014, 0.012, 0.012)
+    return Scene(
+        title="six spheres in the corner of three planes",
+        camera=Camera((4.5, 0.8, 4.5), (0, 0.3, 0)),
+        sky=BLUE_SKY,
+        lights=(
+            Light((0, 1.7, 1), (1.5, 1.5, 1.5)),
+            Light((3, 2, 3), (2, 2, 2)),
+            Light((4, 3, -1), (2.5, 2.5, 2.5)),
+        ),
+        spheres=(
+            Sphere((0, 0.1, 0), 0.3, Material(6, 0.0181, (0.7, 0.882, 0.786), dark)),
+            Sphere((1, -0.05, 0), 0.15, Material(1.3771, 0.01589, (1, 0.852, 1.172), (0.26, 0.036, 0.014))),
+            Sphere((3, 0.05, 2), 0.25, Material(3, 0.00181, (0.7, 0.882, 0.786), dark)),
+            Sphere(
+                (1.3, 0, 2.6), 0.215, Material(1.5771, 0.01589, (0.8, 0.852, 0.8172), (0.46, 0.136, 0.114))
+            ),
+            Sphere((1.9, 0.05, 2.2), 0.25, Material(1.3051, 0.567, (0.7, 0.739, 0.721), (0.06, 0.26, 0.22))),
+            Sphere((0, 0, 1), 0.2, Material(1.1153, 0.18, (1, 0.965, 1.07), (0.012, 0.036, 0.406))),
+        ),
+        planes=(
+            Plane((0, 1, 0), 0.2, Material(1.382, 0.05886, (0.2, 0.2, 0.2), (0.2, 0.4, 0.3))),
+            Plane((1, 0, -1), 2, Material(1.8382, 0.886, (0.2, 0.2, 0.1), (0.5, 0.09, 0.07))),
+            Plane((0.3, -0.2, 1), 4, Material(1.9382, 0.0886, (0.5, 0.5, 0.5), (0.1, 0.3, 0.05))),
+        ),
+        focal_distance=2.0,
+    )
+
+
+def _scene_4(count: int = 600) -> Scene:
+    numbers = c_rand()
+    spheres = []
+    for _ in range(count):
+        material = SCENE_4_MATERIALS[next(numbers) % 10]
+        radius = 0.05 + next(numbers) % 200 / 1000
+        z, y, x = 1 + next(numbers) % 650 / 100, next(numbers) % 650 / 100, 1 + next(numbers) % 650 / 100
+        spheres.append(Sphere((x, y, z), radius, material))
+    return Scene(
+        title="600 spheres in the corner of three planes",
+        camera=Camera((6, 4, 6), (0, 1, 0), hfov=90),
+        sky=BLUE_SKY,
+        lights=(
+            Light((10, 10.7, 1), (1.5, 1.5, 1.5)),
+            Light((8, 20, 3), (2, 2, 2)),
+            Light((4, 30, -1), (2.5, 2.5, 2.5)),
+        ),
+        spheres=tuple(spheres),
+        planes=(
+            Plane((0, 1, 0), 0.2, Material(2.382, 0.005886, (0.2, 0.2, 0.2), (0.2, 0.4, 0.3))),
+            Plane((1, 0, 0), 2, Material(2.8382, 0.00886, (0.2, 0.2, 0.1), (0.5, 0.09, 0.07))),
+            Plane((0, 0, 1), 4, Material(2.9382, 0.00886, (0.5, 0.5, 0.5), (0.1, 0.3, 0.05))),
+        ),
+        focal_distance=0.1,
+        focal_range=3.0,
+    )
+
+
+def _scene_9() -> Scene:
+    wood = Material(1.0771, 0.0589, (0.26, 0.036, 0.014), (1, 0.852, 1.172))
+    return Scene(
+        title="a cone above a plane",
+        camera=Camera((3, 3, 0), (0, 0, 0)),
+        sky=BLUE_SKY,
+        lights=(
+            Light((2.8, -28.34, 4.33), (0.3764705882352941, 0.11176470588235295, 0.08431372549019608)),
+            Light((3, 3, 3), (2.5, 2.5, 2.5)),
+        ),
+        planes=(Plane((0, 1, 0), 0, wood),),
+        cones=(Cone((0, 1.5, 0), (0, 0.5, 0), 0.648361, wood),),
+    )
+
+
+def c_rand(seed: int = 1) -> Iterator[int]:
+    """The numbers of the GNU C library's ``rand()``: an additive feedback generator over 31 words.
+
+    Source: the polynomial x³¹ + x³ + 1 of its manual page, started by a Lehmer generator (multiplier 16807),
+    the first 310 numbers thrown away.
+    """
+    words = [seed]
+    for _ in range(30):
+        words.append(16807 * words[-1] % 0x7FFFFFFF)
+    words += words[:3]
+    for i in range(34, 344):
+        words.append((words[i - 31] + words[i - 3]) & 0xFFFFFFFF)
+    while True:
+        words = words[-31:]
+        words.append((words[-31] + words[-3]) & 0xFFFFFFFF)
+        yield words[-1] >> 1
+
+
+_BUILDERS = {0: _scene_0, 1: _scene_1, 2: _scene_2, 3: _scene_3, 4: _scene_4, 9: _scene_9}
+_DEMOS = (5, 6, 7, 8)
+NUMBERS = tuple(sorted({*_BUILDERS, *_DEMOS}))
+
+# Those made of analytic surfaces only, without meshes and textures: what the float64 reference draws
+ANALYTIC = tuple(_BUILDERS)
+
+
+@cache
+def report_scene(number: int) -> Scene:
+    """One of the report's scenes; 5 to 8 are of our own models. Raises ``UsageError`` for any other
+    number."""
+    if number in _DEMOS:
+        from mrt_mitsuba.scene import demos  # models in numpy, which the other scenes do without
+
+        return getattr(demos, f"scene_{number}")()
+    if number not in _BUILDERS:
+        raise UsageError(f"there is no scene {number!r}: choose one of {', '.join(map(str, NUMBERS))}")
+    return _BUILDERS[number]()

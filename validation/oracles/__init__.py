@@ -1,0 +1,1 @@
+"""Independent answers: a float64 tracer and exact values."""

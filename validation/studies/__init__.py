@@ -1,0 +1,1 @@
+"""The studies of ``mrt-validate``, one module or package each."""

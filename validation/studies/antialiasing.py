@@ -1,0 +1,322 @@
+"""Adaptive anti-aliasing against full supersampling: error, rays and time; and whether it chases noise."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba import filters
+from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.warm import Warm, measure
+
+TITLE = "Anti-aliasing: adaptive against full"
+
+MODES = ("none", "luma", "sobel", "geometry")
+COLUMNS = (
+    "scene",
+    "lattice",
+    "mode",
+    "aa",
+    "RMSE",
+    "error / full",
+    "rays",
+    "rays / full",
+    "seconds",
+    "time / full",
+    "spread",
+    "pixels refined",
+    "error in the others",
+)
+
+# An error counts as that of full supersampling up to here; a twentieth is less than doubling aa changes by a
+# factor of 2
+SAME_ERROR = 1.05
+THIRD = 1 / 3
+
+# Luma contrast of a 3x3 neighbourhood in the converged picture: below, nothing is worth refining; above, it
+# is an edge
+FLAT, EDGE = 0.02, 0.2
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much to measure."""
+
+    scenes: Sequence[int]
+    lattices: Sequence[str]
+    amounts: Sequence[int]
+    reference_aa: int
+    size: tuple[int, int]
+    repeats: int
+    light_size: tuple[int, int]
+    light_spp: int  # of the reference, for each of its samples
+    noise_spp: Sequence[int]
+
+
+FULL = Extent(
+    range(5), ("report", "centered"), (2, 4, 8), 32, (400, 300), 3, (200, 150), 64, (2, 4, 8, 16, 32, 64)
+)
+QUICK = Extent((0, 3), ("report",), (2, 4), 16, (120, 90), 1, (80, 60), 16, (4, 16))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One setting, beside full supersampling at the same aa."""
+
+    mode: str
+    aa: int
+    warm: Warm
+    error: float  # RMSE
+    unrefined_share: float  # of the squared error, in pixels with one sample
+
+    @property
+    def rays(self) -> int:
+        return self.warm.result.rays["primary"]
+
+    @property
+    def refined(self) -> float:
+        """Share of pixels with more than one sample."""
+        return float(np.mean(_samples(self.warm.result) > 1))
+
+
+def run(study: Study, *, quick: bool) -> None:
+    """Fill the study."""
+    extent = QUICK if quick else FULL
+    _compare_modes(study, extent)
+    _compare_modes_over_path(study, extent)
+    _chase_noise(study, extent)
+
+
+# ----------------------------------------- The report's scenes ------------------------------------------
+
+
+def _compare_modes(study: Study, extent: Extent) -> None:
+    width, height = extent.size
+    table, reached = [], 0
+    with study.stage("Anti-aliasing", len(extent.scenes) * len(extent.lattices)) as advance:
+        for number in extent.scenes:
+            for lattice in extent.lattices:
+                rows = _rows(
+                    _load(mrt.scene_dict(number, width=width, height=height)), extent, lattice=lattice
+                )
+                table += _cells(str(number), lattice, rows)
+                if lattice == "report":
+                    reached += _read(study, number, rows)
+                    _hold(study, f"scene {number}", rows)
+                    _show_contours(study, number, rows)
+                gc.collect()  # scenes that stay alive slow down the kernels of later ones
+                advance(1)
+    study.table(
+        "modes",
+        f"Error to aa={extent.reference_aa} of the same lattice, {width}x{height}",
+        COLUMNS,
+        table,
+        "Seconds are medians of warm runs of this session, each setting in turn.",
+    )
+    study.record("scenes where sobel or geometry reach the error of full in a third of its time", reached)
+
+
+def _load(scene: dict[str, Any]) -> Any:
+    import mitsuba as mi
+
+    mrt.register()
+    return mi.load_dict(scene)
+
+
+def _rows(
+    scene: Any, extent: Extent, *, reference_aa: int = 0, reference_spp: int = 1, **options: Any
+) -> list[Row]:
+    """Every mode and amount on a scene; the options are those of ``mrt.render``."""
+    shared = {"integrator": options.pop("integrator", None), "lattice": options.pop("lattice")}
+    reference = mrt.render(
+        scene, aa=reference_aa or extent.reference_aa, aamode="none", spp=reference_spp, seed=77, **shared
+    ).image.astype(np.float64)
+    runs = {
+        (mode, aa): partial(mrt.render, scene, aa=aa, aamode=mode, **shared, **options)
+        for mode in MODES
+        for aa in extent.amounts
+    }
+    return [
+        _row(mode, aa, warm, reference) for (mode, aa), warm in measure(runs, repeats=extent.repeats).items()
+    ]
+
+
+def _row(mode: str, aa: int, warm: Warm, reference: np.ndarray) -> Row:
+    squared = np.square(warm.result.image - reference).mean(axis=-1)
+    alone = squared[_samples(warm.result) == 1].sum() / max(squared.sum(), 1e-300)
+    return Row(mode, aa, warm, float(np.sqrt(squared.mean())), float(alone))
+
+
+def _samples(result: Any) -> np.ndarray:
+    full = np.full(result.image.shape[:2], result.plan.lattice.count, np.float32)
+    return result.layers.get("samples.Y", full)
+
+
+def _cells(scene: str, lattice: str, rows: Sequence[Row]) -> list[tuple[Any, ...]]:
+    full = {row.aa: row for row in rows if row.mode == "none"}
+    return [
+        (
+            scene,
+            lattice,
+            row.mode,
+            row.aa,
+            row.error,
+            row.error / full[row.aa].error,
+            row.rays,
+            row.rays / full[row.aa].rays,
+            row.warm.seconds,
+            row.warm.seconds / full[row.aa].warm.seconds,
+            row.warm.spread,
+            row.refined,
+            row.unrefined_share,
+        )
+        for row in rows
+    ]
+
+
+def _hold(study: Study, name: str, rows: Sequence[Row]) -> None:
+    """What must be true on any machine: rays, and errors."""
+    full = {row.aa: row for row in rows if row.mode == "none"}
+    off = [row.rays - _expected_rays(row) for row in rows if row.mode != "none"]
+    study.at_most(
+        f"{name}: camera rays other than one a pixel and aa² - 1 in refined ones", max(map(abs, off)), 0
+    )
+    least = max(full)
+    sobel = next(row for row in rows if (row.mode, row.aa) == ("sobel", least))
+    # scene 4 leaves a fifth of its pixels alone and twice the error, scene 2 the outlines of its dark
+    # spheres; a detector that finds nothing has four times the error or more
+    study.at_most(f"{name}: error of sobel / full at aa={least}", sobel.error / full[least].error, 2.2)
+
+
+def _expected_rays(row: Row) -> int:
+    samples = _samples(row.warm.result)
+    return samples.size + int((samples > 1).sum()) * (row.aa**2 - 1)
+
+
+def _read(study: Study, number: int, rows: Sequence[Row]) -> bool:
+    """Say what it takes to reach the error of full supersampling, or why it is not to be had for a third."""
+    target = max((row for row in rows if row.mode == "none"), key=lambda row: row.aa)
+    good = [
+        row for row in rows if row.mode in ("sobel", "geometry") and row.error <= SAME_ERROR * target.error
+    ]
+    best = min(good, key=lambda row: row.warm.seconds, default=None)
+    name = f"Scene {number}, full supersampling at aa={target.aa}"
+    if best is not None:
+        share = best.warm.seconds / target.warm.seconds
+        study.record(f"scene {number}: time of the cheapest equal error / full", share)
+        text = (
+            f"{name}: {best.mode} at aa={best.aa} reaches its error ({best.error:.2g} to "
+            f"{target.error:.2g}) with "
+            f"{best.rays / target.rays:.0%} of the rays, in {share:.0%} of the time."
+        )
+        if share > THIRD:
+            text += (
+                f" Not in a third: the detector refines {best.refined:.0%} of all pixels, "
+                f"and looking for them costs a pass."
+            )
+        study.text(text)
+        return share <= THIRD
+    near = min((row for row in rows if row.mode in ("sobel", "geometry")), key=lambda row: row.error)
+    study.text(
+        f"{name}: neither sobel nor geometry reaches its error of {target.error:.2g}. The nearest is "
+        f"{near.mode} at "
+        f"aa={near.aa} with {near.error:.2g}, and {near.unrefined_share:.0%} of its squared error lies in "
+        f"pixels "
+        f"that it left alone: faint or unseen by it."
+    )
+    return False
+
+
+def _show_contours(study: Study, number: int, rows: Sequence[Row]) -> None:
+    """What each detector would refine, as the report shows it."""
+    aa = min(row.aa for row in rows)
+    masks = [_samples(row.warm.result) > 1 for row in rows if row.aa == aa and row.mode != "none"]
+    found = [filters.EdgeMap(mask=mask, value=mask.astype(np.float32)) for mask in masks]
+    study.picture(
+        f"contours-{number}",
+        f"Scene {number}: refined pixels",
+        filters.contours(*found),
+        "Left to right: luma, sobel, geometry.",
+    )
+
+
+# --------------------------------------------- Monte Carlo ----------------------------------------------
+
+
+def lit_by_a_sphere(width: int, height: int) -> dict[str, Any]:
+    """Scene 0 in Mitsuba's own plugins, lit by a small sphere instead of two points."""
+    scene = mrt.scene_dict(0, width=width, height=height, flavor="stock")
+    kept = {name: node for name, node in scene.items() if not name.startswith(("light", "sky", "integrator"))}
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": 30.0}}
+    light = {"type": "sphere", "center": [1, 2, 0.5], "radius": 0.3, "emitter": emitter}
+    sky = {"type": "constant", "radiance": 0.2}
+    return {**kept, "light": light, "sky": sky, "integrator": {"type": "path", "max_depth": 4}}
+
+
+def _compare_modes_over_path(study: Study, extent: Extent) -> None:
+    scene = _load(lit_by_a_sphere(*extent.light_size))
+    rows = _rows(scene, extent, reference_aa=8, reference_spp=extent.light_spp, lattice="report", spp=8)
+    width, height = extent.light_size
+    study.table(
+        "path",
+        f"Mitsuba's path under an area light, 8 rays for each sample, {width}x{height}",
+        COLUMNS,
+        _cells("0, area light", "report", rows),
+        f"Error to aa=8 with {extent.light_spp} rays for each sample. Most of it is noise, which falls with "
+        f"every "
+        f"ray, wherever it goes; so the error follows the number of rays, and adaptive sampling only spares "
+        f"those that "
+        f"sharp edges do not need.",
+    )
+
+
+def _chase_noise(study: Study, extent: Extent) -> None:
+    """Refined pixels where the converged picture is flat, and where it has an edge."""
+    scene = _load(lit_by_a_sphere(*extent.light_size))
+    truth = mrt.render(scene, aa=1, aamode="none", spp=16 * extent.light_spp, seed=78).image
+    contrast = _contrast(truth)
+    flat, edge = contrast < FLAT, contrast > EDGE
+    rows = []
+    for detector, find in (("luma", filters.luma_edges), ("sobel", filters.sobel_edges)):
+        for spp in extent.noise_spp:
+            seen = _samples(mrt.render(scene, aa=2, aamode=detector, spp=spp)) > 1
+            blind = np.asarray(find(mrt.render(scene, aa=1, aamode="none", spp=spp).image).mask)[1:-1, 1:-1]
+            seen = seen[1:-1, 1:-1]
+            rows.append((detector, spp, seen[flat].mean(), seen[edge].mean(), blind[flat].mean()))
+    study.table(
+        "noise",
+        "Does a detector chase noise? Share of pixels refined",
+        ("detector", "rays a pixel", "flat", "edges", "flat, without the variance"),
+        rows,
+        f"Flat: luma contrast below {FLAT} in the converged picture; edges: above {EDGE}.",
+    )
+    # three standard deviations: 0.3 % for one normal value; estimated from 4 samples, tails are longer
+    study.at_most(
+        "noise: share of flat pixels refined, 4 rays a pixel or more",
+        max(r[2] for r in rows if r[1] >= 4),
+        0.03,
+    )
+    # noise of 0.03 in a picture whose edges begin at a contrast of 0.2: at three deviations either way, most
+    # of them
+    study.at_least(
+        "noise: share of edges found with 16 rays a pixel", min(r[3] for r in rows if r[1] == 16), 0.55
+    )
+    study.at_least(
+        "noise: the same flat pixels without the variance",
+        min(r[4] for r in rows),
+        0.3,
+        "shows that there is noise to chase",
+    )
+
+
+def _contrast(image: np.ndarray) -> np.ndarray:
+    """Largest less smallest luma of the 3x3 neighbourhood, the border left out, [H - 2, W - 2]."""
+    luma = np.sqrt(image @ np.array(filters.edges.LUMA_WEIGHTS, np.float32))
+    windows = np.lib.stride_tricks.sliding_window_view(luma, (3, 3))
+    return windows.max(axis=(2, 3)) - windows.min(axis=(2, 3))

@@ -1,0 +1,502 @@
+"""``mrt_bsdf`` against Mitsuba's ``roughconductor``: values, pictures, metals, noise and time."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.validation.oracles import exact
+from mrt_mitsuba.validation.studies import metals
+from mrt_mitsuba.validation.tools import image_tests
+from mrt_mitsuba.validation.tools.bsdf_probe import (
+    Array,
+    evaluate,
+    is_scalar,
+    largest,
+    lobe_pairs,
+    relative_error,
+    rgb,
+)
+from mrt_mitsuba.validation.tools.image_tests import Comparison
+from mrt_mitsuba.validation.tools.study import Study
+
+TITLE = "The BSDF against Mitsuba's roughconductor"
+
+ALPHAS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+POINTWISE = 2e-5  # exp of up to 16, of arguments that are right to a few roundings
+SCALAR_PAIRS = 60  # scalar variants take milliseconds for each
+SHORT = 0.02  # of |ωi + ωo|²: above, Mitsuba's density is right to 3e-6
+JUDGED = 10  # densities for each variant and roughness
+LEVEL = 1e-3  # probability with which a test of pictures rejects equal ones
+POWER_ALPHA = 0.3  # of the pictures in which small errors must be seen; a highlight is then some pixels wide
+MUTATIONS: Mapping[str, Mapping[str, Any]] = {
+    "radiance x 1.02": {"specular_reflectance": 1.02},
+    "alpha x 1.05": {"alpha": 1.05 * POWER_ALPHA},
+}
+
+
+def run(study: Study, *, quick: bool) -> None:
+    """All parts; ``compare_roughconductor`` does the pictures of one roughness."""
+    study.text(
+        "With F = 1 and no diffuse part, mrt_bsdf and roughconductor are the same function: their values are "
+        "compared point by point and in pictures, with equal random numbers and with independent ones. Real "
+        "metals then show what Schlick's Fresnel term costs, and samples what either pays for the same noise."
+    )
+    pointwise(study, quick=quick)
+    rendered(study, quick=quick)
+    metals.run(study, quick=quick)
+    efficiency(study, quick=quick)
+
+
+# ------------------------------------------ Point by point ------------------------------------------
+
+
+def ours(alpha: float, *, visible: bool = True, **more: Any) -> dict[str, Any]:
+    """``mrt_bsdf`` with F = 1 and no diffuse part."""
+    return {
+        "type": "mrt_bsdf",
+        "alpha": alpha,
+        "fresnel": "unity",
+        "diffuse_reflectance": 0.0,
+        "sample_visible": visible,
+        **more,
+    }
+
+
+def theirs(alpha: float, *, visible: bool = True) -> dict[str, Any]:
+    """``roughconductor`` with F = 1."""
+    return {
+        "type": "roughconductor",
+        "material": "none",
+        "distribution": "beckmann",
+        "alpha": alpha,
+        "sample_visible": visible,
+    }
+
+
+@dataclass(frozen=True)
+class Pointwise:
+    """Largest relative differences; of plain D sampling's density where the half vector is well known."""
+
+    value: float
+    pdf_visible: float
+    pdf_plain: float
+    judged: tuple[tuple[float, float], ...]  # elsewhere, where those densities differ most: our error, theirs
+
+
+def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> Pointwise:
+    """Compare values and densities of ``count`` random pairs of directions, in the current variant.
+
+    Mitsuba's density of plain D sampling divides by ωo·h and so feels the rounding of the length of ωo, by
+    6e-8 / |ωi + ωo|². Where |ωi + ωo|² < ``SHORT`` and the densities differ, 50 digits judge both.
+    """
+    import mitsuba as mi
+
+    wi, wo = lobe_pairs(count, alpha, seed=seed)
+    found = {}
+    for visible in (True, False):
+        pair = (mi.load_dict(bsdf(alpha, visible=visible)) for bsdf in (ours, theirs))
+        found[visible] = [evaluate(bsdf, wi, wo) for bsdf in pair]
+    values = [relative_error(one[0], other[0]).max() for one, other in found.values()]
+    visible_error = relative_error(found[True][0][1], found[True][1][1])
+    plain = found[False][0][1], found[False][1][1]
+    plain_error = relative_error(*plain)
+    short = ((wi.astype(float) + wo) ** 2).sum(axis=-1) < SHORT
+    apart = np.flatnonzero(short & (plain_error > POINTWISE))
+    worst = apart[np.argsort(-plain_error[apart])[:JUDGED]]
+    return Pointwise(
+        largest(values),
+        float(visible_error.max()),
+        float(plain_error[~short].max()),
+        tuple(_judge(wi[i], wo[i], alpha, plain[0][i], plain[1][i]) for i in worst),
+    )
+
+
+def _judge(wi: Array, wo: Array, alpha: float, one: float, other: float) -> tuple[float, float]:
+    """Relative errors of two densities of plain D sampling, D cos θh / (4 ωo·h), against 50 digits.
+
+    h is the half vector of the directions as they are given, on which D depends; ωo·h is that of directions
+    of length 1.
+    """
+    given = exact.unit([float(a) + float(b) for a, b in zip(wi, wo, strict=True)])
+    cos_d = sum(a * b for a, b in zip(exact.unit(list(wo)), exact.half_vector(wi, wo), strict=True))
+    alpha_used = alpha if is_scalar() else np.float32(alpha)
+    true = exact.beckmann_d(given[2], alpha_used) * given[2] / (4 * cos_d)
+    return abs(float(one / true) - 1), abs(float(other / true) - 1)
+
+
+def pointwise(study: Study, *, quick: bool) -> None:
+    """Values and densities, over roughness and in every variant that can run here."""
+    variants = runtime.usable_variants()
+    if quick:  # every colour mode once, and one scalar variant
+        variants = [name for name in variants if not name.startswith("scalar") or name == runtime.SLOW]
+    before = runtime.use()
+    rows: list[list[Any]] = []
+    judged: list[tuple[float, float]] = []
+    with study.stage("points", len(variants) * len(ALPHAS)) as advance:
+        for variant in variants:
+            runtime.use(variant)
+            count = SCALAR_PAIRS if is_scalar() else 5_000 if quick else 200_000
+            for alpha in ALPHAS:
+                found = compare_pointwise(alpha, count=count)
+                rows.append(
+                    [
+                        variant,
+                        alpha,
+                        count,
+                        found.value,
+                        found.pdf_visible,
+                        found.pdf_plain,
+                        len(found.judged),
+                    ]
+                )
+                judged += found.judged
+                advance(1)
+    runtime.use(before)
+    columns = ["variant", "alpha", "pairs", "value", "density, visible", "density, D", "judged"]
+    study.table(
+        "pointwise",
+        "Largest relative differences from roughconductor",
+        columns,
+        rows,
+        "Judged: pairs at grazing angles whose densities of plain D sampling differ by more, up to 10.",
+    )
+    why = "exp of up to 16, of arguments right to a few roundings"
+    names = ("value", "density of visible normals", "density of plain D sampling")
+    for column, name in enumerate(names, start=3):
+        study.at_most(
+            f"{name}, relative, {len(variants)} variants",
+            largest(row[column] for row in rows),
+            POINTWISE,
+            why,
+        )
+    _hold_judged(study, judged)
+
+
+def _hold_judged(study: Study, judged: Sequence[tuple[float, float]]) -> None:
+    study.record("densities of plain D sampling at grazing angles judged by 50 digits", len(judged))
+    if judged:
+        errors = np.array(judged)
+        study.record("their largest error among these", errors[:, 1].max())
+        study.at_most(
+            "our largest error where the densities differ, against 50 digits",
+            errors[:, 0].max(),
+            POINTWISE,
+            "the same, of D alone",
+        )
+
+
+# --------------------------------------------- Pictures ---------------------------------------------
+
+
+def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96, studio: bool = False) -> Any:
+    """A ball of the material on a floor under a sky and a point light, ``size`` × ¾ ``size`` pixels.
+
+    In the ``studio`` it is alone under a sky of bright and dark fields: all noise is then that of its
+    samples, and no light comes back from a floor in rare bright ones.
+    """
+    import mitsuba as mi
+
+    look = mi.ScalarTransform4f().look_at([0, -4, 1.6], [0, 0, 0.6], [0, 0, 1])
+    film = {
+        "type": "hdrfilm",
+        "width": size,
+        "height": size * 3 // 4,
+        "rfilter": {"type": "box"},
+        "pixel_format": "rgb",
+        "component_format": "float32",
+    }
+    ground = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().scale(4),
+        "bsdf": {"type": "diffuse", "reflectance": rgb((0.5, 0.4, 0.3))},
+    }
+    around = {
+        "sky": {"type": "constant", "radiance": rgb((0.3, 0.4, 0.6))},
+        "lamp": {"type": "point", "position": [1.5, -2, 3], "intensity": rgb((12, 10, 8))},
+        "floor": ground,
+    }
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 5},
+            "sensor": {"type": "perspective", "fov": 32, "to_world": look, "film": film},
+            "ball": {"type": "sphere", "center": [0, 0, 0.7], "radius": 0.7, "bsdf": dict(bsdf)},
+            **({"sky": _fields()} if studio else around),
+        }
+    )
+
+
+def _fields() -> dict[str, Any]:
+    """A sky of 16 × 8 fields with random brightness, a decade from the median to the brighter ones."""
+    import mitsuba as mi
+
+    fields = 10 ** np.random.default_rng(0).normal(-0.5, 0.5, (8, 16, 1)) * np.ones(3)
+    return {"type": "envmap", "bitmap": mi.Bitmap(fields.astype(np.float32))}
+
+
+def side_by_side(one: Array, other: Array, *, gain: float) -> Array:
+    """Two pictures [H, W, 3] and their absolute difference, enlarged, in a row."""
+    return np.concatenate([one, other, gain * np.abs(one - other)], axis=1)
+
+
+@dataclass(frozen=True)
+class RoughconductorComparison:
+    """Ours against Mitsuba's, of one roughness. ``images``: "ours", "theirs", "difference" [H, W, 3]."""
+
+    alpha: float
+    errors: Mapping[str, float]  # by name, unitless
+    timings: Mapping[str, float]  # seconds: the median of renders, kernels compiled before; and their ratio
+    images: Mapping[str, NDArray[np.float32]]
+    test: Comparison  # of renders with independent random numbers
+    samples: int  # per pixel, in each of the two averages
+
+    @property
+    def equal(self) -> bool:
+        """Can they be told apart neither point by point nor by their pictures?"""
+        named = ("value", "density of visible normals", "density of plain D sampling")
+        return not self.test.rejects and all(self.errors[name] <= POINTWISE for name in named)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write an EXR: ours as R, G, B, and the layers "theirs" and "difference". Raises ``OutputError``."""
+        from mrt_mitsuba.output.files import write_exr
+
+        layers = {name: self.images[name] for name in ("theirs", "difference")}
+        header = {"mrt:alpha": self.alpha, "mrt:errors": dict(self.errors), "mrt:timings": dict(self.timings)}
+        write_exr(path, self.images["ours"], layers, header)
+
+    def __str__(self) -> str:
+        rows = {
+            **self.errors,
+            **{
+                f"{name} [s]" if name != "ratio" else "time, ours / theirs": value
+                for name, value in self.timings.items()
+            },
+        }
+        verdict = "equal" if self.equal else "different"
+        lines = [f"  {name:<44} {value:.4g}" for name, value in rows.items()]
+        return "\n".join([f"mrt_bsdf and roughconductor, alpha = {self.alpha:g}: {verdict}", *lines])
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        return f"<pre>{escape(str(self))}</pre>"
+
+
+def compare_roughconductor(
+    alpha: float = 0.1,
+    *,
+    size: int = 96,
+    spp: int = 8,
+    renders: int = 32,
+    sample_visible: bool = True,
+    pairs: int = 20_000,
+    seed: int = 0,
+) -> RoughconductorComparison:
+    """Compare ``mrt_bsdf`` (F = 1, no diffuse part) with Mitsuba's ``roughconductor``.
+
+    ``size``: width of the pictures in pixels; ``spp``: samples per pixel of each of the ``renders``, whose
+    mean and variance are compared; ``pairs``: of directions for the comparison point by point.
+
+    Needs ``pip install 'mrt-mitsuba[validation]'``. Works in a vectorised variant, which becomes current.
+    Raises ``UsageError`` for a roughness that ``roughconductor`` does not take.
+    """
+    if not 0 < alpha <= 1:
+        raise UsageError(f"alpha={alpha!r}: roughconductor is compared for a roughness in (0, 1]")
+    runtime.use(runtime.FAST)
+    points = compare_pointwise(alpha, count=pairs)
+    stacks, seconds = _render_both(
+        [ours(alpha, visible=sample_visible), theirs(alpha, visible=sample_visible)],
+        size=size,
+        spp=spp,
+        renders=renders,
+        seed=seed,
+    )
+    first, second = (stack.mean(axis=0) for stack in stacks)
+    test = image_tests.compare(*(image_tests.estimate(stack) for stack in stacks), level=LEVEL)
+    errors = {
+        "value": points.value,
+        "density of visible normals": points.pdf_visible,
+        "density of plain D sampling": points.pdf_plain,
+        "relRMSE of the pictures": test.rel_rmse,
+        "probability of so much between equal pictures": test.p,
+        "pixels that differ, with the same random numbers": same_numbers(
+            alpha, size=size, visible=sample_visible
+        ),
+    }
+    timings = {"ours": seconds[0], "theirs": seconds[1], "ratio": seconds[0] / seconds[1]}
+    images = {"ours": first, "theirs": second, "difference": first - second}
+    return RoughconductorComparison(
+        alpha, errors, timings, {n: i.astype(np.float32) for n, i in images.items()}, test, spp * renders
+    )
+
+
+def _render_both(
+    bsdfs: Sequence[Mapping[str, Any]], *, size: int, spp: int, renders: int, seed: int, studio: bool = False
+) -> tuple[list[Array], list[float]]:
+    """Renders [N, H, W, 3] of each material, all with different seeds, in turn, and their median seconds."""
+    import mitsuba as mi
+
+    scenes = [ball_scene(bsdf, size=size, studio=studio) for bsdf in bsdfs]
+    for scene in scenes:
+        np.array(mi.render(scene, spp=spp))  # compiles
+    stacks: list[list[Array]] = [[] for _ in scenes]
+    seconds: list[list[float]] = [[] for _ in scenes]
+    for number in range(renders):
+        for index, scene in enumerate(scenes):
+            start = time.perf_counter()
+            picture = np.array(mi.render(scene, spp=spp, seed=seed + 1 + number * len(scenes) + index))
+            seconds[index].append(time.perf_counter() - start)
+            stacks[index].append(picture)
+    return [np.stack(stack) for stack in stacks], [statistics.median(times) for times in seconds]
+
+
+def same_numbers(alpha: float, *, size: int = 96, visible: bool = True, spp: int = 16) -> float:
+    """Share of pixels that differ by more than 1e-4 when both renders draw the same random numbers.
+
+    A path that rounding sends past the other side of an edge goes on differently; anything else would show in
+    most pixels of the ball.
+    """
+    import mitsuba as mi
+
+    scenes = (ball_scene(bsdf(alpha, visible=visible), size=size) for bsdf in (ours, theirs))
+    one, other = (np.array(mi.render(scene, spp=spp, seed=1)) for scene in scenes)
+    return float((np.abs(one - other) > 1e-4 * np.maximum(other, other.mean())).any(axis=-1).mean())
+
+
+def rendered(study: Study, *, quick: bool) -> None:
+    """Pictures: equal with equal random numbers, not told apart with others, while small errors are."""
+    settings: dict[str, Any] = (
+        {"size": 64, "spp": 8, "renders": 64} if quick else {"size": 128, "spp": 8, "renders": 96}
+    )
+    alphas = (POWER_ALPHA,) if quick else (0.03, 0.1, POWER_ALPHA)
+    with study.stage("pictures", len(alphas) + len(MUTATIONS)) as advance:
+        for alpha in alphas:
+            _hold_pictures(study, compare_roughconductor(alpha, **settings))
+            advance(1)
+        for name, change in MUTATIONS.items():
+            _hold_power(study, name, change, settings)
+            advance(1)
+
+
+def _hold_pictures(study: Study, found: RoughconductorComparison) -> None:
+    at = f"alpha {found.alpha:g}"
+    study.at_most(
+        f"share of pixels that differ with the same random numbers, {at}",
+        found.errors["pixels that differ, with the same random numbers"],
+        5e-3,
+        "paths that rounding sends past an edge; the ball covers a third of the picture",
+    )
+    study.at_least(
+        f"p of the difference with independent numbers, {at}",
+        found.test.p,
+        LEVEL,
+        "pixels, tiles and the picture, with Šidák's correction",
+    )
+    study.record(f"relRMSE of the averages, {at}", found.test.rel_rmse)
+    study.record(f"time, ours over theirs, {at}", found.timings["ratio"])
+    study.picture(
+        f"pictures-{found.alpha:g}",
+        f"Ours, Mitsuba's, |difference| × 20; {at}",
+        side_by_side(found.images["ours"], found.images["theirs"], gain=20),
+        f"{found.samples} samples per pixel each, independent: the difference is noise.",
+        exr=True,
+    )
+
+
+def _hold_power(study: Study, name: str, change: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    """The same test of pictures must reject a small error of ours."""
+    broken = {**ours(POWER_ALPHA), **change}
+    stacks, _ = _render_both([broken, theirs(POWER_ALPHA)], seed=100, **settings)
+    test = image_tests.compare(*(image_tests.estimate(stack) for stack in stacks), level=LEVEL)
+    study.at_most(
+        f"p of the difference with {name}", test.p, LEVEL, "the test of pictures must see this error"
+    )
+
+
+# ------------------------------------------ Noise and time ------------------------------------------
+
+
+@dataclass(frozen=True)
+class Efficiency:
+    """Noise of one sampler: geometric mean of the variances of pixels, and seconds of a render."""
+
+    variance: float
+    seconds: float
+
+    @property
+    def equal_time_error(self) -> float:
+        """Typical error of a pixel after a second."""
+        return float(np.sqrt(self.variance * self.seconds))
+
+
+def measure_efficiency(
+    alpha: float, *, size: int, spp: int, renders: int
+) -> dict[tuple[str, bool], Efficiency]:
+    """Both plugins with both samplings, rendered in turn; keys are ("ours" or "theirs", visible)."""
+    keys = [(name, visible) for visible in (True, False) for name in ("ours", "theirs")]
+    bsdfs = [(ours if name == "ours" else theirs)(alpha, visible=visible) for name, visible in keys]
+    stacks, seconds = _render_both(bsdfs, size=size, spp=spp, renders=renders, seed=500, studio=True)
+    spreads = [stack.var(axis=0, ddof=1) for stack in stacks]
+    noisy = np.min(spreads, axis=0) > 0  # the ball, not the sky around it
+    # the geometric mean: of the mean, a few bright pixels would make a figure of luck
+    variances = [float(np.exp(np.log(spread[noisy]).mean())) for spread in spreads]
+    return {key: Efficiency(v, s) for key, v, s in zip(keys, variances, seconds, strict=True)}
+
+
+def efficiency(study: Study, *, quick: bool) -> None:
+    """Noise at equal sample counts, which is held; at equal time, which depends on the machine, recorded."""
+    settings = {"size": 64, "spp": 16, "renders": 12} if quick else {"size": 96, "spp": 16, "renders": 32}
+    alphas = (0.1, 0.5) if quick else (0.02, 0.1, 0.3, 0.6)
+    rows: list[list[Any]] = []
+    ratios = []
+    with study.stage("noise", len(alphas)) as advance:
+        for alpha in alphas:
+            found = measure_efficiency(alpha, **settings)
+            for visible in (True, False):
+                one, other = found["ours", visible], found["theirs", visible]
+                ratios.append(one.variance / other.variance)
+                rows.append(
+                    [
+                        alpha,
+                        "visible" if visible else "D",
+                        ratios[-1],
+                        one.seconds / other.seconds,
+                        one.equal_time_error / other.equal_time_error,
+                    ]
+                )
+            advance(1)
+    columns = ["alpha", "sampling", "variance", "time", "equal-time error"]
+    study.table(
+        "efficiency", "Ours over Mitsuba's", columns, rows, "Times: medians of renders taken in turn."
+    )
+    study.plot(
+        "efficiency", "Error at equal time, ours over Mitsuba's", _bars(rows), "Below 1 ours is the better."
+    )
+    study.at_most(
+        "variance at equal sample count, ours over theirs",
+        largest(ratios),
+        1.1,
+        "the same sampling; the variances of a thousand pixels are known to a few percent",
+    )
+    study.record("equal-time error, ours over theirs, median", statistics.median(row[-1] for row in rows))
+
+
+def _bars(rows: Sequence[Sequence[Any]]) -> Any:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 3.5))
+    axes = figure.subplots()
+    axes.bar([f"α {row[0]:g}\n{row[1]}" for row in rows], [row[-1] for row in rows])
+    axes.axhline(1, color="black", linewidth=0.8)
+    axes.set(ylabel="error at equal time, ratio")
+    return figure

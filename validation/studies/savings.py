@@ -1,0 +1,152 @@
+"""What the render plan saves: everything it leaves out, forced into scenes that do not need it."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.scene.model import Cone, Plane, Scene
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.tools.knobs import load
+from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.warm import ratio
+
+# Half a step of an 8-bit picture, which is what the cut-off promises; the rest changes nothing
+INVISIBLE = 0.5 / 255
+
+LAYERS = ("depth", "normal", "albedo", "direct", "reflection", "bounces")
+
+
+def _same(nodes: dict[str, Any]) -> dict[str, Any]:
+    return nodes
+
+
+@dataclass(frozen=True)
+class Forced:
+    """A scene that does not need something, and how it is forced in."""
+
+    what: str
+    scene: Scene
+    holding: Scene | None = None  # the scene that needs it; by default the same
+    change: Callable[[dict[str, Any]], dict[str, Any]] = _same  # of the dict of the scene that needs it
+    shared: dict[str, Any] = field(default_factory=dict)  # options of both renders
+    more: dict[str, Any] = field(default_factory=dict)  # options of the second
+    bounces: bool = False  # must the integrator be told that mirror rays matter?
+
+
+def table(study: Study, *, size: tuple[int, int], aa: int, repeats: int) -> None:
+    """Add the table of what is left out, and hold the pictures to be the same."""
+    cases, rows = forced(), []
+    with study.stage("What the plan saves", len(cases)) as advance:
+        for case in cases:
+            rows.append(_row(case, size, aa, repeats))
+            gc.collect()  # scenes that stay alive slow down the kernels of later ones
+            advance(1)
+    study.table(
+        "plan",
+        f"What the plan saves on a scene that does not need it, {size[0]}x{size[1]}, aa={aa}",
+        (
+            "left out",
+            "s without",
+            "s with",
+            "saves, s",
+            "with / without",
+            "quartiles",
+            "change of the picture",
+        ),
+        rows,
+        "Scene 0 without what is named, and with it forced in, in turn; medians of ratios.",
+    )
+    study.text(_sentence(rows))
+    study.at_most(
+        "plan: largest change of the picture by what is left out",
+        max(row[-1] for row in rows),
+        INVISIBLE,
+        "half a step of an 8-bit picture",
+    )
+
+
+def _sentence(rows: Sequence[tuple[Any, ...]]) -> str:
+    most = max(rows, key=lambda row: row[4])
+    costly = [row[0] for row in rows if row[4] > 1.05]
+    text = f"Most is saved by leaving out {most[0]}: with it, the render takes {most[4]:.2g} times as long. "
+    return text + (
+        f"{len(costly)} of {len(rows)} things left out would cost more than 5 %: {', '.join(costly)}."
+        if costly
+        else "None would cost more than 5 %."
+    )
+
+
+def _row(case: Forced, size: tuple[int, int], aa: int, repeats: int) -> tuple[Any, ...]:
+    options = {"aa": aa, "aamode": "none", **case.shared}
+    nodes = [_nodes(scene, size) for scene in (case.scene, case.holding or case.scene)]
+    scenes = [load(nodes[0]), load(case.change(nodes[1]))]
+    if case.bounces:
+        scenes[1].integrator().bounces = lambda prepared: True
+    without = partial(mrt.render, scenes[0], **options)
+    forced_in = partial(mrt.render, scenes[1], **{**options, **case.more})
+    change = float(np.abs(without().image - forced_in().image).max())
+    time = ratio(forced_in, without, repeats=repeats)
+    saved = time.seconds - time.other_seconds
+    quartiles = f"{time.low:.3g} to {time.high:.3g}"
+    return (case.what, time.other_seconds, time.seconds, saved, time.median, quartiles, change)
+
+
+def _nodes(scene: Scene, size: tuple[int, int]) -> dict[str, Any]:
+    return scene.to_dict(width=size[0], height=size[1])
+
+
+def forced() -> list[Forced]:
+    """Every kind of thing that a plan leaves out."""
+    plain = report_scene(0)
+    dull, stuff = _without_reflection(plain), plain.spheres[0].material
+    all_paths = {"integrator": {"type": "mrt_whitted", "min_contribution": 0.0}}
+    dark = dataclasses.replace(plain, lights=())
+    # with a cut-off of zero, a light too dim to be seen still gets its shadow rays
+    dim = dataclasses.replace(
+        plain, lights=tuple(dataclasses.replace(light, color=(1e-9,) * 3) for light in plain.lights)
+    )
+    far_cone = dataclasses.replace(plain, cones=(Cone((1e3, 1, 0), (1e3, 0, 0), 0.1, stuff),))
+    far_plane = dataclasses.replace(plain, planes=(*plain.planes, Plane((0, 1, 0), 1e4, stuff)))
+    # without a sky in sight, nothing is out of focus
+    inside = dataclasses.replace(plain, planes=(*plain.planes, Plane((1, 0, 0), 20, stuff)))
+    return [
+        Forced("bounce loop (nothing reflects)", dull, bounces=True),
+        Forced("shadow rays (no light)", dark, dim, shared=all_paths),
+        Forced("shadow rays and paths that cannot matter", plain, more=all_paths),
+        Forced("cone code (no cone)", plain, far_cone),
+        Forced("a plane", plain, far_plane),
+        Forced("texture code (uniform colours)", plain, change=_textured),
+        Forced("depth of field (all in focus)", inside, more={"focaldist": 1.0, "focalrange": 1e6}),
+        Forced("edge pass (aa=1)", plain, shared={"aa": 1}, more={"aamode": "sobel", "layers": ["edges"]}),
+        Forced("layers (not asked for)", plain, more={"layers": list(LAYERS)}),
+    ]
+
+
+def _without_reflection(scene: Scene) -> Scene:
+    """Nothing reflects: a black mirror colour."""
+
+    def dull(thing: Any) -> Any:
+        return dataclasses.replace(thing, material=dataclasses.replace(thing.material, specular=(0, 0, 0)))
+
+    return dataclasses.replace(
+        scene, spheres=tuple(map(dull, scene.spheres)), planes=tuple(map(dull, scene.planes))
+    )
+
+
+def _textured(description: dict[str, Any]) -> dict[str, Any]:
+    """The same colours, each as a picture of one colour."""
+    import mitsuba as mi
+
+    for node in description.values():
+        if isinstance(node, dict) and node.get("type") == "mrt_bsdf":
+            colour = np.full((2, 2, 3), node["diffuse_reflectance"]["value"], np.float32)
+            node["diffuse_reflectance"] = {"type": "bitmap", "bitmap": mi.Bitmap(colour), "raw": True}
+    return description

@@ -1,0 +1,18 @@
+"""``mrt-validate stability``: does float32 hold on stiff and extreme cases, and where must it give out?"""
+
+from __future__ import annotations
+
+from mrt_mitsuba.validation.studies.stability import bsdf, filters, finite, geometry, transport
+from mrt_mitsuba.validation.tools.study import Study
+
+TITLE = "Numerical stability on stiff and extreme cases"
+
+PARTS = (bsdf, geometry, transport, filters, finite)
+
+
+def run(study: Study, *, quick: bool) -> None:
+    """All parts, each with its tables: reflectance, geometry, light transport, filters, finite results."""
+    with study.stage(TITLE, len(PARTS)) as advance:
+        for part in PARTS:
+            part.run(study, quick=quick)
+            advance(1)

@@ -1,0 +1,58 @@
+"""Cases of the stability study: what was done, is expected and came out, and the bound it is held to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from mrt_mitsuba.validation.tools.study import Bound, Study
+
+COLUMNS = ("case", "what", "expected", "measured", "bound", "")
+
+
+@dataclass
+class Cases:
+    """Rows of one table. A case with a bound is held to it; one without cannot hold, and says why."""
+
+    study: Study
+    name: str
+    title: str
+    rows: list[tuple[str, str, str, float, str, str]] = field(default_factory=list)
+    bounds: list[Bound] = field(default_factory=list)
+
+    def at_most(self, name: str, what: str, expected: str, measured: float, limit: float) -> None:
+        """A case whose figure must not exceed ``limit``."""
+        self._add(Bound(f"{self.title}: {name}", float(measured), float(limit)), name, what, expected)
+
+    def at_least(self, name: str, what: str, expected: str, measured: float, limit: float) -> None:
+        """A case whose figure must not be below ``limit``."""
+        self._add(Bound(f"{self.title}: {name}", float(measured), float(limit), False), name, what, expected)
+
+    def beyond_float32(self, name: str, what: str, measured: float, why: str) -> None:
+        """A case that no float32 renderer can pass: its figure is shown, not held to anything."""
+        self.rows.append((name, what, why, float(measured), "-", "cannot hold"))
+
+    def close(self, note: str = "") -> None:
+        """Give table and bounds to the study."""
+        for bound in self.bounds:
+            self.study.bounds.append(bound)
+        self.study.table(self.name, self.title, COLUMNS, self.rows, note)
+
+    def _add(self, bound: Bound, name: str, what: str, expected: str) -> None:
+        sign = "<=" if bound.at_most else ">="
+        self.rows.append(
+            (
+                name,
+                what,
+                expected,
+                bound.measured,
+                f"{sign} {bound.limit:.3g}",
+                "ok" if bound.holds else "MISSED",
+            )
+        )
+        self.bounds.append(bound)
+
+
+def hexadecimal(values: Iterable[float]) -> str:
+    """Numbers in Python's exact notation, which ``float.fromhex`` reads back."""
+    return " ".join(float(value).hex() for value in values)

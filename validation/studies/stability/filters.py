@@ -1,0 +1,307 @@
+"""The filters on pictures that are constant, tiny, damaged or of huge range."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba import filters, runtime
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.validation.studies.stability.cases import Cases
+from mrt_mitsuba.validation.tools.study import Study
+
+SHAPES = ((1, 1), (1, 17), (17, 1), (2, 2), (3, 3), (1, 2), (40, 30))
+BLUR = {"focal_distance": 2.0, "focal_range": 0.5}
+MODES = ("report", "corrected")
+
+# A blurred pixel is a weighted mean of at most 16² others: sums of as many float32 products
+MEAN = 64 * 2.0**-24
+
+Edges = Callable[[np.ndarray, np.ndarray], Any]
+EDGES: dict[str, Edges] = {
+    "luma": lambda image, depth: filters.luma_edges(image),
+    "sobel": lambda image, depth: filters.sobel_edges(image),
+    "geometry": lambda image, depth: filters.geometry_edges(_flat_normals(image), depth),
+}
+
+
+def run(study: Study, *, quick: bool) -> None:
+    """The table of cases, in both kinds of variants."""
+    del quick  # all of it is quick
+    cases = Cases(study, "filters", "Filters")
+    import mitsuba as mi
+
+    before = mi.variant()
+    for variant in (before, runtime.SLOW):
+        runtime.use(variant)
+        try:
+            for case in CASES:
+                name = case.name if variant == before else f"{case.name} ({variant})"
+                cases.at_most(name, case.what, case.expected, case.measure(), case.limit)
+        finally:
+            runtime.use(before)
+    cases.beyond_float32(
+        "constant pictures of 1e-30, blur",
+        "relative change",
+        _constant_blur((1e-30,)),
+        "the smallest weights are 2⁻³⁰: their products are below the least normal float32 and become 0",
+    )
+    cases.close()
+
+
+@dataclass(frozen=True)
+class _Case:
+    name: str
+    what: str
+    expected: str
+    measure: Callable[[], float]
+    limit: float = 0.0
+
+
+def _constant(shape: Sequence[int], value: float) -> np.ndarray:
+    return np.full((*shape, 3), value, np.float32)
+
+
+def _flat_normals(image: np.ndarray) -> np.ndarray:
+    return np.broadcast_to(np.array([0, 0, 1], np.float32), image.shape)
+
+
+def _blurred(image: np.ndarray, depth: np.ndarray, mode: str, **changes: Any) -> np.ndarray:
+    return np.asarray(filters.gaussian_dof(image, depth, mode=mode, **{**BLUR, **changes}))
+
+
+def _noise(shape: Sequence[int], seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).random((*shape, 3)).astype(np.float32)
+
+
+def _depths(shape: Sequence[int], seed: int = 2) -> np.ndarray:
+    """Distances on both sides of the focus, and some misses."""
+    depth = np.random.default_rng(seed).uniform(0.1, 12, shape).astype(np.float32)
+    depth[np.random.default_rng(seed + 1).random(shape) < 0.1] = np.inf
+    return depth
+
+
+# ------------------------------------------------ Figures --------------------------------------------------
+
+
+def _constant_blur(values: Sequence[float]) -> float:
+    """Largest relative change of a constant picture by the blur, over sizes, values and modes."""
+    changes = [
+        np.abs(_blurred(_constant(shape, value), _depths(shape), mode) / value - 1).max()
+        for shape in SHAPES
+        for value in values
+        for mode in MODES
+    ]
+    return float(np.max(changes))
+
+
+def _constant_edges() -> float:
+    """Edge pixels in bright constant pictures of all sizes, seen at one distance."""
+    return float(
+        sum(
+            np.asarray(find(_constant(shape, value), np.full(shape, 3, np.float32)).mask).sum()
+            for shape in SHAPES
+            for value in (0.5, 100.0, 1e6)
+            for find in EDGES.values()
+        )
+    )
+
+
+def _outside_range() -> float:
+    """Largest amount by which blurred values leave the range of those they are made from, relative to it."""
+    excess = 0.0
+    for shape in SHAPES:
+        for mode in MODES:
+            image = _noise(shape) * np.float32(1e20) - np.float32(3e19)
+            out = _blurred(image, _depths(shape), mode)
+            low, high = image.min(), image.max()
+            span = max(abs(low), abs(high))
+            excess = max(excess, float((low - out).max() / span), float((out - high).max() / span))
+    return excess
+
+
+def _spread_of_damage(value: float) -> float:
+    """Other pixels that a damaged one makes not finite, in both modes of the blur."""
+    image, depth = _noise((40, 30)), _depths((40, 30))
+    image[20, 15, 1] = value
+    return float(sum((~np.isfinite(_blurred(image, depth, mode)).all(axis=-1)).sum() - 1 for mode in MODES))
+
+
+def _damage_kept() -> float:
+    """1 if a damaged pixel is not returned as it is."""
+    image, depth = _noise((40, 30)), _depths((40, 30))
+    image[20, 15, 1] = np.nan
+    return float(any(not np.isnan(_blurred(image, depth, mode)[20, 15, 1]) for mode in MODES))
+
+
+def _damage_reported(value: float) -> float:
+    """Pixels of the 3×3 around a damaged one that are no infinite edges, and such edges elsewhere."""
+    wrong = 0
+    for name, find in EDGES.items():
+        image, depth = _constant((12, 10), 0.5), np.full((12, 10), 3, np.float32)
+        if name == "geometry":
+            depth[6, 5] = np.nan
+        else:
+            image[6, 5, 2] = value
+        found = find(image, depth)
+        expected = np.zeros((12, 10), bool)
+        expected[5:8, 4:7] = True
+        wrong += int((np.isinf(np.asarray(found.value)) != expected).sum())
+        wrong += int((~np.asarray(found.mask)[expected]).sum())
+    return float(wrong)
+
+
+def _sobel_range() -> float:
+    """Largest error of Sobel's value at a step between two greys, both above 1, or one below 0."""
+    errors = []
+    for low, high in ((2.0, 3.0), (10.0, 4000.0), (-1.0, 0.5), (-2.0, -1.0), (-0.001, 0.001)):
+        image = _constant((5, 6), low)
+        image[:, 3:] = high
+        # 0.07 + 0.72 + 0.21 is 1 but for a rounding, so a grey on a whole number may be either side of it:
+        # one level
+        step = abs(np.trunc(255 * high) - np.trunc(255 * low))
+        value = np.asarray(filters.sobel_edges(image).value)[2, 2]
+        errors.append(abs(value - 4 * step))
+    return float(max(errors))
+
+
+def _no_focus() -> float:
+    """Calls without a focal distance that do not give back the very picture."""
+    image, depth = _noise((8, 9)), _depths((8, 9))
+    return float(
+        sum(
+            filters.gaussian_dof(image, depth, focal_distance=distance, mode=mode) is not image
+            for distance in (None, 0.0, -1.0)
+            for mode in MODES
+        )
+    )
+
+
+def _border() -> float:
+    """Difference at the border, where nothing is blurred, between a picture and a part of it."""
+    image, depth = _noise((40, 30)), np.full((40, 30), 2.0, np.float32)
+    depth[18:22, 13:17] = 30.0
+    worst = 0.0
+    for mode in MODES:
+        cut = (slice(4, -4), slice(4, -4))
+        inner, outer = _blurred(image[cut], depth[cut], mode), _blurred(image, depth, mode)
+        worst = max(
+            worst,
+            float(np.abs(inner[0] - outer[4, 4:-4]).max()),
+            float(np.abs(inner[-1] - image[-5, 4:-4]).max()),
+        )
+    return worst
+
+
+def _huge_range() -> float:
+    """Values that are not finite among blurs of pictures between 1e-38 and 1e34, with any focal range."""
+    image = (10 ** np.random.default_rng(5).uniform(-38, 34, (20, 20, 3))).astype(np.float32)
+    depth = (10 ** np.random.default_rng(6).uniform(-30, 30, (20, 20))).astype(np.float32)
+    return float(
+        sum(
+            (~np.isfinite(_blurred(image, depth, mode, focal_distance=f, focal_range=r))).sum()
+            for mode in MODES
+            for f in (1e-30, 1.0, 1e30)
+            for r in (0.0, 1e-30, 1e30, np.inf)
+        )
+    )
+
+
+def _edges_finite() -> float:
+    """NaN among the values of detectors on pictures between -1e34 and 1e34."""
+    rng = np.random.default_rng(7)
+    image = (10 ** rng.uniform(-38, 34, (20, 20, 3)) * rng.choice([-1, 1], (20, 20, 3))).astype(np.float32)
+    depth = (10 ** rng.uniform(-37, 37, (20, 20))).astype(np.float32)
+    return float(sum(np.isnan(np.asarray(find(image, depth).value)).sum() for find in EDGES.values()))
+
+
+def _refused() -> float:
+    """Senseless arguments that are not refused with a ``UsageError``."""
+    image, depth = _noise((4, 4)), _depths((4, 4))
+    calls: Sequence[Callable[[], Any]] = (
+        lambda: filters.gaussian_dof(image, depth, focal_distance=np.nan),
+        lambda: filters.gaussian_dof(image, depth, focal_distance=1.0, focal_range=np.nan),
+        lambda: filters.gaussian_dof(image, depth, focal_distance=1.0, mode="other"),
+        lambda: filters.gaussian_dof(image, depth[:3], focal_distance=1.0),
+        lambda: filters.gaussian_dof(image[..., :2], depth, focal_distance=1.0),
+        lambda: filters.sobel_edges(image, threshold=np.nan),
+        lambda: filters.luma_edges(image[:, :0]),
+        lambda: filters.geometry_edges(image, depth, crease_angle=0),
+        lambda: filters.geometry_edges(image, depth, depth_step=0),
+    )
+    return float(sum(not _raises_usage_error(call) for call in calls))
+
+
+def _raises_usage_error(call: Callable[[], Any]) -> bool:
+    try:
+        call()
+    except UsageError:
+        return True
+    return False
+
+
+# One line for each case
+CASES = (
+    _Case(
+        "constant pictures, blur",
+        "1×1 … 40×30, values 1e-25, 0.3, 1e30: relative change",
+        "a mean of equals",
+        lambda: _constant_blur((1e-25, 0.3, 1e30)),
+        MEAN,
+    ),
+    _Case(
+        "constant pictures, edges",
+        "1×1 … 40×30, values 0.5, 100, 1e6: edge pixels, all detectors",
+        "none",
+        _constant_edges,
+    ),
+    _Case(
+        "range of a blur",
+        "values to 1e20, negative ones too: how far means leave their range",
+        "not at all",
+        _outside_range,
+        MEAN,
+    ),
+    _Case(
+        "NaN in a picture, blur",
+        "other pixels that are not finite afterwards",
+        "none: damage stays local",
+        lambda: _spread_of_damage(np.nan),
+    ),
+    _Case(
+        "infinity in a picture, blur",
+        "other pixels that are not finite afterwards",
+        "none: damage stays local",
+        lambda: _spread_of_damage(np.inf),
+    ),
+    _Case("NaN in a picture, kept", "1 if the pixel itself is hidden", "it stays to be seen", _damage_kept),
+    _Case(
+        "NaN in a picture, edges",
+        "pixels not marked in its 3×3, or marked elsewhere",
+        "none: reported, and local",
+        lambda: _damage_reported(np.nan),
+    ),
+    _Case("infinity in a picture, edges", "the same", "none", lambda: _damage_reported(np.inf)),
+    _Case(
+        "Sobel beyond 0 … 1",
+        "error of the value at steps above 1 and below 0",
+        "one grey level on either side",
+        _sobel_range,
+        8.0,
+    ),
+    _Case(
+        "focal distance 0", "calls that do not return the very picture, for none, 0 and -1", "none", _no_focus
+    ),
+    _Case("blur in the middle", "change at the border", "none", _border),
+    _Case(
+        "huge ranges, blur",
+        "values that are not finite, pictures 1e-38 … 1e34, depths 1e-30 … 1e30",
+        "none",
+        _huge_range,
+    ),
+    _Case("huge ranges, edges", "NaN among the values, pictures to ±1e34", "none", _edges_finite),
+    _Case("senseless arguments", "calls that are not refused with a UsageError", "none", _refused),
+)

@@ -1,0 +1,436 @@
+"""Nothing that is not finite, and nothing negative: plugins in bulk, whole renders, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.plugins.intersect import (
+    cone_frame,
+    cone_surface,
+    cylinder_frame,
+    cylinder_surface,
+    intersect_cone,
+    intersect_cylinder,
+    intersect_plane,
+    intersect_sphere,
+)
+from mrt_mitsuba.rendering.api import render
+from mrt_mitsuba.scene.model import Cone, Cylinder, Light, Material, Plane, Scene, Sphere
+from mrt_mitsuba.validation.studies.stability.cases import Cases
+from mrt_mitsuba.validation.studies.stability.transport import BASE
+from mrt_mitsuba.validation.tools.study import Study
+
+AT_ONCE = 2_500_000
+TINY, NORMAL = 1e-45, 1.2e-38  # the least float32 of all, and the least with all its digits
+_ZERO_UP = (0, TINY, NORMAL, 1e-20, 1e-8, 1e-4, 0.1, 1, 1e2, 1e6, 3e38, np.inf, np.nan)
+ALPHAS: tuple[float, ...] = (*_ZERO_UP, *(-a for a in _ZERO_UP[1:-1]))
+IORS = (1, 1 + 1.2e-7, 1 - 6e-8, TINY, NORMAL, 1e-3, 1e6, 1e9, 3e38, np.inf, np.nan, 0, -1)
+COSINES = (1, 1 - 6e-8, 0.5, 1e-3, 1e-7, 1e-12, 1e-20, NORMAL, TINY, 0, -TINY, -1e-7, -0.5, -1)
+NUMBERS = (0, 1, -1, TINY, -TINY, NORMAL, 1e-20, 1e-7, -1e-7, 0.5, 2, 1e3, -1e6)
+UNIFORM = (0, 6e-8, 0.5, 1 - 6e-8)
+FRESNEL = ("schlick", "dielectric", "unity")
+
+
+def run(study: Study, *, quick: bool) -> None:
+    """Bulk evaluations with one in three numbers an extreme one; scenes drawn by lot; refusals."""
+    cases = Cases(study, "finite", "Finite and not negative")
+    count = 10**6 if quick else 10**8
+    for name, what, evaluate in BULK:
+        bad = _bulk(evaluate, count)
+        cases.at_most(name, f"{count:.0e} random and adversarial evaluations: {what}", "none", bad, 0)
+    _scalar_variant(cases, 50 if quick else 1000)
+    _random_scenes(cases, 3 if quick else 40)
+    _refusals(cases)
+    _small_alpha(cases)
+    cases.close(
+        "A negative alpha is allowed: D sees its square, G₁ its sign, and where the BSDF "
+        "would be negative it is 0. "
+        "|alpha| below 1e-8, 0 included, acts as 1e-8, above 1e6 as 1e6; an update with NaN acts as 1e-8."
+    )
+
+
+def _bulk(evaluate: Callable[[_Draw], Any], count: int) -> int:
+    """Bad results among ``count`` evaluations, in kernels of ``AT_ONCE``; one trace serves all."""
+    parts = range(-(-count // AT_ONCE))
+    return sum(int(np.sum(evaluate(_Draw(min(AT_ONCE, count), part)))) for part in parts)
+
+
+class _Draw:
+    """Random numbers of N lanes; every third is an extreme one."""
+
+    def __init__(self, count: int, seed: int) -> None:
+        import mitsuba as mi
+
+        self.count = count
+        self._generator = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))
+
+    def uniform(self) -> Any:
+        return self._or(UNIFORM, self._generator.next_float32())
+
+    def log(self, least: float, most: float, extremes: Sequence[float]) -> Any:
+        """Spread over decades."""
+        u = self._generator.next_float32()
+        return self._or(extremes, dr.exp(dr.lerp(float(np.log(least)), float(np.log(most)), u)))
+
+    def coordinate(self, size: float = 1.0) -> Any:
+        return size * self._or(NUMBERS, 4 * self._generator.next_float32() - 2)
+
+    def vector(self, kind: Any, size: float = 1.0) -> Any:
+        return kind(self.coordinate(size), self.coordinate(size), self.coordinate(size))
+
+    def unit(self) -> Any:
+        """A unit vector, often with components that are 0 or tiny."""
+        import mitsuba as mi
+
+        v = self.vector(mi.Vector3f)
+        length = dr.norm(v)
+        usable = (length > 1e-15) & (length < 1e15)
+        return dr.select(usable, v / dr.select(usable, length, 1), mi.Vector3f(0, 0, 1))
+
+    def local(self) -> Any:
+        """A direction by its cosine to +z."""
+        import mitsuba as mi
+
+        z = self._or(COSINES, 2 * self._generator.next_float32() - 1)
+        sine, cosine = dr.sincos(2 * dr.pi * self.uniform())
+        r = dr.sqrt(dr.maximum((1 - z) * (1 + z), 0))
+        return mi.Vector3f(r * cosine, r * sine, z)
+
+    def _or(self, extremes: Sequence[float], ordinary: Any) -> Any:
+        import mitsuba as mi
+
+        table = mi.Float(np.array(extremes, np.float32))
+        index = mi.UInt32(self._generator.next_float32() * 3 * len(extremes))
+        extreme = index < len(extremes)
+        return dr.select(extreme, dr.gather(mi.Float, table, index, extreme), ordinary)
+
+
+def _bad(*values: Any) -> Any:
+    """Where any of several numbers or colours is not finite, or negative."""
+    import mitsuba as mi
+
+    result = mi.Bool(False)
+    for value in values:
+        for component in [value] if dr.depth_v(value) == 1 else value:
+            result |= ~(component >= 0) | ~dr.isfinite(component)
+    return result
+
+
+def _not_unit(v: Any) -> Any:
+    return ~(dr.abs(dr.norm(v) - 1) < 1e-5)
+
+
+# ------------------------------------------------ Plugins --------------------------------------------------
+
+
+def _bsdf(form: str, visible: bool) -> Callable[[_Draw], Any]:
+    """Value, density, sample and mirror reflectance, with an alpha and indices for each lane."""
+
+    def evaluate(draw: _Draw) -> Any:
+        import mitsuba as mi
+
+        bsdf = mi.load_dict(
+            {
+                "type": "mrt_bsdf",
+                "fresnel": form,
+                "sample_visible": visible,
+                "specular_reflectance": 100.0,
+                "diffuse_reflectance": 2.0,
+            }
+        )
+        parameters = mi.traverse(bsdf)
+        sign = dr.select(draw.uniform() < 0.8, mi.Float(1), -1)
+        parameters["alpha"] = sign * draw.log(1e-9, 1e3, ALPHAS)
+        parameters["int_ior"], parameters["ext_ior"] = draw.log(1e-3, 1e3, IORS), draw.log(0.5, 2, IORS)
+        parameters.update()
+        si = dr.zeros(mi.SurfaceInteraction3f, draw.count)
+        si.wi = draw.local()
+        context = mi.BSDFContext()
+        value, pdf = bsdf.eval_pdf(context, si, draw.local())
+        drawn, weight = bsdf.sample(context, si, draw.uniform(), mi.Point2f(draw.uniform(), draw.uniform()))
+        mirror = bsdf.eval_attribute("mirror_reflectance", si)
+        return _bad(value, pdf, weight, drawn.pdf, mirror) | _not_unit(drawn.wo)
+
+    return evaluate
+
+
+def _light(draw: _Draw) -> Any:
+    import mitsuba as mi
+
+    light = mi.load_dict({"type": "mrt_light", "intensity": 1e3})
+    parameters = mi.traverse(light)
+    parameters["position"] = draw.vector(mi.Point3f)
+    parameters.update()
+    si = dr.zeros(mi.SurfaceInteraction3f, draw.count)
+    si.p = draw.vector(mi.Point3f)
+    ds, weight = light.sample_direction(si, mi.Point2f(0.5))
+    # Between points that are no further apart than the square root of the least float32, no direction is left
+    far = dr.max(dr.abs(ds.p - si.p)) > 1e-15
+    return _bad(weight, ds.dist, ds.pdf) | (far & _not_unit(ds.d)) | ~dr.all(dr.isfinite(ds.d))
+
+
+def _texture(draw: _Draw) -> Any:
+    import mitsuba as mi
+
+    texels = np.random.default_rng(9).random((5, 7, 3)).astype(np.float32)
+    texture = mi.load_dict({"type": "mrt_texture", "bitmap": mi.Bitmap(texels)})
+    si = dr.zeros(mi.SurfaceInteraction3f, draw.count)
+    si.uv = mi.Point2f(draw.coordinate(1e3), draw.coordinate(1e3))
+    color = texture.eval(si)
+    return _bad(color) | (dr.max(color) > 1)
+
+
+def _plane(draw: _Draw) -> Any:
+    import mitsuba as mi
+
+    t = intersect_plane(draw.vector(mi.Point3f), draw.unit(), draw.unit(), draw.coordinate())
+    return ~(t > 0)
+
+
+def _sphere(draw: _Draw) -> Any:
+    import mitsuba as mi
+
+    o, d, center = draw.vector(mi.Point3f), draw.unit(), draw.vector(mi.Point3f)
+    return ~(intersect_sphere(o, d, center, draw.log(1e-6, 1e6, (1e-7, 0.5, 1, 1e7))) > 0)
+
+
+def _quadric(to_frame: Any, intersect: Any, surface: Any) -> Callable[[_Draw], Any]:
+    """Distance and normal of a shape by lot for each lane, with rays from its end among them."""
+
+    def evaluate(draw: _Draw) -> Any:
+        import mitsuba as mi
+
+        end, axis = draw.vector(mi.Point3f), draw.unit()
+        frame = to_frame(
+            end, end + axis * draw.log(1e-2, 1e2, (1e-3, 1, 1e3)), draw.log(1e-2, 1e2, (1e-3, 1, 1e3))
+        )
+        straight = dr.isfinite(dr.norm(frame.z))  # the ends are not one point after rounding
+        o = dr.select(draw.uniform() < 0.2, end, draw.vector(mi.Point3f))
+        d = draw.unit()
+        hit = intersect(o, d, frame)
+        found = hit.t < 1e10
+        point = surface(dr.select(found, o + d * hit.t, end), hit.part, frame)
+        return straight & (~(hit.t > 0) | (found & (_not_unit(point.n) | ~dr.isfinite(point.u + point.v))))
+
+    return evaluate
+
+
+def _whitted(draw: _Draw) -> Any:
+    """Rays by lot through a scene of every kind of shape, from inside of them too."""
+    import mitsuba as mi
+
+    scene = mi.load_dict(_everything().to_dict())
+    integrator = mi.load_dict({"type": "mrt_whitted", "clamp": False, "min_contribution": 0.0})
+    integrator.prepare(scene)
+    trace = integrator.trace(scene, None, mi.Ray3f(draw.vector(mi.Point3f), draw.unit()))
+    si = trace.hit.si
+    lost = trace.hit.found & (~dr.isfinite(si.t) | _not_unit(si.n))
+    bad = _bad(trace.radiance, trace.direct) | lost
+    dr.eval(bad)  # while the scene lives
+    return bad
+
+
+def _everything() -> Scene:
+    glossy = Material(1.5, 1e-3, (1, 1, 1), (0.5, 0.5, 0.5))
+    rough = Material(3.0, -0.04, (1, 0.9, 0.8), (0.5, 0.2, 0.1))
+    return replace(
+        BASE,
+        spheres=(
+            Sphere((0, 0, 0), 1.0, glossy),
+            Sphere((1, 1, 1), 1e-3, rough),
+            Sphere((0, 0.5, 0), 0.5, rough),
+        ),
+        planes=(Plane((0, 1, 0), 2.0, glossy), Plane((1, 1, 1), 5.0, rough)),
+        cones=(Cone((-1, 1, 0), (-1, 0, 0), 0.5, glossy),),
+        cylinders=(Cylinder((1, -1, 1), (1, 1, -1), 0.3, rough),),
+    )
+
+
+# What is evaluated in bulk: plugin, results that are looked at, and the function of the lanes
+BULK: Sequence[tuple[str, str, Callable[[_Draw], Any]]] = (
+    *(
+        (f"mrt_bsdf, {form}", "values, densities, samples and reflectances", _bsdf(form, True))
+        for form in FRESNEL
+    ),
+    ("mrt_bsdf, normals drawn from D", "the same", _bsdf("dielectric", False)),
+    ("mrt_light", "directions, distances and weights", _light),
+    ("mrt_texture", "colours, which are of [0, 1]", _texture),
+    ("mrt_plane", "distances", _plane),
+    ("sphere of the float64 tracer", "distances", _sphere),
+    (
+        "mrt_cone",
+        "distances, normals and texture coordinates",
+        _quadric(cone_frame, intersect_cone, cone_surface),
+    ),
+    ("mrt_cylinder", "the same", _quadric(cylinder_frame, intersect_cylinder, cylinder_surface)),
+    ("mrt_whitted", "radiance, distances and normals", _whitted),
+)
+
+
+def _scalar_variant(cases: Cases, count: int) -> None:
+    """The BSDF, one evaluation at a time, at the extremes of its parameters."""
+    import mitsuba as mi
+
+    before = mi.variant()
+    runtime.use(runtime.SLOW)
+    rng = np.random.default_rng(3)
+    try:
+        bad = sum(_scalar_evaluation(mi, rng) for _ in range(count))
+    finally:
+        runtime.use(before)
+    cases.at_most(
+        "mrt_bsdf in scalar_rgb", f"{count} adversarial evaluations", "none, and no division by zero", bad, 0
+    )
+
+
+def _scalar_evaluation(mi: Any, rng: np.random.Generator) -> bool:
+    bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": FRESNEL[rng.integers(3)]})
+    parameters = mi.traverse(bsdf)
+    for name, extremes in (("alpha", ALPHAS), ("int_ior", IORS), ("ext_ior", IORS)):
+        parameters[name] = type(parameters[name])(float(rng.choice(extremes)))
+    parameters.update()
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi, wo = (_scalar_direction(mi, rng) for _ in range(2))
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo)
+    u = [float(x) for x in rng.choice(UNIFORM, 3)]
+    drawn, weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
+    found = np.array([*value, pdf, *weight, drawn.pdf, *bsdf.eval_attribute("mirror_reflectance", si)])
+    return bool((~(found >= 0) | np.isinf(found)).any())
+
+
+def _scalar_direction(mi: Any, rng: np.random.Generator) -> Any:
+    z, phi = float(rng.choice(COSINES)), float(rng.uniform(0, 2 * np.pi))
+    r = float(np.sqrt((1 - z) * (1 + z)))
+    return mi.Vector3f(r * float(np.cos(phi)), r * float(np.sin(phi)), z)
+
+
+# --------------------------------------------- Whole renders -----------------------------------------------
+
+
+def _random_scenes(cases: Cases, count: int) -> None:
+    """Scenes of extreme objects, materials and lights by lot."""
+    bad = 0
+    for seed in range(count):
+        described = _random_scene(np.random.default_rng(seed)).to_dict(
+            width=64, height=48, fresnel=FRESNEL[seed % 3]
+        )
+        described["integrator"] = {"type": "mrt_whitted", "clamp": bool(seed % 2)}
+        image = render(described, aa=1).image
+        bad += int((~(image >= 0) | np.isinf(image)).sum())
+    cases.at_most(
+        "scenes by lot", f"{count} pictures of extreme objects, materials and lights", "none", bad, 0
+    )
+
+
+def _random_scene(rng: np.random.Generator) -> Scene:
+    def color() -> tuple[float, float, float]:
+        r, g, b = map(float, rng.choice([0, 1e-30, 0.5, 1, 10], 3))
+        return (r, g, b)
+
+    def material() -> Material:
+        alpha = float(rng.choice([0, 1e-8, 1e-4, -0.04, 0.1, 1, 100, 1e20]))
+        ior = float(rng.choice([1e-8, 0.5, 1, 1.0000001, 1.5, 1e6, 1e30]))
+        return Material(ior, alpha, color(), color())
+
+    def point() -> tuple[float, float, float]:
+        x, y, z = rng.uniform(-2, 2, 3)
+        return (float(x), float(y), float(z))
+
+    def radius() -> float:
+        return float(10 ** rng.uniform(-4, 0.5))
+
+    return replace(
+        BASE,
+        lights=(*(Light(point(), (1.0, 1.0, 1.0)) for _ in range(2)), Light((1e6, 1e6, 0), (1e3, 1e3, 1e3))),
+        spheres=tuple(Sphere(point(), radius(), material()) for _ in range(8)),
+        planes=(Plane(point(), 2.5, material()), Plane((0, 1e-20, 0), 1.5, material())),
+        cones=tuple(Cone(point(), point(), radius(), material()) for _ in range(3)),
+        cylinders=tuple(Cylinder(point(), point(), radius(), material()) for _ in range(3)),
+    )
+
+
+# ------------------------------------------------ Refusals -------------------------------------------------
+
+NAN, INF = float("nan"), float("inf")
+CONE = {"type": "mrt_cone", "apex": [0, 1, 0], "base_center": [0, 0, 0]}
+CYLINDER = {"type": "mrt_cylinder", "p0": [0, 1, 0], "p1": [0, 0, 0]}
+
+# Parameter and senseless values of it; the plugins refuse them when they are made
+REFUSED: Sequence[tuple[dict[str, Any], str, Sequence[Any]]] = (
+    ({"type": "mrt_bsdf"}, "alpha", (NAN, INF, -INF)),
+    ({"type": "mrt_bsdf"}, "int_ior", (NAN, INF, 0.0, -1.5)),
+    ({"type": "mrt_bsdf"}, "ext_ior", (NAN, INF, 0.0, -1.5)),
+    ({"type": "mrt_bsdf"}, "fresnel", ("other",)),
+    (CONE, "radius", (NAN, INF, 0.0, -1.0)),
+    (CONE, "apex", ([0, 0, 0], [NAN, 0, 0], [INF, 0, 0])),
+    (CONE, "segments", (2,)),
+    (CYLINDER, "radius", (NAN, INF, 0.0, -1.0)),
+    (CYLINDER, "p0", ([0, 0, 0], [NAN, 0, 0])),
+    ({"type": "mrt_plane", "normal": [0, 1, 0]}, "normal", ([0, 0, 0], [NAN, 0, 1], [INF, 0, 0])),
+    ({"type": "mrt_plane", "normal": [0, 1, 0]}, "distance", (NAN, INF)),
+    ({"type": "mrt_plane", "normal": [0, 1, 0]}, "extent", (NAN, 0.0, -1.0)),
+    ({"type": "mrt_light"}, "position", ([NAN, 0, 0], [INF, 0, 0])),
+    ({"type": "mrt_whitted"}, "max_depth", (0, -1)),
+    ({"type": "mrt_whitted"}, "min_contribution", (NAN, -1.0)),
+    ({"type": "mrt_whitted"}, "bounce_budget", ("other",)),
+)
+
+
+def _refusals(cases: Cases) -> None:
+    for plugin, key, values in REFUSED:
+        accepted = sum(not _refuses({**plugin, key: value}, key) for value in values)
+        cases.at_most(
+            f"{plugin['type']}, {key}",
+            f"of {', '.join(map(str, values))}: how many are accepted, or refused without "
+            f"naming the parameter",
+            "a ParameterError for each",
+            accepted,
+            0,
+        )
+
+
+def _refuses(description: dict[str, Any], key: str) -> bool:
+    """Does the plugin refuse to be made, with its typed error that names the parameter?"""
+    import mitsuba as mi
+
+    try:
+        mi.load_dict(description)
+    except RuntimeError as error:  # Mitsuba passes on what a plugin raised as text
+        return "ParameterError" in str(error) and f'"{key}"' in str(error)
+    return False
+
+
+def _small_alpha(cases: Cases) -> None:
+    """What alpha = 0 and the like do: the same as 1e-8."""
+    import mitsuba as mi
+
+    def value(alpha: float) -> float:
+        bsdf = mi.load_dict(
+            {"type": "mrt_bsdf", "alpha": alpha, "diffuse_reflectance": 0.0, "fresnel": "unity"}
+        )
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi = mi.Vector3f(0, 0, 1)
+        return float(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(1e-8, 0, 1))[0][0])
+
+    expected = value(1e-8)
+    for alpha in (0.0, TINY, 1e-20, 9e-9):
+        cases.at_most(
+            f"alpha {alpha:g}",
+            "difference of the BSDF from that of alpha 1e-8",
+            "the same value",
+            abs(value(alpha) - expected),
+            0,
+        )
+    cases.at_least(
+        "alpha 1e-8",
+        "the BSDF half an alpha off the mirror direction",
+        "1e14, the peak of D over 4",
+        expected,
+        1e14,
+    )

@@ -1,0 +1,394 @@
+"""Single objects hit by float32 rays at all sizes and distances, against float64 at the same numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.plugins.intersect import (
+    cone_frame,
+    cone_surface,
+    cylinder_frame,
+    cylinder_surface,
+    intersect_cone,
+    intersect_cylinder,
+    intersect_plane,
+    intersect_sphere,
+)
+from mrt_mitsuba.validation.studies.stability.cases import Cases, hexadecimal
+from mrt_mitsuba.validation.tools.arrays import Backend, Vector3, backend, numbers
+
+ROUNDING = 2.0**-24
+DECADES = 10.0 ** np.arange(-6, 7, 2)
+
+# Beyond this ratio of distance to size, the roundings of the ray's origin are as large as the object
+FARTHEST = 1e5
+
+# In roundings of the largest coordinate, across the surface: what intersection and a ray's own t lose
+# together
+ACROSS = 16
+# A ray that passes the outline by less than this may hit or miss
+OUTLINE = 64
+# Angle between the normals, in roundings of the largest coordinate over the size: the place on the surface
+# moves by ACROSS and along it by as much again, and curvature is at most 2 / size (cone and cylinder: 1 /
+# radius)
+NORMAL = 64
+
+# Directions to a light flatter than this may meet their own surface
+FLATTEST = 1e-3
+
+
+@dataclass(frozen=True)
+class Truth:
+    """First hits in float64: distance [N], inf for a miss, and unit normal [N, 3]."""
+
+    t: np.ndarray
+    n: np.ndarray
+
+
+@dataclass(frozen=True)
+class Solid:
+    """An object of about the size 1 around the origin, to be scaled."""
+
+    name: str
+    to_dict: Callable[[float], dict[str, Any]]  # of this size
+    hit: Callable[[Backend, Vector3, Vector3, float], Truth]  # in float64, of this size
+    closed: bool  # does every ray from the inside meet it
+
+
+APEX, BASE, CONE_RADIUS = (0.1, 0.6, -0.2), (-0.1, -0.4, 0.2), 0.5
+CORNERS = np.array([(-0.8, -0.5, 0.1), (0.9, -0.3, -0.2), (0.1, 0.9, 0.3)])
+NORMAL_OF_PLANE = np.array([0.6, 0.64, 0.48])
+PLANE_DISTANCE = 0.3
+
+
+def _single(value: float) -> float:
+    return float(np.float32(value))
+
+
+def _scaled(point: Any, size: float) -> list[float]:
+    return [_single(c * size) for c in point]
+
+
+def _sphere_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth:
+    t = numbers(intersect_sphere(o, d, arrays.vector_parameter((0, 0, 0)), arrays.parameter(size)))
+    return Truth(t, _at(o, d, t) / size)
+
+
+def _plane_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth:
+    normal = NORMAL_OF_PLANE / np.linalg.norm(NORMAL_OF_PLANE)
+    t = numbers(
+        intersect_plane(o, d, arrays.vector_parameter(normal), arrays.parameter(PLANE_DISTANCE * size))
+    )
+    return Truth(t, np.broadcast_to(normal, (len(t), 3)))
+
+
+def _triangle_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth:
+    a, b, c = CORNERS * size
+    origin, direction = numbers(o), numbers(d)
+    normal = np.cross(b - a, c - a)
+    slope = direction @ normal
+    t = (a - origin) @ normal / np.where(slope == 0, np.nan, slope)
+    p = origin + t[:, None] * direction
+    edges = [(a, b), (b, c), (c, a)]
+    inside = np.all([np.cross(q - r, p - r) @ normal >= 0 for r, q in edges], axis=0)
+    t = np.where(inside & (t > 0), t, np.inf)
+    return Truth(t, np.broadcast_to(normal / np.linalg.norm(normal), p.shape))
+
+
+def _cone_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth:
+    apex, base = (arrays.vector_parameter(np.multiply(end, size)) for end in (APEX, BASE))
+    frame = cone_frame(apex, base, arrays.parameter(CONE_RADIUS * size))
+    found = intersect_cone(o, d, frame)
+    t = numbers(found.t)
+    return Truth(t, numbers(cone_surface(arrays.vectors(_at(o, d, t)), found.part, frame).n))
+
+
+def _cylinder_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth:
+    p0, p1 = (arrays.vector_parameter(np.multiply(end, size)) for end in (APEX, BASE))
+    frame = cylinder_frame(p0, p1, arrays.parameter(CONE_RADIUS * size))
+    found = intersect_cylinder(o, d, frame)
+    t = numbers(found.t)
+    return Truth(t, numbers(cylinder_surface(arrays.vectors(_at(o, d, t)), found.part, frame).n))
+
+
+def _at(o: Vector3, d: Vector3, t: np.ndarray) -> np.ndarray:
+    return numbers(o) + np.where(np.isfinite(t), t, 0)[:, None] * numbers(d)
+
+
+def _triangle_dict(size: float) -> dict[str, Any]:
+    import mitsuba as mi
+
+    positions = mi.Bitmap((CORNERS * size).astype(np.float32)[np.newaxis])
+    faces = mi.Bitmap(np.array([[[0, 1, 2]]], np.uint32))
+    return {"type": "mrt_mesh", "positions": positions, "faces": faces}
+
+
+def _axis_dict(kind: str, first: str, second: str) -> Callable[[float], dict[str, Any]]:
+    def make(size: float) -> dict[str, Any]:
+        return {
+            "type": kind,
+            first: _scaled(APEX, size),
+            second: _scaled(BASE, size),
+            "radius": _single(CONE_RADIUS * size),
+        }
+
+    return make
+
+
+SOLIDS = (
+    Solid("sphere", lambda s: {"type": "sphere", "radius": _single(s)}, _sphere_hit, True),
+    Solid(
+        "plane",
+        lambda s: {"type": "mrt_plane", "normal": NORMAL_OF_PLANE.tolist(), "distance": PLANE_DISTANCE * s},
+        _plane_hit,
+        False,
+    ),
+    Solid("triangle", _triangle_dict, _triangle_hit, False),
+    Solid("cone", _axis_dict("mrt_cone", "apex", "base_center"), _cone_hit, True),
+    Solid("cylinder", _axis_dict("mrt_cylinder", "p0", "p1"), _cylinder_hit, True),
+)
+
+
+def shape_cases(cases: Cases, worst: list[tuple[str, str, float, str]], *, quick: bool) -> None:
+    """Distance, normal and self-intersection of every solid at every size and distance."""
+    sizes = DECADES[::3] if quick else DECADES
+    for solid in SOLIDS:
+        cells = [cell for size in sizes for cell in _measure(solid, size, rays=300 if quick else 3000)]
+        _hold(cases, solid, cells)
+        widest = max(cells, key=lambda cell: cell.across)
+        worst.append((solid.name, "distance", widest.across, widest.inputs))
+
+
+def _hold(cases: Cases, solid: Solid, cells: Sequence[_Cell]) -> None:
+    name, what = solid.name, f"sizes 1e-6 … 1e6, from 1e-6 to {FARTHEST:g} sizes away and from inside"
+    cases.at_least(
+        f"{name}, rays that hit", what, "the figures below mean something", sum(c.hits for c in cells), 500
+    )
+    cases.at_most(
+        f"{name}, place",
+        f"{what}: worst distance error across the surface, in float32 roundings of the largest coordinate",
+        "a few roundings",
+        max(c.across for c in cells),
+        ACROSS,
+    )
+    cases.at_most(
+        f"{name}, normal",
+        "its worst angle times the cosine of incidence, in roundings of the largest coordinate over the size",
+        "a few roundings",
+        max(c.normal for c in cells),
+        NORMAL,
+    )
+    expected = "none"
+    for title, member, what in (
+        (
+            "hits and misses",
+            "wrong",
+            f"rays that hit nothing or miss, further than {OUTLINE} roundings off the outline",
+        ),
+        ("leaks", "leaks", "rays from inside that meet nothing"),
+        ("mirror rays", "self_hits", "mirror rays that meet the surface they leave"),
+        ("shadow rays", "self_shadows", "points that their own surface hides from a light above it"),
+        ("finite", "not_finite", "distances and normals that are no finite numbers"),
+    ):
+        cases.at_most(f"{name}, {title}", what, expected, sum(getattr(c, member) for c in cells), 0)
+
+
+def start_cases(cases: Cases, *, quick: bool) -> None:
+    """Rays that start on a surface or at the apex of the cone."""
+    count = 1000 if quick else 20000
+    rng = np.random.default_rng(8)
+    for solid in (s for s in SOLIDS if s.closed):
+        lost = not_finite = 0
+        for size in DECADES[::3]:
+            o, _ = _rays(size, 3 * size, count)
+            arrays = backend("scalar")  # few rays at a time: kernels would only be launched
+            inwards = (-o / np.linalg.norm(o, axis=1, keepdims=True)).astype(np.float32)
+            truth = solid.hit(arrays, arrays.vectors(o), arrays.vectors(inwards), size)
+            hit = np.isfinite(truth.t)
+            p = (o + np.where(hit, truth.t, 0)[:, None] * inwards)[hit].astype(np.float32)
+            d = _units(rng, len(p))
+            d -= np.maximum((d * truth.n[hit]).sum(axis=1) + 0.1, 0)[:, None] * truth.n[hit]
+            d /= np.linalg.norm(d, axis=1, keepdims=True)
+            traced = _trace(solid, size, p, d.astype(np.float32))
+            lost += int((~traced.found).sum())
+            not_finite += int((~np.isfinite(traced.n)).any(axis=1).sum())
+        what = f"{count} points rounded to float32, at sizes 1e-6, 1 and 1e6"
+        cases.at_most(
+            f"{solid.name}, from its surface inwards", f"{what}: rays that meet nothing", "none", lost, 0
+        )
+        cases.at_most(
+            f"{solid.name}, from its surface inwards, finite", what, "finite normals", not_finite, 0
+        )
+    _apex_cases(cases, count, rng)
+
+
+def _apex_cases(cases: Cases, count: int, rng: np.random.Generator) -> None:
+    cone = next(s for s in SOLIDS if s.name == "cone")
+    apex, base = (np.array(end, np.float32) for end in (APEX, BASE))
+    axis = np.float64(base) - apex
+    height = np.linalg.norm(axis)
+    aside = np.cross(axis / height, _units(rng, count))
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    tangent = CONE_RADIUS / height
+    o = np.broadcast_to(apex, (count, 3))
+    for name, slopes in (
+        ("inwards", rng.uniform(0, 0.99, count)),
+        ("outwards", rng.uniform(1.01, 30, count)),
+    ):
+        d = axis / height + aside * (tangent * slopes)[:, None]
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        traced = _trace(cone, 1.0, o, d.astype(np.float32))
+        to_base = height / (d @ (axis / height))
+        far = traced.found & (traced.t > OUTLINE * ROUNDING)
+        if name == "inwards":
+            error = np.abs(np.where(far, traced.t, np.inf) - to_base).max() / ROUNDING
+            cases.at_most(
+                "cone, from its apex inwards",
+                "distance to the base, error in roundings; inf: not met",
+                "the base",
+                error,
+                ACROSS,
+            )
+        else:
+            cases.at_most(
+                "cone, from its apex outwards",
+                "rays that meet the cone away from the apex",
+                "none",
+                far.sum(),
+                0,
+            )
+
+
+# --------------------------------------------- Measuring ---------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """What rays from one distance found at one size of a solid."""
+
+    hits: int
+    across: float  # worst error across the surface, in roundings of the largest coordinate
+    normal: float  # worst angle of the normal times the cosine of incidence, in the same over the size
+    wrong: int  # hits where there is nothing, and the other way around
+    leaks: int  # rays from the inside that met nothing
+    self_hits: int  # mirror rays that met the surface they left
+    self_shadows: int  # points that their own surface hides from a light above it
+    not_finite: int
+    inputs: str  # of the worst ray
+
+
+@dataclass(frozen=True)
+class _Traced:
+    """What the integrator found along N rays."""
+
+    found: np.ndarray
+    t: np.ndarray
+    n: np.ndarray  # [N, 3]
+    direct: np.ndarray
+    bounces: np.ndarray
+
+    def only(self, keep: slice) -> _Traced:
+        return _Traced(*(getattr(self, f.name)[keep] for f in fields(self)))
+
+
+def _measure(solid: Solid, size: float, *, rays: int) -> list[_Cell]:
+    # None is on the surface: what starts there has cases of its own
+    distances = [1.5 * d if d == size else d for d in DECADES if d <= FARTHEST * size]
+    bundles = [_rays(size, distance, rays) for distance in distances]
+    o, d = (np.concatenate(part) for part in zip(*bundles, strict=True))
+    traced = _trace(solid, size, o, d)
+    parts = [slice(k * rays, (k + 1) * rays) for k in range(len(distances))]
+    return [_compare(solid, size, o[part], d[part], traced.only(part)) for part in parts]
+
+
+def _rays(size: float, distance: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays (o [N, 3], d [N, 3]) from a distance to all parts of an object, a third to its outline."""
+    rng = np.random.default_rng(7)
+    towards = _units(rng, count)
+    o = (distance * towards).astype(np.float32)
+    aside = np.cross(towards, _units(rng, count))
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    offset = np.where(
+        rng.random(count) < 1 / 3, 1 + 1e-3 * rng.normal(size=count), rng.uniform(0, 1.2, count)
+    )
+    d = aside * (size * offset)[:, None] - o
+    if distance < 0.05 * size:
+        d = _units(rng, count)
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    return o, d.astype(np.float32)
+
+
+def _units(rng: np.random.Generator, count: int) -> np.ndarray:
+    v = rng.normal(size=(count, 3))
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def _light(size: float) -> np.ndarray:
+    return np.array([3.0, 5.0, 4.0]) * size
+
+
+def _trace(solid: Solid, size: float, o: np.ndarray, d: np.ndarray) -> _Traced:
+    """Trace rays with ``mrt_whitted`` against a white mirror of that form under one light."""
+    import mitsuba as mi
+
+    mirror = {"type": "mrt_bsdf", "fresnel": "unity", "alpha": 1.0, "diffuse_reflectance": 1.0}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "solid": {**solid.to_dict(size), "bsdf": mirror},
+            "light": {"type": "mrt_light", "position": _light(size).tolist()},
+        }
+    )
+    integrator = mi.load_dict({"type": "mrt_whitted", "min_contribution": 0.0, "bounce_budget": "plain"})
+    integrator.prepare(scene)
+    found = integrator.trace(scene, None, mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T)))
+    si, hit = found.hit.si, np.array(found.hit.found)
+    t = np.where(hit, np.array(si.t, np.float64), np.inf)
+    return _Traced(hit, t, np.array(si.n, np.float64).T, np.array(found.direct[0]), np.array(found.bounces))
+
+
+def _compare(solid: Solid, size: float, o: np.ndarray, d: np.ndarray, traced: _Traced) -> _Cell:
+    arrays = backend("scalar")  # few rays at a time: kernels would only be launched
+    origin, direction = arrays.vectors(o), arrays.vectors(d)
+    scale = max(float(np.abs(o).max()), size)
+    rounding = ROUNDING * scale / size  # of the largest coordinate, in sizes
+    truth, larger, smaller = (
+        solid.hit(arrays, origin, direction, size * (1 + k * OUTLINE * rounding)) for k in (0, 1, -1)
+    )
+    exists = np.isfinite(truth.t)
+    both = traced.found & exists
+    cosine = np.where(both, (truth.n * d).sum(axis=1), 1)
+    t = np.where(both, truth.t, 0)
+    p = o + t[:, None] * d
+    across = np.abs((np.where(both, traced.t, 0) - t) * cosine)
+    across /= ROUNDING * np.maximum(scale, np.abs(p).max(axis=1))
+    # Where other parts of the surface are within reach, the normal may be that of another part
+    smooth = both & np.isfinite(larger.t) & np.isfinite(smaller.t)
+    spread = np.linalg.norm(larger.n - smaller.n, axis=1) * np.abs(cosine)
+    smooth &= spread < 4 * NORMAL * rounding
+    angle = np.linalg.norm(traced.n - truth.n, axis=1) * np.abs(cosine) / rounding
+    near_outline = np.isfinite(larger.t) != np.isfinite(smaller.t)
+    front = both & (cosine < -FLATTEST)
+    to_light = _light(size) - p
+    height = (to_light * truth.n).sum(axis=1) / np.linalg.norm(to_light, axis=1)
+    dark = front & (height > FLATTEST + OUTLINE * rounding) & ~(traced.direct > 0)
+    inside = solid.closed & (np.abs(o).max() < 0.05 * size)
+    i = int(np.argmax(across))
+    finite = np.isfinite(traced.direct) & (
+        ~traced.found | np.isfinite(traced.n).all(axis=1) & np.isfinite(traced.t)
+    )
+    return _Cell(
+        hits=int(both.sum()),
+        across=float(across.max()),
+        normal=float(np.max(angle, where=smooth, initial=0)),
+        wrong=int(((traced.found != exists) & ~near_outline).sum()),
+        leaks=int((inside & ~traced.found).sum()),
+        self_hits=int((front & (traced.bounces > 1)).sum()),
+        self_shadows=int(dark.sum()),
+        not_finite=int((~finite).sum()),
+        inputs=f"size {hexadecimal([size])}, o {hexadecimal(o[i])}, d {hexadecimal(d[i])}",
+    )

@@ -1,0 +1,348 @@
+"""Mitsuba against ours: direct light, gloss and mirrors, anti-aliasing, approximations, mistakes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.scene.model import Scene
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.oracles.reference import camera_directions
+from mrt_mitsuba.validation.studies import approximations
+from mrt_mitsuba.validation.tools import mutations
+from mrt_mitsuba.validation.tools.gallery import gallery
+from mrt_mitsuba.validation.tools.image_tests import estimate
+from mrt_mitsuba.validation.tools.sensitivity import sensitivity
+from mrt_mitsuba.validation.tools.study import Study
+
+TITLE = "Against Mitsuba's own integrators, lights and materials"
+
+# Pixel by pixel, relative to 1 + value: a few dozen float32 roundings
+DIRECT_TOLERANCE = 1e-5
+
+# Mitsuba starts shadow rays 9e-5 (1 + |p|) off their surface, ours start a few roundings off: shadows end up
+# to a hundredth of a pixel apart
+DISPLACEMENT = 1e-2
+
+# How smooth the surroundings are that the mirrors show: a few periods around the horizon
+WAVES = 3
+
+
+def run(study: Study, *, quick: bool) -> None:
+    """All comparisons with what Mitsuba brings."""
+    _direct(study)
+    _gloss(study, quick)
+    _antialiasing(study, quick)
+    study.text("The blur is compared with Mitsuba's thinlens camera in the study depth-of-field.")
+    approximations.run(study, quick=quick)
+    mutations.run(study, quick=quick)
+
+
+# -------------------------------------------- Direct light only ---------------------------------------------
+
+
+@dataclass(frozen=True)
+class DirectComparison:
+    """``mrt_whitted`` without bounces and clamp against ``direct``, under one stock light.
+
+    ``error`` [H, W]: largest difference in a channel, relative to 1 + value. The others [H, W]: pixels where
+    the stand-in of a plane has ended, those on silhouettes or at edges of shadows, and those whose own colour
+    changes by more than the error within a hundredth of a pixel, as in the highlights of smooth spheres.
+    """
+
+    ours: np.ndarray
+    theirs: np.ndarray
+    error: np.ndarray
+    beyond: np.ndarray
+    edge: np.ndarray
+    steep: np.ndarray
+
+    @property
+    def off(self) -> np.ndarray:
+        """Pixels [H, W] off by more than the tolerance."""
+        return self.error > DIRECT_TOLERANCE
+
+    @property
+    def unexplained(self) -> int:
+        """Pixels off for no reason."""
+        return int(np.sum(self.off & ~self.beyond & ~self.edge & ~self.steep))
+
+
+def compare_direct(scene: Scene, light: int, *, width: int, height: int) -> DirectComparison:
+    """Render a scene with one of its lights, as a stock point light with falloff, by ``mrt_whitted`` and by
+    ``direct``.
+
+    One light at a time, since ``direct`` picks one at random.
+    """
+    import mitsuba as mi
+
+    scene = dataclasses.replace(scene, lights=(scene.lights[light],))
+    size: dict[str, Any] = {"width": width, "height": height}
+    nodes = mrt.scene_dict(scene, fresnel="dielectric", **size)
+    del nodes["sky"]  # direct would light the scene with it
+    nodes["light_0"] = mrt.scene_dict(scene, flavor="stock", **size)["light_0"]
+    loaded = mi.load_dict(nodes)
+    whitted = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
+    one_ray: dict[str, Any] = {"aa": 1, "aamode": "none"}
+    ours = mrt.render(loaded, integrator=whitted, **one_ray).image
+    theirs = mrt.render(loaded, integrator="direct", **one_ray).image
+    found = sensitivity(scene, displacement=DISPLACEMENT, max_depth=1, clamp=False, **size)
+    error = (np.abs(ours - theirs) / (1 + theirs)).max(axis=-1)
+    beyond = _beyond_stand_in(scene, found.reference)
+    # The tracer's light has no falloff; relative to the colour, that makes no difference to so small a step
+    steep = error <= found.spread / (1 + found.reference.image.max(axis=-1))
+    return DirectComparison(ours, theirs, error, beyond, found.silhouette | found.shadow, steep)
+
+
+def _beyond_stand_in(scene: Scene, reference: Any, extent: float = 100.0) -> np.ndarray:
+    """Where a ray meets a plane outside the circle in its stand-in; ``extent`` is the default of
+    ``mrt_plane``."""
+    height, width = reference.depth.shape
+    rows, columns = np.mgrid[:height, :width]
+    d = camera_directions(scene.camera, width, height, columns.ravel() + 0.5, height - rows.ravel() - 0.5)
+    hit = np.isfinite(reference.depth)
+    p = np.add(
+        scene.camera.position, np.where(hit, reference.depth, 0)[..., None] * d.reshape(height, width, 3)
+    )
+    beyond = np.zeros((height, width), bool)
+    for i, plane in enumerate(scene.planes):
+        foot = -plane.distance * np.array(plane.normal) / np.linalg.norm(plane.normal)
+        outside = np.linalg.norm(p - foot, axis=-1) > extent / 2
+        beyond |= outside & (reference.object_id == len(scene.spheres) + i)
+    return beyond
+
+
+def _direct(study: Study) -> None:
+    # The size that DISPLACEMENT was chosen for. At 320x240 it leaves 5, 4 and 43 of some 230 000 pixels in
+    # scenes 2, 3 and 4 without a reason: Mitsuba's offset, one of the scene, may be more pixels there; not
+    # yet shown
+    size: dict[str, Any] = {"width": 120, "height": 90}
+    rows: list[list[Any]] = []
+    numbers = (0, 1, 2, 3)
+    with study.stage("Direct light", len(numbers)) as advance:
+        for number in numbers:
+            scene = report_scene(number)
+            found = [compare_direct(scene, light, **size) for light in range(len(scene.lights))]
+            rows += [_direct_row(number, light, c) for light, c in enumerate(found)]
+            advance(1)
+            study.at_most(
+                f"direct light, scene {number}: pixels off by > 1e-5 without a reason",
+                sum(c.unexplained for c in found),
+                0,
+            )
+            explained = np.mean([(c.off & ~c.beyond).mean() for c in found])
+            study.at_most(
+                f"direct light, scene {number}: share of pixels off by > 1e-5 with a reason",
+                explained,
+                0.002,
+                "an edge moves by a hundredth of a pixel, and a pixel in ten has one",
+            )
+    study.table(
+        "direct",
+        "mrt_whitted without bounces and clamp against direct, light by light",
+        [
+            "scene",
+            "light",
+            "median",
+            "99.9 %",
+            "off by > 1e-5",
+            "on an edge",
+            "in a steep highlight",
+            "beyond the stand-in",
+            "without a reason",
+        ],
+        rows,
+        "Stock point light, no sky. Differences relative to 1 + value. To direct, a plane is a square of "
+        "side 100: beyond, there is nothing.",
+    )
+
+
+def _direct_row(number: int, light: int, c: DirectComparison) -> list[Any]:
+    near = c.error[~c.beyond]
+    counts = [
+        np.sum(c.off),
+        np.sum(c.off & c.edge & ~c.beyond),
+        np.sum(c.off & c.steep & ~c.edge & ~c.beyond),
+        np.sum(c.off & c.beyond),
+        c.unexplained,
+    ]
+    return [number, light, float(np.median(near)), float(np.quantile(near, 0.999)), *map(int, counts)]
+
+
+# ------------------------------------- The mirror as the limit of gloss -------------------------------------
+
+
+@dataclass(frozen=True)
+class GlossLimit:
+    """How far the glossy reflection of ``path`` is from the mirror term of ``mrt_whitted``, per alpha."""
+
+    alphas: Sequence[float]
+    errors: Sequence[float]  # mean absolute difference over the mean of the mirror
+    pictures: Sequence[np.ndarray]  # the mirror, then the gloss of each alpha
+    slope: float  # of log error over log alpha
+
+
+def gloss_limit(alphas: Sequence[float], *, width: int, height: int, spp: int, seed: int = 0) -> GlossLimit:
+    """Render four black, shiny spheres in a smooth environment, as mirrors and with gloss."""
+    nodes = _shiny_spheres(alphas[0], width, height)
+    mirror = mrt.render(
+        nodes,
+        aa=1,
+        aamode="none",
+        layers=["depth"],
+        integrator={"type": "mrt_whitted", "min_contribution": 0.0},
+    )
+    sphere = np.isfinite(mirror.layers["depth.Z"])
+    pictures, errors = [mirror.image], []
+    for i, alpha in enumerate(alphas):
+        path = {"type": "path", "max_depth": 8, "rr_depth": 100}
+        gloss = mrt.render(
+            _shiny_spheres(alpha, width, height), aa=1, aamode="none", spp=spp, seed=seed + i, integrator=path
+        ).image
+        pictures.append(gloss)
+        errors.append(float(np.abs(gloss - mirror.image)[sphere].mean() / mirror.image[sphere].mean()))
+    slope = float(np.polyfit(np.log(alphas), np.log(errors), 1)[0])
+    return GlossLimit(tuple(alphas), tuple(errors), pictures, slope)
+
+
+def _shiny_spheres(alpha: float, width: int, height: int) -> dict[str, Any]:
+    import mitsuba as mi
+
+    scene = report_scene(0)
+    black: dict[str, Any] = {"alpha": alpha, "ior": 3.0, "diffuse": (0, 0, 0), "specular": (1, 1, 1)}
+    spheres = [
+        dataclasses.replace(s, material=dataclasses.replace(s.material, **black)) for s in scene.spheres
+    ]
+    scene = dataclasses.replace(scene, spheres=tuple(spheres), planes=(), lights=())
+    nodes = mrt.scene_dict(scene, width=width, height=height, fresnel="dielectric")
+    y, x = np.mgrid[:64, :128] / 64 * np.pi
+    waves = np.stack([1 + 0.8 * np.sin(WAVES * x + phase) * np.sin(y) for phase in (0, 2, 4)], axis=-1)
+    return {**nodes, "sky": {"type": "envmap", "bitmap": mi.Bitmap(waves.astype(np.float32))}}
+
+
+def _gloss(study: Study, quick: bool) -> None:
+    alphas = (0.3, 0.1, 0.03, 0.01, 0.003) if quick else (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
+    size: dict[str, Any] = (
+        {"width": 64, "height": 48, "spp": 64} if quick else {"width": 160, "height": 120, "spp": 512}
+    )
+    found = gloss_limit(alphas, **size)
+    study.at_most(
+        f"gloss of alpha {alphas[-1]:g} against the mirror term",
+        found.errors[-1],
+        2e-3,
+        "what is left is noise, as wide as the lobe",
+    )
+    study.at_least(
+        "slope of that difference over alpha", found.slope, 0.9, "blur itself has slope 2, noise slope 1"
+    )
+    study.table(
+        "gloss",
+        "Glossy reflection of path against the mirror term",
+        ["alpha", "mean relative difference"],
+        list(zip(found.alphas, found.errors, strict=True)),
+    )
+    study.plot(
+        "gloss",
+        "Gloss becomes a mirror",
+        _curve(found.alphas, {f"slope {found.slope:.2f}": found.errors}, "alpha", "mean relative difference"),
+        "Difference between path with mrt_bsdf and the mirror rays of mrt_whitted.",
+    )
+    names = ["mirror of mrt_whitted", *(f"path, alpha {alpha:g}" for alpha in alphas)]
+    figure = gallery(dict(zip(names, found.pictures, strict=True)), columns=3)
+    study.plot("gloss_pictures", "Gloss, and the mirror", figure)
+
+
+# ---------------------------------------------- Anti-aliasing -----------------------------------------------
+
+
+@dataclass(frozen=True)
+class Antialiasing:
+    """Root mean square error of our lattices against Mitsuba's box filter, by lattice, per aa; and the
+    reference's own noise."""
+
+    amounts: Sequence[int]
+    errors: Mapping[str, Sequence[float]]
+    noise: float
+
+
+def antialiasing(number: int, amounts: Sequence[int], *, width: int, height: int, spp: int) -> Antialiasing:
+    """Compare lattices with random samples that Mitsuba places and filters itself."""
+    import mitsuba as mi
+
+    size: dict[str, Any] = {"width": width, "height": height}
+    scene = mi.load_dict(mrt.scene_dict(number, fresnel="dielectric", **size))
+    whitted = {"type": "mrt_whitted", "min_contribution": 0.0}
+    integrator = mi.load_dict(whitted)
+    runs = [np.array(mi.render(scene, integrator=integrator, spp=spp // 4, seed=seed)) for seed in range(4)]
+    truth = estimate(runs)
+    errors: dict[str, list[float]] = {"centered": [], "report": []}
+    for lattice, values in errors.items():
+        for aa in amounts:
+            image = mrt.render(scene, integrator=whitted, aa=aa, aamode="none", lattice=lattice).image
+            values.append(float(np.sqrt(np.mean((image - truth.mean) ** 2))))
+    return Antialiasing(tuple(amounts), errors, float(np.sqrt(truth.variance.mean())))
+
+
+def _antialiasing(study: Study, quick: bool) -> None:
+    size: dict[str, Any] = (
+        {"width": 96, "height": 72, "spp": 1024} if quick else {"width": 200, "height": 150, "spp": 8192}
+    )
+    found = antialiasing(3, (1, 2, 4, 8), **size)
+    centered = found.errors["centered"]
+    for i in range(1, len(centered)):
+        study.at_most(
+            f"error of aa={found.amounts[i]} over that of aa={found.amounts[i - 1]}, centered lattice",
+            centered[i] / centered[i - 1],
+            0.75,
+            "an edge pixel is known to 1/aa: 0.5, and noise",
+        )
+    study.at_most(
+        "error of aa=8, centered over the report's lattice",
+        centered[-1] / found.errors["report"][-1],
+        0.5,
+        "the report's lattice shifts the picture by almost half a pixel",
+    )
+    study.record("noise of the box-filtered reference", found.noise)
+    study.table(
+        "antialiasing",
+        "Error against Mitsuba's box filter",
+        ["aa", *found.errors],
+        list(zip(found.amounts, *found.errors.values(), strict=True)),
+        f"Root mean square; the reference, of {size['spp']} random samples a pixel, has {found.noise:.2g} "
+        "itself.",
+    )
+    study.plot(
+        "antialiasing",
+        "Lattices against Mitsuba's box filter",
+        _curve(found.amounts, found.errors, "aa", "root mean square error", floor=found.noise),
+        "Scene 3. The centered lattice converges, the report's keeps its shift. Dashed: noise of the "
+        "reference.",
+    )
+
+
+def _curve(
+    x: Sequence[float],
+    series: Mapping[str, Sequence[float]],
+    xlabel: str,
+    ylabel: str,
+    floor: float | None = None,
+) -> Any:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axis = figure.subplots()
+    for label, y in series.items():
+        axis.loglog(x, y, marker="o", label=label)
+    if floor is not None:
+        axis.axhline(floor, color="gray", linestyle="--")
+    axis.set_xticks(x, [f"{value:g}" for value in x])
+    axis.minorticks_off()
+    axis.set_xlabel(xlabel)
+    axis.set_ylabel(ylabel)
+    axis.legend()
+    return figure
