@@ -12,8 +12,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from mrt_mitsuba.command.interrupt import Terminated, ending_soon, leave_now
+from mrt_mitsuba.command.options import Options, parse, usage
 from mrt_mitsuba.errors import MrtError, MrtWarning, UsageError
-from mrt_mitsuba.rendering.options import TABLE, Options, parse, usage
+from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
@@ -130,28 +131,25 @@ def render(options: Options) -> int:
 
 def banner(options: Options) -> str:
     """Return the parameters of the render, one per line."""
-    distance, reach = options.focaldist, options.focalrange
+    size: tuple[object, object] = SIZE
+    focus = options.focus(None, FOCAL_RANGE)
     if options.scene is None:
         from mrt_mitsuba.scene.report import report_scene
 
         scene = report_scene(options.scene_number)
-        distance = scene.focal_distance if distance is None else distance
-        reach = scene.focal_range if reach is None else reach
+        focus = options.focus(scene.focal_distance, scene.focal_range)
+    elif not options.shows_model():
+        size = "from the file", "from the file"
     lines = {
         "Scene": options.scene if options.scene is not None else options.scene_number,
-        "Width": options.width or _from_file(options, "width"),
-        "Height": options.height or _from_file(options, "height"),
+        "Width": options.width or size[0],
+        "Height": options.height or size[1],
         "AA": options.aa,
         "AA mode": options.aamode,
-        "F distance": distance or "off",
-        "F range": reach if distance else "off",
+        "F distance": focus.distance or "off",
+        "F range": focus.range if focus.distance else "off",
     }
     return "\n".join(f"{name + ':':<12}{value}" for name, value in lines.items())
-
-
-def _from_file(options: Options, name: str) -> object:
-    """An OBJ file has no size, unlike other scenes in files."""
-    return TABLE[name].default if options.shows_model() else "from the file"
 
 
 def _help(arguments: list[str]) -> int:
