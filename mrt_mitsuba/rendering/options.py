@@ -11,7 +11,6 @@ import dataclasses
 import math
 import operator
 import os
-import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,7 +26,6 @@ LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than m
 DECIDED_BY_FILE = ("width", "height", "fresnel")
 # An OBJ file has neither camera nor lights; other scenes have their own
 FOR_MODELS = ("texturing", "camera", "target", "up", "fov", "light")
-HELP_WIDTH = 100  # characters
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 SMALLEST_MEMORY = 64 * 2**20  # bytes; about what one tile with all layers takes
 
@@ -400,30 +398,3 @@ def _unknown(name: str) -> str:
     close = difflib.get_close_matches(name.lstrip("-").lower(), TABLE, n=1)
     hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
     return f"unknown option {name!r}.{hint}"
-
-
-def usage() -> str:
-    """Return the help text of the command."""
-    lines = [
-        "usage: mrt FILENAME [SCENE] [name=value ...]",
-        "       mrt help | doctor | scenes | export SCENE --xml PATH [--stock]",
-        "",
-        "Renders a scene and writes FILENAME.png and FILENAME.exr.",
-        f"FILENAME has no extension; SCENE is {_either([str(number) for number in NUMBERS])} (default: 0).",
-        "",
-        "options:",
-    ]
-    for name, field in TABLE.items():
-        shown = field.metadata["shown"] or field.default
-        syntax = f"{name}={field.metadata['kind'].form}"
-        text = f"  {syntax:<27} {field.metadata['help']} (default: {shown})"
-        lines += textwrap.wrap(text, HELP_WIDTH, subsequent_indent=" " * 30)
-    lines += [
-        "",
-        "commands:",
-        "  help                        print this text",
-        "  doctor                      print versions, the LLVM in use, the variants; render a self-test",
-        "  scenes                      list the scenes",
-        "  export SCENE --xml PATH     write a scene as Mitsuba XML; --stock: with stock plugins only",
-    ]
-    return "\n".join(lines) + "\n"

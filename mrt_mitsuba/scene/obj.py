@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,8 +25,6 @@ from mrt_mitsuba.scene.model import (
     Material,
     Mesh,
     Scene,
-    Vector,
-    view_problem,
 )
 from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, decode, find, numbers, read_bytes, read_mtl
 
@@ -158,32 +155,6 @@ def obj_scene(
         meshes=meshes,
         texturing=texturing or convention,
     )
-
-
-def obj_view(
-    path: str | os.PathLike[str],
-    *,
-    convention: str = "report",
-    texturing: str | None = None,
-    camera: Vector | None = None,
-    target: Vector | None = None,
-    up: Vector | None = None,
-    fov: float | None = None,
-    light: Vector | None = None,
-) -> Scene:
-    """``obj_scene`` seen as the options of the command say; what is None stays as ``obj_scene`` places it.
-
-    ``fov`` is horizontal, in degrees; ``light`` is a white light's place. Raises ``UsageError`` for a camera
-    that looks nowhere, and what ``obj_scene`` raises.
-    """
-    lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
-    scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)
-    given: dict[str, Any] = {"position": camera, "target": target, "up": up, "hfov": fov}
-    view = replace(scene.camera, **{name: value for name, value in given.items() if value is not None})
-    problem = view_problem(view)
-    if problem:
-        raise UsageError(problem)
-    return replace(scene, camera=view)
 
 
 @dataclass
