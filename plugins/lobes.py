@@ -32,14 +32,25 @@ IOR_MIN, IOR_MAX = 1e-9, 1e9
 
 
 class Parameters(Protocol):
-    """The parameters of an ``mrt_bsdf`` at a surface point."""
+    """The parameters of an ``mrt_bsdf`` at a surface point; without f0, that of the indices of refraction."""
 
-    alpha: mi.Float
-    int_ior: mi.Float
-    ext_ior: mi.Float
-    diffuse: mi.UnpolarizedSpectrum
-    specular: mi.UnpolarizedSpectrum
-    f0: mi.UnpolarizedSpectrum | None  # None: from the indices of refraction
+    @property
+    def alpha(self) -> mi.Float: ...
+
+    @property
+    def int_ior(self) -> mi.Float: ...
+
+    @property
+    def ext_ior(self) -> mi.Float: ...
+
+    @property
+    def diffuse(self) -> mi.UnpolarizedSpectrum: ...
+
+    @property
+    def specular(self) -> mi.UnpolarizedSpectrum: ...
+
+    @property
+    def f0(self) -> mi.UnpolarizedSpectrum | None: ...
 
 
 @dataclass

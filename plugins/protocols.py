@@ -1,7 +1,7 @@
 """What a plugin declares about itself, so that nobody has to guess it from its attributes.
 
 Mitsuba's classes take no mix-in; a class joins a protocol by registration: after
-``QuadricShape.register(MrtCone)``, ``isinstance(shape, QuadricShape)`` holds. Other people's plugins may join.
+``QuadricShape.register(MrtCone)``, ``isinstance(shape, QuadricShape)`` holds. Others' plugins may join.
 """
 
 from __future__ import annotations

@@ -49,7 +49,9 @@ class SceneReading:
         self.environment = scene.environment()
         self.lights = [e for e in scene.emitters() if not e.is_environment()]
         self.bsdfs = list({id(b): b for b in (s.bsdf() for s in self.shapes)}.values())
-        self.materials = uniform_materials(self.shapes)
+        materials = uniform_materials(self.shapes)
+        self.unmergeable = materials if isinstance(materials, Reason) else None
+        self.materials = {} if isinstance(materials, Reason) else materials
         self.state = self._state()
         self.facts = self._facts()
 
@@ -88,7 +90,7 @@ class SceneReading:
             mirrors=tuple(map(_mirror, filter(has_mirror, self.bsdfs))),
             textured=any(mi.has_flag(b.flags(), mi.BSDFFlags.SpatiallyVarying) for b in self.bsdfs),
             two_sided=any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in self.bsdfs),
-            unmergeable=self.materials if isinstance(self.materials, Reason) else None,
+            unmergeable=self.unmergeable,
         )
 
 
@@ -155,7 +157,8 @@ class SceneData:
             return dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False), mi.Float(0)
         pi = (self.bvh or scene).ray_intersect_preliminary(ray, self.plan.coherent, active)
         found = active & pi.is_valid()
-        if self.plan.spheres == "table" and not (scene.shapes_grad_enabled() or dr.grad_enabled(ray)):
+        differentiable = scene.shapes_grad_enabled() or dr.grad_enabled(ray)
+        if self.spheres is not None and self.plan.spheres == "table" and not differentiable:
             si, scale = self.spheres.interaction(pi, ray, found)
             return si, found, scale
         si = pi.compute_surface_interaction(ray, self.ray_flags, found)
