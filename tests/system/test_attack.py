@@ -45,9 +45,8 @@ for path in sys.argv[1:]:
         print(path, "rendered")
     except mrt.SceneError as error:
         print(path, error)
-scene = {"type": "scene", "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 3}}}
 try:
-    mrt.render({**scene, "shape": {"type": "wicked"}}, aa=1)
+    mrt.render({"type": "scene", "sensor": {"type": "perspective"}, "shape": {"type": "wicked"}}, aa=1)
 except mrt.SceneError as error:
     print("dict", error)
 """
