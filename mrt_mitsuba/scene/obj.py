@@ -13,11 +13,11 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
+from mrt_mitsuba.scene.files import decode, find, numbers, read_bytes
 from mrt_mitsuba.scene.model import (
     BLUE_SKY,
     Camera,
@@ -26,10 +26,8 @@ from mrt_mitsuba.scene.model import (
     Material,
     Mesh,
     Scene,
-    Vector,
-    view_problem,
 )
-from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, decode, find, numbers, read_bytes, read_mtl
+from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, read_mtl
 
 # Statements about names, groups, smoothing, curves and display: nothing that is rendered here
 _IGNORED = frozenset(
@@ -158,32 +156,6 @@ def obj_scene(
         meshes=meshes,
         texturing=texturing or convention,
     )
-
-
-def obj_view(
-    path: str | os.PathLike[str],
-    *,
-    convention: str = "report",
-    texturing: str | None = None,
-    camera: Vector | None = None,
-    target: Vector | None = None,
-    up: Vector | None = None,
-    fov: float | None = None,
-    light: Vector | None = None,
-) -> Scene:
-    """``obj_scene`` seen as the options of the command say; what is None stays as ``obj_scene`` places it.
-
-    ``fov`` is horizontal, in degrees; ``light`` is a white light's place. Raises ``UsageError`` for a camera
-    that looks nowhere, and what ``obj_scene`` raises.
-    """
-    lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
-    scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)
-    given: dict[str, Any] = {"position": camera, "target": target, "up": up, "hfov": fov}
-    view = replace(scene.camera, **{name: value for name, value in given.items() if value is not None})
-    problem = view_problem(view)
-    if problem:
-        raise UsageError(problem)
-    return replace(scene, camera=view)
 
 
 @dataclass

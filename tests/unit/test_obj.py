@@ -11,10 +11,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mrt_mitsuba.command.render import model_view
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
 from mrt_mitsuba.scene.model import Camera, Mesh
 from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, read_mtl
-from mrt_mitsuba.scene.obj import obj_scene, obj_view, read_obj
+from mrt_mitsuba.scene.obj import obj_scene, read_obj
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 UVS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -403,8 +404,8 @@ def test_view_as_asked_for(tmp_path) -> None:
     path = tmp_path / "a.obj"
     path.write_text(TRIANGLE)
     placed = obj_scene(path)
-    assert obj_view(path).camera == placed.camera and obj_view(path).lights == placed.lights
-    view = obj_view(path, camera=(0, 0, 5), fov=30, light=(1, 2, 3), texturing="standard")
+    assert model_view(path).camera == placed.camera and model_view(path).lights == placed.lights
+    view = model_view(path, camera=(0, 0, 5), fov=30, light=(1, 2, 3), texturing="standard")
     assert view.camera == Camera((0, 0, 5), placed.camera.target, hfov=30)
     assert [light.position for light in view.lights] == [(1, 2, 3)] and view.texturing == "standard"
 
@@ -421,4 +422,4 @@ def test_view_of_nothing_is_refused(tmp_path, given: dict, text: str) -> None:
     path = tmp_path / "a.obj"
     path.write_text(TRIANGLE)
     with pytest.raises(UsageError, match=text):
-        obj_view(path, **given)
+        model_view(path, **given)
