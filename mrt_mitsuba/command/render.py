@@ -87,7 +87,7 @@ def model_view(
     camera that sees nothing, and what ``obj_scene`` raises.
     """
     from mrt_mitsuba.scene.model import Light, view_problem
-    from mrt_mitsuba.scene.obj import obj_scene
+    from mrt_mitsuba.scene.placement import obj_scene
 
     lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
     scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)

@@ -10,7 +10,7 @@ from typing import Any
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, is_obj
-from mrt_mitsuba.scene.obj import obj_scene
+from mrt_mitsuba.scene.placement import obj_scene
 from mrt_mitsuba.scene.report import report_scene
 
 
