@@ -15,6 +15,7 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.output.files import LAYERS
 from mrt_mitsuba.output.result import Result, Timings
+from mrt_mitsuba.plugins.protocols import LayeredIntegrator
 from mrt_mitsuba.rays.bundle import Lattice
 from mrt_mitsuba.rays.exposure import Exposure, exposures
 from mrt_mitsuba.rendering import options
@@ -158,15 +159,16 @@ def _workspace(plan: Plan, takes: Sequence[Exposure], memory: int | None) -> Wor
 
 
 def _tracer(source: Source) -> tuple[Tracer, Features]:
-    if hasattr(source.integrator, "trace"):
+    if isinstance(source.integrator, LayeredIntegrator):
         tracer = WhittedTracer(source.scene, source.integrator)
-        return tracer, whitted_features(source.integrator, tracer.prepared)
+        features = whitted_features(source.integrator, tracer.prepared.facts, tracer.prepared.plan)
+        return tracer, features
     return Tracer(source.scene, source.integrator), stock_features(source.integrator)
 
 
 def _name(integrator: Any) -> str:
     """Mitsuba does not tell a plugin's name, and calls every integrator from Python a SamplingIntegrator."""
-    return "mrt_whitted" if hasattr(integrator, "trace") else integrator.class_name()
+    return "mrt_whitted" if isinstance(integrator, LayeredIntegrator) else integrator.class_name()
 
 
 class _Frames:

@@ -172,8 +172,8 @@ class Features:
     layers: frozenset[str]
 
 
-def whitted_features(integrator: Any, prepared: Any) -> Features:
-    """Read off what ``mrt_whitted`` has prepared."""
+def whitted_features(integrator: Any, facts: Any, plan: Any) -> Features:
+    """Put into words what ``mrt_whitted`` has planned."""
     kernel, left_out = [], []
 
     def decide(needed: bool, text: str, what: str, why: str) -> None:
@@ -182,29 +182,23 @@ def whitted_features(integrator: Any, prepared: Any) -> Features:
         else:
             left_out.append(Omission(what, why))
 
+    decide(plan.bvh, f"{facts.native_shapes} shapes in Mitsuba's BVH", "BVH", "no shapes but analytic ones")
+    count = sum(number for _, number in facts.quadrics)
+    text = f"{count} exact objects in a tree: {', '.join(plan.quadrics)}"
+    decide(bool(plan.quadrics), text, "cones and cylinders", "none in the scene")
+    decide(plan.planes, f"{facts.planes} analytic planes", "planes", "none in the scene")
+    handling = {"loop": "in a loop"}.get(plan.lights, plan.lights)
+    decide(plan.lights != "none", f"{facts.lights} lights, {handling}", "shadow rays", "no light")
+    decide(plan.emission, "emission of surfaces", "emission", "no surface emits")
     decide(
-        prepared.shape_count > 0,
-        f"{prepared.shape_count} shapes in Mitsuba's BVH",
-        "BVH",
-        "no shapes but analytic ones",
-    )
-    quadrics = prepared.quadrics
-    text = f"{quadrics.count} exact objects in a tree: {', '.join(quadrics.kinds)}" if quadrics else ""
-    decide(quadrics is not None, text, "cones and cylinders", "none in the scene")
-    decide(bool(prepared.planes), f"{len(prepared.planes)} analytic planes", "planes", "none in the scene")
-    lights = len(prepared.lights)
-    decide(lights > 0, f"{lights} lights, {prepared.light_handling}", "shadow rays", "no light")
-    decide(prepared.emissive, "emission of surfaces", "emission", "no surface emits")
-    decide(
-        integrator.bounces(prepared),
+        plan.mirrors,
         f"mirror bounces, budget {integrator.max_depth}",
         "bounce loop",
         "max_depth is 1" if integrator.max_depth == 1 else "no material reflects visibly",
     )
-    decide(prepared.textured, "textures and their coordinates", "textures", "every material is uniform")
-    decide(prepared.random, "random numbers", "random numbers", "every light is a point or a direction")
-    layers = frozenset({"depth", "normal", "albedo", "direct", "reflection", "bounces", "shadow_rays"})
-    return Features(tuple(kernel), tuple(left_out), layers)
+    decide(plan.textures, "textures and their coordinates", "textures", "every material is uniform")
+    decide(plan.random, "random numbers", "random numbers", "every light is a point or a direction")
+    return Features(tuple(kernel), tuple(left_out), integrator.provided_layers())
 
 
 def stock_features(integrator: Any) -> Features:

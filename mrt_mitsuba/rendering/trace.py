@@ -218,7 +218,7 @@ class WhittedTracer(Tracer):
 
     @property
     def random(self) -> bool:
-        return self.prepared.random
+        return self.prepared.plan.random
 
     def trace(
         self, camera: Camera, ray: Any, weight: Any, sampler: Any, wanted: AbstractSet[str]

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
+from mrt_mitsuba.scene.files import decode, find, numbers, read_bytes
 from mrt_mitsuba.scene.model import (
     BLUE_SKY,
     Camera,
@@ -26,7 +27,7 @@ from mrt_mitsuba.scene.model import (
     Mesh,
     Scene,
 )
-from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, decode, find, numbers, read_bytes, read_mtl
+from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, read_mtl
 
 # Statements about names, groups, smoothing, curves and display: nothing that is rendered here
 _IGNORED = frozenset(

@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import operator
 import os
-import re
 from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import Scene
-from mrt_mitsuba.scene.mtl import require_file
 from mrt_mitsuba.scene.obj import obj_scene
 from mrt_mitsuba.scene.report import report_scene
 
 SIZE = (800, 600)
-
-# The lines of a traceback, which are indented but for the first, and the type of this project's error
-_TRACEBACK = re.compile(
-    r"Traceback \(most recent call last\):\n(?:[ \t][^\n]*\n|\n)*(?:\w*ParameterError: )?"
-)
-# Where in Mitsuba's own sources an error was raised
-_CODE_PLACE = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
 
 
 @dataclass(frozen=True)
@@ -63,11 +55,10 @@ def open_scene(
             "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
         )
     if isinstance(scene, dict):
-        _refuse_none(scene)
-        return _own_source("a dict", _load(mi.load_dict, scene, "the dict"), width, height, integrator)
+        return _own_source("a dict", load_dict(scene), width, height, integrator)
     if isinstance(scene, str | os.PathLike):
         path = os.fspath(scene)
-        return _own_source(os.path.basename(path), _load_file(path), width, height, integrator)
+        return _own_source(os.path.basename(path), load_file(path), width, height, integrator)
     if isinstance(scene, mi.Scene):
         return _own_source("a Mitsuba scene", scene, width, height, integrator)
     raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")
@@ -76,12 +67,8 @@ def open_scene(
 def _report_source(
     name: str, scene: Scene, width: int | None, height: int | None, fresnel: str | None, integrator: Any
 ) -> Source:
-    import mitsuba as mi
-
     width, height = width or SIZE[0], height or SIZE[1]
-    loaded = _load(
-        mi.load_dict, scene.to_dict(width=width, height=height, fresnel=fresnel or "schlick"), name
-    )
+    loaded = load_dict(scene.to_dict(width=width, height=height, fresnel=fresnel or "schlick"), name)
     return Source(
         name,
         loaded,
@@ -95,6 +82,10 @@ def _report_source(
 
 
 def _own_source(name: str, scene: Any, width: int | None, height: int | None, integrator: Any) -> Source:
+    import mitsuba as mi
+
+    if not isinstance(scene, mi.Scene):
+        raise SceneError(f"{name} is a {type(scene).__name__}, not a scene: put it into one, with a sensor")
     if not scene.sensors():
         raise SceneError(f"{name} has no sensor: add one, so that there is something to look through")
     sensor = scene.sensors()[0]
@@ -119,38 +110,10 @@ def _integrator(integrator: Any, scene: Any) -> Any:
     if isinstance(integrator, str):
         integrator = {"type": integrator}
     if isinstance(integrator, dict):
-        _refuse_none(integrator)
-        integrator = _load(mi.load_dict, integrator, f"the integrator {integrator.get('type')!r}")
+        integrator = load_dict(integrator, f"the integrator {integrator.get('type')!r}")
     if not isinstance(integrator, mi.SamplingIntegrator):
         raise UsageError(
             f"the integrator is {' '.join(repr(integrator).split())}: "
             "it must be a sampling integrator, such as path or direct"
         )
     return integrator
-
-
-def _load_file(path: str) -> Any:
-    import mitsuba as mi
-
-    require_file(path)
-    if not path.lower().endswith(".xml"):
-        raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
-    return _load(mi.load_file, path, path)
-
-
-def _refuse_none(node: dict[str, Any], place: str = "") -> None:
-    """Mitsuba ends the process where a dict holds None."""
-    for name, value in node.items():
-        if value is None:
-            raise SceneError(f"cannot load the dict: {place}{name} is None; give it a value, or leave it out")
-        if isinstance(value, dict):
-            _refuse_none(value, f"{place}{name}.")
-
-
-def _load(loader: Any, what: Any, name: str) -> Any:
-    try:
-        return loader(what)
-    except RuntimeError as error:
-        # Of an error in a plugin written in Python, Mitsuba quotes the way there, too
-        text = _CODE_PLACE.sub("", _TRACEBACK.sub("", str(error)))
-        raise SceneError(f"cannot load {name}: {text}") from error
