@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-try:
+if sys.version_info >= (3, 11):
     import tomllib
-except ImportError:  # Python 3.10
+else:
     import tomli as tomllib
 
 from mrt_mitsuba.errors import MrtError, UsageError
@@ -49,7 +50,7 @@ def diff(arguments: Sequence[str]) -> int:
         raise UsageError(f"give two EXR files. Usage: {DIFF}")
     limits = {name: _number(name, value) for name, value in given.items() if name in MEASURES}
     try:
-        found = compare(*files, layer=given.get("layer", ""))
+        found = compare(files[0], files[1], layer=given.get("layer", ""))
         if "out" in given:
             found.save(given["out"])
     except MrtError as error:
