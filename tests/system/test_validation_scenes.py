@@ -74,7 +74,7 @@ def moved(scene: Scene) -> Scene:
 
 MISTAKES = {
     "lights x 1.00001": lambda scene: lit(scene, 1.00001),
-    "sky x 1.0001": lambda scene: dataclasses.replace(scene, sky=tuple(1.0001 * c for c in scene.sky)),
+    "sky x 1.001": lambda scene: dataclasses.replace(scene, sky=tuple(1.001 * c for c in scene.sky)),
     "alpha x 1.0001": lambda scene: altered(scene, alpha=lambda a: 1.0001 * a),
     "index + 0.00003": lambda scene: altered(scene, ior=lambda n: n + 3e-5),
     "Ks x 0.9999": lambda scene: altered(scene, specular=lambda c: tuple(0.9999 * x for x in c)),
