@@ -36,6 +36,11 @@ COMMANDS = {
         "write a scene as Mitsuba XML; --stock: with stock plugins only",
         "mrt_mitsuba.command.export:run",
     ),
+    "sweep": Command(
+        "OUT FILE.toml [workers=N] [cluster=ADDRESS]",
+        "render the grid in a file on several processes or machines",
+        "mrt_mitsuba.command.sweep:run",
+    ),
 }
 # Not in the help
 ALIASES = {
