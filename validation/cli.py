@@ -23,7 +23,6 @@ from mrt_mitsuba.validation.tools.kernels import own_cache
 from mrt_mitsuba.validation.tools.study import Study
 
 
-
 class Entry(NamedTuple):
     """A study of the command: its module, imported when it is run, and what ``--list`` says of it."""
 
@@ -116,8 +115,11 @@ def _spoken(seconds: int) -> str:
 def _validate(options: argparse.Namespace) -> int:
     names = _named(options.study)
     _check_extras()
-    print(f"About {_spoken(sum(getattr(STUDIES[n], 'quick' if options.quick else 'full') for n in names))} "
-          "on two idle cores", file=sys.stderr)
+    print(
+        f"About {_spoken(sum(getattr(STUDIES[n], 'quick' if options.quick else 'full') for n in names))} "
+        "on two idle cores",
+        file=sys.stderr,
+    )
     report.prepare(options.out, "summary.json", "index.html")
     # With a cache of their own, studies of speed can tell how long compilation takes
     own = nullcontext() if options.quick or not set(names) & set(SPEED) else own_cache()

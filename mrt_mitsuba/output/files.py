@@ -17,6 +17,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
+from mrt_mitsuba.output.layers import LAYERS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,18 +27,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# The layers of an EXR and their channels, in the order in which the last axis of an array holds them.
-LAYERS = {
-    "depth": "Z",
-    "normal": "XYZ",
-    "albedo": "RGB",
-    "edges": "Y",
-    "samples": "Y",
-    "blur": "Y",
-    "direct": "RGB",
-    "reflection": "RGB",
-    "bounces": "Y",
-}
 _unfinished: set[str] = set()  # temporary files
 _PIXELS = 2**18  # converted to 8 bit at a time, to bound the memory of intermediate arrays
 
@@ -214,7 +203,7 @@ def _channels(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
         if array.shape[:2] != np.shape(image)[:2] or array.ndim not in (2, 3):
             raise OutputError(f"layer {name} of shape {array.shape} does not fit the picture")
         array = np.atleast_3d(array)
-        letters = LAYERS.get(name, "RGB" if array.shape[2] == 3 else "Y")
+        letters = LAYERS[name].letters if name in LAYERS else "RGB" if array.shape[2] == 3 else "Y"
         names = [name] if "." in name else [f"{name}.{letter}" for letter in letters]
         if len(names) != array.shape[2]:
             raise OutputError(f"layer {name} has {array.shape[2]} channels in place of {len(names)}")
