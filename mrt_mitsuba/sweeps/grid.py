@@ -78,7 +78,7 @@ def _axes(grid: Mapping[str, Any], fixed: Mapping[str, Any]) -> dict[str, list[A
 def _check(key: str, value: Any) -> Any:
     """Return a value as ``render`` takes it; raise ``UsageError`` where it cannot."""
     from mrt_mitsuba import render
-    from mrt_mitsuba.rendering import options
+    from mrt_mitsuba.rendering import settings
 
     if not _finite(value):
         raise UsageError(f"{key}={value!r}: give finite numbers")
@@ -91,7 +91,7 @@ def _check(key: str, value: Any) -> Any:
         raise UsageError(f"{key} is no option of render: {hint}")
     if not isinstance(value, str | bytes | bool | int | float | Mapping | Sequence | None):
         raise UsageError(f"{key}={value!r} cannot be sent elsewhere; give a name, a number or a dict")
-    return options.check(key, value) if key in options.TABLE else value
+    return settings.check(key, value) if key in settings.TABLE else value
 
 
 def plain(value: Any) -> Any:

@@ -14,7 +14,7 @@ from mrt_mitsuba.rendering.progress import Advance, Progress, TerminalProgress
 from mrt_mitsuba.sweeps import cluster as clusters
 from mrt_mitsuba.sweeps.cluster import ClusterError
 from mrt_mitsuba.sweeps.grid import Job, jobs
-from mrt_mitsuba.sweeps.scenes import fingerprint, send
+from mrt_mitsuba.sweeps.scenes import check_parameters, fingerprint, send
 from mrt_mitsuba.sweeps.sheet import MOST, write_sheet
 from mrt_mitsuba.sweeps.table import FILE as TABLE
 from mrt_mitsuba.sweeps.table import Table
@@ -79,6 +79,7 @@ def sweep(
     if workers is not None and cluster is not None:
         raise UsageError("workers are for this machine, and a cluster brings its own: give one of them")
     planned = jobs(scene, grid or {}, zipped, options)
+    check_parameters(planned)
     folder = _folder(out)
     table = Table(folder, tuple(grid or {}), {job.name: job.parameters for job in planned})
     shown = TerminalProgress(unit=" pictures") if progress is None else progress

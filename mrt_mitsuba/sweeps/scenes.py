@@ -9,10 +9,12 @@ import operator
 import os
 import pickle
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.sweeps.grid import Job
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,24 @@ def send(scene: Any, folder: str) -> tuple[Any, str]:
     with open(name, "wb") as file:
         file.write(payload)
     return SceneFile(name), fingerprint(payload)
+
+
+def check_parameters(jobs: Sequence[Job]) -> None:
+    """Raise ``UsageError`` if a job sets what its scene does not have; each scene is loaded once."""
+    from mrt_mitsuba import runtime
+    from mrt_mitsuba.scene.open import open_scene
+    from mrt_mitsuba.scene.parameters import set_parameters
+
+    loaded: dict[int, Any] = {}
+    known = set()
+    for job in jobs:
+        for key, value in job.arguments.get("params", {}).items():
+            if (id(job.scene), key, repr(value)) not in known:
+                if id(job.scene) not in loaded:
+                    runtime.use()
+                    loaded[id(job.scene)] = open_scene(job.scene).scene
+                set_parameters(loaded[id(job.scene)], {key: value})
+                known.add((id(job.scene), key, repr(value)))
 
 
 def fingerprint(*values: Any) -> str:

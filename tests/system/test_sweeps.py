@@ -148,6 +148,17 @@ def test_pictures_are_those_of_render_alone(address: str, tmp_path: Path) -> Non
     assert (tmp_path / "out" / "contact.png").stat().st_size > 2000
 
 
+def test_parameters_of_the_scene(address: str, tmp_path: Path) -> None:
+    grid = {"material_0.alpha": [0.1, 0.6], "light_0.intensity.value": [[1, 0, 0], [0, 1, 0]]}
+    table = mrt.sweep(3, tmp_path, grid=grid, cluster=address, **SMALL)
+    found = [read_exr(tmp_path / row["file"]).image.tobytes() for row in table.rows]
+    alone = [
+        mrt.render(3, params={key: row[key] for key in grid}, **SMALL).image.tobytes() for row in table.rows
+    ]
+    assert found == alone and len(set(found)) == 4
+    assert table.rows[0]["file"] == "material_0.alpha=0.1,light_0.intensity.value=1x0x0.exr"
+
+
 def test_a_second_run_renders_only_what_is_missing_or_was_made_otherwise(
     address: str, tmp_path: Path
 ) -> None:
@@ -205,6 +216,9 @@ def test_frames_are_numbered_for_films(address: str, tmp_path: Path) -> None:
         ({"motion": [[0, 0, float("inf")]]}, {}, "give finite numbers"),
         ({"aa": [1, 2, 1]}, {}, "2 jobs would write the same file aa=1"),
         ({"aa": [1]}, {"aa": 2}, "aa is given twice"),
+        ({"material_0.alpa": [0.1]}, {}, "no parameter material_0.alpa: did you mean material_0.alpha?"),
+        ({"material_0.alpha": ["rough"]}, {}, "material_0.alpha='rough': must be a Float"),
+        ({"material_0.alpha": [0.1, float("nan")]}, {}, "material_0.alpha=nan: give finite numbers"),
         ({"scene": [1]}, {"scene": 3}, "the scene is given twice"),
         ({"scene": [99]}, {"scene": None}, "99"),
         ({"scene": ["none.xml"]}, {"scene": None}, "cannot read none.xml"),
