@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
-from mrt_mitsuba.command.toml import read_toml
+from mrt_mitsuba.command.words import read_toml, words
 from mrt_mitsuba.errors import UsageError
 
-FORM = "OUT FILE.toml [workers=N] [cluster=ADDRESS]"
+FORM = "mrt sweep OUT FILE.toml [workers=N] [cluster=ADDRESS]"
 
 
-def run(words: list[str]) -> int:
+def run(arguments: list[str]) -> int:
     """Render a sweep; return 1 if a job failed."""
-    out, path, overrides = _parse(words)
-    settings = read_toml(path) | overrides
+    out, path, overrides = _parse(arguments)
+    settings = read_toml(Path(path)) | overrides
     grid = dict(_flat(settings.pop("grid", {})))
     scene = settings.pop("scene", None if "scene" in grid else 0)
     from mrt_mitsuba import sweep
@@ -29,20 +30,14 @@ def run(words: list[str]) -> int:
     return 1 if table.failed else 0
 
 
-def _parse(words: list[str]) -> tuple[str, str, dict[str, Any]]:
-    if len(words) < 2:
-        raise UsageError(f"write mrt sweep {FORM}")
-    overrides: dict[str, Any] = {}
-    for word in words[2:]:
-        name, _, value = word.partition("=")
-        if name not in ("workers", "cluster") or not value:
-            raise UsageError(f"unexpected argument {word!r}: write mrt sweep {FORM}")
-        if name in overrides:
-            raise UsageError(f"{name} is given twice")
-        if name == "workers" and not value.isdecimal():
-            raise UsageError(f"{word}: workers must be a whole number, 1 or more")
-        overrides[name] = int(value) if name == "workers" else value
-    return words[0], words[1], overrides
+def _parse(arguments: list[str]) -> tuple[str, str, dict[str, Any]]:
+    plain, given = words(arguments, ("workers", "cluster"), FORM)
+    if len(plain) != 2:
+        raise UsageError(f"give a folder and a file. Usage: {FORM}")
+    overrides: dict[str, Any] = dict(given)
+    if given.get("workers", "").isdecimal():
+        overrides["workers"] = int(given["workers"])
+    return plain[0], plain[1], overrides
 
 
 def _flat(grid: Any, before: str = "") -> Iterator[tuple[str, Any]]:

@@ -352,10 +352,10 @@ def test_the_command_and_workers_that_are_renewed(tmp_path: Path, capsys) -> Non
 @pytest.mark.parametrize(
     ("words", "text", "message"),
     [
-        ([], "", "write mrt sweep OUT FILE.toml"),
-        (["workers=x"], "", "workers must be a whole number"),
-        (["job=1"], "", "unexpected argument 'job=1'"),
-        ([], "a =", "is no TOML"),
+        ([], "", "give a folder and a file"),
+        (["workers=x"], "", "must be a whole number"),
+        (["job=1"], "", "unknown option 'job'"),
+        ([], "a =", "cannot read"),
         ([], "grid = 3", "grid must be a table"),
         ([], "out = 'x'", "out cannot be set in a file"),
         ([], "[grid]\nmaterial_0.alpha = []", "material_0.alpha is an empty list"),
