@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.plugins import intersect
-from mrt_mitsuba.plugins.columns import Vector3
 from mrt_mitsuba.plugins.intersect import BASE, LATERAL, TOP
 from mrt_mitsuba.plugins.quadrics import Quadrics
 from mrt_mitsuba.plugins.tree import Tree
@@ -68,7 +67,7 @@ INF = np.inf
         ("cone", (3, 0, 0.5), (-2, 0, 0), 1.25, LATERAL),
         ("cone", (3, 0, 1.5), (-1, 0, 0), INF, None),  # above the apex
         ("cone", (3, 0, -1e-9), (-1, 0, 0), INF, None),  # just below the base, level with it
-        ("cone", (3, 0, 1e-9), (-1, 0, 0), 2, LATERAL),  # just above
+        ("cone", (3, 0, 1e-9), (-1, 0, 0), 2 + 1e-9, LATERAL),  # just above
         ("cone", (-2, 0.1, 0), (1, 0, 1), INF, None),  # parallel to a generatrix, outside
         ("cone", (-0.5, 0, 0), (1, 0, 1), 0.75, LATERAL),  # ... from inside to the other side
         ("cone", (-0.5, 0, -1), (1, 0, 1), 1, BASE),  # ... entered from below
@@ -97,7 +96,7 @@ def test_single_rays(shape: str, o: tuple, d: tuple, t: float, part: int | None)
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_surface_points_have_their_normal_and_uv(kind: str) -> None:
-    """Points near each part end up on it, with the normal outwards and uv in the unit square, around the axis."""
+    """Points near each part end up on it, with the normal outwards; uv goes around the axis."""
     import drjit.llvm.ad as arrays
 
     make, _, surface_of = KINDS[kind]
@@ -137,13 +136,12 @@ def test_any_ray_gives_a_point_on_the_shape(kind: str, o, d, end0, end1, radius:
         return
     frame = make(V(*end0), V(*end1), radius)
     hit = cut(V(*o), V(*d), frame)
-    listed = cut(Vector3(o), Vector3(d), make(Vector3(end0), Vector3(end1), radius))  # vectors may be lists
-    assert hit.t > 0 and (listed.t == pytest.approx(hit.t, rel=1e-6) or hit.t > 1e3)
+    assert hit.t > 0
     if hit.t == INF:
         return
     q = frame.point(V(*o) + V(*d) * hit.t)
-    # Roundings of coordinates up to 1e4, magnified up to 1e6-fold into the unit frame of the smallest shapes; a
-    # grazing ray turns them into their square root along its way, which is what leaves the bounded part
+    # Roundings of coordinates up to 1e4, magnified up to 1e6-fold into the unit frame of the smallest shapes;
+    # a grazing ray turns them into their square root along its way, which is what leaves the bounded part
     rounding = 2.0**-47 * (1e4 + abs(hit.t) * np.linalg.norm(d)) / min(radius, length)
     side = np.hypot(q.x, q.y) - (q.z if kind == "cone" else 1)
     assert -rounding <= q.z <= 1 + rounding and side <= rounding
