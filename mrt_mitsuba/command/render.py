@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def run(options: Options) -> int:
     """Render and write what the options say; return the exit code."""
     from mrt_mitsuba.memory import check_addresses
-    from mrt_mitsuba.output.files import check_target
+    from mrt_mitsuba.output.replacing import check_target
 
     check_addresses()
     for path in options.outputs():
@@ -43,9 +43,9 @@ def run(options: Options) -> int:
         scene = model_view(scene, convention=options.convention, **options.model_arguments())
     result = render(scene, progress=progress, **options.render_arguments())
     seconds = time.perf_counter() - start
-    for path in options.outputs():
-        result.save(path, tonemap=options.tonemap)
+    result.save(*options.outputs(), tonemap=options.tonemap)
     if not options.quiet:
+        print(f"Wrote {' and '.join(options.outputs())}")
         print(f"Render time: {seconds:.6f}s")
     return 0
 

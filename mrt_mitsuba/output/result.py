@@ -41,23 +41,26 @@ class Result:
     kernel_launches: int  #: how many kernels ran
     options: Mapping[str, Any] = field(default_factory=dict)  #: as they were given
 
-    def save(self, path: str | os.PathLike[str], *, tonemap: str = "report") -> None:
-        """Write a .png or .exr; raise ``OutputError``. ``tonemap`` ("report" or "srgb") concerns a PNG
-        only."""
+    def save(self, *paths: str | os.PathLike[str], tonemap: str = "report") -> None:
+        """Write .png and .exr files, all or none; raise ``OutputError``.
+
+        ``tonemap`` ("report" or "srgb") concerns a PNG only.
+        """
         from mrt_mitsuba.output import files as output
 
-        output.save(path, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
+        output.save(paths, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
 
     def header(self) -> dict[str, Any]:
-        """The header attributes of an EXR."""
-        import mrt_mitsuba
-
+        """The header attributes of an EXR: what the picture was made of, and nothing that differs when the same
+        is rendered again, such as times."""
         return {
+            "software": f"mrt-mitsuba {mrt_mitsuba.__version__}",
             "mrt:version": mrt_mitsuba.__version__,
             "mrt:scene": self.plan.scene,
             "mrt:options": dict(self.options),
             "mrt:variant": self.plan.variant,
-            "mrt:seconds": self.timings.total,
+            **{f"mrt:{name}": text for name, text in versions().items()},
+            **self.camera,
         }
 
     def _repr_png_(self) -> bytes:

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import OutputError, UsageError
-from mrt_mitsuba.output.files import check_target
+from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.progress import Advance, Progress, TerminalProgress
 from mrt_mitsuba.sweeps import cluster as clusters
 from mrt_mitsuba.sweeps.cluster import ClusterError

@@ -183,7 +183,7 @@ def test_home_that_holds_no_kernel_cache(mrt: Mrt, tmp_path: Path, environ: dict
 @pytest.mark.parametrize(("flavor", "plugin"), [((), "mrt_bsdf"), (("--stock",), "roughplastic")])
 def test_exported_scene_renders(mrt: Mrt, tmp_path: Path, flavor: tuple[str, ...], plugin: str) -> None:
     done = mrt("export", "0", "--xml", "zero.xml", *flavor)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "Wrote zero.xml\n", "")
     text = (tmp_path / "zero.xml").read_text()
     assert plugin in text and ("mrt_" in text) is not bool(flavor)
     done = mrt("out", "scene=zero.xml", "aa=1", "aamode=none", "format=exr")
