@@ -1,4 +1,5 @@
-"""Cone and cylinder: intersection and surface against extended precision, and rays where formulas break."""
+"""Cone, cylinder, capsule: intersection and surface against extended precision, and rays where formulas
+break."""
 
 from __future__ import annotations
 
@@ -12,10 +13,13 @@ from mrt_mitsuba.plugins.intersect import (
     BASE,
     LATERAL,
     TOP,
+    capsule_frame,
+    capsule_surface,
     cone_frame,
     cone_surface,
     cylinder_frame,
     cylinder_surface,
+    intersect_capsule,
     intersect_cone,
     intersect_cylinder,
     intersect_plane,
@@ -27,6 +31,7 @@ SCALES = [1e-6, 1.0, 1e6]
 SHAPES = {
     "cone": (cone_frame, intersect_cone, cone_surface),
     "cylinder": (cylinder_frame, intersect_cylinder, cylinder_surface),
+    "capsule": (capsule_frame, intersect_capsule, capsule_surface),
 }
 # The integrator starts secondary rays this many roundings off a surface, relative to the largest coordinate
 OFFSET = 32
@@ -71,13 +76,21 @@ def exact_hits(shape: str, o, d, end0, end1, radius):
     b = (across * u_across).sum(1) - r0 * dr0
     c = (across**2).sum(1) - r0**2
     best, part = np.full(len(o), np.inf, np.longdouble), np.full(len(o), -1)
-    caps = [(length, BASE)] + ([(0, TOP)] if shape == "cylinder" else [])
+    caps = {"cone": [(length, BASE)], "cylinder": [(length, BASE), (0, TOP)], "capsule": []}[shape]
     with np.errstate(all="ignore"):
         for sign in (1, -1):
             t = (-b + sign * np.sqrt(b * b - a * c)) / a
             z = pz + t * uz
             closer = (t > 0) & (z >= 0) & (z <= length) & (t < best)
             best[closer], part[closer] = t[closer], LATERAL
+        for height in (0, length) if shape == "capsule" else ():
+            along = pz - height
+            b, c = (across * u_across).sum(1) + along * uz, (across**2).sum(1) + along**2 - radius**2
+            for sign in (1, -1):
+                t = (-b + sign * np.sqrt(b * b - (d * d).sum(1) * c)) / (d * d).sum(1)
+                z = pz + t * uz
+                closer = (t > 0) & ((z < 0) if height == 0 else (z > length)) & (t < best)
+                best[closer], part[closer] = t[closer], LATERAL
         for height, name in caps:
             t = (height - pz) / uz
             r = np.sqrt(((across + t[:, None] * u_across) ** 2).sum(1))
@@ -99,7 +112,7 @@ def test_hits_are_those_of_extended_precision(shape: str, precision: str, scale:
     frame = make_frame(shape, precision, end0, end1, radius)
     _, vector = array_types(precision)
     hit = SHAPES[shape][1](vector(o.T), vector(d.T), frame)
-    t, part = hit.t.numpy().astype(np.float64), hit.part.numpy()
+    t, part = hit.t.numpy().astype(np.float64), np.broadcast_to(np.array(hit.part), count)
     exact_t, exact_part = exact_hits(shape, o, d, end0, end1, radius)
 
     found, exact_found = np.isfinite(t), np.isfinite(exact_t)
@@ -112,7 +125,7 @@ def test_hits_are_those_of_extended_precision(shape: str, precision: str, scale:
     # itself is ill-conditioned. Some ten roundings add up, of numbers up to the origin's distance from the
     # shape
     point = vector((o + d * t[:, None])[both].T.astype(precision))
-    surface = SHAPES[shape][2](point, type(hit.part)(part[both]), frame)
+    surface = SHAPES[shape][2](point, dr.llvm.ad.Int(part[both]), frame)
     cos = np.abs((surface.n.numpy().T * d[both]).sum(1))
     same = part[both] == exact_part[both]
     error = np.abs(t[both] - exact_t[both]) * cos
@@ -128,7 +141,7 @@ def test_surface_point(shape: str) -> None:
     end0, end1, radius = place(shape, 1, "float64")
     frame = make_frame(shape, "float64", end0, end1, radius)
     p = vector(((end0 + end1) / 2 + rng.normal(size=(1000, 3)) * 0.4).T)
-    for part in (LATERAL, BASE) + ((TOP,) if shape == "cylinder" else ()):
+    for part in {"cone": (LATERAL, BASE), "cylinder": (LATERAL, BASE, TOP), "capsule": (LATERAL,)}[shape]:
         surface = SHAPES[shape][2](p, part, frame)
         q, back = frame.point(surface.p), frame.point(surface.p - surface.n * 1e-6)
         level = {
@@ -136,6 +149,11 @@ def test_surface_point(shape: str) -> None:
             BASE: lambda q: q.z - 1,
             TOP: lambda q: -q.z,
         }[part]
+        if shape == "capsule":
+
+            def level(q, extent=frame.extent):
+                return dr.sqrt(q.x**2 + q.y**2 + dr.square(q.z - dr.clip(q.z, 0, extent))) - 1
+
         mostly = q.z > 0.05  # below its apex a cone has another half
         assert dr.all(~mostly | (dr.abs(level(q)) < 1e-12))
         assert dr.all(~mostly | (level(back) < -1e-7))  # 1e-6 inside, over lengths of about 1
@@ -198,9 +216,14 @@ def random_surface_points(shape, rng, count, end0, end1, radius, frame):
     angle = number(rng.uniform(0, 2 * np.pi, count).astype(np.float32))
     out = s * dr.cos(angle) + t * dr.sin(angle)
     along = number(rng.random(count).astype(np.float32))
-    kinds = 2 if shape == "cone" else 3
+    kinds = {"cone": 2, "cylinder": 3, "capsule": 1}[shape]
     part = dr.llvm.ad.Int(rng.integers(0, kinds, count).astype(np.int32))
     side = end0 + axis * along + out * (radius * (along if shape == "cone" else 1))
+    if shape == "capsule":  # a third of the points on the round ends
+        tip = dr.normalize(out + dr.normalize(axis) * number(rng.normal(size=count).astype(np.float32)))
+        end = dr.select(dr.dot(tip, axis) > 0, end1, end0) + tip * radius
+        side = dr.select(number(rng.random(count).astype(np.float32)) < 1 / 3, end, side)
+        return side, dr.full(type(part), LATERAL, count), radius
     disc = dr.select(part == BASE, end1, end0) + out * (radius * along)
     length = dr.norm(axis)
     shortest = dr.minimum(length, radius) * dr.minimum(1, radius / length)
@@ -314,6 +337,9 @@ def test_any_ray_gives_a_point_on_the_shape(shape: str, o, d, end0, end1, radius
     # bounded part
     rounding = 64 * EPSILON["float64"] * (1e4 + abs(hit.t) * np.linalg.norm(d)) / min(radius, length)
     r = np.hypot(q.x, q.y)
+    if shape == "capsule":
+        assert abs(np.hypot(r, q.z - np.clip(q.z, 0, frame.extent)) - 1) <= rounding
+        return
     side = q.z if shape == "cone" else 1
     assert -rounding <= q.z <= 1 + rounding
     assert r <= side + rounding
