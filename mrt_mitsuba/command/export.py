@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from mrt_mitsuba.command.options import parse
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.rendering.options import parse
 
 FORM = "mrt export SCENE --xml PATH [--stock]"
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 import textwrap
 
+from mrt_mitsuba.command.options import TABLE
 from mrt_mitsuba.command.registry import COMMANDS
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.rendering.options import TABLE
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
 WIDTH = 100  # characters of a line of help

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 from mrt_mitsuba.command import registry
 from mrt_mitsuba.command.interrupt import Terminated, ending_soon, leave_now
-from mrt_mitsuba.errors import MrtError, UsageError
-from mrt_mitsuba.rendering.options import parse
+from mrt_mitsuba.command.options import parse
+from mrt_mitsuba.errors import MrtError, UsageError, printable
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
@@ -104,7 +104,7 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"mrt: {' '.join(message.split())}", file=sys.stderr)
+    print(f"mrt: {' '.join(printable(message).split())}", file=sys.stderr)
     return code
 
 
@@ -117,7 +117,7 @@ def _end_by_force() -> None:
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
-    print(f"mrt: warning: {' '.join(str(message).split())}", file=sys.stderr)
+    print(f"mrt: warning: {' '.join(printable(str(message)).split())}", file=sys.stderr)
 
 
 if __name__ == "__main__":

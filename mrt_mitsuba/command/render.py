@@ -7,8 +7,9 @@ import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from mrt_mitsuba.command.options import Options
 from mrt_mitsuba.errors import MrtWarning, UsageError
-from mrt_mitsuba.rendering.options import TABLE, Options
+from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE
 
 if TYPE_CHECKING:
     from mrt_mitsuba.scene.model import Scene, Vector
@@ -49,28 +50,24 @@ def run(options: Options) -> int:
 
 def banner(options: Options) -> str:
     """Return the parameters of the render, one per line."""
-    distance, reach = options.focaldist, options.focalrange
+    focus = options.focus(None, FOCAL_RANGE)
     if options.scene is None:
         from mrt_mitsuba.scene.report import report_scene
 
         scene = report_scene(options.scene_number)
-        distance = scene.focal_distance if distance is None else distance
-        reach = scene.focal_range if reach is None else reach
+        focus = options.focus(scene.focal_distance, scene.focal_range)
+    own_film = options.scene is not None and not options.shows_model()
+    width, height = ("from the file", "from the file") if own_film else SIZE
     lines = {
         "Scene": options.scene if options.scene is not None else options.scene_number,
-        "Width": options.width or _from_file(options, "width"),
-        "Height": options.height or _from_file(options, "height"),
+        "Width": options.width or width,
+        "Height": options.height or height,
         "AA": options.aa,
         "AA mode": options.aamode,
-        "F distance": distance or "off",
-        "F range": reach if distance else "off",
+        "F distance": focus.distance or "off",
+        "F range": focus.range if focus.distance else "off",
     }
     return "\n".join(f"{name + ':':<12}{value}" for name, value in lines.items())
-
-
-def _from_file(options: Options, name: str) -> object:
-    """An OBJ file has no size, unlike other scenes in files."""
-    return TABLE[name].default if options.shows_model() else "from the file"
 
 
 def model_view(
@@ -90,7 +87,7 @@ def model_view(
     camera that sees nothing, and what ``obj_scene`` raises.
     """
     from mrt_mitsuba.scene.model import Light, view_problem
-    from mrt_mitsuba.scene.obj import obj_scene
+    from mrt_mitsuba.scene.placement import obj_scene
 
     lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
     scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)

@@ -6,18 +6,14 @@ import errno
 import math
 import os
 import stat
+import warnings
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from mrt_mitsuba.errors import SceneError
+from mrt_mitsuba.errors import MrtWarning, SceneError
 
-
-def read_lines(path: Path) -> list[str]:
-    """The logical lines of a text file; where one is continued with a backslash, empty ones follow it."""
-    lines = decode(read_bytes(path)).split("\n")
-    for i in range(len(lines) - 1, 0, -1):
-        if lines[i - 1].endswith("\\"):
-            lines[i - 1], lines[i] = lines[i - 1][:-1] + " " + lines[i], ""
-    return lines
+LONGEST_LINE = 2**18  # bytes, about 40,000 corners of a face
+MISSING = "is missing or may not be read in"  # what is said of a file that was not found
 
 
 def require_file(path: str | os.PathLike[str]) -> None:
@@ -43,8 +39,12 @@ def require_file(path: str | os.PathLike[str]) -> None:
         raise SceneError(f"cannot read {name or repr(name)}: {problem}")
 
 
-def read_bytes(path: Path) -> bytes:
-    """The bytes of a text file, with Unix line ends. Raises ``SceneError`` if it cannot be read as text."""
+def read_text(path: Path) -> bytes:
+    """Return a text file with Unix line ends, one at the end too, and continued lines joined.
+
+    Lines that end in a backslash are joined with the next; empty ones after them keep line numbers right.
+    Raises ``SceneError`` if the file cannot be read as text.
+    """
     require_file(path)
     try:
         data = path.read_bytes()
@@ -54,7 +54,37 @@ def read_bytes(path: Path) -> bytes:
         raise SceneError(f"{path}: is not a text file (it holds a zero byte); export it as OBJ or MTL text")
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    return data.removeprefix(b"\xef\xbb\xbf")
+    data = _join_continued(data.removeprefix(b"\xef\xbb\xbf"))
+    if not data.endswith(b"\n"):
+        data += b"\n"
+    _check_lengths(path, data)
+    return data
+
+
+def _join_continued(data: bytes) -> bytes:
+    first, *others = data.split(b"\\\n")
+    parts, owed = [first], 0
+    for part in others:
+        rest, end, following = part.partition(b"\n")
+        owed += 1
+        parts += [b" ", rest]
+        if end:
+            parts += [b"\n" * (owed + 1), following]
+            owed = 0
+    return b"".join([*parts, b"\n" * owed])
+
+
+def _check_lengths(path: Path, data: bytes) -> None:
+    """Refuse a line that is too long; only long ones hold a whole step."""
+    step = LONGEST_LINE // 2
+    for middle in range(0, len(data), step):
+        if data.find(b"\n", middle, middle + step) < 0:
+            start, end = data.rfind(b"\n", 0, middle) + 1, data.find(b"\n", middle)
+            if end - start > LONGEST_LINE:
+                number = data.count(b"\n", 0, start) + 1
+                raise SceneError(
+                    f"{path}:{number}: a line of {end - start} bytes; at most {LONGEST_LINE} are read"
+                )
 
 
 def decode(data: bytes) -> str:
@@ -66,13 +96,33 @@ def decode(data: bytes) -> str:
 
 
 def find(name: str, folders: list[Path]) -> Path | None:
-    """The file ``name`` relative to the first folder that has it; backslashes may separate folders."""
+    """Return the file ``name`` of the first folder that has it and where it may be read, or None.
+
+    Backslashes may separate folders.
+    """
     for form in (name, name.replace("\\", "/")):
         for folder in folders:
-            candidate = folder / form
-            if candidate.is_file():
-                return candidate
+            candidate = os.path.join(folder, form)
+            if os.path.isfile(candidate) and os.access(candidate, os.R_OK):
+                return Path(candidate)
     return None
+
+
+@dataclass
+class Findings:
+    """Warnings of one reading: the first of each kind is shown, with the number of those like it."""
+
+    texts: dict[str, list[str]] = field(default_factory=dict)
+
+    def add(self, kind: str, text: str) -> None:
+        """Note a warning; ``kind`` is the plural of what it is about."""
+        self.texts.setdefault(kind, []).append(text)
+
+    def warn(self) -> None:
+        """Give the warnings."""
+        for kind, (first, *others) in self.texts.items():
+            more = f" (and so do {len(others)} more {kind})" if others else ""
+            warnings.warn(f"{first}{more}", MrtWarning, stacklevel=4)
 
 
 def numbers(where: str, statement: str, words: list[str], least: int, most: int) -> list[float]:
@@ -87,6 +137,6 @@ def numbers(where: str, statement: str, words: list[str], least: int, most: int)
         except ValueError:
             value = math.nan
         if not abs(value) <= 3.4e38:  # the largest float32; false for NaN, too
-            raise SceneError(f"{where}: {statement} holds {word!r}, which is not a finite number")
+            raise SceneError(f"{where}: {statement} holds {word[:40]!r}, which is not a finite number")
         values.append(value)
     return values

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from mrt_mitsuba.errors import MrtWarning, SceneError
-from mrt_mitsuba.scene.files import find, numbers, read_lines
+from mrt_mitsuba.errors import SceneError
+from mrt_mitsuba.scene.files import MISSING, Findings, decode, find, numbers, read_text
 from mrt_mitsuba.scene.model import Color, Material
 
 CONVENTIONS = ("report", "standard")
@@ -71,15 +70,16 @@ def read_mtl(
     Raises ``SceneError`` with file and line for what cannot be read.
     """
     path = Path(path)
-    entries = _parse(path, read_lines(path))
+    entries = _parse(path, decode(read_text(path)).split("\n"))
     make = {"report": _report_material, "standard": _standard_material}[convention]
-    materials = {}
+    materials, findings = {}, Findings()
     for name, entry in entries.items():
         material = make(entry)
         if entry.map_kd is not None:
             line, rest = entry.map_kd
-            material = replace(material, texture=_texture(path, line, rest, folder))
+            material = replace(material, texture=_texture(path, line, rest, folder, findings))
         materials[name] = material
+    findings.warn()
     return materials
 
 
@@ -162,7 +162,7 @@ def _standard_material(entry: _Entry) -> Material:
     )
 
 
-def _texture(path: Path, line: int, rest: str, folder: Path | None) -> str | None:
+def _texture(path: Path, line: int, rest: str, folder: Path | None, findings: Findings) -> str | None:
     """The picture that a map_Kd statement names, or None, with a warning, where there is none."""
     folders = [path.parent] if folder is None else [folder, path.parent]
     name = rest
@@ -171,10 +171,8 @@ def _texture(path: Path, line: int, rest: str, folder: Path | None) -> str | Non
         name = _without_options(rest)
         found = find(name, folders) if name else None
     if found is None:
-        text = (
-            f"{path}:{line}: the texture {name or rest} is missing in {folders[0]}; Kd is used in its place"
-        )
-        warnings.warn(text, MrtWarning, stacklevel=2)
+        text = f"{path}:{line}: the texture {name or rest} {MISSING} {folders[0]}; Kd is used in its place"
+        findings.add("textures", text)
         return None
     return str(found)
 

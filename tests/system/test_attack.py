@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,9 @@ pytestmark = pytest.mark.attack
 
 SENSOR = """<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>
     <integer name="height" value="3"/></film></sensor>"""
+
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n"
 
 
 def scene_xml(inside: str) -> str:
@@ -102,6 +106,40 @@ def test_hundreds_of_python_shapes_load(variant: str, tmp_path: Path) -> None:
     assert mrt.render(str(tmp_path / "m.obj"), width=4, height=3, aa=1).image.shape == (3, 4, 3)
 
 
+# ------------------------------------------- 3: long lines --------------------------------------------
+
+READ_MODELS = """
+import sys, warnings
+from mrt_mitsuba.scene.obj import read_obj
+points = b"v 0 0 0\\nv 1 0 0\\nv 0 1 0\\n"
+limit = 2**18
+for text in (
+    b"v " + b"1" * 200_000 + b" 0 0\\nf 1 2 3\\n",
+    b"v " + b"1" * 100_000 + b"." + b"1" * 100_000 + b" 0 0\\nf 1 2 3\\n",
+    b"v" + b" " * 100_000 + b"1" + b" " * 100_000 + b"x\\nf 1 2 3\\n",
+    b"#" + b"x" * (limit - 2) + b"\\nf 1 2 \\\\\\n3\\n",
+    b"#" + b"x" * limit + b"\\nf 1 2 3\\n",
+    b"f" + b" 1 2 3" * (10 * limit // 6) + b"\\n",
+    b"f 1 2" + b" \\\\\\n" * 100_000 + b" 3\\n",
+):
+    with open("a.obj", "wb") as file:
+        file.write(points + text)
+    try:
+        print(len(read_obj("a.obj")))
+    except Exception as error:
+        print(type(error).__name__, error)
+"""
+
+
+def test_time_to_read_a_model_grows_with_its_size(run_python) -> None:
+    """The first alone took half an hour; ``run_python`` waits two minutes."""
+    lines = run_python(READ_MODELS).stdout.splitlines()
+    assert [line.split()[0] for line in lines] == [*["SceneError"] * 3, "1", *["SceneError"] * 2, "1"], lines
+    for line in lines[4:6]:
+        assert "at most 262144 are read" in line
+    assert all(len(line) < 200 for line in lines)
+
+
 # ------------------------------------------- 6: XML and pipes ------------------------------------------
 
 
@@ -140,3 +178,40 @@ def test_pipes_are_refused(variant: str, tmp_path: Path, inside: str) -> None:
     (tmp_path / "a.xml").write_text(scene_xml(inside))
     with pytest.raises(SceneError, match="pipe: it is not a regular file"):
         mrt.render(str(tmp_path / "a.xml"), aa=1)
+
+
+# -------------------------------------- 9, 12: files that lie -----------------------------------------
+
+
+@pytest.mark.parametrize("name", ["n" * 300, "closed/m", "pipe", "folder"])
+def test_unreadable_library_and_texture_are_warnings(variant: str, tmp_path: Path, name: str) -> None:
+    """A mode of 0 does not keep the superuser out; a folder of that name stands for it."""
+    (tmp_path / "closed").mkdir(mode=0o000)
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "m.mtl").write_text(f"newmtl a\nKd 1 0 0\nmap_Kd {name}\n")
+    model = tmp_path / "m.obj"
+    model.write_text(f"mtllib {name}\nmtllib m.mtl\n" + TRIANGLE)
+    with pytest.warns(mrt.MrtWarning) as caught:
+        assert mrt.render(str(model), width=4, height=3, aa=1).image.shape == (3, 4, 3)
+    assert [" is missing or may not be read" in str(w.message) for w in caught] == [True, True]
+
+
+def test_messages_are_printable_short_and_few(variant: str, tmp_path: Path) -> None:
+    model = tmp_path / "m.obj"
+    for text in (f"v 0 0 {'z' * 200_000}", "\x1b]0;owned\x07 1", "f 1 2 \u202e3", "usemtl \x9b31m\nx"):
+        model.write_text(text + "\n")
+        with pytest.raises(SceneError) as caught, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            mrt.render(str(model), aa=1)
+        assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
+    (tmp_path / "a.xml").write_text(scene_xml(f"<shape type='{'potato' * 100_000}'/>"))
+    with pytest.raises(SceneError, match="potato") as caught:
+        mrt.render(str(tmp_path / "a.xml"), aa=1)
+    assert len(str(caught.value)) < 1000
+    faces = "".join(f"usemtl m\x1b{i}\nf 1 2 3\n" for i in range(20_000))
+    model.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + faces)
+    with pytest.warns(mrt.MrtWarning) as warned:
+        mrt.render(str(model), width=4, height=3, aa=1)
+    assert len(warned) == 1 and "and so do 19999 more materials" in str(warned[0].message)
+    assert str(warned[0].message).isprintable()

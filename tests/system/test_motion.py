@@ -11,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rays.bundle import Bundle, Lattice, Shutter
+from mrt_mitsuba.rays.bundle import Bundle
+from mrt_mitsuba.rays.lattice import Lattice
+from mrt_mitsuba.rays.shutter import Shutter
 from mrt_mitsuba.scene.report import report_scene
 
 SMALL = {"width": 96, "height": 72, "focaldist": 0}

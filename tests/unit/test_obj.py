@@ -15,7 +15,8 @@ from mrt_mitsuba.command.render import model_view
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
 from mrt_mitsuba.scene.model import Camera, Mesh
 from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, read_mtl
-from mrt_mitsuba.scene.obj import obj_scene, read_obj
+from mrt_mitsuba.scene.obj import read_obj
+from mrt_mitsuba.scene.placement import obj_scene
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 UVS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -179,7 +180,8 @@ def test_texture_names(model, tmp_path: Path, name: str) -> None:
 def test_missing_texture_is_named_and_replaced_by_kd(model, tmp_path: Path) -> None:
     text = "mtllib model.mtl\n" + SQUARE + UVS + "usemtl painted\nf 1/1 2/2 3/3\n"
     with pytest.warns(
-        MrtWarning, match=r"model\.mtl:10: the texture picture\.png is missing in .*Kd is used"
+        MrtWarning,
+        match=r"model\.mtl:10: the texture picture\.png is missing .*Kd is used",
     ):
         (mesh,) = model(text, PAINTED)
     assert mesh.material.texture is None and mesh.material.diffuse == (0.5, 0.5, 0.5)
