@@ -36,7 +36,7 @@ def axial_mesh(kind: str, end0: str, end1: str) -> type[mi.Mesh]:
             _check_axis(plugin, end0, ends[0], end1, ends[1])
             open_twin = KINDS[kind].open_twin
             self.capped = open_twin is None or flag(props, "capped", True)
-            self.kind = kind if self.capped else open_twin
+            self.kind = kind if self.capped or open_twin is None else open_twin
             self.placement = Placement(props)
             self.unit = KINDS[self.kind].mesh(side_count(props, 256))
             self.exact_frame = self._frame_of(vector64(ends[0]), vector64(ends[1]), radius)

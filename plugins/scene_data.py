@@ -221,8 +221,9 @@ def has_mirror(bsdf: Any) -> bool:
 
 def is_textured(bsdf: Any) -> bool:
     """Does a BSDF vary over its surface? Mitsuba's own do not say so by their flags."""
+    flags = bsdf.flags()
     if isinstance(bsdf, MirrorBSDF):
-        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
+        return mi.has_flag(flags, mi.BSDFFlags.SpatiallyVarying)
     return any(isinstance(node, mi.Texture) and varies(node) for node in mi.traverse(bsdf).hierarchy)
 
 
