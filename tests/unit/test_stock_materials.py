@@ -1,4 +1,4 @@
-"""Materials of Mitsuba's own under ``mrt_whitted``: what its ``direct`` gives, with ``max_depth`` 1 and no clamp."""
+"""Materials of Mitsuba's own under ``mrt_whitted``, without bounces and clamp: as ``direct`` has them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 CHECKERS = {"type": "checkerboard", "color0": 0.1, "color1": 0.9}
 SPHERE = {"type": "sphere"}
+DIRECT = {"type": "direct"}
 SQUARE = {"type": "rectangle"}
 
 
@@ -27,10 +28,8 @@ def difference(shape: dict[str, Any], material: dict[str, Any], **more: Any) -> 
         "shape": {**shape, "bsdf": material}, **more,
     })  # fmt: skip
     ours = mi.load_dict({"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0})
-    images = [
-        np.array(mi.render(scene, integrator=i, spp=1)) for i in (ours, mi.load_dict({"type": "direct"}))
-    ]
-    return float(np.abs(images[0] - images[1]).max()), float(images[1].std())
+    pictures = [np.array(mi.render(scene, integrator=i, spp=1)) for i in (ours, mi.load_dict(DIRECT))]
+    return float(np.abs(pictures[0] - pictures[1]).max()), float(pictures[1].std())
 
 
 @pytest.mark.parametrize("shape", [SPHERE, SQUARE])
