@@ -132,7 +132,7 @@ def sphere_frame(center: Any, radius: Any) -> Frame:
     zero = 0 * inverse
     make = type(center)
     rows = (make(v) for v in ([inverse, zero, zero], [zero, inverse, zero], [zero, zero, inverse]))
-    return Frame(center, *rows, 0.0)
+    return Frame(center, *rows, extent=0.0)
 
 
 def _frame_along(origin: Any, axis: Any, radius: Any) -> Frame:

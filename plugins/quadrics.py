@@ -68,7 +68,7 @@ class Quadrics:
     def _frame_and_kind(self, leaf: Any, active: Any = True) -> tuple[Frame, Any]:
         x, y, z, more = (dr.gather(mi.Vector4f, self.table, 4 * leaf + k, active) for k in range(4))
         rows = [mi.Vector3f(r.x, r.y, r.z) for r in (x, y, z)]
-        return Frame(mi.Point3f(x.w, y.w, z.w), *rows, more.z), more.x
+        return Frame(mi.Point3f(x.w, y.w, z.w), *rows, extent=more.z), more.x
 
     def _meet(self, leaf: Any, ray: Any) -> SurfaceHit:
         frame, kind = self._frame_and_kind(leaf)
@@ -139,7 +139,7 @@ class _ScalarObject:
         self.frame = Frame(
             mi.Point3f(table.origins[k].tolist()),
             *(mi.Vector3f(row.tolist()) for row in rows),
-            float(table.extents[k]),
+            extent=float(table.extents[k]),
         )
         self.scale = float(np.abs(table.boxes()[k]).max())
 
