@@ -6,7 +6,6 @@ import itertools
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
@@ -63,15 +62,6 @@ def test_parts_within_a_region(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "MOST_PIXELS", 30 * WIDTH)
     monkeypatch.setattr(memory, "MOST_RAYS", 3001)
     assert_put_together(3, aa=2, focaldist=2.0, focalrange=0.5, **SIZE)
-
-
-@pytest.mark.filterwarnings("ignore:scalar_rgb traces one ray at a time")
-@pytest.mark.parametrize("variant", ["scalar_rgb"], indirect=True)
-def test_one_ray_at_a_time(variant: str) -> None:
-    options = {"width": 20, "height": 15, "aa": 2, "focaldist": 2.0, "focalrange": 0.5, "variant": variant}
-    whole = mrt.render(3, **options).image
-    part = mrt.render(3, region=(3, 4, 10, 5), **options).image
-    np.testing.assert_array_equal(part, whole[4:9, 3:13])
 
 
 def test_only_the_region_is_traced() -> None:
