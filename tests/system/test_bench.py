@@ -40,15 +40,15 @@ def test_file_follows_the_schema_and_a_broken_one_does_not(found):
     run = json.loads(found.read_text())
     assert _fits(run, bench.SCHEMA)
     for where, name in (
-        (lambda run: run["scenes"]["0"], "floor"),
+        (lambda run: run["scenes"]["3"], "floor"),
         (lambda run: run["scenes"]["3"]["each_kernel"][0], "launches"),
         (lambda run: next(iter(run["rivals"].values())), "median"),
     ):
         broken = copy.deepcopy(run)
         del where(broken)[name]
         assert not _fits(broken, bench.SCHEMA)
-    assert set(run["scenes"]) == {"0", "3"}
-    assert run["scenes"]["0"]["rays"]["camera"] == 80 * 60 * 4
+    assert set(run["scenes"]) == {"3"}
+    assert run["scenes"]["3"]["rays"]["camera"] == 80 * 60 * 4
     assert all(run["scenes"]["3"][name] > 0 for name in bench.COMPARED)
     tracing = [k for k in run["scenes"]["3"]["each_kernel"] if k["kind"] == "traces rays"]
     assert [k["size"] for k in tracing] == [80 * 60 * 4] and tracing[0]["seconds"] > 0
