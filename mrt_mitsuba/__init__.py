@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from mrt_mitsuba.rendering.api import render as render
     from mrt_mitsuba.runtime import register as register
     from mrt_mitsuba.scene.export import scene_dict as scene_dict
+    from mrt_mitsuba.sweeps import sweep as sweep
     from mrt_mitsuba.validation.studies.roughconductor import compare_roughconductor as compare_roughconductor
     from mrt_mitsuba.validation.tools.compare import compare as compare
     from mrt_mitsuba.validation.tools.work_precision import error_vs_time as error_vs_time
@@ -42,6 +43,7 @@ _HOME = {
     "register": "mrt_mitsuba.runtime",
     "render": "mrt_mitsuba.rendering.api",
     "scene_dict": "mrt_mitsuba.scene.export",
+    "sweep": "mrt_mitsuba.sweeps.run",
 }
 _SUBMODULES = ("filters",)
 

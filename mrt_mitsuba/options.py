@@ -151,6 +151,18 @@ def anything() -> Kind:
     return Kind("", "anything", str, lambda value: value)
 
 
+def parameters() -> Kind:
+    """Values by the keys of ``mi.traverse``."""
+
+    def check(value: Any) -> dict[str, Any]:
+        value = dict(value)
+        if not all(isinstance(key, str) and "." in key for key in value):
+            raise ValueError
+        return value
+
+    return Kind("", "a dict of values by keys of mi.traverse, such as material_0.alpha", str, check)
+
+
 def path() -> Kind:
     """The path of a file."""
 

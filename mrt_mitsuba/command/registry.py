@@ -36,6 +36,11 @@ COMMANDS = {
         "write a scene as Mitsuba XML; --stock: with stock plugins only",
         "mrt_mitsuba.command.export:run",
     ),
+    "sweep": Command(
+        "OUT FILE.toml [workers=N] [cluster=ADDRESS]",
+        "render the grid in a file on several processes or machines",
+        "mrt_mitsuba.command.sweep:run",
+    ),
     "diff": Command(
         "A.exr B.exr [layer=NAME] [rmse=LIMIT] [flip=LIMIT] [out=PATH]",
         "compare two pictures; exit code 1 beyond a limit, 2 if they do not compare",

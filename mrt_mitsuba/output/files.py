@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, Any
 
+from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
 from mrt_mitsuba.output.layers import LAYERS
 
@@ -101,7 +102,7 @@ def _compressing() -> Iterator[None]:
     import OpenEXR
 
     before = OpenEXR.global_thread_count()
-    OpenEXR.set_global_thread_count(os.cpu_count() or 1)
+    OpenEXR.set_global_thread_count(usable_cores())
     try:
         yield
     finally:

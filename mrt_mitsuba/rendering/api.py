@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -54,6 +54,7 @@ def render(
     integrator: Any = None,
     spp: int = 1,
     count_rays: bool = False,
+    params: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Result:
     """Render a scene.
@@ -83,6 +84,7 @@ def render(
             know the variance of every pixel and take only for an edge what noise does not explain; with one
             random ray they take noise for edges, and refine it ("geometry" does not).
         count_rays: count mirror and shadow rays.
+        params: values of the scene's parameters by their ``mi.traverse`` key, set once it is loaded.
         progress: told of plan, stages and progress.
 
     Raises:
@@ -111,6 +113,7 @@ def render(
         integrator=integrator,
         spp=spp,
         count_rays=count_rays,
+        params=params,
     )
     return render_with(scene, settings, Progress() if progress is None else progress)
 
@@ -128,6 +131,7 @@ def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Res
             fresnel=settings.fresnel,
             convention=settings.convention,
             integrator=settings.integrator,
+            params=settings.params,
         )
         shader = shader_for(source.scene, source.integrator)
         plan = make_plan(_facts(source, shader, variant, settings), settings)

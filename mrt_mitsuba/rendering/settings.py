@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from mrt_mitsuba.options import (
     integer,
     number,
     option,
+    parameters,
     size,
     subset,
     switch,
@@ -91,6 +93,7 @@ class RenderSettings:
     integrator: object = option(None, anything())
     spp: int = option(1, integer(1, 65536), "rays for each sample, where the integrator is random")
     count_rays: bool = option(False, switch())
+    params: Mapping[str, Any] | None = option(None, parameters())
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -109,7 +112,8 @@ class RenderSettings:
 
     def in_force(self, **decided: Any) -> dict[str, Any]:
         """Return the options that shape the picture, by name, with those that the scene ``decided``."""
-        values = {name: getattr(self, name) for name in TABLE if name != "memory"} | decided
+        names = (*(name for name in TABLE if name != "memory"), "params")
+        values = {name: getattr(self, name) for name in names} | decided
         return {name: value for name, value in values.items() if value is not None}
 
 

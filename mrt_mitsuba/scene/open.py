@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import operator
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, is_obj
+from mrt_mitsuba.scene.parameters import set_parameters
 from mrt_mitsuba.scene.placement import obj_scene
 from mrt_mitsuba.scene.report import report_scene
 
@@ -37,6 +39,7 @@ def open_scene(
     fresnel: str | None = None,
     convention: str = "report",
     integrator: Any = None,
+    params: Mapping[str, Any] | None = None,
 ) -> Source:
     """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``."""
     name, model = _model(scene, convention)
@@ -46,10 +49,14 @@ def open_scene(
                 "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
             )
         name, loaded = _own(scene)
+        if params and loaded is scene:
+            raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
+        set_parameters(loaded, params or {})
         size = _film_size(name, loaded, width, height)
         return Source(name, loaded, loaded.sensors()[0], _integrator(integrator, loaded), *size)
     width, height, fresnel = width or SIZE[0], height or SIZE[1], fresnel or "schlick"
     loaded = load_dict(model.to_dict(width=width, height=height, fresnel=fresnel), name)
+    set_parameters(loaded, params or {})
     sensor, integrator = loaded.sensors()[0], _integrator(integrator, loaded)
     focus = model.focal_distance, model.focal_range
     return Source(name, loaded, sensor, integrator, width, height, *focus, fresnel)
