@@ -13,7 +13,7 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Light, Scene
-from mrt_mitsuba.scene.report import many_spheres, report_scene
+from mrt_mitsuba.scene.report import report_scene, scene_of_spheres
 from mrt_mitsuba.scene.shapes import terrain
 from mrt_mitsuba.validation.tools import kernels
 from mrt_mitsuba.validation.tools.knobs import load
@@ -195,7 +195,7 @@ def _samples(count: int) -> Job:
 
 
 def _spheres(count: int) -> Job:
-    return many_spheres(count), SMALL, {"aa": 4}
+    return scene_of_spheres(count), SMALL, {"aa": 4}
 
 
 def _triangles(count: int) -> Job:
