@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba import runtime
+from mrt_mitsuba.memory import Budget, Workspace
 from mrt_mitsuba.output.layers import AVERAGED, TABLE
 from mrt_mitsuba.output.result import Result, Timings
 from mrt_mitsuba.rays.exposure import Exposure
 from mrt_mitsuba.rendering.job import Job, counting_kernels
-from mrt_mitsuba.rendering.memory import Workspace
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import Plan, RenderFacts, make_plan
 from mrt_mitsuba.rendering.progress import Progress
@@ -125,9 +125,10 @@ def render(
 def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Result:
     """Render a scene as ``render`` does."""
     start = time.perf_counter()
-    with counting_kernels() as kernels:
+    with counting_kernels(progress) as kernels:
         variant = runtime.use(settings.variant)
         runtime.warn_if_slow()
+        budget = Budget.of(settings.memory)
         source = open_scene(
             scene,
             width=settings.width,
@@ -135,12 +136,13 @@ def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Res
             fresnel=settings.fresnel,
             convention=settings.convention,
             integrator=settings.integrator,
+            budget=budget,
             params=settings.params,
         )
         shader = shader_for(source.scene, source.integrator)
         plan = make_plan(_facts(source, shader, variant, settings), settings)
         exposures = _exposures(plan, settings.seed)
-        job = Job(progress, _workspace(plan, exposures, settings.memory))
+        job = Job(progress, _workspace(plan, exposures, budget), kernels)
         progress.plan(plan)
         shader.prepare(plan.kernel)
         load = time.perf_counter() - start
@@ -188,14 +190,14 @@ def _exposures(plan: Plan, seed: int) -> list[Exposure]:
     return [replace(whole, seed=seed + 2 * frame, frame=frame) for frame in range(plan.frames)]
 
 
-def _workspace(plan: Plan, exposures: Sequence[Exposure], memory: int | None) -> Workspace:
+def _workspace(plan: Plan, exposures: Sequence[Exposure], budget: Budget) -> Workspace:
     return Workspace.beside(
         plan.seen.width,
         plan.seen.height,
         plan.channels,
         pictures=min(len(exposures), 2),  # the frames' sum, and one of them
         rays_per_pixel=exposures[0].rays_per_pixel,
-        memory=memory,
+        budget=budget,
     )
 
 

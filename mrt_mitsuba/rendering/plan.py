@@ -25,7 +25,7 @@ _WHY = {
     "one-sample": "aa=1 has no further samples to add",
     "all-samples": "aamode=none gives every pixel all its samples",
     "no-focus": "no focal distance",
-    "unused": "nothing needs it",
+    "not-needed": "nothing needs it",
     "not-asked-for": "not asked for",
 }
 
@@ -78,10 +78,12 @@ class Pass:
 
     def __str__(self) -> str:
         times = f", {self.repeats} rays each" if self.repeats > 1 else ""
+        shown = [name for name in LAYERS if name in self.layers]
+        layers = f", with {', '.join(shown)}" if shown else ""
         noise = ", noise will count as edges: variance needs spp >= 2" if self.noisy else ""
         return {
-            FIRST_HITS: "first hits: 1 ray through the centre of a pixel",
-            RENDERING: f"{self.samples} sample{'s' if self.samples > 1 else ''} a pixel{times}",
+            FIRST_HITS: f"first hits: 1 ray through the centre of a pixel{layers}",
+            RENDERING: f"{self.samples} sample{'s' if self.samples > 1 else ''} a pixel{times}{layers}",
             EDGES: f"edges: {self.mode}{noise}",
             REFINEMENT: f"{self.samples} further samples in edge pixels{times}",
             BLUR: f"depth of field: {self.mode}",
@@ -249,6 +251,6 @@ def _left_out(
     if BLUR not in made:
         left_out.append(Omission(BLUR, "no-focus"))
     if "depth" not in traced:
-        left_out.append(Omission("depth", "unused"))
+        left_out.append(Omission("depth", "not-needed"))
     skipped = [name for name in LAYERS if name in facts.layers - traced - {"depth"}]
     return left_out + [Omission(name, "not-asked-for") for name in skipped]

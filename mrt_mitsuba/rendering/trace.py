@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from mrt_mitsuba.memory import Workspace
 from mrt_mitsuba.output.layers import AVERAGED, FIRST_HIT, TABLE
 from mrt_mitsuba.output.layers import channels as channel_count
 from mrt_mitsuba.rays.bundle import Bundle, Samples
 from mrt_mitsuba.rays.sampler import ray_sampler
-from mrt_mitsuba.rendering.memory import Workspace
 from mrt_mitsuba.rendering.shading import Shader
 from mrt_mitsuba.rendering.view import View
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.memory import BYTES_PER_CHANNEL_OF_RAY, Workspace
 from mrt_mitsuba.rays.bundle import Bundle
 from mrt_mitsuba.rays.lattice import Lattice
-from mrt_mitsuba.rendering.memory import BYTES_PER_CHANNEL_OF_RAY, Workspace
 from mrt_mitsuba.rendering.shading import shader_for
 from mrt_mitsuba.rendering.trace import Tracer
 from mrt_mitsuba.rendering.view import View
