@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 
 class LayeredIntegrator(ABC):
-    """An integrator that plans its kernels and returns layers beside the picture."""
+    """An integrator that plans its kernels and returns layers with the picture."""
+
+    plugin_name: str  # by which it is registered
 
     @abstractmethod
     def provided_layers(self) -> frozenset[str]:
