@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mrt_mitsuba.errors import OutputError, UsageError
 from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.progress import Advance, Progress, TerminalProgress
+from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps import cluster as clusters
 from mrt_mitsuba.sweeps.cluster import ClusterError
 from mrt_mitsuba.sweeps.grid import Job, jobs
@@ -18,7 +19,7 @@ from mrt_mitsuba.sweeps.scenes import check_parameters, fingerprint, send
 from mrt_mitsuba.sweeps.sheet import MOST, write_sheet
 from mrt_mitsuba.sweeps.table import FILE as TABLE
 from mrt_mitsuba.sweeps.table import Table
-from mrt_mitsuba.sweeps.worker import TOPIC, House, Task, is_fresh, named, render_task, thumbnail, versions
+from mrt_mitsuba.sweeps.worker import TOPIC, House, Task, is_fresh, named, render_task, thumbnail
 
 if TYPE_CHECKING:
     from distributed import Client, Future

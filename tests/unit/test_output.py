@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtWarning, OutputError
 from mrt_mitsuba.output import files as output
 from mrt_mitsuba.output.replacing import check_target
@@ -70,7 +71,7 @@ def test_exr_holds_every_bit(tmp_path: Path, image: np.ndarray) -> None:
     layers = {"depth.Z": image[:, :, 0], "normal": image, "albedo": image * 2, "samples": image[:, :, 1]}
     header = {
         "mrt:version": "1",
-        "mrt:seconds": 1.5,
+        "mrt:alpha": 1.5,
         "mrt:scene": "4",
         "mrt:options": {"aa": 4, "layers": ["depth"]},
     }
@@ -85,7 +86,7 @@ def test_exr_holds_every_bit(tmp_path: Path, image: np.ndarray) -> None:
     for name, values in expected.items():
         np.testing.assert_array_equal(back.layers[name], values, err_msg=name)
     assert back.header["mrt:options"] == '{"aa": 4, "layers": ["depth"]}'
-    assert back.header["mrt:seconds"] == 1.5
+    assert back.header["mrt:alpha"] == 1.5
 
 
 def test_exr_is_the_same_file_twice(tmp_path: Path, image: np.ndarray) -> None:
@@ -304,3 +305,30 @@ def test_a_forked_process_can_write_too(tmp_path: Path, image: np.ndarray) -> No
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
+SENSORS = {
+    "plain": {"type": "perspective", "fov": 40},
+    "vertical": {"type": "perspective", "fov": 30, "fov_axis": "y"},
+    "lens": {"type": "thinlens", "fov": 50, "aperture_radius": 0.1},
+    "shifted": {"type": "perspective", "principal_point_offset_x": 0.2, "principal_point_offset_y": -0.1},
+}
+
+
+@pytest.mark.parametrize("crop", [{}, {"crop_width": 10, "crop_height": 8, "crop_offset_x": 3}])
+@pytest.mark.parametrize("name", SENSORS)
+def test_matrices_of_the_header_lead_from_rays_to_the_picture(variant: str, name: str, crop: dict) -> None:
+    """A point on the ray through a place of the picture comes back to this place, and the camera sees it."""
+    import mitsuba as mi
+
+    to_world = mi.ScalarTransform4f().look_at([3, 2, 5], [0, 0.5, 0], [0.1, 1, 0])
+    film = {"type": "hdrfilm", "width": 40, "height": 20, **crop}
+    scene = {"type": "scene", "sensor": {**SENSORS[name], "to_world": to_world, "film": film}}
+    header = mrt.render(scene, aa=1, aamode="none").header()
+    sensor = mi.load_dict(scene).sensors()[0]
+    for place in ((0.5, 0.5), (0.1, 0.9), (0.8, 0.3)):
+        ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(place), mi.Point2f(0.5))
+        point = np.append(np.array(ray(7.0)).ravel(), 1.0)
+        x, y, _, w = point @ header["worldToNDC"]
+        np.testing.assert_allclose((x / w, y / w), place, atol=1e-5)  # float32
+        assert (point @ header["worldToCamera"])[2] < 0
