@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from mrt_mitsuba.rendering.api import render as render
     from mrt_mitsuba.runtime import register as register
     from mrt_mitsuba.scene.export import scene_dict as scene_dict
+    from mrt_mitsuba.validation.checks.bsdf import check_bsdf as check_bsdf
+    from mrt_mitsuba.validation.checks.shape import check_shape as check_shape
     from mrt_mitsuba.validation.studies.roughconductor import compare_roughconductor as compare_roughconductor
 
 # Where each public name lives; the module is imported when the name is first used.
@@ -34,6 +36,8 @@ _HOME = {
     "SceneError": "mrt_mitsuba.errors",
     "UsageError": "mrt_mitsuba.errors",
     "VariantError": "mrt_mitsuba.errors",
+    "check_bsdf": "mrt_mitsuba.validation.checks.bsdf",
+    "check_shape": "mrt_mitsuba.validation.checks.shape",
     "compare_roughconductor": "mrt_mitsuba.validation.studies.roughconductor",
     "register": "mrt_mitsuba.runtime",
     "render": "mrt_mitsuba.rendering.api",
