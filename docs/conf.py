@@ -51,7 +51,7 @@ def generate(app: object) -> None:
 
 def options_list() -> str:
     """The options of the command as a list."""
-    from mrt_mitsuba.rendering import options
+    from mrt_mitsuba.command import options
 
     lines = []
     for name, field in options.TABLE.items():

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mrt_mitsuba.command import main as cli
-from mrt_mitsuba.rendering import options
+from mrt_mitsuba.command import options
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
 SIZE = "width=400 height=300"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 
 from mrt_mitsuba import llvm
+from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, UnknownVariantError, VariantError
 
 FAST = "llvm_ad_rgb"
@@ -37,6 +38,7 @@ def use(variant: str | None = None) -> str:
             mi.set_variant(variant)
         except ImportError as error:
             raise VariantError(f"the variant {variant} cannot be used: {error}") from error
+        _keep_to_quota()
     _register_plugins()
     return variant
 
@@ -113,6 +115,14 @@ def _cuda_obstacle() -> str | None:
     return f"it needs an NVIDIA GPU with its driver, and none was found. Use {FAST} or {SLOW}."
 
 
+def _keep_to_quota() -> None:
+    """Let Dr.Jit have no more threads than cores: by itself it does not look at quotas of control groups."""
+    import drjit as dr
+
+    if dr.thread_count() > usable_cores():
+        dr.set_thread_count(usable_cores())
+
+
 def _unknown(variant: str, known: list[str]) -> str:
     import difflib
 
@@ -123,5 +133,7 @@ def _unknown(variant: str, known: list[str]) -> str:
 
 def _register_plugins() -> None:
     from mrt_mitsuba import plugins
+    from mrt_mitsuba.scene.loading import mitsuba_first
 
+    mitsuba_first()
     plugins.register()

@@ -15,7 +15,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, Any
 
+from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
+from mrt_mitsuba.output.layers import LAYERS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,18 +27,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# The layers of an EXR and their channels, in the order in which the last axis of an array holds them.
-LAYERS = {
-    "depth": "Z",
-    "normal": "XYZ",
-    "albedo": "RGB",
-    "edges": "Y",
-    "samples": "Y",
-    "blur": "Y",
-    "direct": "RGB",
-    "reflection": "RGB",
-    "bounces": "Y",
-}
 _unfinished: set[str] = set()  # temporary files
 _PIXELS = 2**18  # converted to 8 bit at a time, to bound the memory of intermediate arrays
 
@@ -112,7 +102,7 @@ def _compressing() -> Iterator[None]:
     import OpenEXR
 
     before = OpenEXR.global_thread_count()
-    OpenEXR.set_global_thread_count(os.cpu_count() or 1)
+    OpenEXR.set_global_thread_count(usable_cores())
     try:
         yield
     finally:
@@ -134,6 +124,22 @@ class _Stream:
 def read_exr(path: str | os.PathLike[str]) -> Picture:
     """Read an EXR with the channels R, G, B; raise ``OutputError`` if there is none or it is broken."""
     import numpy as np
+
+    planes, header = _read(path)
+    missing = [channel for channel in "RGB" if channel not in planes]
+    if missing:
+        raise OutputError(f"cannot read {os.fspath(path)}: it has no channel {missing[0]!r}")
+    image = np.stack([planes.pop(channel) for channel in "RGB"], axis=-1)  # [H, W, 3]
+    return Picture(image, planes, header)
+
+
+def read_channels(path: str | os.PathLike[str]) -> dict[str, Image]:
+    """Read every channel of an EXR, [H, W] float32 by name; raise ``OutputError`` if it is none or broken."""
+    return _read(path)[0]
+
+
+def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Image], dict[str, Any]]:
+    import numpy as np
     import OpenEXR
 
     name = os.fspath(path)
@@ -142,14 +148,11 @@ def read_exr(path: str | os.PathLike[str]) -> Picture:
             file.read(1)
         part = OpenEXR.File(name, separate_channels=True)
         planes = {key: np.asarray(value.pixels, np.float32) for key, value in part.channels().items()}
-        image = np.stack([planes.pop(channel) for channel in "RGB"], axis=-1)  # [H, W, 3]
-    except KeyError as error:
-        raise OutputError(f"cannot read {name}: it has no channel {error}") from error
+        return planes, dict(part.header())
     except OSError as error:
         raise OutputError(f"cannot read {name}: {error.strerror or error}") from error
     except (RuntimeError, ValueError, TypeError) as error:
         raise OutputError(f"cannot read {name}: not a whole EXR ({error})") from error
-    return Picture(image, planes, dict(part.header()))
 
 
 def to_8bit(image: Image, tonemap: str = "report") -> NDArray[np.uint8]:
@@ -213,7 +216,7 @@ def _channels(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
         if array.shape[:2] != np.shape(image)[:2] or array.ndim not in (2, 3):
             raise OutputError(f"layer {name} of shape {array.shape} does not fit the picture")
         array = np.atleast_3d(array)
-        letters = LAYERS.get(name, "RGB" if array.shape[2] == 3 else "Y")
+        letters = LAYERS[name].letters if name in LAYERS else "RGB" if array.shape[2] == 3 else "Y"
         names = [name] if "." in name else [f"{name}.{letter}" for letter in letters]
         if len(names) != array.shape[2]:
             raise OutputError(f"layer {name} has {array.shape[2]} channels in place of {len(names)}")

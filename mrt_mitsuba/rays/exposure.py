@@ -1,4 +1,4 @@
-"""The time while the shutter is open: how it is cut into frames, and when the rays of a pixel are traced."""
+"""The time while the shutter is open: how it is divided into frames, and what is traced for each."""
 
 from __future__ import annotations
 
@@ -6,66 +6,53 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from mrt_mitsuba.rays.bundle import Bundle, Lattice, Shutter
-from mrt_mitsuba.rendering.plan import Plan
-
-CENTRE = Lattice("report", 1)
+from mrt_mitsuba.rays.bundle import Bundle
+from mrt_mitsuba.rays.lattice import CENTRE, Lattice
+from mrt_mitsuba.rays.shutter import Shutter
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """One picture while the shutter is open. ``frame``: which of the plan's frames, or None for all of the
-    time."""
+    """The rays of one picture while the shutter is open."""
 
-    plan: Plan
+    samples: Lattice
+    repeats: int  #: rays for each sample
+    motion: str | None  #: "frames", "stratified", or None where the camera stands still
+    moments: int  #: of the whole time
     seed: int
-    frame: int | None = None
+    frame: int | None = None  #: number of the only moment that is seen, or None for all of them
 
     def lattice(self, pixels: Any, *, first: int = 0) -> Bundle:
-        """The lattice's samples from ``first`` on."""
-        plan, count = self.plan, self.plan.lattice.count - first
-        if plan.motion == "stratified":
+        """Return the lattice's samples from ``first`` on."""
+        count, repeats, shutter = self.samples.count - first, self.repeats * self._moments, self._shutter
+        if self.motion == "stratified":
             # every ray of a pixel in a part of its own
-            repeats = plan.repeats * math.ceil(plan.motion_samples / (count * plan.repeats))
-            return Bundle(
-                pixels, plan.lattice, first, count, repeats, Shutter(count * repeats, seed=self.seed)
-            )
-        return Bundle(pixels, plan.lattice, first, count, plan.repeats * self._moments, self._shutter)
+            repeats = self.repeats * math.ceil(self.moments / (count * self.repeats))
+            shutter = Shutter(count * repeats, seed=self.seed)
+        return Bundle(pixels, self.samples, first, count, repeats, shutter)
 
     def centre(self, pixels: Any) -> Bundle:
-        """The pixel's centre alone, at the same times in every pixel: a detector must see no noise."""
-        return Bundle(pixels, CENTRE, repeats=self.plan.repeats * self._moments, shutter=self._shutter)
+        """Return the pixel's centre alone, at the same times in every pixel: a detector must see no noise."""
+        return Bundle(pixels, CENTRE, repeats=self.repeats * self._moments, shutter=self._shutter)
 
     def first_hit(self, pixels: Any) -> Bundle:
-        """The pixel's centre when the shutter opens, or at the moment of the frame."""
-        still = self.plan.motion is None
-        return Bundle(
-            pixels,
-            CENTRE,
-            shutter=None if still else Shutter(1, (self.frame or 0) / self.plan.motion_samples),
-        )
+        """Return the pixel's centre when the shutter opens, or at the moment of the frame."""
+        shutter = None if self.motion is None else Shutter(1, (self.frame or 0) / self.moments)
+        return Bundle(pixels, CENTRE, shutter=shutter)
 
     @property
     def rays_per_pixel(self) -> int:
-        """Of the pass that traces the most."""
+        """Rays of a pixel in the pass that traces the most."""
         return self.lattice(range(0)).rays_per_pixel
 
     @property
     def _moments(self) -> int:
-        return self.plan.motion_samples if self.frame is None else 1
+        return self.moments if self.frame is None else 1
 
     @property
     def _shutter(self) -> Shutter | None:
-        if self.plan.motion is None:
+        if self.motion is None:
             return None
         if self.frame is not None:
-            return Shutter(1, self.frame / self.plan.motion_samples)
-        return Shutter(self._moments, 0.0 if self.plan.motion == "frames" else 0.5)
-
-
-def exposures(plan: Plan, seed: int) -> list[Exposure]:
-    """What to average: one picture, or the frames of a camera's way where each needs filters of its own."""
-    if plan.motion == "frames" and (plan.detector or plan.blur):
-        # two passes in a frame, each with random numbers of its own
-        return [Exposure(plan, seed + 2 * frame, frame) for frame in range(plan.motion_samples)]
-    return [Exposure(plan, seed)]
+            return Shutter(1, self.frame / self.moments)
+        return Shutter(self._moments, 0.0 if self.motion == "frames" else 0.5)

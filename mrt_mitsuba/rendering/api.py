@@ -1,29 +1,31 @@
 """``render``: a scene in, a picture out.
 
-scene → plan → rays → integrator → filters → result; each step is a module, this one puts them in order.
+scene → facts → plan → rays → integrator → filters → result: each step is a module, this one orders them.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.output.files import LAYERS
+from mrt_mitsuba.output.layers import AVERAGED, TABLE
 from mrt_mitsuba.output.result import Result, Timings
-from mrt_mitsuba.rays.bundle import Lattice
-from mrt_mitsuba.rays.exposure import Exposure, exposures
-from mrt_mitsuba.rendering import options
+from mrt_mitsuba.rays.exposure import Exposure
 from mrt_mitsuba.rendering.job import Job, counting_kernels
 from mrt_mitsuba.rendering.memory import Workspace
-from mrt_mitsuba.rendering.passes import Focus, Frame
-from mrt_mitsuba.rendering.plan import Features, Plan, make_plan, stock_features, whitted_features
+from mrt_mitsuba.rendering.passes import Passes
+from mrt_mitsuba.rendering.plan import Plan, RenderFacts, make_plan
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.rendering.trace import AVERAGED, Camera, Tracer, WhittedTracer
+from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.rendering.shading import Shader, shader_for
+from mrt_mitsuba.rendering.trace import Tracer
+from mrt_mitsuba.rendering.view import View
 from mrt_mitsuba.scene.open import Source, open_scene
 
 log = logging.getLogger(__name__)
@@ -52,6 +54,7 @@ def render(
     integrator: Any = None,
     spp: int = 1,
     count_rays: bool = False,
+    params: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Result:
     """Render a scene.
@@ -81,6 +84,7 @@ def render(
             know the variance of every pixel and take only for an edge what noise does not explain; with one
             random ray they take noise for edges, and refine it ("geometry" does not).
         count_rays: count mirror and shadow rays.
+        params: values of the scene's parameters by their ``mi.traverse`` key, set once it is loaded.
         progress: told of plan, stages and progress.
 
     Raises:
@@ -88,111 +92,125 @@ def render(
         SceneError: for a scene that cannot be read.
         VariantError: for a variant that cannot run here.
     """
+    settings = RenderSettings.of(
+        width=width,
+        height=height,
+        aa=aa,
+        aamode=aamode,
+        lattice=lattice,
+        fresnel=fresnel,
+        focaldist=focaldist,
+        focalrange=focalrange,
+        dof=dof,
+        layers=layers,
+        motion=motion,
+        motionsamples=motionsamples,
+        motionmode=motionmode,
+        convention=convention,
+        variant=variant,
+        memory=memory,
+        seed=seed,
+        integrator=integrator,
+        spp=spp,
+        count_rays=count_rays,
+        params=params,
+    )
+    return render_with(scene, settings, Progress() if progress is None else progress)
+
+
+def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Result:
+    """Render a scene as ``render`` does."""
     start = time.perf_counter()
-    arguments = {name: value for name, value in locals().items() if name in options.TABLE and name != "scene"}
-    given = {name: options.check(name, value) for name, value in arguments.items()}
-    progress = Progress() if progress is None else progress
     with counting_kernels() as kernels:
-        variant = runtime.use(variant)
+        variant = runtime.use(settings.variant)
         runtime.warn_if_slow()
         source = open_scene(
             scene,
-            width=given["width"],
-            height=given["height"],
-            fresnel=given["fresnel"],
-            convention=given["convention"],
-            integrator=integrator,
+            width=settings.width,
+            height=settings.height,
+            fresnel=settings.fresnel,
+            convention=settings.convention,
+            integrator=settings.integrator,
+            params=settings.params,
         )
-        tracer, features = _tracer(source)
-        focus = _focus(source, given["focaldist"], given["focalrange"])
-        plan = make_plan(
-            scene=source.name,
-            variant=variant,
-            integrator=_name(source.integrator),
-            width=source.width,
-            height=source.height,
-            lattice=Lattice(given["lattice"], given["aa"]),
-            aamode=given["aamode"],
-            focal_distance=focus.distance,
-            dof=given["dof"],
-            layers=frozenset(given["layers"]),
-            count_rays=count_rays,
-            repeats=given["spp"],
-            motion=given["motionmode"] if given["motion"] else None,
-            motion_samples=given["motionsamples"],
-            random=tracer.random,
-            features=features,
-        )
-        takes = exposures(plan, given["seed"])
-        job = Job(progress, _workspace(plan, takes, given["memory"]))
+        shader = shader_for(source.scene, source.integrator)
+        plan = make_plan(_facts(source, shader, variant, settings), settings)
+        exposures = _exposures(plan, settings.seed)
+        job = Job(progress, _workspace(plan, exposures, settings.memory))
         progress.plan(plan)
+        shader.prepare(plan.kernel)
         load = time.perf_counter() - start
         log.info("scene %s loaded in %.3f s for %s", source.name, load, variant)
-        camera = Camera(source.sensor, source.width, source.height, given["motion"])
-        frames = _Frames()
-        for exposure in takes:
-            frames.add(Frame(job, tracer, camera, plan, focus, exposure).render())
+        view = View(source.sensor, source.width, source.height, settings.motion)
+        tracer = Tracer(shader, view, job.workspace)
+        total: dict[str, np.ndarray] = {}
+        for exposure in exposures:
+            _add(total, Passes(job, tracer, plan, exposure).run())
     log.info("%d kernels: compiled in %.3f s, ran for %.3f s", kernels.launches, kernels.compile, kernels.run)
     timings = Timings(time.perf_counter() - start, load, kernels.compile, kernels.run, job.passes)
-    shown = {
-        name: value for name, value in given.items() if value is not None and name not in ("memory", "quiet")
-    }
-    image, planes = frames.mean(plan)
-    return Result(image, planes, plan, timings, job.rays, kernels.launches, shown)
+    options = settings.in_force(
+        width=plan.width,
+        height=plan.height,
+        fresnel=source.fresnel,
+        focaldist=plan.focus.distance or 0.0,
+        focalrange=plan.focus.range,
+        variant=variant,
+    )
+    image, layers = _mean(total, plan)
+    return Result(image, layers, plan, timings, tracer.rays, kernels.launches, options)
 
 
-def _focus(source: Source, distance: float | None, reach: float | None) -> Focus:
-    distance = source.focal_distance if distance is None else distance
-    return Focus(distance or None, source.focal_range if reach is None else reach)
+def _facts(source: Source, shader: Shader, variant: str, settings: RenderSettings) -> RenderFacts:
+    return RenderFacts(
+        scene=source.name,
+        variant=variant,
+        integrator=shader.name,
+        width=source.width,
+        height=source.height,
+        focus=settings.focus(source.focal_distance, source.focal_range),
+        layers=shader.layers,
+        random=shader.random,
+        kernel=shader.kernel,
+        parts=shader.facts,
+    )
 
 
-def _workspace(plan: Plan, takes: Sequence[Exposure], memory: int | None) -> Workspace:
+def _exposures(plan: Plan, seed: int) -> list[Exposure]:
+    """Return what to average: one picture, or the frames of a camera's way if each needs its own filters."""
+    whole = Exposure(plan.lattice, plan.repeats, plan.motion, plan.motion_samples, seed)
+    if plan.frames == 1:
+        return [whole]
+    # two passes in a frame, each with random numbers of its own
+    return [replace(whole, seed=seed + 2 * frame, frame=frame) for frame in range(plan.frames)]
+
+
+def _workspace(plan: Plan, exposures: Sequence[Exposure], memory: int | None) -> Workspace:
     return Workspace.beside(
         plan.width,
         plan.height,
         plan.channels,
-        pictures=min(len(takes), 2),  # the frames' sum, and one of them
-        rays_per_pixel=takes[0].rays_per_pixel,
+        pictures=min(len(exposures), 2),  # the frames' sum, and one of them
+        rays_per_pixel=exposures[0].rays_per_pixel,
         memory=memory,
     )
 
 
-def _tracer(source: Source) -> tuple[Tracer, Features]:
-    if hasattr(source.integrator, "trace"):
-        tracer = WhittedTracer(source.scene, source.integrator)
-        return tracer, whitted_features(source.integrator, tracer.prepared)
-    return Tracer(source.scene, source.integrator), stock_features(source.integrator)
+def _add(total: dict[str, np.ndarray], picture: dict[str, np.ndarray]) -> None:
+    """Add a picture's averaged layers to the total; of others, those of the first picture stay."""
+    for name, values in picture.items():
+        if name not in total:
+            total[name] = values
+        elif TABLE[name].source == AVERAGED:
+            total[name] += values
 
 
-def _name(integrator: Any) -> str:
-    """Mitsuba does not tell a plugin's name, and calls every integrator from Python a SamplingIntegrator."""
-    return "mrt_whitted" if hasattr(integrator, "trace") else integrator.class_name()
-
-
-class _Frames:
-    """The mean of the frames of a motion-blurred render, or the only frame."""
-
-    def __init__(self) -> None:
-        self._sum: dict[str, np.ndarray] = {}
-        self._count = 0
-
-    def add(self, frame: dict[str, np.ndarray]) -> None:
-        """Add a frame; of layers that name a point, the first frame's stay."""
-        for name, values in frame.items():
-            if self._count == 0:
-                self._sum[name] = values
-            elif name in AVERAGED:
-                self._sum[name] += values
-        self._count += 1
-
-    def mean(self, plan: Plan) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """The picture [H, W, 3], and its layers by EXR channel name, [H, W] each; those that nobody asked for
-        only if free. All are views."""
-        shape, layers = (plan.height, plan.width), {}
-        for name, values in self._sum.items():
-            if name in AVERAGED and self._count > 1:
-                values /= np.float32(self._count)
-            if name in plan.returned_layers:
-                for index, letter in enumerate(LAYERS[name]):
-                    layers[f"{name}.{letter}"] = values[:, index].reshape(shape)
-        return self._sum["image"].reshape(*shape, 3), dict(sorted(layers.items()))
+def _mean(total: dict[str, np.ndarray], plan: Plan) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the mean picture [H, W, 3] and its layers by EXR channel, [H, W] each; all are views."""
+    shape, layers = (plan.height, plan.width), {}
+    for name, values in total.items():
+        if TABLE[name].source == AVERAGED and plan.frames > 1:
+            values /= np.float32(plan.frames)
+        if name in plan.layers:
+            for index, letter in enumerate(TABLE[name].letters):
+                layers[f"{name}.{letter}"] = values[:, index].reshape(shape)
+    return total["image"].reshape(*shape, 3), dict(sorted(layers.items()))

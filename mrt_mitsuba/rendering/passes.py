@@ -1,100 +1,84 @@
 """One picture, pass by pass: its rays, its edges, further samples there, depth of field.
 
-Whatever a pass does, it does in parts that fit into memory beside the picture, and the picture does not show
-them: rays know nothing of each other, and a filter sees as many rows around a band as it looks at.
+Every pass works in parts that fit into memory next to the picture, and the result does not depend on them:
+rays are independent of each other, and a filter sees as many rows around a band as it reads.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from mrt_mitsuba.output.layers import TABLE
+from mrt_mitsuba.rays.bundle import Bundle
 from mrt_mitsuba.rays.exposure import Exposure
+from mrt_mitsuba.rendering.detectors import DETECTORS
 from mrt_mitsuba.rendering.job import Job
-from mrt_mitsuba.rendering.plan import Plan
-from mrt_mitsuba.rendering.trace import AVERAGED, CHANNELS, FIRST_HIT, Camera, Planes, Tracer
+from mrt_mitsuba.rendering.plan import BLUR, EDGES, FIRST_HITS, REFINEMENT, RENDERING, Pass, Plan
+from mrt_mitsuba.rendering.trace import Channels, Tracer
 
 
-@dataclass(frozen=True)
-class Focus:
-    """The distance in focus, None for no blur, and half the width of the sharp zone, in scene units."""
-
-    distance: float | None
-    range: float
-
-
-class Frame:
+class Passes:
     """A picture in the making. ``layers``: by name, [pixels, channels] float32, row by row from the top."""
 
-    def __init__(
-        self, job: Job, tracer: Tracer, camera: Camera, plan: Plan, focus: Focus, exposure: Exposure
-    ) -> None:
-        self._job, self._tracer, self._camera = job, tracer, camera
-        self._plan, self._focus, self._exposure = plan, focus, exposure
+    def __init__(self, job: Job, tracer: Tracer, plan: Plan, exposure: Exposure) -> None:
+        self._job, self._tracer = job, tracer
+        self._plan, self._exposure = plan, exposure
         self._shape = plan.height, plan.width
         self._pixels = range(plan.width * plan.height)
         self.layers: dict[str, np.ndarray] = {}
 
-    def render(self) -> dict[str, np.ndarray]:
-        """Run the passes; return the layers."""
-        wanted = self._plan.traced_layers | {"image"}
-        if self._plan.detector is None:
-            self._all_samples(wanted)
-        else:
-            self._trace("Rendering", self._exposure.centre(self._pixels), wanted)
-            edges = self._detect()
-            if self._plan.lattice.count > 1:
-                self._refine(edges)
-        if self._plan.blur:
-            self._blur()
+    def run(self) -> dict[str, np.ndarray]:
+        """Run the passes of the plan; return the layers."""
+        run = {
+            FIRST_HITS: self._first_hits,
+            RENDERING: self._render,
+            EDGES: self._detect,
+            REFINEMENT: self._refine,
+            BLUR: self._blur,
+        }
+        for step in self._plan.passes:
+            run[step.name](step)
+        if "samples" in self._plan.layers and "samples" not in self.layers:
+            self._add("samples")[:] = self._plan.lattice.count
         return self.layers
 
     # --------------------------------------------- Rays ---------------------------------------------
 
-    def _all_samples(self, wanted: frozenset[str]) -> None:
-        """Every sample of every pixel; layers of the first hit belong to the pixel's centre."""
-        lattice, at_centre = self._plan.lattice, wanted & FIRST_HIT.keys()
-        if at_centre and not lattice.holds_centre:
-            self._trace("First hits", self._exposure.first_hit(self._pixels), at_centre)
-            wanted -= at_centre
-        self._trace("Rendering", self._exposure.lattice(self._pixels), wanted)
-        if "samples" in self._plan.returned_layers:
-            self._add("samples", 1)[:] = lattice.count
+    def _first_hits(self, step: Pass) -> None:
+        self._trace_all(step, self._exposure.first_hit(self._pixels))
 
-    def _trace(self, title: str, bundle: Any, wanted: frozenset[str]) -> None:
+    def _render(self, step: Pass) -> None:
+        source = self._exposure.centre if self._plan.detector else self._exposure.lattice
+        self._trace_all(step, source(self._pixels))
+
+    def _trace_all(self, step: Pass, bundle: Bundle) -> None:
         """Trace all pixels; their layers are new."""
-        for name in wanted:
-            self._add(name, CHANNELS[name])
-        with self._job.stage(title, len(bundle.pixels)) as advance:
-            parts = self._job.trace(self._tracer, self._camera, bundle, wanted, seed=self._exposure.seed)
-            for pixels, planes in parts:
+        for name in step.layers:
+            self._add(name)
+        with self._job.stage(step.name, len(bundle.pixels)) as advance:
+            for pixels, values in self._tracer.trace(bundle, step.layers, seed=self._exposure.seed):
                 rows = slice(pixels.start, pixels.stop)
-                for name, channel, plane in _channels(planes):
+                for name, channel, plane in _channels(values):
                     self.layers[name][rows, channel] = plane
                 advance(len(pixels))
 
-    def _refine(self, count: int) -> None:
-        """Add the lattice's other samples in the pixels at edges, so many; the first sample is not traced
-        again."""
-        lattice = self._plan.lattice
-        first = 1 if lattice.holds_centre else 0
-        wanted = frozenset(self.layers.keys() & AVERAGED.keys())
-        with self._job.stage("Anti-aliasing", count, "Computing Anti aliasing..") as advance:
+    def _refine(self, step: Pass) -> None:
+        """Add the lattice's other samples in the pixels at edges."""
+        count, seed = np.count_nonzero(self.layers["samples"] > 1), self._exposure.seed + 1
+        with self._job.stage(step.name, int(count), "Computing Anti aliasing..") as advance:
             for before, edges in self._edges():
-                bundle = self._exposure.lattice(edges, first=first)
-                seed = self._exposure.seed + 1
-                parts = self._job.trace(self._tracer, self._camera, bundle, wanted, seed=seed, before=before)
-                for pixels, planes in parts:
-                    for name, channel, plane in _channels(planes):
-                        total = first * self.layers[name][pixels, channel] + bundle.count * plane
-                        self.layers[name][pixels, channel] = total / np.float32(lattice.count)
+                bundle = self._exposure.lattice(edges, first=step.first)
+                for pixels, values in self._tracer.trace(bundle, step.layers, seed=seed, before=before):
+                    for name, channel, plane in _channels(values):
+                        total = step.first * self.layers[name][pixels, channel] + bundle.count * plane
+                        self.layers[name][pixels, channel] = total / np.float32(self._plan.lattice.count)
                     advance(len(pixels))
 
     def _edges(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Some rows of the picture at a time: how many edge pixels came before, and the indices of these."""
+        """Yield edge pixels, some rows at a time: how many came before, and their indices."""
         samples, step = self.layers["samples"][:, 0], self._rows_at_once * self._plan.width
         before = 0
         for start in range(0, len(samples), step):
@@ -105,50 +89,48 @@ class Frame:
 
     # -------------------------------------------- Filters --------------------------------------------
 
-    def _detect(self) -> int:
-        """Look for edges, note how many samples each pixel is due, and return the number of edge pixels."""
+    def _detect(self, step: Pass) -> None:
+        """Look for edges, and note how many samples each pixel is due."""
         from mrt_mitsuba.filters.edges import REACH
 
-        count = 0
-        edges, samples = (self._add(name, 1).reshape(self._shape) for name in ("edges", "samples"))
-        with self._job.stage("Edges", len(self._pixels)) as advance:
+        edges, samples = (self._add(name).reshape(self._shape) for name in ("edges", "samples"))
+        with self._job.stage(step.name, len(self._pixels)) as advance:
             for band in self._bands(REACH):
-                found = self._find_edges(band.seen)
+                found = self._find_edges(step.mode, band.seen)
                 mask = found.mask[band.inner]
                 edges[band.rows] = found.value[band.inner]
                 samples[band.rows] = np.where(mask, np.float32(self._plan.lattice.count), np.float32(1))
-                count += int(np.count_nonzero(mask))
                 advance(mask.size)
         self.layers.pop("square", None)
-        return count
 
-    def _find_edges(self, rows: slice) -> Any:
+    def _find_edges(self, detector: str, rows: slice) -> Any:
         from mrt_mitsuba import filters
 
-        if self._plan.detector == "geometry":
-            return filters.geometry_edges(self._picture("normal")[rows], self._picture("depth")[rows, :, 0])
-        image, variance = self._picture("image")[rows], None
+        read = [self._picture(name)[rows] for name in DETECTORS[detector].reads]
+        options = {}
         if "square" in self.layers:
             rays = self._exposure.centre(self._pixels).rays_per_pixel
-            variance = np.maximum(self._picture("square")[rows] - image**2, 0) / (rays - 1)
-        detect = filters.luma_edges if self._plan.detector == "luma" else filters.sobel_edges
-        return detect(image, variance=variance)
+            options["variance"] = np.maximum(self._picture("square")[rows] - read[0] ** 2, 0) / (rays - 1)
+        return getattr(filters, f"{detector}_edges")(*read, **options)
 
-    def _blur(self) -> None:
+    def _blur(self, step: Pass) -> None:
         """Blur the picture in place; what the next band sees of this one is kept as it was."""
         from mrt_mitsuba import filters
         from mrt_mitsuba.filters.dof import REACH
 
-        focus: dict[str, Any] = {"focal_distance": self._focus.distance, "focal_range": self._focus.range}
-        image, depth = self._picture("image"), self._picture("depth")[:, :, 0]
-        amount = self._add("blur", 1).reshape(self._shape) if "blur" in self._plan.layers else None
+        focus: dict[str, Any] = {
+            "focal_distance": self._plan.focus.distance,
+            "focal_range": self._plan.focus.range,
+        }
+        image, depth = self._picture("image"), self._picture("depth")
+        amount = self._add("blur").reshape(self._shape) if "blur" in self._plan.layers else None
         above = image[:0]
-        with self._job.stage("Depth of field", len(self._pixels), "Computing depth of field..") as advance:
+        with self._job.stage(step.name, len(self._pixels), "Computing depth of field..") as advance:
             for band in self._bands(REACH):
                 sharp = image[band.start : band.bottom]
                 if len(above):
                     sharp = np.concatenate([above, sharp])
-                blurred = filters.gaussian_dof(sharp, depth[band.seen], **focus, mode=str(self._plan.blur))
+                blurred = filters.gaussian_dof(sharp, depth[band.seen], **focus, mode=step.mode)
                 above = sharp[: band.stop - band.top][-REACH:].copy()
                 image[band.rows] = blurred[band.inner]
                 if amount is not None:
@@ -168,18 +150,18 @@ class Frame:
 
     # -------------------------------------------- Layers --------------------------------------------
 
-    def _add(self, name: str, channels: int) -> np.ndarray:
-        """A new layer, 0 everywhere. All but the picture channel by channel, as an EXR wants them."""
-        size = len(self._pixels), channels
+    def _add(self, name: str) -> np.ndarray:
+        """Return a new layer, 0 everywhere; all but the picture channel by channel, as an EXR wants them."""
+        size = len(self._pixels), TABLE[name].channels
         self.layers[name] = np.zeros(size, np.float32, order="C" if name == "image" else "F")
         return self.layers[name]
 
     def _picture(self, name: str) -> np.ndarray:
-        """A view of a layer, [H, W, channels]."""
-        return self.layers[name].reshape(*self._shape, -1)
+        """Return a view of a layer, [H, W, channels], or [H, W] of a single channel."""
+        return self.layers[name].reshape(*self._shape, -1).squeeze(-1 if TABLE[name].channels == 1 else ())
 
 
-def _channels(planes: Planes) -> Iterator[tuple[str, int, np.ndarray]]:
-    for name, channels in planes.items():
+def _channels(values: Channels) -> Iterator[tuple[str, int, np.ndarray]]:
+    for name, channels in values.items():
         for channel, plane in enumerate(channels):
             yield name, channel, plane

@@ -2,20 +2,87 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from itertools import groupby
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.rays.bundle import Lattice
-from mrt_mitsuba.rendering.trace import CHANNELS
+from mrt_mitsuba.output import layers
+from mrt_mitsuba.output.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
+from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
+from mrt_mitsuba.rays.lattice import Lattice
+from mrt_mitsuba.rendering import kernel_text
+from mrt_mitsuba.rendering.detectors import DETECTORS
+from mrt_mitsuba.rendering.settings import Focus, RenderSettings
+
+# Passes over the picture, in the order in which they may occur
+FIRST_HITS, RENDERING, EDGES = "first hits", "rendering", "edges"
+REFINEMENT, BLUR = "anti-aliasing", "depth of field"
+
+_WHY = {
+    "one-sample": "aa=1 has no further samples to add",
+    "all-samples": "aamode=none gives every pixel all its samples",
+    "no-focus": "no focal distance",
+    "unused": "nothing needs it",
+    "not-asked-for": "not asked for",
+}
+
+
+@dataclass(frozen=True)
+class RenderFacts:
+    """What is known of a scene, its integrator and the variant before anything is decided."""
+
+    scene: str  #: its number or name
+    variant: str  #: of Mitsuba
+    integrator: str  #: name of its plugin
+    width: int  #: pixels
+    height: int  #: pixels
+    focus: Focus  #: the scene's own, or what was asked for
+    layers: frozenset[str]  #: that can be traced
+    random: bool  #: does the integrator draw random numbers
+    kernel: KernelPlan | None = None  #: decisions about the tracing kernels; None where nobody knows them
+    parts: SceneFacts | None = None  #: what they depend on
 
 
 @dataclass(frozen=True)
 class Omission:
-    """Something that exists in general, but not in this render, and why."""
+    """Something that exists in general, but not in this render."""
 
-    what: str
-    why: str
+    name: str  #: of a pass, a layer, or a field of the ``KernelPlan``
+    reason: str  #: a word for machines
+
+    @property
+    def what(self) -> str:
+        """The thing, in words."""
+        return "edge pass" if self.name == EDGES else kernel_text.WHAT.get(self.name, self.name)
+
+    @property
+    def why(self) -> str:
+        """The reason, in words."""
+        return _WHY.get(self.reason) or kernel_text.WHY[kernel_text.Reason(self.reason)]
+
+
+@dataclass(frozen=True)
+class Pass:
+    """A pass over the picture. ``str()`` shows it."""
+
+    name: str  #: ``FIRST_HITS``, ``RENDERING``, ``EDGES``, ``REFINEMENT`` or ``BLUR``
+    layers: frozenset[str] = frozenset()  #: that it traces
+    samples: int = 0  #: that it traces in a pixel
+    first: int = 0  #: number of the first one
+    repeats: int = 1  #: rays for each sample
+    mode: str = ""  #: of a filter
+    noisy: bool = False  #: does a filter take noise for edges
+
+    def __str__(self) -> str:
+        times = f", {self.repeats} rays each" if self.repeats > 1 else ""
+        noise = ", noise will count as edges: variance needs spp >= 2" if self.noisy else ""
+        return {
+            FIRST_HITS: "first hits: 1 ray through the centre of a pixel",
+            RENDERING: f"{self.samples} sample{'s' if self.samples > 1 else ''} a pixel{times}",
+            EDGES: f"edges: {self.mode}{noise}",
+            REFINEMENT: f"{self.samples} further samples in edge pixels{times}",
+            BLUR: f"depth of field: {self.mode}",
+        }[self.name]
 
 
 @dataclass(frozen=True)
@@ -30,183 +97,137 @@ class Plan:
     lattice: Lattice  #: where the samples of a pixel lie
     detector: str | None  #: edge detector; None where every pixel gets all samples at once
     blur: str | None  #: depth-of-field mode
+    focus: Focus  #: what is sharp
     repeats: int  #: rays for each sample
     motion: str | None  #: "frames", "stratified", or None where the camera stands still
     motion_samples: int  #: moments while the shutter is open
-    count_rays: bool  #: were they asked for
-    layers: frozenset[str]  #: asked for
-    traced_layers: frozenset[str]  #: what the tracing kernels return beside the picture
-    kernel: tuple[str, ...]  #: what the tracing kernels hold
-    passes: tuple[str, ...]  #: over the picture, in their order
-    left_out: tuple[Omission, ...] = field(default=())  #: what, and why
+    layers: frozenset[str]  #: that are returned
+    passes: tuple[Pass, ...]  #: over the picture, in their order
+    kernel: KernelPlan | None  #: what the tracing kernels hold; None where the integrator does not say
+    parts: SceneFacts | None  #: what the kernels depend on
+    left_out: tuple[Omission, ...] = ()  #: what, and why
 
     @property
-    def returned_layers(self) -> frozenset[str]:
-        """The layers that were asked for, and those that are known anyway."""
-        free = {"samples", "edges"} if self.detector else set()
-        if self.blur:
-            free |= {"depth"}
-        return self.layers | free
+    def traced(self) -> frozenset[str]:
+        """The layers that tracing kernels return."""
+        return frozenset().union(*(step.layers for step in self.passes))
 
     @property
     def channels(self) -> int:
         """Float32 channels kept for every pixel: the picture, its layers, and the detector's."""
-        sizes = CHANNELS | {"edges": 1, "samples": 1, "blur": 1}
-        return sum(sizes[name] for name in {"image", *self.traced_layers, *self.returned_layers})
+        return layers.channels(self.traced | self.layers)
+
+    @property
+    def frames(self) -> int:
+        """Pictures to average, each with filters of its own."""
+        return self.motion_samples if self.motion == "frames" and (self.detector or self.blur) else 1
 
     def __str__(self) -> str:
         lines = [f"Plan for {self.scene}, {self.width}x{self.height}, {self.integrator} in {self.variant}"]
-        lines += [f"  pass    {text}" for text in self.passes]
-        lines += [f"  kernel  {text}" for text in self.kernel]
-        lines += [f"  without {omission.what}: {omission.why}" for omission in self.left_out]
+        moments = "at least {} moments in a pixel" if self.motion == "stratified" else "{} frames"
+        if self.motion:
+            lines += [f"  pass    motion blur: {moments.format(self.motion_samples)}"]
+        lines += [f"  pass    {step}" for step in self.passes]
+        if self.kernel is None or self.parts is None:
+            lines += [f"  kernel  {self.integrator}.sample"]
+        else:
+            lines += [f"  kernel  {text}" for text in kernel_text.held(self.kernel, self.parts)]
+        for why, group in groupby(self.left_out, lambda omission: omission.why):
+            lines += [f"  without {', '.join(omission.what for omission in group)}: {why}"]
         return "\n".join(lines)
 
 
-def make_plan(
-    *,
-    scene: str,
-    variant: str,
-    integrator: str,
-    width: int,
-    height: int,
-    lattice: Lattice,
-    aamode: str,
-    focal_distance: float | None,
-    dof: str,
-    layers: frozenset[str],
-    count_rays: bool,
-    repeats: int,
-    motion: str | None,
-    motion_samples: int,
-    random: bool,
-    features: Features,
-) -> Plan:
-    """Decide what to trace and what to leave out. ``layers``: asked for; ``features``: of scene and
-    integrator."""
-    _check_layers(layers, features, aamode, integrator)
-    detector = aamode if aamode != "none" and (lattice.aa > 1 or "edges" in layers) else None
-    blur = dof if focal_distance else None
-    left_out = list(features.left_out)
-    if detector is None and aamode != "none":
-        left_out.append(Omission("edge pass", "aa=1 has no further samples to add"))
-    elif detector is None:
-        left_out.append(Omission("edge pass", "aamode=none gives every pixel all its samples"))
-    if blur is None:
-        left_out.append(Omission("depth of field", "no focal distance"))
-    traced = set(layers & features.layers)
-    if blur:
-        traced.add("depth")
-    elif "depth" not in layers:
-        left_out.append(Omission("depth", "nothing asks for it"))
-    if detector == "geometry":
-        traced |= {"depth", "normal"}
-    if detector in ("luma", "sobel") and repeats > 1:
-        traced.add("square")
-    if count_rays:
-        traced |= {"bounces", "shadow_rays"} & features.layers
-    skipped = sorted(features.layers - traced - {"depth", "square", "shadow_rays"})
-    if skipped:
-        left_out.append(Omission(f"layers {', '.join(skipped)}", "not asked for"))
+def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
+    """Decide what to trace and what to leave out. Raises ``UsageError`` for layers that nothing provides."""
+    asked, lattice = frozenset(settings.layers), Lattice(settings.lattice, settings.aa)
+    _check_layers(asked, facts, settings.aamode)
+    detector = settings.aamode if settings.aamode != "none" and (lattice.aa > 1 or "edges" in asked) else None
+    blur = settings.dof if facts.focus.distance else None
+    traced = _traced(asked, facts, settings, detector)
+    passes = _passes(traced, lattice, detector, blur, settings.spp, facts.random)
+    made = {step.name for step in passes}
     return Plan(
-        scene=scene,
-        variant=variant,
-        integrator=integrator,
-        width=width,
-        height=height,
+        scene=facts.scene,
+        variant=facts.variant,
+        integrator=facts.integrator,
+        width=facts.width,
+        height=facts.height,
         lattice=lattice,
         detector=detector,
         blur=blur,
-        repeats=repeats,
-        motion=motion,
-        motion_samples=motion_samples if motion else 1,
-        count_rays=count_rays,
-        layers=layers,
-        traced_layers=frozenset(traced),
-        kernel=features.kernel,
-        passes=(*_motion_pass(motion, motion_samples), *_passes(lattice, detector, blur, repeats, random)),
-        left_out=tuple(left_out),
+        focus=facts.focus,
+        repeats=settings.spp,
+        motion=settings.motionmode if settings.motion else None,
+        motion_samples=settings.motionsamples if settings.motion else 1,
+        layers=asked | {name for name, layer in LAYERS.items() if layer.free_with in made},
+        passes=passes,
+        kernel=facts.kernel,
+        parts=facts.parts,
+        left_out=tuple(_left_out(traced, facts, made, lattice.aa, settings.aamode)),
     )
 
 
-def _check_layers(layers: frozenset[str], features: Features, aamode: str, integrator: str) -> None:
-    if "edges" in layers and aamode == "none":
+def _check_layers(asked: frozenset[str], facts: RenderFacts, aamode: str) -> None:
+    if "edges" in asked and aamode == "none":
         raise UsageError("layers=edges: aamode=none looks for none; choose luma, sobel or geometry")
-    missing = sorted(layers - features.layers - {"edges", "samples", "blur"})
+    missing = sorted(asked - facts.layers - layers.named(DERIVED))
     if missing:
-        raise UsageError(f"layers={','.join(missing)}: {integrator} does not tell; mrt_whitted does")
+        raise UsageError(
+            f"layers={','.join(missing)}: {facts.integrator} does not provide these layers; use mrt_whitted"
+        )
 
 
-def _motion_pass(motion: str | None, moments: int) -> list[str]:
-    if motion is None:
-        return []
-    return [
-        f"motion blur: {moments} frames"
-        if motion == "frames"
-        else f"motion blur: at least {moments} moments in a pixel"
-    ]
+def _traced(
+    asked: frozenset[str], facts: RenderFacts, settings: RenderSettings, detector: str | None
+) -> frozenset[str]:
+    """Return the layers that must be traced: for the picture, the passes over it, and those asked for."""
+    wanted = {"image"} | asked & facts.layers
+    if facts.focus.distance:
+        wanted |= {"depth"}
+    if detector:
+        wanted |= set(DETECTORS[detector].reads)
+        if settings.spp > 1 and DETECTORS[detector].takes_variance:
+            wanted |= {"square"}
+    if settings.count_rays:
+        wanted |= {name for name, layer in TABLE.items() if layer.counts} & facts.layers
+    return frozenset(wanted)
 
 
 def _passes(
-    lattice: Lattice, detector: str | None, blur: str | None, repeats: int, random: bool
-) -> list[str]:
-    times = f", {repeats} rays each" if repeats > 1 else ""
+    traced: frozenset[str],
+    lattice: Lattice,
+    detector: str | None,
+    blur: str | None,
+    repeats: int,
+    random: bool,
+) -> tuple[Pass, ...]:
     passes = []
+    at_centre = traced & layers.named(FIRST_HIT)
     if detector is None:
-        passes += [f"{lattice.count} samples a pixel{times}"]
+        if at_centre and not lattice.holds_centre:
+            # layers of the first hit belong to the pixel's centre
+            passes.append(Pass(FIRST_HITS, at_centre, 1))
+            traced -= at_centre
+        passes.append(Pass(RENDERING, traced, lattice.count, repeats=repeats))
     else:
-        blind = random and repeats == 1 and detector in ("luma", "sobel")
-        doubt = ", in which noise counts as edges: one random ray tells no noise, spp=2 does" if blind else ""
-        passes += [f"1 sample a pixel{times}", f"edges: {detector}{doubt}"]
-    if detector is not None and lattice.count > 1:
-        further = lattice.count - 1 if lattice.holds_centre else lattice.count
-        passes += [f"{further} further samples in edge pixels{times}"]
-    return passes + ([f"depth of field: {blur}"] if blur else [])
+        noisy = random and repeats == 1 and DETECTORS[detector].takes_variance
+        passes += [Pass(RENDERING, traced, 1, repeats=repeats), Pass(EDGES, mode=detector, noisy=noisy)]
+        if lattice.count > 1:
+            first = 1 if lattice.holds_centre else 0  # the centre is not traced again
+            averaged = traced - at_centre - {"square"}
+            passes.append(Pass(REFINEMENT, averaged, lattice.count - first, first, repeats))
+    return tuple(passes + ([Pass(BLUR, mode=blur)] if blur else []))
 
 
-@dataclass(frozen=True)
-class Features:
-    """What a scene and its integrator ask of the tracing kernels, and which layers those can return."""
-
-    kernel: tuple[str, ...]
-    left_out: tuple[Omission, ...]
-    layers: frozenset[str]
-
-
-def whitted_features(integrator: Any, prepared: Any) -> Features:
-    """Read off what ``mrt_whitted`` has prepared."""
-    kernel, left_out = [], []
-
-    def decide(needed: bool, text: str, what: str, why: str) -> None:
-        if needed:
-            kernel.append(text)
-        else:
-            left_out.append(Omission(what, why))
-
-    decide(
-        prepared.shape_count > 0,
-        f"{prepared.shape_count} shapes in Mitsuba's BVH",
-        "BVH",
-        "no shapes but analytic ones",
-    )
-    quadrics = prepared.quadrics
-    text = f"{quadrics.count} exact objects in a tree: {', '.join(quadrics.kinds)}" if quadrics else ""
-    decide(quadrics is not None, text, "cones and cylinders", "none in the scene")
-    decide(bool(prepared.planes), f"{len(prepared.planes)} analytic planes", "planes", "none in the scene")
-    lights = len(prepared.lights)
-    decide(lights > 0, f"{lights} lights, {prepared.light_handling}", "shadow rays", "no light")
-    decide(prepared.emissive, "emission of surfaces", "emission", "no surface emits")
-    decide(
-        integrator.bounces(prepared),
-        f"mirror bounces, budget {integrator.max_depth}",
-        "bounce loop",
-        "max_depth is 1" if integrator.max_depth == 1 else "no material reflects visibly",
-    )
-    decide(prepared.textured, "textures and their coordinates", "textures", "every material is uniform")
-    decide(prepared.random, "random numbers", "random numbers", "every light is a point or a direction")
-    layers = frozenset({"depth", "normal", "albedo", "direct", "reflection", "bounces", "shadow_rays"})
-    return Features(tuple(kernel), tuple(left_out), layers)
-
-
-def stock_features(integrator: Any) -> Features:
-    """Of an integrator that is not ours: only what ``SamplingIntegrator.sample`` and the first hit tell."""
-    return Features((f"{integrator.class_name()}.sample",), (), frozenset({"depth", "normal", "albedo"}))
+def _left_out(
+    traced: frozenset[str], facts: RenderFacts, made: set[str], aa: int, aamode: str
+) -> list[Omission]:
+    left_out = [Omission(name, reason.value) for name, reason in facts.kernel.reasons] if facts.kernel else []
+    if EDGES not in made:
+        left_out.append(Omission(EDGES, "all-samples" if aamode == "none" else "one-sample"))
+    if BLUR not in made:
+        left_out.append(Omission(BLUR, "no-focus"))
+    if "depth" not in traced:
+        left_out.append(Omission("depth", "unused"))
+    skipped = [name for name in LAYERS if name in facts.layers - traced - {"depth"}]
+    return left_out + [Omission(name, "not-asked-for") for name in skipped]

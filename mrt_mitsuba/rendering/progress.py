@@ -26,7 +26,7 @@ class Progress:
 
 
 class TerminalProgress(Progress):
-    """Prints messages, and a bar if ``bar_file`` is a terminal.
+    """Prints messages, and a bar if ``bar_file`` is a terminal, or in a notebook.
 
     ``show_plan``: whether to print the render plan. Messages go to ``file``, bars to ``bar_file``; these
     count in ``unit``.
@@ -53,10 +53,10 @@ class TerminalProgress(Progress):
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
         if message:
             print(message, file=self.file, flush=True)
-        if not self.bar_file.isatty():
+        if not (self.bar_file.isatty() or "ipykernel" in sys.modules):
             yield lambda steps: None
             return
-        from tqdm import tqdm
+        from tqdm.auto import tqdm
 
         with tqdm(
             total=total,

@@ -8,7 +8,7 @@ from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.rendering.options import check
+from mrt_mitsuba.rendering.settings import check
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
 

@@ -7,6 +7,7 @@ Lengths are in scene units, colours are linear RGB. ``Scene.to_dict()`` gives th
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,15 @@ Color = tuple[float, float, float]
 
 # The sky of most scenes of the report
 BLUE_SKY: Color = (0.2, 0.2, 0.7)
+
+
+SIZE = (800, 600)  # of the picture, in pixels, where the scene brings no film
+FOCAL_RANGE = 2.0  # half-width of the sharp zone
+
+
+def is_obj(scene: object) -> bool:
+    """Return whether a scene is given as the path of an OBJ file."""
+    return isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".obj")
 
 
 @dataclass(frozen=True)
@@ -114,7 +124,7 @@ class Scene:
     meshes: tuple[Mesh, ...] = ()
     texturing: str = "report"  # or "standard": bilinear, sRGB-aware
     focal_distance: float | None = None
-    focal_range: float = 2.0
+    focal_range: float = FOCAL_RANGE
     title: str = field(default="", compare=False)
 
     def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> dict[str, Any]:

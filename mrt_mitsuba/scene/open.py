@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import operator
 import os
-import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.scene.model import Scene
-from mrt_mitsuba.scene.mtl import require_file
-from mrt_mitsuba.scene.obj import obj_scene
+from mrt_mitsuba.scene.loading import load_dict, load_file
+from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, is_obj
+from mrt_mitsuba.scene.parameters import set_parameters
+from mrt_mitsuba.scene.placement import obj_scene
 from mrt_mitsuba.scene.report import report_scene
-
-SIZE = (800, 600)
-
-# The lines of a traceback, which are indented but for the first, and the type of this project's error
-_TRACEBACK = re.compile(
-    r"Traceback \(most recent call last\):\n(?:[ \t][^\n]*\n|\n)*(?:\w*ParameterError: )?"
-)
-# Where in Mitsuba's own sources an error was raised
-_CODE_PLACE = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
 
 
 @dataclass(frozen=True)
@@ -35,7 +27,8 @@ class Source:
     width: int
     height: int
     focal_distance: float | None = None
-    focal_range: float = 2.0
+    focal_range: float = FOCAL_RANGE
+    fresnel: str | None = None  #: the formula in force, where the scene leaves the choice
 
 
 def open_scene(
@@ -46,59 +39,64 @@ def open_scene(
     fresnel: str | None = None,
     convention: str = "report",
     integrator: Any = None,
+    params: Mapping[str, Any] | None = None,
 ) -> Source:
     """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``."""
-    import mitsuba as mi
+    name, model = _model(scene, convention)
+    if model is None:
+        if fresnel is not None:
+            raise UsageError(
+                "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
+            )
+        name, loaded = _own(scene)
+        if params and loaded is scene:
+            raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
+        set_parameters(loaded, params or {})
+        size = _film_size(name, loaded, width, height)
+        return Source(name, loaded, loaded.sensors()[0], _integrator(integrator, loaded), *size)
+    width, height, fresnel = width or SIZE[0], height or SIZE[1], fresnel or "schlick"
+    loaded = load_dict(model.to_dict(width=width, height=height, fresnel=fresnel), name)
+    set_parameters(loaded, params or {})
+    sensor, integrator = loaded.sensors()[0], _integrator(integrator, loaded)
+    focus = model.focal_distance, model.focal_range
+    return Source(name, loaded, sensor, integrator, width, height, *focus, fresnel)
 
+
+def _model(scene: Any, convention: str) -> tuple[str, Scene | None]:
+    """Return the name and the model of a scene in the report's terms; no model of any other."""
     if isinstance(scene, Scene):
-        return _report_source(scene.title or "a scene", scene, width, height, fresnel, integrator)
+        return scene.title or "a scene", scene
     if hasattr(scene, "__index__"):
         number = operator.index(scene)
-        return _report_source(str(number), report_scene(number), width, height, fresnel, integrator)
-    if isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".obj"):
+        return str(number), report_scene(number)
+    if is_obj(scene):
         model = obj_scene(scene, convention=convention)
-        return _report_source(model.title, model, width, height, fresnel, integrator)
-    if fresnel is not None:
-        raise UsageError(
-            "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
-        )
+        return model.title, model
+    return "", None
+
+
+def _own(scene: Any) -> tuple[str, Any]:
+    """Return the name of someone's own scene, and the Mitsuba scene."""
+    import mitsuba as mi
+
     if isinstance(scene, dict):
-        _refuse_none(scene)
-        return _own_source("a dict", _load(mi.load_dict, scene, "the dict"), width, height, integrator)
+        return "a dict", load_dict(scene)
     if isinstance(scene, str | os.PathLike):
         path = os.fspath(scene)
-        return _own_source(os.path.basename(path), _load_file(path), width, height, integrator)
+        return os.path.basename(path), load_file(path)
     if isinstance(scene, mi.Scene):
-        return _own_source("a Mitsuba scene", scene, width, height, integrator)
+        return "a Mitsuba scene", scene
     raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")
 
 
-def _report_source(
-    name: str, scene: Scene, width: int | None, height: int | None, fresnel: str | None, integrator: Any
-) -> Source:
+def _film_size(name: str, scene: Any, width: int | None, height: int | None) -> tuple[int, int]:
     import mitsuba as mi
 
-    width, height = width or SIZE[0], height or SIZE[1]
-    loaded = _load(
-        mi.load_dict, scene.to_dict(width=width, height=height, fresnel=fresnel or "schlick"), name
-    )
-    return Source(
-        name,
-        loaded,
-        loaded.sensors()[0],
-        _integrator(integrator, loaded),
-        width,
-        height,
-        scene.focal_distance,
-        scene.focal_range,
-    )
-
-
-def _own_source(name: str, scene: Any, width: int | None, height: int | None, integrator: Any) -> Source:
+    if not isinstance(scene, mi.Scene):
+        raise SceneError(f"{name} is a {type(scene).__name__}, not a scene: put it into one, with a sensor")
     if not scene.sensors():
         raise SceneError(f"{name} has no sensor: add one, so that there is something to look through")
-    sensor = scene.sensors()[0]
-    own_width, own_height = (int(n) for n in sensor.film().crop_size())
+    own_width, own_height = (int(n) for n in scene.sensors()[0].film().crop_size())
     if own_width < 1 or own_height < 1:
         raise SceneError(f"{name} brings a film of {own_width}x{own_height}: give it one pixel at least")
     if width not in (None, own_width) or height not in (None, own_height):
@@ -106,7 +104,7 @@ def _own_source(name: str, scene: Any, width: int | None, height: int | None, in
             f"{name} brings a film of {own_width}x{own_height}: "
             "change it there, or leave out width and height"
         )
-    return Source(name, scene, sensor, _integrator(integrator, scene), own_width, own_height)
+    return own_width, own_height
 
 
 def _integrator(integrator: Any, scene: Any) -> Any:
@@ -119,38 +117,10 @@ def _integrator(integrator: Any, scene: Any) -> Any:
     if isinstance(integrator, str):
         integrator = {"type": integrator}
     if isinstance(integrator, dict):
-        _refuse_none(integrator)
-        integrator = _load(mi.load_dict, integrator, f"the integrator {integrator.get('type')!r}")
+        integrator = load_dict(integrator, f"the integrator {integrator.get('type')!r}")
     if not isinstance(integrator, mi.SamplingIntegrator):
         raise UsageError(
             f"the integrator is {' '.join(repr(integrator).split())}: "
             "it must be a sampling integrator, such as path or direct"
         )
     return integrator
-
-
-def _load_file(path: str) -> Any:
-    import mitsuba as mi
-
-    require_file(path)
-    if not path.lower().endswith(".xml"):
-        raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
-    return _load(mi.load_file, path, path)
-
-
-def _refuse_none(node: dict[str, Any], place: str = "") -> None:
-    """Mitsuba ends the process where a dict holds None."""
-    for name, value in node.items():
-        if value is None:
-            raise SceneError(f"cannot load the dict: {place}{name} is None; give it a value, or leave it out")
-        if isinstance(value, dict):
-            _refuse_none(value, f"{place}{name}.")
-
-
-def _load(loader: Any, what: Any, name: str) -> Any:
-    try:
-        return loader(what)
-    except RuntimeError as error:
-        # Of an error in a plugin written in Python, Mitsuba quotes the way there, too
-        text = _CODE_PLACE.sub("", _TRACEBACK.sub("", str(error)))
-        raise SceneError(f"cannot load {name}: {text}") from error

@@ -76,7 +76,7 @@ COMMANDS = [
 
 @pytest.mark.parametrize(("path", "command"), COMMANDS, ids=lambda value: getattr(value, "stem", value))
 def test_commands_of_the_pages_are_understood(path: Path, command: str) -> None:
-    from mrt_mitsuba.rendering import options
+    from mrt_mitsuba.command import options
     from mrt_mitsuba.validation import cli
 
     name, *arguments = shlex.split(command)

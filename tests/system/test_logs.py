@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mrt_mitsuba.command.logs import LEVELS
-from mrt_mitsuba.rendering.options import Options, parse
+from mrt_mitsuba.command.options import Options, parse
 
 
 def told(folder: Path, *options: str) -> list[str]:
@@ -44,4 +44,4 @@ def test_every_level_is_an_option(level: str) -> None:
 
 
 def test_default_is_a_level() -> None:
-    assert Options("a").log in LEVELS
+    assert Options(filename="a").log in LEVELS

@@ -51,7 +51,7 @@ def test_commands_run(command, tmp_path):
 
 
 def test_every_option_named_exists():
-    from mrt_mitsuba.rendering.options import TABLE
+    from mrt_mitsuba.command.options import TABLE
 
     named = {
         name

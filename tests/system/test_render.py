@@ -11,8 +11,12 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rays.bundle import Bundle, Lattice
-from mrt_mitsuba.rendering.trace import Camera, WhittedTracer, trace_bundle
+from mrt_mitsuba.rays.bundle import Bundle
+from mrt_mitsuba.rays.lattice import Lattice
+from mrt_mitsuba.rendering.memory import BYTES_PER_CHANNEL_OF_RAY, Workspace
+from mrt_mitsuba.rendering.shading import shader_for
+from mrt_mitsuba.rendering.trace import Tracer
+from mrt_mitsuba.rendering.view import View
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.scene.report import report_scene
 
@@ -128,13 +132,14 @@ def test_the_same_render_twice_is_the_same_bit_for_bit():
 
 def test_splitting_the_wavefront_changes_nothing():
     source = open_scene(3, width=40, height=30)
-    tracer, camera = WhittedTracer(source.scene, source.integrator), Camera(source.sensor, 40, 30)
+    shader, view = shader_for(source.scene, source.integrator), View(source.sensor, 40, 30)
     bundle = Bundle(range(40 * 30), Lattice("report", 2), count=4)
     wanted = frozenset({"image", "depth", "normal", "bounces"})
-    ((pixels, whole),) = trace_bundle(tracer, camera, bundle, wanted)
+    ((pixels, whole),) = Tracer(shader, view, Workspace(2**30)).trace(bundle, wanted)
     assert pixels == bundle.pixels and whole.keys() == wanted
     start = 0
-    for pixels, part in trace_bundle(tracer, camera, bundle, wanted, rays_at_once=1000):
+    room = Workspace(1000 * 8 * BYTES_PER_CHANNEL_OF_RAY)  # for a thousand rays of eight channels
+    for pixels, part in Tracer(shader, view, room).trace(bundle, wanted):
         assert pixels == range(start, min(start + 250, len(bundle.pixels)))
         for name, planes in part.items():
             for values, expected in zip(planes, whole[name], strict=True):

@@ -8,8 +8,8 @@ import mitsuba as mi
 from mrt_mitsuba.plugins.microfacet import beckmann_d, smith_g1, smith_g1_over_cos, tan2_theta
 from mrt_mitsuba.plugins.variants import first, is_jit, updatable
 
-# Each mistake, and the laws that it breaks: a value without its cosine is no reciprocal one, and what sample()
-# and eval() disagree on shows in the energy as well
+# Each mistake, and the laws that it breaks: a value without its cosine is no reciprocal one, and what
+# sample() and eval() disagree on shows in the energy as well
 MISTAKES = {
     "missing cosine": {"weights", "energy", "reciprocity"},
     "density x 1.1": {"sampling", "energy"},

@@ -181,7 +181,7 @@ def test_what_a_check_leaves(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("formula", "alpha"), [(Report, 0.1), (Report, 0.01), (Ours, 0.1), (Ours, 0.01)])
 def test_noise_is_found_without_a_reference(formula: Any, alpha: float) -> None:
-    """Against 50 digits: the estimate is a deviation, 1.5 medians of an error, and within a factor of three."""
+    """Against 50 digits: the estimate is a deviation, 1.5 medians of an error, within a factor of 3."""
     lobes, truth = lobes_with_truth(2)
     here = np.isclose(lobes.alpha, alpha) & (lobes.cell[:, 1] < 5) & (lobes.steepness < 16)
     few, form = lobes.only(here), formula()

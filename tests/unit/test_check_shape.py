@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 OPEN = {"watertight"}
 CONE = {"apex": [0, 1, 0], "base_center": [0, 0, 0], "radius": 0.5}
 
-# Parameters, the laws that are known to fail, and those that make no sense; docs/check_your_plugin.md says why
+# Parameters, laws that are known to fail, and those that make no sense; docs/check_your_plugin.md says why
 SHAPES: dict[str, tuple[dict[str, Any], set[str], set[str]]] = {
     "sphere": ({"center": [3, 1, 2], "radius": 0.5}, set(), set()),
     "rectangle": ({}, set(), OPEN),

@@ -334,7 +334,7 @@ def test_bar_on_a_terminal_shows_the_time_left() -> None:
 
 def test_header_survives_json() -> None:
     """The options go into the EXR header as JSON."""
-    from mrt_mitsuba.rendering.options import parse
+    from mrt_mitsuba.command.options import parse
 
     arguments = parse(["o", "layers=depth", "motion=1,2,3", "memory=4G"]).render_arguments()
     assert json.loads(json.dumps(arguments))["motion"] == [1, 2, 3]

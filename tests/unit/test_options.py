@@ -10,21 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mrt_mitsuba.command import listings, options
+from mrt_mitsuba.command.options import Options, parse
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.rendering import options
-from mrt_mitsuba.rendering.options import Options, parse
+from mrt_mitsuba.output import LAYERS
 
 
 def test_defaults_of_the_report() -> None:
     parsed = parse(["out"])
-    assert (parsed.filename, parsed.scene_number, parsed.width, parsed.height) == ("out", 0, 800, 600)
+    assert (parsed.filename, parsed.scene_number, parsed.width, parsed.height) == ("out", 0, None, None)
     assert (parsed.aa, parsed.aamode, parsed.focaldist, parsed.focalrange) == (4, "sobel", None, None)
-    assert (parsed.fresnel, parsed.tonemap, parsed.lattice, parsed.dof) == (
-        "schlick",
-        "report",
-        "report",
-        "report",
-    )
+    assert (parsed.fresnel, parsed.tonemap, parsed.lattice, parsed.dof) == (None, *["report"] * 3)
     assert parsed.outputs() == ("out.png", "out.exr")
 
 
@@ -41,18 +37,18 @@ def test_defaults_of_the_report() -> None:
             {"fresnel": "dielectric", "variant": "scalar_rgb"},
         ),
         (["o", "layers=depth,normal"], {"layers": ("depth", "normal")}),
-        (["o", "layers=all"], {"layers": tuple(options.LAYERS)}),
+        (["o", "layers=all"], {"layers": tuple(LAYERS)}),
         (
             ["o", "layers=all", "aamode=none"],
-            {"layers": tuple(name for name in options.LAYERS if name != "edges"), "aamode": "none"},
+            {"layers": tuple(name for name in LAYERS if name != "edges"), "aamode": "none"},
         ),
         (["o", "motion=0.1,-2,3e-1", "motionsamples=4"], {"motion": (0.1, -2.0, 0.3), "motionsamples": 4}),
         (["o", "memory=4G"], {"memory": 4 * 2**30}),
         (["o", "memory=1.5gib"], {"memory": 3 * 2**29}),
         (["o", "memory=512MB"], {"memory": 2**29}),
         (["o", "memory=100000000"], {"memory": 10**8}),
-        (["o", "scene=a=b.xml"], {"scene": "a=b.xml", "width": None, "height": None, "fresnel": None}),
-        (["o", "scene=a.xml", "width=3"], {"scene": "a.xml", "width": 3, "height": None, "fresnel": None}),
+        (["o", "scene=a=b.xml"], {"scene": "a=b.xml"}),
+        (["o", "scene=a.xml", "width=3"], {"scene": "a.xml", "width": 3}),
         (
             ["o", "scene=a.OBJ", "camera=1,2,3", "target=0,0,.5", "up=0,0,1", "fov=45", "light=0,9,0"],
             {
@@ -62,14 +58,11 @@ def test_defaults_of_the_report() -> None:
                 "up": (0, 0, 1),
                 "fov": 45.0,
                 "light": (0, 9, 0),
-                "width": None,
-                "height": None,
-                "fresnel": None,
             },
         ),
         (
             ["o", "scene=a.obj", "texturing=standard"],
-            {"scene": "a.obj", "texturing": "standard", "width": None, "height": None, "fresnel": None},
+            {"scene": "a.obj", "texturing": "standard"},
         ),
         (["o", "quiet=1", "plan=show"], {"quiet": True, "plan": "show"}),
         (["o", "quiet=no"], {"quiet": False}),
@@ -267,8 +260,8 @@ def test_values_from_python_refused(name: str, value: object) -> None:
 
 
 def test_usage_names_every_option_with_its_default() -> None:
-    text = options.usage()
-    assert max(map(len, text.splitlines())) <= options.HELP_WIDTH
+    text = listings.usage()
+    assert max(map(len, text.splitlines())) <= listings.WIDTH
     entries = re.split(r"\n  (?=\w+=)", text.partition("\n\ncommands:")[0])[1:]
     assert [entry.partition("=")[0] for entry in entries] == list(options.TABLE)
     assert all(re.search(r"\(default:\s+[^)]+\)$", entry) for entry in entries)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rays.bundle import Divisor
+from mrt_mitsuba.rays.divisor import Divisor
 
 LARGEST = 2**32 - 1
 

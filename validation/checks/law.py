@@ -13,6 +13,8 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.tools import report
 from mrt_mitsuba.validation.tools.study import Bound, Study
 
+TITLE = "Laws of plugins"
+
 
 class Skip(Exception):
     """Raised by the check of a law that makes no sense for its subject; the text is the reason."""
@@ -35,7 +37,7 @@ class Part(Bound):
 
 @dataclass
 class Law:
-    """One law: its figures, or why it was skipped. ``measured``, ``limit`` and ``why`` are of the worst one."""
+    """One law: its figures, or why it was skipped. ``measured``, ``limit``, ``why`` are of the worst one."""
 
     name: str
     parts: list[Part] = field(default_factory=list)
@@ -121,7 +123,7 @@ class Check:
 
     def study(self) -> Study:
         """Return the findings in the form that pages are made of."""
-        study = Study(self.subject, f"{self.subject}, {self.variant}")
+        study = Study(self.subject, f"{self.subject}, {self.variant}", seconds=self.seconds)
         for law in self.laws.values():
             for part in law.parts:
                 name = f"{law.name}: {part.name}"
@@ -135,28 +137,16 @@ class Check:
 
     def save(self, folder: str | Path) -> None:
         """Write the page (``index.html``), ``summary.json`` and CSV files. Raises ``OutputError``."""
-        save([self], folder)
+        report.save(folder, self.study(), title=TITLE, quick=self.quick)
 
     def _repr_html_(self) -> str:
-        from html import escape
-
-        rows = "".join(
-            f"<tr><td>{escape(law.name)}</td><td>{law.verdict}</td><td>{law.measured:.4g}</td>"
-            f"<td>{law.limit:.4g}</td><td>{escape(law.skipped or law.note)}"
-            + (f"<pre>{escape(law.snippet)}</pre>" if law.snippet and not law.holds else "")
-            + "</td></tr>"
-            for law in self.laws.values()
-        )
-        head = "<tr><th>law</th><th></th><th>measured</th><th>limit</th><th>note</th></tr>"
-        return f"<b>{escape(str(self).splitlines()[0])}</b><table>{head}{rows}</table>"
+        return report.notebook(self.study(), title=TITLE)
 
 
-def save(checks: Iterable[Check], folder: str | Path) -> None:
-    """Write the page, JSON and CSV of several checks. Raises ``OutputError``."""
-    checks = list(checks)
-    report.prepare(Path(folder), "summary.json", "index.html")
-    outcomes = [report.Outcome(check.study(), check.seconds) for check in checks]
-    report.write(Path(folder), outcomes, report.header(quick=all(check.quick for check in checks)))
+def class_name(plugin: Any) -> str:
+    """Return the name of a plugin's class: Mitsuba calls all those in Python by that of their base."""
+    python = type(plugin).__module__.split(".")[0] != "mitsuba"
+    return type(plugin).__name__ if python or not hasattr(plugin, "class_name") else plugin.class_name()
 
 
 def examine(

@@ -1,8 +1,9 @@
-"""The noise of a float32 function without a reference, after Moré and Wild's ECNoise, and its conditioning.
+"""The noise of a float32 function without a reference, after Moré and Wild, and its conditioning.
 
-Along a line of inputs a few float32 steps apart, what a function *should* do is smooth, and differences of high
-order make it vanish; what is left is noise. Source: Moré and Wild, "Estimating Computational Noise", SIAM J.
-Sci. Comput. 33(3), 2011, §§ 3 and 5: with T_k the differences of order k, σ² ≈ γ_k ⟨T_k²⟩, γ_k = (k!)² / (2k)!.
+Along a line of inputs a few float32 steps apart, what a function *should* do is smooth, and differences of
+high order make it vanish; what is left is noise. Source: Moré and Wild, "Estimating Computational Noise",
+SIAM J. Sci. Comput. 33(3), 2011, §§ 3 and 5: with T_k the differences of order k, σ² ≈ γ_k ⟨T_k²⟩,
+γ_k = (k!)² / (2k)!.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ class Noise:
 def ecnoise(lines: Array) -> Array:
     """Return the noise [N] of values along lines [P, N], in their own unit; 0 where nothing is noise.
 
-    The first order k counts from which on three estimates agree to a factor of four and whose differences have both
-    signs; the smallest of all, if none is so.
+    The first order k counts from which on three estimates agree to a factor of four and whose differences
+    have both signs; the smallest of all, if none is so.
     """
     table, gamma, levels, signs = lines.astype(np.float64), 1.0, [], []
     for k in range(1, len(lines)):
@@ -68,10 +69,11 @@ def measure(
     stride: int = 2,
     seed: int = 0,
 ) -> Noise:
-    """Estimate the noise of ``function([M, K]) -> [M]`` at float32 inputs [N, K], and what these explain.
+    """Estimate the noise of ``function([M, K]) -> [M]`` at float32 inputs [N, K], and what they explain.
 
-    ``size`` [N]: what roundings are of, the value itself if left out. ``stride``: the most float32 steps between
-    points of a line; noise that is coarser than the whole line is not seen. A slope is a central difference; of several widths, the one that agrees best with its neighbour counts.
+    ``size`` [N]: what roundings are of, the value itself if left out. ``stride``: the most float32 steps
+    between points of a line; noise that is coarser than the whole line is not seen. A slope is a central
+    difference; of several widths, the one that agrees best with its neighbour counts.
     """
     count, width = inputs.shape
     inputs = inputs.astype(np.float32)

@@ -67,7 +67,7 @@ def interaction(wi: Any, uv: Any) -> Any:
 
 
 class Probe:
-    """Calls one BSDF. Directions are [N, 3] in its frame, texture coordinates [N, 2], random numbers [N, 3]."""
+    """Calls one BSDF; directions [N, 3] in its frame, texture coordinates [N, 2], random numbers [N, 3]."""
 
     def __init__(self, bsdf: Any) -> None:
         self.bsdf = bsdf
@@ -102,8 +102,8 @@ class Probe:
 
         kinds = ("Vector3f", wi), ("Point2f", uv), ("Float", u[:, 0]), ("Point2f", u[:, 1:])
         wo, pdf, eta, kind, component, weight = lanes(call, *kinds)
-        integers = (x[:, 0].astype(np.int64) for x in (kind, component))
-        return Samples(wo, pdf[:, 0], eta[:, 0], *integers, weight)
+        kinds_of, components = (x[:, 0].astype(np.int64) for x in (kind, component))
+        return Samples(wo, pdf[:, 0], eta[:, 0], kinds_of, components, weight)
 
     def _directions(self, call: Callable[..., Any], wi: Array, wo: Array, uv: Array, ctx: Any) -> list[Array]:
         ctx = ctx or context()

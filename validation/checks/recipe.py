@@ -79,6 +79,6 @@ def source(value: Any) -> str | None:
         shape, flat = value.values.shape, [float(x) for x in value.values.ravel()]
         return f"mi.TensorXf(np.array({flat}, np.float32).reshape({shape}))"
     if isinstance(value, (list, tuple)):
-        parts = [source(entry) for entry in value]
-        return None if None in parts else f"[{', '.join(parts)}]"
+        entries = [source(entry) for entry in value]
+        return None if None in entries else f"[{', '.join(map(str, entries))}]"
     return repr(value) if isinstance(value, (bool, int, float, str)) else None

@@ -12,8 +12,8 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.checks import noise, snippets
-from mrt_mitsuba.validation.checks.law import Check, Law, Skip, examine
-from mrt_mitsuba.validation.checks.probe import SCALAR_SHARE, Array, direction, is_scalar, lanes, unit
+from mrt_mitsuba.validation.checks.law import Check, Law, Skip, class_name, examine
+from mrt_mitsuba.validation.checks.probe import SCALAR_SHARE, Array, is_scalar, lanes, unit
 from mrt_mitsuba.validation.checks.recipe import Recipe, Transform
 
 ROUNDING = noise.ROUNDING
@@ -31,8 +31,8 @@ def check_shape(
 ) -> Check:
     """Check the laws of a shape in the current variant: a dict for ``mi.load_dict``, or a loaded one.
 
-    An object that is no Mitsuba shape but has ``ray_intersect``, ``ray_test`` and ``bbox`` will do as well. ``quick``:
-    fewer rays. ``only``: names of ``LAWS``. Raises ``UsageError`` for anything else.
+    An object that is no Mitsuba shape but has ``ray_intersect``, ``ray_test`` and ``bbox`` will do as well.
+    ``quick``: fewer rays. ``only``: names of ``LAWS``. Raises ``UsageError`` for anything else.
     """
     import mitsuba as mi
 
@@ -43,11 +43,7 @@ def check_shape(
         raise UsageError(
             f"{type(loaded).__name__} is no shape of {mi.variant()}: give a dict or a loaded shape"
         )
-    name = (
-        recipe.description["type"]
-        if recipe.description
-        else getattr(loaded, "class_name", type(loaded).__name__.lower)()
-    )
+    name = recipe.description["type"] if recipe.description else class_name(loaded)
     with np.errstate(all="ignore"):
         return examine(name, Case(loaded, recipe, quick, seed), LAWS, only=only, quick=quick)
 
@@ -77,8 +73,8 @@ def trace(target: Any, o: Array, d: Array) -> Hits:
         si = target.ray_intersect(mi.Ray3f(origin, direction))
         return [si.is_valid(), si.t, si.p, si.n, si.sh_frame.n, si.dp_du, si.dp_dv, si.uv, si.prim_index]
 
-    found, t, *rest, part = lanes(call, ("Point3f", o), ("Vector3f", d))
-    return Hits(found[:, 0].astype(bool), t[:, 0], *rest, part[:, 0])
+    found, t, p, n, shading, du, dv, uv, part = lanes(call, ("Point3f", o), ("Vector3f", d))
+    return Hits(found[:, 0].astype(bool), t[:, 0], p, n, shading, du, dv, uv, part[:, 0])
 
 
 @dataclass
@@ -94,8 +90,11 @@ class Case:
         import mitsuba as mi
 
         self.rng = np.random.default_rng(self.seed)
-        alone = isinstance(self.shape, mi.Shape)
-        self.target = mi.load_dict({"type": "scene", "shape": self.shape}) if alone else self.shape
+        self.target = self.shape
+        if isinstance(self.shape, mi.Shape):
+            name = self.shape.id()
+            self.target = mi.load_dict({"type": "scene", "shape": self.shape})
+            self.shape.set_id(name)  # which the scene has changed
         box = self.shape.bbox()
         low, high = (np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max))
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (high >= low).all()):
@@ -265,13 +264,11 @@ def _roundoff(law: Law, case: Case) -> None:
         ("hit point", lambda h: h.p.sum(axis=1), scale),
         ("normal", lambda h: h.n @ np.array([0.6, 0.48, 0.64]), np.ones_like(scale)),
     ):
-        found = noise.measure(
-            lambda x, pick=pick: pick(trace(case.target, x[:, :3], x[:, 3:])),
-            inputs,
-            size=size,
-            stride=64,
-            seed=case.seed,
-        )
+
+        def function(x: Array, pick: Any = pick) -> Array:
+            return np.asarray(pick(trace(case.target, x[:, :3], x[:, 3:])))
+
+        found = noise.measure(function, inputs, size=size, stride=64, seed=case.seed)
         lost = np.nan_to_num(found.lost(noise.ALLOWANCE), posinf=0)
         measured = float(np.quantile(lost, 0.9))
         i = int(np.abs(lost - measured).argmin())
@@ -289,6 +286,8 @@ def _roundoff(law: Law, case: Case) -> None:
 
 def normals(law: Law, case: Case) -> None:
     """Unit length, outwards, as the partial derivatives and differences have it."""
+    import mitsuba as mi
+
     o, d, met = case.met
     length = np.abs(np.linalg.norm(np.stack([met.n, met.shading]).astype(np.float64), axis=-1) - 1).max(
         axis=0
@@ -301,7 +300,7 @@ def normals(law: Law, case: Case) -> None:
         "a square root and a quotient",
         case.snippet(o[i], d[i]),
     )
-    flipped = bool(case.recipe.description and case.recipe.description.get("flip_normals", False))
+    flipped = isinstance(case.shape, mi.Shape) and case.shape.has_flipped_normals()
     if case.closed:
         o, d, seen = case.seen
         judged, turns = case.turns
@@ -444,7 +443,7 @@ def scale(law: Law, case: Case) -> None:
     """A millionth and a million times the size: the same, scaled. Powers of two leave no roundings."""
     import mitsuba as mi
 
-    given = case.recipe.with_().description.get("to_world")
+    given = (case.recipe.with_().description or {}).get("to_world")
     matrix = given.matrix if isinstance(given, Transform) else np.eye(4)
     o, d, seen = case.seen
     few = slice(0, case.count(2**12, 2**14))
@@ -454,8 +453,10 @@ def scale(law: Law, case: Case) -> None:
         larger = np.diag([2.0**power] * 3 + [1]) @ matrix
         try:
             shape = case.recipe.with_(to_world=mi.ScalarTransform4f(larger)).load()
-        except RuntimeError as error:
-            raise Skip(f"to_world is not accepted: {str(error).strip().splitlines()[-1][:200]}") from error
+        except RuntimeError as problem:
+            raise Skip(
+                f"to_world is not accepted: {str(problem).strip().splitlines()[-1][:200]}"
+            ) from problem
         box = shape.bbox()
         grown = np.linalg.norm(np.ravel(np.array(box.max, np.float64) - np.array(box.min, np.float64)))
         if not np.isclose(grown, 2.0**power * case.size, rtol=1e-3):
@@ -486,8 +487,8 @@ def scale(law: Law, case: Case) -> None:
 
 
 def far(law: Law, case: Case) -> None:
-    """From ten thousand sizes away: hit where the same line is hit from nearby, to roundings of the distance."""
-    o, d, met = case.met
+    """From ten thousand sizes away: hit where the same line is hit from nearby, to some roundings."""
+    _, d, met = case.met
     few = slice(0, case.count(2**12, 2**15))
     goal, d = met.p[few].astype(np.float64), d[few]
     origin = (goal - FAR * case.size * d.astype(np.float64)).astype(np.float32)
@@ -520,7 +521,7 @@ def far(law: Law, case: Case) -> None:
 
 
 def finite(law: Law, case: Case) -> None:
-    """Rays along axes, from the surface, from the middle and corners, from very far: all results are numbers."""
+    """Rays along axes, from the surface, the middle, corners and very far: all results are numbers."""
     _, _, met = case.met
     count = case.count(2**12, 2**15)
     pick = case.rng.integers
@@ -573,8 +574,8 @@ def sampling(law: Law, case: Case) -> None:
     try:
         p, n, pdf, again = lanes(positions, ("Point2f", u))
         area = float(np.ravel(np.array(case.shape.surface_area()))[0])
-    except RuntimeError as error:
-        raise Skip(f"positions cannot be sampled: {str(error).strip().splitlines()[-1][:120]}") from error
+    except RuntimeError as problem:
+        raise Skip(f"positions cannot be sampled: {str(problem).strip().splitlines()[-1][:120]}") from problem
     for what, measured in (
         ("density of a position against pdf_position()", np.abs(pdf / again - 1).max()),
         ("mean of 1 / density against surface_area()", abs(np.mean(1 / pdf) / area - 1)),
@@ -624,15 +625,15 @@ def _area(law: Law, case: Case, p: Array, area: float) -> None:
     estimate = 2 * np.pi * radius**2 * crossed.mean()
     error = 2 * np.pi * radius**2 * crossed.std() / np.sqrt(count)
     law.at_most(
-        f"surface_area() against that by crossings of random lines, relative, beyond {SIGMAS} standard errors",
+        f"surface_area() against that by crossings of lines, relative, beyond {SIGMAS} standard errors",
         max(abs(estimate - area) - SIGMAS * error, 0) / area,
         1e-2,
         "lines that graze may cross twice within the offset of a spawned ray",
         snippets.positions(case.shape, case.recipe.description),
     )
     # cells of equally many sampled positions, by halving along axes in turn
-    points = np.concatenate(points)
-    both, cells = np.concatenate([p, points]), np.zeros(len(p) + len(points), int)
+    both = np.concatenate([p, *points])
+    cells = np.zeros(len(both), int)
     axes = case.units(6)  # aslant, so that flat faces are no jumps
     for level in range(6):
         for cell in range(2**level):
@@ -706,8 +707,9 @@ def bbox(law: Law, case: Case) -> None:
 
     o, d, met = case.met
     points = [met.p]
-    if _corners(case) is not None:
-        points.append(_corners(case))
+    corners = _corners(case)
+    if corners is not None:
+        points.append(corners)
     elif isinstance(case.shape, mi.Shape):
         try:
             u = case.rng.random((len(o), 2), np.float32)
@@ -742,10 +744,10 @@ def variants(law: Law, case: Case) -> None:
         mi.set_variant(other)
         runtime.use(other)
         there = trace(mi.load_dict({"type": "scene", "shape": case.recipe.load()}), o, d)
-    except RuntimeError as error:
-        if "not found" not in str(error):
+    except RuntimeError as problem:
+        if "not found" not in str(problem):
             raise
-        raise Skip(f"{other} does not know the plugin: register it there, too") from error
+        raise Skip(f"{other} does not know the plugin: register it there, too") from problem
     finally:
         mi.set_variant(here)
     steep = np.abs((seen.n * d).sum(axis=1)) > FLAT

@@ -50,7 +50,7 @@ NORMALISED = (
 smooth = (bsdf.pdf(ctx, si, bs.wo) > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
 print("share of samples that pdf() stands for:", dr.count(smooth)[0] / n)
 wo = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-print("integral of pdf(), with the noise of uniform directions:", dr.mean(bsdf.pdf(ctx, si, wo))[0] * 4 * dr.pi)
+print("integral of pdf() by uniform directions:", dr.mean(bsdf.pdf(ctx, si, wo))[0] * 4 * dr.pi)
 """
 )
 WEIGHT = (
@@ -71,7 +71,7 @@ component, stated = np.array(bs.sampled_component), np.array(bs.pdf)
 delta = np.array(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta))
 for i in np.unique(component[delta]):
     here = delta & (component == i)
-    print("component", i, "is stated to be drawn with probability", stated[here].mean(), "and is with", here.mean())
+    print("component", i, "states a probability of", stated[here].mean(), "and its share is", here.mean())
 """
 )
 PAIR = (
@@ -232,7 +232,7 @@ def head(name: str, loaded: Any, description: dict[str, Any] | None, variant: st
         f"mi.set_variant({variant!r})",
     ]
     lines += ["mrt.register()"] if ours else []
-    if text is None:
+    if description is None or text is None:
         return "\n".join([*lines, f"# {name}: the object that was checked", f"load = lambda: {name}", ""])
     if "python" in str(type(loaded).__mro__[0]) or not type(loaded).__module__.startswith("mitsuba"):
         lines += [] if ours else [f"# register {description['type']!r} here"]
@@ -293,7 +293,8 @@ n = 100_000
 rng = mi.PCG32(n)
 ps = shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))
 print("mean of 1 / density:", dr.mean(1 / ps.pdf), "surface_area():", shape.surface_area())
-print("pdf_position() / density:", dr.min(shape.pdf_position(ps) / ps.pdf), "...", dr.max(shape.pdf_position(ps) / ps.pdf))
+ratio = shape.pdf_position(ps) / ps.pdf
+print("pdf_position() / density:", dr.min(ratio), "...", dr.max(ratio))
 """
 
 

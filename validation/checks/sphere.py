@@ -1,12 +1,13 @@
 """The sphere of directions cut into cells, small where samples are dense: for chi-square and quadrature.
 
 A direction has a hemisphere, r = √(1 − |z|) and an azimuth. Near the normal r keeps all digits of x and y,
-which the cosine loses; dω = 2 r dr dφ. A cell is a square of a quadtree in (r, φ), named by the Morton code at
-which it starts and its level.
+which the cosine loses; dω = 2 r dr dφ. A cell is a square of a quadtree in (r, φ), named by its level and the
+Morton code at which it starts.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,11 +115,13 @@ class Integrals:
     variance: Array
 
 
-def integrate(function, cells: Cells, rng: np.random.Generator, *, counts: Array, samples: int) -> Integrals:
+def integrate(
+    function: Callable[[Array], Array], cells: Cells, rng: np.random.Generator, *, counts: Array, samples: int
+) -> Integrals:
     """Integrate ``function(directions [N, 3]) -> [N, K]`` over cells; those known too badly are cut further.
 
-    ``counts``: how many of ``samples`` samples fell into each cell, a hint at what the first integrand gives; the
-    integrals are made as certain as so many samples would be.
+    ``counts``: how many of ``samples`` samples fell into each cell, a hint at what the first integrand gives;
+    the integrals are made as certain as so many samples would be.
     """
     done, hint = [], counts / samples
     for attempt in range(8):
@@ -143,7 +146,9 @@ def integrate(function, cells: Cells, rng: np.random.Generator, *, counts: Array
     return Integrals(Cells(start[order], level), mean, variance)
 
 
-def _estimate(function, cells: Cells, rng: np.random.Generator, side: int = 6) -> tuple[Array, Array]:
+def _estimate(
+    function: Callable[[Array], Array], cells: Cells, rng: np.random.Generator, side: int = 6
+) -> tuple[Array, Array]:
     wo, omega = cells.points(side, rng)
     values = function(wo.reshape(-1, 3))
     values = np.where(np.isfinite(values), values, 0).reshape(*omega.shape, -1) * omega[..., None] * side**2

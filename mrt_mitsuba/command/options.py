@@ -1,0 +1,155 @@
+"""The options of the ``mrt`` command: of ``RenderSettings`` and its own, one table for parsing and help."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mrt_mitsuba.command.logs import LEVELS
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.options import angle, checked, choice, either, from_text, option, path, plain, switch, vector
+from mrt_mitsuba.rendering import settings
+from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.scene.model import is_obj
+from mrt_mitsuba.scene.report import NUMBERS
+
+# An OBJ file has neither camera nor lights; other scenes have their own
+FOR_MODELS = ("texturing", "camera", "target", "up", "fov", "light")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(RenderSettings):
+    """What to render, how, and what to write. None: the scene or the machine decides."""
+
+    filename: str
+    scene_number: int = 0
+    scene: str | None = option(None, path(), "XML or OBJ file to render in place of a numbered scene", "none")
+    texturing: str | None = option(
+        None,
+        choice("report", "standard"),
+        "textures of an OBJ file: nearest texel, or bilinear from sRGB",
+        "as convention",
+    )
+    camera: tuple[float, float, float] | None = option(
+        None, vector(), "OBJ file: where the camera is", "by the model's size"
+    )
+    target: tuple[float, float, float] | None = option(
+        None, vector(), "OBJ file: what the camera looks at", "the model's centre"
+    )
+    up: tuple[float, float, float] | None = option(None, vector(), "OBJ file: what is up", "0,1,0")
+    fov: float | None = option(None, angle(), "OBJ file: horizontal field of view", "60")
+    light: tuple[float, float, float] | None = option(
+        None, vector(), "OBJ file: where a white light is, in place of the two", "two, by the model's size"
+    )
+    format: str = option("both", choice("png", "exr", "both"), "files to write")
+    tonemap: str = option(
+        "report", choice("report", "srgb"), "values in the PNG: linear as in the report, or sRGB"
+    )
+    plan: str = option("hide", choice("show", "hide"), "print what will run and what is left out, and why")
+    quiet: bool = option(False, switch(), "print errors only", "0")
+    log: str = option("warn", choice(*LEVELS), "what to print: warnings; times; every kernel")
+
+    def render_arguments(self) -> dict[str, Any]:
+        """Return the options that say how to render, by name, without those about files and messages."""
+        return {name: getattr(self, name) for name in settings.TABLE}
+
+    def shows_model(self) -> bool:
+        """Return whether the scene is an OBJ file, which has neither camera nor lights."""
+        return is_obj(self.scene)
+
+    def model_arguments(self) -> dict[str, Any]:
+        """Return what was given about the view of an OBJ file, by name."""
+        return {name: getattr(self, name) for name in FOR_MODELS if getattr(self, name) is not None}
+
+    def outputs(self) -> tuple[str, ...]:
+        """Return the paths of the pictures to write."""
+        endings = ("png", "exr") if self.format == "both" else (self.format,)
+        return tuple(f"{self.filename}.{ending}" for ending in endings)
+
+
+TABLE = {field.name: field for field in dataclasses.fields(Options) if field.metadata.get("help")}
+
+
+def parse(arguments: Sequence[str]) -> Options:
+    """Turn ``FILENAME [SCENE] [name=value ...]`` into options; raise ``UsageError`` naming what is wrong."""
+    if not arguments:
+        raise UsageError("FILENAME is missing: mrt FILENAME [SCENE] [name=value ...]")
+    values: dict[str, Any] = {"filename": _filename(arguments[0])}
+    rest = list(arguments[1:])
+    if rest and "=" not in rest[0]:
+        values["scene_number"] = _scene_number(rest.pop(0))
+    for argument in rest:
+        name, equals, text = argument.partition("=")
+        if not equals:
+            raise UsageError(f"unexpected argument {argument!r}: options are written name=value")
+        if name not in TABLE:
+            raise UsageError(_unknown(name))
+        if name in values:
+            raise UsageError(f"{name} is given twice")
+        values[name] = from_text(TABLE[name], text)
+    _check_together(values)
+    if "layers=all" in rest and values.get("aamode") == "none":
+        values["layers"] = tuple(layer for layer in values["layers"] if layer != "edges")  # nothing detects
+    return Options(**values)
+
+
+def _check_together(values: dict[str, Any]) -> None:
+    """Raise ``UsageError`` for options that exclude each other, or need one that is missing."""
+    if "scene" in values and "scene_number" in values:
+        raise UsageError(f"both SCENE {values['scene_number']} and scene={values['scene']}: give one of them")
+    for name in ("motionsamples", "motionmode"):
+        if name in values and "motion" not in values:
+            raise UsageError(f"{name} is of use only with motion=dx,dy,dz")
+    of_models = [name for name in FOR_MODELS if name in values]
+    if of_models and not is_obj(values.get("scene")):
+        raise UsageError(f"{of_models[0]} is of use only with an OBJ file: scene=PATH.obj")
+    if "camera" in values and values["camera"] == values.get("target"):
+        raise UsageError("camera and target are the same point: move one of them")
+    if values.get("up") == (0, 0, 0):
+        raise UsageError("up=0,0,0: up must have a length, such as up=0,1,0")
+
+
+def check(name: str, value: Any) -> Any:
+    """Return a value from Python as the option ``name`` holds it; raise ``UsageError`` if it must not."""
+    if name not in TABLE:
+        raise UsageError(_unknown(name))
+    return checked(TABLE[name], value)
+
+
+def _filename(text: str) -> str:
+    stem, ending = os.path.splitext(text)
+    if "=" in text and text.partition("=")[0] in TABLE:
+        raise UsageError(f"FILENAME is missing before {text}: mrt FILENAME [SCENE] [name=value ...]")
+    if text.startswith("-"):
+        raise UsageError(f"unknown option {text}: options are written name=value; 'mrt help' lists them")
+    if ending.lower() in (".png", ".exr"):
+        raise UsageError(f"FILENAME has no extension: write {stem} format={ending[1:].lower()}")
+    if not os.path.basename(text) or "\0" in text:
+        raise UsageError(f"FILENAME {text!r} names no file")
+    return text
+
+
+def _scene_number(text: str) -> int:
+    try:
+        number = int(plain(text))
+    except ValueError:
+        hint = f" For a file of your own, write scene={text}" if "." in text or os.path.exists(text) else ""
+        raise UsageError(f"SCENE {text!r}: must be {_scenes()}.{hint}") from None
+    if number not in NUMBERS:
+        raise UsageError(f"SCENE {number}: must be {_scenes()}")
+    return number
+
+
+def _scenes() -> str:
+    return f"{either([str(number) for number in NUMBERS])} ('mrt scenes' lists them)"
+
+
+def _unknown(name: str) -> str:
+    import difflib
+
+    close = difflib.get_close_matches(name.lstrip("-").lower(), TABLE, n=1)
+    hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
+    return f"unknown option {name!r}.{hint}"

@@ -1,0 +1,217 @@
+"""Options: kinds of values, how text becomes one, and the check that Python and the command share."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import operator
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mrt_mitsuba.errors import UsageError
+
+UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
+SMALLEST_MEMORY = 64 * 2**20  # bytes; about what one tile with all layers takes
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of value. ``form`` is the help's "name=form", ``allowed`` completes "must be ...".
+
+    ``from_text`` turns text into a value, ``check`` returns an allowed value; both raise ValueError or
+    TypeError.
+    """
+
+    form: str
+    allowed: str
+    from_text: Callable[[str], Any]
+    check: Callable[[Any], Any]
+
+
+def integer(low: int, high: int) -> Kind:
+    """A whole number in [low, high]."""
+
+    def check(value: Any) -> int:
+        if isinstance(value, bool) or not low <= operator.index(value) <= high:
+            raise ValueError
+        return operator.index(value)
+
+    return Kind("N", f"a whole number from {low} to {high}", lambda text: int(plain(text)), check)
+
+
+def number(low: float) -> Kind:
+    """A finite number ≥ low."""
+
+    def check(value: Any) -> float:
+        if isinstance(value, bool) or not (math.isfinite(value) and value >= low):
+            raise ValueError
+        return float(value)
+
+    return Kind("X", f"a finite number, {low:g} or more", lambda text: float(plain(text)), check)
+
+
+def choice(*names: str) -> Kind:
+    """One of some names."""
+
+    def check(value: Any) -> str:
+        if value not in names:
+            raise ValueError
+        return str(value)
+
+    return Kind("|".join(names), either(names), str, check)
+
+
+def switch() -> Kind:
+    """Yes or no."""
+    words = {"1": True, "0": False, "yes": True, "no": False, "true": True, "false": False}
+
+    def check(value: Any) -> bool:
+        if value not in (False, True):
+            raise ValueError
+        return bool(value)
+
+    return Kind("1|0", "1 or 0", lambda text: words.get(text.lower()), check)
+
+
+def subset(known: Iterable[str]) -> Kind:
+    """A comma list of known names, each once, or ``all``."""
+    known = tuple(known)
+
+    def parse(text: str) -> tuple[str, ...]:
+        return known if text == "all" else tuple(text.split(","))
+
+    def check(value: Any) -> tuple[str, ...]:
+        if isinstance(value, str):
+            value = parse(value)
+        if len(set(value)) != len(value) or not set(value) <= set(known):
+            raise ValueError
+        return tuple(value)
+
+    return Kind("A,B,..", f"a comma list out of {', '.join(known)}, each once, or all", parse, check)
+
+
+def angle() -> Kind:
+    """Degrees between 0 and 180, without these."""
+
+    def check(value: Any) -> float:
+        if isinstance(value, bool) or not 0 < value < 180:
+            raise ValueError
+        return float(value)
+
+    return Kind("DEGREES", "degrees, more than 0 and less than 180", lambda text: float(plain(text)), check)
+
+
+def vector(form: str = "X,Y,Z") -> Kind:
+    """Three finite numbers."""
+
+    def check(value: Any) -> tuple[float, float, float]:
+        x, y, z = (float(coordinate) for coordinate in value)
+        if not all(map(math.isfinite, (x, y, z))):
+            raise ValueError
+        return x, y, z
+
+    def parse(text: str) -> list[float]:
+        return [float(plain(part)) for part in text.split(",")]
+
+    return Kind(form, "three finite numbers separated by commas", parse, check)
+
+
+def size() -> Kind:
+    """A number of bytes, as text with a unit: 4G, 512M."""
+
+    def parse(text: str) -> int:
+        upper = plain(text).upper().removesuffix("B").removesuffix("I")
+        unit = upper[-1:] if upper[-1:] in UNITS else ""
+        return int(float(upper.removesuffix(unit)) * UNITS[unit])
+
+    def check(value: Any) -> int:
+        value = parse(value) if isinstance(value, str) else operator.index(value)
+        if value < SMALLEST_MEMORY:
+            raise ValueError
+        return value
+
+    return Kind("BYTES", "bytes with an optional unit K, M, G or T, at least 64M, such as 4G", parse, check)
+
+
+def word() -> Kind:
+    """A name made of letters, digits and underscores, such as a variant."""
+
+    def check(value: Any) -> str:
+        if not (isinstance(value, str) and value.isidentifier()):
+            raise ValueError
+        return value
+
+    return Kind("NAME", "a name such as llvm_ad_rgb or scalar_rgb", str, check)
+
+
+def anything() -> Kind:
+    """Whatever Python gives; checked where it is used."""
+    return Kind("", "anything", str, lambda value: value)
+
+
+def parameters() -> Kind:
+    """Values by the keys of ``mi.traverse``."""
+
+    def check(value: Any) -> dict[str, Any]:
+        value = dict(value)
+        if not all(isinstance(key, str) and "." in key for key in value):
+            raise ValueError
+        return value
+
+    return Kind("", "a dict of values by keys of mi.traverse, such as material_0.alpha", str, check)
+
+
+def path() -> Kind:
+    """The path of a file."""
+
+    def check(value: Any) -> str:
+        value = os.fspath(value)
+        if not value or "\0" in value:
+            raise ValueError
+        return str(value)
+
+    return Kind("PATH", "the path of a file", str, check)
+
+
+def plain(text: str) -> str:
+    """Return text that may be a number; raise ``ValueError`` for spaces and underscores, which int takes."""
+    if not text.isascii() or "_" in text or text != text.strip():
+        raise ValueError
+    return text
+
+
+def either(names: Sequence[str]) -> str:
+    """Return "a, b or c"."""
+    return " or ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
+
+
+def option(default: Any, kind: Kind, text: str = "", shown: str | None = None) -> Any:
+    """Declare a field of a table of options; ``shown`` is the default as the help names it.
+
+    A field without ``text`` is no option of the command.
+    """
+    return dataclasses.field(default=default, metadata={"kind": kind, "help": text, "shown": shown})
+
+
+def checked(field: dataclasses.Field[Any], value: Any) -> Any:
+    """Return a value from Python as the field holds it; raise ``UsageError`` if it is not allowed.
+
+    None passes where it is the default.
+    """
+    if value is None and field.default is None:
+        return None
+    try:
+        return field.metadata["kind"].check(value)
+    except (TypeError, ValueError, OverflowError):
+        raise UsageError(f"{field.name}={value!r}: must be {field.metadata['kind'].allowed}") from None
+
+
+def from_text(field: dataclasses.Field[Any], text: str) -> Any:
+    """Return the value of a word of the command line; raise ``UsageError`` if it is not allowed."""
+    kind = field.metadata["kind"]
+    try:
+        return kind.check(kind.from_text(text))
+    except (TypeError, ValueError, OverflowError):
+        raise UsageError(f"{field.name}={text}: {field.name} must be {kind.allowed}") from None

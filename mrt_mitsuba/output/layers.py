@@ -1,0 +1,71 @@
+"""The layers of a picture, one row each: read by the plan, the tracer, the files and the help.
+
+A new layer takes one row. What its ``value`` is computed from along camera rays, see ``rendering.shading``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+FIRST_HIT = "first hit"  # of the first ray of a pixel; a mean would name no point
+AVERAGED = "averaged"  # over the rays of a pixel, as the picture is
+DERIVED = "derived"  # by a pass over the picture
+
+
+def _derived(values: Any) -> Any:
+    raise TypeError("a derived layer has no values along rays")
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A row of the table."""
+
+    name: str
+    letters: str  #: names of its EXR channels, in the order of the last axis
+    source: str  #: ``FIRST_HIT``, ``AVERAGED`` or ``DERIVED``
+    doc: str
+    value: Callable[[Any], Any] = _derived  #: along rays
+    free_with: str = ""  #: the pass that makes it in any case
+    counts: str = ""  #: the kind of rays that it counts
+    internal: bool = False  #: cannot be asked for
+
+    @property
+    def channels(self) -> int:
+        """Number of float32 values in a pixel."""
+        return len(self.letters)
+
+
+_ROWS = (
+    Layer(
+        "depth", "Z", FIRST_HIT, "distance of the first hit", lambda r: r.distance, free_with="depth of field"
+    ),
+    Layer("normal", "XYZ", FIRST_HIT, "geometric normal", lambda r: r.normal),
+    Layer("albedo", "RGB", FIRST_HIT, "diffuse reflectance", lambda r: r.albedo),
+    Layer("edges", "Y", DERIVED, "what the edge detector measured", free_with="edges"),
+    Layer("samples", "Y", DERIVED, "samples of the pixel", free_with="edges"),
+    Layer("blur", "Y", DERIVED, "amount of blur in pixels"),
+    Layer("image", "RGB", AVERAGED, "the picture", lambda r: r.image, internal=True),
+    Layer("direct", "RGB", AVERAGED, "light without mirror rays", lambda r: r.direct),
+    Layer("reflection", "RGB", AVERAGED, "light that mirror rays add", lambda r: r.reflection),
+    Layer("bounces", "Y", AVERAGED, "mirror rays", lambda r: r.bounces, counts="mirror"),
+    Layer(
+        "shadow_rays", "Y", AVERAGED, "shadow rays", lambda r: r.shadow_rays, counts="shadow", internal=True
+    ),
+    Layer("square", "RGB", AVERAGED, "square of the picture", lambda r: r.image * r.image, internal=True),
+)
+
+TABLE = {layer.name: layer for layer in _ROWS}
+#: The layers that can be asked for, by name
+LAYERS = {name: layer for name, layer in TABLE.items() if not layer.internal}
+
+
+def named(source: str) -> frozenset[str]:
+    """Return the names of all layers from a source."""
+    return frozenset(name for name, layer in TABLE.items() if layer.source == source)
+
+
+def channels(layers: Iterable[str]) -> int:
+    """Return the number of float32 values that layers take in a pixel."""
+    return sum(TABLE[name].channels for name in layers)

@@ -1,0 +1,70 @@
+"""A kernel plan in words: what the kernels hold, what is left out, and why."""
+
+from __future__ import annotations
+
+from mrt_mitsuba.plugins.kernel_plan import KernelPlan, Reason, SceneFacts
+
+#: What a decision is about, by its name
+WHAT = {
+    "bvh": "BVH",
+    "coherent": "coherent packets",
+    "spheres": "table of spheres",
+    "quadrics": "cones and cylinders",
+    "planes": "planes",
+    "lights": "shadow rays",
+    "random": "random numbers",
+    "emission": "emission",
+    "sky": "sky",
+    "mirrors": "bounce loop",
+    "textures": "textures",
+    "shading_frames": "shading normals",
+    "merged": "merged materials",
+    "two_sided": "light from behind",
+}
+
+WHY = {
+    Reason.NO_NATIVE_SHAPES: "no shapes but analytic ones",
+    Reason.NO_MESHES: "no mesh in the scene",
+    Reason.NO_SPHERES: "no sphere in the scene",
+    Reason.NO_QUADRICS: "none in the scene",
+    Reason.NO_PLANES: "none in the scene",
+    Reason.NO_LIGHTS: "no light",
+    Reason.NO_SURFACE_EMITTERS: "no surface emits",
+    Reason.NO_SKY: "no sky in the scene",
+    Reason.DELTA_LIGHTS: "every light is a point or a direction",
+    Reason.MAX_DEPTH: "max_depth admits no mirror ray",
+    Reason.NO_MIRRORS: "no material reflects visibly",
+    Reason.UNIFORM: "every material is uniform",
+    Reason.ONE_SIDED: "no material is lit from behind",
+    Reason.SCALAR_VARIANT: "a scalar variant compiles no kernel",
+    Reason.SPECTRAL_VARIANT: "a spectral variant",
+    Reason.NATIVE_SHAPES: "other shapes, or spheres that emit or face inwards",
+    Reason.INSTANCES: "instances in the scene",
+    Reason.OTHER_BSDF: "a material other than mrt_bsdf",
+    Reason.MIXED_FRESNEL: "materials of different Fresnel formulas",
+    Reason.VARYING: "a material varies over its surface",
+    Reason.GRADIENTS: "derivatives are wanted",
+}
+
+
+def held(kernel: KernelPlan, facts: SceneFacts) -> list[str]:
+    """Return a line for each thing that the kernels hold."""
+    spheres = {"table": "spheres from a table of centres and radii", "corrected": "hits moved onto spheres"}
+    count = sum(count for kind, count in facts.quadrics if kind in kernel.quadrics)
+    lines = {
+        "bvh": f"{facts.native_shapes} shapes in Mitsuba's BVH",
+        "coherent": "coherent packets of rays",
+        "spheres": spheres.get(kernel.spheres, ""),
+        "quadrics": f"{count} exact objects in a tree: {', '.join(kernel.quadrics)}",
+        "planes": f"{facts.planes} analytic planes",
+        "lights": f"{facts.lights} lights, {'in a loop' if kernel.lights == 'loop' else kernel.lights}",
+        "random": "random numbers",
+        "emission": "emission of surfaces",
+        "sky": {"parameter": "the integrator's sky", "environment": "the scene's sky"}.get(kernel.sky, ""),
+        "mirrors": "mirror bounces",
+        "textures": "textures and their coordinates",
+        "shading_frames": "shading normals of meshes",
+        "merged": "all materials as one, from a table",
+        "two_sided": "light from behind surfaces",
+    }
+    return [text for name, text in lines.items() if getattr(kernel, name) not in (False, "none", ())]

@@ -1,0 +1,186 @@
+"""What an integrator returns along camera rays, and what the layers are made of.
+
+``shader_for`` chooses by capability: a ``LayeredIntegrator`` plans its kernels and knows layers of its own;
+any other sampling integrator gives the picture, and Mitsuba the first hit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cached_property
+from typing import Any
+
+from mrt_mitsuba.output.layers import FIRST_HIT, TABLE, named
+from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
+from mrt_mitsuba.plugins.protocols import LayeredIntegrator
+from mrt_mitsuba.rays.bundle import Samples
+from mrt_mitsuba.rendering.view import View
+
+
+class RayValues:
+    """Values along camera rays, for the rows of the table of layers; what no row reads costs nothing."""
+
+    image: Any
+    si: Any  # interaction at the first hit
+    found: Any  # is there one
+
+    def __init__(self, view: View, ray: Any, weight: Any) -> None:
+        import mitsuba as mi
+
+        self.view, self.ray, self.weight = view, ray, mi.unpolarized_spectrum(weight)
+
+    @property
+    def distance(self) -> Any:
+        """Distance of the first hit from the eye; inf for a miss."""
+        import drjit as dr
+
+        return dr.select(self.found, self.view.distance(self.si), dr.inf)
+
+    @property
+    def normal(self) -> Any:
+        """Geometric normal at the first hit; 0 for a miss."""
+        import drjit as dr
+        import mitsuba as mi
+
+        return dr.select(self.found, mi.Vector3f(self.si.n), 0)
+
+    @property
+    def albedo(self) -> Any:
+        """Diffuse reflectance at the first hit; 0 for a miss."""
+        import drjit as dr
+        import mitsuba as mi
+
+        albedo = mi.UnpolarizedSpectrum(0)
+        if not mi.variant().startswith("scalar") or self.found:
+            bsdf = self.si.bsdf(mi.RayDifferential3f(self.ray))
+            albedo = bsdf.eval_diffuse_reflectance(self.si, self.found)
+        return to_rgb(dr.select(self.found, albedo, 0), self.ray)
+
+    def rgb(self, spectrum: Any) -> Any:
+        """Linear sRGB of a radiance along the rays, with the sensor's weight."""
+        return to_rgb(spectrum * self.weight, self.ray)
+
+
+class SampledValues(RayValues):
+    """Values of any sampling integrator: the picture; Mitsuba knows the first hit."""
+
+    def __init__(self, view: View, ray: Any, weight: Any, spectrum: Any, scene: Any) -> None:
+        super().__init__(view, ray, weight)
+        self.scene, self.image = scene, self.rgb(spectrum)
+
+    @cached_property
+    def si(self) -> Any:
+        import mitsuba as mi
+
+        return self.scene.ray_intersect(mi.Ray3f(self.ray))
+
+    @property
+    def found(self) -> Any:
+        return self.si.is_valid()
+
+
+class LayeredValues(RayValues):
+    """Values of a ``LayeredIntegrator``, all from what its ``trace`` returns."""
+
+    def __init__(self, view: View, ray: Any, weight: Any, trace: Any) -> None:
+        super().__init__(view, ray, weight)
+        self.trace, self.image = trace, self.rgb(trace.radiance)
+        self.si, self.found = trace.hit.si, trace.hit.found
+
+    @property
+    def direct(self) -> Any:
+        """Light that needs no mirror ray."""
+        return self.rgb(self.trace.direct)
+
+    @property
+    def reflection(self) -> Any:
+        """Light that mirror rays add."""
+        return self.rgb(self.trace.radiance - self.trace.direct)
+
+    @property
+    def bounces(self) -> Any:
+        """Number of mirror rays."""
+        import mitsuba as mi
+
+        return mi.Float(self.trace.bounces)
+
+    @property
+    def shadow_rays(self) -> Any:
+        """Number of shadow rays."""
+        import mitsuba as mi
+
+        return mi.Float(self.trace.shadow_rays)
+
+
+class Shader:
+    """A sampling integrator on a scene."""
+
+    facts: SceneFacts | None = None  #: what its kernels depend on; None where it does not say
+    kernel: KernelPlan | None = None  #: what its kernels hold
+    random = True  #: does it draw random numbers
+
+    def __init__(self, scene: Any, integrator: Any) -> None:
+        self.scene, self.integrator = scene, integrator
+        self.name = integrator.class_name()
+
+    @property
+    def layers(self) -> frozenset[str]:
+        """Names of the layers that can be traced, but for internal ones."""
+        return named(FIRST_HIT)
+
+    def prepare(self, kernel: KernelPlan | None) -> None:
+        """Get ready to trace by a plan of the kernels."""
+
+    def trace(self, names: Iterable[str], view: View, samples: Samples, sampler: Any) -> dict[str, Any]:
+        """Return layers along each ray through some places on the film."""
+        ray, weight = view.rays(samples, sampler)
+        values = self._values(view, ray, weight, sampler)
+        return {name: TABLE[name].value(values) for name in names}
+
+    def _values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
+        import mitsuba as mi
+
+        spectrum, _, _ = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(ray))
+        return SampledValues(view, ray, weight, mi.unpolarized_spectrum(spectrum), self.scene)
+
+
+class LayeredShader(Shader):
+    """A ``LayeredIntegrator`` on a scene, such as ``mrt_whitted``."""
+
+    def __init__(self, scene: Any, integrator: Any) -> None:
+        super().__init__(scene, integrator)
+        self.facts = integrator.scene_facts(scene)
+        self.kernel = integrator.kernel_plan(self.facts)
+        self.random = self.kernel.random
+        self.name = "mrt_whitted"
+
+    @property
+    def layers(self) -> frozenset[str]:
+        return super().layers | self.integrator.provided_layers()
+
+    def prepare(self, kernel: KernelPlan | None) -> None:
+        self.integrator.prepare(self.scene, kernel)
+
+    def _values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
+        return LayeredValues(view, ray, weight, self.integrator.trace(self.scene, sampler, ray))
+
+
+def shader_for(scene: Any, integrator: Any) -> Shader:
+    """Return the shader that an integrator is capable of."""
+    kind = LayeredShader if isinstance(integrator, LayeredIntegrator) else Shader
+    return kind(scene, integrator)
+
+
+def to_rgb(spectrum: Any, ray: Any) -> Any:
+    """Return the linear sRGB of a spectrum in the current variant."""
+    import mitsuba as mi
+
+    if mi.is_spectral:
+        xyz = sum(
+            mi.cie1931_xyz(wavelength) * value
+            for wavelength, value in zip(ray.wavelengths, spectrum, strict=True)
+        )
+        return mi.xyz_to_srgb(xyz * (mi.MI_CIE_Y_NORMALIZATION / len(spectrum)))
+    if mi.is_monochromatic:
+        return mi.Color3f(spectrum[0])
+    return mi.Color3f(spectrum)

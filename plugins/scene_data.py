@@ -1,0 +1,288 @@
+"""What ``mrt_whitted`` reads from a scene: first the facts, then, by a plan, the data of its kernels."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
+from .lookup import ByShape
+from .merged_bsdf import MergedBSDF, uniform_materials
+from .planes import Planes
+from .protocols import MirrorBSDF, PlaneShape, QuadricShape
+from .quadrics import quadrics_of
+from .spheres import Spheres, is_plain_sphere, is_sphere
+from .variants import but_not, is_jit, pointer
+
+# A secondary ray starts this far off its surface, relative to the size of the coordinates involved: 32
+# float32 roundings, a few times what intersection, projection and ray test lose together
+OFFSET = 32 * 2.0**-24
+
+# Reach of a mirror ray: any number that float32 holds
+FARTHEST = 2.0**127
+
+
+@dataclass
+class Hit:
+    """What a ray meets first: an interaction, valid where ``found``, and the size of its coordinates."""
+
+    si: mi.SurfaceInteraction3f
+    found: mi.Bool
+    scale: mi.Float
+
+
+class SceneReading:
+    """The objects of a scene, sorted by who traces them, and the facts about them."""
+
+    def __init__(self, scene: mi.Scene) -> None:
+        # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed
+        self.objects = _objects(scene)
+        self.shapes = scene.shapes()
+        self.planes = [s for s in self.shapes if isinstance(s, PlaneShape)]
+        self.quadrics = [s for s in self.shapes if isinstance(s, QuadricShape)]
+        self.native = [s for s in self.shapes if not isinstance(s, (PlaneShape, QuadricShape))]
+        self.environment = scene.environment()
+        self.lights = [e for e in scene.emitters() if not e.is_environment()]
+        self.bsdfs = list({id(b): b for b in (s.bsdf() for s in self.shapes)}.values())
+        materials = uniform_materials(self.shapes)
+        self.unmergeable = materials if isinstance(materials, Reason) else None
+        self.materials = {} if isinstance(materials, Reason) else materials
+        self.state = self._state()
+        self.facts = self._facts()
+
+    def is_of(self, scene: mi.Scene) -> bool:
+        """Is it this scene that was read? The id of a scene may have passed to another one, those of objects
+        held here cannot.
+        """
+        return _objects(scene) == self.objects
+
+    def is_stale(self, scene: mi.Scene) -> bool:
+        """Is it another scene, or changed since?"""
+        return not self.is_of(scene) or self._state() != self.state
+
+    def _state(self) -> list[Any]:
+        """Return what changes whenever a shape was moved, a mesh edited or a material changed."""
+        materials = [b.state() for b in self.bsdfs if isinstance(b, MirrorBSDF)]
+        return [*map(_shape_state, self.shapes), *materials]
+
+    def _facts(self) -> SceneFacts:
+        quadrics: Counter[str] = Counter()
+        for table in (s.quadrics() for s in self.quadrics):
+            quadrics[table.kind] += len(table.rows)
+        delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
+        return SceneFacts(
+            vectorised=is_jit(),
+            native_shapes=len(self.native),
+            meshes=sum(s.is_mesh() for s in self.native),
+            spheres=sum(map(is_sphere, self.native)),
+            plain_spheres=sum(map(is_plain_sphere, self.native)),
+            planes=len(self.planes),
+            quadrics=tuple(sorted(quadrics.items())),
+            lights=len(self.lights),
+            random_lights=sum(not mi.has_flag(e.flags(), delta) for e in self.lights),
+            surface_emitters=sum(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in self.lights),
+            environment=self.environment is not None,
+            mirrors=tuple(map(_mirror, filter(has_mirror, self.bsdfs))),
+            textured=any(mi.has_flag(b.flags(), mi.BSDFFlags.SpatiallyVarying) for b in self.bsdfs),
+            two_sided=any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in self.bsdfs),
+            unmergeable=self.unmergeable,
+        )
+
+
+class SceneData:
+    """The data of the kernels for a scene, as a plan wants them, and its ray queries."""
+
+    def __init__(self, reading: SceneReading, plan: KernelPlan) -> None:
+        self.reading, self.facts, self.plan = reading, reading.facts, plan
+        exact = [s for s in reading.quadrics if s.quadrics().kind in plan.quadrics]
+        planes = reading.planes if plan.planes else []
+        own = {id(s) for s in (*exact, *planes)}
+        others = [s for s in reading.shapes if id(s) not in own]
+        if others and not plan.bvh:
+            raise ValueError(f"the plan leaves {len(others)} shapes untraced: set its bvh to True")
+        # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the others only
+        self.bvh = _scene_of(others) if own else None
+        self.planes = Planes(planes)
+        self.quadrics = quadrics_of(exact)
+        self.scales = _Scales(others)
+        self.spheres = Spheres(others) if plan.spheres != "none" else None
+        self.lights = reading.lights if plan.lights != "none" else []
+        self.light_pointers = pointer("Emitter", self.lights) if plan.lights == "loop" else None
+        self.environment = reading.environment
+        self.merged = MergedBSDF(reading.shapes, reading.materials) if plan.merged else None
+        self.ray_flags = +mi.RayFlags.Minimal
+        if plan.textures:
+            self.ray_flags |= +mi.RayFlags.UV
+        if plan.shading_frames:
+            self.ray_flags |= +mi.RayFlags.ShadingFrame
+
+    # ----------------------------------------- Ray queries ---------------------------------------------
+
+    def intersect(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> Hit:
+        """Return the nearest hit among Mitsuba's shapes, the quadrics and the analytic planes."""
+        t, plane, on_plane = self.planes.intersect(ray, active)
+        # What lies behind a plane need not be looked for
+        ray = mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths)
+        si, found, scale = self._intersect_shapes(scene, ray, active)
+        if self.quadrics is not None:
+            reach = dr.select(found, si.t, ray.maxt)
+            quadric = self.quadrics.intersect(
+                mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths), active
+            )
+            closer = active & (quadric[0] < reach)
+            self.quadrics.put_into(si, ray, quadric, closer)
+            scale = dr.select(closer, self.quadrics.scale(quadric[1], closer), scale)
+            found = found | closer
+        if self.plan.planes:
+            on_plane = but_not(on_plane, found)
+            scale = self.planes.put_into(si, ray, plane, on_plane, scale)
+            found = found | on_plane
+        si.sh_frame = mi.Frame3f(si.sh_frame.n)
+        si.wi = si.to_local(-ray.d)
+        si.time, si.wavelengths = ray.time, ray.wavelengths
+        return Hit(si, found, dr.maximum(scale, dr.max(dr.abs(si.p))))
+
+    def _intersect_shapes(
+        self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Bool, mi.Float]:
+        """Return the interaction with the nearest of Mitsuba's shapes, where there is one, and the size of
+        its coordinates.
+        """
+        if not self.plan.bvh:
+            return dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False), mi.Float(0)
+        pi = (self.bvh or scene).ray_intersect_preliminary(ray, self.plan.coherent, active)
+        found = active & pi.is_valid()
+        differentiable = scene.shapes_grad_enabled() or dr.grad_enabled(ray)
+        if self.spheres is not None and self.plan.spheres == "table" and not differentiable:
+            si, scale = self.spheres.interaction(pi, ray, found)
+            return si, found, scale
+        si = pi.compute_surface_interaction(ray, self.ray_flags, found)
+        if self.spheres is not None:
+            self.spheres.put_back(si, found)
+        return si, found, self.scales(si, found)
+
+    def occluded(self, scene: mi.Scene, hit: Hit, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Bool:
+        """Does anything block the segment from ``hit`` to the light sample ``ds``?"""
+        o = self._off_surface(hit, ds.d)
+        blocked = self.planes.separate(o, ds.p)
+        if not self.plan.bvh and self.quadrics is None:
+            return blocked
+        to_light = ds.p - o
+        # Stop short of a light that has a surface of its own
+        reach = 1 - mi.math.ShadowEpsilon if self.plan.emission else 1
+        ray = mi.Ray3f(o, to_light, reach, hit.si.time, hit.si.wavelengths)
+        if self.plan.bvh:
+            blocked |= (self.bvh or scene).ray_test(ray, self.plan.coherent, but_not(active, blocked))
+        if self.quadrics is not None:
+            blocked |= self.quadrics.occluded(ray, but_not(active, blocked))
+        return blocked
+
+    def mirror_ray(self, ray: mi.Ray3f, hit: Hit) -> mi.Ray3f:
+        """Return the ray reflected at ``hit``."""
+        n = hit.si.sh_frame.n
+        d = ray.d - 2 * dr.dot(ray.d, n) * n
+        return mi.Ray3f(self._off_surface(hit, d), d, FARTHEST, ray.time, ray.wavelengths)
+
+    @staticmethod
+    def _off_surface(hit: Hit, d: mi.Vector3f) -> mi.Point3f:
+        """Return the point of ``hit`` moved to the side of its surface that ``d`` points to, clear of
+        rounding errors.
+        """
+        distance = OFFSET * hit.scale
+        n = hit.si.n
+        return hit.si.p + n * dr.select(dr.dot(n, d) >= 0, distance, -distance)
+
+    # -------------------------------------------- Materials -----------------------------------------------
+
+    def eval_bsdf(
+        self, hit: Hit, wos: list[mi.Vector3f], facing: list[mi.Bool], mirror: bool
+    ) -> tuple[list[mi.UnpolarizedSpectrum], mi.UnpolarizedSpectrum, mi.Float]:
+        """Return the values f cos θo at ``hit`` towards ``wos``, the mirror reflectance and its index of
+        refraction: all of it in one call.
+        """
+        arguments = (hit.si, wos, facing, hit.found)
+        evaluate = partial(_eval_bsdf, mirror)  # dispatch would take a bool among the arguments for its mask
+        if not is_jit():
+            return evaluate(hit.si.bsdf() if hit.found else None, *arguments)
+        if self.merged is None:
+            return dr.dispatch(hit.si.bsdf(), evaluate, *arguments)
+        # A branch only to keep the code together: mixed with that of shadow rays, it runs out of registers
+        return dr.if_stmt(
+            arguments, hit.found, partial(evaluate, self.merged), partial(evaluate, None), label="bsdf"
+        )
+
+
+def has_mirror(bsdf: Any) -> bool:
+    """Does a BSDF reflect like a mirror?"""
+    return bsdf.has_attribute("mirror_reflectance") or mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
+
+
+def _mirror(bsdf: Any) -> Mirror:
+    return bsdf.mirror_bound() if isinstance(bsdf, MirrorBSDF) else Mirror(1.0, 1.0)
+
+
+def _eval_bsdf(
+    mirror: bool,
+    bsdf: Any,
+    si: mi.SurfaceInteraction3f,
+    wos: list[mi.Vector3f],
+    facing: list[mi.Bool],
+    active: mi.Bool,
+) -> tuple[list[mi.UnpolarizedSpectrum], mi.UnpolarizedSpectrum, mi.Float]:
+    values = [mi.UnpolarizedSpectrum(0) for _ in wos]
+    reflectance, int_ior = mi.UnpolarizedSpectrum(0), mi.Float(1)
+    if bsdf is None:
+        return values, reflectance, int_ior
+    context = mi.BSDFContext()
+    values = [
+        mi.unpolarized_spectrum(bsdf.eval(context, si, wo, seen))
+        for wo, seen in zip(wos, facing, strict=True)
+    ]
+    if mirror and bsdf.has_attribute("mirror_reflectance"):
+        reflectance = bsdf.eval_attribute("mirror_reflectance", si, active)
+        int_ior = bsdf.eval_attribute_1("int_ior", si, active)
+    elif mirror and has_mirror(bsdf):
+        context.type_mask = +mi.BSDFFlags.DeltaReflection
+        reflectance = mi.unpolarized_spectrum(bsdf.sample(context, si, mi.Float(0), mi.Point2f(0), active)[1])
+    return values, reflectance, int_ior
+
+
+class _Scales:
+    """Size of the coordinates of the shape that was hit: the largest number in its bounding box."""
+
+    def __init__(self, shapes: list[mi.Shape]) -> None:
+        sizes = [_coordinate_size(s.bbox()) for s in shapes]
+        # The shapes inside an instance are not of the scene's own: the largest for them
+        self.by_shape = ByShape(mi.Float, shapes, sizes, max(sizes, default=0.0)) if shapes else None
+
+    def __call__(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Float:
+        return mi.Float(0) if self.by_shape is None else self.by_shape(si, found)
+
+
+def _coordinate_size(bbox: Any) -> float:
+    return max(abs(float(x)) for corner in (bbox.min, bbox.max) for x in corner)
+
+
+def _scene_of(shapes: list[mi.Shape]) -> mi.Scene | None:
+    if not shapes:
+        return None
+    # Mitsuba names an object after its key, and these belong to another scene: they keep their names
+    names = [s.id() or f"shape_{i}" for i, s in enumerate(shapes)]
+    if len(set(names)) < len(names):
+        names = [f"shape_{i}" for i in range(len(shapes))]
+    return mi.load_dict({"type": "scene", **dict(zip(names, shapes, strict=True))})
+
+
+def _objects(scene: mi.Scene) -> list[Any]:
+    return [*scene.shapes(), *scene.emitters()]
+
+
+def _shape_state(shape: Any) -> tuple:
+    bbox = shape.bbox()
+    version = shape.vertex_positions_buffer().index if is_jit() and isinstance(shape, mi.Mesh) else 0
+    return (version, *bbox.min, *bbox.max)
