@@ -7,6 +7,7 @@ import warnings
 from mrt_mitsuba import llvm
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, UnknownVariantError, VariantError
+from mrt_mitsuba.memory import check_addresses
 
 FAST = "llvm_ad_rgb"
 SLOW = "scalar_rgb"
@@ -24,6 +25,7 @@ def use(variant: str | None = None) -> str:
     that cannot run here.
     """
     llvm.prepare()
+    check_addresses()
     import mitsuba as mi
 
     if variant is None:

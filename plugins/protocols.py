@@ -14,11 +14,13 @@ if TYPE_CHECKING:
 
     from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
     from .merged_bsdf import UniformMaterial
-    from .revolution import QuadricTable
+    from .quadric_kinds import QuadricTable
 
 
 class LayeredIntegrator(ABC):
-    """An integrator that plans its kernels and returns layers beside the picture."""
+    """An integrator that plans its kernels and returns layers with the picture."""
+
+    plugin_name: str  # by which it is registered
 
     @abstractmethod
     def provided_layers(self) -> frozenset[str]:

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba import runtime
+from mrt_mitsuba.memory import Budget, Workspace
 from mrt_mitsuba.output.layers import AVERAGED, TABLE
 from mrt_mitsuba.output.result import Result, Timings
 from mrt_mitsuba.rays.exposure import Exposure
 from mrt_mitsuba.rendering.job import Job, counting_kernels
-from mrt_mitsuba.rendering.memory import Workspace
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import Plan, RenderFacts, make_plan
 from mrt_mitsuba.rendering.progress import Progress
@@ -55,6 +55,7 @@ def render(
     spp: int = 1,
     count_rays: bool = False,
     params: Mapping[str, Any] | None = None,
+    region: Sequence[int] | None = None,
     progress: Progress | None = None,
 ) -> Result:
     """Render a scene.
@@ -85,6 +86,8 @@ def render(
             random ray they take noise for edges, and refine it ("geometry" does not).
         count_rays: count mirror and shadow rays.
         params: values of the scene's parameters by their ``mi.traverse`` key, set once it is loaded.
+        region: column, row, width and height of the pixels to return, in place of all; they are the same as
+            in the whole picture.
         progress: told of plan, stages and progress.
 
     Raises:
@@ -114,6 +117,7 @@ def render(
         spp=spp,
         count_rays=count_rays,
         params=params,
+        region=region,
     )
     return render_with(scene, settings, Progress() if progress is None else progress)
 
@@ -121,9 +125,10 @@ def render(
 def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Result:
     """Render a scene as ``render`` does."""
     start = time.perf_counter()
-    with counting_kernels() as kernels:
+    with counting_kernels(progress) as kernels:
         variant = runtime.use(settings.variant)
         runtime.warn_if_slow()
+        budget = Budget.of(settings.memory)
         source = open_scene(
             scene,
             width=settings.width,
@@ -131,12 +136,13 @@ def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Res
             fresnel=settings.fresnel,
             convention=settings.convention,
             integrator=settings.integrator,
+            budget=budget,
             params=settings.params,
         )
         shader = shader_for(source.scene, source.integrator)
         plan = make_plan(_facts(source, shader, variant, settings), settings)
         exposures = _exposures(plan, settings.seed)
-        job = Job(progress, _workspace(plan, exposures, settings.memory))
+        job = Job(progress, _workspace(plan, exposures, budget), kernels)
         progress.plan(plan)
         shader.prepare(plan.kernel)
         load = time.perf_counter() - start
@@ -184,14 +190,14 @@ def _exposures(plan: Plan, seed: int) -> list[Exposure]:
     return [replace(whole, seed=seed + 2 * frame, frame=frame) for frame in range(plan.frames)]
 
 
-def _workspace(plan: Plan, exposures: Sequence[Exposure], memory: int | None) -> Workspace:
+def _workspace(plan: Plan, exposures: Sequence[Exposure], budget: Budget) -> Workspace:
     return Workspace.beside(
-        plan.width,
-        plan.height,
+        plan.seen.width,
+        plan.seen.height,
         plan.channels,
         pictures=min(len(exposures), 2),  # the frames' sum, and one of them
         rays_per_pixel=exposures[0].rays_per_pixel,
-        memory=memory,
+        budget=budget,
     )
 
 
@@ -206,11 +212,11 @@ def _add(total: dict[str, np.ndarray], picture: dict[str, np.ndarray]) -> None:
 
 def _mean(total: dict[str, np.ndarray], plan: Plan) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return the mean picture [H, W, 3] and its layers by EXR channel, [H, W] each; all are views."""
-    shape, layers = (plan.height, plan.width), {}
+    shape, inside, layers = (plan.seen.height, plan.seen.width), plan.region.inside(plan.seen), {}
     for name, values in total.items():
         if TABLE[name].source == AVERAGED and plan.frames > 1:
             values /= np.float32(plan.frames)
         if name in plan.layers:
             for index, letter in enumerate(TABLE[name].letters):
-                layers[f"{name}.{letter}"] = values[:, index].reshape(shape)
-    return total["image"].reshape(*shape, 3), dict(sorted(layers.items()))
+                layers[f"{name}.{letter}"] = values[:, index].reshape(shape)[inside]
+    return total["image"].reshape(*shape, 3)[inside], dict(sorted(layers.items()))

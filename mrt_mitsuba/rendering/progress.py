@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator
-from typing import TextIO
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TextIO
 
 Advance = Callable[[int], object]
 
@@ -15,6 +15,9 @@ class Progress:
 
     def plan(self, plan: object) -> None:
         """Called once, before anything is traced, with the render plan."""
+
+    def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
+        """Called now and then with what Dr.Jit recorded of its kernels since the last call."""
 
     @contextlib.contextmanager
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, is_obj
 from mrt_mitsuba.scene.parameters import set_parameters
@@ -39,23 +40,27 @@ def open_scene(
     fresnel: str | None = None,
     convention: str = "report",
     integrator: Any = None,
+    budget: Budget | None = None,
     params: Mapping[str, Any] | None = None,
 ) -> Source:
-    """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``."""
+    """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``.
+
+    ``budget``: memory from which its textures take theirs.
+    """
     name, model = _model(scene, convention)
     if model is None:
         if fresnel is not None:
             raise UsageError(
                 "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
             )
-        name, loaded = _own(scene)
+        name, loaded = _own(scene, budget)
         if params and loaded is scene:
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
         set_parameters(loaded, params or {})
         size = _film_size(name, loaded, width, height)
         return Source(name, loaded, loaded.sensors()[0], _integrator(integrator, loaded), *size)
     width, height, fresnel = width or SIZE[0], height or SIZE[1], fresnel or "schlick"
-    loaded = load_dict(model.to_dict(width=width, height=height, fresnel=fresnel), name)
+    loaded = load_dict(model.to_dict(width=width, height=height, fresnel=fresnel), name, budget)
     set_parameters(loaded, params or {})
     sensor, integrator = loaded.sensors()[0], _integrator(integrator, loaded)
     focus = model.focal_distance, model.focal_range
@@ -75,15 +80,15 @@ def _model(scene: Any, convention: str) -> tuple[str, Scene | None]:
     return "", None
 
 
-def _own(scene: Any) -> tuple[str, Any]:
+def _own(scene: Any, budget: Budget | None) -> tuple[str, Any]:
     """Return the name of someone's own scene, and the Mitsuba scene."""
     import mitsuba as mi
 
     if isinstance(scene, dict):
-        return "a dict", load_dict(scene)
+        return "a dict", load_dict(scene, budget=budget)
     if isinstance(scene, str | os.PathLike):
         path = os.fspath(scene)
-        return os.path.basename(path), load_file(path)
+        return os.path.basename(path), load_file(path, budget)
     if isinstance(scene, mi.Scene):
         return "a Mitsuba scene", scene
     raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")

@@ -238,6 +238,7 @@ def error_vs_time(
     repeats: int = 5,
     shared: Options | None = None,
     errors: Sequence[float] | None = None,
+    strips: bool = True,
     progress: Progress | None = None,
 ) -> WorkPrecision:
     """Measure the error and the time of settings of ``render``.
@@ -253,6 +254,7 @@ def error_vs_time(
         repeats: with other seeds, in turn, after a cold and a warm run of each case.
         shared: options of all cases and of the reference.
         errors: RMSEs to give the time for; by default round ones in the range that was measured.
+        strips: render what each curve reaches in the same time.
 
     A case that fails is kept, with the reason. Raises ``UsageError`` for wrong arguments, and what
     ``render`` raises for the reference.
@@ -277,8 +279,8 @@ def error_vs_time(
         repeats=repeats,
         errors=_round_errors(points.values(), truth.error) if errors is None else _claimed(errors, truth),
     )
-    strips = _strips(found, runner)
-    return WorkPrecision(**{**vars(found), "strips": strips, "took": time.perf_counter() - start})
+    shown = _strips(found, runner) if strips else []
+    return WorkPrecision(**{**vars(found), "strips": shown, "took": time.perf_counter() - start})
 
 
 class _Runner:
