@@ -178,8 +178,8 @@ def _render(task: Task, worker: Any) -> dict[str, Any]:
 
 def _memory(worker: Any) -> int | None:
     """Half of what is free or, where less, of what the worker may take: others take theirs."""
+    from mrt_mitsuba.memory import free_memory
     from mrt_mitsuba.options import SMALLEST_MEMORY
-    from mrt_mitsuba.rendering.memory import free_memory
 
     limit = worker.memory_manager.memory_limit
     return max(min(free_memory(), limit) // 2, SMALLEST_MEMORY) if limit else None
