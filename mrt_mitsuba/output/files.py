@@ -75,8 +75,8 @@ def write_exr(
     """Write a linear picture [H, W, 3] as float32 EXR, with layers and header attributes.
 
     A layer is named by one channel ("depth.Z", [H, W]) or as a whole ("depth", [H, W]; "normal", [H, W, 3]),
-    with the channels of ``LAYERS``, else R, G, B or Y. Header values are text, numbers or float32
-    matrices [4, 4]; anything else is written as JSON. Raises ``OutputError``.
+    with the channels of ``LAYERS``, else R, G, B or Y. Header values are text or numbers; anything else is
+    written as JSON. Raises ``OutputError``.
     """
     with replacing_together([path]) as (file,):
         _write_exr(file, image, layers or {}, header or {})
@@ -99,12 +99,12 @@ def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], heade
     attributes |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     # The library does not report a full disk when it opens the file itself, so the file is ours.
     picture = OpenEXR.File(attributes, _channels(image, layers))
-    with _compressing():
+    with compressing():
         picture.write(_Stream(file))
 
 
 @contextlib.contextmanager
-def _compressing() -> Iterator[None]:
+def compressing() -> Iterator[None]:
     """Let the EXR library compress in threads, to the same file. They are gone afterwards: a process that is
     forked while it has some waits for them for ever."""
     import OpenEXR
@@ -233,10 +233,7 @@ def _channels(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
     return result
 
 
-def _attribute(value: Any) -> Any:
-    """Return text, a number or a matrix as it is, anything else as JSON."""
+def _attribute(value: Any) -> str | int | float:
     import json
 
-    import numpy as np
-
-    return value if isinstance(value, str | int | float | np.ndarray) else json.dumps(value)
+    return value if isinstance(value, str | int | float) else json.dumps(value)

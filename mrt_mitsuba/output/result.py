@@ -43,7 +43,7 @@ class Result:
     kernel_launches: int  #: how many kernels ran
     options: Mapping[str, Any]  #: the values in force
     versions: Mapping[str, str]  #: of what decides about pixels
-    camera: Mapping[str, np.ndarray]  #: float32 [4, 4], as EXR headers have them, see ``rendering.view``
+    camera: Mapping[str, np.ndarray]  #: float64 [4, 4], see ``rendering.view``
     inputs: frozenset[str] = frozenset()  #: paths of the pictures that the scene was read from
 
     def save(self, *paths: str | os.PathLike[str], tonemap: str = "report") -> None:
@@ -71,7 +71,7 @@ class Result:
             "mrt:options": dict(self.options),
             "mrt:variant": self.plan.variant,
             **{f"mrt:{name}": self.versions[name] for name in ("mitsuba", "drjit", "llvm")},
-            **self.camera,
+            **{f"mrt:{name}": matrix.tolist() for name, matrix in self.camera.items()},
         }
 
     def _repr_png_(self) -> bytes:

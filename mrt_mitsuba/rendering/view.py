@@ -53,7 +53,7 @@ class View:
         return mi.Vector3f(way) * time
 
     def matrices(self) -> dict[str, np.ndarray]:
-        """Return the matrices that EXR headers have, float32 [4, 4] for row vectors on their left.
+        """Return the camera's matrices, float64 [4, 4] for row vectors on their left, as EXR defines them.
 
         ``worldToCamera``: to a camera at the origin that looks along -z, with x to the right and y up.
         ``worldToNDC``, of pinhole cameras: to the picture, x from 0 to 1 to the right and y downwards.
@@ -87,4 +87,4 @@ class View:
                 ]
             )
             found["worldToNDC"] = projection @ to_camera
-        return {name: np.ascontiguousarray(matrix.T, np.float32) for name, matrix in found.items()}
+        return {name: matrix.T for name, matrix in found.items()}

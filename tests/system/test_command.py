@@ -61,8 +61,8 @@ def test_picture_and_its_two_files(mrt: Mrt, tmp_path: Path) -> None:
         "mrt:drjit",
         "mrt:llvm",
         "software",
-        "worldToCamera",
-        "worldToNDC",
+        "mrt:worldToCamera",
+        "mrt:worldToNDC",
     } <= exr.header.keys()
     with Image.open(tmp_path / "out.png") as png:
         np.testing.assert_array_equal(np.asarray(png), np.clip(np.trunc(exr.image * 255), 0, 255))

@@ -329,6 +329,6 @@ def test_matrices_of_the_header_lead_from_rays_to_the_picture(variant: str, name
     for place in ((0.5, 0.5), (0.1, 0.9), (0.8, 0.3)):
         ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(place), mi.Point2f(0.5))
         point = np.append(np.array(ray(7.0)).ravel(), 1.0)
-        x, y, _, w = point @ header["worldToNDC"]
+        x, y, _, w = point @ header["mrt:worldToNDC"]
         np.testing.assert_allclose((x / w, y / w), place, atol=1e-5)  # float32
-        assert (point @ header["worldToCamera"])[2] < 0
+        assert (point @ header["mrt:worldToCamera"])[2] < 0
