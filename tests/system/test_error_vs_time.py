@@ -64,7 +64,7 @@ def test_errors_fall_as_theory_says_and_a_bias_is_found(scene):
     assert few.rmse_interval[0] < few.rmse < few.rmse_interval[1] and few.efficiency > 0
     assert few.cold > 0 and few.rays["primary"] == 4 * SIZE[0] * SIZE[1]
     (strip,) = found.strips[:1]
-    assert [panel.name.split(",")[0] for panel in strip.panels] == ["path", "blind"]
+    assert [panel.name.split(",")[0].split()[0] for panel in strip.panels] == ["path", "blind"]
     assert all(np.isfinite(panel.image).all() and panel.seconds > 0 for panel in strip.panels)
 
 
