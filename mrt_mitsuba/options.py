@@ -151,6 +151,18 @@ def anything() -> Kind:
     return Kind("", "anything", str, lambda value: value)
 
 
+def rectangle() -> Kind:
+    """Column and row of the first pixel, width and height."""
+
+    def check(value: Any) -> tuple[int, int, int, int]:
+        x, y, width, height = (operator.index(number) for number in value)
+        if x < 0 or y < 0 or width < 1 or height < 1:
+            raise ValueError
+        return x, y, width, height
+
+    return Kind("", "four whole numbers: column, row, width and height in pixels", str, check)
+
+
 def parameters() -> Kind:
     """Values by the keys of ``mi.traverse``."""
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
     from .merged_bsdf import UniformMaterial
-    from .revolution import QuadricTable
+    from .quadric_kinds import QuadricTable
 
 
 class LayeredIntegrator(ABC):

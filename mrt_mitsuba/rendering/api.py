@@ -55,6 +55,7 @@ def render(
     spp: int = 1,
     count_rays: bool = False,
     params: Mapping[str, Any] | None = None,
+    region: Sequence[int] | None = None,
     progress: Progress | None = None,
 ) -> Result:
     """Render a scene.
@@ -85,6 +86,8 @@ def render(
             random ray they take noise for edges, and refine it ("geometry" does not).
         count_rays: count mirror and shadow rays.
         params: values of the scene's parameters by their ``mi.traverse`` key, set once it is loaded.
+        region: column, row, width and height of the pixels to return, in place of all; they are the same as
+            in the whole picture.
         progress: told of plan, stages and progress.
 
     Raises:
@@ -114,6 +117,7 @@ def render(
         spp=spp,
         count_rays=count_rays,
         params=params,
+        region=region,
     )
     return render_with(scene, settings, Progress() if progress is None else progress)
 
@@ -188,8 +192,8 @@ def _exposures(plan: Plan, seed: int) -> list[Exposure]:
 
 def _workspace(plan: Plan, exposures: Sequence[Exposure], budget: Budget) -> Workspace:
     return Workspace.beside(
-        plan.width,
-        plan.height,
+        plan.seen.width,
+        plan.seen.height,
         plan.channels,
         pictures=min(len(exposures), 2),  # the frames' sum, and one of them
         rays_per_pixel=exposures[0].rays_per_pixel,
@@ -208,11 +212,11 @@ def _add(total: dict[str, np.ndarray], picture: dict[str, np.ndarray]) -> None:
 
 def _mean(total: dict[str, np.ndarray], plan: Plan) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return the mean picture [H, W, 3] and its layers by EXR channel, [H, W] each; all are views."""
-    shape, layers = (plan.height, plan.width), {}
+    shape, inside, layers = (plan.seen.height, plan.seen.width), plan.region.inside(plan.seen), {}
     for name, values in total.items():
         if TABLE[name].source == AVERAGED and plan.frames > 1:
             values /= np.float32(plan.frames)
         if name in plan.layers:
             for index, letter in enumerate(TABLE[name].letters):
-                layers[f"{name}.{letter}"] = values[:, index].reshape(shape)
-    return total["image"].reshape(*shape, 3), dict(sorted(layers.items()))
+                layers[f"{name}.{letter}"] = values[:, index].reshape(shape)[inside]
+    return total["image"].reshape(*shape, 3)[inside], dict(sorted(layers.items()))

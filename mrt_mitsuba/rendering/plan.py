@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.output import layers
 from mrt_mitsuba.output.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rays.lattice import Lattice
+from mrt_mitsuba.rays.region import Region
 from mrt_mitsuba.rendering import kernel_text
 from mrt_mitsuba.rendering.detectors import DETECTORS
 from mrt_mitsuba.rendering.settings import Focus, RenderSettings
@@ -96,6 +99,7 @@ class Plan:
     integrator: str  #: name of its plugin
     width: int  #: pixels
     height: int  #: pixels
+    region: Region  #: that is returned
     lattice: Lattice  #: where the samples of a pixel lie
     detector: str | None  #: edge detector; None where every pixel gets all samples at once
     blur: str | None  #: depth-of-field mode
@@ -120,12 +124,21 @@ class Plan:
         return layers.channels(self.traced | self.layers)
 
     @property
+    def seen(self) -> Region:
+        """The region with the pixels around it that filters look at."""
+        reach = (edges.REACH if self.detector else 0) + (dof.REACH if self.blur else 0)
+        return self.region.grown(reach, self.width, self.height)
+
+    @property
     def frames(self) -> int:
         """Pictures to average, each with filters of its own."""
         return self.motion_samples if self.motion == "frames" and (self.detector or self.blur) else 1
 
     def __str__(self) -> str:
         lines = [f"Plan for {self.scene}, {self.width}x{self.height}, {self.integrator} in {self.variant}"]
+        part = self.region
+        if (part.width, part.height) != (self.width, self.height):
+            lines += [f"  region  {part.width}x{part.height} from column {part.x}, row {part.y}"]
         moments = "at least {} moments in a pixel" if self.motion == "stratified" else "{} frames"
         if self.motion:
             lines += [f"  pass    motion blur: {moments.format(self.motion_samples)}"]
@@ -154,6 +167,7 @@ def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
         integrator=facts.integrator,
         width=facts.width,
         height=facts.height,
+        region=_region(settings.region, facts),
         lattice=lattice,
         detector=detector,
         blur=blur,
@@ -167,6 +181,13 @@ def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
         parts=facts.parts,
         left_out=tuple(_left_out(traced, facts, made, lattice.aa, settings.aamode)),
     )
+
+
+def _region(asked: Sequence[int] | None, facts: RenderFacts) -> Region:
+    region = Region(*(asked or (0, 0, facts.width, facts.height)))
+    if region.x + region.width > facts.width or region.y + region.height > facts.height:
+        raise UsageError(f"region={asked}: it exceeds the picture, {facts.width}x{facts.height} pixels")
+    return region
 
 
 def _check_layers(asked: frozenset[str], facts: RenderFacts, aamode: str) -> None:

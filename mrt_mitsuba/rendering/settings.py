@@ -16,6 +16,7 @@ from mrt_mitsuba.options import (
     number,
     option,
     parameters,
+    rectangle,
     size,
     subset,
     switch,
@@ -94,6 +95,7 @@ class RenderSettings:
     spp: int = option(1, integer(1, 65536), "rays for each sample, where the integrator is random")
     count_rays: bool = option(False, switch())
     params: Mapping[str, Any] | None = option(None, parameters())
+    region: tuple[int, int, int, int] | None = option(None, rectangle())
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -112,7 +114,7 @@ class RenderSettings:
 
     def in_force(self, **decided: Any) -> dict[str, Any]:
         """Return the options that shape the picture, by name, with those that the scene ``decided``."""
-        names = (*(name for name in TABLE if name != "memory"), "params")
+        names = (*(name for name in TABLE if name != "memory"), "params", "region")
         values = {name: getattr(self, name) for name in names} | decided
         return {name: value for name, value in values.items() if value is not None}
 

@@ -34,7 +34,7 @@ BACKWARDS = {
 # The loops of the integrator are one story; the options of a render are many
 ALLOWED = {"mrt_mitsuba.plugins.whitted.MrtWhitted.trace", "mrt_mitsuba.rendering.api.render"}
 
-FOUNDATION = {"errors", "options", "runtime"}
+FOUNDATION = {"errors", "memory", "options", "runtime"}
 
 _BRANCH = ast.If | ast.IfExp | ast.For | ast.While | ast.ExceptHandler | ast.match_case | ast.comprehension
 

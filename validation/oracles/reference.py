@@ -126,7 +126,7 @@ def specular_lobe(n: np.ndarray, to_light: np.ndarray, to_eye: np.ndarray, alpha
     spread = np.exp(-sin2 / cos2 / alpha**2) / (math.pi * alpha**2 * cos2**2)
     shadowing = 1.0
     for way in (to_light, to_eye):
-        a = dot(n, way) / (alpha * np.linalg.norm(np.cross(n, way), axis=-1))
+        a = np.minimum(dot(n, way) / (alpha * np.linalg.norm(np.cross(n, way), axis=-1)), 1.6)
         fit = a * (3.535 + 2.181 * a) / (1 + a * (2.276 + 2.577 * a))
         shadowing = shadowing * np.where(a < 1.6, fit, 1.0)
     return spread * shadowing / (4 * dot(n, to_light) * dot(n, to_eye))
