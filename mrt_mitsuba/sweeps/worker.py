@@ -166,9 +166,11 @@ def _render(task: Task, worker: Any) -> dict[str, Any]:
     result = render(scene, **arguments)
     header = result.header() | {MADE_WITH: task.made_with}
     for file in task.files:
-        path = os.path.join(task.scratch, file)
+        path, target = os.path.join(task.scratch, file), os.path.join(task.folder, file)
+        for place in (path, target):  # tiles have a folder of their own
+            os.makedirs(os.path.dirname(place), exist_ok=True)
         save(path, result.image, layers=result.layers, header=header)
-        os.replace(path, os.path.join(task.folder, file))
+        os.replace(path, target)
     return {
         "file": task.files[-1],
         "seconds": time.perf_counter() - start,
@@ -178,8 +180,8 @@ def _render(task: Task, worker: Any) -> dict[str, Any]:
 
 def _memory(worker: Any) -> int | None:
     """Half of what is free or, where less, of what the worker may take: others take theirs."""
+    from mrt_mitsuba.memory import free_memory
     from mrt_mitsuba.options import SMALLEST_MEMORY
-    from mrt_mitsuba.rendering.memory import free_memory
 
     limit = worker.memory_manager.memory_limit
     return max(min(free_memory(), limit) // 2, SMALLEST_MEMORY) if limit else None

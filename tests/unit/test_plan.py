@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from contextlib import contextmanager
 from dataclasses import fields
 from typing import Any
 
@@ -48,16 +47,14 @@ def scene(**nodes: Any) -> dict[str, Any]:
 
 
 class Watch(Progress):
-    """Keeps the kernel of the last stage that traced rays."""
+    """Keeps the kernel that traced the rays: the longest."""
 
-    kernel = ""
+    operations, kernel = 0, ""
 
-    @contextmanager
-    def stage(self, title, total, message=""):
-        dr.kernel_history_clear()
-        yield lambda steps: None
-        history = dr.kernel_history([dr.KernelType.JIT])
-        self.kernel = max(history, key=lambda entry: entry["operation_count"])["ir"].getvalue()
+    def kernels(self, records: Any) -> None:
+        for record in records:
+            if record["type"] == dr.KernelType.JIT and record["operation_count"] > self.operations:
+                self.operations, self.kernel = record["operation_count"], record["ir"].getvalue()
 
 
 def planned(nodes: dict[str, Any], **options: Any) -> tuple[mrt.Result, str]:
