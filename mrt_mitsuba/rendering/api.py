@@ -174,7 +174,7 @@ def _facts(source: Source, shader: Shader, variant: str, settings: RenderSetting
         width=source.width,
         height=source.height,
         focus=settings.focus(source.focal_distance, source.focal_range),
-        layers=shader.layers,
+        traceable=shader.layers,
         random=shader.random,
         kernel=shader.kernel,
         parts=shader.facts,
