@@ -91,12 +91,12 @@ def write_exr(
     attributes |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     # The library does not report a full disk when it opens the file itself, so the file is ours.
     picture = OpenEXR.File(attributes, _channels(image, layers or {}))
-    with replacing(path) as file, _compressing():
+    with replacing(path) as file, compressing():
         picture.write(_Stream(file))
 
 
 @contextlib.contextmanager
-def _compressing() -> Iterator[None]:
+def compressing() -> Iterator[None]:
     """Let the EXR library compress in threads, to the same file. They are gone afterwards: a process that is
     forked while it has some waits for them for ever."""
     import OpenEXR

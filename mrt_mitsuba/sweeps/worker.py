@@ -166,9 +166,11 @@ def _render(task: Task, worker: Any) -> dict[str, Any]:
     result = render(scene, **arguments)
     header = result.header() | {MADE_WITH: task.made_with}
     for file in task.files:
-        path = os.path.join(task.scratch, file)
+        path, target = os.path.join(task.scratch, file), os.path.join(task.folder, file)
+        for place in (path, target):  # tiles have a folder of their own
+            os.makedirs(os.path.dirname(place), exist_ok=True)
         save(path, result.image, layers=result.layers, header=header)
-        os.replace(path, os.path.join(task.folder, file))
+        os.replace(path, target)
     return {
         "file": task.files[-1],
         "seconds": time.perf_counter() - start,
