@@ -19,19 +19,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Timings:
-    """Seconds of one render. ``passes`` adds up to about ``total``; ``compile`` and ``kernels`` are parts of
-    it."""
+    """Seconds of one render; ``load`` and ``passes`` add up to about ``total``."""
 
     total: float  #: all of the render
-    load: float  #: scene and plan
-    compile: float  #: kernels that were not in the cache
-    kernels: float  #: kernels running
+    load: float  #: of the scene, and planning
+    compile: float  #: of kernels that were not in the cache
+    kernels: float  #: of running kernels
     passes: Mapping[str, float]  #: by the name of the pass
 
 
 @dataclass(frozen=True)
 class Result:
-    """A finished picture and what became known on the way."""
+    """A finished picture, its layers, and how it was made."""
 
     image: Image  #: float32 [H, W, 3], linear, top row first
     layers: Mapping[str, Image]  #: float32 [H, W] by EXR channel name, such as "depth.Z"
@@ -39,17 +38,16 @@ class Result:
     timings: Timings  #: seconds
     rays: Mapping[str, int]  #: number by kind; "mirror" and "shadow" only where they were counted
     kernel_launches: int  #: how many kernels ran
-    options: Mapping[str, Any] = field(default_factory=dict)  #: as they were given
+    options: Mapping[str, Any] = field(default_factory=dict)  #: in force
 
     def save(self, path: str | os.PathLike[str], *, tonemap: str = "report") -> None:
-        """Write a .png or .exr; raise ``OutputError``. ``tonemap`` ("report" or "srgb") concerns a PNG
-        only."""
+        """Write a .png or .exr; raise ``OutputError``. ``tonemap`` ("report" or "srgb") is for PNG only."""
         from mrt_mitsuba.output import files as output
 
         output.save(path, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
 
     def header(self) -> dict[str, Any]:
-        """The header attributes of an EXR."""
+        """Return the header attributes of an EXR."""
         import mrt_mitsuba
 
         return {
