@@ -211,7 +211,7 @@ class Scene:
 def _check(scene: Scene) -> None:
     """Refuse what Mitsuba would draw as nothing, or as noise, without a word. Materials, lights, planes and
     meshes are checked by their plugins."""
-    from mrt_mitsuba.plugins.quadric_kinds import KINDS  # the command checks its words without it
+    from mrt_mitsuba.plugins.quadric_kinds import KINDS  # which brings Dr.Jit
 
     problem = view_problem(scene.camera)
     if problem:
