@@ -46,6 +46,11 @@ COMMANDS = {
         "compare two pictures; exit code 1 beyond a limit, 2 if they do not compare",
         "mrt_mitsuba.validation.tools.commands:diff",
     ),
+    "check": Command(
+        "SCENE|scene=PATH [out=DIR] [quick=1]",
+        "check the laws of every BSDF, shape and emitter, and find pixels that are not finite",
+        "mrt_mitsuba.validation.checks.scene:command",
+    ),
     "error-vs-time": Command(
         "SCENE|scene=PATH cases=FILE.toml [out=DIR]",
         "measure error and time of any settings of any scene",

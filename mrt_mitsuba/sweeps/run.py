@@ -9,8 +9,9 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import OutputError, UsageError
-from mrt_mitsuba.output.files import check_target
+from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.progress import Advance, Progress, TerminalProgress
+from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps import cluster as clusters
 from mrt_mitsuba.sweeps.cluster import ClusterError
 from mrt_mitsuba.sweeps.grid import Job, jobs
@@ -18,7 +19,8 @@ from mrt_mitsuba.sweeps.scenes import check_parameters, fingerprint, send
 from mrt_mitsuba.sweeps.sheet import MOST, write_sheet
 from mrt_mitsuba.sweeps.table import FILE as TABLE
 from mrt_mitsuba.sweeps.table import Table
-from mrt_mitsuba.sweeps.worker import TOPIC, House, Task, is_fresh, named, render_task, thumbnail, versions
+from mrt_mitsuba.sweeps.tiles import Mosaic, assemble_task
+from mrt_mitsuba.sweeps.worker import TOPIC, House, Task, is_fresh, named, render_task, thumbnail
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -78,6 +80,8 @@ def sweep(
             raise UsageError(f"{name}={number!r}: must be a whole number, {least} or more")
     if workers is not None and cluster is not None:
         raise UsageError("workers are for this machine, and a cluster brings its own: give one of them")
+    if tiles is not None and (png or not _are_tiles(tiles)):
+        raise UsageError(f"tiles={tiles!r}: give rows and columns, such as (4, 4), and no png")
     planned = jobs(scene, grid or {}, zipped, options)
     check_parameters(planned)
     folder = _folder(out)
@@ -89,17 +93,28 @@ def sweep(
         rest = [task for task in tasks if task.name not in table]
         if not rest:
             return table
+        mosaics = [Mosaic.of(task, tiles) for task in rest] if tiles else []
         variant = options.get("variant") or ""
-        count = workers or min(clusters.default_workers(variant), len(rest))
+        most = sum(len(mosaic.tiles) for mosaic in mosaics) or len(rest)
+        count = workers or min(clusters.default_workers(variant), most)
         local = clusters.Local(count, retries, variant.startswith("cuda"), dashboard)
         with clusters.connected(cluster, local) as client:
             sharing = clusters.inspect(client, scratch, count if cluster is None else 1)
             house = House(sharing, renew, cluster is None, versions())
-            with table.writing(), shown.stage("Sweep", len(tasks)) as advance:
-                advance(len(table))
-                _render(client, rest, house, retries, table, advance)
-            _write_sheet(client, tasks)
+            work = _Work(client, house, retries, resume)
+            with table.writing(), shown.stage("Sweep", len(rest) + most * bool(tiles)) as advance:
+                work.finish(work.submit(rest, mosaics), table, advance)
+            if not tiles:
+                _write_sheet(client, tasks)
     return table
+
+
+def _are_tiles(tiles: Any) -> bool:
+    return (
+        isinstance(tiles, list | tuple)
+        and len(tiles) == 2
+        and all(isinstance(number, int) and number > 0 for number in tiles)
+    )
 
 
 def _folder(out: str | os.PathLike[str]) -> str:
@@ -121,29 +136,61 @@ def _task(job: Job, folder: str, scratch: str, png: bool) -> Task:
     )
 
 
-def _render(
-    client: Client, tasks: Sequence[Task], house: House, retries: int, table: Table, advance: Advance
-) -> None:
-    """Let the workers render; each picture's row goes into the table as it comes."""
-    from distributed import as_completed
+class _Work:
+    """The jobs as the engine has them."""
 
-    attempts: Counter[str] = Counter()
-    client.subscribe_topic(TOPIC, lambda event: attempts.update([event[1]]))
-    futures = client.map(
-        render_task, tasks, key=[task.key for task in tasks], house=house, retries=retries, pure=False
+    def __init__(self, client: Client, house: House, retries: int, resume: bool) -> None:
+        self._client, self._house, self._resume = client, house, resume
+        self._options: dict[str, Any] = {"house": house, "retries": retries, "pure": False}
+        self._attempts: Counter[str] = Counter()
+
+    def submit(self, tasks: Sequence[Task], mosaics: Sequence[Mosaic]) -> dict[Future, Sequence[Task]]:
+        """Hand the jobs over; return for each its task, that of its picture first, or nothing for a tile."""
+        self._client.subscribe_topic(TOPIC, lambda event: self._attempts.update([event[1]]))
+        if not mosaics:
+            return {future: [task] for future, task in zip(self._map(tasks), tasks, strict=True)}
+        pending: dict[Future, Sequence[Task]] = {}
+        for mosaic in mosaics:
+            tiles = mosaic.tiles
+            there = [self._resume and is_fresh(tile) for tile in tiles]
+            futures = iter(self._map([tile for tile, fresh in zip(tiles, there, strict=True) if not fresh]))
+            found = [{} if fresh else next(futures) for fresh in there]
+            pending |= {tile: () for tile in found if tile}
+            picture = self._client.submit(
+                assemble_task, mosaic, found, key=mosaic.picture.key, **self._options
+            )
+            pending[picture] = [mosaic.picture, *tiles]
+        return pending
+
+    def _map(self, tasks: Sequence[Task]) -> list[Future]:
+        keys = [task.key for task in tasks]
+        return list(self._client.map(render_task, tasks, key=keys, **self._options))
+
+    def finish(self, pending: dict[Future, Sequence[Task]], table: Table, advance: Advance) -> None:
+        """Wait for the jobs; each picture's row goes into the table as it comes."""
+        from distributed import as_completed
+
+        try:
+            for future in as_completed(list(pending), self._client.loop):
+                tasks = pending.pop(future)
+                if tasks:
+                    attempts = max(1, *(self._attempts[task.key] for task in tasks))
+                    facts = {"versions": named(self._house.versions), "attempts": attempts}
+                    table.add(tasks[0].name, _facts(future) | facts)
+                elif future.cancelled():
+                    raise _gone()
+                future.release()  # what no one needs is not computed again when its worker goes
+                advance(1)
+        finally:
+            if self._client.status == "running":
+                self._client.cancel(list(pending))
+                self._client.unsubscribe_topic(TOPIC)
+
+
+def _gone() -> ClusterError:
+    return ClusterError(
+        "the scheduler is gone: start it and its workers, and then the same sweep again, which goes on"
     )
-    pending = dict(zip(futures, tasks, strict=True))
-    try:
-        for future in as_completed(list(pending), client.loop):
-            facts = _facts(future) | {"versions": named(house.versions)}
-            task = pending.pop(future)
-            future.release()  # what no one needs is not computed again when its worker goes
-            table.add(task.name, facts | {"attempts": max(1, attempts[task.key])})
-            advance(1)
-    finally:
-        if client.status == "running":
-            client.cancel(list(pending))
-            client.unsubscribe_topic(TOPIC)
 
 
 def _facts(future: Future) -> dict[str, Any]:
@@ -156,10 +203,7 @@ def _facts(future: Future) -> dict[str, Any]:
             return {"error": " ".join(f"{type(error).__name__}: {error}".split())}
         return dict(future.result())
     except (CancelledError, OSError) as error:
-        raise ClusterError(
-            "the scheduler is gone: start it and its workers, and then the same sweep again, which goes on "
-            "from here"
-        ) from error
+        raise _gone() from error
 
 
 def _write_sheet(client: Client, tasks: Sequence[Task]) -> None:

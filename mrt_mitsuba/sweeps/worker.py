@@ -9,12 +9,11 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import metadata
 from typing import Any
 
-from mrt_mitsuba import __version__, llvm
 from mrt_mitsuba.cores import affinity, usable_cores
 from mrt_mitsuba.errors import MrtError, OutputError
+from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps.scenes import SceneFile
 
 TOPIC = "mrt-sweep"  # of the scheduler's events, which tell a client what began
@@ -62,16 +61,6 @@ class House:
     renew: int
     local: bool
     versions: Mapping[str, str]
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what decides about pixels."""
-    return {
-        "mrt-mitsuba": __version__,
-        "mitsuba": metadata.version("mitsuba"),
-        "drjit": metadata.version("drjit"),
-        "llvm": llvm.version_text(llvm.prepare().version),
-    }
 
 
 def named(versions: Mapping[str, str]) -> str:
@@ -166,9 +155,11 @@ def _render(task: Task, worker: Any) -> dict[str, Any]:
     result = render(scene, **arguments)
     header = result.header() | {MADE_WITH: task.made_with}
     for file in task.files:
-        path = os.path.join(task.scratch, file)
+        path, target = os.path.join(task.scratch, file), os.path.join(task.folder, file)
+        for place in (path, target):  # tiles have a folder of their own
+            os.makedirs(os.path.dirname(place), exist_ok=True)
         save(path, result.image, layers=result.layers, header=header)
-        os.replace(path, os.path.join(task.folder, file))
+        os.replace(path, target)
     return {
         "file": task.files[-1],
         "seconds": time.perf_counter() - start,
@@ -178,8 +169,8 @@ def _render(task: Task, worker: Any) -> dict[str, Any]:
 
 def _memory(worker: Any) -> int | None:
     """Half of what is free or, where less, of what the worker may take: others take theirs."""
+    from mrt_mitsuba.memory import free_memory
     from mrt_mitsuba.options import SMALLEST_MEMORY
-    from mrt_mitsuba.rendering.memory import free_memory
 
     limit = worker.memory_manager.memory_limit
     return max(min(free_memory(), limit) // 2, SMALLEST_MEMORY) if limit else None

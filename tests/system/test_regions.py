@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba import memory
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.rendering import memory
 
 WIDTH, HEIGHT = 131, 97
 SIZE = {"width": WIDTH, "height": HEIGHT}

@@ -383,3 +383,65 @@ def test_threads_are_shared_out(address: str, tmp_path: Path) -> None:
     with Client(address, set_as_default=False) as client:
         mrt.sweep(3, tmp_path, grid={"seed": range(4)}, cluster=client, **SMALL)
         assert set(client.run(threads).values()) <= {max(1, usable_cores() // 2)}
+
+
+# ------------------------------------------------- Tiles -------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"aa": 3, "focaldist": 2.0, "focalrange": 0.5, "layers": ["normal", "blur"]},
+        {"aa": 2, "aamode": "luma", "integrator": "path", "spp": 2, "seed": 3},
+    ],
+    ids=["filters", "random numbers"],
+)
+def test_tiles_make_the_same_picture(address: str, tmp_path: Path, options: dict[str, Any]) -> None:
+    size = {"width": 231, "height": 173}
+    mrt.render(3, **size, **options).save(tmp_path / "whole.exr")
+    table = mrt.sweep(3, tmp_path / "out", tiles=(3, 4), cluster=address, **size, **options)
+    assert [row["error"] for row in table.rows] == [""] and table.rows[0]["rays"] > 231 * 173
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["picture.exr", "table.csv"]
+    whole, tiled = (read_exr(path) for path in (tmp_path / "whole.exr", tmp_path / "out" / "picture.exr"))
+    assert tiled.image.tobytes() == whole.image.tobytes()
+    assert tiled.layers.keys() == whole.layers.keys()
+    for name, values in whole.layers.items():
+        assert tiled.layers[name].tobytes() == values.tobytes(), name
+    own = {"mrt:sweep"}
+    assert tiled.header.keys() - own == whole.header.keys() - own
+    assert all(str(tiled.header[key]) == str(whole.header[key]) for key in whole.header.keys() - own)
+
+
+def test_tiles_of_an_earlier_sweep_are_kept(address: str, tmp_path: Path) -> None:
+    (tmp_path / "picture.exr").mkdir()  # in the way of the picture, when its tiles are there
+    options = {"tiles": (2, 2), "cluster": address, **SMALL}
+    first = mrt.sweep(3, tmp_path, **options)
+    assert "cannot put picture together" in first.failed[0]["error"]
+    assert sorted(path.name for path in (tmp_path / "picture.tiles").iterdir()) == [
+        f"{row},{column}.exr" for row in (0, 1) for column in (0, 1)
+    ]
+    (tmp_path / "picture.exr").rmdir()
+    (tmp_path / "picture.tiles" / "1,0.exr").unlink()
+    second = mrt.sweep(3, tmp_path, **options)
+    assert (
+        not second.failed and second.rows[0]["rays"] is None
+    )  # those of the tiles that were there are unknown
+    assert read_exr(tmp_path / "picture.exr").image.tobytes() == mrt.render(3, **SMALL).image.tobytes()
+    assert not (tmp_path / "picture.tiles").exists()
+
+
+def test_a_tile_that_fails_fails_its_picture(address: str, tmp_path: Path) -> None:
+    scenes = [str(tmp_path / name) for name in ("good.xml", "bad.xml")]
+    assert cli.main(["export", "1", "--xml", scenes[0]]) == 0
+    Path(scenes[1]).write_text(Path(scenes[0]).read_text().replace("mrt_bsdf", "none_such"))
+    size = {"width": 800, "height": 600}  # those of the file: no one looks into it before
+    grid = {"scene": scenes}
+    table = mrt.sweep(None, tmp_path / "out", grid=grid, tiles=(2, 1), cluster=address, aa=1, **size)
+    assert [bool(row["error"]) for row in table.rows] == [False, True]
+    assert "none_such" in table.failed[0]["error"]
+
+
+@pytest.mark.parametrize("tiles", [(0, 1), (2,), 3, (2.0, 2), (49, 1)])
+def test_tiles_that_cannot_be(tmp_path: Path, tiles: object) -> None:
+    with pytest.raises(UsageError, match="tiles="):
+        mrt.sweep(3, tmp_path, tiles=tiles, **SMALL)

@@ -14,7 +14,7 @@ from mrt_mitsuba.validation.tools import knobs
 from mrt_mitsuba.validation.tools.study import Plot, Study, Table
 from mrt_mitsuba.validation.tools.work_precision import Point
 
-SETTINGS = knobs.Extent((40, 30), (1, 4), 12, (1, 16), 256)
+SETTINGS = knobs.Extent((40, 30), (1, 4), 24, (1, 16), 256)
 
 
 def _point(name: str, seconds: float, rmse: float) -> Point:

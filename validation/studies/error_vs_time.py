@@ -31,12 +31,12 @@ class Extent:
 
 SCENES = (0, 1, 2, 3, 4, 7, 9)
 FULL = Extent(
-    knobs.Extent((240, 180), (1, 2, 4, 8), 32, (1, 4, 16, 64), 2048),
+    knobs.Extent((240, 180), (1, 2, 4, 8), 48, (1, 4, 16, 64), 2048),
     {"sampling": SCENES, "whitted": SCENES, "path": TAME, "lens": (3, 4), "cone": (9,)},
     5,
 )
 QUICK = Extent(
-    knobs.Extent((64, 48), (1, 4), 12, (1, 16), 512),
+    knobs.Extent((64, 48), (1, 4), 24, (1, 16), 512),
     {"sampling": (0,), "whitted": (0,), "path": (0,), "lens": (3,), "cone": (9,)},
     1,
 )
@@ -150,8 +150,8 @@ def _hold_whitted(study: Study, where: str, found: WorkPrecision) -> None:
     study.at_least(
         f"{where}: RMSE of max_depth={first} - that of {last}",
         _rmse(found, f"max_depth={first}") - _rmse(found, f"max_depth={last}"),
-        0,
-        "a bounce less is no nearer; a limit that has no effect leaves 0, and is seen by the tests",
+        3e-4,
+        "seen is 6e-4 (scene 9) and above; a limit that has no effect leaves 0",
     )
 
 

@@ -41,7 +41,7 @@ class Extent:
 
     size: tuple[int, int]
     amounts: Sequence[int]  # aa
-    reference_aa: int
+    reference_aa: int  # an even multiple of each: at an odd one, lattices share samples and with them errors
     spp: Sequence[int]
     reference_spp: int
 

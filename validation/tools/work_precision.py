@@ -28,6 +28,7 @@ from mrt_mitsuba.validation.tools.intervals import Estimate, estimate
 
 REFERENCE_SEEDS = (2**20 + 1, 2**20 + 2)  # far from those of the repeats
 RESOLVED = 2.0  # times the reference's own error from which on an error is told from it
+NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?"
 STEPS = (1, 2, 5)  # of the errors that the time is asked for, times powers of ten
 MOST_ERRORS = 4
 
@@ -52,8 +53,9 @@ class Point:
 
     @property
     def family(self) -> str:
-        """Cases whose names differ in numbers only are one curve."""
-        return " ".join(re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?(/\d+)?", " ", self.name).split()).rstrip(" =")
+        """The name without its numbers: cases that differ in these alone are one curve."""
+        bare = re.sub(rf"(\w+=)?{NUMBER}", " ", self.name).split()
+        return " ".join(bare or re.sub(f"=?{NUMBER}", " ", self.name).split()) or self.name
 
     @cached_property
     def time(self) -> Estimate:
@@ -101,7 +103,7 @@ class Point:
 
     @property
     def bias(self) -> float:
-        """|bias| = √(MSE − variance), 0 where noise explains the whole error; NaN for one repeat."""
+        """Absolute bias, √(MSE − variance), 0 where noise explains the whole error; NaN for one repeat."""
         return float(np.sqrt(np.maximum(self.bias_squared.value, 0)))
 
     @property
@@ -222,7 +224,7 @@ def _verdict(error: float, times: Mapping[str, Estimate], repeats: int) -> str:
     best = reached[0][1]
     like = [name for _, name in reached[1:] if times[name].overlaps(times[best])]
     if like:
-        return f"{where}: {' and '.join([best, *like])} are not told apart, their intervals overlap."
+        return f"{where}: not told apart, for their intervals overlap: {', '.join([best, *like])}."
     if len(reached) == 1:
         return f"{where}: only {best} comes so low, in {times[best]} s."
     value, second = reached[1]

@@ -1,0 +1,126 @@
+"""``check_shape``: the laws that any shape must obey, stock, mesh or in Python."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.validation.checks.law import Check, Law, Skip, class_name, examine
+from mrt_mitsuba.validation.checks.noise import ROUNDING
+from mrt_mitsuba.validation.checks.probe import is_scalar, lanes
+from mrt_mitsuba.validation.checks.recipe import Recipe
+from mrt_mitsuba.validation.checks.shape_case import FLAT, HIT_ROUNDINGS, Case, corners, trace
+from mrt_mitsuba.validation.checks.shape_range import far, finite, scale
+from mrt_mitsuba.validation.checks.shape_samples import sampling
+from mrt_mitsuba.validation.checks.shape_surface import hits, normals, surface, watertight
+
+
+def check_shape(
+    shape: Any, *, quick: bool = False, seed: int = 0, only: Iterable[str] | None = None
+) -> Check:
+    """Check the laws of a shape in the current variant: a dict for ``mi.load_dict``, or a loaded one.
+
+    An object that is no Mitsuba shape but has ``ray_intersect``, ``ray_test`` and ``bbox`` will do as well.
+    ``quick``: fewer rays. ``only``: names of ``LAWS``. Raises ``UsageError`` for anything else.
+    """
+    import mitsuba as mi
+
+    runtime.use()
+    recipe = Recipe.of(shape)
+    loaded = shape if recipe.description is None else recipe.load()
+    if not all(hasattr(loaded, name) for name in ("ray_intersect", "ray_test", "bbox")):
+        raise UsageError(
+            f"{type(loaded).__name__} is no shape of {mi.variant()}: give a dict or a loaded shape"
+        )
+    name = recipe.description["type"] if recipe.description else class_name(loaded)
+    with np.errstate(all="ignore"):
+        return examine(name, Case(loaded, recipe, quick, seed), LAWS, only=only, quick=quick)
+
+
+def bbox(law: Law, case: Case) -> None:
+    """Whatever is hit or sampled lies in the bounding box."""
+    import mitsuba as mi
+
+    o, d, met = case.met
+    points = [met.p]
+    ends = corners(case.shape)
+    if ends is not None:
+        points.append(ends)
+    elif isinstance(case.shape, mi.Shape):
+        try:
+            u = case.rng.random((len(o), 2), np.float32)
+            points += lanes(lambda mi, x: [case.shape.sample_position(0, x).p], ("Point2f", u))
+        except RuntimeError:
+            law.notes.append("sample_position() is not there")
+    p = np.concatenate(points)
+    out = np.maximum(case.low - p, p - case.high).max(axis=1) / case.size
+    i = int(out.argmax())
+    law.at_most(
+        "points outside the bounding box, in sizes",
+        max(out[i], 0),
+        1e-5,
+        "some roundings",
+        case.snippet(o[min(i, len(o) - 1)], d[min(i, len(o) - 1)]),
+    )
+
+
+def variants(law: Law, case: Case) -> None:
+    """The same hits in the scalar variant, or of a scalar one in the vectorised."""
+    import mitsuba as mi
+
+    case.recipe.with_()
+    here = mi.variant()
+    swap = ("scalar_", "llvm_ad_") if is_scalar() else (here.split("_")[0] + "_ad_", "scalar_")
+    other = here.replace(*swap)
+    if other not in mi.variants() or runtime.obstacle(other):
+        raise Skip(f"{other} cannot run here")
+    few = slice(0, case.count(500, 2000))
+    o, d, seen = case.seen[0][few], case.seen[1][few], case.seen[2].only(few)
+    try:
+        mi.set_variant(other)
+        runtime.use(other)
+        there = trace(mi.load_dict({"type": "scene", "shape": case.recipe.load()}), o, d)
+    except RuntimeError as problem:
+        if "not found" not in str(problem):
+            raise
+        raise Skip(f"{other} does not know the plugin: register it there, too") from problem
+    finally:
+        mi.set_variant(here)
+    steep = np.abs((seen.n * d).sum(axis=1)) > FLAT
+    bad = (there.found != seen.found) & (steep | ~seen.found)
+    both = there.found & seen.found & steep
+    scale = np.abs(o).max(axis=1) + seen.t
+    error = np.where(both, np.abs(there.t - seen.t) / (ROUNDING * scale), 0)
+    i = int((bad if bad.any() else error).argmax())
+    law.at_most(
+        f"share of rays answered otherwise in {other}",
+        bad.mean(),
+        2e-3,
+        "outlines hang on roundings",
+        case.snippet(o[i], d[i]),
+    )
+    law.at_most(
+        f"distance in {other}, off by roundings of the largest number",
+        error.max(),
+        4 * HIT_ROUNDINGS,
+        "some dozen operations each, and another cosine with the surface",
+        case.snippet(o[i], d[i]),
+    )
+
+
+LAWS = {
+    "hits": hits,
+    "surface": surface,
+    "normals": normals,
+    "watertight": watertight,
+    "scale": scale,
+    "far": far,
+    "finite": finite,
+    "sampling": sampling,
+    "bbox": bbox,
+    "variants": variants,
+}
