@@ -57,6 +57,11 @@ def axial_mesh(kind: str, end0: str, end1: str) -> type[mi.Mesh]:
             """Return what ``mrt_whitted`` intersects in place of the mesh."""
             return QuadricTable.of_one(self.kind, self.exact_frame)
 
+        def moving_frame(self) -> Frame | None:
+            """Return the unit frame with its derivatives, None where none are wanted."""
+            values = list(self.parameters.values())
+            return self._frame_of(*values) if dr.grad_enabled(values) else None
+
         def traverse(self, callback: Any) -> None:
             mi.Mesh.traverse(self, callback)
             flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous

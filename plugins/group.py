@@ -69,6 +69,9 @@ class MrtGroup(mi.Mesh):
         """What ``mrt_whitted`` intersects in place of the mesh."""
         return self.table
 
+    def moving_frame(self) -> None:
+        """Return None: its objects have no derivatives."""
+
     def to_string(self) -> str:
         return f"MrtGroup[{self.content}]"
 

@@ -131,8 +131,8 @@ def sphere_frame(center: Any, radius: Any) -> Frame:
     inverse = 1 / radius
     zero = 0 * inverse
     make = type(center)
-    rows = (make(v) for v in ([inverse, zero, zero], [zero, inverse, zero], [zero, zero, inverse]))
-    return Frame(center, *rows, extent=0.0)
+    x, y, z = make([inverse, zero, zero]), make([zero, inverse, zero]), make([zero, zero, inverse])
+    return Frame(center, x, y, z, 0.0)
 
 
 def _frame_along(origin: Any, axis: Any, radius: Any) -> Frame:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import numpy as np
 
+    from .intersect import Frame
     from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
     from .merged_bsdf import UniformMaterial
     from .quadric_kinds import QuadricTable
@@ -57,6 +58,10 @@ class QuadricShape(ABC):
     @abstractmethod
     def quadrics(self) -> QuadricTable:
         """Return the quadrics."""
+
+    @abstractmethod
+    def moving_frame(self) -> Frame | None:
+        """Return the unit frame of the only quadric with its derivatives; None where none are wanted."""
 
 
 class MirrorBSDF(ABC):

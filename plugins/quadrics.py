@@ -46,6 +46,11 @@ class Quadrics:
         self.shapes = dr.gather(mi.ShapePtr, pointer("Shape", shapes), mi.UInt32(owner))
         self.faces = mi.UInt32(faces)
         dr.eval(self.shapes, self.faces)
+        frames = [s.moving_frame() for s in shapes]
+        first = np.cumsum([0, *counts])
+        self.moving = [
+            (int(tree.leaf_of[k]), f) for k, f in zip(first, frames, strict=False) if f is not None
+        ]
 
     def intersect(self, ray: Any, active: Any) -> tuple[Any, Any, Any]:
         """Distance, place in the tables and part of the nearest quadric; distance ``ray.maxt`` for none."""
@@ -67,8 +72,9 @@ class Quadrics:
 
     def _frame_and_kind(self, leaf: Any, active: Any = True) -> tuple[Frame, Any]:
         x, y, z, more = (dr.gather(mi.Vector4f, self.table, 4 * leaf + k, active) for k in range(4))
-        rows = [mi.Vector3f(r.x, r.y, r.z) for r in (x, y, z)]
-        return Frame(mi.Point3f(x.w, y.w, z.w), *rows, extent=more.z), more.x
+        origin = mi.Point3f(x.w, y.w, z.w)
+        x, y, z = (mi.Vector3f(r.x, r.y, r.z) for r in (x, y, z))
+        return Frame(origin, x, y, z, more.z), more.x
 
     def _meet(self, leaf: Any, ray: Any) -> SurfaceHit:
         frame, kind = self._frame_and_kind(leaf)
@@ -83,15 +89,29 @@ class Quadrics:
         """Make ``si`` the interaction of ``ray`` with what ``intersect`` found."""
         t, leaf, part = hit
         frame, kind = self._frame_and_kind(leaf, where)
-        p = dr.fma(ray.d, t, ray.o)
+        for number, moving in self.moving:
+            own = leaf == number
+            frame = Frame(
+                *(dr.select(own, *both) for both in zip(_frame(moving), _frame(frame), strict=True))
+            )
+        if self.moving:
+            # The hit goes along the ray as the surface moves
+            surface = self._surface(ray.o + ray.d * t, part, frame, kind)
+            to_surface = dr.dot(surface.p - (ray.o + ray.d * t), surface.n)
+            t = dr.replace_grad(t, t + to_surface / dr.dot(ray.d, surface.n))
+        surface = self._surface(dr.fma(ray.d, t, ray.o), part, frame, kind)
+        _put_surface(si, t, surface, dr.gather(mi.ShapePtr, self.shapes, leaf, where), where)
+        si.prim_index = dr.select(where, dr.gather(mi.UInt32, self.faces, leaf, where), si.prim_index)
+
+    def _surface(self, p: Any, part: Any, frame: Frame, kind: Any) -> SurfacePoint:
+        """Put a point onto the quadric of this frame and kind."""
         surface = KINDS[self.kinds[0]].surface(p, part, frame)
         for k, name in list(enumerate(self.kinds))[1:]:
             other, own = KINDS[name].surface(p, part, frame), kind == k
             surface = SurfacePoint(
                 *(dr.select(own, a, b) for a, b in zip(_members(other), _members(surface), strict=True))
             )
-        _put_surface(si, t, surface, dr.gather(mi.ShapePtr, self.shapes, leaf, where), where)
-        si.prim_index = dr.select(where, dr.gather(mi.UInt32, self.faces, leaf, where), si.prim_index)
+        return surface
 
     def scale(self, leaf: Any, active: Any) -> Any:
         """Size of the coordinates of a quadric: the largest number in its box."""
@@ -135,12 +155,8 @@ class _ScalarObject:
 
     def __init__(self, shape: Any, table: QuadricTable, k: int) -> None:
         self.shape, self.kind, self.first_face = shape, table.kind, int(table.first_faces[k])
-        rows = table.rows[k]
-        self.frame = Frame(
-            mi.Point3f(table.origins[k].tolist()),
-            *(mi.Vector3f(row.tolist()) for row in rows),
-            extent=float(table.extents[k]),
-        )
+        x, y, z = (mi.Vector3f(row.tolist()) for row in table.rows[k])
+        self.frame = Frame(mi.Point3f(table.origins[k].tolist()), x, y, z, float(table.extents[k]))
         self.scale = float(np.abs(table.boxes()[k]).max())
 
 
@@ -153,6 +169,14 @@ def quadrics_of(shapes: list) -> Quadrics | ScalarQuadrics | None:
 
 def _members(surface: SurfacePoint) -> tuple:
     return surface.p, surface.n, surface.u, surface.v
+
+
+def _frame(frame: Frame) -> tuple:
+    return (
+        mi.Vector3f(frame.origin),
+        *(mi.Vector3f(r) for r in (frame.x, frame.y, frame.z)),
+        mi.Float(frame.extent),
+    )
 
 
 def _put_surface(si: Any, t: Any, surface: SurfacePoint, shape: Any, where: Any) -> None:

@@ -69,7 +69,8 @@ class SceneReading:
     def _state(self) -> list[Any]:
         """Return what changes whenever a shape was moved, a mesh edited or a material changed."""
         materials = [b.state() for b in self.bsdfs if isinstance(b, MirrorBSDF)]
-        return [*map(_shape_state, self.shapes), *materials]
+        moving = [s.moving_frame() is not None for s in self.quadrics]
+        return [*map(_shape_state, self.shapes), *moving, *materials]
 
     def _facts(self) -> SceneFacts:
         quadrics: Counter[str] = Counter()

@@ -161,9 +161,21 @@ def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Res
         focaldist=plan.focus.distance or 0.0,
         focalrange=plan.focus.range,
         variant=variant,
+        integrator=plan.integrator,
     )
     image, layers = _mean(total, plan)
-    return Result(image, layers, plan, timings, tracer.rays, kernels.launches, options)
+    return Result(
+        image,
+        layers,
+        plan,
+        timings,
+        tracer.rays,
+        kernels.launches,
+        options,
+        runtime.versions(),
+        view.matrices(),
+        frozenset(budget.pictures),
+    )
 
 
 def _facts(source: Source, shader: Shader, variant: str, settings: RenderSettings) -> RenderFacts:
