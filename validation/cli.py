@@ -89,7 +89,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def listing() -> str:
     """Return a line on each study, with how long it takes on two idle cores."""
-    quick, full = (sum(entry[i] for entry in STUDIES.values()) for i in (2, 3))
+    quick, full = (sum(getattr(e, name) for e in STUDIES.values()) for name in ("quick", "full"))
     lines = [f"  {'':<15}{'quick':>7}{'full':>8}"]
     for name, entry in {**STUDIES, "all": Entry("", "all of these", quick, full)}.items():
         lines.append(f"  {name:<15}{_spoken(entry.quick):>7}{_spoken(entry.full):>8}  {entry.about}")

@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 from mrt_mitsuba.rendering.progress import Advance, Progress
 
@@ -46,8 +45,12 @@ class Kernel:
 def own_cache() -> Iterator[None]:
     """Let Dr.Jit keep its kernels in a new folder, for ``forget`` to work; to be entered before it starts."""
     with tempfile.TemporaryDirectory(prefix=PREFIX, ignore_cleanup_errors=True) as folder:
-        with mock.patch.dict(os.environ, {CACHE: folder}):
+        before, os.environ[CACHE] = os.environ.get(CACHE), folder
+        try:
             yield
+        finally:
+            del os.environ[CACHE]
+            os.environ |= {} if before is None else {CACHE: before}
 
 
 def forget() -> None:
