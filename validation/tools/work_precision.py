@@ -103,7 +103,7 @@ class Point:
 
     @property
     def bias(self) -> float:
-        """|bias| = √(MSE − variance), 0 where noise explains the whole error; NaN for one repeat."""
+        """Absolute bias, √(MSE − variance), 0 where noise explains the whole error; NaN for one repeat."""
         return float(np.sqrt(np.maximum(self.bias_squared.value, 0)))
 
     @property
