@@ -40,6 +40,7 @@ STUDIES = {
     "antialiasing": Entry("antialiasing", "does refining edges give the picture of refining all"),
     "depth-of-field": Entry("depth_of_field", "what do the blur filters get wrong against a lens"),
     "stability": Entry("stability", "where must float32 give out, and where does it not"),
+    "exhaustive": Entry("exhaustive", "how far off are formulas at every float32 cosine", 2, 600),
     "error-vs-time": Entry("error_vs_time", "what does each setting buy for its time"),
     "cost": Entry("cost", "where does the time of a render go, and what does the plan save"),
     "growth": Entry("growth", "how does time grow with pixels, samples, objects, lights and bounces"),
