@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.command.options import Options
-from mrt_mitsuba.errors import MrtWarning, UsageError
+from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE
 
 if TYPE_CHECKING:
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
 def run(options: Options) -> int:
     """Render and write what the options say; return the exit code."""
     from mrt_mitsuba.memory import check_addresses
-    from mrt_mitsuba.output.files import check_target
+    from mrt_mitsuba.output.replacing import check_target
 
     check_addresses()
     for path in options.outputs():
@@ -41,13 +43,22 @@ def run(options: Options) -> int:
     scene: Any = options.scene if options.scene is not None else options.scene_number
     if options.shows_model():
         scene = model_view(scene, convention=options.convention, **options.model_arguments())
+        _spare_textures(scene, options.outputs())
     result = render(scene, progress=progress, **options.render_arguments())
     seconds = time.perf_counter() - start
-    for path in options.outputs():
-        result.save(path, tonemap=options.tonemap)
+    result.save(*options.outputs(), tonemap=options.tonemap)
     if not options.quiet:
+        print(f"Wrote {' and '.join(options.outputs())}")
         print(f"Render time: {seconds:.6f}s")
     return 0
+
+
+def _spare_textures(scene: Scene, outputs: Sequence[str]) -> None:
+    """Refuse at once what ``Result.save`` would refuse after the render."""
+    textures = {mesh.material.texture for mesh in scene.meshes if mesh.material.texture}
+    for path in outputs:
+        if os.path.realpath(path) in map(os.path.realpath, textures):
+            raise OutputError(f"cannot write {path}: the scene uses this picture; choose another name")
 
 
 def banner(options: Options) -> str:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+from mrt_mitsuba.errors import OutputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,8 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Timings:
-    """Seconds of one render. ``passes`` adds up to about ``total``; ``compile`` and ``kernels`` are parts of
-    it."""
+    """Seconds of one render; ``load`` and ``passes`` add up to about ``total``."""
 
     total: float  #: all of the render
     load: float  #: scene and plan
@@ -31,7 +32,7 @@ class Timings:
 
 @dataclass(frozen=True)
 class Result:
-    """A finished picture and what became known on the way."""
+    """A finished picture, its layers, and how it was made."""
 
     image: Image  #: float32 [H, W, 3], linear, top row first
     layers: Mapping[str, Image]  #: float32 [H, W] by EXR channel name, such as "depth.Z"
@@ -39,25 +40,38 @@ class Result:
     timings: Timings  #: seconds
     rays: Mapping[str, int]  #: number by kind; "mirror" and "shadow" only where they were counted
     kernel_launches: int  #: how many kernels ran
-    options: Mapping[str, Any] = field(default_factory=dict)  #: as they were given
+    options: Mapping[str, Any]  #: the values in force
+    versions: Mapping[str, str]  #: of what decides about pixels
+    camera: Mapping[str, np.ndarray]  #: float64 [4, 4], see ``rendering.view``
+    inputs: frozenset[str] = frozenset()  #: paths of the pictures that the scene was read from
 
-    def save(self, path: str | os.PathLike[str], *, tonemap: str = "report") -> None:
-        """Write a .png or .exr; raise ``OutputError``. ``tonemap`` ("report" or "srgb") concerns a PNG
-        only."""
+    def save(self, *paths: str | os.PathLike[str], tonemap: str = "report") -> None:
+        """Write .png and .exr files, all or none; raise ``OutputError``.
+
+        ``tonemap`` ("report" or "srgb") concerns a PNG only.
+        """
         from mrt_mitsuba.output import files as output
 
-        output.save(path, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
+        for path in paths:
+            if os.path.realpath(path) in self.inputs:
+                raise OutputError(
+                    f"cannot write {os.fspath(path)}: the scene uses this picture; choose another name"
+                )
+        output.save(paths, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
 
     def header(self) -> dict[str, Any]:
-        """The header attributes of an EXR."""
-        import mrt_mitsuba
-
+        """Return the header attributes of an EXR: how the picture was made, and nothing such as seconds that
+        changes when it is made again.
+        """
+        version = self.versions["mrt-mitsuba"]
         return {
-            "mrt:version": mrt_mitsuba.__version__,
+            "software": f"mrt-mitsuba {version}",
+            "mrt:version": version,
             "mrt:scene": self.plan.scene,
             "mrt:options": dict(self.options),
             "mrt:variant": self.plan.variant,
-            "mrt:seconds": self.timings.total,
+            **{f"mrt:{name}": self.versions[name] for name in ("mitsuba", "drjit", "llvm")},
+            **{f"mrt:{name}": matrix.tolist() for name, matrix in self.camera.items()},
         }
 
     def _repr_png_(self) -> bytes:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import SceneError
-from mrt_mitsuba.plugins.quadric_kinds import KINDS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -123,7 +122,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything a render needs, but for the picture's size and sampling."""
+    """Everything that a render needs except the size of the picture and the sampling."""
 
     camera: Camera
     sky: Color
@@ -140,7 +139,7 @@ class Scene:
     title: str = field(default="", compare=False)
 
     def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> dict[str, Any]:
-        """The scene as a Mitsuba dict of this project's plugins, materials shared by reference.
+        """Return the scene as a Mitsuba dict of this project's plugins, materials shared by reference.
 
         Raises ``SceneError`` for a camera, a sky or an object of numbers that make no sense.
         """
@@ -212,6 +211,8 @@ class Scene:
 def _check(scene: Scene) -> None:
     """Refuse what Mitsuba would draw as nothing, or as noise, without a word. Materials, lights, planes and
     meshes are checked by their plugins."""
+    from mrt_mitsuba.plugins.quadric_kinds import KINDS  # which brings Dr.Jit
+
     problem = view_problem(scene.camera)
     if problem:
         raise SceneError(problem)
@@ -227,7 +228,7 @@ def _check(scene: Scene) -> None:
 
 
 def view_problem(camera: Camera) -> str | None:
-    """What keeps a camera from seeing anything, or None."""
+    """Return why a camera can see nothing, or None."""
     import numpy as np
 
     for name in ("position", "target", "up"):
@@ -246,7 +247,7 @@ def view_problem(camera: Camera) -> str | None:
 
 
 def _all_finite(values: Sequence[float], count: int) -> bool:
-    """Whether these are so many finite numbers."""
+    """Return whether these are ``count`` finite numbers."""
     try:
         return len(values) == count and all(map(math.isfinite, values))
     except TypeError:
@@ -300,12 +301,12 @@ def _numbers(thing: Any) -> tuple[float, ...]:
 # More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape
 # and more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of
 # recursion
-_MOST_SINGLE = {Sphere: 1000, Cone: 100, Cylinder: 100, Capsule: 100}
+MOST_SINGLE = {Sphere: 1000, Cone: 100, Cylinder: 100, Capsule: 100}
 
 
 def _split(objects: tuple) -> tuple[tuple, tuple]:
-    """What becomes a shape of its own, and what goes into a group; textures need the former."""
-    if not objects or len(objects) <= _MOST_SINGLE[type(objects[0])]:
+    """Return objects that become single shapes and those for a group; textures need the former."""
+    if not objects or len(objects) <= MOST_SINGLE[type(objects[0])]:
         return objects, ()
     return (
         tuple(o for o in objects if o.material.texture is not None),
@@ -368,5 +369,5 @@ def _mrt_bsdf(m: Material, fresnel: str, texturing: str) -> dict[str, Any]:
 
 
 def _texture(path: str, texturing: str) -> dict[str, Any]:
-    """A picture as the report looks it up, or as Mitsuba does: bilinear, sRGB-aware, repeated."""
+    """Return a texture looked up as in the report, or as by Mitsuba: bilinear, sRGB-aware, repeated."""
     return {"type": {"report": "mrt_texture", "standard": "bitmap"}[texturing], "filename": path}
