@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba import runtime
+from mrt_mitsuba.interrupts import surfacing
 from mrt_mitsuba.memory import Budget, Workspace
 from mrt_mitsuba.output.layers import AVERAGED, TABLE
 from mrt_mitsuba.output.result import Result, Timings
@@ -119,7 +120,8 @@ def render(
         params=params,
         region=region,
     )
-    return render_with(scene, settings, Progress() if progress is None else progress)
+    with surfacing(), runtime.one_at_a_time:
+        return render_with(scene, settings, Progress() if progress is None else progress)
 
 
 def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Result:

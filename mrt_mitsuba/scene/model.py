@@ -301,12 +301,12 @@ def _numbers(thing: Any) -> tuple[float, ...]:
 # More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape
 # and more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of
 # recursion
-_MOST_SINGLE = {Sphere: 1000, Cone: 100, Cylinder: 100, Capsule: 100}
+MOST_SINGLE = {Sphere: 1000, Cone: 100, Cylinder: 100, Capsule: 100}
 
 
 def _split(objects: tuple) -> tuple[tuple, tuple]:
     """Return objects that become single shapes and those for a group; textures need the former."""
-    if not objects or len(objects) <= _MOST_SINGLE[type(objects[0])]:
+    if not objects or len(objects) <= MOST_SINGLE[type(objects[0])]:
         return objects, ()
     return (
         tuple(o for o in objects if o.material.texture is not None),

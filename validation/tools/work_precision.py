@@ -12,7 +12,7 @@ import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -168,7 +168,7 @@ class WorkPrecision:
         Between measured cases the curve is a straight line in logarithms; beyond them nothing is assumed.
         """
         return {
-            name: estimate(self.repeats, lambda index, points=points: _crossing(points, error, index))
+            name: estimate(self.repeats, partial(_crossing, points, error))
             for name, points in self.families.items()
         }
 
