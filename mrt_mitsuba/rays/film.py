@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.rays.bundle import Divisor
+from mrt_mitsuba.rays.divisor import Divisor
+
+STEPS = 32  # of a pixel, where integrals over a filter are summed
 
 
 @dataclass(frozen=True)
@@ -69,23 +71,26 @@ class Film:
         return place, *sensor.sample_ray_differential(time, wavelength, inside, aperture)
 
     @cached_property
-    def spread(self) -> np.ndarray:
-        """Share of a pixel's rays in the variance of its neighbours along an axis, from −reach to reach.
+    def weights(self) -> np.ndarray:
+        """Values of the filter along an axis, ``STEPS`` to a pixel, [2 reach + 1, STEPS]."""
+        import mitsuba as mi
 
-        The mean of the squared filter over the pixel, scaled to a sum of 1.
-        """
-        if self.reach == 0:
-            return np.ones(1)
-        places = np.arange(-self.reach, self.reach + 1)[:, None] + (np.arange(32) + 0.5) / 32 - 0.5
-        rfilter = self.sensor.film().rfilter()
-        share = np.mean([[float(np.ravel(rfilter.eval(x))[0]) ** 2 for x in row] for row in places], axis=1)
+        places = np.arange(-self.reach, self.reach + 1)[:, None] + (np.arange(STEPS) + 0.5) / STEPS - 0.5
+        values = self.sensor.film().rfilter().eval(mi.Float(places.ravel()))
+        return np.asarray(values, np.float64).reshape(places.shape)
+
+    @cached_property
+    def spread(self) -> np.ndarray:
+        """Share that the rays of the pixels −reach to reach along an axis have in the variance of pixel 0."""
+        share = np.square(self.weights).sum(axis=1)
         return np.asarray(share / share.sum())
 
     @property
     def correlation(self) -> float:
         """Sum of the squared correlations of a pixel's error with those of all pixels, itself included."""
-        along = np.correlate(np.sqrt(self.spread), np.sqrt(self.spread), "full")
-        return float(np.sum(along**2)) ** 2
+        values = self.weights.ravel()
+        overlap = np.correlate(values, values, "full")[(len(values) - 1) % STEPS :: STEPS]
+        return float(np.sum(np.square(overlap / overlap.max()))) ** 2
 
     def spread_out(self, variance: np.ndarray) -> np.ndarray:
         """Return the variance [..., H, W] of pixels, up to a factor, given that of the rays in each."""
@@ -106,7 +111,7 @@ class Canvas:
     the other. A box needs none: there, the sums over the rays of each pixel are the picture.
     """
 
-    def __init__(self, film: Film, pictures: int, channels: int, *, coalesce: bool) -> None:
+    def __init__(self, film: Film, pictures: int, channels: int, coalesce: bool) -> None:
         import mitsuba as mi
 
         self.film, self.pictures, self.rows = film, pictures, film.height + 2 * film.reach

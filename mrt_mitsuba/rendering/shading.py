@@ -6,7 +6,7 @@ any other sampling integrator gives the picture, and Mitsuba the first hit.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -23,6 +23,8 @@ class RayValues:
     image: Any
     si: Any  # interaction at the first hit
     found: Any  # is there one
+    valid: Any  # did the integrator find anything; Mitsuba's alpha
+    aovs: Sequence[Any] = ()  # channels of the integrator's own
 
     def __init__(self, view: View, ray: Any, weight: Any) -> None:
         import mitsuba as mi
@@ -64,9 +66,12 @@ class RayValues:
 class SampledValues(RayValues):
     """Values of any sampling integrator: the picture; Mitsuba knows the first hit."""
 
-    def __init__(self, view: View, ray: Any, weight: Any, spectrum: Any, scene: Any) -> None:
+    def __init__(self, view: View, ray: Any, weight: Any, sample: tuple[Any, Any, Any], scene: Any) -> None:
+        import mitsuba as mi
+
         super().__init__(view, ray, weight)
-        self.scene, self.image = scene, self.rgb(spectrum)
+        spectrum, self.valid, self.aovs = sample
+        self.scene, self.image = scene, self.rgb(mi.unpolarized_spectrum(spectrum))
 
     @cached_property
     def si(self) -> Any:
@@ -86,6 +91,7 @@ class LayeredValues(RayValues):
         super().__init__(view, ray, weight)
         self.trace, self.image = trace, self.rgb(trace.radiance)
         self.si, self.found = trace.hit.si, trace.hit.found
+        self.valid = self.found
 
     @property
     def direct(self) -> Any:
@@ -133,15 +139,20 @@ class Shader:
 
     def trace(self, names: Iterable[str], view: View, samples: Samples, sampler: Any) -> dict[str, Any]:
         """Return layers along each ray through some places on the film."""
-        ray, weight = view.rays(samples, sampler)
-        values = self._values(view, ray, weight, sampler)
+        values = self.values(view, *view.rays(samples, sampler), sampler)
         return {name: TABLE[name].value(values) for name in names}
 
-    def _values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
+    @property
+    def aovs(self) -> tuple[str, ...]:
+        """Names of the integrator's own channels."""
+        return tuple(self.integrator.aov_names())
+
+    def values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
+        """Return what is known along rays with these weights."""
         import mitsuba as mi
 
-        spectrum, _, _ = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(ray))
-        return SampledValues(view, ray, weight, mi.unpolarized_spectrum(spectrum), self.scene)
+        sample = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(ray))
+        return SampledValues(view, ray, weight, sample, self.scene)
 
 
 class LayeredShader(Shader):
@@ -161,7 +172,7 @@ class LayeredShader(Shader):
     def prepare(self, kernel: KernelPlan | None) -> None:
         self.integrator.prepare(self.scene, kernel)
 
-    def _values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
+    def values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
         return LayeredValues(view, ray, weight, self.integrator.trace(self.scene, sampler, ray))
 
 
@@ -169,6 +180,13 @@ def shader_for(scene: Any, integrator: Any) -> Shader:
     """Return the shader that an integrator is capable of."""
     kind = LayeredShader if isinstance(integrator, LayeredIntegrator) else Shader
     return kind(scene, integrator)
+
+
+def components(value: Any) -> list[Any]:
+    """Return the channels of a layer's value."""
+    import drjit as dr
+
+    return list(value) if dr.depth_v(value) > 1 else [value]
 
 
 def to_rgb(spectrum: Any, ray: Any) -> Any:
