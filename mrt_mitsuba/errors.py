@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+LONGEST = 800  # characters of a message
+
+
+def printable(text: str) -> str:
+    """Return a text for people: what a file put into it can neither steer a terminal nor flood it.
+
+    Characters that do not print are escaped, but for line ends; of a long text, start and end stay.
+    """
+    if len(text) > LONGEST:
+        left_out = len(text) - LONGEST
+        text = f"{text[: LONGEST * 3 // 4]} [... {left_out} characters ...] {text[-LONGEST // 4 :]}"
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+
 
 class MrtError(Exception):
     """Base of all errors raised on purpose; the commands print one line and end with ``exit_code``."""
 
     exit_code = 1
+
+    def __init__(self, text: str = "") -> None:
+        super().__init__(printable(text))
 
 
 class UsageError(MrtError, ValueError):
@@ -33,3 +51,6 @@ class UnknownVariantError(VariantError, UsageError):
 
 class MrtWarning(UserWarning):
     """Something works less well than it could; the text says how to get the better way."""
+
+    def __init__(self, text: str = "") -> None:
+        super().__init__(printable(text))

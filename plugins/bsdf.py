@@ -2,37 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from .fresnel import f0_from_ior, fresnel_dielectric, fresnel_schlick
-from .lookup import ByShape
-from .microfacet import (
-    beckmann_d,
-    half_vector_angles,
-    microfacet_specular,
-    sample_beckmann,
-    sample_beckmann_visible,
-    smith_g1_over_cos,
-    tan2_theta,
-)
+from .kernel_plan import Mirror, Reason
+from .lobes import Lobes, Pair
+from .merged_bsdf import UniformMaterial
 from .parameters import ParameterError, choice, flag, number, spectrum
+from .protocols import MergeableBSDF
 from .variants import first, is_jit, updatable
 
 FRESNEL_FORMS = ("schlick", "dielectric", "unity")
 
-# Roughness below this (zero included) acts as this: the lobe is then narrower than float32 directions can
-# resolve, and D, its inverse square, still fits. Above the other, D is the same everywhere but at the horizon
-ALPHA_MIN, ALPHA_MAX = 1e-8, 1e6
-
-# Directions that are nearer to the horizon count as below it: what divides by their cosines stays in float32
-COS_MIN = 1e-12
-
-# Indices of textures and of updates, whose values are not checked, are brought between these
-IOR_MIN, IOR_MAX = 1e-9, 1e9
+# Names of the parameters under ``mi.traverse``
+NUMBERS, COLORS = ("alpha", "int_ior", "ext_ior"), ("diffuse_reflectance", "specular_reflectance")
 
 
 class MrtBSDF(mi.BSDF):
@@ -83,7 +69,7 @@ class MrtBSDF(mi.BSDF):
     In polarised variants the reflected light is depolarised.
     """
 
-    def __init__(self, props: mi.Properties):
+    def __init__(self, props: mi.Properties) -> None:
         mi.BSDF.__init__(self, props)
         self.fresnel = choice(props, "fresnel", FRESNEL_FORMS)
         self.int_ior = self._number_or_texture(props, "int_ior", 1.5, above=0)
@@ -93,16 +79,16 @@ class MrtBSDF(mi.BSDF):
         self.specular_reflectance = spectrum(props, "specular_reflectance", 1.0)
         self.f0 = self._read_f0(props)
         self.sample_visible = flag(props, "sample_visible", True)
-        self.version = 0
+        self._updates = 0
         self._update()
 
     @staticmethod
-    def _number_or_texture(props, name, default, **limits):
+    def _number_or_texture(props: mi.Properties, name: str, default: float, **limits: float) -> Any:
         if name in props and props.type(name) == mi.Properties.Type.Object:
             return spectrum(props, name)
         return updatable(number(props, name, default, **limits))
 
-    def _read_f0(self, props):
+    def _read_f0(self, props: mi.Properties) -> mi.Texture | None:
         if "f0" not in props:
             return None
         if self.fresnel != "schlick":
@@ -126,324 +112,168 @@ class MrtBSDF(mi.BSDF):
         self.m_flags = diffuse | glossy
 
     @staticmethod
-    def _varies(*parameters) -> bool:
+    def _varies(*parameters: Any) -> bool:
         return any(isinstance(p, mi.Texture) and _varies(p) for p in parameters)
 
-    def traverse(self, callback) -> None:
+    def traverse(self, callback: Any) -> None:
         flags = mi.ParamFlags.Differentiable
-        for name in ("alpha", "int_ior", "ext_ior", "diffuse_reflectance", "specular_reflectance"):
+        for name in (*NUMBERS, *COLORS):
             callback.put(name, getattr(self, name), flags)
         if self.f0 is not None:
             callback.put("f0", self.f0, flags)
 
-    def parameters_changed(self, keys=()) -> None:
+    def parameters_changed(self, keys: Any = ()) -> None:
         self._update()
-        self.version += 1  # what others have derived from the parameters is out of date
+        self._updates += 1
 
-    def point(self, si, active) -> _Point:
-        """The parameters at a surface point."""
-        return _Point(self, si, active)
+    def lobes(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Lobes:
+        """Return the lobes at a surface point."""
+        return Lobes(self.fresnel, _PointParameters(self, si, active), si.wi, visible=self.sample_visible)
 
-    def constants(self) -> _Constants | None:
-        """The parameters as numbers; None where one varies, has derivatives, or has no place there."""
-        names = ("alpha", "int_ior", "ext_ior", "diffuse_reflectance", "specular_reflectance")
-        if self.f0 is not None or self._varies(*(getattr(self, name) for name in names)):
-            return None
-        point = self.point(dr.zeros(mi.SurfaceInteraction3f), True)
-        numbers, colors = [point.alpha_given, point.int_ior, point.ext_ior], [point.diffuse, point.specular]
-        if dr.grad_enabled(numbers, colors):
-            return None
-        return _Constants([first(x) for x in numbers], *([first(x) for x in color] for color in colors))
+    def state(self) -> tuple[int, bool]:
+        """Return what changes whenever ``uniform`` or ``mirror_bound`` may."""
+        return self._updates, self._is_uniform() and self._needs_gradients()
 
-    @staticmethod
-    def merged(shapes) -> MrtBSDF | None:
-        """One BSDF that is, at each of ``shapes``, what theirs are; None where that cannot be."""
-        return _Merged.of(shapes)
+    def uniform(self) -> UniformMaterial | Reason:
+        """Return the parameters as plain numbers, or why they are none."""
+        if not self._is_uniform():
+            return Reason.VARYING
+        if self._needs_gradients():
+            return Reason.GRADIENTS
+        numbers, (diffuse, specular) = self._uniform_values()
+        return UniformMaterial(*(tuple(first(x) for x in values) for values in (numbers, diffuse, specular)))
+
+    def _is_uniform(self) -> bool:
+        return self.f0 is None and not self._varies(*(getattr(self, name) for name in (*NUMBERS, *COLORS)))
+
+    def _needs_gradients(self) -> bool:
+        return dr.grad_enabled(self._uniform_values())
+
+    def _uniform_values(self) -> tuple[list[mi.Float], list[mi.UnpolarizedSpectrum]]:
+        point = _PointParameters(self, dr.zeros(mi.SurfaceInteraction3f), True)
+        return [point.alpha, point.int_ior, point.ext_ior], [point.diffuse, point.specular]
 
     # -------------------------------------- Value and density ------------------------------------------
 
-    def eval(self, ctx, si, wo, active=True):
-        return mi.depolarizer(self._value(ctx, self.point(si, active), _Pair.above(si.wi, wo, active)))
+    def eval(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> mi.Spectrum:
+        return mi.depolarizer(self.lobes(si, active).value(ctx, Pair.above(si.wi, wo, active)))
 
-    def pdf(self, ctx, si, wo, active=True):
-        return self._density(ctx, self.point(si, active), _Pair.above(si.wi, wo, active))
+    def pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> mi.Float:
+        return self.lobes(si, active).density(ctx, Pair.above(si.wi, wo, active))
 
-    def eval_pdf(self, ctx, si, wo, active=True):
-        point, pair = self.point(si, active), _Pair.above(si.wi, wo, active)
-        return mi.depolarizer(self._value(ctx, point, pair)), self._density(ctx, point, pair)
+    def eval_pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        lobes, pair = self.lobes(si, active), Pair.above(si.wi, wo, active)
+        return mi.depolarizer(lobes.value(ctx, pair)), lobes.density(ctx, pair)
 
-    def _value(self, ctx, point, pair):
-        """f cos θo of the enabled lobes."""
-        diffuse, specular = self._enabled(ctx)
-        value = mi.UnpolarizedSpectrum(0)
-        if specular:
-            fresnel = point.fresnel(*half_vector_angles(pair.wi, pair.wo))
-            lobe = microfacet_specular(pair.wi, pair.wo, pair.tan2_theta_h, point.alpha)
-            value += point.specular * fresnel * lobe
-        if diffuse:
-            value += point.diffuse * (dr.inv_pi * pair.wo.z)
-        # The report's G₁ of a negative roughness can be negative; light cannot
-        return dr.select(pair.active, dr.maximum(value, 0), 0)
-
-    def _density(self, ctx, point, pair):
-        """Density per solid angle with which ``sample`` draws ``pair.wo``."""
-        diffuse, specular = self._enabled(ctx)
-        density, probability = mi.Float(0), self._specular_probability(ctx, point)
-        if specular:
-            density += probability * self._specular_density(pair, point.alpha)
-        if diffuse:
-            density += (1 - probability) * (dr.inv_pi * pair.wo.z)
-        return dr.select(pair.active, density, 0)
-
-    def _specular_density(self, pair, alpha):
-        """That of the microfacet normal over 4 ωo·h."""
-        d = beckmann_d(pair.tan2_theta_h, alpha)
-        if self.sample_visible:
-            return 0.25 * d * smith_g1_over_cos(pair.wi, dr.abs(alpha))
-        # D cos θh / (4 ωo·h), where h = ωi + ωo is not normalised: cos θh = h.z / |h|, ωo·h = |h|² / 2, and
-        # |h|² = h.z² (1 + tan²θh). The product ωo·h itself would feel the rounding of ωo's length: by 2 % at
-        # cos θ = 1e-3 in float32
-        return 0.5 * d / ((pair.wi.z + pair.wo.z) * (1 + pair.tan2_theta_h))
-
-    def _specular_probability(self, ctx, point):
-        """Probability of drawing from the specular lobe, after the lobes' reflectances towards ``si.wi``."""
-        diffuse, specular = self._enabled(ctx)
-        if not (diffuse and specular):
-            return mi.Float(1 if specular else 0)
-        weight = dr.abs(dr.mean(point.mirror_reflectance))
-        total = weight + dr.abs(dr.mean(point.diffuse))
-        return dr.select(total > 0, weight / dr.select(total > 0, total, 1), 0.5)
-
-    @staticmethod
-    def _enabled(ctx) -> tuple[bool, bool]:
-        return (
-            ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0),
-            ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1),
-        )
-
-    # ------------------------------------------- Sampling ----------------------------------------------
-
-    def sample(self, ctx, si, sample1, sample2, active=True):
-        point = self.point(si, active)
-        above = active & (si.wi.z > COS_MIN)
-        wi = dr.select(above, si.wi, mi.Vector3f(0, 0, 1))
-        specular = sample1 < self._specular_probability(ctx, point)
-        m = self._sample_normal(wi, point.alpha, sample2)
-        lambertian = mi.warp.square_to_cosine_hemisphere(sample2)
-        wo = dr.select(specular, mi.reflect(wi, m), lambertian)
-        # The drawn normal *is* the half vector: of a narrow lobe, wi + wo has lost what sets it apart from n
-        tan2_theta_h = dr.select(specular, tan2_theta(m), tan2_theta(wi + lambertian))
-        pair = _Pair.above(wi, wo, above, tan2_theta_h)
-        pdf = self._density(ctx, point, pair)
+    def sample(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+        lobes = self.lobes(si, active)
+        wo, pair, specular = lobes.sample(ctx, sample1, sample2, active)
+        pdf = lobes.density(ctx, pair)
         drawn = pdf > 0
-        weight = dr.select(drawn, self._value(ctx, point, pair) / dr.select(drawn, pdf, 1), 0)
-        return self._record(wo, pdf, specular), mi.depolarizer(weight)
-
-    @staticmethod
-    def _record(wo, pdf, specular):
+        weight = dr.select(drawn, lobes.value(ctx, pair) / dr.select(drawn, pdf, 1), 0)
         bs = mi.BSDFSample3f()
         bs.wo, bs.pdf, bs.eta = wo, pdf, mi.Float(1)
         bs.sampled_component = dr.select(specular, mi.UInt32(1), mi.UInt32(0))
-        glossy, diffuse = (
-            mi.UInt32(+mi.BSDFFlags.GlossyReflection),
-            mi.UInt32(+mi.BSDFFlags.DiffuseReflection),
-        )
-        bs.sampled_type = dr.select(specular, glossy, diffuse)
-        return bs
-
-    def _sample_normal(self, wi, alpha, sample2):
-        if not self.sample_visible:
-            return sample_beckmann(alpha, sample2.x, sample2.y, mi.Vector3f)
-        unit = mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, 1.0)
-        return sample_beckmann_visible(wi, alpha, sample2, unit.sample_visible_11, mi.Vector3f)
+        glossy, diffuse = mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DiffuseReflection
+        bs.sampled_type = dr.select(specular, mi.UInt32(+glossy), mi.UInt32(+diffuse))
+        return bs, mi.depolarizer(weight)
 
     # ------------------------------------------ Attributes ---------------------------------------------
 
-    def eval_diffuse_reflectance(self, si, active=True):
-        return mi.Spectrum(self.point(si, active).diffuse)
+    def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+        return mi.Spectrum(self.diffuse_reflectance.eval(si, active))
 
-    def has_attribute(self, name, active=True):
+    def has_attribute(self, name: str, active: mi.Bool = True) -> mi.Bool:
         return name in ("mirror_reflectance", "int_ior")
 
-    def eval_attribute(self, name, si, active=True):
+    def eval_attribute(
+        self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool = True
+    ) -> mi.UnpolarizedSpectrum:
         if name == "mirror_reflectance":
-            return self.point(si, active).mirror_reflectance
+            return self.lobes(si, active).mirror_reflectance
         raise ParameterError(f'mrt_bsdf: no spectrum attribute "{name}"; there is "mirror_reflectance"')
 
-    def eval_attribute_1(self, name, si, active=True):
+    def eval_attribute_1(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Float:
         if name == "int_ior":
-            return self.point(si, active).int_ior
+            return _PointParameters(self, si, active).int_ior
         raise ParameterError(f'mrt_bsdf: no scalar attribute "{name}"; there is "int_ior"')
 
-    def mirror_bound(self) -> tuple[float, float]:
-        """An upper bound of ``mirror_reflectance``, and ``int_ior``; inf where they vary or are unknown."""
+    def mirror_bound(self) -> Mirror:
+        """Return an upper bound of ``mirror_reflectance``, and ``int_ior``; inf for what varies."""
         reflectance = self._largest(self.specular_reflectance)
         if self.f0 is not None:
             reflectance *= max(1, self._largest(self.f0))
         int_ior = float("inf") if isinstance(self.int_ior, mi.Texture) else first(self.int_ior)
-        return reflectance, int_ior
+        return Mirror(reflectance, int_ior)
 
     @staticmethod
-    def _largest(texture) -> float:
+    def _largest(texture: mi.Texture) -> float:
         if _varies(texture) or mi.is_spectral:
             return float("inf")
         return max(abs(first(x)) for x in texture.eval(dr.zeros(mi.SurfaceInteraction3f)))
 
     def to_string(self) -> str:
-        names = ("alpha", "int_ior", "ext_ior", "diffuse_reflectance", "specular_reflectance", "f0")
+        names = (*NUMBERS, *COLORS, "f0")
         return f"MrtBSDF[fresnel={self.fresnel}, " + ", ".join(f"{n}={getattr(self, n)}" for n in names) + "]"
 
 
-def _varies(texture) -> bool:
+def _varies(texture: mi.Texture) -> bool:
     """Is a texture not the same everywhere? Mitsuba's ``mesh_attribute`` denies it, and needs a shape."""
     return texture.is_spatially_varying() or texture.class_name() == "MeshAttribute"
 
 
-class _Point:
+class _PointParameters:
     """The parameters at a surface point; each is read when it is first asked for, and once."""
 
-    def __init__(self, bsdf: MrtBSDF, si, active):
-        self.bsdf, self.si, self.active = bsdf, si, active
+    def __init__(self, bsdf: MrtBSDF, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
+        self._bsdf, self._si, self._active = bsdf, si, active
 
-    def _read(self, name: str):
-        parameter = getattr(self.bsdf, name)
+    def _number(self, name: str) -> mi.Float:
+        parameter = getattr(self._bsdf, name)
         if isinstance(parameter, mi.Texture):
-            return parameter.eval_1(self.si, self.active)
+            return parameter.eval_1(self._si, self._active)
         return parameter if is_jit() else first(parameter)
 
-    @cached_property
-    def alpha_given(self):
-        return self._read("alpha")
+    def _color(self, texture: mi.Texture) -> mi.UnpolarizedSpectrum:
+        return texture.eval(self._si, self._active)
 
     @cached_property
-    def alpha(self):
-        alpha = self.alpha_given
-        size = _within(dr.abs(alpha), ALPHA_MIN, ALPHA_MAX)
-        return dr.select(alpha < 0, -size, size)
+    def alpha(self) -> mi.Float:
+        return self._number("alpha")
 
     @cached_property
-    def int_ior(self):
-        return self._read("int_ior")
+    def int_ior(self) -> mi.Float:
+        return self._number("int_ior")
 
     @cached_property
-    def ext_ior(self):
-        return self._read("ext_ior")
+    def ext_ior(self) -> mi.Float:
+        return self._number("ext_ior")
 
     @cached_property
-    def diffuse(self):
-        return self.bsdf.diffuse_reflectance.eval(self.si, self.active)
+    def diffuse(self) -> mi.UnpolarizedSpectrum:
+        return self._color(self._bsdf.diffuse_reflectance)
 
     @cached_property
-    def specular(self):
-        return self.bsdf.specular_reflectance.eval(self.si, self.active)
-
-    def fresnel(self, cos_theta, sin2_theta):
-        """F at a microfacet: a float, or a spectrum where ``f0`` was given."""
-        if self.bsdf.fresnel == "unity":
-            return mi.Float(1)
-        ext_ior, int_ior = (_within(ior, IOR_MIN, IOR_MAX) for ior in (self.ext_ior, self.int_ior))
-        if self.bsdf.fresnel == "dielectric":
-            return fresnel_dielectric(cos_theta, ext_ior, int_ior, sin2_theta)
-        given = self.bsdf.f0
-        f0 = f0_from_ior(ext_ior, int_ior) if given is None else given.eval(self.si, self.active)
-        return fresnel_schlick(cos_theta, f0, sin2_theta)
+    def specular(self) -> mi.UnpolarizedSpectrum:
+        return self._color(self._bsdf.specular_reflectance)
 
     @cached_property
-    def mirror_reflectance(self):
-        """k_s F(θi): what a perfect mirror in place of the lobe would reflect; 0 from behind."""
-        wi = self.si.wi
-        above = wi.z > COS_MIN
-        sin2_theta = dr.square(wi.x) + dr.square(wi.y)
-        fresnel = self.fresnel(dr.select(above, wi.z, 1), dr.select(above, sin2_theta, 0))
-        return dr.select(above, self.specular * fresnel, 0)
+    def f0(self) -> mi.UnpolarizedSpectrum | None:
+        return None if self._bsdf.f0 is None else self._color(self._bsdf.f0)
 
 
-def _within(x, least: float, most: float):
-    """``x`` between two limits; NaN gives the lower one."""
-    return dr.select(x >= least, dr.minimum(x, most), least)
-
-
-@dataclass
-class _Pair:
-    """Two directions, above the surface where ``active``, and tan² of their half vector's angle to z."""
-
-    wi: mi.Vector3f
-    wo: mi.Vector3f
-    tan2_theta_h: mi.Float
-    active: mi.Bool
-
-    @classmethod
-    def above(cls, wi, wo, active, tan2_theta_h=None) -> _Pair:
-        above_i, above_o = wi.z > COS_MIN, active & (wo.z > COS_MIN)
-        # Masked lanes get harmless directions: scalar variants raise on 0/0, and no NaN is born. What depends
-        # on wi alone is computed once for all wo
-        up = mi.Vector3f(0, 0, 1)
-        wi, wo, active = dr.select(above_i, wi, up), dr.select(above_o, wo, up), above_i & above_o
-        return cls(wi, wo, tan2_theta(wi + wo) if tan2_theta_h is None else tan2_theta_h, active)
-
-
-# --------------------------------------------- Many as one ----------------------------------------------
-
-
-@dataclass
-class _Constants:
-    """Parameters that are the same everywhere."""
-
-    numbers: list[float]  # alpha, int_ior, ext_ior
-    diffuse: list[float]  # of each channel
-    specular: list[float]
-
-
-class _Merged(MrtBSDF):
-    """An ``mrt_bsdf`` whose parameters are those of the shape that was hit, looked up in tables.
-
-    Mitsuba calls each BSDF of a scene in turn, and the Python code of each runs to record the call: 1 ms for
-    an instance, at every render. This one is recorded once, for any number of materials.
-    """
-
-    def __init__(self, shapes, constants: list[_Constants]):
-        # Without mi.BSDF.__init__, by which Dr.Jit would come to know one more BSDF and record its calls in
-        # the kernels of every scene: this one is called from Python only
-        self.fresnel, self.f0 = shapes[0].bsdf().fresnel, None
-        self.numbers, self.diffuse, self.specular = (
-            ByShape(mi.Vector4f, shapes, [[*row, *[0] * (4 - len(row))] for row in rows], [1] * 4)
-            for rows in zip(*(vars(c).values() for c in constants), strict=True)
-        )
-
-    @classmethod
-    def of(cls, shapes) -> _Merged | None:
-        """None where a BSDF is of another kind, varies over a surface, or its derivatives are wanted."""
-        bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
-        # Inside an instance, shapes are not the scene's own
-        if not is_jit() or mi.is_spectral or any(s.class_name() == "Instance" for s in shapes):
-            return None
-        if (
-            not all(type(b) is MrtBSDF for b in bsdfs.values())
-            or len({b.fresnel for b in bsdfs.values()}) != 1
-        ):
-            return None
-        constants = {key: b.constants() for key, b in bsdfs.items()}
-        if None in constants.values():
-            return None
-        return cls(shapes, [constants[id(s.bsdf())] for s in shapes])
-
-    def point(self, si, active):
-        return _Row(self, si, active)
-
-
-class _Row(_Point):
-    """The parameters of the shape at a surface point."""
-
-    def __init__(self, merged: _Merged, si, active):
-        super().__init__(merged, si, active)
-        # One mask for all lights, or they would be looked up for each
-        everywhere = mi.Bool(True)
-        self.alpha_given, self.int_ior, self.ext_ior, _ = merged.numbers(si, everywhere)
-        channels = dr.size_v(mi.UnpolarizedSpectrum)
-        self.diffuse, self.specular = (
-            mi.UnpolarizedSpectrum(list(color(si, everywhere))[:channels])
-            for color in (merged.diffuse, merged.specular)
-        )
-
-
+MergeableBSDF.register(MrtBSDF)
 mi.register_bsdf("mrt_bsdf", MrtBSDF)

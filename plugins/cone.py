@@ -9,6 +9,7 @@ import mitsuba as mi
 from .adapter import construct, keep_apart
 from .intersect import Frame, cone_frame
 from .parameters import flag, number, vector
+from .protocols import QuadricShape
 from .revolution import (
     Placement,
     QuadricTable,
@@ -109,4 +110,5 @@ class MrtCone(mi.Mesh):
         return f"MrtCone[{ends}, radius={first(self.radius):g}, capped={self.capped}]"
 
 
+QuadricShape.register(MrtCone)
 mi.register_shape("mrt_cone", MrtCone)

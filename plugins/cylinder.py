@@ -9,6 +9,7 @@ import mitsuba as mi
 from .adapter import construct, keep_apart
 from .intersect import Frame, cylinder_frame
 from .parameters import flag, number, vector
+from .protocols import QuadricShape
 from .revolution import (
     Placement,
     QuadricTable,
@@ -104,4 +105,5 @@ class MrtCylinder(mi.Mesh):
         return f"MrtCylinder[{ends}, radius={first(self.radius):g}, capped={self.capped}]"
 
 
+QuadricShape.register(MrtCylinder)
 mi.register_shape("mrt_cylinder", MrtCylinder)

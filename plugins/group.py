@@ -11,6 +11,7 @@ from .adapter import construct, keep_apart, write_buffers
 from .columns import Columns, column
 from .intersect import cone_frame, cylinder_frame
 from .parameters import ParameterError, choice
+from .protocols import QuadricShape
 from .revolution import (
     QuadricTable,
     UnitMesh,
@@ -141,4 +142,5 @@ def _stand_in(unit: UnitMesh, table: QuadricTable) -> dict[str, Any]:
     }
 
 
+QuadricShape.register(MrtGroup)
 mi.register_shape("mrt_group", MrtGroup)

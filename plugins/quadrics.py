@@ -162,17 +162,11 @@ class _ScalarObject:
         )
 
 
-def is_quadric(shape: Any) -> bool:
-    """Does ``mrt_whitted`` trace this shape itself?"""
-    return hasattr(shape, "quadrics")
-
-
 def quadrics_of(shapes: list) -> Quadrics | ScalarQuadrics | None:
-    """What traces the shapes that are quadrics; None where there is none."""
-    found = [s for s in shapes if is_quadric(s)]
-    if not found:
+    """What traces these quadrics; None where there is none."""
+    if not shapes:
         return None
-    return Quadrics(found) if is_jit() else ScalarQuadrics(found)
+    return Quadrics(shapes) if is_jit() else ScalarQuadrics(shapes)
 
 
 def _members(surface: SurfacePoint) -> tuple:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from importlib import import_module, util
 from pathlib import Path
+from typing import NamedTuple
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError
@@ -21,21 +22,30 @@ from mrt_mitsuba.validation.tools import report
 from mrt_mitsuba.validation.tools.kernels import own_cache
 from mrt_mitsuba.validation.tools.study import Study
 
-# A study by its name on the command line: the module of this package that runs it, imported when it is run
+
+class Entry(NamedTuple):
+    """A study of the command: its module, imported when it is run, and what ``--list`` says of it."""
+
+    module: str
+    about: str
+    quick: int = 0  # seconds on two cores, about
+    full: int = 0
+
+
 STUDIES = {
-    "laws": "bsdf_laws",
-    "roughconductor": "roughconductor",
-    "stock": "stock",
-    "scenes": "scenes",
-    "antialiasing": "antialiasing",
-    "depth-of-field": "depth_of_field",
-    "stability": "stability",
-    "error-vs-time": "error_vs_time",
-    "cost": "cost",
-    "growth": "growth",
-    "rivals": "rivals",
-    "objects": "objects",
-    "acceleration": "acceleration",
+    "laws": Entry("bsdf_laws", "does the material obey its own laws"),
+    "roughconductor": Entry("roughconductor", "is the material the function that Mitsuba's is"),
+    "stock": Entry("stock", "are light, gloss, mirrors and anti-aliasing what Mitsuba computes"),
+    "scenes": Entry("scenes", "are the report's scenes right, with a reason for every pixel that differs"),
+    "antialiasing": Entry("antialiasing", "does refining edges give the picture of refining all"),
+    "depth-of-field": Entry("depth_of_field", "what do the blur filters get wrong against a lens"),
+    "stability": Entry("stability", "where must float32 give out, and where does it not"),
+    "error-vs-time": Entry("error_vs_time", "what does each setting buy for its time"),
+    "cost": Entry("cost", "where does the time of a render go, and what does the plan save"),
+    "growth": Entry("growth", "how does time grow with pixels, samples, objects, lights and bounces"),
+    "rivals": Entry("rivals", "how fast are our plugins against Mitsuba's own"),
+    "objects": Entry("objects", "how good are cones, exact and as meshes"),
+    "acceleration": Entry("acceleration", "how does time grow with the number of objects"),
 }
 # All about speed; the first name stands for all of them
 SPEED = ("error-vs-time", "cost", "growth", "rivals")
@@ -64,18 +74,16 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="mrt-validate",
         description="Compare the renderer with Mitsuba, with exact numbers and with itself.",
-        epilog="Exit code: 0 if every bound holds, 1 if one is missed or a study fails, 2 for wrong usage.",
+        epilog=f"studies:\n{listing()}\n\nerror-vs-time also runs the other studies of speed: "
+        f"{', '.join(SPEED[1:])}.\n"
+        "Exit code: 0 if every bound holds, 1 if one is missed or a study fails, 2 for wrong usage.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    names = [*STUDIES, "all"]
+    parser.add_argument("study", nargs="+", choices=names, metavar="STUDY", help="one or more, or all")
+    parser.add_argument("--list", action="version", version=listing(), help="list the studies and stop")
     parser.add_argument(
-        "study",
-        nargs="+",
-        choices=[*STUDIES, "all"],
-        metavar="STUDY",
-        help=f"one or more of: {', '.join(STUDIES)}; or all. error-vs-time is all studies of speed: "
-        f"{', '.join(SPEED[1:])} as well",
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="fewer samples and cases: under two minutes in all"
+        "--quick", action="store_true", help=f"fewer samples and cases: {_duration(True)} in all"
     )
     parser.add_argument(
         "--out",
@@ -87,9 +95,31 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def listing() -> str:
+    """Return a line on each study, with how long it takes on two cores."""
+    lines = [f"  {'':<15}{'quick':>8}{'whole':>9}"]
+    for name, entry in STUDIES.items():
+        times = (_spoken(seconds) for seconds in (entry.quick, entry.full))
+        lines.append(f"  {name:<15}{next(times):>8}{next(times):>9}  {entry.about}")
+    return "\n".join([*lines, f"  {'all':<15}{_duration(True):>8}{_duration(False):>9}"])
+
+
+def _duration(quick: bool) -> str:
+    return _spoken(sum(entry.quick if quick else entry.full for entry in STUDIES.values()))
+
+
+def _spoken(seconds: int) -> str:
+    return f"{seconds} s" if seconds < 100 else f"{round(seconds / 60)} min"
+
+
 def _validate(options: argparse.Namespace) -> int:
     names = _named(options.study)
     _check_extras()
+    print(
+        f"About {_spoken(sum(getattr(STUDIES[n], 'quick' if options.quick else 'full') for n in names))} "
+        "on two idle cores",
+        file=sys.stderr,
+    )
     report.prepare(options.out, "summary.json", "index.html")
     # With a cache of their own, studies of speed can tell how long compilation takes
     own = nullcontext() if options.quick or not set(names) & set(SPEED) else own_cache()
@@ -98,7 +128,7 @@ def _validate(options: argparse.Namespace) -> int:
 
 
 def _named(given: Sequence[str]) -> list[str]:
-    """The studies that the names given stand for, each once, in the order of ``STUDIES``."""
+    """Return the studies that the given names stand for, each once, in the order of ``STUDIES``."""
     chosen = {*given, *(SPEED if SPEED[0] in given else ())}
     return [name for name in STUDIES if name in chosen or "all" in chosen]
 
@@ -121,7 +151,7 @@ def run_study(name: str, *, quick: bool, progress: Progress | None = None) -> re
     start, failure = time.perf_counter(), ""
     try:
         runtime.use(runtime.default_variant())
-        module = import_module(f"mrt_mitsuba.validation.studies.{STUDIES[name]}")
+        module = import_module(f"mrt_mitsuba.validation.studies.{STUDIES[name].module}")
         study.title = module.TITLE
         print(f"{name}: {study.title} ...", file=sys.stderr, flush=True)
         module.run(study, quick=quick)

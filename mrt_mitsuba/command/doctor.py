@@ -9,9 +9,16 @@ from importlib import metadata
 
 import mrt_mitsuba
 from mrt_mitsuba import llvm
+from mrt_mitsuba.command.listings import no_arguments
 from mrt_mitsuba.errors import MrtError
 
 PACKAGES = ("mitsuba", "drjit", "numpy", "OpenEXR", "pillow", llvm.WHEEL)
+
+
+def run(words: list[str]) -> int:
+    """Print the report; return 0 if the self-test passed, else 1."""
+    no_arguments("doctor", words)
+    return 0 if report() else 1
 
 
 def report() -> bool:

@@ -6,15 +6,13 @@ import errno
 import os
 import signal
 import sys
-import time
 import warnings
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
+from mrt_mitsuba.command import registry
 from mrt_mitsuba.command.interrupt import Terminated, ending_soon, leave_now
-from mrt_mitsuba.command.options import Options, parse, usage
-from mrt_mitsuba.errors import MrtError, MrtWarning, UsageError
-from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE
+from mrt_mitsuba.command.options import parse
+from mrt_mitsuba.errors import MrtError, UsageError, printable
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
@@ -84,141 +82,29 @@ def _unexpected(error: Exception) -> int:
     return _fail(f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)", 1)
 
 
-def _dispatch(arguments: list[str]) -> int:
-    if not arguments:
+def _dispatch(words: list[str]) -> int:
+    if not words:
+        from mrt_mitsuba.command.listings import usage
+
         sys.stderr.write(usage())
         return UsageError.exit_code
-    command, rest = arguments[0], arguments[1:]
-    if command in COMMANDS:
-        return COMMANDS[command](rest)
-    return render(parse(arguments))
+    command = registry.find(words[0])
+    if command is not None:
+        return command.run(words[1:])
+    meant = registry.near_miss(words)
+    if meant:
+        raise UsageError(
+            f"there is no command {words[0]!r}: did you mean mrt {meant}? For a picture of that "
+            f"name, write mrt ./{words[0]}"
+        )
+    options = parse(words)
+    from mrt_mitsuba.command import render
 
-
-def render(options: Options) -> int:
-    """Render and write what the options say."""
-    from mrt_mitsuba.output.files import check_target
-
-    for path in options.outputs():
-        check_target(path)
-    from mrt_mitsuba.rendering.api import render as render_scene
-    from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
-
-    if options.quiet:
-        warnings.simplefilter("ignore", MrtWarning)
-    else:
-        print(banner(options), flush=True)
-    if options.log != "warn":
-        from mrt_mitsuba import runtime
-        from mrt_mitsuba.command import logs
-
-        runtime.use(options.variant)
-        logs.show(options.log)
-    progress = Progress() if options.quiet else TerminalProgress(show_plan=options.plan == "show")
-    start = time.perf_counter()
-    scene: Any = options.scene if options.scene is not None else options.scene_number
-    if options.shows_model():
-        from mrt_mitsuba.scene.obj import obj_view
-
-        scene = obj_view(scene, convention=options.convention, **options.model_arguments())
-    result = render_scene(scene, progress=progress, **options.render_arguments())
-    seconds = time.perf_counter() - start
-    for path in options.outputs():
-        result.save(path, tonemap=options.tonemap)
-    if not options.quiet:
-        print(f"Render time: {seconds:.6f}s")
-    return 0
-
-
-def banner(options: Options) -> str:
-    """Return the parameters of the render, one per line."""
-    size: tuple[object, object] = SIZE
-    focus = options.focus(None, FOCAL_RANGE)
-    if options.scene is None:
-        from mrt_mitsuba.scene.report import report_scene
-
-        scene = report_scene(options.scene_number)
-        focus = options.focus(scene.focal_distance, scene.focal_range)
-    elif not options.shows_model():
-        size = "from the file", "from the file"
-    lines = {
-        "Scene": options.scene if options.scene is not None else options.scene_number,
-        "Width": options.width or size[0],
-        "Height": options.height or size[1],
-        "AA": options.aa,
-        "AA mode": options.aamode,
-        "F distance": focus.distance or "off",
-        "F range": focus.range if focus.distance else "off",
-    }
-    return "\n".join(f"{name + ':':<12}{value}" for name, value in lines.items())
-
-
-def _help(arguments: list[str]) -> int:
-    _no_arguments("help", arguments)
-    sys.stdout.write(usage())
-    return 0
-
-
-def _version(arguments: list[str]) -> int:
-    _no_arguments("--version", arguments)
-    from mrt_mitsuba import __version__
-
-    print(f"mrt-mitsuba {__version__}")
-    return 0
-
-
-def _doctor(arguments: list[str]) -> int:
-    _no_arguments("doctor", arguments)
-    from mrt_mitsuba.command import doctor
-
-    return 0 if doctor.report() else 1
-
-
-def _scenes(arguments: list[str]) -> int:
-    _no_arguments("scenes", arguments)
-    from mrt_mitsuba.scene.report import NUMBERS, report_scene
-
-    for number in NUMBERS:
-        print(f"{number}  {report_scene(number).title}")
-    return 0
-
-
-def _export(arguments: list[str]) -> int:
-    flavor = "stock" if "--stock" in arguments else "mrt"
-    words = list(arguments)
-    if flavor == "stock":
-        words.remove("--stock")
-    if len(words) != 3 or words[1] != "--xml":
-        raise UsageError("write mrt export SCENE --xml PATH [--stock]")
-    number, path = parse(["export", words[0]]).scene_number, words[2]
-    if not path:
-        raise UsageError("PATH is empty: write mrt export SCENE --xml PATH [--stock]")
-    from mrt_mitsuba.output.files import check_target
-
-    check_target(path)
-    from mrt_mitsuba.scene.export import write_xml
-
-    write_xml(number, path, flavor=flavor)
-    return 0
-
-
-def _no_arguments(command: str, arguments: list[str]) -> None:
-    if arguments:
-        raise UsageError(f"unexpected argument {arguments[0]!r} after mrt {command}")
-
-
-COMMANDS: dict[str, Callable[[list[str]], int]] = {
-    "help": _help,
-    "-h": _help,
-    "--help": _help,
-    "--version": _version,
-    "doctor": _doctor,
-    "scenes": _scenes,
-    "export": _export,
-}
+    return render.run(options)
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"mrt: {' '.join(message.split())}", file=sys.stderr)
+    print(f"mrt: {' '.join(printable(message).split())}", file=sys.stderr)
     return code
 
 
@@ -231,7 +117,7 @@ def _end_by_force() -> None:
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
-    print(f"mrt: warning: {' '.join(str(message).split())}", file=sys.stderr)
+    print(f"mrt: warning: {' '.join(printable(str(message)).split())}", file=sys.stderr)
 
 
 if __name__ == "__main__":

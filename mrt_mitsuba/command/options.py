@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +18,6 @@ from mrt_mitsuba.scene.report import NUMBERS
 
 # An OBJ file has neither camera nor lights; other scenes have their own
 FOR_MODELS = ("texturing", "camera", "target", "up", "fov", "light")
-HELP_WIDTH = 100  # characters
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,30 +153,3 @@ def _unknown(name: str) -> str:
     close = difflib.get_close_matches(name.lstrip("-").lower(), TABLE, n=1)
     hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
     return f"unknown option {name!r}.{hint}"
-
-
-def usage() -> str:
-    """Return the help text of the command."""
-    lines = [
-        "usage: mrt FILENAME [SCENE] [name=value ...]",
-        "       mrt help | doctor | scenes | export SCENE --xml PATH [--stock]",
-        "",
-        "Renders a scene and writes FILENAME.png and FILENAME.exr.",
-        f"FILENAME has no extension; SCENE is {either([str(number) for number in NUMBERS])} (default: 0).",
-        "",
-        "options:",
-    ]
-    for name, field in TABLE.items():
-        shown = field.metadata["shown"] or field.default
-        syntax = f"{name}={field.metadata['kind'].form}"
-        text = f"  {syntax:<27} {field.metadata['help']} (default: {shown})"
-        lines += textwrap.wrap(text, HELP_WIDTH, subsequent_indent=" " * 30)
-    lines += [
-        "",
-        "commands:",
-        "  help                        print this text",
-        "  doctor                      print versions, the LLVM in use, the variants; render a self-test",
-        "  scenes                      list the scenes",
-        "  export SCENE --xml PATH     write a scene as Mitsuba XML; --stock: with stock plugins only",
-    ]
-    return "\n".join(lines) + "\n"

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import os
-import stat
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from mrt_mitsuba.errors import MrtWarning, SceneError
+from mrt_mitsuba.errors import SceneError
+from mrt_mitsuba.scene.files import MISSING, Findings, decode, find, numbers, read_text
 from mrt_mitsuba.scene.model import Color, Material
 
 CONVENTIONS = ("report", "standard")
@@ -72,97 +70,17 @@ def read_mtl(
     Raises ``SceneError`` with file and line for what cannot be read.
     """
     path = Path(path)
-    entries = _parse(path, read_lines(path))
+    entries = _parse(path, decode(read_text(path)).split("\n"))
     make = {"report": _report_material, "standard": _standard_material}[convention]
-    materials = {}
+    materials, findings = {}, Findings()
     for name, entry in entries.items():
         material = make(entry)
         if entry.map_kd is not None:
             line, rest = entry.map_kd
-            material = replace(material, texture=_texture(path, line, rest, folder))
+            material = replace(material, texture=_texture(path, line, rest, folder, findings))
         materials[name] = material
+    findings.warn()
     return materials
-
-
-def read_lines(path: Path) -> list[str]:
-    """The logical lines of a text file; where one is continued with a backslash, empty ones follow it."""
-    lines = decode(read_bytes(path)).split("\n")
-    for i in range(len(lines) - 1, 0, -1):
-        if lines[i - 1].endswith("\\"):
-            lines[i - 1], lines[i] = lines[i - 1][:-1] + " " + lines[i], ""
-    return lines
-
-
-def require_file(path: str | os.PathLike[str]) -> None:
-    """Raise ``SceneError`` unless ``path`` is a file that may be read. Pipes and devices have no end to wait
-    for."""
-    name, problem = os.fspath(path), ""
-    try:
-        mode = os.stat(path).st_mode
-        if stat.S_ISDIR(mode):
-            problem = "it is a folder; name a file in it"
-        elif not stat.S_ISREG(mode):
-            problem = "it is not a regular file; copy its content into one"
-        elif not os.access(path, os.R_OK):
-            problem = f"permission denied; try chmod +r {name}"
-    except (FileNotFoundError, NotADirectoryError):
-        problem = f"there is no such file in {os.path.dirname(os.path.abspath(name))}"
-    except ValueError as error:  # a zero byte in the name
-        problem = str(error)
-    except OSError as error:
-        circle = error.errno == errno.ELOOP
-        problem = "its symbolic links lead in a circle" if circle else error.strerror or str(error)
-    if problem:
-        raise SceneError(f"cannot read {name or repr(name)}: {problem}")
-
-
-def read_bytes(path: Path) -> bytes:
-    """The bytes of a text file, with Unix line ends. Raises ``SceneError`` if it cannot be read as text."""
-    require_file(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SceneError(f"cannot read {path}: {error.strerror or error}") from None
-    if b"\0" in data:
-        raise SceneError(f"{path}: is not a text file (it holds a zero byte); export it as OBJ or MTL text")
-    if b"\r" in data:
-        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    return data.removeprefix(b"\xef\xbb\xbf")
-
-
-def decode(data: bytes) -> str:
-    """Text of unknown encoding: UTF-8, else the Latin letters that older exporters wrote."""
-    try:
-        return data.decode()
-    except UnicodeDecodeError:
-        return data.decode("latin-1")
-
-
-def find(name: str, folders: list[Path]) -> Path | None:
-    """The file ``name`` relative to the first folder that has it; backslashes may separate folders."""
-    for form in (name, name.replace("\\", "/")):
-        for folder in folders:
-            candidate = folder / form
-            if candidate.is_file():
-                return candidate
-    return None
-
-
-def numbers(where: str, statement: str, words: list[str], least: int, most: int) -> list[float]:
-    """``least`` to ``most`` finite numbers. Raises ``SceneError`` that names the statement."""
-    if not least <= len(words) <= most:
-        wanted = f"{least}" if least == most else f"{least} to {most}"
-        raise SceneError(f"{where}: {statement} has {len(words)} numbers, but must have {wanted}")
-    values = []
-    for word in words:
-        try:
-            value = float(word) if word.isascii() and "_" not in word else math.nan
-        except ValueError:
-            value = math.nan
-        if not abs(value) <= 3.4e38:  # the largest float32; false for NaN, too
-            raise SceneError(f"{where}: {statement} holds {word!r}, which is not a finite number")
-        values.append(value)
-    return values
 
 
 def _parse(path: Path, lines: list[str]) -> dict[str, _Entry]:
@@ -244,7 +162,7 @@ def _standard_material(entry: _Entry) -> Material:
     )
 
 
-def _texture(path: Path, line: int, rest: str, folder: Path | None) -> str | None:
+def _texture(path: Path, line: int, rest: str, folder: Path | None, findings: Findings) -> str | None:
     """The picture that a map_Kd statement names, or None, with a warning, where there is none."""
     folders = [path.parent] if folder is None else [folder, path.parent]
     name = rest
@@ -253,10 +171,8 @@ def _texture(path: Path, line: int, rest: str, folder: Path | None) -> str | Non
         name = _without_options(rest)
         found = find(name, folders) if name else None
     if found is None:
-        text = (
-            f"{path}:{line}: the texture {name or rest} is missing in {folders[0]}; Kd is used in its place"
-        )
-        warnings.warn(text, MrtWarning, stacklevel=2)
+        text = f"{path}:{line}: the texture {name or rest} {MISSING} {folders[0]}; Kd is used in its place"
+        findings.add("textures", text)
         return None
     return str(found)
 

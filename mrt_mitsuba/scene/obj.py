@@ -2,77 +2,32 @@
 
 Mitsuba's own ``obj`` plugin makes one mesh with one material of a whole file, so the reader is the project's
 own. Runs of lines of the usual forms are recognised by one regular expression and turned into arrays at once,
-a million triangles in two or three seconds; every other line is read by itself, with care.
+a million triangles in two or three seconds; every other line is read by itself, with care. The time grows
+with the size of the file whatever it holds: the lengths of numbers and gaps in the expression are bounded.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
-from mrt_mitsuba.scene.model import (
-    BLUE_SKY,
-    Camera,
-    Color,
-    Light,
-    Material,
-    Mesh,
-    Scene,
-    Vector,
-    view_problem,
-)
-from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, decode, find, numbers, read_bytes, read_mtl
+from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.scene.files import MISSING, Findings, decode, find, numbers, read_text
+from mrt_mitsuba.scene.model import Material, Mesh
+from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, read_mtl
 
-# Statements about names, groups, smoothing, curves and display: nothing that is rendered here
-_IGNORED = frozenset(
-    {
-        "g",
-        "s",
-        "o",
-        "mg",
-        "l",
-        "p",
-        "vp",
-        "deg",
-        "bmat",
-        "step",
-        "cstype",
-        "curv",
-        "curv2",
-        "surf",
-        "parm",
-        "trim",
-        "hole",
-        "scrv",
-        "sp",
-        "end",
-        "con",
-        "bevel",
-        "c_interp",
-        "d_interp",
-        "lod",
-        "shadow_obj",
-        "trace_obj",
-        "ctech",
-        "stech",
-        "call",
-        "csh",
-        "maplib",
-        "usemap",
-    }
-)
+# Names, groups, smoothing, curves and display: nothing that is rendered here
+_UNUSED = """g s o mg l p vp deg bmat step cstype curv curv2 surf parm trim hole scrv sp end con bevel
+    c_interp d_interp lod shadow_obj trace_obj ctech stech call csh maplib usemap"""
+_IGNORED = frozenset(_UNUSED.split())
 
 _LINES_AT_ONCE = 4096  # regular expressions keep a state for each repetition
-_GAP, _END = rb"[ \t]+", rb"[ \t]*\n"
-_REAL = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_GAP, _END = rb"[ \t]{1,99}", rb"[ \t]{0,99}\n"
+_REAL = rb"[-+]?(?:\d{1,99}(?:\.\d{0,99})?|\.\d{1,99})(?:[eE][-+]?\d{1,9})?"
 _INDEX = rb"-?\d{1,18}"  # what fits 64 bits
 # Forms of a corner: the pattern, and what its indices are of
 _CORNERS = {
@@ -120,72 +75,6 @@ def read_obj(path: str | os.PathLike[str], *, convention: str = "report") -> tup
     return reader.meshes()
 
 
-def obj_scene(
-    path: str | os.PathLike[str],
-    *,
-    convention: str = "report",
-    texturing: str | None = None,
-    camera: Camera | None = None,
-    lights: Sequence[Light] | None = None,
-    sky: Color = BLUE_SKY,
-) -> Scene:
-    """A scene of an OBJ file, which has neither camera nor lights: what is not given is placed by the model's
-    size.
-
-    The camera stands in front, towards +z, a little above and to the right, and sees all of it; a light is up
-    on each side, the right one brighter. ``texturing`` follows ``convention`` unless given. Raises as
-    ``read_obj`` does.
-    """
-    meshes = read_obj(path, convention=convention)
-    low = np.min([m.vertices.min(axis=0) for m in meshes], axis=0).astype(float)
-    high = np.max([m.vertices.max(axis=0) for m in meshes], axis=0).astype(float)
-    center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
-
-    def place(x: float, y: float, z: float) -> tuple[float, float, float]:
-        """A point in radii from the centre."""
-        px, py, pz = (center + radius * np.array([x, y, z])).tolist()
-        return px, py, pz
-
-    # A ball of radius 1 fills a view of 45° height, that of 60° width in a 4:3 picture, from a distance of
-    # 2.6
-    return Scene(
-        title=os.path.basename(path),
-        camera=camera or Camera(place(1.0, 0.8, 2.4), place(0, 0, 0)),
-        sky=sky,
-        lights=tuple(lights)
-        if lights is not None
-        else (Light(place(4, 5, 4), (2.5, 2.5, 2.5)), Light(place(-4, 3, 5), (1.0, 1.0, 1.2))),
-        meshes=meshes,
-        texturing=texturing or convention,
-    )
-
-
-def obj_view(
-    path: str | os.PathLike[str],
-    *,
-    convention: str = "report",
-    texturing: str | None = None,
-    camera: Vector | None = None,
-    target: Vector | None = None,
-    up: Vector | None = None,
-    fov: float | None = None,
-    light: Vector | None = None,
-) -> Scene:
-    """``obj_scene`` seen as the options of the command say; what is None stays as ``obj_scene`` places it.
-
-    ``fov`` is horizontal, in degrees; ``light`` is a white light's place. Raises ``UsageError`` for a camera
-    that looks nowhere, and what ``obj_scene`` raises.
-    """
-    lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
-    scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)
-    given: dict[str, Any] = {"position": camera, "target": target, "up": up, "hfov": fov}
-    view = replace(scene.camera, **{name: value for name, value in given.items() if value is not None})
-    problem = view_problem(view)
-    if problem:
-        raise UsageError(problem)
-    return replace(scene, camera=view)
-
-
 @dataclass
 class _Faces:
     """Faces of as many corners each: vertex and texture indices from 0, texture −1 for none."""
@@ -209,6 +98,7 @@ class _Reader:
         self.material: str | None = None
         self.line = 1
         self.unknown_materials: set[str] = set()
+        self.findings = Findings()
         self.highest_normal = -1, 0  # index from 0, and the line that has it
 
     def fail(self, text: str, line: int | None = None) -> None:
@@ -217,9 +107,7 @@ class _Reader:
     # ------------------------------------------ Statements ---------------------------------------------
 
     def read(self) -> None:
-        data = _join_continued(read_bytes(self.path))
-        if not data.endswith(b"\n"):
-            data += b"\n"
+        data = read_text(self.path)
         for match in _BLOCKS.finditer(data):
             kind, *form = str(match.lastgroup).split("_")
             if kind == "line":
@@ -324,8 +212,10 @@ class _Reader:
             self.fail("usemtl has no name; write usemtl NAME")
         if name not in self.materials and name not in self.unknown_materials:
             self.unknown_materials.add(name)
-            text = f"{self.path}:{self.line}: no library has the material {name!r}; it gets the default"
-            warnings.warn(text, MrtWarning, stacklevel=2)
+            where = f"{self.path}:{self.line}"
+            self.findings.add(
+                "materials", f"{where}: no library has the material {name!r}; it gets the default"
+            )
         self.material = name
 
     def _library(self, rest: str) -> None:
@@ -335,8 +225,8 @@ class _Reader:
         for name in [rest] if find(rest, [folder]) else rest.split():
             found = find(name, [folder])
             if found is None:
-                text = f"{self.path}:{self.line}: the material library {name} is missing in {folder}"
-                warnings.warn(f"{text}; its materials get the default", MrtWarning, stacklevel=2)
+                text = f"{self.path}:{self.line}: the material library {name} {MISSING} {folder}"
+                self.findings.add("libraries", f"{text}; its materials get the default")
             else:
                 self.materials |= read_mtl(found, convention=self.convention, folder=folder)
 
@@ -344,6 +234,7 @@ class _Reader:
 
     def meshes(self) -> tuple[Mesh, ...]:
         """One mesh for each material, in the order of their first use."""
+        self.findings.warn()
         self._check_ranges()
         vertices = np.concatenate(self.arrays["v"]) if self.arrays["v"] else np.empty((0, 3), np.float32)
         uvs = np.concatenate(self.arrays["vt"]) if self.arrays["vt"] else np.empty((0, 2), np.float32)
@@ -400,18 +291,6 @@ def _compact(index: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     used[index] = True
     new = np.cumsum(used, dtype=np.uint32) - np.uint32(1)
     return np.flatnonzero(used), new[index]
-
-
-def _join_continued(data: bytes) -> bytes:
-    """Lines that end in a backslash joined with the next; empty ones after them keep line numbers right."""
-    if b"\\\n" not in data:
-        return data
-
-    def join(match: re.Match[bytes]) -> bytes:
-        text = match[0]
-        return text.replace(b"\\\n", b" ") + b"\n" * text.count(b"\\\n")
-
-    return re.sub(rb"(?:[^\n]*\\\n)+[^\n]*", join, data)
 
 
 def _rest(text: bytes, keyword: str) -> str:

@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import operator
 import os
-import re
 from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, is_obj
-from mrt_mitsuba.scene.mtl import require_file
-from mrt_mitsuba.scene.obj import obj_scene
+from mrt_mitsuba.scene.placement import obj_scene
 from mrt_mitsuba.scene.report import report_scene
-
-# The lines of a traceback, which are indented but for the first, and the type of this project's error
-_TRACEBACK = re.compile(
-    r"Traceback \(most recent call last\):\n(?:[ \t][^\n]*\n|\n)*(?:\w*ParameterError: )?"
-)
-# Where in Mitsuba's own sources an error was raised
-_CODE_PLACE = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
 
 
 @dataclass(frozen=True)
@@ -47,8 +39,6 @@ def open_scene(
     integrator: Any = None,
 ) -> Source:
     """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``."""
-    import mitsuba as mi
-
     name, model = _model(scene, convention)
     if model is None:
         if fresnel is not None:
@@ -59,7 +49,7 @@ def open_scene(
         size = _film_size(name, loaded, width, height)
         return Source(name, loaded, loaded.sensors()[0], _integrator(integrator, loaded), *size)
     width, height, fresnel = width or SIZE[0], height or SIZE[1], fresnel or "schlick"
-    loaded = _load(mi.load_dict, model.to_dict(width=width, height=height, fresnel=fresnel), name)
+    loaded = load_dict(model.to_dict(width=width, height=height, fresnel=fresnel), name)
     sensor, integrator = loaded.sensors()[0], _integrator(integrator, loaded)
     focus = model.focal_distance, model.focal_range
     return Source(name, loaded, sensor, integrator, width, height, *focus, fresnel)
@@ -83,17 +73,20 @@ def _own(scene: Any) -> tuple[str, Any]:
     import mitsuba as mi
 
     if isinstance(scene, dict):
-        _refuse_none(scene)
-        return "a dict", _load(mi.load_dict, scene, "the dict")
+        return "a dict", load_dict(scene)
     if isinstance(scene, str | os.PathLike):
         path = os.fspath(scene)
-        return os.path.basename(path), _load_file(path)
+        return os.path.basename(path), load_file(path)
     if isinstance(scene, mi.Scene):
         return "a Mitsuba scene", scene
     raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")
 
 
 def _film_size(name: str, scene: Any, width: int | None, height: int | None) -> tuple[int, int]:
+    import mitsuba as mi
+
+    if not isinstance(scene, mi.Scene):
+        raise SceneError(f"{name} is a {type(scene).__name__}, not a scene: put it into one, with a sensor")
     if not scene.sensors():
         raise SceneError(f"{name} has no sensor: add one, so that there is something to look through")
     own_width, own_height = (int(n) for n in scene.sensors()[0].film().crop_size())
@@ -117,38 +110,10 @@ def _integrator(integrator: Any, scene: Any) -> Any:
     if isinstance(integrator, str):
         integrator = {"type": integrator}
     if isinstance(integrator, dict):
-        _refuse_none(integrator)
-        integrator = _load(mi.load_dict, integrator, f"the integrator {integrator.get('type')!r}")
+        integrator = load_dict(integrator, f"the integrator {integrator.get('type')!r}")
     if not isinstance(integrator, mi.SamplingIntegrator):
         raise UsageError(
             f"the integrator is {' '.join(repr(integrator).split())}: "
             "it must be a sampling integrator, such as path or direct"
         )
     return integrator
-
-
-def _load_file(path: str) -> Any:
-    import mitsuba as mi
-
-    require_file(path)
-    if not path.lower().endswith(".xml"):
-        raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
-    return _load(mi.load_file, path, path)
-
-
-def _refuse_none(node: dict[str, Any], place: str = "") -> None:
-    """Mitsuba ends the process where a dict holds None."""
-    for name, value in node.items():
-        if value is None:
-            raise SceneError(f"cannot load the dict: {place}{name} is None; give it a value, or leave it out")
-        if isinstance(value, dict):
-            _refuse_none(value, f"{place}{name}.")
-
-
-def _load(loader: Any, what: Any, name: str) -> Any:
-    try:
-        return loader(what)
-    except RuntimeError as error:
-        # Of an error in a plugin written in Python, Mitsuba quotes the way there, too
-        text = _CODE_PLACE.sub("", _TRACEBACK.sub("", str(error)))
-        raise SceneError(f"cannot load {name}: {text}") from error

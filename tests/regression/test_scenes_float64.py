@@ -12,6 +12,7 @@ import dataclasses
 from functools import cache
 from itertools import product
 
+import filters_reference
 import numpy as np
 import pytest
 
@@ -19,7 +20,6 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.oracles import filters_reference
 from mrt_mitsuba.validation.oracles.reference import reference_render
 
 pytestmark = pytest.mark.skipif(

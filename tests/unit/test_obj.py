@@ -11,10 +11,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mrt_mitsuba.command.render import model_view
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
 from mrt_mitsuba.scene.model import Camera, Mesh
 from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, read_mtl
-from mrt_mitsuba.scene.obj import obj_scene, obj_view, read_obj
+from mrt_mitsuba.scene.obj import read_obj
+from mrt_mitsuba.scene.placement import obj_scene
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 UVS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -178,7 +180,8 @@ def test_texture_names(model, tmp_path: Path, name: str) -> None:
 def test_missing_texture_is_named_and_replaced_by_kd(model, tmp_path: Path) -> None:
     text = "mtllib model.mtl\n" + SQUARE + UVS + "usemtl painted\nf 1/1 2/2 3/3\n"
     with pytest.warns(
-        MrtWarning, match=r"model\.mtl:10: the texture picture\.png is missing in .*Kd is used"
+        MrtWarning,
+        match=r"model\.mtl:10: the texture picture\.png is missing .*Kd is used",
     ):
         (mesh,) = model(text, PAINTED)
     assert mesh.material.texture is None and mesh.material.diffuse == (0.5, 0.5, 0.5)
@@ -403,8 +406,8 @@ def test_view_as_asked_for(tmp_path) -> None:
     path = tmp_path / "a.obj"
     path.write_text(TRIANGLE)
     placed = obj_scene(path)
-    assert obj_view(path).camera == placed.camera and obj_view(path).lights == placed.lights
-    view = obj_view(path, camera=(0, 0, 5), fov=30, light=(1, 2, 3), texturing="standard")
+    assert model_view(path).camera == placed.camera and model_view(path).lights == placed.lights
+    view = model_view(path, camera=(0, 0, 5), fov=30, light=(1, 2, 3), texturing="standard")
     assert view.camera == Camera((0, 0, 5), placed.camera.target, hfov=30)
     assert [light.position for light in view.lights] == [(1, 2, 3)] and view.texturing == "standard"
 
@@ -421,4 +424,4 @@ def test_view_of_nothing_is_refused(tmp_path, given: dict, text: str) -> None:
     path = tmp_path / "a.obj"
     path.write_text(TRIANGLE)
     with pytest.raises(UsageError, match=text):
-        obj_view(path, **given)
+        model_view(path, **given)

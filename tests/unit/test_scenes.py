@@ -1,4 +1,4 @@
-"""The report's scenes as numbers."""
+"""The report's scenes as numbers; scenes 5 to 8 and the models in them; scenes from OBJ files."""
 
 from __future__ import annotations
 
@@ -9,12 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from mrt_mitsuba import UsageError
-from mrt_mitsuba.scene.model import Material, Scene
-from mrt_mitsuba.scene.report import NUMBERS, SCENE_4_MATERIALS, c_rand, report_scene
+import mrt_mitsuba as mrt
+from mrt_mitsuba.scene import shapes as models
+from mrt_mitsuba.scene.model import Material, Mesh, Scene
+from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL
+from mrt_mitsuba.scene.placement import obj_scene
+from mrt_mitsuba.scene.report import NUMBERS, c_rand, report_scene
 
 REPORT = (0, 1, 2, 3, 4, 9)
+SIZE = {"width": 96, "height": 72, "aa": 1}
+
+
+# ---- the report's scenes ----
 
 
 def test_c_rand_is_the_c_librarys() -> None:
@@ -24,24 +32,6 @@ def test_c_rand_is_the_c_librarys() -> None:
     assert next(islice(c_rand(), 9_999, None)) == 1908609430
     assert list(islice(c_rand(42), 3)) == [71876166, 708592740, 1483128881]
     assert all(0 <= x < 2**31 for x in islice(c_rand(), 1000))
-
-
-@pytest.mark.parametrize(
-    ("number", "lights", "spheres", "planes", "cones"),
-    [
-        (0, 2, 4, 1, 0),
-        (1, 2, 21, 1, 0),
-        (2, 3, 40, 1, 0),
-        (3, 3, 6, 3, 0),
-        (4, 3, 600, 3, 0),
-        (9, 2, 0, 1, 1),
-    ],
-)
-def test_what_is_in_them(number: int, lights: int, spheres: int, planes: int, cones: int) -> None:
-    scene = report_scene(number)
-    assert (len(scene.lights), len(scene.spheres), len(scene.planes)) == (lights, spheres, planes)
-    assert len(scene.cones) == cones
-    assert report_scene(number) is scene
 
 
 def numbers_of(scene: Scene) -> list[float]:
@@ -59,76 +49,164 @@ def numbers_of(scene: Scene) -> list[float]:
     return numbers
 
 
-CHECKSUMS = {
-    0: "a4fed8279d9f45a4",
-    1: "59e6d0293dcd62af",
-    2: "479f60dbec271721",
-    3: "669691de4cc8b866",
-    4: "8c1edd15fa716260",
-    9: "181e4b35414501f8",
-}
-
-
-@pytest.mark.parametrize("number", REPORT)
-def test_no_number_has_changed(number: int) -> None:
+@pytest.mark.parametrize(
+    ("number", "checksum", "focus", "counts"),
+    [
+        (0, "a4fed8279d9f45a4", (None, 2), (2, 4, 1, 0)),
+        (1, "59e6d0293dcd62af", (None, 2), (2, 21, 1, 0)),
+        (2, "479f60dbec271721", (None, 2), (3, 40, 1, 0)),
+        (3, "669691de4cc8b866", (2, 2), (3, 6, 3, 0)),
+        (4, "8c1edd15fa716260", (0.1, 3), (3, 600, 3, 0)),
+        (9, "181e4b35414501f8", (None, 2), (2, 0, 1, 1)),
+    ],
+)
+def test_no_number_has_changed(number: int, checksum: str, focus: tuple, counts: tuple) -> None:
     """To nine digits; the checksums were taken when the numbers had been compared with the original's."""
-    text = " ".join(f"{x + 0.0:.9g}" for x in numbers_of(report_scene(number)))
-    assert hashlib.sha256(text.encode()).hexdigest()[:16] == CHECKSUMS[number]
-
-
-def test_scene_4_is_drawn_in_the_order_of_the_report() -> None:
-    """Material, radius, z, y, x from the C library's numbers; the first two spheres by hand."""
-    one, two = report_scene(4).spheres[:2]
-    # 1804289383 % 10; 846930886 % 200; 1681692777, 1714636915 and 1957747793 % 650
-    assert one.material == SCENE_4_MATERIALS[3]
-    assert one.radius == pytest.approx(0.05 + 0.086)
-    assert one.center == pytest.approx((1 + 4.43, 6.15, 1 + 4.27))
-    # 424238335 % 10; 719885386 % 200; 1649760492, 596516649 and 1189641421 % 650
-    assert two.material == SCENE_4_MATERIALS[5]
-    assert two.radius == pytest.approx(0.05 + 0.186)
-    assert two.center == pytest.approx((1 + 3.71, 5.99, 1 + 0.42))
-
-
-def test_scene_2_has_negative_roughness() -> None:
-    alphas = {s.material.alpha for s in report_scene(2).spheres}
-    assert sorted(alphas)[:2] == pytest.approx([-0.0432, -0.0432 + 0.1 / 3])
-    assert sum(a < 0 for a in alphas) == 2
-
-
-def test_defaults_of_the_blur() -> None:
-    """Scene 3 is in focus at 2, scene 4 at 0.1 with a range of 3; the others have none."""
-    found = {n: (report_scene(n).focal_distance, report_scene(n).focal_range) for n in REPORT}
-    assert found == {0: (None, 2), 1: (None, 2), 2: (None, 2), 3: (2, 2), 4: (0.1, 3), 9: (None, 2)}
-
-
-def test_unknown_number_is_refused() -> None:
-    with pytest.raises(UsageError, match="there is no scene 77: choose one of 0, 1, 2, 3, 4"):
-        report_scene(77)
-    assert set(REPORT) <= set(NUMBERS)
+    scene = report_scene(number)
+    assert tuple(map(len, (scene.lights, scene.spheres, scene.planes, scene.cones))) == counts
+    assert (scene.focal_distance, scene.focal_range) == focus
+    text = " ".join(f"{x + 0.0:.9g}" for x in numbers_of(scene))
+    assert hashlib.sha256(text.encode()).hexdigest()[:16] == checksum
 
 
 def test_every_number_is_the_originals(original_data: Path) -> None:
-    """Against its own file, to the digits it holds."""
+    """Against its own file, to the nine digits it holds."""
+
+    def material(thing: dict) -> list[float]:
+        m = thing["material"]
+        return [m["ior"], m["roughness"], *m["specular"], *m["diffuse"]]
+
     original = json.loads((original_data / "scenes.json").read_text())
     assert {int(key) for key in original} == set(REPORT)
     for number in REPORT:
         theirs, ours = original[str(number)], report_scene(number)
         camera = theirs["camera"]
-        expected = [*camera["position"], *camera["target"], *camera["up"], camera["hfov_deg"]]
-        expected += theirs["sky"]
-        expected += [x for light in theirs["lights"] for x in (*light["position"], *light["color"])]
-        for s in theirs["spheres"]:
-            expected += [*s["center"], s["radius"], *material_numbers(s["material"])]
-        for p in theirs["planes"]:
-            expected += [*p["normal"], p["distance"], *material_numbers(p["material"])]
-        for c in theirs["cones"]:
-            expected += [*c["apex"], *c["base_center"], c["radius"], *material_numbers(c["material"])]
-        np.testing.assert_allclose(
-            numbers_of(ours), expected, rtol=1e-9, atol=1e-9
-        )  # nine digits in the file
+        expected = [*camera["position"], *camera["target"], *camera["up"], camera["hfov_deg"], *theirs["sky"]]
+        for kind, keys in (
+            ("lights", ("position", "color")),
+            ("spheres", ("center", "radius")),
+            ("planes", ("normal", "distance")),
+            ("cones", ("apex", "base_center", "radius")),
+        ):
+            for thing in theirs[kind]:
+                expected += np.hstack([thing[key] for key in keys]).tolist()
+                expected += material(thing) if "material" in thing else []
+        np.testing.assert_allclose(numbers_of(ours), expected, rtol=1e-9, atol=1e-9)
         assert theirs["default_focal_distance"] == ours.focal_distance
         assert theirs["default_focal_range"] == ours.focal_range
 
 
-def material_numbers(m: dict) -> list[float]:
-    return [m["ior"], m["roughness"], *m["specular"], *m["diffuse"]]
+def test_there_are_ten_scenes_each_read_once_and_no_others() -> None:
+    assert tuple(range(10)) == NUMBERS
+    assert len({report_scene(number).title for number in NUMBERS}) == 10
+    assert report_scene(3) is report_scene(3)
+    with pytest.raises(mrt.UsageError, match="there is no scene 77: choose one of 0, 1, 2, 3, 4"):
+        report_scene(77)
+
+
+# ---- models ----
+
+
+def volume(mesh: Mesh) -> float:
+    """By the divergence theorem: negative inside out, wrong where there is a hole."""
+    corners = mesh.vertices[mesh.faces].astype(float) - mesh.vertices.mean(axis=0)
+    return float(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
+
+
+def is_closed(mesh: Mesh) -> bool:
+    """Does every edge between two places belong to two triangles, once in each direction?"""
+    _, place = np.unique(mesh.vertices.round(5), axis=0, return_inverse=True)
+    faces = place.reshape(-1)[mesh.faces]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return sorted(map(tuple, edges.tolist())) == sorted(map(tuple, edges[:, ::-1].tolist()))
+
+
+PINES = models.pines([(0, 0, 0), (3, 0, 1)], 1.0, DEFAULT_MATERIAL, DEFAULT_MATERIAL)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "low", "high"),
+    [
+        # a torus of 200 × 100 faces, a little smaller than 2π² 0.09
+        (models.torus((1, 2, 3), 1, 0.3, DEFAULT_MATERIAL, rings=200, sides=100), 1.773, 1.7766),
+        (models.block((1, 2, 3), (1, 2, 3), DEFAULT_MATERIAL, turn=30), 5.9999, 6.0001),
+        (models.tent((1, 0, 3), 1, 1.5, 2, DEFAULT_MATERIAL, turn=30), 1.49999, 1.50001),
+        (models.rock((1, 0, 3), 1, DEFAULT_MATERIAL, seed=1), 1.33, 2.22),  # an icosahedron's, moved about
+        (PINES[0], 0, np.inf),
+        (PINES[1], 0, np.inf),
+    ],
+)
+def test_models_are_closed_and_face_outwards(mesh: Mesh, low: float, high: float) -> None:
+    assert is_closed(mesh) and low < volume(mesh) < high
+
+
+def test_pines_are_as_many_as_asked_for() -> None:
+    assert [len(mesh.faces) for mesh in PINES] == [2 * 3 * 14, 2 * 8]
+
+
+def test_terrain_is_whole_faces_up_and_is_split_by_height() -> None:
+    other = report_scene(0).spheres[0].material
+    pieces = models.terrain(lambda x, z: x, 2, 10, [(0.0, DEFAULT_MATERIAL), (9, other)])
+    assert [m.material for m in pieces] == [DEFAULT_MATERIAL, other]
+    assert sum(len(m.faces) for m in pieces) == 200
+    assert pieces[0].vertices[pieces[0].faces].mean(axis=1)[:, 1].max() <= 0
+    for piece in pieces:
+        a, b, c = piece.vertices[piece.faces].transpose(1, 0, 2)
+        assert (np.cross(b - a, c - a)[:, 1] > 0).all()
+
+
+def test_picture_of_the_block_is_the_one_that_is_shipped() -> None:
+    np.testing.assert_array_equal(np.array(Image.open(models.BLOCK_PICTURE)), models.block_picture())
+
+
+# ---- the project's own scenes ----
+
+
+def test_what_the_scenes_hold() -> None:
+    lake = report_scene(7)
+    assert sum(len(m.faces) for m in lake.meshes) >= 3080  # the size of the report's landscape
+    assert len({m.material for m in lake.meshes}) >= 5
+    glossy = [s for s in report_scene(5).spheres if max(s.material.specular) > 0.5]
+    assert len(glossy) == 2 and len(report_scene(5).meshes) >= 3
+    assert report_scene(6).cones and report_scene(6).cylinders and report_scene(6).meshes
+    assert Path(report_scene(8).meshes[0].material.texture).is_file()
+
+
+@pytest.mark.parametrize("number", range(10))
+def test_watertight_triangles_are_asked_for_where_there_are_any(number: int) -> None:
+    """The report's own scenes hold none, and their pictures shall not change by a bit."""
+    flag = mrt.scene_dict(number).get("embree_use_robust_intersections", False)
+    assert flag is (number in (5, 6, 7, 8))
+
+
+@pytest.mark.parametrize("number", [5, 6, 7, 8])
+def test_scenes_render_and_repeat(number: int) -> None:
+    image = mrt.render(number, **SIZE).image
+    assert np.isfinite(image).all()
+    assert 0.1 < image.mean() < 0.8 and image.std() > 0.1
+    assert np.array_equal(image, mrt.render(number, **SIZE).image)
+
+
+def test_arrow_on_the_block_points_up() -> None:
+    """Above the middle of the block's front the picture is blue, below it is wood: v = 0 is the first row."""
+    image = mrt.render(8, width=240, height=180, aa=1).image
+    blue = (image[..., 2] > 1.3 * image[..., 0]) & (image[..., 2] > 0.25)
+    rows, columns = np.nonzero(blue[60:150, 100:140])
+    widths = [np.ptp(columns[rows == row]) for row in np.unique(rows)]
+    assert np.mean(widths[: len(widths) // 3]) < np.max(widths)  # a tip
+    assert np.argmax(widths) < len(widths) / 2  # the head is above the shaft
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1, 1e3])
+def test_scene_of_an_obj_file(tmp_path: Path, scale: float) -> None:
+    """All of the model is in view, from in front, whatever its size and place."""
+    corners = np.indices((2, 2, 2)).reshape(3, -1).T
+    lines = [f"v {scale * (7 + x)} {scale * (y - 2)} {scale * z}" for x, y, z in corners]
+    faces = ["f 1 2 4 3", "f 5 7 8 6", "f 1 5 6 2", "f 3 4 8 7", "f 1 3 7 5", "f 2 6 8 4"]
+    (tmp_path / "cube.obj").write_text("\n".join(lines + faces))
+    result = mrt.render(str(tmp_path / "cube.obj"), **SIZE, layers=["depth"])
+    hit = np.isfinite(result.layers["depth.Z"])
+    assert 0.1 < hit.mean() < 0.6
+    assert not (hit[0].any() or hit[-1].any() or hit[:, 0].any() or hit[:, -1].any())
+    assert result.image[hit].mean() > 0.1
+    assert obj_scene(tmp_path / "cube.obj").title == "cube.obj"

@@ -213,7 +213,10 @@ def _floor_row(study: Study, number: int, extent: Extent) -> tuple[Any, ...]:
     )
     if number in GOAL_SCENES:
         quartiles = f"quartiles {under.time.low:.3g} and {under.time.high:.3g} of {repeats} ratios"
-        study.goal(f"scene {number}: seconds / floor", under.time.median, FLOOR_GOAL, quartiles)
+        interval = (under.time.low, under.time.high)
+        study.goal(
+            f"scene {number}: seconds / floor", under.time.median, FLOOR_GOAL, quartiles, interval=interval
+        )
     in_kernels = sum(k.seconds for k in found)
     return (
         number,

@@ -93,7 +93,7 @@ def run(study: Study, *, quick: bool) -> None:
 
 
 def _hold_code(study: Study, what: str, found: Mapping[int, Found]) -> None:
-    """The code of the largest task is no longer than that of smaller ones, and compiles no longer."""
+    """The code of the largest task is no longer than that of smaller ones."""
     *smaller, largest = found.values()
     study.at_most(
         f"{what}: operations in kernels at {max(found)} / at smaller sizes",
@@ -107,14 +107,6 @@ def _hold_code(study: Study, what: str, found: Mapping[int, Found]) -> None:
         1,
         "as above",
     )
-    slowest = max(f.compile for f in smaller)
-    if kernels.has_own_cache():
-        study.goal(
-            f"{what}: compilation at {max(found)} / at smaller sizes",
-            largest.compile / slowest,
-            1.3,
-            "seconds",
-        )
 
 
 def _measure(job: Job, repeats: int) -> Found:

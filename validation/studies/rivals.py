@@ -96,8 +96,13 @@ def run(study: Study, *, quick: bool) -> None:
             advance(1)
     for one in found:
         if one.pair.goal is not None:
-            quartiles = f"quartiles {one.time.low:.3g} and {one.time.high:.3g} of {extent.repeats} ratios"
-            study.goal(one.pair.name, one.time.median, one.pair.goal, quartiles)
+            study.goal(
+                one.pair.name,
+                one.time.median,
+                one.pair.goal,
+                f"quartiles {one.time.low:.3g} and {one.time.high:.3g} of {extent.repeats} ratios",
+                interval=(one.time.low, one.time.high),
+            )
         if one.pair.brightness is not None:
             off = abs(one.means / one.pair.brightness - 1)
             note = "the same light, else it would be no comparison; the rest is noise"

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import base64
 import csv
+import html
 import io
 import json
+import os
 import re
 import sys
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -17,17 +20,19 @@ from typing import Any
 from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.output.files import check_target, replacing, to_8bit, write_exr
 from mrt_mitsuba.validation.tools import machine
-from mrt_mitsuba.validation.tools.study import Bound, Picture, Plot, Study, Table
+from mrt_mitsuba.validation.tools.study import Picture, Plot, Study, Table
 
 LONG_TABLE = 12  # rows from which on a table of the page is folded
 LONG_LIST = 30  # bounds from which on they are folded if all hold
 DOTS_PER_INCH = 110
+COLUMN = 6.5  # inches from which on a plot has a row of the page to itself, too
+VALIDATION = "Validation of mrt-mitsuba"
 BROAD = 2  # width over height from which on a picture has a row of the page to itself
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A study after its run; ``failure`` tells how it broke off, if it did."""
+    """A study after its run; ``failure`` is the traceback where it broke off."""
 
     study: Study
     seconds: float
@@ -39,7 +44,7 @@ class Outcome:
 
     @property
     def verdict(self) -> str:
-        """One word: passed, missed (a bound), failed (broke off) or empty (found nothing to hold)."""
+        """Return one word: passed, missed (a bound), failed (broke off) or empty (nothing was held)."""
         if self.failure:
             return "failed"
         if not self.study.bounds:
@@ -48,7 +53,7 @@ class Outcome:
 
 
 def header(*, quick: bool) -> dict[str, Any]:
-    """What the figures were made with."""
+    """Return what the figures were made with."""
     found = machine.versions()
     return {
         "version": found.pop("mrt-mitsuba"),
@@ -60,7 +65,7 @@ def header(*, quick: bool) -> dict[str, Any]:
 
 
 def summary(outcomes: Sequence[Outcome], about: Mapping[str, Any]) -> dict[str, Any]:
-    """Everything that was found, as JSON-ready values."""
+    """Return everything that was found, as JSON-ready values."""
     studies = {
         outcome.study.name: {
             **outcome.study.summary(),
@@ -75,22 +80,18 @@ def summary(outcomes: Sequence[Outcome], about: Mapping[str, Any]) -> dict[str, 
 
 
 def terminal_table(outcomes: Sequence[Outcome]) -> str:
-    """The bounds of all studies, one per line, under the verdict on each study."""
+    """Return the bounds of all studies, one per line, under the verdict on each study."""
     lines = []
     for outcome in outcomes:
         study = outcome.study
         lines += ["", f"{study.name}: {study.title} - {outcome.verdict.upper()} in {outcome.seconds:.1f} s"]
-        width = max((len(bound.name) for bound in (*study.bounds, *study.goals)), default=0)
-        lines += [_bound_line(bound, width, "ok", "MISSED") for bound in study.bounds]
-        lines += [_bound_line(goal, width, "goal", "slower") for goal in study.goals]
+        shown = [*study.bounds, *study.goals]
+        width = max((len(bound.name) for bound in shown), default=0)
+        lines += [
+            f"  {b.verdict:<6} {b.name:<{width}}  {b.measured:>10.4g} {b.sign} {b.limit:.4g}" for b in shown
+        ]
         lines += [f"  FAILED {outcome.failure.splitlines()[-1]}"] if outcome.failure else []
     return "\n".join(lines[1:])
-
-
-def _bound_line(bound: Bound, width: int, holds: str, missed: str) -> str:
-    mark = holds if bound.holds else missed
-    sign = "<=" if bound.at_most else ">="
-    return f"  {mark:<6} {bound.name:<{width}}  {bound.measured:>10.4g} {sign} {bound.limit:.4g}"
 
 
 def prepare(folder: Path, *names: str) -> None:
@@ -108,15 +109,32 @@ def prepare(folder: Path, *names: str) -> None:
         check_target(folder / name)
 
 
-def write(folder: Path, outcomes: Sequence[Outcome], about: Mapping[str, Any]) -> None:
-    """Write every file of the report into an existing folder. Raises ``OutputError``.
+def write(
+    folder: Path, outcomes: Sequence[Outcome], about: Mapping[str, Any], *, title: str = VALIDATION
+) -> None:
+    """Write every file of the report into an existing folder; ``title`` heads the page.
 
-    A figure is drawn once: the file and the page hold the same bytes.
+    A figure is drawn once: the file and the page hold the same bytes. Raises ``OutputError``.
     """
     sections = [_section(folder, outcome) for outcome in outcomes]
     result = summary(outcomes, about)
     _write(folder / "summary.json", json.dumps(result, indent=2, allow_nan=False).encode() + b"\n")
-    _write(folder / "index.html", _page(sections, result).encode())
+    _write(folder / "index.html", _page(sections, result, title).encode())
+
+
+def save(folder: str | os.PathLike[str], study: Study, *, title: str, quick: bool = False) -> None:
+    """Write the report of one study that a tool made into a folder, made if need be. Raises ``OutputError``."""
+    place = Path(folder)
+    prepare(place, "summary.json", "index.html")
+    write(place, [Outcome(study, study.seconds)], header(quick=quick), title=title)
+
+
+def notebook(study: Study, *, title: str) -> str:
+    """Return the page of a study as a frame for a notebook, whose own style it leaves alone."""
+    with tempfile.TemporaryDirectory() as folder:
+        save(folder, study, title=title)
+        page = (Path(folder) / "index.html").read_text("utf-8")
+    return f'<iframe srcdoc="{html.escape(page)}" style="width: 100%; height: 40rem; border: 0"></iframe>'
 
 
 def _section(folder: Path, outcome: Outcome) -> dict[str, Any]:
@@ -143,14 +161,21 @@ def _section(folder: Path, outcome: Outcome) -> dict[str, Any]:
                 "part": part,
                 "data": base64.b64encode(png).decode(),
                 "kind": type(part).__name__.lower(),
-                "broad": isinstance(part, Picture) and part.image.shape[1] > BROAD * part.image.shape[0],
+                "broad": _is_broad(part),
             }
         )
     return section
 
 
-def _page(sections: Sequence[Mapping[str, Any]], result: Mapping[str, Any]) -> str:
-    """The self-contained HTML page."""
+def _is_broad(part: Plot | Picture) -> bool:
+    """Return whether an image needs the whole width of the page to be read."""
+    if isinstance(part, Picture):
+        return part.image.shape[1] > BROAD * part.image.shape[0]
+    return bool(part.figure.get_figwidth() > COLUMN)
+
+
+def _page(sections: Sequence[Mapping[str, Any]], result: Mapping[str, Any], title: str) -> str:
+    """Return the self-contained HTML page."""
     from importlib.resources import files
 
     import jinja2
@@ -158,11 +183,13 @@ def _page(sections: Sequence[Mapping[str, Any]], result: Mapping[str, Any]) -> s
     template = (files("mrt_mitsuba.validation.tools") / "templates" / "report.html").read_text("utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters["cell"] = cell
-    return environment.from_string(template).render(sections=sections, long_list=LONG_LIST, **result)
+    return environment.from_string(template).render(
+        sections=sections, long_list=LONG_LIST, title=title, explain=title == VALIDATION, **result
+    )
 
 
 def cell(value: Any) -> str:
-    """A value as people read it: floats to four digits, the rest as it is."""
+    """Return a value as people read it: floats to four digits, the rest as it is."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):
@@ -174,7 +201,7 @@ def cell(value: Any) -> str:
 
 
 def _numeric(table: Table) -> list[bool]:
-    """Which columns hold numbers only, and are set flush right."""
+    """Return which columns hold numbers only, and are set flush right."""
     import numbers
 
     columns = zip(*table.rows, strict=True) if table.rows else [[]] * len(table.columns)
@@ -212,5 +239,5 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _slug(name: str) -> str:
-    """A name that is safe in file names."""
+    """Return a name that is safe in file names."""
     return re.sub(r"[^A-Za-z0-9.]+", "-", name).strip("-.").lower()

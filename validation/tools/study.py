@@ -1,6 +1,6 @@
 """What a validation study produces: bounds, tables, plots and pictures, collected while it runs.
 
-A study is a module with ``TITLE`` and ``run(study, *, quick)``. It says what it finds through the ``Study``
+A study is a module with ``TITLE`` and ``run(study, *, quick)``. It states its findings through the ``Study``
 it is given; ``report`` turns the result into a table on the terminal, ``summary.json``, CSV files and a page.
 """
 
@@ -29,14 +29,43 @@ class Bound:
 
     @property
     def holds(self) -> bool:
-        """NaN never holds."""
+        """Return whether the figure is within the limit; NaN never is."""
         return self.measured <= self.limit if self.at_most else self.measured >= self.limit
 
+    @property
+    def sign(self) -> str:
+        return "<=" if self.at_most else ">="
+
+    @property
+    def verdict(self) -> str:
+        return "ok" if self.holds else "MISSED"
+
     def __str__(self) -> str:
-        sign = "<=" if self.at_most else ">="
-        return (
-            f"{'ok    ' if self.holds else 'MISSED'} {self.name}: {self.measured:.4g} {sign} {self.limit:.4g}"
-        )
+        return f"{self.verdict:<6} {self.name}: {self.measured:.4g} {self.sign} {self.limit:.4g}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values."""
+        return {
+            "name": self.name,
+            "measured": _plain(self.measured),
+            "limit": _plain(self.limit),
+            "sense": self.sign,
+            "holds": self.holds,
+            "note": self.note,
+        }
+
+
+@dataclass(frozen=True)
+class Goal(Bound):
+    """A time, or a ratio of times, and what is aimed at; decided only where its whole interval is."""
+
+    low: float = -math.inf
+    high: float = math.inf
+
+    @property
+    def verdict(self) -> str:
+        """Return "goal" (reached), "slower", or "open" where the interval holds the limit."""
+        return "goal" if self.high <= self.limit else "slower" if self.low > self.limit else "open"
 
 
 @dataclass(frozen=True)
@@ -81,8 +110,9 @@ class Study:
     progress: Progress = field(default_factory=Progress)
     parts: list[Table | Plot | Picture | str] = field(default_factory=list)
     bounds: list[Bound] = field(default_factory=list)
-    goals: list[Bound] = field(default_factory=list)  # of speed: shown, but the verdict does not hang on them
+    goals: list[Goal] = field(default_factory=list)  # of speed: shown, but the verdict does not hang on them
     figures: dict[str, float] = field(default_factory=dict)  # single numbers worth keeping, without a bound
+    seconds: float = 0.0  # that it took, where a tool made it
 
     @property
     def passed(self) -> bool:
@@ -90,19 +120,19 @@ class Study:
 
     def at_most(self, name: str, measured: float, limit: float, note: str = "") -> Bound:
         """Hold a figure to an upper bound."""
-        return self._hold(Bound(name, float(measured), float(limit), True, note))
+        self.bounds.append(Bound(name, float(measured), float(limit), True, note))
+        return self.bounds[-1]
 
     def at_least(self, name: str, measured: float, limit: float, note: str = "") -> Bound:
         """Hold a figure to a lower bound."""
-        return self._hold(Bound(name, float(measured), float(limit), False, note))
+        self.bounds.append(Bound(name, float(measured), float(limit), False, note))
+        return self.bounds[-1]
 
-    def _hold(self, bound: Bound) -> Bound:
-        self.bounds.append(bound)
-        return bound
-
-    def goal(self, name: str, measured: float, limit: float, note: str = "") -> None:
+    def goal(
+        self, name: str, measured: float, limit: float, note: str = "", *, interval: tuple[float, float]
+    ) -> None:
         """Show whether a time or a ratio of times is at most so much; a busy machine must fail no study."""
-        self.goals.append(Bound(name, float(measured), float(limit), True, note))
+        self.goals.append(Goal(name, float(measured), float(limit), True, note, *map(float, interval)))
 
     def record(self, name: str, value: float) -> None:
         """Keep a number in the summary."""
@@ -145,13 +175,13 @@ class Study:
             yield advance
 
     def summary(self) -> Mapping[str, Any]:
-        """The study as JSON-ready values; numbers that JSON cannot hold become text."""
+        """Return the study as JSON-ready values; numbers that JSON cannot hold become text."""
         return {
             "title": self.title,
             "passed": self.passed,
-            "bounds": [_bound(b) for b in self.bounds],
-            "goals": [_bound(b) for b in self.goals],
-            "figures": {name: _number(value) for name, value in self.figures.items()},
+            "bounds": [bound.as_dict() for bound in self.bounds],
+            "goals": [goal.as_dict() | {"verdict": goal.verdict} for goal in self.goals],
+            "figures": {name: _plain(value) for name, value in self.figures.items()},
             "tables": {
                 part.name: {
                     "title": part.title,
@@ -164,25 +194,10 @@ class Study:
         }
 
 
-def _bound(b: Bound) -> dict[str, Any]:
-    return {
-        "name": b.name,
-        "measured": _number(b.measured),
-        "limit": _number(b.limit),
-        "sense": "<=" if b.at_most else ">=",
-        "holds": b.holds,
-        "note": b.note,
-    }
-
-
 def _plain(value: Any) -> Any:
-    """A cell of a table as JSON has it."""
+    """Return a value as JSON holds it."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):
-        return _number(value)
+        return value if math.isfinite(value) else str(value)
     return value if isinstance(value, (bool, int, str)) else str(value)
-
-
-def _number(value: float) -> float | str:
-    return value if math.isfinite(value) else str(value)

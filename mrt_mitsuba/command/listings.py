@@ -1,0 +1,69 @@
+"""``mrt help``, ``mrt scenes``, ``mrt --version``: what only prints."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+
+from mrt_mitsuba.command.options import TABLE
+from mrt_mitsuba.command.registry import COMMANDS
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.scene.report import NUMBERS, report_scene
+
+WIDTH = 100  # characters of a line of help
+_COLUMN = 30  # where explanations start
+
+
+def usage() -> str:
+    """Return the help text of the command."""
+    options = {
+        f"{name}={field.metadata['kind'].form}": f"{field.metadata['help']} "
+        f"(default: {field.metadata['shown'] or field.default})"
+        for name, field in TABLE.items()
+    }
+    commands = {f"{name} {command.form}".strip(): command.help for name, command in COMMANDS.items()}
+    lines = [
+        "usage: mrt FILENAME [SCENE] [name=value ...]",
+        f"       mrt {' | '.join(COMMANDS)} ...",
+        "",
+        "Renders a scene and writes FILENAME.png and FILENAME.exr.",
+        f"FILENAME has no extension; SCENE is {NUMBERS[0]} to {NUMBERS[-1]} (default: 0).",
+    ]
+    for title, entries in (("options", options), ("commands", commands)):
+        lines += ["", f"{title}:"]
+        for form, text in entries.items():
+            indent = {"initial_indent": "  ", "subsequent_indent": " " * _COLUMN}
+            if len(form) > _COLUMN - 3:
+                lines, form = [*lines, f"  {form}"], ""
+            lines += textwrap.wrap(f"{form:<{_COLUMN - 3}} {text}", WIDTH, **indent)
+    return "\n".join(lines) + "\n"
+
+
+def show_help(words: list[str]) -> int:
+    """Print the help text."""
+    no_arguments("help", words)
+    sys.stdout.write(usage())
+    return 0
+
+
+def show_version(words: list[str]) -> int:
+    """Print the version of the package."""
+    no_arguments("--version", words)
+    from mrt_mitsuba import __version__
+
+    print(f"mrt-mitsuba {__version__}")
+    return 0
+
+
+def show_scenes(words: list[str]) -> int:
+    """Print number and title of every scene."""
+    no_arguments("scenes", words)
+    for number in NUMBERS:
+        print(f"{number}  {report_scene(number).title}")
+    return 0
+
+
+def no_arguments(command: str, words: list[str]) -> None:
+    """Raise ``UsageError`` if there are words after a command that takes none."""
+    if words:
+        raise UsageError(f"unexpected argument {words[0]!r} after mrt {command}")

@@ -1,0 +1,142 @@
+"""Reading the text files of a model: bytes, lines, numbers, and where a file that they name lies."""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import stat
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mrt_mitsuba.errors import MrtWarning, SceneError
+
+LONGEST_LINE = 2**18  # bytes, about 40,000 corners of a face
+MISSING = "is missing or may not be read in"  # what is said of a file that was not found
+
+
+def require_file(path: str | os.PathLike[str]) -> None:
+    """Raise ``SceneError`` unless ``path`` is a file that may be read. Pipes and devices have no end to wait
+    for."""
+    name, problem = os.fspath(path), ""
+    try:
+        mode = os.stat(path).st_mode
+        if stat.S_ISDIR(mode):
+            problem = "it is a folder; name a file in it"
+        elif not stat.S_ISREG(mode):
+            problem = "it is not a regular file; copy its content into one"
+        elif not os.access(path, os.R_OK):
+            problem = f"permission denied; try chmod +r {name}"
+    except (FileNotFoundError, NotADirectoryError):
+        problem = f"there is no such file in {os.path.dirname(os.path.abspath(name))}"
+    except ValueError as error:  # a zero byte in the name
+        problem = str(error)
+    except OSError as error:
+        circle = error.errno == errno.ELOOP
+        problem = "its symbolic links lead in a circle" if circle else error.strerror or str(error)
+    if problem:
+        raise SceneError(f"cannot read {name or repr(name)}: {problem}")
+
+
+def read_text(path: Path) -> bytes:
+    """Return a text file with Unix line ends, one at the end too, and continued lines joined.
+
+    Lines that end in a backslash are joined with the next; empty ones after them keep line numbers right.
+    Raises ``SceneError`` if the file cannot be read as text.
+    """
+    require_file(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"cannot read {path}: {error.strerror or error}") from None
+    if b"\0" in data:
+        raise SceneError(f"{path}: is not a text file (it holds a zero byte); export it as OBJ or MTL text")
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    data = _join_continued(data.removeprefix(b"\xef\xbb\xbf"))
+    if not data.endswith(b"\n"):
+        data += b"\n"
+    _check_lengths(path, data)
+    return data
+
+
+def _join_continued(data: bytes) -> bytes:
+    first, *others = data.split(b"\\\n")
+    parts, owed = [first], 0
+    for part in others:
+        rest, end, following = part.partition(b"\n")
+        owed += 1
+        parts += [b" ", rest]
+        if end:
+            parts += [b"\n" * (owed + 1), following]
+            owed = 0
+    return b"".join([*parts, b"\n" * owed])
+
+
+def _check_lengths(path: Path, data: bytes) -> None:
+    """Refuse a line that is too long; only long ones hold a whole step."""
+    step = LONGEST_LINE // 2
+    for middle in range(0, len(data), step):
+        if data.find(b"\n", middle, middle + step) < 0:
+            start, end = data.rfind(b"\n", 0, middle) + 1, data.find(b"\n", middle)
+            if end - start > LONGEST_LINE:
+                number = data.count(b"\n", 0, start) + 1
+                raise SceneError(
+                    f"{path}:{number}: a line of {end - start} bytes; at most {LONGEST_LINE} are read"
+                )
+
+
+def decode(data: bytes) -> str:
+    """Text of unknown encoding: UTF-8, else the Latin letters that older exporters wrote."""
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def find(name: str, folders: list[Path]) -> Path | None:
+    """Return the file ``name`` of the first folder that has it and where it may be read, or None.
+
+    Backslashes may separate folders.
+    """
+    for form in (name, name.replace("\\", "/")):
+        for folder in folders:
+            candidate = os.path.join(folder, form)
+            if os.path.isfile(candidate) and os.access(candidate, os.R_OK):
+                return Path(candidate)
+    return None
+
+
+@dataclass
+class Findings:
+    """Warnings of one reading: the first of each kind is shown, with the number of those like it."""
+
+    texts: dict[str, list[str]] = field(default_factory=dict)
+
+    def add(self, kind: str, text: str) -> None:
+        """Note a warning; ``kind`` is the plural of what it is about."""
+        self.texts.setdefault(kind, []).append(text)
+
+    def warn(self) -> None:
+        """Give the warnings."""
+        for kind, (first, *others) in self.texts.items():
+            more = f" (and so do {len(others)} more {kind})" if others else ""
+            warnings.warn(f"{first}{more}", MrtWarning, stacklevel=4)
+
+
+def numbers(where: str, statement: str, words: list[str], least: int, most: int) -> list[float]:
+    """``least`` to ``most`` finite numbers. Raises ``SceneError`` that names the statement."""
+    if not least <= len(words) <= most:
+        wanted = f"{least}" if least == most else f"{least} to {most}"
+        raise SceneError(f"{where}: {statement} has {len(words)} numbers, but must have {wanted}")
+    values = []
+    for word in words:
+        try:
+            value = float(word) if word.isascii() and "_" not in word else math.nan
+        except ValueError:
+            value = math.nan
+        if not abs(value) <= 3.4e38:  # the largest float32; false for NaN, too
+            raise SceneError(f"{where}: {statement} holds {word[:40]!r}, which is not a finite number")
+        values.append(value)
+    return values

@@ -1,0 +1,240 @@
+"""Loading dicts and XML files with Mitsuba, after a look at what they would make it do.
+
+Mitsuba takes a plugin from ``plugins/NAME.so`` in the first folder of its file resolver that has one, and the
+folders of a scene and of the process come before its own: a file that lies there would run as native code.
+Here Mitsuba's own folder comes first, and a plugin that only another folder has is refused; the other folders
+serve for data. Files that are read without an end (pipes, devices) and elements nested so deep that Mitsuba's
+parser would end the process are refused as well.
+
+Objects are made one after the other. In parallel, Mitsuba makes Python objects inside each other, to the
+limit of the stack, and Dr.Jit's messages may wait for each other for ever; one by one takes no longer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import html
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.scene.files import require_file
+
+DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from about 3000 on
+_NATIVE = (".so", ".dylib", ".dll")
+
+# The lines of a traceback, which are indented but for the first, and the type of this project's error
+_TRACEBACK = re.compile(
+    r"Traceback \(most recent call last\):\n(?:[ \t][^\n]*\n|\n)*(?:\w*ParameterError: )?"
+)
+# Where in Mitsuba's own sources an error was raised
+_CODE_PLACE = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
+
+
+def load_dict(scene: Mapping[str, Any], name: str = "the dict") -> Any:
+    """Return what a Mitsuba dict describes. Raises ``SceneError`` that calls it ``name``."""
+    import mitsuba as mi
+
+    with _resolving(None):
+        _check_dict(scene, name)
+        return _make(lambda config: mi.parser.parse_dict(config, scene), name)
+
+
+def load_file(path: str, **parameters: Any) -> Any:
+    """Return the scene of an XML file, with values for the ``$parameters`` that it declares.
+
+    Raises ``SceneError``, and ``UsageError`` for a file of another kind.
+    """
+    import mitsuba as mi
+
+    require_file(path)
+    if not path.lower().endswith(".xml"):
+        raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
+    given = {key: str(value) for key, value in parameters.items()}
+    with _resolving(os.path.dirname(path) or "."):
+        _check_xml(path, given)
+        return _make(lambda config: mi.parser.parse_file(config, path, **given), path)
+
+
+def _make(parse: Callable[[Any], Any], name: str) -> Any:
+    """Parse, check and instantiate."""
+    import mitsuba as mi
+
+    config = mi.parser.ParserConfig(mi.variant())
+    config.parallel = False
+    try:
+        state = parse(config)
+        mi.set_file_resolver(_mitsuba_first())  # a <path> of the file puts its folder before
+        for node in state.nodes:
+            _check_plugin(node.props.plugin_name(), name)
+            filename = node.props.get("filename", None)
+            if isinstance(filename, str):
+                _check_data(filename)
+        mi.parser.transform_all(config, state)
+        return mi.parser.instantiate(config, state)
+    except RuntimeError as error:
+        # Of an error in a plugin written in Python, Mitsuba quotes the way there, too
+        text = _CODE_PLACE.sub("", _TRACEBACK.sub("", str(error)))
+        raise SceneError(f"cannot load {name}: {text}") from error
+
+
+# ---------------------------------------------- Folders ------------------------------------------------
+
+
+@contextlib.contextmanager
+def _resolving(folder: str | None) -> Iterator[None]:
+    """Within the block, plugins come from Mitsuba's own folder, data from ``folder`` as well."""
+    import mitsuba as mi
+
+    before = mi.file_resolver()
+    mi.set_file_resolver(_mitsuba_first(folder))
+    try:
+        yield
+    finally:
+        mi.set_file_resolver(before)
+
+
+def mitsuba_first() -> None:
+    """Let Mitsuba find its own plugins before files of their names in other folders."""
+    import mitsuba as mi
+
+    mi.set_file_resolver(_mitsuba_first())
+
+
+def _mitsuba_first(folder: str | None = None) -> Any:
+    import mitsuba as mi
+
+    home, current = _home(), mi.file_resolver()
+    folders = [home, *([folder] if folder else []), *(str(current[i]) for i in range(len(current)))]
+    resolver = mi.FileResolver()
+    resolver.clear()
+    for each in dict.fromkeys(folders):
+        resolver.append(each)
+    return resolver
+
+
+def _home() -> str:
+    import mitsuba as mi
+
+    return os.path.dirname(os.path.abspath(mi.__file__))
+
+
+def _resolved(path: str) -> str:
+    import mitsuba as mi
+
+    return str(mi.file_resolver().resolve(path))
+
+
+# ---------------------------------------------- Checks -------------------------------------------------
+
+
+def _check_plugin(plugin: str, name: str) -> None:
+    """Refuse a native plugin that lies outside Mitsuba's folder. Mitsuba reports a name that it knows not."""
+    if plugin == "scene":  # never looked up
+        return
+    for ending in _NATIVE:
+        file = os.path.join("plugins", plugin + ending)
+        strange = "/" in plugin or not os.path.isfile(os.path.join(_home(), file))
+        if strange and os.path.exists(_resolved(file)):
+            raise SceneError(
+                f"cannot load {name}: the plugin {plugin!r} is {_resolved(file)}, native code that is not "
+                f"Mitsuba's; move it away or, if you trust it, into {_home()}/plugins"
+            )
+
+
+def _check_data(filename: str) -> None:
+    """Refuse a pipe, a device or a folder. Mitsuba reports a file that is missing."""
+    path = _resolved(filename)
+    if os.path.exists(path):
+        require_file(path)
+
+
+def _check_dict(scene: Mapping[str, Any], name: str) -> None:
+    """Look at every entry. None, cycles and depth would end the process."""
+    waiting = [("", scene, 1)]
+    while waiting:
+        place, node, depth = waiting.pop()
+        if depth > DEEPEST:
+            raise SceneError(f"cannot load {name}: it is nested more than {DEEPEST} levels deep")
+        for key, value in node.items():
+            if value is None:
+                raise SceneError(
+                    f"cannot load {name}: {place}{key} is None; give it a value, or leave it out"
+                )
+            if isinstance(value, dict):
+                waiting.append((f"{place}{key}.", value, depth + 1))
+            elif key == "type" and isinstance(value, str):
+                _check_plugin(value, name)
+            elif key == "filename" and isinstance(value, str):
+                _check_data(value)
+
+
+_ATTRIBUTE = re.compile(rb"""\b(\w+)\s*=\s*("[^"]*"|'[^']*')""")
+_TAG_MARK = re.compile(rb"""[>"']""")
+_NO_TAGS = ((b"<!--", b"-->"), (b"<![CDATA[", b"]]>"), (b"<?", b"?>"), (b"<!", b">"))
+
+
+def _check_xml(path: str, parameters: Mapping[str, str]) -> None:
+    """Look at an XML file, and at those that it includes, before Mitsuba opens them."""
+    values, waiting, seen = dict(parameters), [path], set()
+    while waiting:
+        file = waiting.pop()
+        if file in seen:
+            continue
+        seen.add(file)
+        require_file(file)
+        with open(file, "rb") as stream:
+            data = stream.read()
+        if b"\0" in data:
+            raise SceneError(f"cannot load {file}: it holds zero bytes; save it as text in UTF-8")
+        depth = 0
+        for tag in _tags(data):
+            depth += -1 if tag.startswith(b"</") else not tag.endswith(b"/>")
+            if depth > DEEPEST:
+                raise SceneError(f"cannot load {file}: it is nested more than {DEEPEST} levels deep")
+            if b"filename" in tag or tag.startswith(b"<default"):
+                attributes = {key.decode(): _text(value) for key, value in _ATTRIBUTE.findall(tag)}
+                if tag.startswith(b"<default"):
+                    values.setdefault(attributes.get("name", ""), attributes.get("value", ""))
+                elif "filename" in attributes:
+                    filename = _with_values(attributes["filename"], values)
+                    _check_data(filename)
+                    if tag.startswith(b"<include") and os.path.isfile(_resolved(filename)):
+                        waiting.append(_resolved(filename))
+
+
+def _tags(data: bytes) -> Iterator[bytes]:
+    """Opening and closing tags of XML, up to the first that has no end."""
+    start = data.find(b"<")
+    while start >= 0:
+        closing = next((end for begin, end in _NO_TAGS if data.startswith(begin, start)), None)
+        end = _end_of_tag(data, start) if closing is None else data.find(closing, start + 2)
+        if end < 0:
+            return
+        if closing is None:
+            yield data[start : end + 1]
+        start = data.find(b"<", end)
+
+
+def _end_of_tag(data: bytes, position: int) -> int:
+    """Place of the next ``>`` outside quotes, or -1."""
+    while mark := _TAG_MARK.search(data, position):
+        if mark[0] == b">":
+            return mark.start()
+        position = data.find(mark[0], mark.end()) + 1
+        if position == 0:
+            break
+    return -1
+
+
+def _text(quoted: bytes) -> str:
+    return html.unescape(quoted[1:-1].decode(errors="replace"))
+
+
+def _with_values(text: str, values: Mapping[str, str]) -> str:
+    """Put values in the place of ``$names``, the longest name first, as Mitsuba does."""
+    for name in sorted(values, key=len, reverse=True):
+        text = text.replace(f"${name}", values[name]) if name else text
+    return text

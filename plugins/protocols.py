@@ -1,0 +1,79 @@
+"""What a plugin declares about itself, so that nobody has to guess it from its attributes.
+
+Mitsuba's classes take no mix-in; a class joins a protocol by registration: after
+``QuadricShape.register(MrtCone)``, ``isinstance(shape, QuadricShape)`` holds. Others' plugins may join.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
+    from .merged_bsdf import UniformMaterial
+    from .revolution import QuadricTable
+
+
+class LayeredIntegrator(ABC):
+    """An integrator that plans its kernels and returns layers beside the picture."""
+
+    @abstractmethod
+    def provided_layers(self) -> frozenset[str]:
+        """Return the names of the layers that ``trace`` knows."""
+
+    @abstractmethod
+    def scene_facts(self, scene: Any) -> SceneFacts:
+        """Return what the kernels depend on."""
+
+    @abstractmethod
+    def kernel_plan(self, facts: SceneFacts) -> KernelPlan:
+        """Return what the kernels for such a scene hold."""
+
+    @abstractmethod
+    def prepare(self, scene: Any, plan: KernelPlan | None = None) -> Any:
+        """Get ready to trace the scene by a plan; by default, by that of ``kernel_plan``."""
+
+    @abstractmethod
+    def trace(self, scene: Any, sampler: Any, ray: Any, active: Any = True) -> Any:
+        """Return the radiance along rays, and what the layers are made of."""
+
+
+class PlaneShape(ABC):
+    """A shape that stands for an infinite plane."""
+
+    unit_normal: np.ndarray  # float64 [3]
+    distance: float  # unit_normal · P + distance = 0
+    tangents: np.ndarray  # float64 [2, 3]
+
+
+class QuadricShape(ABC):
+    """A mesh that stands for exact quadrics."""
+
+    @abstractmethod
+    def quadrics(self) -> QuadricTable:
+        """Return the quadrics."""
+
+
+class MirrorBSDF(ABC):
+    """A BSDF with the attributes ``mirror_reflectance`` and ``int_ior``, which drive the mirror rays."""
+
+    @abstractmethod
+    def mirror_bound(self) -> Mirror:
+        """Return upper bounds of them."""
+
+    @abstractmethod
+    def state(self) -> Any:
+        """Return what changes whenever a bound may: values derived from it are then out of date."""
+
+
+class MergeableBSDF(MirrorBSDF):
+    """A ``MirrorBSDF`` with the lobes of ``mrt_bsdf``, which may be looked up in a table of materials."""
+
+    fresnel: str  # one of the forms of mrt_bsdf
+
+    @abstractmethod
+    def uniform(self) -> UniformMaterial | Reason:
+        """Return the parameters as plain numbers, or why they are none; ``state`` covers this, too."""

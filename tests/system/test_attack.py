@@ -1,0 +1,217 @@
+"""What files, signals, threads and small machines may try: nothing breaks, hangs, or runs code of theirs."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.errors import SceneError
+
+pytestmark = pytest.mark.attack
+
+SENSOR = """<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>
+    <integer name="height" value="3"/></film></sensor>"""
+
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n"
+
+
+def scene_xml(inside: str) -> str:
+    return f"<scene version='3.0.0'>{SENSOR}{inside}</scene>"
+
+
+def cones(count: int) -> str:
+    cone = "<shape type='mrt_cone'><integer name='segments' value='3'/><float name='radius' value='1'/>"
+    ends = "<point name='apex' value='{0} 1 0'/><point name='base_center' value='{0} 0 0'/></shape>"
+    return "".join(cone + ends.format(i) for i in range(count))
+
+
+# ------------------------------------------- 1: native code --------------------------------------------
+
+TRAP = """
+#include <stdlib.h>
+#include <fcntl.h>
+__attribute__((constructor)) static void run(void) { open(getenv("MRT_TRAP"), O_CREAT | O_WRONLY, 0600); }
+"""
+RENDER_FILES = """
+import sys, mrt_mitsuba as mrt
+for path in sys.argv[1:]:
+    try:
+        mrt.render(path, aa=1, integrator="path")
+        print(path, "rendered")
+    except mrt.SceneError as error:
+        print(path, error)
+try:
+    mrt.render({"type": "scene", "sensor": {"type": "perspective"}, "shape": {"type": "wicked"}}, aa=1)
+except mrt.SceneError as error:
+    print("dict", error)
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_no_native_code_from_the_folders_of_process_and_scene(run_python, tmp_path: Path) -> None:
+    trap, sign = tmp_path / "trap.so", tmp_path / "it ran"
+    (tmp_path / "trap.c").write_text(TRAP)
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", trap, tmp_path / "trap.c"], check=True, timeout=60)
+    for folder in (tmp_path, tmp_path / "scene", tmp_path / "more"):
+        (folder / "plugins").mkdir(parents=True)
+        for name in ("sphere", "diffuse", "hdrfilm", "path", "scene", "constant", "wicked"):
+            shutil.copy(trap, folder / "plugins" / f"{name}.so")
+    files = {
+        "known": "<shape type='sphere'><bsdf type='diffuse'/></shape>",
+        "unknown": "<shape type='wicked'/>",
+        "by_path": "<path value='more'/><shape type='sphere'><bsdf type='diffuse'/></shape>",
+        "by_parameter": "<default name='kind' value='wicked'/><shape type='$kind'/>",
+        "by_place": "<shape type='../../scene/plugins/wicked'/>",
+    }
+    for name, text in files.items():
+        (tmp_path / "scene" / f"{name}.xml").write_text(scene_xml(text))
+    done = run_python(RENDER_FILES, *(f"scene/{name}.xml" for name in files), MRT_TRAP=str(sign))
+    assert done.returncode == 0, done.stderr
+    lines = dict(line.split(" ", 1) for line in done.stdout.splitlines())
+    assert not sign.exists(), lines
+    assert lines["scene/known.xml"] == lines["scene/by_path.xml"] == "rendered"
+    for name in ("scene/unknown.xml", "scene/by_parameter.xml", "dict"):
+        assert "native code that is not Mitsuba's" in lines[name]
+    command = [Path(sys.executable).with_name("mrt"), "out", "3", "width=8", "height=6", "quiet=1"]
+    environ = os.environ | {"MRT_TRAP": str(sign)}
+    subprocess.run(command, cwd=tmp_path, env=environ, check=True, timeout=120)
+    (tmp_path / "plugins" / "wicked.so").rename(
+        tmp_path / "plugins" / "mrt_bsdf.so"
+    )  # looked for there first
+    done = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1 and "native code that is not Mitsuba's" in done.stderr
+    assert not sign.exists()
+
+
+# ------------------------------------------- 2: many shapes --------------------------------------------
+
+
+def test_hundreds_of_python_shapes_load(variant: str, tmp_path: Path) -> None:
+    """Loaded in parallel, 300 of them overflowed the stack each time."""
+    (tmp_path / "cones.xml").write_text(scene_xml(cones(1200)))
+    assert mrt.render(str(tmp_path / "cones.xml"), aa=1).image.shape == (3, 4, 3)
+    lines = ["mtllib m.mtl", "v 0 0 0", "v 1 0 0", "v 0 1 0"]
+    names = [f"m{i}" for i in range(1200)]
+    (tmp_path / "m.mtl").write_text("".join(f"newmtl {n}\nKd 0.5 0.5 0.{n[1:]}\n" for n in names))
+    (tmp_path / "m.obj").write_text("\n".join(lines + [f"usemtl {n}\nf 1 2 3" for n in names]) + "\n")
+    assert mrt.render(str(tmp_path / "m.obj"), width=4, height=3, aa=1).image.shape == (3, 4, 3)
+
+
+# ------------------------------------------- 3: long lines --------------------------------------------
+
+READ_MODELS = """
+import sys, warnings
+from mrt_mitsuba.scene.obj import read_obj
+points = b"v 0 0 0\\nv 1 0 0\\nv 0 1 0\\n"
+limit = 2**18
+for text in (
+    b"v " + b"1" * 200_000 + b" 0 0\\nf 1 2 3\\n",
+    b"v " + b"1" * 100_000 + b"." + b"1" * 100_000 + b" 0 0\\nf 1 2 3\\n",
+    b"v" + b" " * 100_000 + b"1" + b" " * 100_000 + b"x\\nf 1 2 3\\n",
+    b"#" + b"x" * (limit - 2) + b"\\nf 1 2 \\\\\\n3\\n",
+    b"#" + b"x" * limit + b"\\nf 1 2 3\\n",
+    b"f" + b" 1 2 3" * (10 * limit // 6) + b"\\n",
+    b"f 1 2" + b" \\\\\\n" * 100_000 + b" 3\\n",
+):
+    with open("a.obj", "wb") as file:
+        file.write(points + text)
+    try:
+        print(len(read_obj("a.obj")))
+    except Exception as error:
+        print(type(error).__name__, error)
+"""
+
+
+def test_time_to_read_a_model_grows_with_its_size(run_python) -> None:
+    """The first alone took half an hour; ``run_python`` waits two minutes."""
+    lines = run_python(READ_MODELS).stdout.splitlines()
+    assert [line.split()[0] for line in lines] == [*["SceneError"] * 3, "1", *["SceneError"] * 2, "1"], lines
+    for line in lines[4:6]:
+        assert "at most 262144 are read" in line
+    assert all(len(line) < 200 for line in lines)
+
+
+# ------------------------------------------- 6: XML and pipes ------------------------------------------
+
+
+@pytest.mark.parametrize("depth", [1000, 100_000])
+def test_deep_nesting_is_refused(variant: str, tmp_path: Path, depth: int) -> None:
+    nested = "<shape type='instance'>" * depth + "</shape>" * depth
+    (tmp_path / "deep.xml").write_text(scene_xml(nested))
+    (tmp_path / "outer.xml").write_text(scene_xml("<include filename='deep.xml'/>"))
+    scene: dict[str, Any] = {}
+    for _ in range(depth):
+        scene = {"type": "scene", "inner": scene}
+    for what in (str(tmp_path / "deep.xml"), str(tmp_path / "outer.xml"), scene):
+        with pytest.raises(SceneError, match="nested more than 256 levels"):
+            mrt.render(what, aa=1)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+@pytest.mark.parametrize(
+    "inside",
+    [
+        "<include filename='pipe'/>",
+        "<default name='p' value='pipe'/><include filename='$p'/>",
+        "<include filename='p&#105;pe'/>",
+        "<emitter type='envmap'><string name='filename' value='pipe'/></emitter>",
+        "<shape type='ply'><string name='filename' value='pipe'/></shape>",
+        "<bsdf type='diffuse'><spectrum name='reflectance' filename='pipe'/></bsdf>",
+        "<bsdf type='diffuse'><texture name='reflectance' type='bitmap'>"
+        "<string name='filename' value='pipe'/></texture></bsdf>",
+        "<bsdf type='diffuse'><texture name='reflectance' type='mrt_texture'>"
+        "<string name='filename' value='pipe'/></texture></bsdf>",
+    ],
+    ids=range(8),
+)
+def test_pipes_are_refused(variant: str, tmp_path: Path, inside: str) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "a.xml").write_text(scene_xml(inside))
+    with pytest.raises(SceneError, match="pipe: it is not a regular file"):
+        mrt.render(str(tmp_path / "a.xml"), aa=1)
+
+
+# -------------------------------------- 9, 12: files that lie -----------------------------------------
+
+
+@pytest.mark.parametrize("name", ["n" * 300, "closed/m", "pipe", "folder"])
+def test_unreadable_library_and_texture_are_warnings(variant: str, tmp_path: Path, name: str) -> None:
+    """A mode of 0 does not keep the superuser out; a folder of that name stands for it."""
+    (tmp_path / "closed").mkdir(mode=0o000)
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "m.mtl").write_text(f"newmtl a\nKd 1 0 0\nmap_Kd {name}\n")
+    model = tmp_path / "m.obj"
+    model.write_text(f"mtllib {name}\nmtllib m.mtl\n" + TRIANGLE)
+    with pytest.warns(mrt.MrtWarning) as caught:
+        assert mrt.render(str(model), width=4, height=3, aa=1).image.shape == (3, 4, 3)
+    assert [" is missing or may not be read" in str(w.message) for w in caught] == [True, True]
+
+
+def test_messages_are_printable_short_and_few(variant: str, tmp_path: Path) -> None:
+    model = tmp_path / "m.obj"
+    for text in (f"v 0 0 {'z' * 200_000}", "\x1b]0;owned\x07 1", "f 1 2 \u202e3", "usemtl \x9b31m\nx"):
+        model.write_text(text + "\n")
+        with pytest.raises(SceneError) as caught, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            mrt.render(str(model), aa=1)
+        assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
+    (tmp_path / "a.xml").write_text(scene_xml(f"<shape type='{'potato' * 100_000}'/>"))
+    with pytest.raises(SceneError, match="potato") as caught:
+        mrt.render(str(tmp_path / "a.xml"), aa=1)
+    assert len(str(caught.value)) < 1000
+    faces = "".join(f"usemtl m\x1b{i}\nf 1 2 3\n" for i in range(20_000))
+    model.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + faces)
+    with pytest.warns(mrt.MrtWarning) as warned:
+        mrt.render(str(model), width=4, height=3, aa=1)
+    assert len(warned) == 1 and "and so do 19999 more materials" in str(warned[0].message)
+    assert str(warned[0].message).isprintable()
