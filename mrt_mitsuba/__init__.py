@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from mrt_mitsuba.runtime import register as register
     from mrt_mitsuba.scene.export import scene_dict as scene_dict
     from mrt_mitsuba.validation.studies.roughconductor import compare_roughconductor as compare_roughconductor
+    from mrt_mitsuba.validation.tools.compare import compare as compare
+    from mrt_mitsuba.validation.tools.work_precision import error_vs_time as error_vs_time
 
 # Where each public name lives; the module is imported when the name is first used.
 _HOME = {
@@ -34,7 +36,9 @@ _HOME = {
     "SceneError": "mrt_mitsuba.errors",
     "UsageError": "mrt_mitsuba.errors",
     "VariantError": "mrt_mitsuba.errors",
+    "compare": "mrt_mitsuba.validation.tools.compare",
     "compare_roughconductor": "mrt_mitsuba.validation.studies.roughconductor",
+    "error_vs_time": "mrt_mitsuba.validation.tools.work_precision",
     "register": "mrt_mitsuba.runtime",
     "render": "mrt_mitsuba.rendering.api",
     "scene_dict": "mrt_mitsuba.scene.export",

@@ -36,6 +36,16 @@ COMMANDS = {
         "write a scene as Mitsuba XML; --stock: with stock plugins only",
         "mrt_mitsuba.command.export:run",
     ),
+    "diff": Command(
+        "A.exr B.exr [layer=NAME] [rmse=LIMIT] [flip=LIMIT] [out=PATH]",
+        "compare two pictures; exit code 1 beyond a limit, 2 if they do not compare",
+        "mrt_mitsuba.validation.tools.commands:diff",
+    ),
+    "error-vs-time": Command(
+        "SCENE|scene=PATH cases=FILE.toml [out=DIR]",
+        "measure error and time of any settings of any scene",
+        "mrt_mitsuba.validation.tools.commands:error_vs_time",
+    ),
 }
 # Not in the help
 ALIASES = {

@@ -123,6 +123,22 @@ class _Stream:
 def read_exr(path: str | os.PathLike[str]) -> Picture:
     """Read an EXR with the channels R, G, B; raise ``OutputError`` if there is none or it is broken."""
     import numpy as np
+
+    planes, header = _read(path)
+    missing = [channel for channel in "RGB" if channel not in planes]
+    if missing:
+        raise OutputError(f"cannot read {os.fspath(path)}: it has no channel {missing[0]!r}")
+    image = np.stack([planes.pop(channel) for channel in "RGB"], axis=-1)  # [H, W, 3]
+    return Picture(image, planes, header)
+
+
+def read_channels(path: str | os.PathLike[str]) -> dict[str, Image]:
+    """Read every channel of an EXR, [H, W] float32 by name; raise ``OutputError`` if it is none or broken."""
+    return _read(path)[0]
+
+
+def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Image], dict[str, Any]]:
+    import numpy as np
     import OpenEXR
 
     name = os.fspath(path)
@@ -131,14 +147,11 @@ def read_exr(path: str | os.PathLike[str]) -> Picture:
             file.read(1)
         part = OpenEXR.File(name, separate_channels=True)
         planes = {key: np.asarray(value.pixels, np.float32) for key, value in part.channels().items()}
-        image = np.stack([planes.pop(channel) for channel in "RGB"], axis=-1)  # [H, W, 3]
-    except KeyError as error:
-        raise OutputError(f"cannot read {name}: it has no channel {error}") from error
+        return planes, dict(part.header())
     except OSError as error:
         raise OutputError(f"cannot read {name}: {error.strerror or error}") from error
     except (RuntimeError, ValueError, TypeError) as error:
         raise OutputError(f"cannot read {name}: not a whole EXR ({error})") from error
-    return Picture(image, planes, dict(part.header()))
 
 
 def to_8bit(image: Image, tonemap: str = "report") -> NDArray[np.uint8]:

@@ -28,13 +28,13 @@ EPSILON = 1e-2
 class Estimate:
     """A picture with noise: mean and variance *of the mean*, both [H, W, C].
 
-    ``samples``: how many independent renders the variance was estimated from; infinite if it is known, as for
-    a picture without noise, whose variance is 0.
+    ``samples``: how many independent renders the variance was estimated from, for all pixels or [H, W, 1];
+    infinite if it is known, as for a picture without noise, whose variance is 0.
     """
 
     mean: np.ndarray
     variance: np.ndarray
-    samples: float = np.inf
+    samples: np.ndarray | float = np.inf
 
     def __post_init__(self) -> None:
         if self.mean.ndim != 3 or self.mean.shape != self.variance.shape:
@@ -45,7 +45,7 @@ class Estimate:
             np.isfinite(self.mean).all() and np.isfinite(self.variance).all() and (self.variance >= 0).all()
         ):
             raise UsageError("an estimate holds infinite or undefined values, or a negative variance")
-        if self.samples < 2:
+        if np.min(self.samples) < 2:
             raise UsageError(f"samples={self.samples}: a variance needs at least two independent renders")
 
 
@@ -145,7 +145,7 @@ def _welch(ours: Estimate, theirs: Estimate, size: int, rounding: float) -> tupl
     variances = [_cell_sums(e.variance, size) for e in (ours, theirs)]
     total = sum(variances) + floor**2
     # Welch and Satterthwaite: a sum of estimated variances is known as well as these degrees of freedom say
-    spread = sum(_cell_sums(e.variance**2, size) / (e.samples - 1) for e in (ours, theirs))
+    spread = sum(_cell_sums(e.variance**2 / (e.samples - 1), size) for e in (ours, theirs))
     t = np.divide(difference, np.sqrt(total), out=np.zeros_like(difference), where=total > 0)
     return t, np.divide(total**2, spread, out=np.full_like(total, np.inf), where=spread > 0)
 

@@ -123,7 +123,7 @@ def write(
 
 
 def save(folder: str | os.PathLike[str], study: Study, *, title: str, quick: bool = False) -> None:
-    """Write the report of one study that a tool made into a folder, made if need be. Raises ``OutputError``."""
+    """Write the report of a tool's study into a folder, made if need be. Raises ``OutputError``."""
     place = Path(folder)
     prepare(place, "summary.json", "index.html")
     write(place, [Outcome(study, study.seconds)], header(quick=quick), title=title)

@@ -1,0 +1,126 @@
+"""``mrt.compare`` and ``mrt diff``: known differences, layers, noise, and what cannot be compared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.command.main import main
+from mrt_mitsuba.output.files import read_exr, write_exr
+
+pytest.importorskip("flip_evaluator")
+
+GREY = np.full((12, 16, 3), 0.5, np.float32)
+
+
+def spotted(by: float = 0.1) -> np.ndarray:
+    image = GREY.copy()
+    image[3, 5, 1] += by
+    return image
+
+
+def test_measures_are_those_of_a_known_difference() -> None:
+    found = mrt.compare(spotted(), GREY)
+    n = GREY.size
+    assert found.mae == pytest.approx(0.1 / n, rel=1e-6) and found.rmse == pytest.approx(
+        0.1 / n**0.5, rel=1e-6
+    )
+    assert found.rel_mse == pytest.approx(0.01 / n / 0.26, rel=1e-6)
+    assert found.psnr == pytest.approx(10 * np.log10(n / 0.01), rel=1e-6)
+    assert mrt.compare(spotted(), GREY, peak=2).psnr == pytest.approx(10 * np.log10(4 * n / 0.01), rel=1e-6)
+    assert found.largest == pytest.approx(0.1, rel=1e-6) and found.place == (3, 5)
+    assert found.flip > 0 and found.p_value is None
+    np.testing.assert_array_equal(found.difference, spotted() - GREY)
+    assert "<td>rmse</td>" in found._repr_html_()
+    same = mrt.compare(GREY, GREY)
+    assert (same.mae, same.rmse, same.psnr, same.largest, same.flip) == (0, 0, np.inf, 0, 0)
+
+
+def test_infinite_depths_are_equal_where_both_are() -> None:
+    depth = np.array([[1.0, np.inf], [2.0, np.inf]], np.float32)
+    other = np.array([[1.5, np.inf], [2.0, 3.0]], np.float32)
+    assert mrt.compare(depth, depth).largest == 0
+    assert mrt.compare(depth[:, :1], other[:, :1]).largest == 0.5
+    assert mrt.compare(depth, other).mae == np.inf  # one of them hits nothing there
+
+
+@pytest.mark.parametrize("spread", ["error", "variance"])
+def test_noise_alone_and_more_than_noise(spread: str, tmp_path: Path) -> None:
+    """The mean of 16 rays: p is uniform for equal pictures, and small for one 2 % brighter."""
+    rng = np.random.default_rng(1)
+
+    def noisy(name: str, scale: float) -> Path:
+        rays = 0.5 * scale * (1 + 0.1 * rng.normal(size=(16, 24, 32, 3)))
+        variance = rays.var(axis=0, ddof=1) / 16
+        layers = {"samples": np.full((24, 32), 16)} | (
+            {"error": np.sqrt(variance.mean(axis=-1))} if spread == "error" else {"variance": variance}
+        )
+        write_exr(tmp_path / name, rays.mean(axis=0), layers)
+        return tmp_path / name
+
+    p = [mrt.compare(noisy("a.exr", 1), noisy("b.exr", 1)).p_value for _ in range(40)]
+    assert sum(value < 0.05 for value in p) <= 7  # 2 expected; more than 7 once in a thousand times
+    assert mrt.compare(noisy("a.exr", 1.02), noisy("b.exr", 1)).p_value < 1e-6
+    assert mrt.compare(noisy("a.exr", 1.02), 0.5 * np.ones((24, 32, 3))).p_value < 1e-6  # one side exact
+
+
+def test_results_have_layers(variant) -> None:
+    result = mrt.render(0, width=24, height=18, aa=1, layers=["depth", "normal"])
+    assert mrt.compare(result, result.image).largest == 0
+    assert mrt.compare(result, result, layer="normal").difference.shape == (18, 24, 3)
+    with pytest.raises(mrt.UsageError, match=r"has no layer 'albedo'; it has .*depth, normal"):
+        mrt.compare(result, result, layer="albedo")
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, str]:
+    depth = np.full((12, 16), 2.0, np.float32)
+    write_exr(tmp_path / "a.exr", spotted(), {"depth": 1.5 * depth})
+    write_exr(tmp_path / "b.exr", GREY, {"depth": depth})
+    write_exr(tmp_path / "small.exr", GREY[:5])
+    write_exr(tmp_path / "nan.exr", np.where(spotted() > 0.55, np.nan, GREY))
+    (tmp_path / "text.exr").write_text("no picture")
+    return {path.stem: str(path) for path in tmp_path.iterdir()} | {"none": str(tmp_path / "none.exr")}
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (("a", "b"), 0, "rmse     0.004167"),
+        (("a", "b", "rmse=0.005", "largest=0.2", "psnr=40", "flip=0.5"), 0, "ok     psnr: 47.6 >= 40"),
+        (("a", "b", "rmse=0.004", "largest=0.2"), 1, "MISSED rmse: 0.004167 <= 0.004"),
+        (("a", "b", "psnr=50"), 1, "MISSED psnr"),
+        (("a", "b", "layer=depth", "mae=0.5"), 1, "MISSED mae: 1 <= 0.5"),
+        (("a", "b", "layer=depth.Z"), 0, "largest  1\n"),
+        (("a", "b", "layer=depth", "flip=0.1"), 2, "FLIP needs three channels"),
+        (("a", "b", "p_value=0.1"), 2, 'layer "error"'),
+        (("a", "b", "layer=normal"), 2, "has no layer 'normal'; it has B, G, R, depth"),
+        (("a", "small"), 2, "16x12 with 3 channels and 16x5 with 3 channels"),
+        (("nan", "b"), 2, "is NaN in 1 pixels, the first at row 3, column 5"),
+        (("a", "text"), 2, "not a whole EXR"),
+        (("a", "none"), 2, "No such file"),
+        (("a",), 2, "give two EXR files"),
+        (("a", "b", "rsme=1"), 2, "unknown option 'rsme', meant rmse?"),
+        (("a", "b", "rmse=much"), 2, "must be a number"),
+        (("a", "b", "rmse=1", "rmse=2"), 2, "given twice"),
+    ],
+)
+def test_command(words, code: int, said: str, files, capsys) -> None:
+    assert main(["diff", *(files.get(word, word) for word in words)]) == code
+    out, err = capsys.readouterr()
+    assert said in (err if code == 2 else out)
+
+
+def test_difference_is_written(files, tmp_path: Path, capsys) -> None:
+    assert main(["diff", files["a"], files["b"], f"out={tmp_path / 'd.png'}"]) == 0
+    written = read_exr(tmp_path / "d.exr")
+    np.testing.assert_array_equal(written.image, spotted() - GREY)
+    assert float(written.header["rmse"]) == pytest.approx(0.1 / GREY.size**0.5, rel=1e-6)
+    from PIL import Image
+
+    shown = np.asarray(Image.open(tmp_path / "d.png")).astype(int).sum(axis=-1)
+    assert np.unravel_index(shown.argmax(), shown.shape) == (3, 5) and (shown < 20).sum() == shown.size - 1
+    assert main(["diff", files["a"], files["b"], f"out={tmp_path}/no/such/place"]) == 2

@@ -1,0 +1,245 @@
+"""``mrt.error_vs_time`` on scenes of one's own: known errors, biases and intervals, and the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.command.main import main
+from mrt_mitsuba.validation.tools.intervals import Estimate, estimate
+from mrt_mitsuba.validation.tools.precision_page import front
+from mrt_mitsuba.validation.tools.work_precision import Point, WorkPrecision
+
+for needed in ("matplotlib", "jinja2", "scipy", "flip_evaluator"):
+    pytest.importorskip(needed)
+
+SIZE = (32, 24)
+ONE_RAY = {"aa": 1, "aamode": "none"}
+# A diffuse floor under a bright sky: every path is one bounce, tame noise, and the same for path and direct
+FLOOR = {
+    "type": "scene",
+    "sensor": {
+        "type": "perspective",
+        "to_world": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 3], [0, 0, 0, 1]],
+        "film": {"type": "hdrfilm", "width": SIZE[0], "height": SIZE[1], "rfilter": {"type": "box"}},
+    },
+    "sky": {"type": "constant"},
+    "ball": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "diffuse"}},
+    "light": {"type": "point", "position": [2, 2, 2], "intensity": {"type": "rgb", "value": 9.0}},
+}
+
+
+@pytest.fixture
+def scene(variant):
+    import mitsuba as mi
+
+    up = mi.ScalarTransform4f().look_at(origin=[0, 1, 3], target=[0, 0, 0], up=[0, 1, 0])
+    return {**FLOOR, "sensor": {**FLOOR["sensor"], "to_world": up}}
+
+
+def path(spp: int, **more: object) -> dict[str, object]:
+    return {"integrator": "path", "spp": spp, **more}
+
+
+def test_errors_fall_as_theory_says_and_a_bias_is_found(scene):
+    cases = {f"path {n}": path(n) for n in (4, 16, 64)}
+    cases |= {f"blind {n}": path(n, integrator={"type": "path", "max_depth": 1}) for n in (1, 16)}
+    found = mrt.error_vs_time(scene, cases, reference=path(2048), repeats=6, shared=ONE_RAY)
+    assert not found.failed and list(found.families) == ["path", "blind"]
+    points = found.points
+    few, many = points["path 4"], points["path 64"]
+    # 768 pixels of 6 repeats: their mean square is known to some 5 %
+    assert few.rmse / many.rmse == pytest.approx(4, rel=0.15)
+    assert few.rmse**2 == pytest.approx(few.variance, rel=0.1)
+    assert few.bias_interval[0] == 0 and few.bias_interval[1] < 0.5 * few.rmse  # a quarter of the MSE at most
+    blind = points["blind 16"]
+    assert blind.bias == pytest.approx(blind.rmse, rel=0.01) and blind.bias_interval[0] > 0.9 * blind.bias
+    # the reference's error is that of 2048 rays
+    assert found.reference_error == pytest.approx(many.rmse * (64 / 2048) ** 0.5, rel=0.15)
+    assert few.seconds_interval[0] <= few.seconds <= few.seconds_interval[1]
+    assert few.rmse_interval[0] < few.rmse < few.rmse_interval[1] and few.efficiency > 0
+    assert few.cold > 0 and few.rays["primary"] == 4 * SIZE[0] * SIZE[1]
+    (strip,) = found.strips[:1]
+    assert [panel.name.split(",")[0] for panel in strip.panels] == ["path", "blind"]
+    assert all(np.isfinite(panel.image).all() and panel.seconds > 0 for panel in strip.panels)
+
+
+def test_nothing_is_claimed_below_the_reference(scene):
+    cases = {f"path {n}": path(n) for n in (4, 256)}
+    found = mrt.error_vs_time(scene, cases, reference=path(16), repeats=2, shared=ONE_RAY)
+    assert found.points["path 4"].rmse > found.points["path 256"].rmse
+    assert not found.points["path 256"].resolved
+    assert all(error > 2 * found.reference_error for error in found.errors)
+    with pytest.raises(mrt.UsageError, match="take a better reference"):
+        mrt.error_vs_time(scene, cases, reference=path(16), repeats=1, errors=[1e-4], shared=ONE_RAY)
+
+
+def test_failed_cases_are_kept_with_the_reason(scene, tmp_path):
+    black = {**scene, "dark": {"type": "point", "position": [0, 3, 0], "intensity": float("nan")}}
+    small = mrt.scene_dict(0, width=8, height=6)
+    cases = {
+        "good": path(4),
+        "typo": {"integratr": "path"},
+        "unknown": {"integrator": "no_such_integrator"},
+        "nan": path(4, scene=black),
+        "small": path(4, scene=small),
+    }
+    found = mrt.error_vs_time(scene, cases, reference=path(64), repeats=1, shared=ONE_RAY)
+    assert list(found.points) == ["good"]
+    assert {name: word in found.failed[name] for name, word in
+            {"typo": "integratr", "unknown": "no_such_integrator", "nan": "NaN", "small": "8x6"}.items()} == (
+        dict.fromkeys(found.failed, True))  # fmt: skip
+    found.save(tmp_path)
+    summary = json.loads((tmp_path / "summary.json").read_text())["studies"]["error-vs-time"]
+    assert summary["verdict"] == "missed" and len(summary["tables"]["failed"]["rows"]) == 4
+    assert "one repeat" in (tmp_path / "index.html").read_text("utf-8")
+
+
+def test_references_of_other_kinds(variant, tmp_path):
+    """Two lattices, the better first; and a picture."""
+    scene = mrt.scene_dict(0, width=32, height=24)
+    lattice = {"aamode": "none", "lattice": "centered"}
+    found = mrt.error_vs_time(
+        scene, {"aa=2": {"aa": 2}}, reference=[{"aa": 8}, {"aa": 6}], repeats=2, shared=lattice
+    )
+    best = mrt.render(scene, aa=8, **lattice)
+    second = mrt.render(scene, aa=6, **lattice)
+    error = mrt.compare(mrt.render(scene, aa=2, **lattice), best).rmse
+    assert found.reference_error == pytest.approx(mrt.compare(second, best).rmse, rel=1e-5)
+    assert found.points["aa=2"].rmse == pytest.approx(error, rel=1e-5)
+    assert found.points["aa=2"].rmse_interval == pytest.approx((error, error), rel=1e-5)  # nothing is random
+    assert np.isnan(found.points["aa=2"].efficiency)
+    best.save(tmp_path / "best.exr")
+    again = mrt.error_vs_time(
+        scene, {"aa=2": {"aa": 2}}, reference=tmp_path / "best.exr", repeats=1, shared=lattice
+    )
+    assert again.points["aa=2"].rmse == pytest.approx(error, rel=1e-4) and again.reference_error == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"cases": {}}, "at least one case"),
+        ({"repeats": 0}, "one repeat"),
+        ({"cases": {"a": {"seed": 3}}}, "a sets a seed"),
+        ({"reference": np.ones((3, 3, 4, 1))}, "has the shape"),
+    ],
+)
+def test_wrong_arguments(arguments, message, variant):
+    with pytest.raises(mrt.UsageError, match=message):
+        mrt.error_vs_time(0, **{"cases": {"a": {}}, "reference": {}, **arguments})
+
+
+# ------------------------------------------- From known figures -------------------------------------------
+
+
+def point(name: str, times: list[float], rmse: float) -> Point:
+    gram = rmse**2 * np.eye(len(times))
+    image = np.full((2, 2, 3), 0.5, np.float32)
+    return Point(name, {}, np.array(times), gram, 1.0, 0.5, {}, image, mrt.compare(image, image), 0.0)
+
+
+def found_of(*points: Point, errors: tuple[float, ...] = (0.1,)) -> WorkPrecision:
+    repeats = len(points[0].times)
+    return WorkPrecision("test", {p.name: p for p in points}, {}, np.zeros((2, 2, 3)), 0.0, repeats, errors)
+
+
+def test_time_to_an_error_is_read_off_the_curve():
+    curve = found_of(point("a 1", [1.0] * 3, 0.4), point("a 4", [4.0] * 3, 0.2), point("b", [9.0] * 3, 0.01))
+    for error, seconds in ((0.5, 1), (0.4, 1), (0.4 / 2**0.5, 2), (0.2, 4), (0.19, np.inf)):
+        time = curve.time_to(error)["a"]
+        assert (time.value, time.low, time.high) == pytest.approx((seconds,) * 3)
+
+
+@pytest.mark.parametrize(
+    ("other", "verdict"),
+    [
+        ([2.0, 2.1, 1.9, 2.05], "RMSE of 0.1: a is the fastest, 1"),
+        ([0.9, 1.3, 0.8, 1.4], "a and b are not told apart"),
+        (None, "only a comes so low"),
+    ],
+)
+def test_a_winner_is_named_only_if_intervals_are_apart(other, verdict):
+    b = point("b", other or [1.0] * 4, 0.1 if other else 0.2)
+    assert verdict in found_of(point("a", [1.0, 1.1, 0.9, 1.05], 0.1), b).verdicts[0]
+
+
+def test_one_repeat_gives_no_verdict():
+    found = found_of(point("a", [1.0], 0.1), point("b", [9.0], 0.1), errors=(0.1, 1e-3))
+    assert "no verdict" in found.verdicts[0] and "no case" in found.verdicts[1]
+
+
+def test_front_is_what_nothing_beats_in_both():
+    figures = {"a": (1, 0.5), "b": (2, 0.6), "c": (3, 0.1), "d": (4, 0.1), "e": (0.5, 0.9)}
+    assert [p.name for p in front([point(n, [t], e) for n, (t, e) in figures.items()])] == ["e", "a", "c"]
+
+
+@pytest.mark.parametrize("count", [3, 5, 10])
+@pytest.mark.parametrize("statistic", [np.mean, np.median])
+def test_intervals_cover_what_they_should(count, statistic):
+    """95 % of them, of log-normal times as a busy machine makes them; 200 trials leave ± 4.6 %."""
+    rng = np.random.default_rng(count)
+    truth = float(statistic(np.exp(rng.normal(0, 0.3, 10**6))))
+    inside = 0
+    for _ in range(200):
+        values = np.exp(rng.normal(0, 0.3, count))
+        e = estimate(count, lambda index, values=values: statistic(values[index], axis=-1))
+        inside += e.low <= truth <= e.high
+    assert inside >= 0.88 * 200
+    assert np.isnan(estimate(1, lambda index: index[..., 0] + 1.0).low)
+
+
+def test_estimates_overlap_unless_they_are_apart():
+    a, b, unknown = Estimate(1, 0.5, 1.5), Estimate(2, 1.6, 3), Estimate(1, np.nan, np.nan)
+    assert not a.overlaps(b) and not b.overlaps(a) and a.overlaps(a) and a.overlaps(unknown)
+
+
+# ---------------------------------------------- The command ----------------------------------------------
+
+
+def cases_file(folder: Path, text: str) -> str:
+    (folder / "cases.toml").write_text(text)
+    return f"cases={folder / 'cases.toml'}"
+
+
+GOOD = """
+repeats = 2
+shared = {width = 24, height = 18, aamode = "none", focaldist = 0}
+reference = {aa = 4}
+[cases]
+"aa=1" = {aa = 1}
+"aa=2" = {aa = 2}
+"""
+
+
+def test_command_writes_a_page(tmp_path, capsys, variant):
+    out = tmp_path / "report"
+    assert main(["error-vs-time", "3", cases_file(tmp_path, GOOD), f"out={out}"]) == 0
+    shown = capsys.readouterr().out
+    assert "aa=2" in shown and "index.html" in shown
+    names = {path.name for path in out.iterdir()}
+    assert {"index.html", "summary.json", "error-vs-time-diagram.png", "error-vs-time-points.csv"} <= names
+    broken = cases_file(tmp_path, GOOD + '"bad" = {aa = 1, lattice = "none"}\n')
+    assert main(["error-vs-time", "scene=3", broken, f"out={out}"]) == 1
+    assert "bad" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "text", "said"),
+    [
+        (["3"], None, "give one scene and a file of cases"),
+        (["3", "4"], GOOD, "give one scene"),
+        (["3"], "cases = {", "cannot read"),
+        (["3"], "cases = {}", "no entry 'reference'"),
+        (["3"], GOOD.replace("repeats", "repeat"), "unknown entry 'repeat'"),
+        (["3", "cases=none.toml"], None, "No such file"),
+    ],
+)
+def test_command_refuses(words, text, said, tmp_path, capsys):
+    arguments = [cases_file(tmp_path, text)] if text else []
+    assert main(["error-vs-time", *words, *arguments, f"out={tmp_path / 'out'}"]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()

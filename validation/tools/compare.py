@@ -1,0 +1,210 @@
+"""Two pictures of the same thing: how far one is from the other, in the measures in use."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.errors import OutputError, UsageError
+from mrt_mitsuba.output.files import read_channels, write_exr, write_png
+from mrt_mitsuba.output.result import Result
+from mrt_mitsuba.validation.tools import image_tests
+
+ORDER = {letter: index for index, letter in enumerate("RGBXYZUVA")}  # of channels within a layer
+# What may stand next to a picture and says how well it is known: the layer, and its power of the deviation
+SPREADS = {"error": 2, "variance": 1}
+MEASURES = ("mae", "rmse", "rel_mse", "psnr", "largest", "flip", "p_value")
+# Why a measure may be None
+UNDEFINED = {
+    "flip": "FLIP needs three channels, finite and not negative, a reference that is not black, and the "
+    "package flip-evaluator",
+    "p_value": 'neither has a layer "error" or "variance" next to its picture',
+}
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How far ``a`` is from ``b``, the reference; infinite where only one of them is."""
+
+    mae: float  #: mean absolute error
+    rmse: float  #: root of the mean squared error
+    rel_mse: float  #: mean of (a − b)² / (b² + 0.01)
+    psnr: float  #: peak signal-to-noise ratio in dB
+    largest: float  #: largest absolute error of a channel
+    place: tuple[int, int]  #: row and column of the largest error
+    p_value: float | None  #: of as much difference by noise alone; None where no noise is known
+    difference: np.ndarray  #: a − b, float32 [H, W, C]
+    pictures: tuple[np.ndarray, np.ndarray] = field(repr=False)
+
+    @cached_property
+    def flip(self) -> float | None:
+        """Mean of FLIP, the difference that a viewer sees, from 0 to 1; None where it is not defined."""
+        try:
+            return image_tests.flip(*reversed(self.pictures)).mean
+        except (UsageError, ImportError):
+            return None
+
+    def measures(self) -> dict[str, float | None]:
+        """Return all measures by name."""
+        return {name: getattr(self, name) for name in MEASURES}
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the signed difference as .exr, and its size in false colours as .png, black for none.
+
+        The ending of ``path`` does not matter. Raises ``OutputError``.
+        """
+        from matplotlib import colormaps
+
+        stem = Path(path).with_suffix("") if Path(path).suffix in (".exr", ".png") else Path(path)
+        values = self.difference
+        shown = values if values.shape[2] == 3 else np.repeat(values[..., :1], 3, axis=2)
+        write_exr(f"{stem}.exr", shown, header={k: str(v) for k, v in self.measures().items()})
+        size = np.nan_to_num(np.abs(values).max(axis=2), posinf=np.inf)
+        scale = np.max(size, initial=0, where=np.isfinite(size)) or 1
+        colours = colormaps["inferno"](np.minimum(size / scale, 1))[..., :3]
+        write_png(f"{stem}.png", colours.astype(np.float32))
+
+    def __str__(self) -> str:
+        lines = [f"{name:<8} {_shown(value)}" for name, value in self.measures().items()]
+        return "\n".join([*lines, f"the largest is at row {self.place[0]}, column {self.place[1]}"])
+
+    def _repr_html_(self) -> str:
+        cells = "".join(f"<tr><td>{k}</td><td>{_shown(v)}</td></tr>" for k, v in self.measures().items())
+        return f"<table>{cells}</table>"
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference:
+    """Compare a picture with a reference.
+
+    Args:
+        a, b: each the path of an EXR, an array [H, W] or [H, W, C], or the result of ``render``.
+        layer: a layer of an EXR or a result ("depth"), or one channel of it ("depth.Z"); the picture without.
+        peak: brightest value, for the PSNR.
+
+    The p-value needs a layer "error" (standard error) or "variance" (of the mean) next to the picture, as
+    ``render(target=...)`` and ``aamode="noise"`` write it, and pixels that are independent: a box filter.
+
+    Raises ``UsageError`` for what cannot be compared: another size, no such layer, NaN.
+    """
+    sides = [Layer.read(side, layer, name) for side, name in ((a, "a"), (b, "b"))]
+    first, second = (side.values for side in sides)
+    if first.shape != second.shape:
+        sizes = " and ".join(f"{s.shape[1]}x{s.shape[0]} with {s.shape[2]} channels" for s in (first, second))
+        raise UsageError(f"cannot compare pictures of {sizes}: their sizes must be the same")
+    with np.errstate(invalid="ignore", over="ignore"):
+        difference = np.where(first == second, 0, first.astype(np.float64) - second)  # inf where both are
+        square = difference**2
+        relative = np.divide(square, np.square(second, dtype=np.float64) + image_tests.EPSILON)
+    relative[np.isinf(square)] = np.inf
+    mse = float(square.mean())
+    index = np.unravel_index(np.argmax(np.abs(difference)), difference.shape)
+    return Difference(
+        mae=float(np.abs(difference).mean()),
+        rmse=mse**0.5,
+        rel_mse=float(relative.mean()),
+        psnr=_psnr(mse, peak),
+        largest=float(np.abs(difference[index])),
+        place=(int(index[0]), int(index[1])),
+        p_value=_p_value(sides),
+        difference=difference.astype(np.float32),
+        pictures=(first, second),
+    )
+
+
+def _psnr(mse: float, peak: float) -> float:
+    with np.errstate(divide="ignore"):
+        return float(20 * np.log10(peak) - 10 * np.log10(mse))
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A picture or layer [H, W, C], and the variance of its mean [H, W, C] or [H, W, 1], if it is known."""
+
+    values: np.ndarray
+    variance: np.ndarray | None = None
+    samples: np.ndarray | float = np.inf
+
+    @classmethod
+    def read(cls, source: Any, layer: str = "", name: str = "the picture") -> Layer:
+        """Return the picture, or a layer of it, of whatever ``compare`` takes. Raises ``UsageError``."""
+        if isinstance(source, str | os.PathLike):
+            return cls.of(_read(source), layer, os.fspath(source))
+        if isinstance(source, Result):
+            channels = {letter: source.image[..., i] for i, letter in enumerate("RGB")}
+            return cls.of({**channels, **source.layers}, layer, f"result {name}")
+        values = np.asarray(source, np.float32)
+        if layer:
+            raise UsageError(f"{name} is an array, which has no layer {layer!r}: give a result or an EXR")
+        if values.ndim not in (2, 3) or not values.size:
+            raise UsageError(f"{name} has the shape {values.shape}: a picture is [H, W] or [H, W, C]")
+        return cls._checked(np.atleast_3d(values), name)
+
+    @classmethod
+    def of(cls, channels: Mapping[str, np.ndarray], layer: str, name: str) -> Layer:
+        """Return a layer of a picture by its channels."""
+        chosen = _channels_of(channels, layer)
+        if not chosen:
+            named = sorted({key.rpartition(".")[0] or key for key in channels})
+            raise UsageError(f"{name} has no layer {layer or 'R, G, B'!r}; it has {', '.join(named)}")
+        picture = cls._checked(np.stack([channels[key] for key in chosen], axis=-1), name)
+        for spread, power in SPREADS.items():
+            known = [] if layer else _channels_of(channels, spread)
+            if known:
+                variance = np.stack([channels[key] for key in known], axis=-1).astype(np.float64) ** power
+                samples = channels.get("samples.Y", np.array(np.inf))
+                return cls(picture.values, variance, np.maximum(samples, 2)[..., None])
+        return picture
+
+    @classmethod
+    def _checked(cls, values: np.ndarray, name: str) -> Layer:
+        bad = np.isnan(values).any(axis=-1)
+        if bad.any():
+            row, column = np.argwhere(bad)[0]
+            raise UsageError(
+                f"{name} is NaN in {bad.sum()} pixels, the first at row {row}, column {column}: mend it first"
+            )
+        return cls(values)
+
+
+def _read(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    try:
+        return read_channels(path)
+    except OutputError as error:
+        raise UsageError(f"{error}; only EXR files can be compared") from error
+
+
+def _channels_of(channels: Mapping[str, np.ndarray], layer: str) -> list[str]:
+    """Return the channels of a layer, or the one of that name, in the order in which they belong together."""
+    if not layer:
+        return [c for c in "RGB" if c in channels] or [c for c in "Y" if c in channels]
+    found = [key for key in channels if key == layer or key.rpartition(".")[0] == layer]
+    return sorted(found, key=lambda key: (ORDER.get(key.rpartition(".")[2], len(ORDER)), key))
+
+
+def _p_value(sides: Sequence[Layer]) -> float | None:
+    """Return the probability of so much difference by noise.
+
+    One deviation for all channels, their root mean square, bounds that of their mean, of which the test is
+    then made: it rejects equal pictures less often than it says, never more.
+    """
+    if all(side.variance is None for side in sides):
+        return None
+    of_mean = any(side.variance is not None and side.variance.shape[2] == 1 for side in sides)
+    estimates = []
+    for side in sides:
+        values = side.values.astype(np.float64)
+        variance = np.zeros_like(values) if side.variance is None else side.variance
+        if of_mean:
+            values, variance = (x.mean(axis=2, keepdims=True) for x in (values, variance))
+        estimates.append(image_tests.Estimate(values, variance, side.samples))
+    return image_tests.compare(*estimates).p

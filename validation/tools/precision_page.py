@@ -1,0 +1,240 @@
+"""The page of an ``error_vs_time``: the work-precision diagram, the answers, the strips and the tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.output.files import to_8bit
+from mrt_mitsuba.validation.tools.intervals import Estimate
+from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.work_precision import Interval, Point, Strip, WorkPrecision
+
+TITLE = "Error against time"
+COLUMNS = (
+    "#",
+    "case",
+    "seconds",
+    "interval, s",
+    "cold, s",
+    "of it compiling, s",
+    "RMSE",
+    "interval",
+    "|bias|",
+    "interval of it",
+    "1 / (variance × s)",
+    "relMSE",
+    "largest",
+    "FLIP",
+    "rays",
+    "ahead",
+)
+MARKERS = "osD^vP*X<>hp"
+LABELLED = 30  # points up to which each has its number in the diagram; of more only those ahead
+PANEL = (160, 120)  # pixels of a larger picture that a strip shows
+SAME = 0.02  # errors closer than this are the same: no reason to wait longer
+
+
+def study(found: WorkPrecision) -> Study:
+    """Return the findings in the form that pages are made of."""
+    made = Study(
+        "error-vs-time",
+        f"{TITLE}: {found.scene if not found.scene.isdigit() else 'scene ' + found.scene}",
+        seconds=found.took,
+    )
+    describe(made, found, "", "All cases")
+    return made
+
+
+def describe(study: Study, found: WorkPrecision, name: str, title: str, truth: str = "") -> None:
+    """Add the diagram, the answers and the tables to a study; ``truth`` says what the reference is."""
+    prefix = f"{name}-" if name else ""
+    where = f"{name}: " if name else ""
+    study.at_most(f"{where}cases that failed", len(found.failed), 0, "each of them could be rendered")
+    study.text(" ".join([f"{title}.", _reference(found, truth), *found.verdicts]))
+    if not found.points:
+        return
+    study.plot(f"{prefix}diagram", f"{title}: work and precision", diagram(found), _caption(found))
+    for number, strip in enumerate(found.strips, 1):
+        study.plot(
+            f"{prefix}strip-{number}",
+            f"{title}: what {strip.seconds:.2g} s buy",
+            strip_figure(found, strip),
+            "In sRGB; where a picture is cut, it is where the cases differ most.",
+        )
+    if found.errors:
+        study.table(
+            f"{prefix}times",
+            f"{title}: seconds to an error",
+            ["curve", *(f"RMSE {error:g}" for error in found.errors)],
+            [[curve, *(_reached(found.times[e][curve]) for e in found.errors)] for curve in found.families],
+            "With 95 % intervals. Between measured cases a curve is straight in logarithms; beyond them "
+            "nothing is assumed.",
+            first=True,
+        )
+    ahead = {point.name for point in front(list(found.points.values()))}
+    rows = [_row(number, point, point.name in ahead) for number, point in numbered(found)]
+    study.table(
+        f"{prefix}points",
+        f"{title}: every case",
+        COLUMNS,
+        rows,
+        "Seconds: medians of warm renders without loading the scene; cold: a first run. Errors in units of "
+        "linear light. Ahead: no other case has less error in less time.",
+    )
+    if found.failed:
+        reasons = [list(item) for item in found.failed.items()]
+        study.table(f"{prefix}failed", f"{title}: cases that failed", ["case", "why"], reasons)
+
+
+def _reference(found: WorkPrecision, truth: str) -> str:
+    told = f"Reference: {truth}. " if truth else ""
+    if found.reference_error == 0:
+        return f"{told}It has no error that is known of: it was rendered twice alike, or given."
+    own = f"{found.reference_error:.2g}"
+    return f"{told}Its own RMSE is about {own}; nothing is claimed of errors below twice that."
+
+
+def _reached(time: Estimate) -> str:
+    return str(time) if np.isfinite(time.value) else "not reached"
+
+
+def numbered(found: WorkPrecision) -> Iterator[tuple[int, Point]]:
+    """Yield the points with their numbers in diagram and table, curve by curve."""
+    return enumerate((point for points in found.families.values() for point in points), 1)
+
+
+def front(points: Sequence[Point]) -> list[Point]:
+    """Return the points that gain error over all faster ones, fastest first."""
+    best: list[Point] = []
+    for point in sorted(points, key=lambda p: (p.seconds, p.rmse)):
+        if not best or point.rmse < (1 - SAME) * best[-1].rmse:
+            best.append(point)
+    return best
+
+
+def _row(number: int, p: Point, ahead: bool) -> tuple[Any, ...]:
+    d = p.difference
+    error = (p.rmse, _interval(p.rmse_interval)) if p.resolved else ("at the floor", "")
+    bias = (p.bias, _interval(p.bias_interval)) if np.isfinite(p.bias) else ("–", "")
+    time = (p.seconds, _interval(p.seconds_interval), p.cold, p.compile)
+    efficiency = p.efficiency if np.isfinite(p.efficiency) else "–"
+    shown = "–" if d.flip is None else d.flip
+    others = (efficiency, d.rel_mse, d.largest, shown, sum(p.rays.values()), "yes" if ahead else "")
+    return (number, p.name, *time, *error, *bias, *others)
+
+
+def _interval(ends: Interval) -> str:
+    return f"{ends[0]:.3g} to {ends[1]:.3g}" if np.isfinite(ends[0]) else "one repeat"
+
+
+def _caption(found: WorkPrecision) -> str:
+    least = front([p for p in found.points.values() if p.resolved])
+    names = "; ".join(f"{p.name} ({p.seconds:.2g} s, RMSE {p.rmse:.2g})" for p in least)
+    return "Down and to the left is better. Bars are 95 % intervals, numbers those of the table. " + (
+        f"Ahead of the others: {names}." if names else "No case is told from the reference."
+    )
+
+
+def diagram(found: WorkPrecision) -> Any:
+    """Return the work-precision diagram: RMSE against seconds, both with intervals, and the floor."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    axes = figure.subplots()
+    positive = [p.rmse for p in found.points.values() if p.rmse > 1e-9]
+    bottom = 0.4 * min([*positive, *([found.reference_error] if found.reference_error else [])], default=1e-6)
+    numbers = {point.name: number for number, point in numbered(found)}
+    labelled = (
+        numbers.keys() if len(numbers) <= LABELLED else {p.name for p in front(list(found.points.values()))}
+    )
+    for (name, points), marker in zip(found.families.items(), cycle(MARKERS), strict=False):
+        x, y = ([max(v, low) for v in values] for values, low in (
+            ([p.seconds for p in points], 0), ([p.rmse for p in points], bottom)))  # fmt: skip
+        axes.errorbar(
+            x,
+            y,
+            xerr=_bars([p.time for p in points], x),
+            yerr=_bars([p.error for p in points], y),
+            marker=marker,
+            markersize=5,
+            linewidth=1,
+            capsize=2,
+            label=name,
+        )
+        for point, place in zip(points, zip(x, y, strict=True), strict=True):
+            if point.name in labelled:
+                text = str(numbers[point.name])
+                axes.annotate(text, place, textcoords="offset points", xytext=(4, 4), fontsize=8)
+    if found.reference_error:
+        axes.axhspan(
+            bottom / 10, found.reference_error, color="0.9", zorder=0, label="within the reference's error"
+        )
+    if len(positive) < len(found.points):
+        axes.axhline(bottom, color="0.9", linewidth=8, zorder=0, label="no error")
+    axes.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="RMSE")
+    axes.set_ylim(bottom=0.8 * bottom)
+    axes.margins(x=0.08, y=0.08)
+    axes.grid(alpha=0.3)
+    for axis in (axes.xaxis, axes.yaxis):
+        _label_between_decades(axis)
+    figure.legend(fontsize=8, ncols=4, loc="outside lower center")
+    return figure
+
+
+def _bars(estimates: Sequence[Estimate], values: Sequence[float]) -> np.ndarray:
+    """Return how far intervals reach below and above values, [2, points]; 0 where unknown."""
+    ends = np.array([[v if np.isnan(e.low) else e.low, v if np.isnan(e.high) else e.high]
+                     for e, v in zip(estimates, values, strict=True)]).T  # fmt: skip
+    return np.maximum([values - ends[0], ends[1] - values], 0)
+
+
+def _label_between_decades(axis: Any) -> None:
+    """Label a logarithmic axis of a decade or two with 10, 20, 50, 100."""
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    axis.set_major_formatter(plain)
+    low, high = np.log10(axis.get_view_interval())
+    if high - low < 2.5:
+        axis.set_minor_locator(LogLocator(subs=(2, 5)))
+        axis.set_minor_formatter(plain)
+        axis.set_tick_params(which="minor", labelsize=8)
+
+
+def strip_figure(found: WorkPrecision, strip: Strip) -> Any:
+    """Return the pictures of a strip side by side, the reference last, each with its seconds and error."""
+    from matplotlib.figure import Figure
+
+    images = [panel.image for panel in strip.panels]
+    cut = _most_different(np.stack(images), found.reference)
+    titles = [
+        f"{p.name}\n{p.seconds:.3g} s, RMSE {np.sqrt(np.mean((p.image - found.reference) ** 2)):.2g}"
+        for p in strip.panels
+    ]
+    columns = min(4, len(images) + 1)
+    rows = -(-(len(images) + 1) // columns)
+    ratio = found.reference[cut].shape[0] / found.reference[cut].shape[1]
+    figure = Figure(figsize=(10, rows * (10 / columns * ratio + 0.6)), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis in axes:
+        axis.axis("off")
+    for axis, image, title in zip(axes, [*images, found.reference], [*titles, "reference"], strict=False):
+        axis.imshow(to_8bit(np.asarray(image[cut], np.float32), "srgb"), interpolation="nearest")
+        axis.set_title(title, fontsize=8)
+    return figure
+
+
+def _most_different(images: np.ndarray, reference: np.ndarray) -> tuple[slice, slice]:
+    """Return the window of ``PANEL`` pixels where pictures [N, H, W, 3] differ most from the reference."""
+    width, height = min(PANEL[0], reference.shape[1]), min(PANEL[1], reference.shape[0])
+    errors = np.square(images - reference).sum(axis=(0, 3))
+    sums = np.pad(errors.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    windows = (
+        sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    )
+    row, column = np.unravel_index(np.argmax(windows), windows.shape)
+    return slice(row, row + height), slice(column, column + width)

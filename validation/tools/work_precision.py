@@ -1,0 +1,450 @@
+"""``error_vs_time``: what settings of ``render`` cost, how far off they are, and which of them are ahead.
+
+Each case is repeated with other seeds. The pictures x₁ … x_R and two independent halves h₁, h₂ of the
+reference give the matrix G[r, s] = mean (x_r − h₁)(x_s − h₂), in which the reference's own noise cancels. The
+mean of its diagonal is the squared error, that of the rest the squared bias; the difference is the variance.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.errors import MrtError, UsageError
+from mrt_mitsuba.output.result import Result
+from mrt_mitsuba.rendering.api import render
+from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.scene.open import open_scene
+from mrt_mitsuba.validation.tools import compare, kernels
+from mrt_mitsuba.validation.tools.intervals import Estimate, estimate
+
+REFERENCE_SEEDS = (2**20 + 1, 2**20 + 2)  # far from those of the repeats
+RESOLVED = 2.0  # times the reference's own error from which on an error is told from it
+STEPS = (1, 2, 5)  # of the errors that the time is asked for, times powers of ten
+MOST_ERRORS = 4
+
+Options = Mapping[str, Any]
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Point:
+    """One case: what it costs and how far off it is."""
+
+    name: str
+    options: Options
+    times: np.ndarray  #: seconds of each repeat, warm, without loading the scene
+    gram: np.ndarray  #: G[r, s], see above
+    cold: float  #: seconds of a first run, its kernels compiled or read from a cache
+    compile: float  #: seconds of that in the compiler
+    rays: Mapping[str, int]
+    image: np.ndarray  #: of the first repeat
+    difference: compare.Difference  #: of it from the reference
+    reference_error: float
+
+    @property
+    def family(self) -> str:
+        """Cases whose names differ in numbers only are one curve."""
+        return " ".join(re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?(/\d+)?", " ", self.name).split()).rstrip(" =")
+
+    @cached_property
+    def time(self) -> Estimate:
+        return estimate(len(self.times), lambda index: np.median(self.times[index], axis=-1))
+
+    @cached_property
+    def error(self) -> Estimate:
+        return estimate(len(self.times), self.rmse_of)
+
+    @cached_property
+    def bias_squared(self) -> Estimate:
+        return estimate(len(self.times), self._bias_squared_of, log=False)
+
+    def rmse_of(self, index: np.ndarray) -> np.ndarray:
+        """Return the RMSE over some repeats, [..., repeats] of them."""
+        return np.sqrt(np.maximum(np.diag(self.gram)[index].mean(axis=-1), 1e-30))
+
+    def _bias_squared_of(self, index: np.ndarray) -> np.ndarray:
+        """Return the squared bias by pairs of different repeats; of one repeat, or the same one, NaN."""
+        other = index[..., :, None] != index[..., None, :]
+        total = np.where(other, self.gram[index[..., :, None], index[..., None, :]], 0).sum(axis=(-2, -1))
+        count = other.sum(axis=(-2, -1))
+        return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+
+    @property
+    def seconds(self) -> float:
+        return self.time.value
+
+    @property
+    def seconds_interval(self) -> Interval:
+        return self.time.low, self.time.high
+
+    @property
+    def rmse(self) -> float:
+        return self.error.value
+
+    @property
+    def rmse_interval(self) -> Interval:
+        return self.error.low, self.error.high
+
+    @property
+    def variance(self) -> float:
+        """Mean variance of a pixel between repeats; NaN for one repeat."""
+        return max(0.0, float(np.diag(self.gram).mean()) - self.bias_squared.value)
+
+    @property
+    def bias(self) -> float:
+        """|bias| = √(MSE − variance), 0 where noise explains the whole error; NaN for one repeat."""
+        return float(np.sqrt(np.maximum(self.bias_squared.value, 0)))
+
+    @property
+    def bias_interval(self) -> Interval:
+        low, high = np.sqrt(np.maximum((self.bias_squared.low, self.bias_squared.high), 0))
+        return float(low), float(high)
+
+    @property
+    def efficiency(self) -> float:
+        """1 / (variance × seconds); NaN where nothing is random or there is one repeat."""
+        product = self.variance * self.seconds
+        return 1 / product if product > 1e-12 * self.rmse**2 * self.seconds else float("nan")
+
+    @property
+    def resolved(self) -> bool:
+        """Return whether the error is told from the reference's own."""
+        return self.rmse > RESOLVED * self.reference_error
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A picture of an equal-time strip."""
+
+    name: str
+    seconds: float
+    image: np.ndarray
+
+
+@dataclass(frozen=True)
+class Strip:
+    """What each curve reaches in about the same time."""
+
+    seconds: float
+    panels: Sequence[Panel]
+
+
+@dataclass(frozen=True)
+class WorkPrecision:
+    """What ``error_vs_time`` found."""
+
+    scene: str
+    points: Mapping[str, Point]
+    failed: Mapping[str, str]  #: why, by case
+    reference: np.ndarray
+    reference_error: float  #: RMSE of the reference itself, below which nothing is claimed; 0: exact
+    repeats: int
+    errors: Sequence[float]  #: for which the time is given
+    strips: Sequence[Strip] = field(default_factory=list)
+    took: float = 0.0
+
+    @property
+    def families(self) -> dict[str, list[Point]]:
+        """The points of each curve, fastest first."""
+        groups: dict[str, list[Point]] = {}
+        for point in sorted(self.points.values(), key=lambda p: p.seconds):
+            groups.setdefault(point.family, []).append(point)
+        return {name: groups[name] for name in dict.fromkeys(p.family for p in self.points.values())}
+
+    def time_to(self, error: float) -> dict[str, Estimate]:
+        """Return the seconds in which each curve comes down to an RMSE; infinite where it never does.
+
+        Between measured cases the curve is a straight line in logarithms; beyond them nothing is assumed.
+        """
+        return {
+            name: estimate(self.repeats, lambda index, points=points: _crossing(points, error, index))
+            for name, points in self.families.items()
+        }
+
+    @cached_property
+    def times(self) -> dict[float, dict[str, Estimate]]:
+        """``time_to`` of each of ``errors``."""
+        return {error: self.time_to(error) for error in self.errors}
+
+    @cached_property
+    def verdicts(self) -> list[str]:
+        """A sentence for each of ``errors``; it names a winner only if its interval meets no other."""
+        return [_verdict(error, self.times[error], self.repeats) for error in self.errors]
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""
+        from mrt_mitsuba.validation.tools import precision_page, report
+
+        report.save(folder, precision_page.study(self), title=precision_page.TITLE)
+
+    def _repr_html_(self) -> str:
+        from mrt_mitsuba.validation.tools import precision_page, report
+
+        return report.notebook(precision_page.study(self), title=precision_page.TITLE)
+
+    def __str__(self) -> str:
+        width = max(map(len, [*self.points, *self.failed]), default=0)
+        lines = [f"{p.name:<{width}}  {p.time} s, RMSE {p.error}" for p in self.points.values()]
+        lines += [f"{name:<{width}}  FAILED {why}" for name, why in self.failed.items()]
+        return "\n".join([*lines, f"the reference's own error: {self.reference_error:.2g}", *self.verdicts])
+
+
+def _crossing(points: Sequence[Point], error: float, index: np.ndarray) -> np.ndarray:
+    """Return the seconds in which a curve, fastest point first, comes down to an error, by some repeats."""
+    seconds = np.stack([np.median(p.times[index], axis=-1) for p in points])  # [points, ...]
+    rmse = np.stack([p.rmse_of(index) for p in points])
+    found = np.where(rmse[0] <= error, seconds[0], np.inf)
+    for i in range(1, len(points)):
+        ends = np.log([rmse[i - 1], rmse[i]])
+        steps = np.where(ends[0] > ends[1], ends[0] - ends[1], 1)
+        share = np.clip((ends[0] - np.log(error)) / steps, 0, 1)
+        between = seconds[i - 1] ** (1 - share) * seconds[i] ** share
+        found = np.where(np.isinf(found) & (rmse[i] <= error), between, found)
+    return found
+
+
+def _verdict(error: float, times: Mapping[str, Estimate], repeats: int) -> str:
+    where = f"RMSE of {error:g}"
+    reached = sorted(((t.value, name) for name, t in times.items() if np.isfinite(t.value)))
+    if not reached:
+        return f"{where}: no case comes so low."
+    if repeats < 2:
+        return f"{where}: no verdict, for one repeat has no interval."
+    best = reached[0][1]
+    like = [name for _, name in reached[1:] if times[name].overlaps(times[best])]
+    if like:
+        return f"{where}: {' and '.join([best, *like])} are not told apart, their intervals overlap."
+    if len(reached) == 1:
+        return f"{where}: only {best} comes so low, in {times[best]} s."
+    value, second = reached[1]
+    ratio = value / reached[0][0]
+    return f"{where}: {best} is the fastest, {times[best]} s; {second} takes {ratio:.2g} times as long."
+
+
+def error_vs_time(
+    scene: Any,
+    cases: Mapping[str, Options],
+    *,
+    reference: Any,
+    repeats: int = 5,
+    shared: Options | None = None,
+    errors: Sequence[float] | None = None,
+    progress: Progress | None = None,
+) -> WorkPrecision:
+    """Measure the error and the time of settings of ``render``.
+
+    Args:
+        scene: whatever ``render`` takes.
+        cases: options of ``render`` by a name; names that differ in numbers only make one curve. A case may
+            bring a ``scene`` of its own, of the same size.
+        reference: options that give the truth. Where something is random, it is rendered as two halves of
+            its ``spp``, with other seeds, and their difference is its own error. Two sets of options, the
+            better first: where nothing is random, what they differ by bounds the error of the first. Or a
+            picture: an array, the path of an EXR or a ``Result``, whose error is read from its layer "error".
+        repeats: with other seeds, in turn, after a cold and a warm run of each case.
+        shared: options of all cases and of the reference.
+        errors: RMSEs to give the time for; by default round ones in the range that was measured.
+
+    A case that fails is kept, with the reason. Raises ``UsageError`` for wrong arguments, and what
+    ``render`` raises for the reference.
+    """
+    start = time.perf_counter()
+    if not cases or repeats < 1:
+        raise UsageError("error_vs_time needs at least one case and one repeat")
+    taken = [name for name, options in {"shared": shared or {}, **cases}.items() if "seed" in options]
+    if taken:
+        raise UsageError(f"{taken[0]} sets a seed: repeats have seeds of their own; leave it out")
+    progress = progress or Progress()
+    runner = _Runner(scene, dict(shared or {}))
+    truth = _Truth.of(reference, runner)
+    measured = _measure(runner, cases, truth, repeats, progress)
+    points = {name: m for name, m in measured.items() if isinstance(m, Point)}
+    found = WorkPrecision(
+        scene=runner.name,
+        points=points,
+        failed={name: m for name, m in measured.items() if isinstance(m, str)},
+        reference=truth.image,
+        reference_error=truth.error,
+        repeats=repeats,
+        errors=_round_errors(points.values(), truth.error) if errors is None else _claimed(errors, truth),
+    )
+    strips = _strips(found, runner)
+    return WorkPrecision(**{**vars(found), "strips": strips, "took": time.perf_counter() - start})
+
+
+class _Runner:
+    """Renders cases, each scene loaded once where it can be."""
+
+    def __init__(self, scene: Any, shared: Options) -> None:
+        self.scene, self.shared = scene, shared
+        self.variant = runtime.use(shared.get("variant"))
+        self._loaded: dict[int, tuple[Any, Any]] = {}
+        self.name = ""
+
+    def __call__(self, options: Options, seed: int) -> Result:
+        given = {"scene": self.scene, "variant": self.variant, **self.shared, **options, "seed": seed}
+        if given["variant"] == self.variant and "params" not in given:
+            given["scene"] = self._load(given["scene"])
+        result = render(given.pop("scene"), **given)
+        self.name = self.name or result.plan.scene
+        return result
+
+    def _load(self, scene: Any) -> Any:
+        """Return a scene that is loaded once, of a dict or an XML file; the same of others."""
+        if not isinstance(scene, dict) and not str(scene).lower().endswith(".xml"):
+            return scene
+        if id(scene) not in self._loaded:
+            self._loaded[id(scene)] = (scene, open_scene(scene).scene)
+        return self._loaded[id(scene)][1]
+
+
+@dataclass(frozen=True)
+class _Truth:
+    """The reference: two independent halves, or twice the same picture; and its own error."""
+
+    halves: tuple[np.ndarray, np.ndarray]
+    error: float
+
+    @property
+    def image(self) -> np.ndarray:
+        return (self.halves[0] + self.halves[1]) / 2
+
+    @classmethod
+    def of(cls, reference: Any, runner: _Runner) -> _Truth:
+        if isinstance(reference, Mapping):
+            spp = {"spp": int(reference["spp"]) // 2} if reference.get("spp", 1) > 1 else {}
+            first, second = (_picture(runner({**reference, **spp}, seed)) for seed in REFERENCE_SEEDS)
+            return cls((first, second), _rms(first - second) / 2)
+        if isinstance(reference, Sequence) and not isinstance(reference, str):
+            first, second = (_picture(runner(r, s)) for r, s in zip(reference, REFERENCE_SEEDS, strict=True))
+            return cls((first, first), _rms(first - second))
+        picture = compare.Layer.read(reference)
+        known = 0.0 if picture.variance is None else float(picture.variance.mean()) ** 0.5
+        values = picture.values.astype(np.float64)
+        return cls((values, values), known)
+
+
+def _picture(result: Result) -> np.ndarray:
+    image = np.asarray(result.image, np.float64)
+    bad = ~np.isfinite(image).all(axis=-1)
+    if bad.any():
+        raise MrtError(f"{bad.sum()} pixels are NaN or infinite, the first at {tuple(np.argwhere(bad)[0])}")
+    return image
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _measure(
+    runner: _Runner, cases: Mapping[str, Options], truth: _Truth, repeats: int, progress: Progress
+) -> dict[str, Point | str]:
+    """Return the point of every case, or why it failed.
+
+    It runs cold, warm, and ``repeats`` times in turn, so that a load on the machine meets all alike.
+    """
+    cold: dict[str, Result] = {}
+    failed: dict[str, str] = {}
+    runs: dict[str, list[Result]] = {name: [] for name in cases}
+    with progress.stage("Error against time", len(cases) * (repeats + 2)) as advance:
+        for turn in range(-2, repeats):  # cold, warm, and those that count
+            for name in cases:
+                if name not in failed:
+                    try:
+                        if turn == -2:
+                            kernels.forget()
+                        result = runner(cases[name], max(turn, 0))
+                        _check_size(_picture(result), truth)
+                    except Exception as error:
+                        failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+                    else:
+                        cold.setdefault(name, result)
+                        runs[name] += [result] if turn >= 0 else []
+                advance(1)
+    return {
+        name: failed[name] if name in failed else _point(name, cases[name], cold[name], runs[name], truth)
+        for name in cases
+    }
+
+
+def _check_size(image: np.ndarray, truth: _Truth) -> None:
+    if image.shape != truth.image.shape:
+        sizes = " and the reference ".join(f"{i.shape[1]}x{i.shape[0]}" for i in (image, truth.image))
+        raise UsageError(f"it has {sizes} pixels: their sizes must be the same")
+
+
+def _seconds(result: Result) -> float:
+    """Seconds of a render but for loading its scene."""
+    return result.timings.total - result.timings.load
+
+
+def _point(name: str, options: Options, cold: Result, runs: Sequence[Result], truth: _Truth) -> Point:
+    errors = [np.stack([r.image.ravel() - half.ravel() for r in runs]) for half in truth.halves]
+    gram = errors[0] @ errors[1].T / errors[0].shape[1]
+    return Point(
+        name=name,
+        options=options,
+        times=np.array([_seconds(r) for r in runs]),
+        gram=(gram + gram.T) / 2,
+        cold=_seconds(cold),
+        compile=cold.timings.compile,
+        rays=dict(runs[0].rays),
+        image=runs[0].image,
+        difference=compare.compare(runs[0].image, truth.image),
+        reference_error=truth.error,
+    )
+
+
+def _round_errors(points: Any, floor: float) -> list[float]:
+    """Return some round errors between the largest and the least that are resolved."""
+    found = [p.rmse for p in points if p.resolved and p.rmse > 1e-9]
+    if not found:
+        return []
+    powers = range(int(np.floor(np.log10(min(found)))), int(np.ceil(np.log10(max(found)))) + 1)
+    errors = [float(f"{step}e{power}") for power in powers for step in STEPS]
+    inside = [e for e in errors if max(min(found), RESOLVED * floor) <= e <= max(found)]
+    return inside[::-1][:MOST_ERRORS] or [float(f"{np.sqrt(min(found) * max(found)):.1e}")]
+
+
+def _claimed(errors: Sequence[float], truth: _Truth) -> list[float]:
+    low = [e for e in errors if not e > RESOLVED * truth.error]
+    if low:
+        raise UsageError(
+            f"no claim can be made about an RMSE of {low[0]:g}: the reference's own error is "
+            f"{truth.error:.2g}, and an error is told from it at twice that; take a better reference"
+        )
+    return list(errors)
+
+
+def _strips(found: WorkPrecision, runner: _Runner) -> list[Strip]:
+    """Render what each curve of several cases reaches in times that all of them have."""
+    curves = {name: points for name, points in found.families.items() if len(points) > 1}
+    if len(curves) < 2:
+        return []
+    low = max(points[0].seconds for points in curves.values())
+    high = min(points[-1].seconds for points in curves.values())
+    budgets = [low, high] if high > 3 * low else [np.sqrt(low * high)]
+    return [Strip(t, [_panel(p, t, runner, found.repeats) for p in curves.values()]) for t in budgets]
+
+
+def _panel(points: Sequence[Point], seconds: float, runner: _Runner, seed: int) -> Panel:
+    """Return the case nearest to a time, with as many samples as fill it where they can be chosen."""
+    near = min(points, key=lambda p: abs(np.log(p.seconds / seconds)))
+    spp = near.options.get("spp")
+    wanted = max(1, round(spp * seconds / near.seconds)) if isinstance(spp, int) else spp
+    if wanted == spp:
+        return Panel(near.name, near.seconds, near.image)
+    try:
+        result = runner({**near.options, "spp": wanted}, seed)
+    except Exception:  # so many samples may not fit
+        return Panel(near.name, near.seconds, near.image)
+    return Panel(f"{near.family}, {wanted} spp", _seconds(result), result.image)
