@@ -11,9 +11,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from mpmath import mp, mpf
 
+from mrt_mitsuba.plugins.columns import Vector3
 from mrt_mitsuba.plugins.intersect import intersect_plane, intersect_sphere
 from mrt_mitsuba.validation.oracles import exact
-from mrt_mitsuba.validation.tools.arrays import Vector3
 
 Vector = drjit.scalar.Array3f64
 DIRECTIONS = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: sum(x * x for x in v) > 1e-2)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from mpmath import mp, mpf
 from scipy.integrate import quad
 
+from mrt_mitsuba.plugins.columns import Vector3
 from mrt_mitsuba.plugins.microfacet import (
     TAN2_MAX,
     beckmann_d,
@@ -25,7 +26,6 @@ from mrt_mitsuba.plugins.microfacet import (
     tan2_theta,
 )
 from mrt_mitsuba.validation.oracles import exact
-from mrt_mitsuba.validation.tools.arrays import Vector3
 
 Vector = drjit.scalar.Array3f64
 ALPHAS = st.floats(1e-3, 2)

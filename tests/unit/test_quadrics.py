@@ -271,7 +271,7 @@ def test_cylinder_special_rays(o, d, t, part) -> None:
 
 def test_vectors_may_be_lists() -> None:
     """The float64 reference computes on lists of components."""
-    from mrt_mitsuba.validation.tools.arrays import Vector3
+    from mrt_mitsuba.plugins.columns import Vector3
 
     o, d = Vector3([2.0, 1.0, 3.0]), Vector3([-1.0, -0.4, -1.3])
     apex, base = Vector3([0.0, 0.0, 1.0]), Vector3([0.0, 0.1, 0.0])

@@ -1,45 +1,24 @@
-"""The report's ray tracer in float64, by brute force, as the truth for the float32 renders.
+"""A second truth: the report's ray tracer in plain NumPy and float64, every ray against every object.
 
-Independent of Mitsuba: own camera, every ray against every object, no acceleration structure, no float32.
-Shared with the plugins are only the pure functions of ``plugins/fresnel.py``, ``microfacet.py`` and
-``intersect.py``, which the unit tests hold against 50-digit values.
+Nothing is shared with the plugins, nor with Dr.Jit or Mitsuba: the formulas are written from the papers, in
+other forms where there are any, and the geometry is its own. Slow, and small enough to be read.
+
+* Walter et al. 2007, "Microfacet models for refraction through rough surfaces": D (eq. 25), G₁ (eq. 27), and
+  the Fresnel reflectance in Cook and Torrance's form (eq. 22).
+* Schlick 1994, "An inexpensive BRDF model for physically-based rendering": eq. 15.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
-from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.plugins.fresnel import f0_from_ior, fresnel_dielectric, fresnel_schlick
-from mrt_mitsuba.plugins.intersect import (
-    Frame,
-    SurfaceHit,
-    SurfacePoint,
-    cone_frame,
-    cone_surface,
-    cylinder_frame,
-    cylinder_surface,
-    intersect_cone,
-    intersect_cylinder,
-    intersect_plane,
-    intersect_sphere,
-)
-from mrt_mitsuba.plugins.microfacet import half_vector_angles, microfacet_specular, tan2_theta
-from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Plane, Scene, Sphere, Vector
-from mrt_mitsuba.validation.tools.arrays import Backend, Vector3, backend, numbers
-
-CHOICES = {
-    "lattice": ("report", "centered"),
-    "fresnel": ("dielectric", "schlick", "unity"),
-    "bounce_budget": ("report", "plain"),
-    "self_intersection": ("robust", "original"),
-}
+from mrt_mitsuba.errors import SceneError
+from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Mesh, Plane, Scene, Sphere
 
 # Robust secondary rays start this far off the surface, relative to the coordinates and distances that led to
 # the point: far above the rounding of float64, far below anything a float32 picture can show
@@ -48,423 +27,412 @@ OFFSET = 1e-10
 # The original's absolute constants
 ORIGINAL_SHADOW_START, ORIGINAL_MIRROR_START, ORIGINAL_REACH = 1e-4, 1e-3, 1e5
 
-# With LLVM, objects per kernel: few kernels, and short enough to compile at once
-OBJECTS_PER_KERNEL = 32
+BATCH = 2**20  # pairs of a ray and an object at a time
 
 _HASH = np.uint64(0x9E3779B97F4A7C15)  # odd, so that no step of the hash loses information
 
 
 @dataclass(frozen=True)
 class ReferenceResult:
-    """A picture in linear RGB, top row first, and what the first sample of each pixel met.
+    """A picture in linear RGB, top row first, and what the ray through each pixel met.
 
     ``path`` and ``lights`` are hashes of decisions. Two renders of a scene have the same ``path`` in a pixel
     if all rays met the same objects in the same order, and the same ``lights`` if at each of them the same
     lights were in front, and of these the same in sight. ``terminator`` is the smallest |cos| of the angle
-    between a normal and a light, over all that the sample met: near 0, whether the light reaches the surface
+    between a normal and a light, over all that the ray met: near 0, whether the light reaches the surface
     hangs on rounding.
     """
 
     image: np.ndarray  # float64 [H, W, 3]
     depth: np.ndarray  # float64 [H, W], distance from the camera; inf where nothing was hit
-    object_id: np.ndarray  # int32 [H, W], index in (*spheres, *planes, *cones, *cylinders); -1: nothing
+    object_id: np.ndarray  # int [H, W], in (*spheres, *planes, *cones, *cylinders, *meshes); -1: nothing
     normal: np.ndarray  # float64 [H, W, 3], unit; 0 where nothing was hit
-    bounces: np.ndarray  # int32 [H, W], mirror rays that met something
+    bounces: np.ndarray  # int [H, W], mirror rays that met something
     path: np.ndarray  # uint64 [H, W]
     lights: np.ndarray  # uint64 [H, W]
     terminator: np.ndarray  # float64 [H, W], in [0, 1]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Everything but the scene and the picture's size; the arguments of ``reference_render``."""
+    """The arguments of ``reference_render`` but for the scene and the picture's size."""
 
-    aa: int = 1
-    lattice: str = "report"
-    fresnel: str = "dielectric"
-    clamp: bool = True
+    fresnel: str = "dielectric"  # or "schlick", "unity"
+    clamp: bool = True  # each light's part to [0, 1]
     max_depth: int = 10
-    bounce_budget: str = "report"
-    self_intersection: str = "robust"
-    displacement: tuple[float, float] = (0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        for name, allowed in CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise UsageError(f"{name}={getattr(self, name)!r}: choose one of {', '.join(allowed)}")
-        if self.aa < 1 or self.max_depth < 1:
-            raise UsageError(f"aa={self.aa} and max_depth={self.max_depth} must be at least 1")
-
-    def offsets(self) -> np.ndarray:
-        """Places [aa², 2] of a pixel's samples relative to its centre, in pixels, y upwards."""
-        step = np.arange(self.aa) / self.aa
-        if self.lattice == "centered":
-            step = step + 0.5 / self.aa - 0.5
-        x, y = np.meshgrid(step, step)
-        return np.stack([x.ravel(), y.ravel()], axis=-1) + self.displacement
+    bounce_budget: str = "report"  # or "plain"
+    original: bool = False  # the original's absolute distances off a surface, and its reach
+    displacement: tuple[float, float] = (0.0, 0.0)  # of the rays, in pixels, y upwards
 
 
-def reference_render(
-    scene: Scene, *, width: int, height: int, device: str | None = None, **settings: Any
-) -> ReferenceResult:
-    """Render one of the report's scenes exactly, but for the rounding of float64.
+def reference_render(scene: Scene, *, width: int, height: int, **settings: Any) -> ReferenceResult:
+    """Render a scene with one ray through each pixel, exactly but for the rounding of float64.
 
-    ``settings``: ``aa`` (aa² samples per pixel), ``lattice`` ("report", "centered"), ``fresnel``
-    ("dielectric", "schlick", "unity"), ``clamp`` (each light's part to [0, 1]), ``max_depth``,
-    ``bounce_budget`` ("report", "plain"), ``self_intersection`` ("original": the original's absolute
-    distances and reach; "robust": an offset of 1e-10 of the size of the coordinates, no limit) and
-    ``displacement`` (moves all samples, in pixels, y upwards). ``device`` is "llvm" or "scalar", by default
-    the faster one that works here; both give the same picture.
-
-    Raises ``UsageError`` for a setting that does not exist, and ``SceneError`` for a scene with meshes or
-    textures.
+    ``settings`` are those of ``Settings``. Raises ``SceneError`` for a texture on anything but triangles, or
+    one that is not looked up as in the report.
     """
-    try:
-        chosen = Settings(**settings)
-    except TypeError as error:
-        raise UsageError(f"no such setting: {error}") from error
-    if width < 1 or height < 1:
-        raise UsageError(f"width={width} and height={height} must be at least 1")
-    if scene.meshes or any(thing.material.texture for thing in _objects(scene)):
-        raise SceneError("the float64 reference draws no meshes and no textures: leave them out of the scene")
-    return _Tracer(scene, chosen, backend(device)).render(width, height)
+    chosen = Settings(**settings)
+    pixel = np.arange(width * height)
+    x, y = pixel % width + 0.5 + chosen.displacement[0], pixel // width + 0.5 + chosen.displacement[1]
+    d = camera_directions(scene.camera, width, height, x, y)
+    with np.errstate(all="ignore"):
+        film = _Tracer(scene, chosen).film(np.tile(np.array(scene.camera.position, float), (len(d), 1)), d)
+    # The first row is the lowest
+    return ReferenceResult(**{k: v.reshape(height, width, *v.shape[1:])[::-1] for k, v in film.items()})
 
 
 def camera_directions(camera: Camera, width: int, height: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Unit directions [N, 3] through the points (x, y) of the picture, in pixels from its lower left corner.
+    """Return unit directions [N, 3] through the points (x, y) of the picture, in pixels from its lower left.
 
     The column grows along up × forward: mirrored against a right-handed camera, as in the original.
     """
-    forward = _unit(np.subtract(camera.target, camera.position))
-    right = _unit(np.cross(camera.up, forward))
-    up = np.cross(forward, right)
+    forward = unit(np.subtract(camera.target, camera.position))
+    right = unit(np.cross(camera.up, forward))
     half_width = math.tan(math.radians(camera.hfov) / 2)
-    u = (2 * x / width - 1) * half_width
-    v = (2 * y / height - 1) * half_width * height / width
-    return _unit(forward + u[:, None] * right + v[:, None] * up)
+    u, v = (2 * x - width) / width * half_width, (2 * y - height) / width * half_width
+    return unit(forward + u[:, None] * right + v[:, None] * np.cross(forward, right))
 
 
-def _unit(v: np.ndarray) -> np.ndarray:
+def unit(v: np.ndarray) -> np.ndarray:
+    """Return vectors [..., 3] made one unit long."""
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-# ------------------------------------------------- Objects --------------------------------------------------
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the scalar products of vectors [..., 3]."""
+    return np.einsum("...i,...i->...", a, b)
 
 
-def _objects(scene: Scene) -> list[Any]:
-    return [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders]
+# ------------------------------------------------ Reflectance ----------------------------------------------
 
 
-class _World:
-    """All objects of a scene: distances along rays, and tables of what a hit needs to know."""
-
-    def __init__(self, scene: Scene, arrays: Backend):
-        self.arrays = arrays
-        self.objects = _objects(scene)
-        self.distances = [self._distance(thing) for thing in self.objects]
-        self.extent = np.array([_extent(thing) for thing in self.objects])
-        materials = [thing.material for thing in self.objects]
-        self.ior = np.array([m.ior for m in materials])
-        self.alpha = np.array([m.alpha for m in materials])
-        self.specular = np.array([m.specular for m in materials])
-        self.diffuse = np.array([m.diffuse for m in materials])
-
-    def _distance(self, thing: Any) -> Callable[[Vector3, Vector3], Any]:
-        """The function (o, d) -> t of one object."""
-        parameter, vector = self.arrays.parameter, self.arrays.vector_parameter
-        if isinstance(thing, Sphere):
-            center, radius = vector(thing.center), parameter(thing.radius)
-            return lambda o, d: intersect_sphere(o, d, center, radius)
-        if isinstance(thing, Plane):
-            normal, distance = vector(_unit(np.array(thing.normal))), parameter(thing.distance)
-            return lambda o, d: intersect_plane(o, d, normal, distance)
-        frame, intersect = self._frame(thing), _QUADRICS[type(thing)].intersect
-        return lambda o, d: intersect(o, d, frame).t
-
-    def _frame(self, thing: Cone | Cylinder) -> Frame:
-        start, end = map(self.arrays.vector_parameter, _axis(thing))
-        return _QUADRICS[type(thing)].frame(start, end, self.arrays.parameter(thing.radius))
-
-    def nearest(self, o: np.ndarray, d: np.ndarray, reach: Any) -> tuple[np.ndarray, np.ndarray]:
-        """(distance [N], index [N]) of each ray's first object within ``reach``; (reach, -1) for none."""
-        origin, direction = self.arrays.vectors(o), self.arrays.vectors(d)
-        t = self.arrays.floats(np.broadcast_to(reach, len(o)))
-        index = self.arrays.indices(np.full(len(o), -1))
-        for i, distance in enumerate(self.distances):
-            ti = distance(origin, direction)
-            closer = ti < t
-            t, index = dr.select(closer, ti, t), dr.select(closer, self.arrays.parameter_index(i), index)
-            if i % OBJECTS_PER_KERNEL == OBJECTS_PER_KERNEL - 1:
-                dr.eval(t, index)
-        return numbers(t), numbers(index)
-
-    def normals(self, o: np.ndarray, d: np.ndarray, p: np.ndarray, index: np.ndarray) -> np.ndarray:
-        """Unit normals [N, 3] at the points ``p`` where the rays meet the objects ``index``."""
-        n = np.zeros_like(p)
-        for i in np.unique(index):
-            thing, here = self.objects[i], index == i
-            if isinstance(thing, Sphere):
-                n[here] = p[here] - thing.center
-            elif isinstance(thing, Plane):
-                n[here] = thing.normal
-            else:
-                n[here] = self._quadric_normals(thing, o[here], d[here], p[here])
-        return _unit(n)
-
-    def _quadric_normals(
-        self, thing: Cone | Cylinder, o: np.ndarray, d: np.ndarray, p: np.ndarray
-    ) -> np.ndarray:
-        frame, quadric, vectors = self._frame(thing), _QUADRICS[type(thing)], self.arrays.vectors
-        part = quadric.intersect(vectors(o), vectors(d), frame).part
-        return numbers(quadric.surface(vectors(p), part, frame).n)
+def fresnel(form: str, cos: np.ndarray, ior: np.ndarray) -> np.ndarray:
+    """Return the reflectance for a cosine of incidence in [0, 1], from outside of index 1."""
+    if form == "unity":
+        return np.ones_like(cos)
+    if form == "schlick":
+        at_normal = np.square((ior - 1) / (ior + 1))
+        return at_normal + (1 - at_normal) * (1 - cos) ** 5
+    g2 = ior**2 - 1 + cos**2
+    g = np.sqrt(np.maximum(g2, 0))
+    ratio = (cos * (g + cos) - 1) / (cos * (g - cos) + 1)
+    return np.where(g2 < 0, 1.0, 0.5 * ((g - cos) / (g + cos)) ** 2 * (1 + ratio**2))
 
 
-@dataclass(frozen=True)
-class _Quadric:
-    """The functions of ``plugins/intersect.py`` for one kind of object."""
-
-    frame: Callable[..., Frame]
-    intersect: Callable[..., SurfaceHit]
-    surface: Callable[..., SurfacePoint]
-
-
-_QUADRICS = {
-    Cone: _Quadric(cone_frame, intersect_cone, cone_surface),
-    Cylinder: _Quadric(cylinder_frame, intersect_cylinder, cylinder_surface),
-}
+def specular_lobe(n: np.ndarray, to_light: np.ndarray, to_eye: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Return D G / (4 cos cos) for unit vectors above the surface."""
+    h = unit(to_light + to_eye)
+    cos2, sin2 = dot(n, h) ** 2, np.square(np.cross(n, h)).sum(axis=-1)
+    spread = np.exp(-sin2 / cos2 / alpha**2) / (math.pi * alpha**2 * cos2**2)
+    shadowing = 1.0
+    for way in (to_light, to_eye):
+        a = dot(n, way) / (alpha * np.linalg.norm(np.cross(n, way), axis=-1))
+        fit = a * (3.535 + 2.181 * a) / (1 + a * (2.276 + 2.577 * a))
+        shadowing = shadowing * np.where(a < 1.6, fit, 1.0)
+    return spread * shadowing / (4 * dot(n, to_light) * dot(n, to_eye))
 
 
-def _axis(thing: Cone | Cylinder) -> tuple[Vector, Vector]:
-    return (thing.apex, thing.base_center) if isinstance(thing, Cone) else (thing.p0, thing.p1)
+# ------------------------------------------------- Objects -------------------------------------------------
 
 
-def _extent(thing: Any) -> float:
-    """Size of the numbers that say where an object is."""
-    if isinstance(thing, Plane):
-        return abs(thing.distance)
-    places = (thing.center,) if isinstance(thing, Sphere) else _axis(thing)
-    return max(abs(x) for place in places for x in place) + thing.radius
+class Spheres:
+    """Spheres as rows of numbers, and where rays meet them."""
+
+    def __init__(self, things: Sequence[Sphere]) -> None:
+        self.center = np.array([s.center for s in things], float)
+        self.radius = np.array([s.radius for s in things], float)
+        self.extent = np.abs(self.center).max(axis=1) + self.radius
+
+    def distances(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """Return [N, objects]: how far along the unit directions [N, 3] each is; inf where it is missed."""
+        passed = d @ self.center.T - dot(o, d)[:, None]
+        away2 = dot(o, o)[:, None] - 2 * o @ self.center.T + dot(self.center, self.center)
+        half = np.sqrt(self.radius**2 - away2 + passed**2)
+        return _first_ahead(passed - half, passed + half)
+
+    def normals(self, p: np.ndarray, k: np.ndarray) -> np.ndarray:
+        """Return unit normals [N, 3] at points on the objects k [N]."""
+        return unit(p - self.center[k])
 
 
-# ------------------------------------------------- Tracing --------------------------------------------------
+class Planes:
+    """Planes, as ``Spheres`` are."""
+
+    def __init__(self, things: Sequence[Plane]) -> None:
+        self.normal = unit(np.array([p.normal for p in things], float))
+        self.extent = self.distance = np.array([p.distance for p in things], float)
+
+    def distances(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+        return _first_ahead(-(o @ self.normal.T + self.distance) / (d @ self.normal.T))
+
+    def normals(self, p: np.ndarray, k: np.ndarray) -> np.ndarray:
+        return self.normal[k]
 
 
-class _Rows:
-    """A data class of arrays with one row per path."""
+class Axial:
+    """Closed cones (from the apex to the base) and cylinders (from p0 to p1), as ``Spheres`` are.
 
-    def only(self, keep: np.ndarray) -> Any:
-        return type(self)(*(getattr(self, f.name)[keep] for f in fields(self)))  # type: ignore[arg-type]
+    At the height h above the first end the radius is ``start + slope h``.
+    """
+
+    def __init__(self, things: Sequence[Cone | Cylinder]) -> None:
+        cone = np.array([isinstance(t, Cone) for t in things])
+        ends = [(t.apex, t.base_center) if isinstance(t, Cone) else (t.p0, t.p1) for t in things]
+        self.end, other = np.array(ends, float).swapaxes(0, 1)
+        self.length = np.linalg.norm(other - self.end, axis=1)
+        self.axis = unit(other - self.end)
+        self.radius = np.array([t.radius for t in things], float)
+        self.start, self.slope = np.where(cone, 0, self.radius), np.where(cone, self.radius / self.length, 0)
+        self.extent = np.abs(np.concatenate([self.end, other], axis=1)).max(axis=1) + self.radius
+        self.cone = cone
+
+    def distances(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+        off = o[:, None] - self.end
+        passed = -np.einsum("nki,ni->nk", off, d)  # from where the ray is nearest to the first end
+        off = off + passed[..., None] * d[:, None]
+        height, rise = dot(off, self.axis), d @ self.axis.T
+        across, drift = off - height[..., None] * self.axis, d[:, None] - rise[..., None] * self.axis
+        wide, widening = self.start + self.slope * height, self.slope * rise
+        # |across + t drift|² = (wide + t widening)²
+        a, b = dot(drift, drift) - widening**2, dot(across, drift) - wide * widening
+        c = dot(across, across) - wide**2
+        larger = -(b + np.copysign(np.sqrt(b * b - a * c), b))
+        side = np.stack([larger / a, c / larger])
+        h = height + side * rise
+        side = np.where((h >= 0) & (h <= self.length), side, np.nan)
+        discs = np.stack([-height / rise, (self.length - height) / rise])
+        off = across + discs[..., None] * drift
+        on_disc = dot(off, off) <= self.radius**2
+        on_disc[0] &= ~self.cone
+        return _first_ahead(*(passed + side), *(passed + np.where(on_disc, discs, np.nan)))
+
+    def normals(self, p: np.ndarray, k: np.ndarray) -> np.ndarray:
+        axis, length = self.axis[k], self.length[k]
+        height = dot(p - self.end[k], axis)
+        across = p - self.end[k] - height[:, None] * axis
+        radius = np.linalg.norm(across, axis=1)
+        side = across / radius[:, None] - self.slope[k][:, None] * axis
+        off = [np.abs(radius - self.start[k] - self.slope[k] * height), np.abs(height - length)]
+        off.append(np.where(self.cone[k], np.inf, np.abs(height)))
+        part = np.argmin(off, axis=0)[:, None]
+        return unit(np.where(part == 0, side, np.where(part == 1, axis, -axis)))
+
+
+class Triangles:
+    """The triangles of a mesh, as ``Spheres`` are."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        corners = np.asarray(mesh.vertices, float)[mesh.faces]
+        self.corner, self.edges = corners[:, 0], (corners[:, 1:] - corners[:, :1]).swapaxes(0, 1)
+        self.normal = unit(np.cross(*self.edges))
+        self.extent = np.abs(corners).max(axis=(1, 2))
+        self.uv = None if mesh.uvs is None else np.asarray(mesh.uvs, float)[mesh.faces]
+
+    def distances(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+        first, second = self.edges
+        moment, whole = np.cross(o, d), np.cross(first, second)
+        scale = -1 / (d @ whole.T)
+        u = (moment @ second.T - d @ np.cross(second, self.corner).T) * scale
+        v = -(moment @ first.T + d @ np.cross(self.corner, first).T) * scale
+        t = (o @ whole.T - dot(whole, self.corner)) * scale
+        return _first_ahead(np.where((u >= 0) & (v >= 0) & (u + v <= 1), t, np.nan))
+
+    def normals(self, p: np.ndarray, k: np.ndarray) -> np.ndarray:
+        return self.normal[k]
+
+    def texels(self, picture: np.ndarray, p: np.ndarray, k: np.ndarray) -> np.ndarray:
+        """Return the colours [N, 3] of the texels nearest to points on the triangles k."""
+        first, second = self.edges[:, k]
+        off, whole = p - self.corner[k], np.cross(first, second)
+        area = dot(whole, whole)
+        weights = [dot(np.cross(off, second), whole) / area, dot(np.cross(first, off), whole) / area]
+        shares = np.stack([1 - sum(weights), *weights], axis=1)
+        u, v = np.clip(np.einsum("nc,nci->in", shares, self.uv[k]), 0, 1)
+        rows, columns = picture.shape[:2]
+        row, column = (v * (rows - 1) + 0.5).astype(int), (u * (columns - 1) + 0.5).astype(int)
+        return picture[row % rows, column % columns]
+
+
+def _first_ahead(*distances: np.ndarray) -> np.ndarray:
+    return np.min([np.where(t > 0, t, np.inf) for t in distances], axis=0)
+
+
+# ------------------------------------------------- Tracing -------------------------------------------------
 
 
 @dataclass
-class _Paths(_Rows):
+class _Hits:
+    """N rays that met something: where, on what, and from where."""
+
     pixel: np.ndarray  # [N]
-    o: np.ndarray  # [N, 3]
-    d: np.ndarray  # [N, 3], unit
+    d: np.ndarray  # [N, 3], of the ray
     throughput: np.ndarray  # [N, 3]
-    depth: np.ndarray  # [N]
-
-
-@dataclass
-class _Surface(_Rows):
-    """Where paths meet objects, in a local frame with the normal along z."""
-
-    index: np.ndarray  # [N], of the object
+    depth: np.ndarray  # [N], bounce budget spent
+    t: np.ndarray  # [N]
+    thing: np.ndarray  # [N], index of the object
     p: np.ndarray  # [N, 3]
-    scale: np.ndarray  # [N], size of the numbers that ``p`` was computed from
-    frame: np.ndarray  # [N, 3, 3], rows: tangent, tangent, normal
-    wi: np.ndarray  # [N, 3], local direction to where the path comes from
+    n: np.ndarray  # [N, 3]
+    scale: np.ndarray  # [N], size of the numbers that p was computed from
+    diffuse: np.ndarray  # [N, 3]
+
+    def only(self, keep: np.ndarray) -> _Hits:
+        return _Hits(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     @property
-    def n(self) -> np.ndarray:
-        return self.frame[:, 2]
-
-    def local(self, v: np.ndarray) -> np.ndarray:
-        return np.einsum("nij,nj->ni", self.frame, v)
-
-
-@dataclass
-class _Lighting:
-    """What all lights together do to surfaces."""
-
-    radiance: np.ndarray  # [N, 3]
-    seen: np.ndarray  # [N], a number for which lights are in front, and which of these in sight
-    grazing: np.ndarray  # [N], least |cos| of the angles between normal and light
+    def outside(self) -> np.ndarray:
+        """Points just above the surface."""
+        return self.p + OFFSET * self.scale[:, None] * self.n
 
 
 class _Tracer:
-    def __init__(self, scene: Scene, settings: Settings, arrays: Backend):
-        self.scene, self.settings, self.arrays = scene, settings, arrays
-        self.world = _World(scene, arrays)
-        self.original = settings.self_intersection == "original"
-        self.cost = np.array([self._bounce_cost(ior) for ior in self.world.ior])
+    def __init__(self, scene: Scene, settings: Settings) -> None:
+        self.scene, self.settings = scene, settings
+        self.reach = ORIGINAL_REACH if settings.original else np.inf
+        things = [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
+        groups = [(Spheres, scene.spheres), (Planes, scene.planes), (Axial, (*scene.cones, *scene.cylinders))]
+        # Each with the numbers of its objects; all triangles of a mesh are one object
+        self.groups: list[tuple[Any, np.ndarray]] = []
+        for kind, members in groups:
+            if members:
+                first = sum(len(numbers) for _, numbers in self.groups)
+                self.groups.append((kind(members), first + np.arange(len(members))))
+        for k, mesh in enumerate(scene.meshes):
+            number = len(things) - len(scene.meshes) + k
+            self.groups.append((Triangles(mesh), np.full(len(mesh.faces), number)))
+        materials = [thing.material for thing in things]
+        self.ior = np.array([m.ior for m in materials])
+        self.alpha = np.array([m.alpha for m in materials])
+        self.specular = np.array([m.specular for m in materials], float).reshape(-1, 3)
+        self.diffuse = np.array([m.diffuse for m in materials], float).reshape(-1, 3)
+        self.pictures = {i: _picture(scene, things[i]) for i, m in enumerate(materials) if m.texture}
+        spent = [max(1, 10 - int(10 * m.ior)) for m in materials]
+        self.cost = np.array([1] * len(spent) if settings.bounce_budget == "plain" else spent, int)
 
-    def _bounce_cost(self, ior: float) -> int:
-        return 1 if self.settings.bounce_budget == "plain" else max(1, 10 - int(10 * ior))
-
-    # ---------------------------------------- Pixels ----------------------------------------
-
-    def render(self, width: int, height: int) -> ReferenceResult:
-        first, *others = (self._one_sample(width, height, offset) for offset in self.settings.offsets())
-        first.image = sum((film.image for film in others), first.image) / self.settings.aa**2
-        layers = {f.name: getattr(first, f.name) for f in fields(first)}
-        # The first row is the lowest
-        return ReferenceResult(**{k: v.reshape(height, width, *v.shape[1:])[::-1] for k, v in layers.items()})
-
-    def _one_sample(self, width: int, height: int, offset: np.ndarray) -> _Film:
-        film = _Film.empty(width * height)
-        for start in range(0, width * height, self.arrays.batch):
-            pixel = np.arange(start, min(start + self.arrays.batch, width * height))
-            x, y = pixel % width + 0.5 + offset[0], pixel // width + 0.5 + offset[1]
-            d = camera_directions(self.scene.camera, width, height, x, y)
-            o = np.broadcast_to(np.array(self.scene.camera.position, dtype=np.float64), d.shape)
-            self._follow(_Paths(pixel, o, d, np.ones_like(d), np.zeros(len(d), dtype=int)), film)
-        return film
-
-    def _follow(self, paths: _Paths, film: _Film) -> None:
-        """Trace paths to their ends and add up what they carry."""
-        reach = ORIGINAL_REACH if self.original else np.inf
+    def film(self, o: np.ndarray, d: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the layers of ``ReferenceResult`` for rays, one each, in their order."""
+        count, scene = len(o), self.scene
+        layers = {
+            "image": np.zeros((count, 3)),
+            "depth": np.full(count, np.inf),
+            "object_id": np.full(count, -1),
+            "normal": np.zeros((count, 3)),
+            "bounces": np.zeros(count, int),
+            "path": np.ones(count, np.uint64),
+            "lights": np.ones(count, np.uint64),
+            "terminator": np.ones(count),
+        }
+        pixel, throughput, depth = np.arange(count), np.ones((count, 3)), np.zeros(count, int)
         for bounce in range(self.settings.max_depth):
-            t, index = self.world.nearest(paths.o, paths.d, reach)
-            film.path[paths.pixel] = _mix(film.path[paths.pixel], index)
-            found = index >= 0
-            missed = paths.only(~found)
-            film.image[missed.pixel] += missed.throughput * np.array(self.scene.sky)
-            paths = paths.only(found)
-            if not len(paths.pixel):
-                return
-            surface = self._surface(paths, t[found], index[found])
+            hits, missed, met = self.hits(pixel, o, d, throughput, depth)
+            layers["path"][pixel] = _mix(layers["path"][pixel], met)
+            layers["image"][pixel[missed]] += throughput[missed] * np.array(scene.sky)
             if bounce == 0:
-                film.record(paths, surface, t[found])
-            film.bounces[paths.pixel] = bounce
-            film.add(paths, self._direct(surface))
-            paths = self._reflect(paths, surface)
-            if not len(paths.pixel):
-                return
+                for name, values in (("depth", hits.t), ("object_id", hits.thing), ("normal", hits.n)):
+                    layers[name][hits.pixel] = values
+            layers["bounces"][hits.pixel] = bounce
+            radiance, seen, grazing = self.direct(hits)
+            layers["image"][hits.pixel] += hits.throughput * radiance
+            layers["lights"][hits.pixel] = _mix(layers["lights"][hits.pixel], seen)
+            layers["terminator"][hits.pixel] = np.minimum(layers["terminator"][hits.pixel], grazing)
+            pixel, o, d, throughput, depth = self.reflected(hits)
+            if not len(pixel):
+                break
+        return layers
 
-    def _surface(self, paths: _Paths, t: np.ndarray, index: np.ndarray) -> _Surface:
-        p = paths.o + t[:, None] * paths.d
-        normals = self.world.normals(paths.o, paths.d, p, index)
-        scale = np.abs(paths.o).max(axis=-1) + t + self.world.extent[index]
-        surface = _Surface(index, p, scale, _frames(normals), np.empty_like(p))
-        surface.wi = surface.local(-paths.d)
-        return surface
+    def nearest(self, o: np.ndarray, d: np.ndarray, reach: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return of each ray's first object within reach: distance, group (-1 for none), and row in it."""
+        t = np.broadcast_to(reach, len(o)).copy()
+        group, row = np.full(len(o), -1), np.zeros(len(o), int)
+        for g, (shapes, numbers) in enumerate(self.groups):
+            for part in _batches(len(o), len(numbers)):
+                found = shapes.distances(o[part], d[part])
+                k = found.argmin(axis=1)
+                closest = found[np.arange(len(k)), k]
+                closer = closest < t[part]
+                t[part[closer]], group[part[closer]], row[part[closer]] = closest[closer], g, k[closer]
+        return t, group, row
 
-    def _reflect(self, paths: _Paths, surface: _Surface) -> _Paths:
-        """The mirror rays of the paths that go on."""
-        n, cos_theta = surface.n, surface.wi[:, 2]
-        sin2_theta = surface.wi[:, 0] ** 2 + surface.wi[:, 1] ** 2
-        d = _unit(paths.d + 2 * cos_theta[:, None] * n)
-        o = surface.p + ORIGINAL_MIRROR_START * d if self.original else _off_surface(surface)
-        fresnel = self._fresnel(cos_theta, sin2_theta, surface.index)
-        throughput = paths.throughput * self.world.specular[surface.index] * fresnel[:, None]
-        depth = paths.depth + self.cost[surface.index]
-        goes_on = (cos_theta > 0) & (depth < self.settings.max_depth) & (throughput != 0).any(axis=-1)
-        return _Paths(paths.pixel, o, d, throughput, depth).only(goes_on)
-
-    # ---------------------------------------- Shading ----------------------------------------
-
-    def _direct(self, surface: _Surface) -> _Lighting:
-        count = len(surface.p)
-        lighting = _Lighting(np.zeros((count, 3)), np.zeros(count, dtype=int), np.ones(count))
-        for light in self.scene.lights:
-            wo = surface.local(_unit(np.array(light.position) - surface.p))
-            lighting.grazing = np.minimum(lighting.grazing, np.abs(wo[:, 2]))
-            lighting.seen *= 3
-            facing = np.flatnonzero((surface.wi[:, 2] > 0) & (wo[:, 2] > 0))
-            if not len(facing):
+    def hits(self, pixel: Any, o: Any, d: Any, throughput: Any, depth: Any) -> tuple[_Hits, Any, np.ndarray]:
+        """Return what rays meet, which [N] meet nothing, and the number [N] of the object, or -1."""
+        t, group, row = self.nearest(o, d, self.reach)
+        p = o + np.where(group >= 0, t, 0)[:, None] * d
+        n, thing, extent = np.zeros_like(p), np.full(len(p), -1), np.zeros(len(p))
+        diffuse = np.zeros_like(p)
+        for g, (shapes, numbers) in enumerate(self.groups):
+            here = np.flatnonzero(group == g)
+            if not len(here):
                 continue
-            visible = ~self._blocked(surface.only(facing), light)
-            lighting.seen[facing] += 1 + visible
-            lit = facing[visible]
-            if len(lit):
-                value = np.array(light.color) * self._bsdf_cos(surface.only(lit), wo[lit])
-                lighting.radiance[lit] += np.clip(value, 0, 1) if self.settings.clamp else value
-        return lighting
+            thing[here], extent[here] = numbers[row[here]], np.abs(shapes.extent[row[here]])
+            n[here] = shapes.normals(p[here], row[here])
+            diffuse[here] = self.diffuse[thing[here]]
+            picture = self.pictures.get(int(numbers[0]))
+            if picture is not None:
+                diffuse[here] = shapes.texels(picture, p[here], row[here])
+        scale = np.abs(o).max(axis=1) + t + extent
+        found = group >= 0
+        everything = _Hits(pixel, d, throughput, depth, t, thing, p, n, scale, diffuse)
+        return everything.only(found), ~found, thing
 
-    def _blocked(self, surface: _Surface, light: Light) -> np.ndarray:
-        """Is there anything between the surface and the light? [N]"""
-        to_light = np.array(light.position) - surface.p
-        if self.original:
-            distance = np.linalg.norm(to_light, axis=-1)
-            d = to_light / distance[:, None]
-            o, reach = surface.p + ORIGINAL_SHADOW_START * d, distance - ORIGINAL_SHADOW_START
-        else:
-            o, reach = _off_surface(surface), 1.0
-            d = np.array(light.position) - o
-        return self.world.nearest(o, d, reach)[1] >= 0
+    def direct(self, hits: _Hits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the light sent back along the rays, a code of which lights are seen, and the least |cos|."""
+        count = len(hits.p)
+        radiance, seen, grazing = np.zeros((count, 3)), np.zeros(count, int), np.ones(count)
+        for light in self.scene.lights:
+            to_light = np.array(light.position) - hits.p
+            cos = dot(hits.n, unit(to_light))
+            grazing = np.minimum(grazing, np.abs(cos))
+            facing = np.flatnonzero((cos > 0) & (dot(hits.n, hits.d) < 0))
+            lit = facing[~self.blocked(hits.only(facing), np.array(light.position))]
+            seen *= 3
+            seen[facing] += 1
+            seen[lit] += 1
+            value = self.reflectance(hits.only(lit), unit(to_light[lit])) * cos[lit, None] * light.color
+            radiance[lit] += np.clip(value, 0, 1) if self.settings.clamp else value
+        return radiance, seen, grazing
 
-    def _bsdf_cos(self, surface: _Surface, wo: np.ndarray) -> np.ndarray:
-        """BSDF times cosine [N, 3] towards the local directions ``wo``; both cosines positive."""
-        i, o = self.arrays.vectors(surface.wi), self.arrays.vectors(wo)
-        alpha = self.arrays.floats(self.world.alpha[surface.index])
-        lobe = numbers(microfacet_specular(i, o, tan2_theta(i + o), alpha))
-        cos_theta, sin2_theta = map(numbers, half_vector_angles(i, o))
-        lobe = lobe * self._fresnel(cos_theta, sin2_theta, surface.index)
-        diffuse = self.world.diffuse[surface.index] * (wo[:, 2:] / math.pi)
+    def blocked(self, hits: _Hits, light: np.ndarray) -> np.ndarray:
+        o = hits.outside
+        if self.settings.original:
+            o = hits.p + ORIGINAL_SHADOW_START * unit(light - hits.p)
+        way = light - o
+        return self.nearest(o, unit(way), np.linalg.norm(way, axis=1))[1] >= 0
+
+    def reflectance(self, hits: _Hits, to_light: np.ndarray) -> np.ndarray:
+        """Return the BSDF [N, 3]; both directions are above the surface."""
+        k = hits.thing
+        cos = dot(unit(to_light - hits.d), to_light)
+        lobe = specular_lobe(hits.n, to_light, -hits.d, self.alpha[k])
+        lobe = lobe * fresnel(self.settings.fresnel, cos, self.ior[k])
         # The G₁ of a negative roughness can be negative; light cannot
-        return np.maximum(diffuse + self.world.specular[surface.index] * lobe[:, None], 0)
+        return np.maximum(hits.diffuse / math.pi + self.specular[k] * lobe[:, None], 0)
 
-    def _fresnel(self, cos_theta: np.ndarray, sin2_theta: np.ndarray, index: np.ndarray) -> np.ndarray:
-        """F [N] of the objects ``index``, whose surroundings have index 1."""
-        form = self.settings.fresnel
-        if form == "unity":
-            return np.ones(len(index))
-        c, s2, ior = map(self.arrays.floats, (cos_theta, sin2_theta, self.world.ior[index]))
-        if form == "dielectric":
-            return numbers(fresnel_dielectric(c, 1.0, ior, s2))
-        return numbers(fresnel_schlick(c, f0_from_ior(1.0, ior), s2))
-
-
-def _off_surface(surface: _Surface) -> np.ndarray:
-    """Points just outside a surface."""
-    return surface.p + OFFSET * surface.scale[:, None] * surface.n
+    def reflected(self, hits: _Hits) -> tuple[np.ndarray, ...]:
+        """Return the mirror rays that go on: pixel, o, d, throughput, depth."""
+        cos = -dot(hits.n, hits.d)
+        d = unit(hits.d + 2 * cos[:, None] * hits.n)
+        o = hits.p + ORIGINAL_MIRROR_START * d if self.settings.original else hits.outside
+        mirrored = fresnel(self.settings.fresnel, cos, self.ior[hits.thing])
+        throughput = hits.throughput * self.specular[hits.thing] * mirrored[:, None]
+        depth = hits.depth + self.cost[hits.thing]
+        on = (cos > 0) & (depth < self.settings.max_depth) & (throughput != 0).any(axis=1)
+        return hits.pixel[on], o[on], d[on], throughput[on], depth[on]
 
 
-def _frames(n: np.ndarray) -> np.ndarray:
-    """Orthonormal frames [N, 3, 3] with the unit vectors ``n`` [N, 3] in the last row."""
-    axis = np.eye(3)[np.abs(n).argmin(axis=-1)]
-    s = _unit(np.cross(axis, n))
-    return np.stack([s, np.cross(n, s), n], axis=1)
+def _picture(scene: Scene, thing: Any) -> np.ndarray:
+    """Return the texels [rows, columns, 3] of a mesh's material, as they are stored."""
+    from PIL import Image
+
+    if not isinstance(thing, Mesh) or thing.uvs is None or scene.texturing != "report":
+        raise SceneError("the float64 reference draws textures on triangles only, looked up as in the report")
+    with Image.open(thing.material.texture) as picture:
+        return np.asarray(picture.convert("RGB")) / 255
+
+
+def _batches(rays: int, objects: int) -> Iterator[np.ndarray]:
+    step = max(1, BATCH // objects)
+    return (np.arange(start, min(start + step, rays)) for start in range(0, rays, step))
 
 
 def _mix(hashed: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """A hash continued by one more number."""
+    """Continue a hash by one more number."""
     return (hashed ^ (value + 2).astype(np.uint64)) * _HASH
-
-
-@dataclass
-class _Film:
-    """The layers of ``ReferenceResult``, pixels in one row, the lowest line of the picture first."""
-
-    image: np.ndarray
-    depth: np.ndarray
-    object_id: np.ndarray
-    normal: np.ndarray
-    bounces: np.ndarray
-    path: np.ndarray
-    lights: np.ndarray
-    terminator: np.ndarray
-
-    @staticmethod
-    def empty(count: int) -> _Film:
-        return _Film(
-            image=np.zeros((count, 3)),
-            depth=np.full(count, np.inf),
-            object_id=np.full(count, -1, dtype=np.int32),
-            normal=np.zeros((count, 3)),
-            bounces=np.zeros(count, dtype=np.int32),
-            path=np.ones(count, dtype=np.uint64),
-            lights=np.ones(count, dtype=np.uint64),
-            terminator=np.ones(count),
-        )
-
-    def record(self, paths: _Paths, surface: _Surface, t: np.ndarray) -> None:
-        self.depth[paths.pixel] = t
-        self.object_id[paths.pixel] = surface.index
-        self.normal[paths.pixel] = surface.n
-
-    def add(self, paths: _Paths, lighting: _Lighting) -> None:
-        self.image[paths.pixel] += paths.throughput * lighting.radiance
-        self.lights[paths.pixel] = _mix(self.lights[paths.pixel], lighting.seen)
-        self.terminator[paths.pixel] = np.minimum(self.terminator[paths.pixel], lighting.grazing)

@@ -8,18 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.plugins.intersect import (
-    cone_frame,
-    cone_surface,
-    cylinder_frame,
-    cylinder_surface,
-    intersect_cone,
-    intersect_cylinder,
-    intersect_plane,
-    intersect_sphere,
-)
+from mrt_mitsuba.scene.model import Cone, Cylinder, Material, Mesh, Plane, Sphere
+from mrt_mitsuba.validation.oracles import reference
 from mrt_mitsuba.validation.studies.stability.cases import Cases, hexadecimal
-from mrt_mitsuba.validation.tools.arrays import Backend, Vector3, backend, numbers
 
 ROUNDING = 2.0**-24
 DECADES = 10.0 ** np.arange(-6, 7, 2)
@@ -55,8 +46,17 @@ class Solid:
 
     name: str
     to_dict: Callable[[float], dict[str, Any]]  # of this size
-    hit: Callable[[Backend, Vector3, Vector3, float], Truth]  # in float64, of this size
+    exact: Callable[[float], Any]  # of this size, for the float64 tracer
     closed: bool  # does every ray from the inside meet it
+
+    def hit(self, o: np.ndarray, d: np.ndarray, size: float) -> Truth:
+        """Return the first hits of rays [N, 3] with the solid of a size."""
+        with np.errstate(all="ignore"):
+            shape, o, d = self.exact(size), np.float64(o), np.float64(d)
+            t = shape.distances(o, d / np.linalg.norm(d, axis=1, keepdims=True))[:, 0]
+            t = t / np.linalg.norm(d, axis=1)
+            p = o + np.where(np.isfinite(t), t, 0)[:, None] * d
+            return Truth(t, shape.normals(p, np.zeros(len(p), int)))
 
 
 APEX, BASE, CONE_RADIUS = (0.1, 0.6, -0.2), (-0.1, -0.4, 0.2), 0.5
@@ -73,50 +73,7 @@ def _scaled(point: Any, size: float) -> list[float]:
     return [_single(c * size) for c in point]
 
 
-def _sphere_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth:
-    t = numbers(intersect_sphere(o, d, arrays.vector_parameter((0, 0, 0)), arrays.parameter(size)))
-    return Truth(t, _at(o, d, t) / size)
-
-
-def _plane_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth:
-    normal = NORMAL_OF_PLANE / np.linalg.norm(NORMAL_OF_PLANE)
-    t = numbers(
-        intersect_plane(o, d, arrays.vector_parameter(normal), arrays.parameter(PLANE_DISTANCE * size))
-    )
-    return Truth(t, np.broadcast_to(normal, (len(t), 3)))
-
-
-def _triangle_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth:
-    a, b, c = CORNERS * size
-    origin, direction = numbers(o), numbers(d)
-    normal = np.cross(b - a, c - a)
-    slope = direction @ normal
-    t = (a - origin) @ normal / np.where(slope == 0, np.nan, slope)
-    p = origin + t[:, None] * direction
-    edges = [(a, b), (b, c), (c, a)]
-    inside = np.all([np.cross(q - r, p - r) @ normal >= 0 for r, q in edges], axis=0)
-    t = np.where(inside & (t > 0), t, np.inf)
-    return Truth(t, np.broadcast_to(normal / np.linalg.norm(normal), p.shape))
-
-
-def _cone_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth:
-    apex, base = (arrays.vector_parameter(np.multiply(end, size)) for end in (APEX, BASE))
-    frame = cone_frame(apex, base, arrays.parameter(CONE_RADIUS * size))
-    found = intersect_cone(o, d, frame)
-    t = numbers(found.t)
-    return Truth(t, numbers(cone_surface(arrays.vectors(_at(o, d, t)), found.part, frame).n))
-
-
-def _cylinder_hit(arrays: Backend, o: Vector3, d: Vector3, size: float) -> Truth:
-    p0, p1 = (arrays.vector_parameter(np.multiply(end, size)) for end in (APEX, BASE))
-    frame = cylinder_frame(p0, p1, arrays.parameter(CONE_RADIUS * size))
-    found = intersect_cylinder(o, d, frame)
-    t = numbers(found.t)
-    return Truth(t, numbers(cylinder_surface(arrays.vectors(_at(o, d, t)), found.part, frame).n))
-
-
-def _at(o: Vector3, d: Vector3, t: np.ndarray) -> np.ndarray:
-    return numbers(o) + np.where(np.isfinite(t), t, 0)[:, None] * numbers(d)
+MATTE = Material(0.0, 1.0, (0, 0, 0), (1, 1, 1))
 
 
 def _triangle_dict(size: float) -> dict[str, Any]:
@@ -139,17 +96,41 @@ def _axis_dict(kind: str, first: str, second: str) -> Callable[[float], dict[str
     return make
 
 
+def _ends(size: float) -> Any:
+    return np.multiply(APEX, size), np.multiply(BASE, size), CONE_RADIUS * size, MATTE
+
+
 SOLIDS = (
-    Solid("sphere", lambda s: {"type": "sphere", "radius": _single(s)}, _sphere_hit, True),
+    Solid(
+        "sphere",
+        lambda s: {"type": "sphere", "radius": _single(s)},
+        lambda s: reference.Spheres([Sphere((0, 0, 0), s, MATTE)]),
+        True,
+    ),
     Solid(
         "plane",
         lambda s: {"type": "mrt_plane", "normal": NORMAL_OF_PLANE.tolist(), "distance": PLANE_DISTANCE * s},
-        _plane_hit,
+        lambda s: reference.Planes([Plane(tuple(NORMAL_OF_PLANE), PLANE_DISTANCE * s, MATTE)]),
         False,
     ),
-    Solid("triangle", _triangle_dict, _triangle_hit, False),
-    Solid("cone", _axis_dict("mrt_cone", "apex", "base_center"), _cone_hit, True),
-    Solid("cylinder", _axis_dict("mrt_cylinder", "p0", "p1"), _cylinder_hit, True),
+    Solid(
+        "triangle",
+        _triangle_dict,
+        lambda s: reference.Triangles(Mesh(CORNERS * s, np.array([[0, 1, 2]]), MATTE)),
+        False,
+    ),
+    Solid(
+        "cone",
+        _axis_dict("mrt_cone", "apex", "base_center"),
+        lambda s: reference.Axial([Cone(*_ends(s))]),
+        True,
+    ),
+    Solid(
+        "cylinder",
+        _axis_dict("mrt_cylinder", "p0", "p1"),
+        lambda s: reference.Axial([Cylinder(*_ends(s))]),
+        True,
+    ),
 )
 
 
@@ -205,9 +186,8 @@ def start_cases(cases: Cases, *, quick: bool) -> None:
         lost = not_finite = 0
         for size in DECADES[::3]:
             o, _ = _rays(size, 3 * size, count)
-            arrays = backend("scalar")  # few rays at a time: kernels would only be launched
             inwards = (-o / np.linalg.norm(o, axis=1, keepdims=True)).astype(np.float32)
-            truth = solid.hit(arrays, arrays.vectors(o), arrays.vectors(inwards), size)
+            truth = solid.hit(o, inwards, size)
             hit = np.isfinite(truth.t)
             p = (o + np.where(hit, truth.t, 0)[:, None] * inwards)[hit].astype(np.float32)
             d = _units(rng, len(p))
@@ -352,13 +332,9 @@ def _trace(solid: Solid, size: float, o: np.ndarray, d: np.ndarray) -> _Traced:
 
 
 def _compare(solid: Solid, size: float, o: np.ndarray, d: np.ndarray, traced: _Traced) -> _Cell:
-    arrays = backend("scalar")  # few rays at a time: kernels would only be launched
-    origin, direction = arrays.vectors(o), arrays.vectors(d)
     scale = max(float(np.abs(o).max()), size)
     rounding = ROUNDING * scale / size  # of the largest coordinate, in sizes
-    truth, larger, smaller = (
-        solid.hit(arrays, origin, direction, size * (1 + k * OUTLINE * rounding)) for k in (0, 1, -1)
-    )
+    truth, larger, smaller = (solid.hit(o, d, size * (1 + k * OUTLINE * rounding)) for k in (0, 1, -1))
     exists = np.isfinite(truth.t)
     both = traced.found & exists
     cosine = np.where(both, (truth.n * d).sum(axis=1), 1)

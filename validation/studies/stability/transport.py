@@ -139,8 +139,7 @@ def _case(cases: Cases, path: Path) -> tuple[Any, ...]:
     settings = {"fresnel": "dielectric", "clamp": True, **path.settings}
     image = _render(path.scene, **settings)
     scene = path.truth or path.scene
-    # Two objects and few pixels: kernels would only be launched
-    truth = reference_render(scene, width=WIDTH, height=HEIGHT, device="scalar", **settings).image
+    truth = reference_render(scene, width=WIDTH, height=HEIGHT, **settings).image
     difference = np.abs(image - truth) / np.maximum(truth, 1)
     share = float((~(difference.max(axis=-1) <= TOLERANCE)).mean())
     median = float(np.median(difference))
