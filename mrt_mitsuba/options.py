@@ -118,6 +118,23 @@ def vector(form: str = "X,Y,Z") -> Kind:
     return Kind(form, "three finite numbers separated by commas", parse, check)
 
 
+def error_or_place() -> Kind:
+    """A positive number, or three finite ones."""
+    place = vector()
+
+    def check(value: Any) -> Any:
+        if isinstance(value, Iterable):
+            return place.check(value)
+        if isinstance(value, bool) or not 0 < value < math.inf:
+            raise ValueError
+        return float(value)
+
+    def parse(text: str) -> Any:
+        return place.from_text(text) if "," in text else float(plain(text))
+
+    return Kind("X|X,Y,Z", "a positive number, or three separated by commas", parse, check)
+
+
 def size() -> Kind:
     """A number of bytes, as text with a unit: 4G, 512M."""
 

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from mrt_mitsuba.output.error import ErrorEstimate, Round
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -40,6 +42,8 @@ class Result:
     rays: Mapping[str, int]  #: number by kind; "mirror" and "shadow" only where they were counted
     kernel_launches: int  #: how many kernels ran
     options: Mapping[str, Any] = field(default_factory=dict)  #: as they were given
+    error: ErrorEstimate | None = None  #: to the converged picture; None where nothing was estimated
+    rounds: tuple[Round, ...] = ()  #: what was known after each: the error over the time of this render
 
     def save(self, path: str | os.PathLike[str], *, tonemap: str = "report") -> None:
         """Write a .png or .exr; raise ``OutputError``. ``tonemap`` ("report" or "srgb") concerns a PNG

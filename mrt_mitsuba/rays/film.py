@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from mrt_mitsuba.rays.divisor import Divisor
 
+LUMINANCE = np.array([0.212671, 0.715160, 0.072169])  # of linear sRGB, as in Mitsuba
 STEPS = 32  # of a pixel, where integrals over a filter are summed
 
 
@@ -23,6 +25,7 @@ class Film:
     border: int  #: pixels that are sampled around the picture, and are no part of it
     reach: int  #: pixels on either side to which a ray contributes
     alpha: bool  #: does it keep the coverage
+    grey: bool  #: does it keep the luminance only
 
     @classmethod
     def of(cls, sensor: Any) -> Film:
@@ -34,7 +37,10 @@ class Film:
         reach = 0 if rfilter.is_box_filter() else int(rfilter.border_size())
         border = int(rfilter.border_size()) if film.sample_border() else 0
         width, height = (int(n) + 2 * border for n in film.crop_size())
-        return cls(sensor, width, height, border, reach, mi.has_flag(film.flags(), mi.FilmFlags.Alpha))
+        alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        return cls(
+            sensor, width, height, border, reach, alpha, pixel_format(film) in ("luminance", "y", "ya")
+        )
 
     @property
     def pixels(self) -> int:
@@ -50,6 +56,20 @@ class Film:
         """Return what lies in the picture, of an array [..., pixels or rows × columns, channels]."""
         rows, columns = (slice(self.border, n - self.border) for n in self.shape)
         return sampled[..., rows, columns, :]
+
+    def framed(self, picture: np.ndarray) -> np.ndarray:
+        """Return a picture [H, W] with the film's border, which is 0."""
+        return np.pad(picture, self.border)
+
+    def toned(self, colors: np.ndarray) -> np.ndarray:
+        """Return colours [..., 3] as the film keeps them."""
+        return np.repeat(colors @ LUMINANCE[:, None], 3, axis=-1) if self.grey else colors
+
+    def rays_near(self, count: int) -> int:
+        """Return the number of rays a pixel that the scene's sampler makes of a number."""
+        sampler = self.sensor.sampler().clone()
+        sampler.set_sample_count(count)
+        return int(sampler.sample_count())
 
     def rays(self, pixel: Any, sampler: Any) -> tuple[Any, Any, Any]:
         """Return places in the film's pixels, in pixels, and rays through them with their weights.
@@ -91,6 +111,12 @@ class Film:
         values = self.weights.ravel()
         overlap = np.correlate(values, values, "full")[(len(values) - 1) % STEPS :: STEPS]
         return float(np.sum(np.square(overlap / overlap.max()))) ** 2
+
+    @property
+    def averaging(self) -> float:
+        """Variance of a pixel over that of the mean of the rays that start in it."""
+        along = np.square(self.weights).mean() / np.square(self.weights.mean())
+        return float(along / len(self.weights)) ** 2
 
     def spread_out(self, variance: np.ndarray) -> np.ndarray:
         """Return the variance [..., H, W] of pixels, up to a factor, given that of the rays in each."""
@@ -137,3 +163,9 @@ class Canvas:
         sums = np.asarray(self.block.tensor(), np.float64)
         sums = sums.reshape(self.pictures, self.rows, self.film.width, -1)
         return sums[:, self.film.reach : self.film.reach + self.film.height]
+
+
+def pixel_format(film: Any) -> str:
+    """Return the pixel format of a film as it prints it, "rgb" or "ya"; nothing for one without."""
+    found = re.search(r"pixel_format = (\w+)", str(film))
+    return found[1] if found else ""

@@ -72,16 +72,77 @@ class Exposed:
     square: np.ndarray  #: [pictures, pixels, 3]: of their squares
 
 
+class Stack:
+    """Pictures in the making, exposure upon exposure.
+
+    An exposure may leave pixels out. It counts in proportion to the independent rays that it brings to a
+    pixel, and only where none is missing under the filter; the rays of a pixel have the same weight in all.
+    """
+
+    def __init__(self, film: Film, pictures: int, channels: int) -> None:
+        self.film = film
+        self.rays = np.zeros((pictures, film.pixels))
+        self._sums = np.zeros((pictures, *film.shape, channels), np.float32)
+        self._weights, self._amount = np.zeros((2, pictures, *film.shape), np.float32)
+
+    def widened(self, groups: np.ndarray) -> np.ndarray:
+        """Return numbers of groups [pictures, pixels], one at least wherever the filter reaches from."""
+        near = np.stack([box_mean(chosen > 0, self.film.reach) > 0 for chosen in self.rows(groups)])
+        return np.maximum(groups, near.reshape(groups.shape))
+
+    def add(self, exposed: Exposed, chosen: np.ndarray) -> None:
+        """Add an exposure that was made for the ``chosen`` pixels [pictures, pixels]."""
+        each = np.where(exposed.rays > 0, 1 / np.maximum(exposed.rays, 1), 1.0)
+        amount = self.rows(chosen) / self.film.spread_out(self.rows(each))
+        self._sums += amount[..., None] * exposed.sums
+        self._weights += amount * exposed.weights
+        self._amount += amount
+        self.rays += exposed.rays
+
+    def pictures(self) -> np.ndarray:
+        """Return the pictures one by one, [pictures, H, W, channels], with the film's border."""
+        return _divided(self._sums, self._weights)
+
+    def mean(self) -> np.ndarray:
+        """Return the mean of the pictures, each counting alike, [H, W, channels], without the border."""
+        amount = np.maximum(self._amount, 1e-30)
+        return self.film.picture(
+            _divided((self._sums / amount[..., None]).sum(0), (self._weights / amount).sum(0))
+        )
+
+    def rows(self, values: np.ndarray) -> np.ndarray:
+        """Return a view [pictures, H, W, ...] of values [pictures, pixels, ...]."""
+        return values.reshape(-1, *self.film.shape, *values.shape[2:])
+
+
+def _divided(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return sums [..., channels] over weights [...], as Mitsuba's films divide them."""
+    return np.asarray(sums / np.where(weights == 0, 1, weights)[..., None])
+
+
+def box_mean(values: np.ndarray, reach: int) -> np.ndarray:
+    """Return the means [H, W, ...] over windows of 2 reach + 1 rows and columns, cut at the border."""
+    for axis in (0, 1):
+        values = np.moveaxis(values, axis, 0)
+        size = len(values)
+        sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, 0, dtype=np.float64)])
+        first = np.maximum(np.arange(size) - reach, 0)
+        last = np.minimum(np.arange(size) + reach + 1, size)
+        counts = (last - first).reshape(-1, *([1] * (values.ndim - 1)))
+        values = np.moveaxis((sums[last] - sums[first]) / counts, 0, axis)
+    return values
+
+
 @dataclass
 class Exposer:
-    """A shader that exposes a film. ``rays`` counts what was traced."""
+    """A shader that exposes a film. ``rays`` counts what is traced, by kind."""
 
     shader: Shader
     film: Film
     view: View
     workspace: Workspace
+    rays: dict[str, int]
     layers: Sequence[str] = ()  #: averaged layers to expose with the picture
-    rays: int = 0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -117,9 +178,11 @@ class Exposer:
             part, own = groups.part(start, start + step), pixel[start : start + step]
             lanes = self._lanes(part, seed, start, progressive)
             planes = self._trace(part, lanes, canvas, kept, moments)
-            for row, plane in zip(total, planes, strict=True):
+            for row, plane in zip(total, planes, strict=False):
                 row[own[0] : own[-1] + 1] += np.bincount(own - own[0], np.asarray(plane))
-            self.rays += len(own) * groups.size
+            self._count("primary", len(own) * groups.size)
+            for kind, plane in zip(self._counted.values(), planes[len(total) :], strict=True):
+                self._count(kind, round(np.sum(np.asarray(plane), dtype=np.float64)))
             advance(len(own) * groups.size)
         rays = groups.size * np.bincount(pixel, minlength=pictures * film.pixels)
         rays = rays.reshape(pictures, film.pixels)
@@ -130,6 +193,14 @@ class Exposer:
         else:
             sums = canvas.sums
         return Exposed(sums[..., :-1], sums[..., -1], rays, total[..., :3], total[..., kept:])
+
+    @property
+    def _counted(self) -> dict[str, str]:
+        """The layers that count rays, and of which kind."""
+        return {name: TABLE[name].counts for name in self.layers if TABLE[name].counts}
+
+    def _count(self, kind: str, number: int) -> None:
+        self.rays[kind] = self.rays.get(kind, 0) + number
 
     def _lanes(self, groups: Groups, seed: int, before: int, progressive: bool) -> _Lanes:
         """Return the rays of a wavefront, ``before`` groups having been traced."""
@@ -159,8 +230,8 @@ class Exposer:
     def _trace(
         self, groups: Groups, lanes: _Lanes, canvas: Canvas | None, kept: int, moments: bool
     ) -> list[Any]:
-        """Trace a wavefront onto the canvas; return sums over each group of the first ``kept`` channels, and
-        of squared colours."""
+        """Trace a wavefront onto the canvas; return sums over each group of the first ``kept`` channels, of
+        squared colours, and of numbers of rays."""
         import drjit as dr
         import mitsuba as mi
 
@@ -172,9 +243,10 @@ class Exposer:
         if self.film.alpha:
             channels.append(dr.select(values.valid, mi.Float(1), 0))
         channels += values.aovs
-        for name in self.layers:
-            channels += [mi.Float(c) for c in components(TABLE[name].value(values))]
+        layers = {name: TABLE[name].value(values) for name in self.layers}
+        channels += [mi.Float(c) for value in layers.values() for c in components(value)]
         planes = channels[:kept] + [c * c for c in channels[: 3 * moments]]
+        planes += [mi.Float(layers[name]) for name in self._counted]
         if canvas is not None:
             share = dr.gather(mi.Float, mi.Float(groups.weights), lanes.group)
             canvas.put(place, lanes.picture, [*(c * share for c in channels), share])

@@ -18,13 +18,13 @@ from collections.abc import Callable
 import numpy as np
 
 from mrt_mitsuba.output.error import ErrorEstimate
-from mrt_mitsuba.rays.film import Film
-from mrt_mitsuba.rendering.exposing import Exposed
+from mrt_mitsuba.rendering.exposing import Exposed, Exposer, Groups, Stack, box_mean
 
 HALVES = 2
 GROUP = 8  # rays that are traced together; two groups to a pixel begin
-GROWTH = 4  # times the rays there are may be there after another round: the variance is known better then
-MARGIN = 0.97  # of the target to aim at: an estimate is as often too low as too high
+STEP = (
+    1.25  # times the rays there are must be there after another round: a short one costs more than it brings
+)
 
 # Candidates for the smoothing of variances: half the width of a window, and how many rays its mean is worth
 _WINDOWS = ((1, 8), (1, 32), (2, 32), (2, math.inf), (4, math.inf), (8, math.inf))
@@ -32,52 +32,51 @@ _FLOORS = (0.003, 0.03, 0.2, 1.0)  # share of the picture's mean in the variance
 _REGION = 8  # half the width of the windows in which rays are compared with independent ones
 
 
-class Halves:
+class Halves(Stack):
     """Two half pictures, and the moments of the rays in each pixel, as they grow round by round."""
 
-    def __init__(self, film: Film, channels: int) -> None:
-        self.film, pixels = film, film.pixels
-        self.rays = np.zeros((HALVES, pixels))
-        self._total, self._square = np.zeros((2, HALVES, pixels, 3))
-        self._sums = np.zeros((HALVES, *film.shape, channels))
-        self._weights, self._amount = np.zeros((2, HALVES, *film.shape))
+    def __init__(self, exposer: Exposer, seed: int) -> None:
+        film = exposer.film
+        super().__init__(film, HALVES, len(exposer.names))
+        self._exposer, self._seed = exposer, seed
+        self._total, self._square = np.zeros((2, HALVES, film.pixels, 3))
 
-    def widened(self, groups: np.ndarray) -> np.ndarray:
-        """Return numbers of groups [2, pixels], with one group at least wherever the filter reaches from."""
-        near = np.stack([box_mean(half > 0, self.film.reach) > 0 for half in self._rows(groups)])
-        return np.maximum(groups, near.reshape(groups.shape))
+    # ------------------------------------------- Rounds ---------------------------------------------
+
+    def first(self) -> np.ndarray:
+        """Return one group for each pixel and half."""
+        return np.ones_like(self.rays, np.int64)
+
+    def cost(self, chosen: np.ndarray) -> int:
+        """Return the number of rays that groups for chosen pixels take, with those around them."""
+        return GROUP * int(self.widened(chosen).sum())
+
+    def trace(self, chosen: np.ndarray, advance: Callable[[int], object]) -> None:
+        """Trace numbers of groups, [2, pixels]."""
+        groups = Groups.spread(GROUP, self.widened(chosen), self.rays)
+        exposed = self._exposer.expose(
+            groups, self._seed, pictures=HALVES, progressive=True, moments=True, advance=advance
+        )
+        self.add(exposed, chosen > 0)
+
+    def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the picture [H, W, 3], and the standard error and the rays of each pixel, [H, W]."""
+        return self.mean()[..., :3], np.sqrt(self.variance().mean(-1)), self.samples()
 
     def add(self, exposed: Exposed, chosen: np.ndarray) -> None:
-        """Add a round whose rays went to the ``chosen`` pixels [2, pixels], and around them.
-
-        The rays of a pixel count as one in the round; so a round counts in proportion to the number of
-        independent rays that it brings to a pixel, and only where none is missing under the filter.
-        """
-        each = np.where(exposed.rays > 0, 1 / np.maximum(exposed.rays, 1), 1.0)
-        amount = self._rows(chosen) / self.film.spread_out(self._rows(each))
-        self._sums += amount[..., None] * exposed.sums
-        self._weights += amount * exposed.weights
-        self._amount += amount
-        self.rays += exposed.rays
+        super().add(exposed, chosen)
         self._total += exposed.total
         self._square += exposed.square
 
-    # ------------------------------------------- Pictures -------------------------------------------
-
-    def picture(self) -> np.ndarray:
-        """Return the mean of the halves, [H, W, channels], with the border."""
-        amount = np.maximum(self._amount, 1e-30)
-        return _divided((self._sums / amount[..., None]).sum(0), (self._weights / amount).sum(0))
+    # ------------------------------------------- Errors ---------------------------------------------
 
     def _squared_error(self) -> np.ndarray:
-        """Return an estimate for each pixel of the picture's squared error, mean of channels, [H, W].
+        """Return an estimate for each pixel of the picture's squared error, mean of colours, [H, W].
 
         The mean of two independent values has a variance of a quarter of their expected squared difference.
         """
-        first, second = (
-            _divided(s[..., :3], w) for s, w in zip(self._sums, self._weights, strict=True)
-        )
-        return np.asarray(np.square(first - second).mean(-1) / 4)
+        first, second = self.pictures()[..., :3]
+        return np.asarray(np.square(first - second, dtype=np.float64).mean(-1) / 4)
 
     def error(self) -> ErrorEstimate:
         """Return the estimated RMSE of the picture, without the border.
@@ -96,31 +95,32 @@ class Halves:
     def variance(self) -> np.ndarray:
         """Return the estimated variance of each channel in the picture, [H, W, 3], without the border."""
         moments = self._moments()
-        each = np.moveaxis((_smoothed(moments, self._rows(self.rays)[..., None], 1, 8)), -1, 1)
-        each = each / self._rows(self.rays)[:, None]
-        better = self._better(moments.mean(-1))
-        return self.film.picture(np.moveaxis(self.film.spread_out(each.sum(0)) / 4 * better, 0, -1))
+        rays = self.rows(self.rays)[..., None]
+        each = (_smoothed(moments, rays, 1, 8) / rays).sum(0)
+        spread = np.moveaxis(self.film.spread_out(np.moveaxis(each, -1, 0)), 0, -1)
+        return self.film.picture(spread / 4 * self._better(moments.mean(-1))[..., None])
 
     def samples(self) -> np.ndarray:
         """Return the rays of each pixel, [H, W], without the border."""
-        return self._inside(self._rows(self.rays).sum(0))
+        return self._inside(self.rows(self.rays).sum(0))
 
     # ------------------------------------------- Sharing --------------------------------------------
 
-    def share_out(
-        self, *, rays: float, target: float | None = None
-    ) -> np.ndarray:
+    def next(self, most: float, target: float | None) -> np.ndarray:
         """Return numbers of further groups, [2, pixels].
 
-        Enough for the RMSE to fall to ``target``, if that takes no more than ``rays`` a pixel in all.
+        Enough for an RMSE of ``target``, if that takes a mean of no more than ``most`` rays a pixel in all.
         """
         variance = self._decisive()
-        deviation, most = np.sqrt(variance), rays * self.film.pixels
+        deviation, most = np.sqrt(variance), most * self.film.pixels
         if target is not None:
             allowed = (variance / self.rays).sum() * (target / self.error().rmse) ** 2
             wanted = _water(self.rays, deviation, lambda due: (variance / due).sum() <= allowed)
-            if wanted.sum() <= most:
+            least = STEP * self.rays.sum()
+            if least <= wanted.sum() <= most:
                 return self._groups(wanted)
+            if wanted.sum() < least:
+                most = min(most, least)
         return self._groups(_water(self.rays, deviation, lambda due: due.sum() >= most))
 
     def _groups(self, due: np.ndarray) -> np.ndarray:
@@ -133,7 +133,7 @@ class Halves:
 
     def _decisive(self) -> np.ndarray:
         """Return the variance of a ray's value that decides in each half, [2, pixels]: the other half's."""
-        moments, rays = self._moments().mean(-1), self._rows(self.rays)
+        moments, rays = self._moments().mean(-1), self.rows(self.rays)
         measured = moments * self._better(moments)
         mean = measured.mean((1, 2))[:, None, None]
         best, least = measured, math.inf
@@ -151,7 +151,7 @@ class Halves:
         """Return the variance of a ray's value in each half and channel, [2, H, W, 3]."""
         rays = self.rays[..., None]
         variance = (self._square - self._total**2 / rays) / np.maximum(rays - 1, 1)
-        return self._rows(np.maximum(variance, 0))
+        return self.rows(np.maximum(variance, 0))
 
     def _better(self, moments: np.ndarray) -> np.ndarray:
         """Return the squared error over that of independent rays whose value has this variance, [H, W].
@@ -159,24 +159,13 @@ class Halves:
         Below 1 where rays are stratified, and where a filter averages pixels.
         """
         found = self._squared_error()
-        expected = self.film.spread_out((moments / self._rows(self.rays)).sum(0)) / 4
+        expected = self.film.spread_out((moments / self.rows(self.rays)).sum(0)) / 4
         few = 0.1  # windows without noise take the picture's ratio
         ratio = box_mean(found, _REGION) + few * found.mean()
         return ratio / np.maximum(box_mean(expected, _REGION) + few * expected.mean(), 1e-30)
 
-    # -------------------------------------------- Shapes --------------------------------------------
-
-    def _rows(self, values: np.ndarray) -> np.ndarray:
-        """Return a view [2, H, W, ...] of values [2, pixels, ...]."""
-        return values.reshape(HALVES, *self.film.shape, *values.shape[2:])
-
     def _inside(self, values: np.ndarray) -> np.ndarray:
         return self.film.picture(values[..., None])[..., 0]
-
-
-def _divided(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return sums [..., channels] over weights [...], as Mitsuba's films divide them."""
-    return np.asarray(sums / np.where(weights == 0, 1, weights)[..., None])
 
 
 def _smoothed(variance: np.ndarray, rays: np.ndarray, width: int, worth: float) -> np.ndarray:
@@ -195,16 +184,3 @@ def _water(have: np.ndarray, shape: np.ndarray, enough: Callable[[np.ndarray], b
         middle = (low + high) / 2
         low, high = (low, middle) if enough(np.maximum(have, middle * shape)) else (middle, high)
     return np.maximum(have, high * shape)
-
-
-def box_mean(values: np.ndarray, reach: int) -> np.ndarray:
-    """Return the means [H, W, ...] over windows of 2 reach + 1 rows and columns, cut at the border."""
-    for axis in (0, 1):
-        values = np.moveaxis(values, axis, 0)
-        size = len(values)
-        sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, 0, dtype=np.float64)])
-        first = np.maximum(np.arange(size) - reach, 0)
-        last = np.minimum(np.arange(size) + reach + 1, size)
-        counts = (last - first).reshape(-1, *([1] * (values.ndim - 1)))
-        values = np.moveaxis((sums[last] - sums[first]) / counts, 0, axis)
-    return values

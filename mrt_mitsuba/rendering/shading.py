@@ -26,10 +26,11 @@ class RayValues:
     valid: Any  # did the integrator find anything; Mitsuba's alpha
     aovs: Sequence[Any] = ()  # channels of the integrator's own
 
-    def __init__(self, view: View, ray: Any, weight: Any) -> None:
+    def __init__(self, scene: Any, view: View, ray: Any, weight: Any) -> None:
         import mitsuba as mi
 
-        self.view, self.ray, self.weight = view, ray, mi.unpolarized_spectrum(weight)
+        self.scene, self.view, self.ray = scene, view, ray
+        self.weight = mi.unpolarized_spectrum(weight)
 
     @property
     def distance(self) -> Any:
@@ -45,6 +46,50 @@ class RayValues:
         import mitsuba as mi
 
         return dr.select(self.found, mi.Vector3f(self.si.n), 0)
+
+    @property
+    def position(self) -> Any:
+        """Place of the first hit; 0 for a miss."""
+        import drjit as dr
+        import mitsuba as mi
+
+        return dr.select(self.found, mi.Vector3f(self.si.p), 0)
+
+    @property
+    def uv(self) -> Any:
+        """Texture coordinates of the first hit; 0 for a miss."""
+        import drjit as dr
+        import mitsuba as mi
+
+        return dr.select(self.found, mi.Vector2f(self.si.uv), 0)
+
+    @property
+    def shape(self) -> Any:
+        """Number of the scene's shape that is hit first, from 1; 0 for a miss."""
+        import drjit as dr
+        import mitsuba as mi
+
+        from mrt_mitsuba.plugins.lookup import ByShape
+
+        hit, shapes = mi.SurfaceInteraction3f(self.si), self.scene.shapes()
+        if mi.variant().startswith("scalar"):
+            hit.shape = hit.instance or hit.shape
+        else:
+            hit.shape = dr.select(hit.instance != None, hit.instance, hit.shape)  # noqa: E711 - lane by lane
+        return ByShape(mi.Float, shapes, range(1, len(shapes) + 1), 0.0)(hit, self.found)
+
+    @property
+    def material(self) -> Any:
+        """Number of the material that is hit first, from 1 in the order of the shapes; 0 for a miss, and in
+        an instance."""
+        import mitsuba as mi
+
+        from mrt_mitsuba.plugins.lookup import ByShape
+
+        shapes, numbers = self.scene.shapes(), dict[int, int]()
+        materials = [shape.bsdf() for shape in shapes]  # kept, so that each has an id of its own
+        rows = [numbers.setdefault(id(material), len(numbers) + 1) for material in materials]
+        return ByShape(mi.Float, shapes, rows, 0.0)(self.si, self.found)
 
     @property
     def albedo(self) -> Any:
@@ -66,12 +111,12 @@ class RayValues:
 class SampledValues(RayValues):
     """Values of any sampling integrator: the picture; Mitsuba knows the first hit."""
 
-    def __init__(self, view: View, ray: Any, weight: Any, sample: tuple[Any, Any, Any], scene: Any) -> None:
+    def __init__(self, scene: Any, view: View, ray: Any, weight: Any, sample: tuple[Any, Any, Any]) -> None:
         import mitsuba as mi
 
-        super().__init__(view, ray, weight)
+        super().__init__(scene, view, ray, weight)
         spectrum, self.valid, self.aovs = sample
-        self.scene, self.image = scene, self.rgb(mi.unpolarized_spectrum(spectrum))
+        self.image = self.rgb(mi.unpolarized_spectrum(spectrum))
 
     @cached_property
     def si(self) -> Any:
@@ -87,8 +132,8 @@ class SampledValues(RayValues):
 class LayeredValues(RayValues):
     """Values of a ``LayeredIntegrator``, all from what its ``trace`` returns."""
 
-    def __init__(self, view: View, ray: Any, weight: Any, trace: Any) -> None:
-        super().__init__(view, ray, weight)
+    def __init__(self, scene: Any, view: View, ray: Any, weight: Any, trace: Any) -> None:
+        super().__init__(scene, view, ray, weight)
         self.trace, self.image = trace, self.rgb(trace.radiance)
         self.si, self.found = trace.hit.si, trace.hit.found
         self.valid = self.found
@@ -152,7 +197,7 @@ class Shader:
         import mitsuba as mi
 
         sample = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(ray))
-        return SampledValues(view, ray, weight, sample, self.scene)
+        return SampledValues(self.scene, view, ray, weight, sample)
 
 
 class LayeredShader(Shader):
@@ -173,7 +218,7 @@ class LayeredShader(Shader):
         self.integrator.prepare(self.scene, kernel)
 
     def values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
-        return LayeredValues(view, ray, weight, self.integrator.trace(self.scene, sampler, ray))
+        return LayeredValues(self.scene, view, ray, weight, self.integrator.trace(self.scene, sampler, ray))
 
 
 def shader_for(scene: Any, integrator: Any) -> Shader:

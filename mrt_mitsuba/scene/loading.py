@@ -58,6 +58,15 @@ def load_file(path: str, **parameters: Any) -> Any:
         return _make(lambda config: mi.parser.parse_file(config, path, **given), path)
 
 
+def declared(path: str) -> dict[str, str]:
+    """Return the parameters that an XML file declares, with their defaults. Raises ``SceneError``."""
+    require_file(path)
+    with open(path, "rb") as stream:
+        tags = [tag for tag in _tags(stream.read()) if tag.startswith(b"<default")]
+    found = [{key: _text(value) for key, value in _ATTRIBUTE.findall(tag)} for tag in tags]
+    return {each.get(b"name", ""): each.get(b"value", "") for each in found}
+
+
 def _make(parse: Callable[[Any], Any], name: str) -> Any:
     """Parse, check and instantiate."""
     import mitsuba as mi
