@@ -54,7 +54,7 @@ def acne() -> str:
 
     scene = report_scene(3)
     exact = reference_render(scene, **SIZE).image
-    original = reference_render(scene, **SIZE, original=True).image
+    original = reference_render(scene, **SIZE, start="original").image
     ours = mrt.render(3, **PLAIN, aa=1, fresnel="dielectric").image
     share = [100 * np.mean(np.abs(image - exact).max(axis=-1) > 1 / 255) for image in (original, ours)]
     figures = f"original {share[0]:.3f} %, ours {share[1]:.3f} %"

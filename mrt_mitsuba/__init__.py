@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from mrt_mitsuba.rendering.api import render as render
     from mrt_mitsuba.runtime import register as register
     from mrt_mitsuba.scene.export import scene_dict as scene_dict
+    from mrt_mitsuba.sweeps import sweep as sweep
+    from mrt_mitsuba.validation.checks.bsdf import check_bsdf as check_bsdf
+    from mrt_mitsuba.validation.checks.scene import check_scene as check_scene
+    from mrt_mitsuba.validation.checks.shape import check_shape as check_shape
     from mrt_mitsuba.validation.studies.roughconductor import compare_roughconductor as compare_roughconductor
     from mrt_mitsuba.validation.tools.compare import compare as compare
     from mrt_mitsuba.validation.tools.work_precision import error_vs_time as error_vs_time
@@ -36,12 +40,16 @@ _HOME = {
     "SceneError": "mrt_mitsuba.errors",
     "UsageError": "mrt_mitsuba.errors",
     "VariantError": "mrt_mitsuba.errors",
+    "check_bsdf": "mrt_mitsuba.validation.checks.bsdf",
+    "check_scene": "mrt_mitsuba.validation.checks.scene",
+    "check_shape": "mrt_mitsuba.validation.checks.shape",
     "compare": "mrt_mitsuba.validation.tools.compare",
     "compare_roughconductor": "mrt_mitsuba.validation.studies.roughconductor",
     "error_vs_time": "mrt_mitsuba.validation.tools.work_precision",
     "register": "mrt_mitsuba.runtime",
     "render": "mrt_mitsuba.rendering.api",
     "scene_dict": "mrt_mitsuba.scene.export",
+    "sweep": "mrt_mitsuba.sweeps.run",
 }
 _SUBMODULES = ("filters",)
 

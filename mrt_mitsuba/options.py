@@ -168,6 +168,35 @@ def anything() -> Kind:
     return Kind("", "anything", str, lambda value: value)
 
 
+def rectangle() -> Kind:
+    """Column and row of the first pixel, width and height."""
+
+    def check(value: Any) -> tuple[int, int, int, int]:
+        x, y, width, height = (operator.index(number) for number in value)
+        if x < 0 or y < 0 or width < 1 or height < 1:
+            raise ValueError
+        return x, y, width, height
+
+    return Kind("", "four whole numbers: column, row, width and height in pixels", str, check)
+
+
+def parameters() -> Kind:
+    """Values by name."""
+
+    def check(value: Any) -> dict[str, Any]:
+        value = dict(value)
+        if not all(isinstance(key, str) and key for key in value):
+            raise ValueError
+        return value
+
+    return Kind(
+        "",
+        "a dict of values by names of an XML file or keys of mi.traverse, such as material_0.alpha",
+        str,
+        check,
+    )
+
+
 def path() -> Kind:
     """The path of a file."""
 

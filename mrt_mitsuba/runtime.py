@@ -5,7 +5,9 @@ from __future__ import annotations
 import warnings
 
 from mrt_mitsuba import llvm
+from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, UnknownVariantError, VariantError
+from mrt_mitsuba.memory import check_addresses
 
 FAST = "llvm_ad_rgb"
 SLOW = "scalar_rgb"
@@ -23,6 +25,7 @@ def use(variant: str | None = None) -> str:
     that cannot run here.
     """
     llvm.prepare()
+    check_addresses()
     import mitsuba as mi
 
     if variant is None:
@@ -37,6 +40,7 @@ def use(variant: str | None = None) -> str:
             mi.set_variant(variant)
         except ImportError as error:
             raise VariantError(f"the variant {variant} cannot be used: {error}") from error
+        _keep_to_quota()
     _register_plugins()
     return variant
 
@@ -111,6 +115,14 @@ def _cuda_obstacle() -> str | None:
     if dr.has_backend(dr.JitBackend.CUDA):
         return None
     return f"it needs an NVIDIA GPU with its driver, and none was found. Use {FAST} or {SLOW}."
+
+
+def _keep_to_quota() -> None:
+    """Let Dr.Jit have no more threads than cores: by itself it does not look at quotas of control groups."""
+    import drjit as dr
+
+    if dr.thread_count() > usable_cores():
+        dr.set_thread_count(usable_cores())
 
 
 def _unknown(variant: str, known: list[str]) -> str:

@@ -1,19 +1,21 @@
 """Mitsuba plugins in Dr.Jit, and the maths they share.
 
-``register()`` makes ``mrt_bsdf``, ``mrt_cone``, ``mrt_cylinder``, ``mrt_group``, ``mrt_light``, ``mrt_mesh``,
-``mrt_plane``, ``mrt_texture`` and ``mrt_whitted`` known to Mitsuba.
+``register()`` makes ``mrt_bsdf``, ``mrt_capsule``, ``mrt_cone``, ``mrt_cylinder``, ``mrt_group``,
+``mrt_light``, ``mrt_mesh``, ``mrt_plane``, ``mrt_texture`` and ``mrt_whitted`` known to Mitsuba;
+``register_modules()`` does the same for plugins of other packages.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Sequence
 from types import ModuleType
 
-MODULES = ("bsdf", "cone", "cylinder", "group", "light", "mesh", "plane", "texture", "whitted")
+MODULES = ("bsdf", "capsule", "cone", "cylinder", "group", "light", "mesh", "plane", "texture", "whitted")
 
-_loaded: dict[tuple[str, str], ModuleType] = {}
-_watching = False
+_packages: dict[str, tuple[str, ...]] = {}  # the plugin modules of each package
+_loaded: dict[tuple[str, str, str], ModuleType] = {}  # by variant, package and name
 
 
 def register() -> None:
@@ -21,41 +23,54 @@ def register() -> None:
 
     Idempotent. Raises ``RuntimeError`` where no variant is set.
     """
-    global _watching
+    register_modules(__name__, MODULES)
+
+
+def register_modules(package: str, names: Sequence[str]) -> None:
+    """Register a package's plugins in the current Mitsuba variant and in every one that is switched to later.
+
+    ``names``: the modules of ``package`` that hold the plugins, each of a class that derives from one of
+    Mitsuba's and a call such as ``mi.register_bsdf``. They are executed once for each variant. Idempotent.
+    Raises ``RuntimeError`` where no variant is set, ``ImportError`` for a module that is not there.
+    """
     import mitsuba as mi
 
     if mi.variant() is None:
-        raise RuntimeError("no Mitsuba variant is set: call mitsuba.set_variant(...) before register()")
+        raise RuntimeError(
+            "no Mitsuba variant is set: call mitsuba.set_variant(...) before registering plugins"
+        )
+    watching = bool(_packages)
+    _packages[package] = tuple(dict.fromkeys((*_packages.get(package, ()), *names)))
     _load_all(mi.variant())
-    if not _watching:
+    if not watching:
         mi.detail.add_variant_callback(lambda old, new: _load_all(new))
-        _watching = True
 
 
-def plugin(name: str) -> ModuleType:
-    """The plugin module ``name`` (e.g. "whitted") as loaded for the current variant."""
+def plugin(name: str, package: str = __name__) -> ModuleType:
+    """Return the plugin module ``name`` (e.g. "whitted") as loaded for the current variant."""
     import mitsuba as mi
 
-    return _loaded[mi.variant(), name]
+    return _loaded[mi.variant(), package, name]
 
 
 def _load_all(variant: str) -> None:
-    for name in MODULES:
-        if (variant, name) not in _loaded:
-            _loaded[variant, name] = _load(variant, name)
+    for package, names in _packages.items():
+        for name in names:
+            if (variant, package, name) not in _loaded:
+                _loaded[variant, package, name] = _load(variant, package, name)
 
 
-def _load(variant: str, name: str) -> ModuleType:
+def _load(variant: str, package: str, name: str) -> ModuleType:
     """Execute a plugin module anew: its class derives from a Mitsuba class, and each variant has its own.
 
     Mitsuba keeps registrations by variant, so once per variant is enough. Each copy gets a module name of its
     own; relative imports still resolve, because the package is the same.
     """
-    found = importlib.util.find_spec(f"{__name__}.{name}")
+    found = importlib.util.find_spec(f"{package}.{name}")
     source = found.origin if found else None
-    spec = importlib.util.spec_from_file_location(f"{__name__}.{name}_{variant}", source)
+    spec = importlib.util.spec_from_file_location(f"{package}.{name}_{variant}", source)
     if spec is None or spec.loader is None:
-        raise ImportError(f"the plugin module {name} is missing in {__name__}: install the package anew")
+        raise ImportError(f"the plugin module {name} is missing in {package}: install the package anew")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)

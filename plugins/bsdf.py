@@ -13,7 +13,7 @@ from .lobes import Lobes, Pair
 from .merged_bsdf import UniformMaterial
 from .parameters import ParameterError, choice, flag, number, spectrum
 from .protocols import MergeableBSDF
-from .variants import first, is_jit, updatable
+from .variants import first, is_jit, updatable, varies
 
 FRESNEL_FORMS = ("schlick", "dielectric", "unity")
 
@@ -113,7 +113,7 @@ class MrtBSDF(mi.BSDF):
 
     @staticmethod
     def _varies(*parameters: Any) -> bool:
-        return any(isinstance(p, mi.Texture) and _varies(p) for p in parameters)
+        return any(isinstance(p, mi.Texture) and varies(p) for p in parameters)
 
     def traverse(self, callback: Any) -> None:
         flags = mi.ParamFlags.Differentiable
@@ -221,18 +221,13 @@ class MrtBSDF(mi.BSDF):
 
     @staticmethod
     def _largest(texture: mi.Texture) -> float:
-        if _varies(texture) or mi.is_spectral:
+        if varies(texture) or mi.is_spectral:
             return float("inf")
         return max(abs(first(x)) for x in texture.eval(dr.zeros(mi.SurfaceInteraction3f)))
 
     def to_string(self) -> str:
         names = (*NUMBERS, *COLORS, "f0")
         return f"MrtBSDF[fresnel={self.fresnel}, " + ", ".join(f"{n}={getattr(self, n)}" for n in names) + "]"
-
-
-def _varies(texture: mi.Texture) -> bool:
-    """Is a texture not the same everywhere? Mitsuba's ``mesh_attribute`` denies it, and needs a shape."""
-    return texture.is_spatially_varying() or texture.class_name() == "MeshAttribute"
 
 
 class _PointParameters:

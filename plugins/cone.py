@@ -2,29 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 
-from .adapter import construct, keep_apart
-from .intersect import Frame, cone_frame
-from .parameters import flag, number, vector
-from .protocols import QuadricShape
-from .revolution import (
-    Placement,
-    QuadricTable,
-    check_axis,
-    fill,
-    refill,
-    side_count,
-    table_of,
-    unit_cone_mesh,
-    vector64,
-)
-from .variants import first, is_jit, updatable
+from .axial_mesh import axial_mesh
 
 
-class MrtCone(mi.Mesh):
+class MrtCone(axial_mesh("cone", "apex", "base_center")):  # type: ignore[misc]
     r"""A full right circular cone: lateral surface and base disc.
 
     ``mrt_whitted`` intersects the quadric and the disc themselves. To every other integrator the shape is a
@@ -63,52 +46,5 @@ class MrtCone(mi.Mesh):
     Nearest stock plugin: ``linearcurve``, whose segments of varying radius have round ends.
     """
 
-    quadric = "cone"  # what ``mrt_whitted`` intersects in place of the mesh
 
-    def __init__(self, props: mi.Properties) -> None:
-        apex, base_center = vector(props, "apex"), vector(props, "base_center")
-        radius = number(props, "radius", 1.0, above=0)
-        check_axis("mrt_cone", "apex", apex, "base_center", base_center)
-        self.capped = flag(props, "capped", True)
-        self.placement = Placement(props)
-        self.unit = unit_cone_mesh(side_count(props, 256), self.capped)
-        self.exact_frame = self.placement(cone_frame(vector64(apex), vector64(base_center), radius))
-        sizes = len(self.unit.points), len(self.unit.faces)
-        construct(self, "mrt_cone", sizes, props, normals=True, texcoords=True)
-        fill(self, self.unit, self.exact_frame)
-        self.apex, self.base_center = mi.Point3f(apex), mi.Point3f(base_center)
-        self.radius = updatable(radius)
-        keep_apart(self, "mrt_cone", sizes[1])
-
-    def frame(self) -> Frame:
-        """The shape's unit frame in world space, in double precision (see ``intersect``)."""
-        return self.exact_frame
-
-    def quadrics(self) -> QuadricTable:
-        """What ``mrt_whitted`` intersects in place of the mesh."""
-        return table_of(self.quadric, self.capped, self.exact_frame)
-
-    def traverse(self, callback: Any) -> None:
-        mi.Mesh.traverse(self, callback)
-        flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
-        for name in ("apex", "base_center", "radius"):
-            if hasattr(self, name):  # not while the mesh is being filled
-                callback.put(name, getattr(self, name), flags)
-
-    def parameters_changed(self, keys: Any = ()) -> None:
-        if not {"apex", "base_center", "radius"}.isdisjoint(keys):
-            ends = vector64(self.apex), vector64(self.base_center)
-            self.exact_frame = self.placement(cone_frame(*ends, first(self.radius)))
-            if is_jit():
-                refill(self, self.unit, self.placement(cone_frame(self.apex, self.base_center, self.radius)))
-            else:
-                fill(self, self.unit, self.exact_frame)
-        mi.Mesh.parameters_changed(self, keys)
-
-    def to_string(self) -> str:
-        ends = f"apex={list(vector64(self.apex))}, base_center={list(vector64(self.base_center))}"
-        return f"MrtCone[{ends}, radius={first(self.radius):g}, capped={self.capped}]"
-
-
-QuadricShape.register(MrtCone)
 mi.register_shape("mrt_cone", MrtCone)

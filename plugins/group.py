@@ -1,4 +1,4 @@
-"""``mrt_group``: thousands of spheres, cones or cylinders in one shape."""
+"""``mrt_group``: thousands of spheres, cones, cylinders or capsules in one shape."""
 
 from __future__ import annotations
 
@@ -7,26 +7,19 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from .adapter import construct, keep_apart, write_buffers
-from .columns import Columns, column
-from .intersect import cone_frame, cylinder_frame
+from .axial_mesh import side_count
+from .mesh_api import construct, keep_apart, write_buffers
 from .parameters import ParameterError, choice
 from .protocols import QuadricShape
-from .revolution import (
-    QuadricTable,
-    UnitMesh,
-    side_count,
-    unit_cone_mesh,
-    unit_cylinder_mesh,
-    unit_sphere_mesh,
-)
+from .quadric_kinds import KINDS, QuadricTable
+from .unit_meshes import UnitMesh
 
-# Numbers of an object: those of two points, or one, and a radius
-_WIDTH = {"sphere": 4, "cone": 7, "cylinder": 7}
+# Kinds that a group may hold
+CLOSED = tuple(name for name, kind in KINDS.items() if kind.closed)
 
 
 class MrtGroup(mi.Mesh):
-    r"""Many spheres, cones or cylinders as one shape, with per-object values for textures.
+    r"""Many spheres, cones, cylinders or capsules as one shape, with per-object values for textures.
 
     Mitsuba takes about 0.1 ms for a native shape, 1 ms for one in Python, and traces the methods of each BSDF
     that is written in Python; a group of 10⁵ objects costs as much as one shape and one BSDF. ``mrt_whitted``
@@ -35,12 +28,12 @@ class MrtGroup(mi.Mesh):
     =============== ========== ========== ==============================================================
     name            type       default    unit or range
     =============== ========== ========== ==============================================================
-    ``kind``        string     sphere     ``sphere``, ``cone`` or ``cylinder`` (both closed)
+    ``kind``        string     sphere     ``sphere``, ``cone``, ``cylinder`` (both closed) or ``capsule``
     ``numbers``     ``Bitmap`` required   float32 [n, 4] for spheres: centre, radius; [n, 7] for cones: apex,
-                                          base centre, radius, and for cylinders: p0, p1, radius
+                                          base centre, radius, and for the others: p0, p1, radius
     ``face_NAME``   ``Bitmap``            float32 [n, 1 or 3], values of the objects that a ``mesh_attribute``
                                           texture of this name looks up
-    ``segments``    integer    8          3 to 65536, sides of the stand-in of a cone or cylinder; that of a
+    ``segments``    integer    8          3 to 65536, sides of the stand-in; that of a
                                           sphere is an octahedron
     =============== ========== ========== ==============================================================
 
@@ -54,17 +47,15 @@ class MrtGroup(mi.Mesh):
     There is no XML form. Nearest stock plugin: ``ellipsoids``.
     """
 
-    quadric = "group"
-
     def __init__(self, props: mi.Properties) -> None:
-        kind = choice(props, "kind", tuple(_WIDTH))
-        numbers = _table(props, "numbers", _WIDTH[kind]).astype(np.float64)
+        kind = choice(props, "kind", CLOSED)
+        numbers = _table(props, "numbers", KINDS[kind].width).astype(np.float64)
         _check(numbers)
         attributes = {name: _table(props, name) for name in props if name.startswith("face_")}
         self.content = f"kind={kind}, objects={len(numbers)}"
-        unit = _unit_mesh(kind, side_count(props, 8))
+        unit = KINDS[kind].mesh(side_count(props, 8))
         faces = len(unit.faces)
-        self.table = QuadricTable(kind, *_frames(kind, numbers), faces * np.arange(len(numbers)))
+        self.table = QuadricTable.of_numbers(kind, numbers, faces)
         sizes = len(numbers) * len(unit.points), len(numbers) * faces
         construct(self, "mrt_group", sizes, props, normals=True)
         write_buffers(self, **_stand_in(unit, self.table))
@@ -77,6 +68,9 @@ class MrtGroup(mi.Mesh):
     def quadrics(self) -> QuadricTable:
         """What ``mrt_whitted`` intersects in place of the mesh."""
         return self.table
+
+    def moving_frame(self) -> None:
+        """Return None: its objects have no derivatives."""
 
     def to_string(self) -> str:
         return f"MrtGroup[{self.content}]"
@@ -112,25 +106,10 @@ def _check(numbers: np.ndarray) -> None:
             raise ParameterError(f'mrt_group: row {row} of "numbers" is {fault}: {numbers[row].tolist()}')
 
 
-def _frames(kind: str, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Origins [n, 3] and rows [n, 3, 3] of the unit frames."""
-    if kind == "sphere":
-        return numbers[:, :3], np.eye(3) / numbers[:, 3, None, None]
-    make = {"cone": cone_frame, "cylinder": cylinder_frame}[kind]
-    frame = make(Columns.of(numbers[:, :3]), Columns.of(numbers[:, 3:6]), column(numbers[:, 6]))
-    return numbers[:, :3], np.stack([row.array() for row in (frame.x, frame.y, frame.z)], axis=1)
-
-
-def _unit_mesh(kind: str, segments: int) -> UnitMesh:
-    if kind == "sphere":
-        return unit_sphere_mesh()
-    return (unit_cone_mesh if kind == "cone" else unit_cylinder_mesh)(segments, capped=True)
-
-
 def _stand_in(unit: UnitMesh, table: QuadricTable) -> dict[str, Any]:
-    """Buffers of the mesh of all objects; the frames of cones and cylinders are left-handed."""
+    """Buffers of the mesh of all objects; the frames of some kinds are left-handed."""
     columns = np.linalg.inv(table.rows).transpose(0, 2, 1)
-    positions = unit.points[None] @ columns + table.origins[:, None]
+    positions = unit.placed(table.extents[:, None]) @ columns + table.origins[:, None]
     normals = unit.gradients[None] @ table.rows
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
     faces = unit.faces if np.linalg.det(table.rows[0]) > 0 else unit.faces[:, ::-1]

@@ -53,10 +53,10 @@ def intersect_sphere(o, d, center, radius):
 
 # ------------------------------------ Quadrics of revolution ------------------------------------------
 #
-# A cone or cylinder is intersected in its unit frame, to which a ``Frame`` maps world space: a cone has its
-# apex at 0 and its base disc of radius 1 at z = 1, a cylinder of radius 1 lies between z = 0 and z = 1. The
-# map is affine, so it changes neither t nor what is hit, and sizes, aspect ratios and shears are gone before
-# anything is squared.
+# A quadric is intersected in its unit frame, to which a ``Frame`` maps world space: a cone has its apex at 0
+# and its base disc of radius 1 at z = 1, a cylinder of radius 1 lies between z = 0 and z = 1, the axis of a
+# capsule of radius 1 between z = 0 and z = extent, a sphere of radius 1 around 0. The map is affine, so it
+# changes neither t nor what is hit, and sizes, aspect ratios and shears are gone before anything is squared.
 #
 # The solid is convex: a line is inside it for one interval. It is cut out of the interval inside the infinite
 # quadric by the slab between the caps, so no ray slips through between two surfaces, at a rim or an apex.
@@ -76,6 +76,7 @@ class Frame:
     x: Any  # rows of the matrix, vectors
     y: Any
     z: Any
+    extent: Any = 1.0  # length of the axis in the unit frame
 
     def point(self, p: Any) -> Any:
         """A world-space point in the unit frame."""
@@ -116,6 +117,22 @@ def cone_frame(apex: Any, base_center: Any, radius: Any) -> Frame:
 def cylinder_frame(p0: Any, p1: Any, radius: Any) -> Frame:
     """Unit frame of a right circular cylinder from ``p0`` (z = 0) to ``p1`` (z = 1)."""
     return _frame_along(p0, p1 - p0, radius)
+
+
+def capsule_frame(p0: Any, p1: Any, radius: Any) -> Frame:
+    """Unit frame of a capsule: the points within ``radius`` of the segment from ``p0`` to ``p1``."""
+    frame = _frame_along(p0, p1 - p0, radius)
+    extent = dr.norm(p1 - p0) / radius
+    return Frame(frame.origin, frame.x, frame.y, frame.z * extent, extent)
+
+
+def sphere_frame(center: Any, radius: Any) -> Frame:
+    """Unit frame of a sphere."""
+    inverse = 1 / radius
+    zero = 0 * inverse
+    make = type(center)
+    x, y, z = make([inverse, zero, zero]), make([zero, inverse, zero]), make([zero, zero, inverse])
+    return Frame(center, x, y, z, 0.0)
 
 
 def _frame_along(origin: Any, axis: Any, radius: Any) -> Frame:
@@ -164,7 +181,7 @@ def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> Surf
     far = dr.select(steep, dr.select(down, dr.inf, first), second)
     inside = steep | ((discriminant >= 0) & (p.z > 0))
     # The slab has one side only, z <= 1; the apex is the other
-    to_base = (1 - p.z) / _off_zero(u.z)
+    to_base = (1 - p.z) / off_zero(u.z)
     level = u.z == 0
     enter_base = dr.select(level | down, -dr.inf, to_base)
     leave_base = dr.select(level | (u.z < 0), dr.inf, to_base)
@@ -194,7 +211,7 @@ def intersect_cylinder(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> 
     inside = dr.select(along, r <= 1, discriminant >= 0)
     level = u.z == 0
     inside = inside & dr.select(level, (p.z >= 0) & (p.z <= 1), True)
-    to_top, to_base = -p.z / _off_zero(u.z), (1 - p.z) / _off_zero(u.z)
+    to_top, to_base = -p.z / off_zero(u.z), (1 - p.z) / off_zero(u.z)
     down = u.z > 0
     enter = dr.select(level, -dr.inf, dr.minimum(to_top, to_base))
     leave = dr.select(level, dr.inf, dr.maximum(to_top, to_base))
@@ -259,6 +276,58 @@ def sphere_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
     return SurfacePoint(p - n * ((r - 1) * inverse), n, dr.select(azimuth < 0, azimuth + 1, azimuth), v)
 
 
+def intersect_capsule(o: Any, d: Any, frame: Frame) -> SurfaceHit:
+    """First intersection at t > 0 of a ray with a capsule.
+
+    A line's interval inside is that of the tube between the ends and of the two balls, taken together.
+    """
+    line, h = _line(o, d, frame), frame.extent
+    p, u = line.p, line.u
+    rho = dr.sqrt(dr.square(u.x) + dr.square(u.y))
+    r = dr.sqrt(dr.square(p.x) + dr.square(p.y))
+    moment = dr.abs(p.x * u.y - p.y * u.x)
+    meets = moment <= rho  # every ball is inside the endless tube, which meets all that is to be met
+    first, second = _roots(
+        dr.square(rho), p.x * u.x + p.y * u.y, (r - 1) * (r + 1), (rho - moment) * (rho + moment)
+    )
+    along, level = rho == 0, u.z == 0
+    to_start, to_end = -p.z / off_zero(u.z), (h - p.z) / off_zero(u.z)
+    enter = dr.select(level, -dr.inf, dr.minimum(to_start, to_end))
+    leave = dr.select(level, dr.inf, dr.maximum(to_start, to_end))
+    near = dr.maximum(dr.select(along, -dr.inf, first), enter)
+    far = dr.minimum(dr.select(along, dr.inf, second), leave)
+    in_tube = meets & dr.select(level, (p.z >= 0) & (p.z <= h), True) & dr.select(along, r <= 1, True)
+    in_tube = in_tube & (near <= far)
+    near, far = dr.select(in_tube, near, dr.inf), dr.select(in_tube, far, -dr.inf)
+    for z in (0 * h, h):
+        middle = z * u.z
+        offset = type(p)([p.x, p.y, p.z - z]) + u * middle
+        distance = dr.norm(offset)
+        half = dr.sqrt(dr.maximum((1 - distance) * (1 + distance), 0))
+        inside = distance <= 1
+        near = dr.select(inside, dr.minimum(near, middle - half), near)
+        far = dr.select(inside, dr.maximum(far, middle + half), far)
+    return _first_boundary(line, near <= far, near, LATERAL, far, LATERAL, True)
+
+
+def capsule_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
+    """Put a point near a capsule onto it, along the normal.
+
+    u = azimuth / 2π in [0, 1); v = 1 at the tip beyond p0, 3/4 and 1/4 at the rims of the tube, 0 at the
+    other tip, linear in the angle and along the tube.
+    """
+    q = frame.point(p)
+    along = dr.clip(q.z, 0, frame.extent)
+    z = q.z - along
+    r = dr.norm(type(q)([q.x, q.y, z]))
+    on_axis = r == 0
+    inverse = 1 / dr.select(on_axis, 1, r)
+    gradient = type(q)([dr.select(on_axis, 1, q.x * inverse), q.y * inverse, z * inverse])
+    surface = _surface_point(p, q, r - 1, gradient, True, frame)
+    v = 0.75 - 0.5 * along / frame.extent - dr.asin(dr.clip(gradient.z, -1, 1)) / (2 * dr.pi)
+    return SurfacePoint(surface.p, surface.n, surface.u, dr.clip(v, 0, 1))
+
+
 @dataclass
 class _Line:
     """A ray's line in the unit frame: s ↦ p + s u with |u| = 1, p · u = 0, and s = t length − start."""
@@ -279,9 +348,9 @@ def _line(o: Any, d: Any, frame: Frame) -> _Line:
     return _Line(p - u * rest, u, -(along + rest), length)
 
 
-def _off_zero(x: Any) -> Any:
-    """``x``, or a tiny number of the same sign where it is smaller."""
-    return dr.select(dr.abs(x) >= _TINY, x, dr.select(x < 0, -_TINY, _TINY))
+def off_zero(x: Any, least: float = _TINY) -> Any:
+    """``x``, or ``least`` with the same sign where it is smaller."""
+    return dr.select(dr.abs(x) >= least, x, dr.select(x < 0, -least, least))
 
 
 def _roots(a: Any, half_b: Any, c: Any, discriminant: Any) -> tuple[Any, Any]:
@@ -291,7 +360,7 @@ def _roots(a: Any, half_b: Any, c: Any, discriminant: Any) -> tuple[Any, Any]:
     """
     root = dr.sqrt(dr.maximum(discriminant, 0))
     q = dr.select(half_b >= 0, -half_b - root, root - half_b)
-    one, other = q / dr.select(a == 0, -_TINY, a), c / _off_zero(q)
+    one, other = q / dr.select(a == 0, -_TINY, a), c / off_zero(q)
     return dr.minimum(one, other), dr.maximum(one, other)
 
 

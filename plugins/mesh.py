@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .adapter import construct, write_buffers
+from .mesh_api import construct, write_buffers
 from .parameters import ParameterError
 
 

@@ -12,13 +12,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import numpy as np
 
+    from .intersect import Frame
     from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
     from .merged_bsdf import UniformMaterial
-    from .revolution import QuadricTable
+    from .quadric_kinds import QuadricTable
 
 
 class LayeredIntegrator(ABC):
-    """An integrator that plans its kernels and returns layers beside the picture."""
+    """An integrator that plans its kernels and returns layers with the picture."""
+
+    plugin_name: str  # by which it is registered
 
     @abstractmethod
     def provided_layers(self) -> frozenset[str]:
@@ -55,6 +58,10 @@ class QuadricShape(ABC):
     @abstractmethod
     def quadrics(self) -> QuadricTable:
         """Return the quadrics."""
+
+    @abstractmethod
+    def moving_frame(self) -> Frame | None:
+        """Return the unit frame of the only quadric with its derivatives; None where none are wanted."""
 
 
 class MirrorBSDF(ABC):

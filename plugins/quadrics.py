@@ -8,31 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .intersect import (
-    LATERAL,
-    Frame,
-    SurfaceHit,
-    SurfacePoint,
-    cone_surface,
-    cylinder_surface,
-    intersect_cone,
-    intersect_cylinder,
-    intersect_unit_sphere,
-    sphere_surface,
-)
+from .intersect import LATERAL, Frame, SurfaceHit, SurfacePoint
 from .lookup import aligned
-from .revolution import QuadricTable
+from .quadric_kinds import KINDS, QuadricTable
 from .tree import Tree
 from .variants import is_jit, pointer
-
-# For each kind, how to meet it and how to put a point onto it
-_KINDS = {
-    "cone": (lambda o, d, f: intersect_cone(o, d, f), cone_surface),
-    "open cone": (lambda o, d, f: intersect_cone(o, d, f, capped=False), cone_surface),
-    "cylinder": (lambda o, d, f: intersect_cylinder(o, d, f), cylinder_surface),
-    "sphere": (lambda o, d, f: intersect_unit_sphere(o, d, f), sphere_surface),
-    "open cylinder": (lambda o, d, f: intersect_cylinder(o, d, f, capped=False), cylinder_surface),
-}
 
 
 class Quadrics:
@@ -49,14 +29,16 @@ class Quadrics:
         kinds = np.repeat([self.kinds.index(t.kind) for t in tables], counts)
         origins = np.concatenate([t.origins for t in tables])  # [n, 3]
         rows = np.concatenate([t.rows for t in tables])  # [n, 3, 3]
-        boxes = _boxes(np.array(self.kinds)[kinds], origins, np.linalg.inv(rows))
+        boxes = np.concatenate([t.boxes() for t in tables])
         tree = self.tree = Tree(boxes)
-        # Four numbers at a time: a row and a coordinate of the origin, three times; kind; size of coordinates
+        # Four numbers at a time: a row and a coordinate of the origin, three times; kind; size of
+        # coordinates; extent
         table = np.zeros((tree.leaves, 4, 4), np.float32)
         table[tree.leaf_of, :3, :3] = rows
         table[tree.leaf_of, :3, 3] = origins
         table[tree.leaf_of, 3, 0] = kinds
         table[tree.leaf_of, 3, 1] = np.abs(boxes).max(axis=(1, 2))
+        table[tree.leaf_of, 3, 2] = np.concatenate([t.extents for t in tables])
         self.table = aligned(table)
         owner, faces = np.zeros((2, tree.leaves), np.uint32)
         owner[tree.leaf_of] = np.repeat(np.arange(len(shapes)), counts)
@@ -64,6 +46,11 @@ class Quadrics:
         self.shapes = dr.gather(mi.ShapePtr, pointer("Shape", shapes), mi.UInt32(owner))
         self.faces = mi.UInt32(faces)
         dr.eval(self.shapes, self.faces)
+        frames = [s.moving_frame() for s in shapes]
+        first = np.cumsum([0, *counts])
+        self.moving = [
+            (int(tree.leaf_of[k]), f) for k, f in zip(first, frames, strict=False) if f is not None
+        ]
 
     def intersect(self, ray: Any, active: Any) -> tuple[Any, Any, Any]:
         """Distance, place in the tables and part of the nearest quadric; distance ``ray.maxt`` for none."""
@@ -85,14 +72,15 @@ class Quadrics:
 
     def _frame_and_kind(self, leaf: Any, active: Any = True) -> tuple[Frame, Any]:
         x, y, z, more = (dr.gather(mi.Vector4f, self.table, 4 * leaf + k, active) for k in range(4))
-        rows = [mi.Vector3f(r.x, r.y, r.z) for r in (x, y, z)]
-        return Frame(mi.Point3f(x.w, y.w, z.w), *rows), more.x
+        origin = mi.Point3f(x.w, y.w, z.w)
+        x, y, z = (mi.Vector3f(r.x, r.y, r.z) for r in (x, y, z))
+        return Frame(origin, x, y, z, more.z), more.x
 
     def _meet(self, leaf: Any, ray: Any) -> SurfaceHit:
         frame, kind = self._frame_and_kind(leaf)
         t, part = mi.Float(dr.inf), mi.Int32(LATERAL)
         for k, name in enumerate(self.kinds):
-            hit = _KINDS[name][0](ray.o, ray.d, frame)
+            hit = KINDS[name].intersect(ray.o, ray.d, frame)
             own = kind == k
             t, part = dr.select(own, hit.t, t), dr.select(own, hit.part, part)
         return SurfaceHit(t, part)
@@ -101,15 +89,29 @@ class Quadrics:
         """Make ``si`` the interaction of ``ray`` with what ``intersect`` found."""
         t, leaf, part = hit
         frame, kind = self._frame_and_kind(leaf, where)
-        p = dr.fma(ray.d, t, ray.o)
-        surface = _KINDS[self.kinds[0]][1](p, part, frame)
+        for number, moving in self.moving:
+            own = leaf == number
+            frame = Frame(
+                *(dr.select(own, *both) for both in zip(_frame(moving), _frame(frame), strict=True))
+            )
+        if self.moving:
+            # The hit goes along the ray as the surface moves
+            surface = self._surface(ray.o + ray.d * t, part, frame, kind)
+            to_surface = dr.dot(surface.p - (ray.o + ray.d * t), surface.n)
+            t = dr.replace_grad(t, t + to_surface / dr.dot(ray.d, surface.n))
+        surface = self._surface(dr.fma(ray.d, t, ray.o), part, frame, kind)
+        _put_surface(si, t, surface, dr.gather(mi.ShapePtr, self.shapes, leaf, where), where)
+        si.prim_index = dr.select(where, dr.gather(mi.UInt32, self.faces, leaf, where), si.prim_index)
+
+    def _surface(self, p: Any, part: Any, frame: Frame, kind: Any) -> SurfacePoint:
+        """Put a point onto the quadric of this frame and kind."""
+        surface = KINDS[self.kinds[0]].surface(p, part, frame)
         for k, name in list(enumerate(self.kinds))[1:]:
-            other, own = _KINDS[name][1](p, part, frame), kind == k
+            other, own = KINDS[name].surface(p, part, frame), kind == k
             surface = SurfacePoint(
                 *(dr.select(own, a, b) for a, b in zip(_members(other), _members(surface), strict=True))
             )
-        _put_surface(si, t, surface, dr.gather(mi.ShapePtr, self.shapes, leaf, where), where)
-        si.prim_index = dr.select(where, dr.gather(mi.UInt32, self.faces, leaf, where), si.prim_index)
+        return surface
 
     def scale(self, leaf: Any, active: Any) -> Any:
         """Size of the coordinates of a quadric: the largest number in its box."""
@@ -129,7 +131,7 @@ class ScalarQuadrics:
     def intersect(self, ray: Any, active: bool) -> tuple[float, int, int]:
         best = (ray.maxt, 0, LATERAL)
         for k, thing in enumerate(self.objects if active else ()):
-            hit = _KINDS[thing.kind][0](ray.o, ray.d, thing.frame)
+            hit = KINDS[thing.kind].intersect(ray.o, ray.d, thing.frame)
             if hit.t < best[0]:
                 best = hit.t, k, hit.part
         return best
@@ -141,7 +143,7 @@ class ScalarQuadrics:
         t, k, part = hit
         if where:
             thing = self.objects[k]
-            _put_surface(si, t, _KINDS[thing.kind][1](ray(t), part, thing.frame), thing.shape, where)
+            _put_surface(si, t, KINDS[thing.kind].surface(ray(t), part, thing.frame), thing.shape, where)
             si.prim_index = thing.first_face
 
     def scale(self, k: int, active: bool) -> float:
@@ -153,13 +155,9 @@ class _ScalarObject:
 
     def __init__(self, shape: Any, table: QuadricTable, k: int) -> None:
         self.shape, self.kind, self.first_face = shape, table.kind, int(table.first_faces[k])
-        rows = table.rows[k]
-        self.frame = Frame(
-            mi.Point3f(table.origins[k].tolist()), *(mi.Vector3f(row.tolist()) for row in rows)
-        )
-        self.scale = float(
-            np.abs(_boxes(np.array([table.kind]), table.origins[k : k + 1], np.linalg.inv(rows)[None])).max()
-        )
+        x, y, z = (mi.Vector3f(row.tolist()) for row in table.rows[k])
+        self.frame = Frame(mi.Point3f(table.origins[k].tolist()), x, y, z, float(table.extents[k]))
+        self.scale = float(np.abs(table.boxes()[k]).max())
 
 
 def quadrics_of(shapes: list) -> Quadrics | ScalarQuadrics | None:
@@ -173,6 +171,14 @@ def _members(surface: SurfacePoint) -> tuple:
     return surface.p, surface.n, surface.u, surface.v
 
 
+def _frame(frame: Frame) -> tuple:
+    return (
+        mi.Vector3f(frame.origin),
+        *(mi.Vector3f(r) for r in (frame.x, frame.y, frame.z)),
+        mi.Float(frame.extent),
+    )
+
+
 def _put_surface(si: Any, t: Any, surface: SurfacePoint, shape: Any, where: Any) -> None:
     si.t = dr.select(where, t, si.t)
     si.p = dr.select(where, surface.p, si.p)
@@ -180,17 +186,3 @@ def _put_surface(si: Any, t: Any, surface: SurfacePoint, shape: Any, where: Any)
     si.sh_frame.n = dr.select(where, mi.Normal3f(surface.n), si.sh_frame.n)
     si.uv = dr.select(where, mi.Point2f(surface.u, surface.v), si.uv)
     si.shape = dr.select(where, shape, si.shape)
-
-
-def _boxes(kinds: np.ndarray, origins: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Bounding boxes [n, 2, 3] of quadrics with these origins and unit-to-world matrices [n, 3, 3]."""
-    round_ = np.char.endswith(kinds, "sphere")[:, None]
-    tip = np.char.endswith(kinds, "cone")[:, None]
-    # Half extents of the disc x² + y² <= 1, and of the ball
-    disc = np.sqrt((columns[:, :, :2] ** 2).sum(axis=2))
-    ball = np.sqrt((columns**2).sum(axis=2))
-    axis = np.where(round_, 0, columns[:, :, 2])
-    at_origin, at_end = np.where(tip, 0, np.where(round_, ball, disc)), np.where(round_, ball, disc)
-    low = np.minimum(origins - at_origin, origins + axis - at_end)
-    high = np.maximum(origins + at_origin, origins + axis + at_end)
-    return np.stack([low, high], axis=1)

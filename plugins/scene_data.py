@@ -13,11 +13,12 @@ import mitsuba as mi
 from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
 from .lookup import ByShape
 from .merged_bsdf import MergedBSDF, uniform_materials
+from .mesh_api import ray_flags, surface_interaction, vertex_version
 from .planes import Planes
 from .protocols import MirrorBSDF, PlaneShape, QuadricShape
 from .quadrics import quadrics_of
 from .spheres import Spheres, is_plain_sphere, is_sphere
-from .variants import but_not, is_jit, pointer
+from .variants import but_not, is_jit, pointer, varies
 
 # A secondary ray starts this far off its surface, relative to the size of the coordinates involved: 32
 # float32 roundings, a few times what intersection, projection and ray test lose together
@@ -68,7 +69,8 @@ class SceneReading:
     def _state(self) -> list[Any]:
         """Return what changes whenever a shape was moved, a mesh edited or a material changed."""
         materials = [b.state() for b in self.bsdfs if isinstance(b, MirrorBSDF)]
-        return [*map(_shape_state, self.shapes), *materials]
+        moving = [s.moving_frame() is not None for s in self.quadrics]
+        return [*map(_shape_state, self.shapes), *moving, *materials]
 
     def _facts(self) -> SceneFacts:
         quadrics: Counter[str] = Counter()
@@ -88,7 +90,7 @@ class SceneReading:
             surface_emitters=sum(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in self.lights),
             environment=self.environment is not None,
             mirrors=tuple(map(_mirror, filter(has_mirror, self.bsdfs))),
-            textured=any(mi.has_flag(b.flags(), mi.BSDFFlags.SpatiallyVarying) for b in self.bsdfs),
+            textured=any(map(is_textured, self.bsdfs)),
             two_sided=any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in self.bsdfs),
             unmergeable=self.unmergeable,
         )
@@ -115,11 +117,7 @@ class SceneData:
         self.light_pointers = pointer("Emitter", self.lights) if plan.lights == "loop" else None
         self.environment = reading.environment
         self.merged = MergedBSDF(reading.shapes, reading.materials) if plan.merged else None
-        self.ray_flags = +mi.RayFlags.Minimal
-        if plan.textures:
-            self.ray_flags |= +mi.RayFlags.UV
-        if plan.shading_frames:
-            self.ray_flags |= +mi.RayFlags.ShadingFrame
+        self.ray_flags = ray_flags(textures=plan.textures, shading_frames=plan.shading_frames)
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 
@@ -161,7 +159,7 @@ class SceneData:
         if self.spheres is not None and self.plan.spheres == "table" and not differentiable:
             si, scale = self.spheres.interaction(pi, ray, found)
             return si, found, scale
-        si = pi.compute_surface_interaction(ray, self.ray_flags, found)
+        si = surface_interaction(self.bvh or scene, pi, ray, self.ray_flags, found)
         if self.spheres is not None:
             self.spheres.put_back(si, found)
         return si, found, self.scales(si, found)
@@ -220,6 +218,14 @@ class SceneData:
 def has_mirror(bsdf: Any) -> bool:
     """Does a BSDF reflect like a mirror?"""
     return bsdf.has_attribute("mirror_reflectance") or mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
+
+
+def is_textured(bsdf: Any) -> bool:
+    """Does a BSDF vary over its surface? Mitsuba's own do not say so by their flags."""
+    flags = bsdf.flags()
+    if isinstance(bsdf, MirrorBSDF):
+        return mi.has_flag(flags, mi.BSDFFlags.SpatiallyVarying)
+    return any(isinstance(node, mi.Texture) and varies(node) for node in mi.traverse(bsdf).hierarchy)
 
 
 def _mirror(bsdf: Any) -> Mirror:
@@ -284,5 +290,4 @@ def _objects(scene: mi.Scene) -> list[Any]:
 
 def _shape_state(shape: Any) -> tuple:
     bbox = shape.bbox()
-    version = shape.vertex_positions_buffer().index if is_jit() and isinstance(shape, mi.Mesh) else 0
-    return (version, *bbox.min, *bbox.max)
+    return (vertex_version(shape), *bbox.min, *bbox.max)

@@ -20,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .intersect import off_zero
 from .lookup import aligned
 
 # Box tests are wider than exact by some float32 roundings, relative to distances and to coordinates
@@ -49,7 +50,7 @@ class Tree:
         hit there if that is less. With ``any_hit``, a ray is done as soon as that has happened.
         """
         # Distance to a plane across an axis: plane * inverse + shift
-        inverse = [1 / _off_zero(c) for c in ray.d]
+        inverse = [1 / off_zero(c, _LEAST_SLOPE) for c in ray.d]
         shift = [-c * i for c, i in zip(ray.o, inverse, strict=True)]
         rows = [mi.UInt32(2 * axis) + dr.select(ray.d[axis] < 0, mi.UInt32(1), 0) for axis in range(3)]
         reach = state[0]
@@ -100,10 +101,6 @@ def _to_next(node: Any, waiting: Any) -> tuple[Any, Any]:
     levels = dr.tzcnt(waiting)
     done = waiting == 0
     return dr.select(done, 0, (node >> levels) ^ 1), dr.select(done, 0, (waiting >> levels) ^ 1)
-
-
-def _off_zero(x: Any) -> Any:
-    return dr.select(dr.abs(x) >= _LEAST_SLOPE, x, dr.select(x < 0, -_LEAST_SLOPE, _LEAST_SLOPE))
 
 
 def _sort(centers: np.ndarray, depth: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What differs between Mitsuba's scalar and vectorised variants."""
+"""What differs between Mitsuba's scalar and vectorised variants, and what its objects do not say."""
 
 from __future__ import annotations
 
@@ -31,3 +31,8 @@ def updatable(number: float):
 def but_not(mask, excluded):
     """``mask & ~excluded``; on a Python bool, ~ gives a number."""
     return mask & ~excluded if is_jit() else mask and not excluded
+
+
+def varies(texture) -> bool:
+    """Is a texture not the same everywhere? Mitsuba's ``mesh_attribute`` denies it, and needs a shape."""
+    return texture.is_spatially_varying() or texture.class_name() == "MeshAttribute"

@@ -94,6 +94,8 @@ class MrtWhitted(mi.SamplingIntegrator):
     ignored.
     """
 
+    plugin_name = "mrt_whitted"
+
     def __init__(self, props: mi.Properties):
         _construct(self, props)
         self.max_depth = integer(props, "max_depth", 10, least=1)
@@ -333,4 +335,4 @@ def _construct(integrator, props) -> None:
 
 
 LayeredIntegrator.register(MrtWhitted)
-mi.register_integrator("mrt_whitted", MrtWhitted)
+mi.register_integrator(MrtWhitted.plugin_name, MrtWhitted)

@@ -18,82 +18,76 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.errors import OutputError, UsageError
+from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.output.files import replacing
 from mrt_mitsuba.validation.studies import rivals
 from mrt_mitsuba.validation.tools import kernels, machine
-from mrt_mitsuba.validation.tools.floor import floor
-from mrt_mitsuba.validation.tools.knobs import load
+from mrt_mitsuba.validation.tools.costs import scene_cost
 from mrt_mitsuba.validation.tools.report import prepare
-from mrt_mitsuba.validation.tools.warm import measure
 
 
-def _object(properties: Mapping[str, Any]) -> dict[str, Any]:
-    """The schema of an object that has all of these."""
-    return {"type": "object", "required": list(properties), "properties": dict(properties)}
+def _object(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the schema of an object that has all of these: a schema each, or what a number means."""
+    known = {
+        name: {"type": "number", "description": field} if isinstance(field, str) else dict(field)
+        for name, field in fields.items()
+    }
+    return {"type": "object", "required": list(known), "properties": known}
 
 
-def _number(description: str) -> dict[str, str]:
-    return {"type": "number", "description": description}
+def _map(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {"type": "object", "additionalProperties": dict(values)}
 
 
 _TEXT, _COUNT = {"type": "string"}, {"type": "integer"}
-KERNEL = _object(
-    {
-        "stage": {"type": "string", "description": "pass of the render"},
-        "kind": {"type": "string", "description": "traces rays, computes, or Dr.Jit's name"},
-        "hash": _TEXT,
-        "launches": _COUNT,
-        "size": {"type": "integer", "description": "threads of all launches"},
-        "operations": {"type": "integer", "description": "length of the code"},
-        "codegen": _number("seconds that Dr.Jit takes to write the code, every time"),
-        "compile": _number("seconds of the compiler, once"),
-        "seconds": _number("running, median"),
-    }
-)
-SCENE = _object(
-    {
-        "render": _number("seconds, median of warm renders"),
-        "spread": _number("(slowest - fastest) / median"),
-        "kernels": _number("seconds in kernels, of one warm render"),
-        "compile": _number("seconds of the compiler in a first render"),
-        "floor": _number("seconds of the same rays through Mitsuba's queries"),
-        "render_to_floor": _number("median of ratios of render and floor, in turn"),
-        "rays_per_second": _number("of all kinds"),
-        "command": _number("seconds of the whole command, median, kernels in the cache"),
-        "command_first": _number("seconds of the whole command, with an empty cache"),
-        "rays": {"type": "object", "additionalProperties": _COUNT},
-        "each_kernel": {"type": "array", "items": KERNEL},
-    }
-)
-RIVALS = _object(
-    {
-        "median": _number("of the ratios of seconds, ours over theirs, in turn"),
-        "low": _number("lower quartile"),
-        "high": _number("upper quartile"),
-        "seconds": _number("ours, median"),
-        "other_seconds": _number("theirs, median"),
-        "kernels": _number("ratio of the seconds in kernels"),
-    }
-)
+KERNEL = {
+    "stage": {"type": "string", "description": "pass of the render"},
+    "kind": {"type": "string", "description": "traces rays, computes, or Dr.Jit's name"},
+    "hash": _TEXT,
+    "launches": _COUNT,
+    "size": {"type": "integer", "description": "threads of all launches"},
+    "operations": {"type": "integer", "description": "length of the code"},
+    "codegen": "seconds that Dr.Jit takes to write the code, every time",
+    "compile": "seconds of the compiler, once",
+    "seconds": "running, median",
+}
+SCENE = {
+    "render": "seconds, median of warm renders",
+    "spread": "(slowest - fastest) / median",
+    "kernels": "seconds in kernels, of one warm render",
+    "compile": "seconds of the compiler in a first render",
+    "floor": "seconds of the same rays through Mitsuba's queries",
+    "render_to_floor": "median of ratios of render and floor, in turn",
+    "rays_per_second": "of all kinds",
+    "command": "seconds of the whole command, median, kernels in the cache",
+    "command_first": "seconds of the whole command, with an empty cache",
+    "rays": _map(_COUNT),
+    "each_kernel": {"type": "array", "items": _object(KERNEL)},
+}
+RIVALS = {
+    "median": "of the ratios of seconds, ours over theirs, in turn",
+    "low": "lower quartile",
+    "high": "upper quartile",
+    "seconds": "ours, median",
+    "other_seconds": "theirs, median",
+    "kernels": "ratio of the seconds in kernels",
+}
+FILE = {
+    "schema": {"const": 2},
+    "machine": _object({"cores": _COUNT, "system": _TEXT}),
+    "versions": _map(_TEXT),
+    "options": {"type": "object"},
+    "scenes": _map(_object(SCENE)),
+    "rivals": _map(_object(RIVALS)),
+}
 SCHEMA = {
     "$schema": "https://json-schema.org/draft/2020-12/schema",
     "title": "mrt-mitsuba benchmark",
-    **_object(
-        {
-            "schema": {"const": 2},
-            "machine": _object({"cores": _COUNT, "system": _TEXT}),
-            "versions": {"type": "object", "additionalProperties": _TEXT},
-            "options": {"type": "object"},
-            "scenes": {"type": "object", "additionalProperties": SCENE},
-            "rivals": {"type": "object", "additionalProperties": RIVALS},
-        }
-    ),
+    **_object(FILE),
 }
 COMPARED = ("render", "kernels", "floor", "render_to_floor", "command")
 
@@ -111,7 +105,7 @@ class Extent:
 
 
 FULL = Extent(800, 600, 4, (0, 1, 2, 3, 4), 5, rivals.Extent((400, 300), 16, (0, 1, 2, 3, 4), 5))
-QUICK = Extent(80, 60, 2, (0, 3), 1, rivals.Extent((40, 30), 4, (0,), 1))
+QUICK = Extent(80, 60, 2, (3,), 1, rivals.Extent((40, 30), 4, (0,), 1))
 
 
 def bench(extent: Extent = FULL) -> dict[str, Any]:
@@ -129,33 +123,27 @@ def bench(extent: Extent = FULL) -> dict[str, Any]:
 
 
 def _scene(number: int, extent: Extent) -> dict[str, Any]:
-    scene = load(mrt.scene_dict(number, width=extent.width, height=extent.height))
-    how: dict[str, Any] = {"aa": extent.aa, "aamode": "none"}
-    render = partial(mrt.render, scene, **how)
-    each = kernels.profile(render, repeats=extent.repeats)
-    warm = measure({"": render}, repeats=extent.repeats)[""]
-    under = floor(scene, repeats=extent.repeats, **how)
-    del scene, render
+    found = scene_cost(number, (extent.width, extent.height), extent.aa, repeats=extent.repeats)
     gc.collect()  # scenes that stay alive slow down the kernels of later ones
     kernels.forget()
     first, *commands = (_command(number, extent) for _ in range(1 + max(1, extent.repeats // 2)))
     return {
-        "render": warm.seconds,
-        "spread": warm.spread,
-        "kernels": sum(k.seconds for k in each),
-        "compile": sum(k.compile for k in each),
-        "floor": under.time.other_seconds,
-        "render_to_floor": under.time.median,
-        "rays_per_second": sum(under.rays.values()) / warm.seconds,
+        "render": found.warm.seconds,
+        "spread": found.warm.spread,
+        "kernels": found.in_kernels,
+        "compile": found.compile,
+        "floor": found.floor.other_seconds,
+        "render_to_floor": found.floor.median,
+        "rays_per_second": found.rays_per_second,
         "command": statistics.median(commands),
         "command_first": first,
-        "rays": under.rays,
-        "each_kernel": [asdict(k) for k in each],
+        "rays": found.recorded,
+        "each_kernel": [asdict(k) for k in found.each],
     }
 
 
 def _command(number: int, extent: Extent) -> float:
-    """Seconds of the command with its default options but for the size."""
+    """Return the seconds of the command with its default options but for the size."""
     with tempfile.TemporaryDirectory() as folder:
         size = [f"{name}={getattr(extent, name)}" for name in ("width", "height", "aa")]
         start = time.perf_counter()
@@ -168,7 +156,7 @@ def _command(number: int, extent: Extent) -> float:
 
 
 def table(now: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> str:
-    """The figures as text; with an earlier run, each followed by its ratio to then."""
+    """Return the figures as text; with an earlier run, each followed by its ratio to then."""
     earlier = before or {"scenes": {}, "rivals": {}}
     lines = ["scene " + "".join(f"{name:>20}" for name in COMPARED)]
     for number, found in now["scenes"].items():
@@ -179,13 +167,12 @@ def table(now: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> st
     lines += ["", f"{'ours / theirs':<{width}}{'ratio of seconds':>20}    quartiles      goal"]
     for name, found in now["rivals"].items():
         cell = _cell(found["median"], earlier["rivals"].get(name, {}).get("median"))
-        goal = "" if "goal" not in found else f"  {found['goal']:g} {_verdict(found)}"
+        verdict = "met" if found["high"] <= found.get("goal", 0) else "missed"
+        if found["low"] <= found.get("goal", 0) < found["high"]:
+            verdict = "not decided"
+        goal = f"  {found['goal']:g} {verdict}" if "goal" in found else ""
         lines.append(f"{name:<{width}}{cell:>20}    {found['low']:.2f} to {found['high']:.2f}{goal}")
     return "\n".join(lines)
-
-
-def _verdict(found: Mapping[str, float]) -> str:
-    return "met" if found["median"] <= found["goal"] else "missed"
 
 
 def _cell(value: float, earlier: float | None) -> str:
@@ -193,12 +180,12 @@ def _cell(value: float, earlier: float | None) -> str:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """An earlier run. Raises ``UsageError`` for a file that is none."""
+    """Return an earlier run. Raises ``UsageError`` for a file that is none."""
     try:
         found = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise UsageError(f"cannot compare with {path}: {error}") from error
-    whole = isinstance(found, dict) and found.keys() >= set(SCHEMA["required"])
+    whole = isinstance(found, dict) and found.keys() >= FILE.keys()
     if not whole or found["schema"] != 2:
         raise UsageError(f"cannot compare with {path}: it is no file of this benchmark (schema 2)")
     return found
@@ -224,9 +211,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prepare(given.out.parent, given.out.name)
     except UsageError as error:
         parser.error(str(error))
-    except OutputError as error:
+    except MrtError as error:
         print(f"make bench: {error}", file=sys.stderr)
-        return OutputError.exit_code
+        return error.exit_code
     with kernels.own_cache():  # seconds of compilation are then the compiler's
         now = bench(QUICK if given.quick else FULL)
     with replacing(given.out) as file:

@@ -36,10 +36,20 @@ COMMANDS = {
         "write a scene as Mitsuba XML; --stock: with stock plugins only",
         "mrt_mitsuba.command.export:run",
     ),
+    "sweep": Command(
+        "OUT FILE.toml [workers=N] [cluster=ADDRESS]",
+        "render the grid in a file on several processes or machines",
+        "mrt_mitsuba.command.sweep:run",
+    ),
     "diff": Command(
         "A.exr B.exr [layer=NAME] [rmse=LIMIT] [flip=LIMIT] [out=PATH]",
         "compare two pictures; exit code 1 beyond a limit, 2 if they do not compare",
         "mrt_mitsuba.validation.tools.commands:diff",
+    ),
+    "check": Command(
+        "SCENE|scene=PATH [out=DIR] [quick=1]",
+        "check the laws of every BSDF, shape and emitter, and find pixels that are not finite",
+        "mrt_mitsuba.validation.checks.scene:command",
     ),
     "error-vs-time": Command(
         "SCENE|scene=PATH cases=FILE.toml [out=DIR]",

@@ -13,8 +13,10 @@ from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, is_obj
 
 def run(options: Options) -> int:
     """Render and write what the options say; return the exit code."""
+    from mrt_mitsuba.memory import check_addresses
     from mrt_mitsuba.output.files import check_target
 
+    check_addresses()
     for path in options.outputs():
         check_target(path)
     from mrt_mitsuba.rendering.api import render

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, Any
 
+from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
 from mrt_mitsuba.output.layers import LAYERS
 
@@ -90,18 +91,18 @@ def write_exr(
     attributes |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     # The library does not report a full disk when it opens the file itself, so the file is ours.
     picture = OpenEXR.File(attributes, _channels(image, layers or {}))
-    with replacing(path) as file, _compressing():
+    with replacing(path) as file, compressing():
         picture.write(_Stream(file))
 
 
 @contextlib.contextmanager
-def _compressing() -> Iterator[None]:
+def compressing() -> Iterator[None]:
     """Let the EXR library compress in threads, to the same file. They are gone afterwards: a process that is
     forked while it has some waits for them for ever."""
     import OpenEXR
 
     before = OpenEXR.global_thread_count()
-    OpenEXR.set_global_thread_count(os.cpu_count() or 1)
+    OpenEXR.set_global_thread_count(usable_cores())
     try:
         yield
     finally:

@@ -53,14 +53,14 @@ class Bundle:
             pixel = dr.gather(mi.UInt32, mi.UInt32(self.pixels), order)
         # Sizes are data, not constants: another picture size needs no other kernel
         numbers = self._numbers(width, height, dr.opaque, Divisor.opaque)
-        return self._samples(lane, order, pixel, rest, numbers)
+        return self._samples(order, pixel, rest, numbers)
 
     def each_sample(self, width: int, height: int) -> Iterator[Samples]:
         """Yield the same, one ray at a time, for scalar variants."""
         numbers = self._numbers(width, height, lambda kind, value: kind(value), Divisor)
         for lane in range(self.ray_count):
             order, rest = divmod(lane, self.rays_per_pixel)
-            yield self._samples(lane, order, int(self.pixels[order]), rest, numbers)
+            yield self._samples(order, int(self.pixels[order]), rest, numbers)
 
     def _numbers(
         self, width: int, height: int, number: Number, divisor: Callable[[int], Divisor]
@@ -72,11 +72,12 @@ class Bundle:
             height=number(mi.UInt32, height),
             repeats=divisor(self.repeats),
             first=number(mi.UInt32, self.first),
+            rays_per_pixel=number(mi.UInt64, self.rays_per_pixel),
             aa=divisor(self.lattice.aa),
             shutter=self.shutter.numbers(number) if self.shutter else (),
         )
 
-    def _samples(self, lane: Any, order: Any, pixel: Any, rest: Any, numbers: _Numbers) -> Samples:
+    def _samples(self, order: Any, pixel: Any, rest: Any, numbers: _Numbers) -> Samples:
         import mitsuba as mi
 
         row, column = numbers.width.divide(pixel)
@@ -86,7 +87,8 @@ class Bundle:
             (mi.Float(row) + y) / mi.Float(numbers.height),
         )
         time = self.shutter.time(rest, pixel, *numbers.shutter) if self.shutter else mi.Float(0)
-        return Samples(lane=lane, order=order, is_first=rest == 0, place=place, time=time)
+        number = mi.UInt64(pixel) * numbers.rays_per_pixel + mi.UInt64(rest)
+        return Samples(number=number, order=order, is_first=rest == 0, place=place, time=time)
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,7 @@ class _Numbers:
     height: Any
     repeats: Divisor
     first: Any
+    rays_per_pixel: Any
     aa: Divisor
     shutter: tuple[Any, ...]
 
@@ -105,7 +108,7 @@ class _Numbers:
 class Samples:
     """Where rays of a bundle start: one ray, or arrays of them."""
 
-    lane: Any  #: number of the ray in the bundle
+    number: Any  #: of the ray, among as many of each pixel of the picture
     order: Any  #: place of its pixel in the bundle
     is_first: Any  #: is it the first ray of its pixel
     place: Any  #: on the film, x to the right, y down; the picture is [0, 1]²

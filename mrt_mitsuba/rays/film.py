@@ -57,9 +57,9 @@ class Film:
         rows, columns = (slice(self.border, n - self.border) for n in self.shape)
         return sampled[..., rows, columns, :]
 
-    def framed(self, picture: np.ndarray) -> np.ndarray:
-        """Return a picture [H, W] with the film's border, which is 0."""
-        return np.pad(picture, self.border)
+    def framed(self, picture: np.ndarray, value: object) -> np.ndarray:
+        """Return a picture [H, W] with the film's border around it, of one value."""
+        return np.pad(picture, self.border, constant_values=value)
 
     def toned(self, colors: np.ndarray) -> np.ndarray:
         """Return colours [..., 3] as the film keeps them."""

@@ -34,14 +34,17 @@ def _sampler_class(variant: str) -> type:
 
         def start(self, seed: int, first: int, count: int) -> None:
             """Turn to the rays ``first`` to ``first + count - 1``."""
-            high, low = divmod(first, 2**32)
-            seed = (seed + high * _STRIDE) % 2**32
+            self.start_at(seed, dr.arange(mi.UInt64, count) + dr.opaque(mi.UInt64, first))
+
+        def start_at(self, seed: int, number: Any) -> None:
+            """Turn to the rays of these numbers, or of this one in scalar variants."""
             if mi.variant().startswith("scalar"):
-                state, sequence = mi.sample_tea_32(seed, low)
+                seed = (seed + (number >> 32) * _STRIDE) % 2**32
+                state, sequence = mi.sample_tea_32(seed, number % 2**32)
             else:
-                mi.Sampler.seed(self, seed, count)
-                lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, low)
-                state, sequence = mi.sample_tea_32(dr.opaque(mi.UInt32, seed), lane)
+                mi.Sampler.seed(self, seed, dr.width(number))
+                start = dr.opaque(mi.UInt32, seed) + mi.UInt32(number >> 32) * _STRIDE
+                state, sequence = mi.sample_tea_32(start, mi.UInt32(number))
             self.random = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
 
         def next_1d(self, active: Any = True) -> Any:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba import runtime
+from mrt_mitsuba.memory import Budget, Workspace
 from mrt_mitsuba.output.layers import AVERAGED, TABLE
 from mrt_mitsuba.output.result import Result, Timings
 from mrt_mitsuba.rays.exposure import Exposure
@@ -21,8 +22,7 @@ from mrt_mitsuba.rays.film import pixel_format
 from mrt_mitsuba.rays.lattice import FILM
 from mrt_mitsuba.rendering.defaults import decided
 from mrt_mitsuba.rendering.film_passes import FilmPasses
-from mrt_mitsuba.rendering.job import Job, counting_kernels
-from mrt_mitsuba.rendering.memory import Workspace
+from mrt_mitsuba.rendering.job import Job, Kernels, counting_kernels
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import FilmFacts, Plan, RenderFacts, make_plan
 from mrt_mitsuba.rendering.progress import Progress
@@ -63,13 +63,14 @@ def render(
     fov: float | None = None,
     light: Sequence[float] | None = None,
     sensor: int = 0,
-    params: Mapping[str, Any] | None = None,
     variant: str | None = None,
     memory: int | str | None = None,
     seed: int = 0,
     integrator: Any = None,
     spp: int | None = None,
     count_rays: bool = False,
+    params: Mapping[str, Any] | None = None,
+    region: Sequence[int] | None = None,
     progress: Progress | None = None,
 ) -> Result:
     """Render a scene.
@@ -99,7 +100,6 @@ def render(
         convention: meaning of MTL files, "report" or "standard".
         texturing, camera, up, fov, light: of an OBJ file, see ``scene.placement.model_scene``.
         sensor: number of the sensor in a scene that has several.
-        params: values for the ``$parameters`` of an XML file, by name.
         variant: Mitsuba variant; by default the current one, else ``llvm_ad_rgb``.
         memory: bytes (or text such as "4G") to stay within.
         seed: for whatever is random.
@@ -110,6 +110,10 @@ def render(
             know the variance of every pixel and take only for an edge what noise does not explain; with one
             random ray they take noise for edges, and refine it ("geometry" does not).
         count_rays: count mirror and shadow rays.
+        params: values for the ``$names`` that an XML file declares, and, by keys of ``mi.traverse`` (which
+            have a dot), of a scene that is loaded here.
+        region: column, row, width and height of the pixels to return, in place of all; they are the same as
+            in the whole picture.
         progress: told of plan, stages and progress.
 
     Raises:
@@ -142,13 +146,14 @@ def render(
         fov=fov,
         light=light,
         sensor=sensor,
-        params=params,
         variant=variant,
         memory=memory,
         seed=seed,
         integrator=integrator,
         spp=spp,
         count_rays=count_rays,
+        params=params,
+        region=region,
     )
     return render_with(scene, settings, Progress() if progress is None else progress)
 
@@ -156,46 +161,45 @@ def render(
 def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Result:
     """Render a scene as ``render`` does."""
     start = time.perf_counter()
-    with counting_kernels() as kernels:
+    with counting_kernels(progress) as kernels:
         variant = runtime.use(settings.variant)
         runtime.warn_if_slow()
+        budget = Budget.of(settings.memory)
         source = open_scene(
             scene,
             width=settings.width,
             height=settings.height,
             fresnel=settings.fresnel,
             integrator=settings.integrator,
+            budget=budget,
             sensor=settings.sensor,
             params=settings.params,
             model=settings.model(),
         )
         with sized(source):
-            result = _render(source, settings, variant, progress, start)
+            result = _render(source, settings, budget, kernels, start)
     log.info("%d kernels: compiled in %.3f s, ran for %.3f s", kernels.launches, kernels.compile, kernels.run)
-    timings = replace(
-        result.timings,
-        total=time.perf_counter() - start,
-        compile=kernels.compile,
-        kernels=kernels.run,
-    )
+    total = time.perf_counter() - start
+    timings = replace(result.timings, total=total, compile=kernels.compile, kernels=kernels.run)
     return replace(result, timings=timings, kernel_launches=kernels.launches)
 
 
 def _render(
-    source: Source, settings: RenderSettings, variant: str, progress: Progress, start: float
+    source: Source, settings: RenderSettings, budget: Budget, kernels: Kernels, start: float
 ) -> Result:
-    """Render an open scene; what kernels took is not in the result."""
+    """Render an open scene; what its kernels took in all is not in the result."""
     shader = shader_for(source.scene, source.integrator)
-    facts = _facts(source, shader, variant, settings)
+    facts = _facts(source, shader, settings)
     settings = decided(settings, facts)
     plan = make_plan(facts, settings)
     exposures = _exposures(plan, settings.seed)
-    job = Job(progress, _workspace(plan, exposures, settings.memory))
-    progress.plan(plan)
+    job = Job(kernels.progress, _workspace(plan, exposures, budget), kernels)
+    job.progress.plan(plan)
     shader.prepare(plan.kernel)
     load = time.perf_counter() - start
-    log.info("scene %s loaded in %.3f s for %s", source.name, load, variant)
-    tracer = Tracer(shader, View(source.sensor, source.width, source.height, settings.motion), job.workspace)
+    log.info("scene %s loaded in %.3f s for %s", source.name, load, plan.variant)
+    view = View(source.sensor, source.width, source.height, settings.motion)
+    tracer = Tracer(shader, view, job.workspace)
     kind = FilmPasses if plan.lattice.kind == FILM else Passes
     goal = Goal(
         settings.rmse,
@@ -213,17 +217,32 @@ def _render(
         fresnel=source.fresnel,
         focaldist=plan.focus.distance or 0.0,
         focalrange=plan.focus.range,
-        variant=variant,
+        variant=plan.variant,
+        integrator=plan.integrator,
     )
     image, layers = _mean(total, plan)
-    timings = Timings(0.0, load, 0.0, 0.0, job.passes)
-    return Result(image, layers, plan, timings, tracer.rays, 0, options, passes.error, tuple(passes.rounds))
+    return Result(
+        image,
+        layers,
+        plan,
+        Timings(0.0, load, 0.0, 0.0, job.passes),
+        tracer.rays,
+        0,
+        options,
+        runtime.versions(),
+        view.matrices(),
+        frozenset(budget.pictures),
+        passes.error,
+        tuple(passes.rounds),
+    )
 
 
-def _facts(source: Source, shader: Shader, variant: str, settings: RenderSettings) -> RenderFacts:
+def _facts(source: Source, shader: Shader, settings: RenderSettings) -> RenderFacts:
+    import mitsuba as mi
+
     return RenderFacts(
         scene=source.name,
-        variant=variant,
+        variant=str(mi.variant()),
         integrator=shader.name,
         width=source.width,
         height=source.height,
@@ -256,14 +275,14 @@ def _exposures(plan: Plan, seed: int) -> list[Exposure]:
     return [replace(whole, seed=seed + 2 * frame, frame=frame) for frame in range(plan.frames)]
 
 
-def _workspace(plan: Plan, exposures: Sequence[Exposure], memory: int | None) -> Workspace:
+def _workspace(plan: Plan, exposures: Sequence[Exposure], budget: Budget) -> Workspace:
     return Workspace.beside(
-        plan.width,
-        plan.height,
+        plan.seen.width,
+        plan.seen.height,
         plan.channels,
         pictures=min(len(exposures), 2),  # the frames' sum, and one of them
         rays_per_pixel=exposures[0].rays_per_pixel,
-        memory=memory,
+        budget=budget,
     )
 
 
@@ -278,14 +297,14 @@ def _add(total: dict[str, np.ndarray], picture: dict[str, np.ndarray]) -> None:
 
 def _mean(total: dict[str, np.ndarray], plan: Plan) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return the mean picture [H, W, 3] and its layers by EXR channel, [H, W] each; all are views."""
-    shape, layers = (plan.height, plan.width), {}
+    shape, inside, layers = (plan.seen.height, plan.seen.width), plan.region.inside(plan.seen), {}
     for name, values in total.items():
         own = name not in TABLE  # a channel of the film's or the integrator's
         if plan.frames > 1 and (own or TABLE[name].source == AVERAGED):
             values /= np.float32(plan.frames)
         if own:
-            layers[name] = values.reshape(shape)
+            layers[name] = values.reshape(shape)[inside]
         elif name in plan.layers:
             for index, letter in enumerate(TABLE[name].letters):
-                layers[f"{name}.{letter}"] = values[:, index].reshape(shape)
-    return total["image"].reshape(*shape, 3), dict(sorted(layers.items()))
+                layers[f"{name}.{letter}"] = values[:, index].reshape(shape)[inside]
+    return total["image"].reshape(*shape, 3)[inside], dict(sorted(layers.items()))

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from mrt_mitsuba.memory import Workspace
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.divisor import Divisor
 from mrt_mitsuba.rays.film import Canvas, Film
 from mrt_mitsuba.rays.sampler import ray_sampler
 from mrt_mitsuba.rays.sequence import pixel_sequence
-from mrt_mitsuba.rendering.memory import Workspace
 from mrt_mitsuba.rendering.shading import Shader, components
 from mrt_mitsuba.rendering.view import View
 
@@ -219,7 +219,9 @@ class Exposer:
             sampler.start(first + number, mi.sample_tea_32(key, dr.opaque(mi.UInt32, seed))[0])
         elif own.class_name() == "IndependentSampler":
             sampler = ray_sampler()
-            sampler.start(seed, before * groups.size, rays)
+            # numbered as Mitsuba numbers the rays of a whole picture
+            number = mi.UInt64(pixel) * dr.opaque(mi.UInt64, groups.size) + mi.UInt64(number)
+            sampler.start_at(seed, number)
         else:
             sampler = own.clone()
             sampler.set_sample_count(groups.size)

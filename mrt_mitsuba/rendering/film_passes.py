@@ -7,6 +7,7 @@ import numpy as np
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.exposure import Exposure
 from mrt_mitsuba.rays.film import Film
+from mrt_mitsuba.rays.region import Region
 from mrt_mitsuba.rendering.exposing import Exposer, Groups, Stack
 from mrt_mitsuba.rendering.job import Job
 from mrt_mitsuba.rendering.noise import Halves
@@ -22,11 +23,17 @@ class FilmPasses(Passes):
     def __init__(self, job: Job, tracer: Tracer, plan: Plan, exposure: Exposure, goal: Goal) -> None:
         super().__init__(job, tracer, plan, exposure, goal)
         self._film = Film.of(tracer.view.sensor)
+        whole = Region(0, 0, plan.width, plan.height)
+        self._seen = plan.seen.inside(whole)
+        # pixels whose rays reach what is seen, as the film numbers them
+        near = np.zeros((plan.height, plan.width), bool)
+        near[plan.seen.grown(self._film.reach, plan.width, plan.height).inside(whole)] = True
+        self._near = self._film.framed(near, True).ravel()
 
     def _render(self, step: Pass) -> None:
         """Expose every pixel alike."""
         exposer, rays = self._exposer(step), self._film.rays_near(step.samples * step.repeats)
-        groups = Groups.uniform(np.arange(self._film.pixels), rays)
+        groups = Groups.uniform(np.flatnonzero(self._near), rays)
         moments = "square" in step.layers
         self._stack = Stack(self._film, 1, len(exposer.names))
         with self._job.stage(step.name, len(groups) * rays) as advance:
@@ -35,13 +42,15 @@ class FilmPasses(Passes):
         if moments:
             mean, square = (self._stack.rows(v)[0] / rays for v in (exposed.total, exposed.square))
             variance = np.maximum(square - mean**2, 0) / (rays - 1) * self._film.averaging
-            self._add("square")[:] = self._film.picture(variance).reshape(-1, 3)
+            self._set("square", self._film.picture(variance))
         self._develop(exposer, self._stack)
 
     def _refine(self, step: Pass) -> None:
         """Expose the pixels at edges further."""
         film, rays = self._film, self._film.rays_near(step.samples * step.repeats)
-        edges = film.framed(self._picture("samples") > 1).reshape(1, -1)
+        edges = np.zeros((self._plan.height, self._plan.width), bool)
+        edges[self._seen] = self._picture("samples") > 1
+        edges = film.framed(edges, False).reshape(1, -1)
         exposer = self._exposer(step)
         groups = Groups.uniform(np.flatnonzero(self._stack.widened(edges)[0]), rays)
         with self._job.stage(step.name, len(groups) * rays, "Computing Anti aliasing..") as advance:
@@ -56,12 +65,9 @@ class FilmPasses(Passes):
         self.error = halves.error()
         self._develop(exposer, halves)
         variance = halves.variance()
-        for name, values in (
-            ("variance", variance),
-            ("error", np.sqrt(variance.mean(-1))),
-            ("samples", halves.samples()),
-        ):
-            self._add(name)[:] = values.reshape(len(self._pixels), -1)
+        self._set("variance", variance)
+        self._set("error", np.sqrt(variance.mean(-1, keepdims=True)))
+        self._set("samples", halves.samples()[..., None])
 
     def _variance(self, rows: slice) -> np.ndarray:
         return self._picture("square")[rows]
@@ -73,8 +79,9 @@ class FilmPasses(Passes):
 
     def _develop(self, exposer: Exposer, stack: Stack) -> None:
         """Turn what is exposed into layers."""
-        picture = stack.mean().reshape(len(self._pixels), -1)
-        self._add("image")[:] = self._film.toned(picture[:, :3])
+        picture = stack.mean()
+        self._set("image", self._film.toned(picture[..., :3]))
+        picture = picture[self._seen].reshape(len(self._pixels), -1)
         for name, channel in zip(exposer.names[3:], picture[:, 3:].T, strict=True):
             own, _, letter = name.partition(".")
             if own in exposer.layers:
@@ -83,3 +90,7 @@ class FilmPasses(Passes):
                 self.layers[own][:, TABLE[own].letters.index(letter)] = channel
             else:
                 self.channels[name] = channel.astype(np.float32)
+
+    def _set(self, name: str, picture: np.ndarray) -> None:
+        """Make a layer of what is seen of a picture [H, W, channels]."""
+        self._add(name)[:] = picture[self._seen].reshape(len(self._pixels), -1)

@@ -8,50 +8,67 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from mrt_mitsuba.rendering.memory import Workspace
+from mrt_mitsuba.memory import Workspace
 from mrt_mitsuba.rendering.progress import Advance, Progress
 
 log = logging.getLogger(__name__)
 
 
 @dataclass
+class Kernels:
+    """What Dr.Jit did: kernels launched, and seconds that it compiled and ran them."""
+
+    progress: Progress
+    launches: int = 0
+    compile: float = 0.0
+    run: float = 0.0
+
+    def collect(self) -> None:
+        """Add up what Dr.Jit recorded since the last call. Records hold the kernels' text: many take room."""
+        import drjit as dr
+
+        records = dr.kernel_history()
+        self.progress.kernels(records)
+        own = [record for record in records if record["type"] == dr.KernelType.JIT]
+        self.launches += len(own)
+        self.compile += sum(record["codegen_time"] + record["backend_time"] for record in own) / 1000
+        self.run += sum(record["execution_time"] for record in own) / 1000
+
+
+@contextmanager
+def counting_kernels(progress: Progress) -> Iterator[Kernels]:
+    """Let Dr.Jit record its kernels meanwhile, and add them up."""
+    import drjit as dr
+
+    kernels = Kernels(progress)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        yield kernels
+        kernels.collect()
+
+
+@dataclass
 class Job:
-    """Progress and memory of a render, and the seconds of its passes."""
+    """Progress, memory and kernels of a render, and the seconds of its passes."""
 
     progress: Progress
     workspace: Workspace
+    kernels: Kernels
     passes: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def stage(self, name: str, total: int, message: str = "") -> Iterator[Advance]:
         """Open a stage of the progress, and measure its time."""
+        self.kernels.collect()
         start = time.perf_counter()
         with self.progress.stage(name.capitalize(), total, message) as advance:
-            yield advance
+
+            def advance_and_collect(steps: int) -> None:
+                advance(steps)
+                self.kernels.collect()
+
+            yield advance_and_collect
+            self.kernels.collect()
         seconds = time.perf_counter() - start
         self.passes[name] = self.passes.get(name, 0.0) + seconds
         log.info("%s: %d pixels in %.3f s", name, total, seconds)
-
-
-@dataclass
-class Kernels:
-    """What Dr.Jit did: kernels launched, and seconds that it compiled and ran them."""
-
-    launches: int = 0
-    compile: float = 0.0
-    run: float = 0.0
-
-
-@contextmanager
-def counting_kernels() -> Iterator[Kernels]:
-    """Let Dr.Jit keep a record of its kernels meanwhile; it is added up at the end."""
-    import drjit as dr
-
-    kernels = Kernels()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        yield kernels
-        history = dr.kernel_history([dr.KernelType.JIT])
-    kernels.launches = len(history)
-    kernels.compile = sum(entry["codegen_time"] + entry["backend_time"] for entry in history) / 1000
-    kernels.run = sum(entry["execution_time"] for entry in history) / 1000

@@ -31,8 +31,8 @@ class Passes:
     def __init__(self, job: Job, tracer: Tracer, plan: Plan, exposure: Exposure, goal: Goal) -> None:
         self._job, self._tracer = job, tracer
         self._plan, self._exposure, self._goal = plan, exposure, goal
-        self._shape = plan.height, plan.width
-        self._pixels = range(plan.width * plan.height)
+        self._shape = plan.seen.height, plan.seen.width
+        self._pixels = plan.seen.pixels(plan.width)
         self.layers: dict[str, np.ndarray] = {}
         self.channels: dict[str, np.ndarray] = {}  # [pixels], of the film's and the integrator's own
         self.error: ErrorEstimate | None = None
@@ -68,19 +68,19 @@ class Passes:
         for name in step.layers:
             self._add(name)
         with self._job.stage(step.name, len(bundle.pixels)) as advance:
-            for pixels, values in self._tracer.trace(bundle, step.layers, seed=self._exposure.seed):
-                rows = slice(pixels.start, pixels.stop)
+            for part, values in self._tracer.trace(bundle, step.layers, seed=self._exposure.seed):
                 for name, channel, plane in _channels(values):
-                    self.layers[name][rows, channel] = plane
-                advance(len(pixels))
+                    self.layers[name][part, channel] = plane
+                advance(part.stop - part.start)
 
     def _refine(self, step: Pass) -> None:
         """Add the lattice's other samples in the pixels at edges."""
         count, seed = np.count_nonzero(self.layers["samples"] > 1), self._exposure.seed + 1
         with self._job.stage(step.name, int(count), "Computing Anti aliasing..") as advance:
-            for before, edges in self._edges():
-                bundle = self._exposure.lattice(edges, first=step.first)
-                for pixels, values in self._tracer.trace(bundle, step.layers, seed=seed, before=before):
+            for edges in self._edges():
+                bundle = self._exposure.lattice(self._indices(edges), first=step.first)
+                for part, values in self._tracer.trace(bundle, step.layers, seed=seed):
+                    pixels = edges[part]
                     for name, channel, plane in _channels(values):
                         total = step.first * self.layers[name][pixels, channel] + bundle.count * plane
                         self.layers[name][pixels, channel] = total / np.float32(self._plan.lattice.count)
@@ -94,10 +94,10 @@ class Passes:
         def trace(aa: int, pixels: np.ndarray) -> np.ndarray:
             """Set pixels to the mean of a lattice; return their colours, [pixels, 3]."""
             exposure = replace(self._exposure, samples=replace(self._plan.lattice, aa=aa))
-            bundle = exposure.lattice(pixels)
+            bundle = exposure.lattice(np.asarray(self._pixels, np.uint32)[pixels])
             for part, values in self._tracer.trace(bundle, step.layers, seed=exposure.seed + aa):
                 for name, channel, plane in _channels(values):
-                    self.layers[name][part, channel] = plane
+                    self.layers[name][pixels[part], channel] = plane
             return self.layers["image"][pixels]
 
         levels = Levels(self._shape, self._plan.lattice.kind, trace)
@@ -106,15 +106,19 @@ class Passes:
         _, errors, samples = levels.maps()
         self._add("error")[:, 0], self._add("samples")[:, 0] = errors.ravel(), samples.ravel()
 
-    def _edges(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield edge pixels, some rows at a time: how many came before, and their indices."""
-        samples, step = self.layers["samples"][:, 0], self._rows_at_once * self._plan.width
-        before = 0
+    def _edges(self) -> Iterator[np.ndarray]:
+        """Yield edge pixels by their place in the layers, some rows at a time."""
+        samples, step = self.layers["samples"][:, 0], self._rows_at_once * self._shape[1]
         for start in range(0, len(samples), step):
             edges = np.flatnonzero(samples[start : start + step] > 1)
             if len(edges):
-                yield before, edges.astype(np.uint32) + np.uint32(start)
-            before += len(edges)
+                yield edges.astype(np.uint32) + np.uint32(start)
+
+    def _indices(self, places: np.ndarray) -> np.ndarray:
+        """Return where in the picture these pixels of the layers are."""
+        if isinstance(self._pixels, range):
+            return places + np.uint32(self._pixels.start)
+        return np.asarray(self._pixels[places])
 
     # -------------------------------------------- Filters --------------------------------------------
 
@@ -167,18 +171,18 @@ class Passes:
                 image[band.rows] = blurred[band.inner]
                 if amount is not None:
                     amount[band.rows] = filters.blur_amount(depth[band.rows], **focus)
-                advance((band.stop - band.start) * self._plan.width)
+                advance((band.stop - band.start) * self._shape[1])
 
     def _bands(self, halo: int) -> Iterator[Any]:
         from mrt_mitsuba.filters.bands import bands
 
         rows = self._rows_at_once
-        yield from bands(self._plan.height, rows, halo)
-        self._job.workspace.after_filter(min(rows, self._plan.height) * self._plan.width)
+        yield from bands(self._shape[0], rows, halo)
+        self._job.workspace.after_filter(min(rows, self._shape[0]) * self._shape[1])
 
     @property
     def _rows_at_once(self) -> int:
-        return self._job.workspace.rows_at_once(self._plan.width)
+        return self._job.workspace.rows_at_once(self._shape[1])
 
     # -------------------------------------------- Layers --------------------------------------------
 

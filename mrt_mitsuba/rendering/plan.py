@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.output import layers
 from mrt_mitsuba.output.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rays.lattice import FILM, Lattice
+from mrt_mitsuba.rays.region import Region
 from mrt_mitsuba.rendering import kernel_text
 from mrt_mitsuba.rendering.detectors import DETECTORS
 from mrt_mitsuba.rendering.settings import NOISE, Focus, RenderSettings
@@ -25,7 +28,7 @@ _WHY = {
     "one-sample": "aa=1 has no further samples to add",
     "all-samples": "aamode=none gives every pixel all its samples",
     "no-focus": "no focal distance",
-    "unused": "nothing needs it",
+    "not-needed": "nothing needs it",
     "not-asked-for": "not asked for",
     "noise": "rounds go where the variance is",
     "linear-rgb": "pictures are linear sRGB, whose luminance or XYZ follow",
@@ -100,10 +103,12 @@ class Pass:
             where = "a pixel" if self.name == RENDERING else "and more in edge pixels"
             return f"{self.samples * self.repeats} rays {where}, placed and filtered by the film"
         times = f", {self.repeats} rays each" if self.repeats > 1 else ""
+        shown = [name for name in LAYERS if name in self.layers]
+        layers = f", with {', '.join(shown)}" if shown else ""
         noise = ", noise will count as edges: variance needs spp >= 2" if self.noisy else ""
         return {
-            FIRST_HITS: "first hits: 1 ray through the centre of a pixel",
-            RENDERING: f"{self.samples} sample{'s' if self.samples > 1 else ''} a pixel{times}",
+            FIRST_HITS: f"first hits: 1 ray through the centre of a pixel{layers}",
+            RENDERING: f"{self.samples} sample{'s' if self.samples > 1 else ''} a pixel{times}{layers}",
             EDGES: f"edges: {self.mode}{noise}",
             REFINEMENT: f"{self.samples} further samples in edge pixels{times}",
             BLUR: f"depth of field: {self.mode}",
@@ -120,6 +125,7 @@ class Plan:
     integrator: str  #: name of its plugin
     width: int  #: pixels
     height: int  #: pixels
+    region: Region  #: that is returned
     lattice: Lattice  #: where the samples of a pixel lie
     detector: str | None  #: edge detector; None where every pixel gets all samples at once
     blur: str | None  #: depth-of-field mode
@@ -155,12 +161,21 @@ class Plan:
         return frozenset(step.name for step in self.passes)
 
     @property
+    def seen(self) -> Region:
+        """The region with the pixels around it that filters look at."""
+        reach = (edges.REACH if self.detector else 0) + (dof.REACH if self.blur else 0)
+        return self.region.grown(reach, self.width, self.height)
+
+    @property
     def frames(self) -> int:
         """Pictures to average, each with filters of its own."""
         return self.motion_samples if self.motion == "frames" and (self.detector or self.blur) else 1
 
     def __str__(self) -> str:
         lines = [f"Plan for {self.scene}, {self.width}x{self.height}, {self.integrator} in {self.variant}"]
+        part = self.region
+        if (part.width, part.height) != (self.width, self.height):
+            lines += [f"  region  {part.width}x{part.height} from column {part.x}, row {part.y}"]
         moments = {"stratified": "at least {} moments in a pixel", "film": "each ray at its own moment"}
         if self.motion:
             text = moments.get(self.motion, "{} frames").format(self.motion_samples)
@@ -193,6 +208,7 @@ def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
         integrator=facts.integrator,
         width=facts.width,
         height=facts.height,
+        region=_region(settings.region, facts),
         lattice=lattice,
         detector=detector,
         blur=blur,
@@ -207,6 +223,13 @@ def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
         film=facts.film,
         left_out=tuple(_left_out(traced, facts, made, settings)),
     )
+
+
+def _region(asked: Sequence[int] | None, facts: RenderFacts) -> Region:
+    region = Region(*(asked or (0, 0, facts.width, facts.height)))
+    if region.x + region.width > facts.width or region.y + region.height > facts.height:
+        raise UsageError(f"region={asked}: it exceeds the picture, {facts.width}x{facts.height} pixels")
+    return region
 
 
 def _check_layers(asked: frozenset[str], facts: RenderFacts, settings: RenderSettings) -> None:
@@ -295,7 +318,7 @@ def _left_out(
     if BLUR not in made:
         left_out.append(Omission(BLUR, "no-focus"))
     if "depth" not in traced:
-        left_out.append(Omission("depth", "unused"))
+        left_out.append(Omission("depth", "not-needed"))
     skipped = [name for name in LAYERS if name in facts.layers - traced - {"depth"}]
     left_out += [Omission(name, "not-asked-for") for name in skipped]
     return left_out + _film_left_out(facts, settings)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator
-from typing import TextIO
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TextIO
 
 Advance = Callable[[int], object]
 
@@ -15,6 +15,9 @@ class Progress:
 
     def plan(self, plan: object) -> None:
         """Called once, before anything is traced, with the render plan."""
+
+    def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
+        """Called now and then with what Dr.Jit recorded of its kernels since the last call."""
 
     @contextlib.contextmanager
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
@@ -26,7 +29,7 @@ class Progress:
 
 
 class TerminalProgress(Progress):
-    """Prints messages, and a bar if ``bar_file`` is a terminal.
+    """Prints messages, and a bar if ``bar_file`` is a terminal, or in a notebook.
 
     ``show_plan``: whether to print the render plan. Messages go to ``file``, bars to ``bar_file``; these
     count in ``unit``.
@@ -53,10 +56,10 @@ class TerminalProgress(Progress):
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
         if message:
             print(message, file=self.file, flush=True)
-        if not self.bar_file.isatty():
+        if not (self.bar_file.isatty() or "ipykernel" in sys.modules):
             yield lambda steps: None
             return
-        from tqdm import tqdm
+        from tqdm.auto import tqdm
 
         with tqdm(
             total=total,

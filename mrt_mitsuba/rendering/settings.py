@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,8 @@ from mrt_mitsuba.options import (
     integer,
     number,
     option,
+    parameters,
+    rectangle,
     size,
     subset,
     switch,
@@ -121,7 +124,6 @@ class RenderSettings:
     seed: int = option(0, integer(0, 2**32 - 1), "seed where anything is random")
     integrator: object = option(None, anything())
     sensor: int = option(0, integer(0, 65535), "number of the sensor, in a scene that has several")
-    params: object = option(None, anything())
     on_round: object = option(None, anything())
     spp: int | None = option(
         None,
@@ -130,6 +132,8 @@ class RenderSettings:
         "1",
     )
     count_rays: bool = option(False, switch())
+    params: Mapping[str, Any] | None = option(None, parameters())
+    region: tuple[int, int, int, int] | None = option(None, rectangle())
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -167,7 +171,8 @@ class RenderSettings:
 
     def in_force(self, **decided: Any) -> dict[str, Any]:
         """Return the options that shape the picture, by name, with those that the scene ``decided``."""
-        values = {name: getattr(self, name) for name in TABLE if name != "memory"} | decided
+        names = (*(name for name in TABLE if name != "memory"), "params", "region")
+        values = {name: getattr(self, name) for name in names} | decided
         return {name: value for name, value in values.items() if value is not None}
 
 

@@ -208,7 +208,7 @@ class LayeredShader(Shader):
         self.facts = integrator.scene_facts(scene)
         self.kernel = integrator.kernel_plan(self.facts)
         self.random = self.kernel.random
-        self.name = "mrt_whitted"
+        self.name = integrator.plugin_name
 
     @property
     def layers(self) -> frozenset[str]:

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from mrt_mitsuba.memory import Workspace
 from mrt_mitsuba.output.layers import AVERAGED, FIRST_HIT, TABLE
 from mrt_mitsuba.output.layers import channels as channel_count
 from mrt_mitsuba.rays.bundle import Bundle, Samples
 from mrt_mitsuba.rays.sampler import ray_sampler
-from mrt_mitsuba.rendering.memory import Workspace
 from mrt_mitsuba.rendering.shading import Shader, components
 from mrt_mitsuba.rendering.view import View
 
@@ -37,16 +37,13 @@ class Tracer:
     rays: dict[str, int] = field(default_factory=lambda: {"primary": 0})
 
     def trace(
-        self, bundle: Bundle, layers: frozenset[str], *, seed: int = 0, before: int = 0
-    ) -> Iterator[tuple[Any, Channels]]:
+        self, bundle: Bundle, layers: frozenset[str], *, seed: int = 0
+    ) -> Iterator[tuple[slice, Channels]]:
         """Trace a bundle, in parts that fit into the workspace or of one pixel.
 
-        Yields the pixels of each part and the layers there, to be read before the next part is asked for.
-        Values do not depend on the parts.
-
-        Args:
-            layers: names of layers of the first hit and averaged ones; nothing else is computed.
-            before: pixels already traced with this seed, whose random numbers are not to be used again.
+        Yields which of the bundle's pixels are in a part, and the layers there, to be read before the next
+        part is asked for. Values do not depend on the parts. ``layers`` names those of the first hit and
+        averaged ones; nothing else is computed.
         """
         import mitsuba as mi
 
@@ -56,10 +53,11 @@ class Tracer:
         log.debug("tracing %d rays, at most %d at once", bundle.ray_count, rays_at_once)
         step = max(1, rays_at_once // bundle.rays_per_pixel)
         for start in range(0, len(bundle.pixels), step):
-            part = bundle.part(start, min(start + step, len(bundle.pixels)))
-            values = trace(part, names, seed, (before + start) * bundle.rays_per_pixel)
+            stop = min(start + step, len(bundle.pixels))
+            part = bundle.part(start, stop)
+            values = trace(part, names, seed)
             self._count(part, values)
-            yield part.pixels, values
+            yield slice(start, stop), values
         self.workspace.after_rays(min(rays_at_once, bundle.ray_count), channels)
 
     def _count(self, bundle: Bundle, values: Channels) -> None:
@@ -70,12 +68,12 @@ class Tracer:
                 count = round(bundle.rays_per_pixel * float(np.sum(first, dtype=np.float64)))
                 self.rays[kind] = self.rays.get(kind, 0) + count
 
-    def _wavefront(self, bundle: Bundle, names: Sequence[str], seed: int, first_ray: int) -> Channels:
+    def _wavefront(self, bundle: Bundle, names: Sequence[str], seed: int) -> Channels:
         import drjit as dr
 
         samples, sampler = bundle.samples(self.view.width, self.view.height), self._sampler()
         if sampler is not None:
-            sampler.start(seed, first_ray, bundle.ray_count)
+            sampler.start_at(seed, samples.number)
         values = self.shader.trace(names, self.view, samples, sampler)
         if bundle.rays_per_pixel == 1:
             dr.eval(values)
@@ -85,12 +83,12 @@ class Tracer:
         # LLVM's arrays are not copied
         return {name: [np.asarray(c, np.float32) for c in channels] for name, channels in result.items()}
 
-    def _one_by_one(self, bundle: Bundle, names: Sequence[str], seed: int, first_ray: int) -> Channels:
+    def _one_by_one(self, bundle: Bundle, names: Sequence[str], seed: int) -> Channels:
         pixels = {name: np.zeros((len(bundle.pixels), TABLE[name].channels)) for name in names}
         sampler = self._sampler()
         for samples in bundle.each_sample(self.view.width, self.view.height):
             if sampler is not None:
-                sampler.start(seed, first_ray + samples.lane, 1)
+                sampler.start_at(seed, samples.number)
             for name, value in self.shader.trace(names, self.view, samples, sampler).items():
                 if TABLE[name].source == AVERAGED:
                     pixels[name][samples.order] += np.array(value) / bundle.rays_per_pixel

@@ -5,7 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from mrt_mitsuba.scene import shapes as models
-from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere, Vector
+from mrt_mitsuba.scene.model import (
+    Camera,
+    Cone,
+    Cylinder,
+    Light,
+    Material,
+    Mesh,
+    Plane,
+    Scene,
+    Sphere,
+    Vector,
+)
 
 EVENING = (0.75, 0.45, 0.3)
 DAY = (0.45, 0.65, 0.9)
@@ -45,19 +56,9 @@ def scene_5() -> Scene:
 def scene_6() -> Scene:
     """A camp: tents between firs, a fire of logs, and its smoke's light."""
     grass, canvas, green = matte(0.22, 0.36, 0.12), matte(0.8, 0.62, 0.3), matte(0.08, 0.3, 0.12)
-    bark, stone = matte(0.3, 0.18, 0.1), matte(0.45, 0.43, 0.42)
+    bark = matte(0.3, 0.18, 0.1)
     flame = Material(0.0, 0.5, NOTHING, (1.6, 0.7, 0.15))
-    angles = 2 * np.pi * np.arange(9) / 9
-    stones = [
-        models.rock((0.42 * np.cos(a), 0.03, 0.42 * np.sin(a)), 0.09, stone, seed=k)
-        for k, a in enumerate(angles)
-    ]
-    logs = tuple(
-        Cylinder(
-            (0.28 * np.cos(a), 0.05, 0.28 * np.sin(a)), (0.03 * np.cos(a), 0.3, 0.03 * np.sin(a)), 0.045, bark
-        )
-        for a in angles[::2].tolist()
-    )
+    stones, logs = _fireplace(bark)
     seats = (
         Cylinder((-1.0, 0.1, 0.5), (-0.55, 0.1, 1.15), 0.1, bark),
         Cylinder((1.15, 0.1, 0.1), (0.9, 0.1, 0.85), 0.1, bark),
@@ -86,6 +87,22 @@ def scene_6() -> Scene:
             *stones,
         ),
     )
+
+
+def _fireplace(bark: Material) -> tuple[list[Mesh], tuple[Cylinder, ...]]:
+    """Return a ring of stones around the origin, and logs that lean against each other."""
+    angles, stone = 2 * np.pi * np.arange(9) / 9, matte(0.45, 0.43, 0.42)
+    stones = [
+        models.rock((0.42 * np.cos(a), 0.03, 0.42 * np.sin(a)), 0.09, stone, seed=k)
+        for k, a in enumerate(angles)
+    ]
+    logs = tuple(
+        Cylinder(
+            (0.28 * np.cos(a), 0.05, 0.28 * np.sin(a)), (0.03 * np.cos(a), 0.3, 0.03 * np.sin(a)), 0.045, bark
+        )
+        for a in angles[::2].tolist()
+    )
+    return stones, logs
 
 
 def scene_7() -> Scene:

@@ -30,9 +30,9 @@ def scene_dict(
 
     ``flavor``: "mrt" for this project's plugins; "stock" for the nearest equivalents among Mitsuba's, which
     any Mitsuba program opens: ``roughplastic`` for the material, ``point`` lights as bright at the camera's
-    target, finite squares for planes, ``cylinder`` and two ``disk`` for a cylinder, ``bitmap`` for a texture,
-    and ``path`` with few bounces for the integrator. Cones and meshes have none but in a file of their own,
-    which ``write_xml`` writes.
+    target, finite squares for planes, ``cylinder`` and two ``disk`` for a cylinder, two ``sphere`` for a
+    capsule, ``bitmap`` for a texture, and ``path`` with few bounces for the integrator. Cones and meshes
+    have none but in a file of their own, which ``write_xml`` writes.
 
     Raises ``UsageError`` for a scene, flavor, size or formula that there is not, ``SceneError`` for a stock
     flavor that cannot be had.
@@ -52,9 +52,10 @@ def write_xml(
 ) -> None:
     """Write a scene as XML through Mitsuba's own writer.
 
-    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file beside it,
-    named after the XML file and the shape. Raises ``OutputError`` if a file cannot be written, ``SceneError``
-    for groups of objects (``mrt_group``), which have neither an XML form nor a stock counterpart.
+    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file
+    beside it, named after the XML file and the shape. Raises ``OutputError`` if a file cannot be written,
+    ``SceneError`` for groups of objects (``mrt_group``), which have neither an XML form nor a stock
+    counterpart.
     """
     from mrt_mitsuba.output.files import replacing
 
@@ -136,8 +137,8 @@ def _stock(scene_as_dict: dict[str, Any], scene: Scene) -> dict[str, Any]:
             raise SceneError(
                 f"{name} has no counterpart among Mitsuba's plugins: {kind} {_WITHOUT_STOCK[kind]}"
             )
-        if kind == "mrt_cylinder":
-            result |= {f"{name}_{part}": child for part, child in _stock_cylinder(node).items()}
+        if kind in ("mrt_cylinder", "mrt_capsule"):
+            result |= {f"{name}_{part}": child for part, child in _stock_tube(node).items()}
         else:
             result[name] = _REPLACEMENTS[kind](node, scene) if kind in _REPLACEMENTS else node
     return result
@@ -183,8 +184,8 @@ def _stock_plane(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
     return {"type": "rectangle", "to_world": _facing(foot, normal, STOCK_EXTENT / 2), "bsdf": node["bsdf"]}
 
 
-def _stock_cylinder(node: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """An open tube and a disc at each end that faces away from the other."""
+def _stock_tube(node: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """An open tube, and at each end a disc that faces away from the other, or a ball."""
     p0, p1, radius = node["p0"], node["p1"], node["radius"]
 
     def disc(center: list[float], opposite: list[float]) -> dict[str, Any]:
@@ -192,6 +193,9 @@ def _stock_cylinder(node: dict[str, Any]) -> dict[str, dict[str, Any]]:
         return {"type": "disk", "to_world": _facing(center, away, radius), "bsdf": node["bsdf"]}
 
     tube = {"type": "cylinder", "p0": p0, "p1": p1, "radius": radius, "bsdf": node["bsdf"]}
+    if node["type"] == "mrt_capsule":
+        balls = ({"type": "sphere", "center": p, "radius": radius, "bsdf": node["bsdf"]} for p in (p0, p1))
+        return {"tube": tube, **dict(zip(("ball0", "ball1"), balls, strict=True))}
     return {"tube": tube, "disc0": disc(p0, p1), "disc1": disc(p1, p0)}
 
 
@@ -225,7 +229,7 @@ _REPLACEMENTS: dict[str, Callable[[dict[str, Any], Scene], dict[str, Any]]] = {
 _IN_FILES = {"mrt": ("mrt_mesh",), "stock": ("mrt_mesh", "mrt_cone")}
 _WITHOUT_XML = {
     "mrt_mesh": "write_xml, or mrt export, puts it into a file beside the XML",
-    "mrt_group": "render it from Python, or write at most 1000 spheres, 100 cones and 100 cylinders",
+    "mrt_group": "render it from Python, or write at most 1000 spheres or 100 objects of another kind",
 }
 _WITHOUT_STOCK = {
     "mrt_mesh": "is made of arrays, and ply reads a file; write_xml, or mrt export, puts it beside the XML",

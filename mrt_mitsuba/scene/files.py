@@ -108,6 +108,28 @@ def find(name: str, folders: list[Path]) -> Path | None:
     return None
 
 
+def picture_size(path: str) -> tuple[int, int] | None:
+    """Return width and height of a picture without reading its pixels; None if its header does not tell."""
+    import OpenEXR
+    from PIL import Image
+
+    try:
+        with open(path, "rb") as file:
+            if file.read(4) == b"\x76\x2f\x31\x01":
+                low, high = OpenEXR.File(path, header_only=True).header()["dataWindow"]
+                return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+            try:
+                with Image.open(path) as picture:
+                    return picture.size
+            finally:
+                Image.MAX_IMAGE_PIXELS = limit
+    except Exception:  # whatever libraries raise of broken files; who reads the pixels reports it
+        return None
+
+
 @dataclass
 class Findings:
     """Warnings of one reading: the first of each kind is shown, with the number of those like it."""

@@ -20,9 +20,11 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.scene.files import require_file
+from mrt_mitsuba.memory import Budget
+from mrt_mitsuba.scene.files import picture_size, require_file
 
 DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from about 3000 on
+_PICTURES = ("mrt_texture", "bitmap", "envmap")  # plugins that read one
 _NATIVE = (".so", ".dylib", ".dll")
 
 # The lines of a traceback, which are indented but for the first, and the type of this project's error
@@ -33,19 +35,22 @@ _TRACEBACK = re.compile(
 _CODE_PLACE = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
 
 
-def load_dict(scene: Mapping[str, Any], name: str = "the dict") -> Any:
-    """Return what a Mitsuba dict describes. Raises ``SceneError`` that calls it ``name``."""
+def load_dict(scene: Mapping[str, Any], name: str = "the dict", budget: Budget | None = None) -> Any:
+    """Return what a Mitsuba dict describes.
+
+    Raises ``SceneError`` that calls it ``name``, and ``UsageError`` for a texture too large for the budget.
+    """
     import mitsuba as mi
 
     with _resolving(None):
         _check_dict(scene, name)
-        return _make(lambda config: mi.parser.parse_dict(config, scene), name)
+        return _make(lambda config: mi.parser.parse_dict(config, scene), name, budget)
 
 
-def load_file(path: str, **parameters: Any) -> Any:
+def load_file(path: str, budget: Budget | None = None, **parameters: Any) -> Any:
     """Return the scene of an XML file, with values for the ``$parameters`` that it declares.
 
-    Raises ``SceneError``, and ``UsageError`` for a file of another kind.
+    Raises ``SceneError``, and ``UsageError`` for another kind of file or a texture too large for the budget.
     """
     import mitsuba as mi
 
@@ -55,7 +60,7 @@ def load_file(path: str, **parameters: Any) -> Any:
     given = {key: str(value) for key, value in parameters.items()}
     with _resolving(os.path.dirname(path) or "."):
         _check_xml(path, given)
-        return _make(lambda config: mi.parser.parse_file(config, path, **given), path)
+        return _make(lambda config: mi.parser.parse_file(config, path, **given), path, budget)
 
 
 def declared(path: str) -> dict[str, str]:
@@ -67,7 +72,7 @@ def declared(path: str) -> dict[str, str]:
     return {each.get(b"name", ""): each.get(b"value", "") for each in found}
 
 
-def _make(parse: Callable[[Any], Any], name: str) -> Any:
+def _make(parse: Callable[[Any], Any], name: str, budget: Budget | None) -> Any:
     """Parse, check and instantiate."""
     import mitsuba as mi
 
@@ -77,10 +82,13 @@ def _make(parse: Callable[[Any], Any], name: str) -> Any:
         state = parse(config)
         mi.set_file_resolver(_mitsuba_first())  # a <path> of the file puts its folder before
         for node in state.nodes:
-            _check_plugin(node.props.plugin_name(), name)
-            filename = node.props.get("filename", None)
+            kind, filename = node.props.plugin_name(), node.props.get("filename", None)
+            _check_plugin(kind, name)
             if isinstance(filename, str):
                 _check_data(filename)
+                size = picture_size(_resolved(filename)) if kind in _PICTURES else None
+                if budget is not None and size is not None:
+                    budget.take_texture(filename, *size, around=kind == "envmap")
         mi.parser.transform_all(config, state)
         return mi.parser.instantiate(config, state)
     except RuntimeError as error:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import SceneError
+from mrt_mitsuba.plugins.quadric_kinds import KINDS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -100,6 +101,16 @@ class Cylinder:
     material: Material
 
 
+@dataclass(frozen=True)
+class Capsule:
+    """All points within the radius of the segment from p0 to p1."""
+
+    p0: Vector
+    p1: Vector
+    radius: float
+    material: Material
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Flat triangles of one material; a normal is on the side from which corners run counter-clockwise."""
@@ -122,6 +133,7 @@ class Scene:
     cones: tuple[Cone, ...] = ()
     cylinders: tuple[Cylinder, ...] = ()
     meshes: tuple[Mesh, ...] = ()
+    capsules: tuple[Capsule, ...] = ()
     texturing: str = "report"  # or "standard": bilinear, sRGB-aware
     focal_distance: float | None = None
     focal_range: float = FOCAL_RANGE
@@ -135,10 +147,10 @@ class Scene:
         _check(self)
         materials = _Materials(lambda m: _mrt_bsdf(m, fresnel, self.texturing))
         shapes: dict[str, Any] = {}
-        for kind, objects in (("sphere", self.spheres), ("cone", self.cones), ("cylinder", self.cylinders)):
-            single, grouped = _split(objects)
+        for kind in OBJECTS:
+            single, grouped = _split(getattr(self, f"{kind}s"))
             for i, thing in enumerate(single):
-                shapes[f"{kind}_{i}"] = {**_OBJECTS[kind](thing), "bsdf": materials.reference(thing.material)}
+                shapes[f"{kind}_{i}"] = {**_shape(kind, thing), "bsdf": materials.reference(thing.material)}
             if grouped:
                 shapes[f"{kind}s"] = _group(kind, grouped, materials, fresnel)
         for i, p in enumerate(self.planes):
@@ -207,10 +219,10 @@ def _check(scene: Scene) -> None:
         raise SceneError(f"sky is {scene.sky!r}, but must be three finite numbers: red, green and blue")
     if scene.texturing not in ("report", "standard"):
         raise SceneError(f"texturing is {scene.texturing!r}, but must be report or standard")
-    for kind, objects in (("sphere", scene.spheres), ("cone", scene.cones), ("cylinder", scene.cylinders)):
-        for i, thing in enumerate(objects):
-            numbers = _NUMBERS[kind](thing)  # the radius last
-            if not _all_finite(numbers, _WIDTHS[kind]) or not numbers[-1] > 0:
+    for kind in OBJECTS:
+        for i, thing in enumerate(getattr(scene, f"{kind}s")):
+            numbers = _numbers(thing)  # the radius last
+            if not _all_finite(numbers, KINDS[kind].width) or not numbers[-1] > 0:
                 raise SceneError(f"{kind}s[{i}] is {thing!r}, but must have finite places and a radius > 0")
 
 
@@ -266,32 +278,29 @@ def _rgb(color: Color) -> dict[str, Any]:
     return {"type": "rgb", "value": list(color)}
 
 
-_OBJECTS: dict[str, Callable[[Any], dict[str, Any]]] = {
-    "sphere": lambda s: {"type": "sphere", "center": list(s.center), "radius": float(s.radius)},
-    "cone": lambda c: {
-        "type": "mrt_cone",
-        "apex": list(c.apex),
-        "base_center": list(c.base_center),
-        "radius": float(c.radius),
-    },
-    "cylinder": lambda y: {
-        "type": "mrt_cylinder",
-        "p0": list(y.p0),
-        "p1": list(y.p1),
-        "radius": float(y.radius),
-    },
-}
-_NUMBERS: dict[str, Callable[[Any], tuple[float, ...]]] = {
-    "sphere": lambda s: (*s.center, s.radius),
-    "cone": lambda c: (*c.apex, *c.base_center, c.radius),
-    "cylinder": lambda y: (*y.p0, *y.p1, y.radius),
-}
-_WIDTHS = {"sphere": 4, "cone": 7, "cylinder": 7}
+# What the plugins of the same names draw; the fields but for the material are their parameters
+OBJECTS: dict[str, type] = {"sphere": Sphere, "cone": Cone, "cylinder": Cylinder, "capsule": Capsule}
+
+
+def _parameters(thing: Any) -> dict[str, Any]:
+    return {f.name: getattr(thing, f.name) for f in fields(thing) if f.name != "material"}
+
+
+def _shape(kind: str, thing: Any) -> dict[str, Any]:
+    *points, (name, radius) = _parameters(thing).items()
+    plugin = "sphere" if kind == "sphere" else f"mrt_{kind}"
+    return {"type": plugin, **{key: list(point) for key, point in points}, name: float(radius)}
+
+
+def _numbers(thing: Any) -> tuple[float, ...]:
+    *points, radius = _parameters(thing).values()
+    return (*(x for point in points for x in point), radius)
+
 
 # More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape
 # and more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of
 # recursion
-_MOST_SINGLE = {Sphere: 1000, Cone: 100, Cylinder: 100}
+_MOST_SINGLE = {Sphere: 1000, Cone: 100, Cylinder: 100, Capsule: 100}
 
 
 def _split(objects: tuple) -> tuple[tuple, tuple]:
@@ -312,7 +321,7 @@ def _group(kind: str, objects: tuple, materials: _Materials, fresnel: str) -> di
     shape = {
         "type": "mrt_group",
         "kind": kind,
-        "numbers": mi.Bitmap(np.array([_NUMBERS[kind](o) for o in objects], np.float32)),
+        "numbers": mi.Bitmap(np.array([_numbers(o) for o in objects], np.float32)),
     }
     own = [o.material for o in objects]
     if len(set(own)) == 1:

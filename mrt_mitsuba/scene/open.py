@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, is_obj
+from mrt_mitsuba.scene.parameters import set_parameters
 from mrt_mitsuba.scene.placement import model_scene
 from mrt_mitsuba.scene.report import report_scene
 
@@ -39,30 +41,40 @@ def open_scene(
     height: int | None = None,
     fresnel: str | None = None,
     integrator: Any = None,
+    budget: Budget | None = None,
     sensor: int = 0,
     params: Mapping[str, Any] | None = None,
     model: Mapping[str, Any] | None = None,
 ) -> Source:
-    """Load a scene; see ``render`` for what it may be. ``model``: options of ``model_scene``.
+    """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``.
 
-    Raises ``SceneError`` or ``UsageError``.
+    ``budget``: memory from which its textures take theirs; ``model``: options of ``model_scene``.
     """
-    if params and not _is_xml(scene):
-        raise UsageError(f"params={dict(params)!r}: only an XML file declares parameters")
     if model and not is_obj(scene) and model.keys() != {"convention"}:
         raise UsageError(f"{next(k for k in model if k != 'convention')} is of use only with an OBJ file")
     name, own = _model(scene, model or {})
+    # a key of mi.traverse has a dot, the name of a parameter of an XML file has none
+    keys = {key: value for key, value in (params or {}).items() if "." in key}
+    declared = {key: value for key, value in (params or {}).items() if "." not in key}
+    if declared and not _is_xml(scene):
+        raise UsageError(
+            f"params: {next(iter(declared))} is no key of mi.traverse, and only an XML file declares names"
+        )
     if own is None:
         if fresnel is not None:
             raise UsageError(
                 "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
             )
-        name, loaded = _own(scene, params or {})
+        name, loaded = _own(scene, budget, declared)
+        if keys and loaded is scene:
+            raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
+        set_parameters(loaded, keys)
         view = _sensor(name, loaded, sensor)
         size = _film_size(name, view, width, height)
         return Source(name, loaded, view, _integrator(integrator, loaded), *size, own=True)
     width, height, fresnel = width or SIZE[0], height or SIZE[1], fresnel or "schlick"
-    loaded = load_dict(own.to_dict(width=width, height=height, fresnel=fresnel), name)
+    loaded = load_dict(own.to_dict(width=width, height=height, fresnel=fresnel), name, budget)
+    set_parameters(loaded, keys)
     view, integrator = _sensor(name, loaded, sensor), _integrator(integrator, loaded)
     return Source(name, loaded, view, integrator, width, height, own.focal_distance, own.focal_range, fresnel)
 
@@ -110,15 +122,15 @@ def _model(scene: Any, options: Mapping[str, Any]) -> tuple[str, Scene | None]:
     return "", None
 
 
-def _own(scene: Any, params: Mapping[str, Any]) -> tuple[str, Any]:
+def _own(scene: Any, budget: Budget | None, declared: Mapping[str, Any]) -> tuple[str, Any]:
     """Return the name of someone's own scene, and the Mitsuba scene."""
     import mitsuba as mi
 
     if isinstance(scene, dict):
-        return "a dict", load_dict(scene)
+        return "a dict", load_dict(scene, budget=budget)
     if isinstance(scene, str | os.PathLike):
         path = os.fspath(scene)
-        return os.path.basename(path), load_file(path, **params)
+        return os.path.basename(path), load_file(path, budget, **declared)
     if isinstance(scene, mi.Scene):
         return "a Mitsuba scene", scene
     raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")

@@ -118,7 +118,8 @@ def _scene_3() -> Scene:
     )
 
 
-def _scene_4(count: int = 600) -> Scene:
+def scene_of_spheres(count: int = 600) -> Scene:
+    """Return scene 4, with ``count`` spheres."""
     numbers = c_rand()
     spheres = []
     for _ in range(count):
@@ -179,18 +180,14 @@ def c_rand(seed: int = 1) -> Iterator[int]:
         yield words[-1] >> 1
 
 
-_BUILDERS = {0: _scene_0, 1: _scene_1, 2: _scene_2, 3: _scene_3, 4: _scene_4, 9: _scene_9}
+_BUILDERS = {0: _scene_0, 1: _scene_1, 2: _scene_2, 3: _scene_3, 4: scene_of_spheres, 9: _scene_9}
 _DEMOS = (5, 6, 7, 8)
 NUMBERS = tuple(sorted({*_BUILDERS, *_DEMOS}))
-
-# Those made of analytic surfaces only, without meshes and textures: what the float64 reference draws
-ANALYTIC = tuple(_BUILDERS)
 
 
 @cache
 def report_scene(number: int) -> Scene:
-    """One of the report's scenes; 5 to 8 are of our own models. Raises ``UsageError`` for any other
-    number."""
+    """Return a scene by its number; 5 to 8 are of our own models. Raises ``UsageError`` for any other."""
     if number in _DEMOS:
         from mrt_mitsuba.scene import demos  # models in numpy, which the other scenes do without
 

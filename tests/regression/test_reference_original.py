@@ -19,7 +19,7 @@ RESIDUE = {0: (1e-6, 0.0002), 1: (4e-5, 0.003), 2: (4e-5, 0.003), 3: (1e-5, 0.00
 def difference(original_data: Path, number: int) -> tuple[ReferenceResult, np.ndarray]:
     image = read_exr(original_data / "renders" / f"s{number}_none_aa1.exr").image
     height, width, _ = image.shape
-    result = reference_render(report_scene(number), width=width, height=height, original=True)
+    result = reference_render(report_scene(number), width=width, height=height, start="original")
     return result, np.abs(result.image - image)
 
 

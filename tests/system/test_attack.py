@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import SceneError
 
 pytestmark = pytest.mark.attack
+MRT = Path(sys.executable).with_name("mrt")
 
 SENSOR = """<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>
     <integer name="height" value="3"/></film></sensor>"""
@@ -81,7 +83,7 @@ def test_no_native_code_from_the_folders_of_process_and_scene(run_python, tmp_pa
     assert lines["scene/known.xml"] == lines["scene/by_path.xml"] == "rendered"
     for name in ("scene/unknown.xml", "scene/by_parameter.xml", "dict"):
         assert "native code that is not Mitsuba's" in lines[name]
-    command = [Path(sys.executable).with_name("mrt"), "out", "3", "width=8", "height=6", "quiet=1"]
+    command = [MRT, "out", "3", "width=8", "height=6", "quiet=1"]
     environ = os.environ | {"MRT_TRAP": str(sign)}
     subprocess.run(command, cwd=tmp_path, env=environ, check=True, timeout=120)
     (tmp_path / "plugins" / "wicked.so").rename(
@@ -138,6 +140,37 @@ def test_time_to_read_a_model_grows_with_its_size(run_python) -> None:
     for line in lines[4:6]:
         assert "at most 262144 are read" in line
     assert all(len(line) < 200 for line in lines)
+
+
+# -------------------------------------------- 4: memory -----------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        "<bsdf type='mrt_bsdf'><texture name='diffuse_reflectance' type='{}'>{}</texture></bsdf>",
+        "<bsdf type='diffuse'><texture name='reflectance' type='{}'>{}</texture></bsdf>",
+    ],
+)
+@pytest.mark.parametrize("kind", ["mrt_texture", "bitmap"])
+def test_textures_count(variant: str, tmp_path: Path, inside: str, kind: str) -> None:
+    """6 kB of compressed black are 0.7 GB of texels at work."""
+    Image.new("1", (4000, 4000)).save(tmp_path / "black.png")
+    texture = inside.format(kind, "<string name='filename' value='black.png'/>")
+    (tmp_path / "a.xml").write_text(scene_xml(f"<shape type='sphere'>{texture}</shape>"))
+    with pytest.raises(mrt.UsageError, match=r"black\.png of 4000x4000 texels, .* 64 MiB may .* memory="):
+        mrt.render(str(tmp_path / "a.xml"), aa=1, memory="64M")
+
+
+@pytest.mark.parametrize("megabytes", [200, 400, 600, 900, 1400])
+def test_limited_addresses_end_in_a_message(tmp_path: Path, megabytes: int) -> None:
+    command = f"{MRT} out 3 width=3000 height=3000 aa=1 focaldist=0 quiet=1"
+    limit = f"ulimit -v {megabytes * 1000} && exec {command}"
+    done = subprocess.run(
+        ["sh", "-c", limit], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
+    )
+    if done.returncode != 0:
+        assert done.returncode == 2 and "memory=" in done.stderr and done.stderr.count("\n") == 1, done.stderr
 
 
 # ------------------------------------------- 6: XML and pipes ------------------------------------------

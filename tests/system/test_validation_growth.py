@@ -19,20 +19,24 @@ def test_exponents_are_recovered_with_an_interval():
     assert found.sizes == sizes[-4:] and found.scale == pytest.approx(0.5)
     noise = np.random.default_rng(0).normal(0, 0.1, (200, 6))
     fits = [growth.fit({n: n**0.7 * np.exp(e) for n, e in zip(sizes, row, strict=True)}) for row in noise]
-    inside = np.mean([abs(f.value - 0.7) <= f.half_width for f in fits])
+    inside = np.mean([f.low <= 0.7 <= f.high for f in fits])
     assert inside == pytest.approx(growth.LEVEL, abs=0.05)  # three standard deviations of 200 trials
-    assert growth.fit({1: 1.0, 10: 2.0}).half_width == np.inf  # two points tell no interval
+    assert growth.fit({1: 1.0, 10: 2.0}).half_width == np.inf  # two points have no interval
 
 
-def test_readings_follow_the_interval():
-    def text(value: float, half_width: float) -> str:
-        return growth._reading(growth.Exponent(value, half_width, 1.0, (1, 10)))
-
-    assert "2 times as long: less than" in text(0.301, 0.1)
-    assert "more than in proportion" in text(1.3, 0.1)
-    assert "not told apart from growth in proportion" in text(0.95, 0.1)
-    assert text(-0.3, 0.6) == text(0.1, 0.2) == "not told apart from no growth"
-    assert "too uncertain" in text(0.1, 1.5)
+@pytest.mark.parametrize(
+    ("value", "half_width", "reading"),
+    [
+        (0.301, 0.1, "2 times as long: less than"),
+        (1.3, 0.1, "more than in proportion"),
+        (0.95, 0.1, "not told apart from growth in proportion"),
+        (-0.3, 0.6, "not told apart from no growth"),
+        (0.1, 0.2, "not told apart from no growth"),
+        (0.1, 1.5, "too uncertain"),
+    ],
+)
+def test_readings_follow_the_interval(value, half_width, reading):
+    assert reading in growth.Exponent(value, half_width, 1.0, (1, 10)).reading()
 
 
 @pytest.mark.parametrize("what", growth.SERIES)
@@ -49,29 +53,31 @@ def test_series_grow_in_what_they_are_named_after(what):
     assert sizes[what] == pytest.approx(49, abs=1)  # two triangles fill a square
 
 
-def test_small_study_holds_and_draws(monkeypatch, variant):
-    extent = growth.Extent({"lights": (1, 9, 12)}, 1)
-    monkeypatch.setattr(growth, "QUICK", extent)
+def _run(monkeypatch, repeats: int = 1, **sizes) -> tuple[Study, set[str], dict[str, Table]]:
+    monkeypatch.setattr(growth, "QUICK", growth.Extent(sizes, repeats))
     study = Study("growth", growth.TITLE)
     growth.run(study, quick=True)
+    plots = {part.name for part in study.parts if isinstance(part, Plot)}
+    return study, plots, {part.name: part for part in study.parts if isinstance(part, Table)}
+
+
+def test_small_study_holds_and_draws(monkeypatch, variant):
+    study, plots, tables = _run(monkeypatch, 2, lights=(1, 9, 12))
     assert study.passed, [str(bound) for bound in study.bounds if not bound.holds]
-    assert [part.name for part in study.parts if isinstance(part, Plot)] == ["growth"]
-    rows = {part.name: part.rows for part in study.parts if isinstance(part, Table)}
-    assert [row[1] for row in rows["growth"]] == [1, 9, 12]
-    operations = [row[-1] for row in rows["growth"]]
-    assert operations[1] == pytest.approx(operations[2], rel=0.01)  # a loop over lights, however many
-    assert operations[1] > 0
+    assert plots == {"growth"} and tables.keys() == {"exponents", "growth"}
+    rows = tables["growth"].rows
+    assert [row[1] for row in rows] == [1, 9, 12]
+    assert rows[1][-1] == pytest.approx(rows[2][-1], rel=0.01) and rows[1][-1] > 0  # a loop over lights
 
 
 def test_code_that_grows_is_noticed(monkeypatch, variant):
-    """Planes are code of their own, each."""
+    """Planes are code of their own, each. One repeat says nothing of time."""
 
     def planes(count: int) -> growth.Job:
         scene = report_scene(0)
         return dataclasses.replace(scene, planes=scene.planes * count), (32, 24), {"aa": 1}
 
     monkeypatch.setitem(growth.SERIES, "planes", planes)
-    monkeypatch.setattr(growth, "QUICK", growth.Extent({"planes": (1, 2, 6)}, 1))
-    study = Study("growth", growth.TITLE)
-    growth.run(study, quick=True)
+    study, plots, tables = _run(monkeypatch, planes=(1, 2, 6))
     assert [bound.holds for bound in study.bounds if "operations" in bound.name] == [False]
+    assert not plots and tables.keys() == {"growth"}

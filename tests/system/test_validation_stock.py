@@ -10,7 +10,6 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
-from mrt_mitsuba.plugins import plugin
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.studies import approximations, stock
 from mrt_mitsuba.validation.tools import mutations
@@ -38,7 +37,7 @@ def test_direct_light_equals_mitsubas_pixel_by_pixel(number: int, light: int) ->
     assert (found.ours > 0.05).any(axis=-1).mean() > 0.05  # there is something to compare
     assert found.beyond.mean() < 0.1
     # edges and highlights of a hundredth of a pixel: a handful at most
-    assert (found.off & ~found.beyond).sum() <= 5
+    assert found.off.sum() <= 5
 
 
 def test_direct_light_of_another_light_is_different() -> None:
@@ -98,19 +97,6 @@ def test_without_what_differs_the_rest_agrees() -> None:
     assert not approximations.compare_rest(3, **SMALL, spp=8).rejects
 
 
-@pytest.mark.parametrize("name", ["radiance", "alpha"])
-def test_a_broken_bsdf_does_not_agree(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    bsdf = plugin("bsdf")
-    if name == "radiance":
-        value = bsdf.MrtBSDF._value
-        monkeypatch.setattr(bsdf.MrtBSDF, "_value", lambda *arguments: 1.02 * value(*arguments))
-    else:
-        read = bsdf._Point._read
-        factor = {"alpha": 1.05}
-        monkeypatch.setattr(bsdf._Point, "_read", lambda self, key: factor.get(key, 1) * read(self, key))
-    assert approximations.compare_rest(0, **SMALL, spp=16).rejects
-
-
 def test_with_diffuse_parts_the_materials_differ() -> None:
     """The comparison that lets black materials pass sees that roughplastic refracts the diffuse light."""
     scene = approximations.physical(report_scene(3), least_alpha=approximations.ALPHA_FOR_TESTS)
@@ -130,11 +116,3 @@ def test_every_mistake_is_found_and_nothing_else() -> None:
     assert set(found) == {mutations.NONE, mutations.CLAMP, *(m.name for m in mutations.MISTAKES)}
     for name, comparison in found.items():
         assert comparison.rejects == (name != mutations.NONE), name
-
-
-@pytest.mark.parametrize("mistake", mutations.MISTAKES, ids=lambda m: m.name)
-def test_a_mistake_changes_the_scene_and_leaves_the_right_one(mistake: mutations.Mistake) -> None:
-    nodes = mrt.scene_dict(0, fresnel="dielectric", **SMALL)
-    before = repr(nodes)
-    assert repr(mistake.change(nodes)) != before
-    assert repr(nodes) == before

@@ -158,6 +158,29 @@ def test_report_runs_only_what_is_needed() -> None:
 # ---- both modes ----
 
 
+@needs_llvm
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("miss", [None, 0.0, math.inf, math.nan])
+def test_what_is_in_focus_runs_no_kernel_and_stays_bit_for_bit(mode: str, miss: float | None) -> None:
+    """From the first amount that changes a pixel on, the kernels run; a miss is as blurred as can be."""
+    image, depth = colours((12, 9), 1), np.full((12, 9), 4.0, np.float32)
+    if miss is not None:
+        depth[0, 0] = miss
+    least = np.float32(1) if mode == "report" else np.float32(0)
+    for largest, runs in ((least - np.float32(1e-6), False), (least, mode == "report")):
+        depth[5, 5] = 4 - largest - 0.5
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            found = gaussian_dof(image, depth, focal_distance=4, focal_range=0.5, mode=mode)
+            kernels = dr.kernel_history([dr.KernelType.JIT])
+        runs_here = runs or miss in (0.0, math.inf)
+        assert bool(kernels) is runs_here
+        expected = gaussian_dof(tensor("llvm", image), depth, focal_distance=4, focal_range=0.5, mode=mode)
+        np.testing.assert_array_equal(found, np.array(expected))
+        if not runs_here:
+            np.testing.assert_array_equal(found, image)
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_a_bad_colour_gives_nothing(mode: str) -> None:
     image = np.full((25, 30, 3), 0.75)

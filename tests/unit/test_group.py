@@ -10,7 +10,7 @@ import pytest
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.scene import model as scene
-from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
+from mrt_mitsuba.scene.model import Camera, Capsule, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +41,7 @@ def crowd(kind: str, count: int, materials: int) -> Scene:
         if kind == "sphere":
             objects.append(Sphere(place, radius, material))
         else:
-            objects.append((Cone if kind == "cone" else Cylinder)(place, end, radius, material))
+            objects.append(scene.OBJECTS[kind](place, end, radius, material))
     return Scene(
         camera=Camera((6, 4, 5), (0, 1.5, 0)),
         sky=(0.2, 0.3, 0.7),
@@ -57,12 +57,12 @@ def picture(content: Scene, width: int = 120, height: int = 90) -> np.ndarray:
 
 
 @pytest.mark.parametrize("materials", [1, 7])
-@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder"])
+@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder", "capsule"])
 def test_a_group_looks_like_its_members(monkeypatch, kind: str, materials: int) -> None:
     """The same rays: but for roundings that move a silhouette or a shadow's edge, the same picture."""
     content = crowd(kind, 40, materials)
     single = picture(content)
-    monkeypatch.setattr(scene, "_MOST_SINGLE", {Sphere: 0, Cone: 0, Cylinder: 0})
+    monkeypatch.setattr(scene, "_MOST_SINGLE", {Sphere: 0, Cone: 0, Cylinder: 0, Capsule: 0})
     nodes = content.to_dict()
     assert nodes[f"{kind}s"]["type"] == "mrt_group" and f"{kind}_0" not in nodes
     grouped = picture(content)
@@ -139,7 +139,7 @@ ONE = np.array([[0, 0, 0, 1]], np.float32)
         ({"numbers": ONE * np.float32("nan")}, "row 0 of .*not finite"),
         ({"numbers": np.ones((1, 7), np.float32), "kind": "cone"}, "axis of no length"),
         ({"numbers": ONE, "face_x": np.ones((2, 1), np.float32)}, "has 2 rows for 1 objects"),
-        ({"numbers": ONE, "kind": "cube"}, "sphere, cone, cylinder"),
+        ({"numbers": ONE, "kind": "cube"}, "sphere, cone, cylinder, capsule"),
     ],
 )
 def test_wrong_parameters_are_named(keys: dict, words: str) -> None:

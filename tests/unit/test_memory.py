@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import pytest
 
+from mrt_mitsuba import memory
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.rendering import memory
-from mrt_mitsuba.rendering.memory import LEAST_RAYS, MOST_PIXELS, MOST_RAYS, Workspace, free_memory
+from mrt_mitsuba.memory import LEAST_RAYS, MOST_PIXELS, MOST_RAYS, Budget, Workspace, free_memory
 
 GIB = 2**30
 
 
 def test_plenty_of_memory_gives_the_largest_parts():
-    space = Workspace.beside(800, 600, 4, memory=64 * GIB)
+    space = Workspace.beside(800, 600, 4, budget=Budget(64 * GIB))
     assert space.rays_at_once(4) == MOST_RAYS
     assert space.rows_at_once(1024) == MOST_PIXELS // 1024
 
 
 def test_less_memory_gives_smaller_parts():
-    spaces = [Workspace.beside(800, 600, 4, memory=memory) for memory in (GIB // 8, GIB // 12, GIB // 16)]
+    spaces = [
+        Workspace.beside(800, 600, 4, budget=Budget(memory)) for memory in (GIB // 8, GIB // 12, GIB // 16)
+    ]
     rays = [space.rays_at_once(4) for space in spaces]
     assert MOST_RAYS > rays[0] > rays[1] > rays[2] >= LEAST_RAYS
     rows = [space.rows_at_once(800) for space in spaces]
@@ -38,16 +40,16 @@ def test_less_memory_gives_smaller_parts():
 )
 def test_a_picture_that_does_not_fit_is_refused_with_both_sizes(more, needed):
     with pytest.raises(UsageError, match=f"16384x16384 pixels needs {needed} of memory, and 4.0 GiB may be"):
-        Workspace.beside(16384, 16384, 3, memory=4 * GIB, **more)
+        Workspace.beside(16384, 16384, 3, budget=Budget(4 * GIB), **more)
 
 
 def test_by_default_half_of_what_is_free(monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda: 8 * GIB)
-    assert Workspace.beside(100, 100, 3) == Workspace.beside(100, 100, 3, memory=4 * GIB)
+    assert Budget.of(None) == Budget(4 * GIB)
 
 
 def test_tiny_pictures_need_no_full_wavefront():
-    space = Workspace.beside(1, 1, 3, memory=2**26)
+    space = Workspace.beside(1, 1, 3, budget=Budget(2**26))
     assert space.rays_at_once(3) >= 1 and space.rows_at_once(1) >= 1
 
 
@@ -64,9 +66,44 @@ def test_what_a_large_pass_used_is_given_back(monkeypatch, filtered, flushed):
 def test_more_than_the_machine_has_is_never_used(monkeypatch):
     monkeypatch.setattr(memory, "all_memory", lambda: 8 * GIB)
     with pytest.raises(UsageError, match=r"and 8\.0 GiB may be used"):
-        Workspace.beside(65536, 65536, 3, memory=10**6 * GIB)
-    assert Workspace.beside(800, 600, 3, memory=64 * GIB).size > 60 * GIB
+        Workspace.beside(65536, 65536, 3, budget=Budget.of(10**6 * GIB))
 
 
 def test_free_memory_is_believable():
     assert 2**26 < free_memory() < 2**46
+
+
+V1, V2 = ("memory.limit_in_bytes", "memory.usage_in_bytes"), ("memory.max", "memory.current")
+
+
+@pytest.mark.parametrize(
+    ("group", "base", "names", "place"),
+    [
+        ("0::/a/b", "", V2, "a/b"),
+        ("0::/a/b", "", V2, "a"),
+        ("4:memory:/a/b", "memory", V1, "a"),
+        ("7:cpu,memory:/elsewhere", "memory", V1, ""),
+    ],
+)
+def test_limits_of_control_groups_count(tmp_path, group, base, names, place):
+    """As the system shows them, in the group itself, in one above, or in a container's only one."""
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/self/cgroup").write_text(f"9:pids:/x\n{group}\n")
+    for folder, size in (("", "max"), ("a", "max"), ("a/b", "max"), (place, str(GIB))):
+        found = tmp_path / "sys/fs/cgroup" / base / folder
+        found.mkdir(parents=True, exist_ok=True)
+        (found / names[0]).write_text(f"{size}\n")
+        (found / names[1]).write_text(f"{GIB // 2}\n")
+        (found / "memory.stat").write_text(f"anon 5\ninactive_file {GIB // 4}\n")
+    assert memory.free_memory(tmp_path) == GIB * 3 // 4
+    assert memory.all_memory(tmp_path) == GIB
+
+
+def test_textures_are_taken_from_the_budget():
+    budget = Budget(GIB)
+    budget.take_texture("a.png", 4000, 4000)
+    assert 300e6 < budget.taken < 400e6
+    room = Workspace.beside(100, 100, 3, budget=Budget(GIB)).size
+    assert Workspace.beside(100, 100, 3, budget=budget).size == room - budget.taken
+    with pytest.raises(UsageError, match=r"b\.png of 6000x6000 texels, the scene needs .*memory="):
+        budget.take_texture("b.png", 6000, 6000)

@@ -48,6 +48,6 @@ def test_scalar_variants_draw_the_same(variant: str) -> None:
     mi.set_variant(variant)
     found = []
     for ray in range(5):
-        scalar.start(7, ray, 1)
+        scalar.start_at(7, ray)
         found.append(scalar.next_1d())
     np.testing.assert_array_equal(np.float32(found), expected)

@@ -24,6 +24,9 @@ from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Mesh, Plane, Scene, 
 # the point: far above the rounding of float64, far below anything a float32 picture can show
 OFFSET = 1e-10
 
+# Of Mitsuba's own integrators, relative to 1 + the largest coordinate: 1500 half roundings of float32
+MITSUBA_OFFSET = 1500 * 2.0**-24
+
 # The original's absolute constants
 ORIGINAL_SHADOW_START, ORIGINAL_MIRROR_START, ORIGINAL_REACH = 1e-4, 1e-3, 1e5
 
@@ -61,7 +64,9 @@ class Settings:
     clamp: bool = True  # each light's part to [0, 1]
     max_depth: int = 10
     bounce_budget: str = "report"  # or "plain"
-    original: bool = False  # the original's absolute distances off a surface, and its reach
+    start: str = (
+        "robust"  # of secondary rays, or "mitsuba", or "original": that program's distances and reach
+    )
     displacement: tuple[float, float] = (0.0, 0.0)  # of the rays, in pixels, y upwards
 
 
@@ -126,7 +131,7 @@ def specular_lobe(n: np.ndarray, to_light: np.ndarray, to_eye: np.ndarray, alpha
     spread = np.exp(-sin2 / cos2 / alpha**2) / (math.pi * alpha**2 * cos2**2)
     shadowing = 1.0
     for way in (to_light, to_eye):
-        a = dot(n, way) / (alpha * np.linalg.norm(np.cross(n, way), axis=-1))
+        a = np.minimum(dot(n, way) / (alpha * np.linalg.norm(np.cross(n, way), axis=-1)), 1.6)
         fit = a * (3.535 + 2.181 * a) / (1 + a * (2.276 + 2.577 * a))
         shadowing = shadowing * np.where(a < 1.6, fit, 1.0)
     return spread * shadowing / (4 * dot(n, to_light) * dot(n, to_eye))
@@ -278,16 +283,11 @@ class _Hits:
     def only(self, keep: np.ndarray) -> _Hits:
         return _Hits(*(getattr(self, f.name)[keep] for f in fields(self)))
 
-    @property
-    def outside(self) -> np.ndarray:
-        """Points just above the surface."""
-        return self.p + OFFSET * self.scale[:, None] * self.n
-
 
 class _Tracer:
     def __init__(self, scene: Scene, settings: Settings) -> None:
         self.scene, self.settings = scene, settings
-        self.reach = ORIGINAL_REACH if settings.original else np.inf
+        self.reach = ORIGINAL_REACH if settings.start == "original" else np.inf
         things = [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
         groups = [(Spheres, scene.spheres), (Planes, scene.planes), (Axial, (*scene.cones, *scene.cylinders))]
         # Each with the numbers of its objects; all triangles of a mesh are one object
@@ -391,11 +391,18 @@ class _Tracer:
         return radiance, seen, grazing
 
     def blocked(self, hits: _Hits, light: np.ndarray) -> np.ndarray:
-        o = hits.outside
-        if self.settings.original:
-            o = hits.p + ORIGINAL_SHADOW_START * unit(light - hits.p)
+        o = self.lifted(hits, unit(light - hits.p), ORIGINAL_SHADOW_START)
         way = light - o
         return self.nearest(o, unit(way), np.linalg.norm(way, axis=1))[1] >= 0
+
+    def lifted(self, hits: _Hits, d: np.ndarray, original: float) -> np.ndarray:
+        """Return where rays that leave in the directions d start."""
+        if self.settings.start == "original":
+            return hits.p + original * d
+        size = OFFSET * hits.scale
+        if self.settings.start == "mitsuba":
+            size = MITSUBA_OFFSET * (1 + np.abs(hits.p).max(axis=1))
+        return hits.p + size[:, None] * hits.n
 
     def reflectance(self, hits: _Hits, to_light: np.ndarray) -> np.ndarray:
         """Return the BSDF [N, 3]; both directions are above the surface."""
@@ -410,7 +417,7 @@ class _Tracer:
         """Return the mirror rays that go on: pixel, o, d, throughput, depth."""
         cos = -dot(hits.n, hits.d)
         d = unit(hits.d + 2 * cos[:, None] * hits.n)
-        o = hits.p + ORIGINAL_MIRROR_START * d if self.settings.original else hits.outside
+        o = self.lifted(hits, d, ORIGINAL_MIRROR_START)
         mirrored = fresnel(self.settings.fresnel, cos, self.ior[hits.thing])
         throughput = hits.throughput * self.specular[hits.thing] * mirrored[:, None]
         depth = hits.depth + self.cost[hits.thing]

@@ -13,7 +13,7 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Light, Scene
-from mrt_mitsuba.scene.report import _scene_4, report_scene
+from mrt_mitsuba.scene.report import report_scene, scene_of_spheres
 from mrt_mitsuba.scene.shapes import terrain
 from mrt_mitsuba.validation.tools import kernels
 from mrt_mitsuba.validation.tools.knobs import load
@@ -57,9 +57,27 @@ class Exponent:
     scale: float  # seconds at size 1
     sizes: Sequence[int]  # that it was fitted over
 
+    @property
+    def low(self) -> float:
+        return self.value - self.half_width
+
+    @property
+    def high(self) -> float:
+        return self.value + self.half_width
+
+    def reading(self) -> str:
+        """Return what the interval allows to say."""
+        if self.low <= 0:
+            unknown = "too uncertain to tell from no growth, or from growth in proportion"
+            return "not told apart from no growth" if self.high < 1 else unknown
+        if self.low <= 1 <= self.high:
+            return "not told apart from growth in proportion"
+        than = "less" if self.high < 1 else "more"
+        return f"ten times as much takes {10**self.value:.2g} times as long: {than} than in proportion"
+
 
 def run(study: Study, *, quick: bool) -> None:
-    """Fill the study."""
+    """Fill the study. A quick one gives no times: it holds the code alone."""
     extent = QUICK if quick else FULL
     series: dict[str, dict[int, Found]] = {}
     with study.stage("Growth", sum(map(len, extent.sizes.values()))) as advance:
@@ -69,44 +87,48 @@ def run(study: Study, *, quick: bool) -> None:
                 series[what][size] = _measure(SERIES[what](size), extent.repeats)
                 gc.collect()  # scenes that stay alive slow down the kernels of later ones
                 advance(1)
+    if extent.repeats > 1:
+        _exponents(study, series)
+    study.table(
+        "growth",
+        "Time and code against the size of the task",
+        ("what grows", "size", "seconds", "spread", "compile, s", "kernels", "operations"),
+        [
+            (what, size, f.warm.seconds, f.warm.spread, f.compile, f.kernels, f.operations)
+            for what, found in series.items()
+            for size, f in found.items()
+        ],
+        "Seconds: medians of warm renders. Kernels and operations: different kernels, and the length of "
+        "their code.",
+    )
+    for what, found in series.items():
+        *smaller, largest = found.values()
+        for name, limit in (("operations", MOST_CODE), ("kernels", 1)):
+            study.at_most(
+                f"{what}: {name} at {max(found)} / at smaller sizes",
+                getattr(largest, name) / max(getattr(f, name) for f in smaller),
+                limit,
+                "numbers are data, not code; a loop that is unrolled makes it as many times longer",
+            )
+
+
+def _exponents(study: Study, series: Mapping[str, Mapping[int, Found]]) -> None:
     exponents = {what: fit({n: f.warm.seconds for n, f in found.items()}) for what, found in series.items()}
     study.table(
         "exponents",
         "Exponents of growth, over the larger half of the sizes",
         ("what grows", "from", "to", "exponent", f"{LEVEL:.0%} interval", "reading"),
-        [_exponent_row(what, e) for what, e in exponents.items()],
+        [
+            (what, e.sizes[0], e.sizes[-1], e.value, f"{e.low:.2f} to {e.high:.2f}", e.reading())
+            for what, e in exponents.items()
+        ],
         "Exponent 1: in proportion; 0: no growth. The interval is that of the slope of a straight line "
         "through the logarithms; wide where that is no straight line.",
         first=True,
     )
-    study.plot("growth", "Time against the size of the task", _figure(series, exponents), _caption(series))
-    study.table(
-        "growth",
-        "Time and code against the size of the task",
-        ("what grows", "size", "seconds", "spread", "compile, s", "kernels", "operations"),
-        [(w, n, *_cells(f)) for w, found in series.items() for n, f in found.items()],
-        "Seconds: medians of warm renders. Kernels and operations: different kernels, and the length of "
-        "their code.",
-    )
-    for what, found in series.items():
-        _hold_code(study, what, found)
-
-
-def _hold_code(study: Study, what: str, found: Mapping[int, Found]) -> None:
-    """The code of the largest task is no longer than that of smaller ones."""
-    *smaller, largest = found.values()
-    study.at_most(
-        f"{what}: operations in kernels at {max(found)} / at smaller sizes",
-        largest.operations / max(f.operations for f in smaller),
-        MOST_CODE,
-        "numbers are data, not code",
-    )
-    study.at_most(
-        f"{what}: kernels at {max(found)} / at smaller sizes",
-        largest.kernels / max(f.kernels for f in smaller),
-        1,
-        "as above",
-    )
+    largest = [f"{max(f)} {what} in {f[max(f)].warm.seconds:.2g} s" for what, f in series.items()]
+    caption = f"The largest of each: {', '.join(largest)}. The line is the fit."
+    study.plot("growth", "Time against the size of the task", _figure(series, exponents), caption)
 
 
 def _measure(job: Job, repeats: int) -> Found:
@@ -121,81 +143,38 @@ def _measure(job: Job, repeats: int) -> Found:
     )
 
 
-def _cells(f: Found) -> tuple[Any, ...]:
-    return f.warm.seconds, f.warm.spread, f.compile, f.kernels, f.operations
-
-
-# ------------------------------------------- What it says -------------------------------------------
-
-
 def fit(seconds: Mapping[int, float]) -> Exponent:
-    """The exponent of time over size, of the larger half of the sizes, and at least four of them."""
+    """Return the exponent of time over size, of the larger half of the sizes, and at least four of them."""
     from scipy import stats
 
     sizes = sorted(seconds)[-max(4, (len(seconds) + 1) // 2) :]
-    x, y = np.log(sizes), np.log([seconds[n] for n in sizes])
-    line = stats.linregress(x, y)
+    line = stats.linregress(np.log(sizes), np.log([seconds[n] for n in sizes]))
     freedom = len(sizes) - 2
     spread = stats.t.ppf((1 + LEVEL) / 2, freedom) * line.stderr if freedom > 0 else float("inf")
     return Exponent(float(line.slope), float(spread), float(np.exp(line.intercept)), sizes)
 
 
-def _exponent_row(what: str, e: Exponent) -> tuple[Any, ...]:
-    low, high = e.value - e.half_width, e.value + e.half_width
-    return (what, e.sizes[0], e.sizes[-1], e.value, f"{low:.2f} to {high:.2f}", _reading(e))
-
-
-def _reading(e: Exponent) -> str:
-    low, high = e.value - e.half_width, e.value + e.half_width
-    if high < 1 and low <= 0:
-        return "not told apart from no growth"
-    if high < 1:
-        return f"ten times as much takes {10**e.value:.2g} times as long: less than in proportion"
-    if low > 1:
-        return f"ten times as much takes {10**e.value:.2g} times as long: more than in proportion"
-    if low <= 0:
-        return "too uncertain to tell from no growth, or from growth in proportion"
-    return "not told apart from growth in proportion"
-
-
-def _caption(series: Mapping[str, Mapping[int, Found]]) -> str:
-    """Two sentences: what a large task takes, and what becomes of the code."""
-    largest = [
-        f"{max(found)} {what} in {found[max(found)].warm.seconds:.2g} s" for what, found in series.items()
-    ]
-    growth = [max(f.operations for f in found.values()) / min(f.operations for f in found.values())
-              for found in series.values()]  # fmt: skip
-    same = sum(g == 1 for g in growth)
-    return (
-        f"The largest of each: {', '.join(largest)}. The code is the same at every size in {same} of "
-        f"{len(growth)} series, and at most {max(growth):.2g} times as long elsewhere."
-    )
-
-
 def _figure(series: Mapping[str, Mapping[int, Found]], exponents: Mapping[str, Exponent]) -> Any:
     from matplotlib.figure import Figure
 
-    columns = 2
-    rows = -(-len(series) // columns)
-    figure = Figure(figsize=(7, 2.6 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    rows = -(-len(series) // 2)
+    figure = Figure(figsize=(9, 2.6 * rows), layout="constrained")
+    axes = figure.subplots(rows, 2, squeeze=False).ravel()
     for axis in axes[len(series) :]:
         axis.remove()
     for axis, (what, found) in zip(axes, series.items(), strict=False):
         e = exponents[what]
-        axis.loglog(list(found), [f.warm.seconds for f in found.values()], "o", markersize=4)
+        seconds = [f.warm.seconds for f in found.values()]
+        axis.loglog(list(found), seconds, "o", markersize=4)
         ends = np.array([e.sizes[0], e.sizes[-1]], float)
         axis.loglog(ends, e.scale * ends**e.value, "-", color="0.4", linewidth=1)
-        for of_axis, values in (
-            (axis.xaxis, list(found)),
-            (axis.yaxis, [f.warm.seconds for f in found.values()]),
-        ):
+        for of_axis, values in ((axis.xaxis, list(found)), (axis.yaxis, seconds)):
             low, high = np.log10([min(values), max(values)])
             of_axis.set_view_interval(10 ** np.floor(low), 10 ** np.ceil(high + 1e-9), ignore=True)
             of_axis.set_minor_formatter("")
-        axis.set_title(f"{what}: {e.value:.2f} ± {e.half_width:.2f}", fontsize=9)
-        axis.set_ylabel("seconds", fontsize=8)
-        axis.tick_params(labelsize=7)
+        axis.set_title(f"{what}: {e.value:.2f} ± {e.half_width:.2f}", fontsize=10)
+        axis.set_ylabel("seconds", fontsize=9)
+        axis.tick_params(labelsize=9)
         axis.grid(alpha=0.3)
     return figure
 
@@ -216,11 +195,11 @@ def _samples(count: int) -> Job:
 
 
 def _spheres(count: int) -> Job:
-    return _scene_4(count), SMALL, {"aa": 4}
+    return scene_of_spheres(count), SMALL, {"aa": 4}
 
 
 def _triangles(count: int) -> Job:
-    """Hills under the camera and the lights of scene 0."""
+    """Return hills under the camera and the lights of scene 0."""
     plain = report_scene(0)
     cells = max(1, round((count / 2) ** 0.5))
     hills = terrain(
@@ -230,11 +209,9 @@ def _triangles(count: int) -> Job:
 
 
 def _lights(count: int) -> Job:
-    """Scene 0 under lights on a circle, together as bright as one."""
-    lights = []
-    for k in range(count):
-        angle = 2 * np.pi * k / count
-        lights.append(Light((10 * np.cos(angle), 10.0, 10 * np.sin(angle)), (1 / count,) * 3))
+    """Return scene 0 under lights on a circle, together as bright as one."""
+    angles = 2 * np.pi * np.arange(count) / count
+    lights = [Light((10 * np.cos(a), 10.0, 10 * np.sin(a)), (1 / count,) * 3) for a in angles.tolist()]
     return dataclasses.replace(report_scene(0), lights=tuple(lights)), SMALL, {"aa": 1}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.oracles.reference import camera_directions
+from mrt_mitsuba.validation.oracles.reference import camera_directions, reference_render
 from mrt_mitsuba.validation.studies import approximations
 from mrt_mitsuba.validation.tools import mutations
 from mrt_mitsuba.validation.tools.gallery import gallery
@@ -24,10 +24,11 @@ TITLE = "Against Mitsuba's own integrators, lights and materials"
 
 # Pixel by pixel, relative to 1 + value: a few dozen float32 roundings
 DIRECT_TOLERANCE = 1e-5
+# Pixels on the other side of an edge, or where Mitsuba's shadow rays start beyond what hides the light;
+# measured: up to 7 in 76,800, and 36 among the 600 spheres of scene 4
+DIRECT_SHARE = 1e-3
 
-# Mitsuba starts shadow rays 9e-5 (1 + |p|) off their surface, ours start a few roundings off: shadows end up
-# to a hundredth of a pixel apart
-DISPLACEMENT = 1e-2
+DISPLACEMENT = 1e-2  # pixels by which float32 may move a highlight of a small ball
 
 # How smooth the surroundings are that the mirrors show: a few periods around the horizon
 WAVES = 3
@@ -35,7 +36,7 @@ WAVES = 3
 
 def run(study: Study, *, quick: bool) -> None:
     """All comparisons with what Mitsuba brings."""
-    _direct(study)
+    _direct(study, quick)
     _gloss(study, quick)
     _antialiasing(study, quick)
     study.text("The blur is compared with Mitsuba's thinlens camera in the study depth-of-field.")
@@ -51,8 +52,9 @@ class DirectComparison:
     """``mrt_whitted`` without bounces and clamp against ``direct``, under one stock light.
 
     ``error`` [H, W]: largest difference in a channel, relative to 1 + value. The others [H, W]: pixels where
-    the stand-in of a plane has ended, those on silhouettes or at edges of shadows, and those whose own colour
-    changes by more than the error within a hundredth of a pixel, as in the highlights of smooth spheres.
+    the stand-in of a plane has ended; where an outline or the edge of a shadow is within a hundredth of a
+    pixel, or between the places where Mitsuba's shadow rays start and ours; and those whose own colour
+    changes by more than the error within that hundredth, as in the highlights of smooth spheres.
     """
 
     ours: np.ndarray
@@ -64,13 +66,13 @@ class DirectComparison:
 
     @property
     def off(self) -> np.ndarray:
-        """Pixels [H, W] off by more than the tolerance."""
-        return self.error > DIRECT_TOLERANCE
+        """Pixels [H, W] off by more than the tolerance, where there is something to compare."""
+        return (self.error > DIRECT_TOLERANCE) & ~self.beyond
 
     @property
     def unexplained(self) -> int:
         """Pixels off for no reason."""
-        return int(np.sum(self.off & ~self.beyond & ~self.edge & ~self.steep))
+        return int(np.sum(self.off & ~self.edge & ~self.steep))
 
 
 def compare_direct(scene: Scene, light: int, *, width: int, height: int) -> DirectComparison:
@@ -88,15 +90,18 @@ def compare_direct(scene: Scene, light: int, *, width: int, height: int) -> Dire
     nodes["light_0"] = mrt.scene_dict(scene, flavor="stock", **size)["light_0"]
     loaded = mi.load_dict(nodes)
     whitted = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
-    one_ray: dict[str, Any] = {"aa": 1, "aamode": "none"}
-    ours = mrt.render(loaded, integrator=whitted, **one_ray).image
-    theirs = mrt.render(loaded, integrator="direct", **one_ray).image
-    found = sensitivity(scene, displacement=DISPLACEMENT, max_depth=1, clamp=False, **size)
+    ours, theirs = (
+        mrt.render(loaded, integrator=integrator, aa=1, aamode="none").image
+        for integrator in (whitted, "direct")
+    )
+    exact: dict[str, Any] = {"max_depth": 1, "clamp": False, **size}
+    found = sensitivity(scene, displacement=DISPLACEMENT, **exact)
+    moved = reference_render(scene, start="mitsuba", **exact)
     error = (np.abs(ours - theirs) / (1 + theirs)).max(axis=-1)
-    beyond = _beyond_stand_in(scene, found.reference)
     # The tracer's light has no falloff; relative to the colour, that makes no difference to so small a step
     steep = error <= found.spread / (1 + found.reference.image.max(axis=-1))
-    return DirectComparison(ours, theirs, error, beyond, found.silhouette | found.shadow, steep)
+    edge = found.silhouette | found.shadow | (moved.lights != found.reference.lights)
+    return DirectComparison(ours, theirs, error, _beyond_stand_in(scene, found.reference), edge, steep)
 
 
 def _beyond_stand_in(scene: Scene, reference: Any, extent: float = 100.0) -> np.ndarray:
@@ -106,9 +111,7 @@ def _beyond_stand_in(scene: Scene, reference: Any, extent: float = 100.0) -> np.
     rows, columns = np.mgrid[:height, :width]
     d = camera_directions(scene.camera, width, height, columns.ravel() + 0.5, height - rows.ravel() - 0.5)
     hit = np.isfinite(reference.depth)
-    p = np.add(
-        scene.camera.position, np.where(hit, reference.depth, 0)[..., None] * d.reshape(height, width, 3)
-    )
+    p = scene.camera.position + np.where(hit, reference.depth, 0)[..., None] * d.reshape(height, width, 3)
     beyond = np.zeros((height, width), bool)
     for i, plane in enumerate(scene.planes):
         foot = -plane.distance * np.array(plane.normal) / np.linalg.norm(plane.normal)
@@ -117,61 +120,41 @@ def _beyond_stand_in(scene: Scene, reference: Any, extent: float = 100.0) -> np.
     return beyond
 
 
-def _direct(study: Study) -> None:
-    # The size that DISPLACEMENT was chosen for. At 320x240 it leaves 5, 4 and 43 of some 230 000 pixels in
-    # scenes 2, 3 and 4 without a reason: Mitsuba's offset, one of the scene, may be more pixels there; not
-    # yet shown
-    size: dict[str, Any] = {"width": 120, "height": 90}
+def _direct(study: Study, quick: bool) -> None:
+    size: dict[str, Any] = {"width": 120, "height": 90} if quick else {"width": 320, "height": 240}
     rows: list[list[Any]] = []
-    numbers = (0, 1, 2, 3)
+    numbers = (0, 1, 2, 3) if quick else (0, 1, 2, 3, 4)
     with study.stage("Direct light", len(numbers)) as advance:
         for number in numbers:
             scene = report_scene(number)
             found = [compare_direct(scene, light, **size) for light in range(len(scene.lights))]
-            rows += [_direct_row(number, light, c) for light, c in enumerate(found)]
+            for light, c in enumerate(found):
+                near = c.error[~c.beyond]
+                counts = (c.off, c.off & c.edge, c.off & ~c.edge & c.steep, c.beyond)
+                shown = [
+                    float(np.median(near)),
+                    float(np.quantile(near, 0.999)),
+                    *(int(np.sum(x)) for x in counts),
+                ]
+                rows.append([number, light, *shown, c.unexplained])
             advance(1)
+            name, share = f"direct light, scene {number}", max(c.off.mean() for c in found)
+            median = max(float(np.median(c.error[~c.beyond])) for c in found)
             study.at_most(
-                f"direct light, scene {number}: pixels off by > 1e-5 without a reason",
-                sum(c.unexplained for c in found),
-                0,
+                f"{name}: median difference", median, 3e-7, "least fault: 1 in a million of the light"
             )
-            explained = np.mean([(c.off & ~c.beyond).mean() for c in found])
-            study.at_most(
-                f"direct light, scene {number}: share of pixels off by > 1e-5 with a reason",
-                explained,
-                0.002,
-                "an edge moves by a hundredth of a pixel, and a pixel in ten has one",
-            )
+            study.at_most(f"{name}: share of pixels off by > 1e-5", share, DIRECT_SHARE)
+            study.at_most(f"{name}: of these without a reason", sum(c.unexplained for c in found), 0)
     study.table(
         "direct",
         "mrt_whitted without bounces and clamp against direct, light by light",
-        [
-            "scene",
-            "light",
-            "median",
-            "99.9 %",
-            "off by > 1e-5",
-            "on an edge",
-            "in a steep highlight",
-            "beyond the stand-in",
-            "without a reason",
-        ],
+        ["scene", "light", "median", "99.9 %", "off by > 1e-5", "on an edge", "in a steep highlight",
+         "beyond the stand-in", "without a reason"],
         rows,
         "Stock point light, no sky. Differences relative to 1 + value. To direct, a plane is a square of "
-        "side 100: beyond, there is nothing.",
-    )
-
-
-def _direct_row(number: int, light: int, c: DirectComparison) -> list[Any]:
-    near = c.error[~c.beyond]
-    counts = [
-        np.sum(c.off),
-        np.sum(c.off & c.edge & ~c.beyond),
-        np.sum(c.off & c.steep & ~c.edge & ~c.beyond),
-        np.sum(c.off & c.beyond),
-        c.unexplained,
-    ]
-    return [number, light, float(np.median(near)), float(np.quantile(near, 0.999)), *map(int, counts)]
+        "side 100: beyond, there is nothing. Mitsuba's shadow rays start 9e-5 (1 + |p|) off their surface, "
+        "ours a few roundings: edges of shadows differ where the tracer says that this matters.",
+    )  # fmt: skip
 
 
 # ------------------------------------- The mirror as the limit of gloss -------------------------------------

@@ -2,40 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
+from mrt_mitsuba.command.words import read_toml, words
 from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.validation.tools.study import Bound
 
 MISSED = 1  # the exit code where a limit is missed, or a case failed
 AT_LEAST = ("psnr", "p_value")  # the limits of other measures are at most
-
-
-def words(arguments: Sequence[str], names: Sequence[str], form: str) -> tuple[list[str], dict[str, str]]:
-    """Split arguments into plain ones and ``name=value``; raise ``UsageError`` for an unknown name."""
-    plain, given = [], {}
-    for word in arguments:
-        name, equals, value = word.partition("=")
-        if not equals:
-            plain.append(word)
-        elif name not in names:
-            close = difflib.get_close_matches(name, names, n=1)
-            meant = f", meant {close[0]}?" if close else "."
-            raise UsageError(f"unknown option {name!r}{meant} Usage: {form}")
-        elif name in given:
-            raise UsageError(f"{name} is given twice")
-        else:
-            given[name] = value
-    return plain, given
 
 
 DIFF = "mrt diff A.exr B.exr [layer=NAME] [mae|rmse|rel_mse|psnr|largest|flip|p_value=LIMIT] [out=PATH]"
@@ -110,10 +86,7 @@ KEYS = ("reference", "cases", "shared", "repeats", "errors")
 
 def read_cases(path: Path) -> dict[str, Any]:
     """Read the arguments of ``error_vs_time`` from a TOML file. Raises ``UsageError``."""
-    try:
-        found = tomllib.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise UsageError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from error
+    found = read_toml(path)
     unknown = sorted(found.keys() - set(KEYS))
     missing = [name for name in KEYS[:2] if name not in found]
     if unknown or missing:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import statistics
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -98,35 +98,34 @@ def profile(render: Callable[..., Any], *, repeats: int = 3) -> list[Kernel]:
 def _watched(render: Callable[..., Any]) -> list[Kernel]:
     watch = _Watch()
     render(progress=watch)
-    return watch.kernels()
+    return watch.grouped()
 
 
 @dataclass
 class _Watch(Progress):
-    """Takes the history of kernels whenever a stage begins or ends."""
+    """Notes kernels with the stage in which they ran."""
 
-    entries: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
+    entries: list[tuple[str, Mapping[str, Any]]] = field(default_factory=list)
+    current: str = OUTSIDE
 
     @contextmanager
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
-        self._take(OUTSIDE)
+        self.current = title.lower()
         with super().stage(title, total, message) as advance:
             yield advance
-        self._take(title.lower())
+        self.current = OUTSIDE
 
-    def _take(self, stage: str) -> None:
-        import drjit as dr
+    def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
+        self.entries += [(self.current, record) for record in records]
 
-        self.entries += [(stage, entry) for entry in dr.kernel_history()]
-
-    def kernels(self) -> list[Kernel]:
-        groups: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    def grouped(self) -> list[Kernel]:
+        groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
         for stage, entry in self.entries:
             groups.setdefault((stage, _kind(entry), str(entry.get("hash", ""))), []).append(entry)
         return [_kernel(key, entries) for key, entries in groups.items()]
 
 
-def _kind(entry: dict[str, Any]) -> str:
+def _kind(entry: Mapping[str, Any]) -> str:
     import drjit as dr
 
     if entry["type"] != dr.KernelType.JIT:
@@ -136,7 +135,7 @@ def _kind(entry: dict[str, Any]) -> str:
     return "traces rays" if "_in_ctx" in code or entry.get("uses_optix") else "computes"
 
 
-def _kernel(key: tuple[str, str, str], entries: Sequence[dict[str, Any]]) -> Kernel:
+def _kernel(key: tuple[str, str, str], entries: Sequence[Mapping[str, Any]]) -> Kernel:
     def total(name: str) -> float:
         return sum(entry.get(name, 0.0) for entry in entries) / 1000  # from milliseconds
 

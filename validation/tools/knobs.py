@@ -1,44 +1,38 @@
-"""Every setting that trades error for time, as cases to run against a converged picture."""
+"""Every setting of ours that trades error for time, as cases for ``error_vs_time``."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.scene.model import Mesh, Scene
+from mrt_mitsuba.scene.model import Cone, Mesh, Scene
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.studies.depth_of_field import Lens, fit_lens
-
-Render = Callable[..., Any]  # returns a ``Result``
+from mrt_mitsuba.validation.studies.depth_of_field import fit_lens
 
 MODES = ("none", "luma", "sobel", "geometry")
 CUT_OFFS = (0.0, 1 / 16 / 255, 1 / 255, 4 / 255, 16 / 255)
 DEPTHS = (1, 2, 3, 5, 10)
 SEGMENTS = (8, 32, 128, 512)
 
+Options = dict[str, Any]
+
 
 @dataclass(frozen=True)
 class Trade:
-    """Settings of one kind on one scene, and the picture they strive for.
+    """Settings of one kind on one scene, and the picture they strive for: arguments of ``error_vs_time``."""
 
-    ``reference`` and ``check``: two renders of the truth, the better one first; what they differ by bounds
-    the error of the first.
-    """
-
-    scene: str
-    name: str
+    scene: Any
     title: str
     truth: str  # what the reference is
-    reference: Render
-    check: Render
-    cases: Mapping[str, Render]
+    cases: Mapping[str, Options]
+    reference: Any
+    shared: Options
 
 
 @dataclass(frozen=True)
@@ -47,13 +41,17 @@ class Extent:
 
     size: tuple[int, int]
     amounts: Sequence[int]  # aa
-    reference_aa: int
+    reference_aa: int  # an even multiple of each: at an odd one, lattices share samples and with them errors
     spp: Sequence[int]
     reference_spp: int
 
+    def scene(self, number: int, **options: Any) -> Options:
+        """Return a scene of the report as a dict, of the extent's size."""
+        return mrt.scene_dict(number, width=self.size[0], height=self.size[1], **options)
 
-def load(scene: dict[str, Any]) -> Any:
-    """A Mitsuba scene of a dict with our plugins."""
+
+def load(scene: Options) -> Any:
+    """Return a Mitsuba scene of a dict with our plugins."""
     import mitsuba as mi
 
     mrt.register()
@@ -61,160 +59,119 @@ def load(scene: dict[str, Any]) -> Any:
 
 
 def sampling(number: int, extent: Extent) -> Trade:
-    """Which pixels get how many samples, and where in the pixel."""
-    scene = _scene(number, extent)
-    cases = {
-        f"{mode} aa={aa} {lattice}": partial(mrt.render, scene, aa=aa, aamode=mode, lattice=lattice)
-        for lattice in ("report", "centered")
-        for mode in MODES
-        for aa in extent.amounts
-        if aa > 1 or mode == "none"
-    }
-    truth = partial(mrt.render, scene, aamode="none", lattice="centered")
+    """Return which pixels get how many samples, and where in the pixel."""
+    most = extent.reference_aa
     return Trade(
-        str(number),
-        "sampling",
+        extent.scene(number),
         "anti-aliasing mode, aa and lattice",
-        f"{extent.reference_aa}x{extent.reference_aa} centered samples in every pixel",
-        partial(truth, aa=extent.reference_aa),
-        partial(truth, aa=extent.reference_aa * 3 // 4),
-        cases,
+        f"{most}x{most} centered samples in every pixel; its error: what three quarters of {most} change",
+        {
+            f"{mode} aa={aa} {lattice}": {"aa": aa, "aamode": mode, "lattice": lattice}
+            for lattice in ("report", "centered")
+            for mode in MODES
+            for aa in extent.amounts
+            if aa > 1 or mode == "none"
+        },
+        [{"aa": aa, "aamode": "none", "lattice": "centered"} for aa in (most, most * 3 // 4)],
+        {},
     )
 
 
 def whitted(number: int, extent: Extent) -> Trade:
-    """Cut-off, bounce limit and form of the Fresnel factor, at the same samples."""
-    scene, exact = _scene(number, extent), _scene(number, extent, fresnel="dielectric")
-    shared: dict[str, Any] = {"aa": 2, "aamode": "none"}
+    """Return cut-off, bounce limit and form of the Fresnel factor, at the same samples."""
 
-    def integrator(**parameters: Any) -> Any:
-        return {"type": "mrt_whitted", **parameters}
+    def integrator(**parameters: Any) -> Options:
+        return {"integrator": {"type": "mrt_whitted", **parameters}}
 
-    cases = {
-        f"min_contribution={255 * c:g}/255": partial(
-            mrt.render, exact, **shared, integrator=integrator(min_contribution=c)
-        )
-        for c in CUT_OFFS
-    }
-    cases |= {
-        f"max_depth={d}": partial(mrt.render, exact, **shared, integrator=integrator(max_depth=d))
-        for d in DEPTHS
-    }
-    cases["fresnel=schlick"] = partial(mrt.render, scene, **shared)
-    truth = partial(mrt.render, exact, **shared, integrator=integrator(min_contribution=0.0))
+    cases = {f"min_contribution={255 * c:g}/255": integrator(min_contribution=c) for c in CUT_OFFS}
+    cases |= {f"max_depth={depth}": integrator(max_depth=depth) for depth in DEPTHS}
     return Trade(
-        str(number),
-        "whitted",
+        extent.scene(number, fresnel="dielectric"),
         "cut-off, bounce limit, Fresnel form",
-        "no cut-off, max_depth=10, exact Fresnel",
-        truth,
-        truth,
-        cases,
+        "no cut-off, max_depth=10, exact Fresnel, the same rays",
+        {**cases, "fresnel=schlick": {"scene": extent.scene(number)}},
+        integrator(min_contribution=0.0),
+        {"aa": 2, "aamode": "none"},
     )
 
 
 def path(number: int, extent: Extent) -> Trade:
-    """Mitsuba's path and direct at rising spp, and mrt_whitted, against converged path."""
-    scene = _scene(number, extent)
-    shared: dict[str, Any] = {"aa": 1, "aamode": "none"}
-    cases = {
-        f"{kind} spp={spp}": partial(mrt.render, scene, **shared, integrator=kind, spp=spp)
+    """Return Mitsuba's path and direct at rising spp, and mrt_whitted, against converged path."""
+    cases: dict[str, Options] = {
+        f"{kind} spp={spp}": {"integrator": kind, "spp": spp}
         for kind in ("path", "direct")
         for spp in extent.spp
     }
-    cases["mrt_whitted"] = partial(mrt.render, scene, **shared)
-    cases["mrt_whitted, no clamp"] = partial(
-        mrt.render, scene, **shared, integrator={"type": "mrt_whitted", "clamp": False}
-    )
-    truth = partial(mrt.render, scene, **shared, integrator="path")
+    cases["mrt_whitted"] = {}
+    cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
     return Trade(
-        str(number),
-        "path",
-        "Whitted, direct and path at rising spp, against converged path",
+        extent.scene(number),
+        "Whitted, direct and path at rising spp",
         f"path with spp={extent.reference_spp}",
-        partial(truth, spp=extent.reference_spp, seed=101),
-        partial(truth, spp=extent.reference_spp, seed=202),
         cases,
+        {"integrator": "path", "spp": extent.reference_spp},
+        {"aa": 1, "aamode": "none"},
     )
 
 
 def lens(number: int, extent: Extent) -> Trade:
-    """Both depth-of-field filters, and a thin lens at rising spp."""
+    """Return both depth-of-field filters, and a thin lens at rising spp."""
     width, height = extent.size
-    scene = report_scene(number)
-    shared: dict[str, Any] = {"aa": 2, "aamode": "none", "lattice": "centered"}
-    sharp = mrt.render(_scene(number, extent), **shared, layers=["depth"])
-    found: Lens = fit_lens(scene, sharp.layers["depth.Z"])
-    description = scene.to_dict(width=width, height=height)
-    description["sensor"] |= {
-        "type": "thinlens",
-        "aperture_radius": found.radius,
-        "focus_distance": found.focus,
-    }
-    through = load(description)
-    cases = {
-        f"filter {dof}": partial(mrt.render, number, width=width, height=height, **shared, dof=dof)
+    shared: Options = {"aa": 2, "aamode": "none", "lattice": "centered"}
+    sharp = mrt.render(load(extent.scene(number)), **shared, layers=["depth"])
+    found = fit_lens(report_scene(number), sharp.layers["depth.Z"])
+    through = extent.scene(number)
+    radius_and_focus = {"aperture_radius": found.radius, "focus_distance": found.focus}
+    through["sensor"] = {**through["sensor"], "type": "thinlens", **radius_and_focus}
+    cases: dict[str, Options] = {
+        f"filter {dof}": {"scene": number, "width": width, "height": height, "dof": dof}
         for dof in ("report", "corrected")
     }
-    cases |= {
-        f"thinlens spp={4 * spp}": partial(mrt.render, through, **shared, spp=spp) for spp in extent.spp
-    }
-    truth = partial(mrt.render, through, **shared, spp=extent.reference_spp // 4)  # of four samples
     return Trade(
-        str(number),
-        "lens",
+        through,
         "depth of field as a filter and through a lens",
         f"a lens fitted to the report's blur, {extent.reference_spp} rays a pixel",
-        partial(truth, seed=101),
-        partial(truth, seed=202),
-        cases,
+        cases | {f"thinlens spp={4 * spp}": {"spp": spp} for spp in extent.spp},
+        {"spp": extent.reference_spp // 4},  # of four samples
+        shared,
     )
 
 
-def cone(extent: Extent) -> Trade:
-    """The cone of scene 9 as triangles, against the analytic one."""
-    scene = report_scene(9)
+def cone(number: int, extent: Extent) -> Trade:
+    """Return cones as triangles, against analytic ones."""
     width, height = extent.size
-    shared: dict[str, Any] = {"aa": 2, "aamode": "none"}
-    cases = {
-        f"{n} segments": partial(
-            mrt.render, load(meshed(scene, n).to_dict(width=width, height=height)), **shared
-        )
+    meshes = {
+        f"{n} segments": {"scene": meshed(report_scene(number), n).to_dict(width=width, height=height)}
         for n in SEGMENTS
     }
-    truth = partial(mrt.render, _scene(9, extent), **shared)
     return Trade(
-        "9",
-        "cone",
+        extent.scene(number),
         "cone segments against the analytic cone",
-        "the analytic cone",
-        truth,
-        truth,
-        {**cases, "analytic": truth},
+        "the analytic cone, the same rays",
+        {**meshes, "analytic": {}},
+        {},
+        {"aa": 2, "aamode": "none"},
     )
+
+
+TRADES = {"sampling": sampling, "whitted": whitted, "path": path, "lens": lens, "cone": cone}
 
 
 def meshed(scene: Scene, segments: int) -> Scene:
-    """The scene with its cones as flat triangles, ``segments`` around, and closed below."""
+    """Return the scene with its cones as flat triangles, ``segments`` around, and closed below."""
     return dataclasses.replace(scene, cones=(), meshes=tuple(_cone_mesh(c, segments) for c in scene.cones))
 
 
-def _cone_mesh(cone: Any, segments: int) -> Mesh:
+def _cone_mesh(cone: Cone, segments: int) -> Mesh:
     apex, base = np.array(cone.apex, float), np.array(cone.base_center, float)
     axis = (apex - base) / np.linalg.norm(apex - base)
     s = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     s /= np.linalg.norm(s)
-    t = np.cross(axis, s)
-    angle = 2 * math.pi * np.arange(segments) / segments
-    rim = base + cone.radius * (np.cos(angle)[:, None] * s + np.sin(angle)[:, None] * t)
+    angle = 2 * math.pi * np.arange(segments)[:, None] / segments
+    rim = base + cone.radius * (np.cos(angle) * s + np.sin(angle) * np.cross(axis, s))
     i = np.arange(segments)
     j = (i + 1) % segments
     side = np.stack([i, j, np.full(segments, segments)], axis=1)
     bottom = np.stack([j, i, np.full(segments, segments + 1)], axis=1)
     vertices = np.concatenate([rim, apex[None], base[None]]).astype(np.float32)
     return Mesh(vertices, np.concatenate([side, bottom]).astype(np.uint32), cone.material)
-
-
-def _scene(number: int, extent: Extent, fresnel: str = "schlick") -> Any:
-    width, height = extent.size
-    return load(mrt.scene_dict(number, width=width, height=height, fresnel=fresnel))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from typing import Any
+
+from mrt_mitsuba.cores import usable_cores
 
 
 def machine() -> dict[str, Any]:
     """Cores and system, without a name."""
-    return {"cores": os.cpu_count() or 1, "system": f"{platform.system()} {platform.machine()}"}
+    return {"cores": usable_cores(), "system": f"{platform.system()} {platform.machine()}"}
 
 
 def versions() -> dict[str, str]:

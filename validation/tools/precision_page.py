@@ -54,10 +54,10 @@ def describe(study: Study, found: WorkPrecision, name: str, title: str, truth: s
     prefix = f"{name}-" if name else ""
     where = f"{name}: " if name else ""
     study.at_most(f"{where}cases that failed", len(found.failed), 0, "each of them could be rendered")
-    study.text(" ".join([f"{title}.", _reference(found, truth), *found.verdicts]))
     if not found.points:
         return
-    study.plot(f"{prefix}diagram", f"{title}: work and precision", diagram(found), _caption(found))
+    caption = " ".join([_caption(found), _reference(found, truth), *found.verdicts])
+    study.plot(f"{prefix}diagram", f"{title}: work and precision", diagram(found), caption)
     for number, strip in enumerate(found.strips, 1):
         study.plot(
             f"{prefix}strip-{number}",
@@ -73,7 +73,7 @@ def describe(study: Study, found: WorkPrecision, name: str, title: str, truth: s
             [[curve, *(_reached(found.times[e][curve]) for e in found.errors)] for curve in found.families],
             "With 95 % intervals. Between measured cases a curve is straight in logarithms; beyond them "
             "nothing is assumed.",
-            first=True,
+            first=not name,
         )
     ahead = {point.name for point in front(list(found.points.values()))}
     rows = [_row(number, point, point.name in ahead) for number, point in numbered(found)]

@@ -28,6 +28,7 @@ from mrt_mitsuba.validation.tools.intervals import Estimate, estimate
 
 REFERENCE_SEEDS = (2**20 + 1, 2**20 + 2)  # far from those of the repeats
 RESOLVED = 2.0  # times the reference's own error from which on an error is told from it
+NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?"
 STEPS = (1, 2, 5)  # of the errors that the time is asked for, times powers of ten
 MOST_ERRORS = 4
 
@@ -52,8 +53,9 @@ class Point:
 
     @property
     def family(self) -> str:
-        """Cases whose names differ in numbers only are one curve."""
-        return " ".join(re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?(/\d+)?", " ", self.name).split()).rstrip(" =")
+        """The name without its numbers: cases that differ in these alone are one curve."""
+        bare = re.sub(rf"(\w+=)?{NUMBER}", " ", self.name).split()
+        return " ".join(bare or re.sub(f"=?{NUMBER}", " ", self.name).split()) or self.name
 
     @cached_property
     def time(self) -> Estimate:
@@ -222,7 +224,7 @@ def _verdict(error: float, times: Mapping[str, Estimate], repeats: int) -> str:
     best = reached[0][1]
     like = [name for _, name in reached[1:] if times[name].overlaps(times[best])]
     if like:
-        return f"{where}: {' and '.join([best, *like])} are not told apart, their intervals overlap."
+        return f"{where}: not told apart, for their intervals overlap: {', '.join([best, *like])}."
     if len(reached) == 1:
         return f"{where}: only {best} comes so low, in {times[best]} s."
     value, second = reached[1]
@@ -238,6 +240,7 @@ def error_vs_time(
     repeats: int = 5,
     shared: Options | None = None,
     errors: Sequence[float] | None = None,
+    strips: bool = True,
     progress: Progress | None = None,
 ) -> WorkPrecision:
     """Measure the error and the time of settings of ``render``.
@@ -253,6 +256,7 @@ def error_vs_time(
         repeats: with other seeds, in turn, after a cold and a warm run of each case.
         shared: options of all cases and of the reference.
         errors: RMSEs to give the time for; by default round ones in the range that was measured.
+        strips: render what each curve reaches in the same time.
 
     A case that fails is kept, with the reason. Raises ``UsageError`` for wrong arguments, and what
     ``render`` raises for the reference.
@@ -277,8 +281,8 @@ def error_vs_time(
         repeats=repeats,
         errors=_round_errors(points.values(), truth.error) if errors is None else _claimed(errors, truth),
     )
-    strips = _strips(found, runner)
-    return WorkPrecision(**{**vars(found), "strips": strips, "took": time.perf_counter() - start})
+    shown = _strips(found, runner) if strips else []
+    return WorkPrecision(**{**vars(found), "strips": shown, "took": time.perf_counter() - start})
 
 
 class _Runner:

@@ -1,0 +1,211 @@
+"""How much memory a render may take: what the picture needs, and how much to do at once with the rest."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from mrt_mitsuba.errors import UsageError
+
+# Of every pixel: what is kept, by channel, and what Pillow needs to write a PNG
+BYTES_PER_CHANNEL = 4
+BYTES_TO_WRITE = 4
+
+# A wavefront's arrays, per ray and channel: what the kernel writes, what is formed of it, and the part before
+BYTES_PER_CHANNEL_OF_RAY = 12
+# What filters need for every pixel under work; measured: 131 at most by the blur, 21 by the detectors, beside
+# copies of what they read
+BYTES_PER_PIXEL_OF_FILTER = 192
+
+# Kernels: what their compilation takes for a moment, and their code
+BYTES_OF_KERNELS = 2**25
+
+# Textures, per texel; measured: at most 22 stay, of a map of the surroundings 39; 17 more while one is read
+BYTES_PER_TEXEL = 24
+BYTES_PER_TEXEL_AROUND = 40
+BYTES_PER_TEXEL_READ = 20
+
+# Addresses, which only matter where they are limited (ulimit -v): Mitsuba and its compiler, and each thread's
+# stack and heap
+ADDRESSES_TO_START = 2**29
+ADDRESSES_AT_WORK = 2**27
+ADDRESSES_PER_THREAD = 72 * 2**20
+
+# Rays of one wavefront at most: more gain no speed, and progress is told by the wavefront
+MOST_RAYS = 2**23
+# and at least: fewer, and starting the kernels costs more than running them
+LEAST_RAYS = 2**16
+# Pixels of one band of a filter at most, and rows at least: fewer, and most of the work is done twice
+MOST_PIXELS = 2**22
+LEAST_ROWS = 24
+
+
+@dataclass
+class Budget:
+    """Bytes that a render may use, of which its scene has taken some."""
+
+    size: int
+    taken: int = 0
+
+    @classmethod
+    def of(cls, memory: int | None) -> Budget:
+        """What was asked for, by default half of what is free; never more than the machine has."""
+        return cls(min(memory if memory is not None else free_memory() // 2, all_memory()))
+
+    def take_texture(self, name: str, width: int, height: int, *, around: bool = False) -> None:
+        """Take the memory of a picture used as a texture; ``around``: as a map of the surroundings.
+
+        Raises ``UsageError`` where there is not so much.
+        """
+        stays = width * height * (BYTES_PER_TEXEL_AROUND if around else BYTES_PER_TEXEL)
+        needed = self.taken + stays + width * height * BYTES_PER_TEXEL_READ
+        if needed > self.size:
+            raise UsageError(
+                f"with the picture {name} of {width}x{height} texels, the scene needs {_text(needed)} of "
+                f"memory, and {_text(self.size)} may be used: choose a smaller picture or a larger memory="
+            )
+        self.taken += stays
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Memory for the rays and the filters at work, beside the picture: ``size`` bytes."""
+
+    size: int
+
+    @classmethod
+    def beside(
+        cls,
+        width: int,
+        height: int,
+        channels: int,
+        *,
+        budget: Budget,
+        pictures: int = 1,
+        rays_per_pixel: int = 1,
+    ) -> Workspace:
+        """What a budget leaves beside a picture of so many float32 channels, held ``pictures`` times over.
+
+        ``rays_per_pixel``: which are traced at once. Raises ``UsageError`` where that does not suffice.
+        """
+        pixels = width * height
+        finished = pixels * (pictures * channels * BYTES_PER_CHANNEL + BYTES_TO_WRITE) + BYTES_OF_KERNELS
+        finished += budget.taken
+        least = max(
+            max(min(LEAST_RAYS, pixels), rays_per_pixel) * channels * BYTES_PER_CHANNEL_OF_RAY,
+            min(LEAST_ROWS, height) * width * BYTES_PER_PIXEL_OF_FILTER,
+        )
+        if finished + least > budget.size:
+            raise UsageError(
+                f"a picture of {width}x{height} pixels needs {_text(finished + least)} of memory, "
+                f"and {_text(budget.size)} may be used: choose a smaller width and height, "
+                f"fewer layers or samples, or a larger memory="
+            )
+        return cls(budget.size - finished)
+
+    def rays_at_once(self, channels: int) -> int:
+        """Rays of one wavefront, which returns so many channels."""
+        return max(1, min(self.size // (channels * BYTES_PER_CHANNEL_OF_RAY), MOST_RAYS))
+
+    def rows_at_once(self, width: int) -> int:
+        """Rows of a picture that a filter works on at once."""
+        return max(1, min(self.size // BYTES_PER_PIXEL_OF_FILTER, MOST_PIXELS) // width)
+
+    def after_rays(self, rays: int, channels: int) -> None:
+        """To be called after a pass that traced so many rays at once."""
+        self._give_back(rays * channels * BYTES_PER_CHANNEL_OF_RAY)
+
+    def after_filter(self, pixels: int) -> None:
+        """To be called after a pass that filtered so many pixels at once."""
+        self._give_back(pixels * BYTES_PER_PIXEL_OF_FILTER)
+
+    def _give_back(self, used: int) -> None:
+        """Give the system what Dr.Jit keeps for reuse, after a pass that used much.
+
+        A frame has up to four passes, and one seldom reuses another's arrays: they differ in size.
+        """
+        import drjit as dr
+
+        if used > self.size // 4:
+            dr.flush_malloc_cache()
+
+
+def free_memory(root: Path = Path("/")) -> int:
+    """Bytes that can be had without swapping; where the system does not tell, all there are.
+
+    ``root``: where the system's folders ``proc`` and ``sys`` are.
+    """
+    free = [all_memory(root), *(limit - used for limit, used in _group_limits(root))]
+    try:
+        with open("/proc/meminfo") as file:
+            fields = dict(line.split(":", 1) for line in file)
+        free.append(int(fields["MemAvailable"].split()[0]) * 1024)
+    except (OSError, KeyError, ValueError):
+        pass
+    return max(0, min(free))
+
+
+def all_memory(root: Path = Path("/")) -> int:
+    """Bytes that the machine has, or that its control groups and the limit of addresses leave."""
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    limits = [machine, *(limit for limit, _ in _group_limits(root))]
+    addresses = _free_addresses()
+    if addresses is not None:
+        limits.append(max(0, addresses - ADDRESSES_AT_WORK - (os.cpu_count() or 1) * ADDRESSES_PER_THREAD))
+    return min(limits)
+
+
+def check_addresses() -> None:
+    """Raise ``UsageError`` where the limit of addresses is too low to start: libraries would crash."""
+    free = _free_addresses()
+    if free is not None and free < ADDRESSES_TO_START:
+        raise UsageError(
+            f"the limit of addresses (ulimit -v) leaves {_text(free)}, but Mitsuba and its compiler need "
+            f"{_text(ADDRESSES_TO_START)} beside memory=: raise it, and limit memory= instead"
+        )
+
+
+def _free_addresses() -> int | None:
+    """Bytes of addresses that are left, or None without a limit."""
+    try:
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit == resource.RLIM_INFINITY:
+            return None
+        with open("/proc/self/statm") as file:
+            return limit - int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    except (ImportError, OSError, ValueError):
+        return None
+
+
+def _group_limits(root: Path) -> Iterator[tuple[int, int]]:
+    """Limit and use, in bytes, of each control group (version 1 or 2) that this process is in."""
+    try:
+        groups = (root / "proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return
+    mount = root / "sys/fs/cgroup"
+    for line in groups:
+        _, controllers, path = line.split(":", 2)
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        base, limit, used = (
+            (mount / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes")
+            if controllers
+            else (mount, "memory.max", "memory.current")
+        )
+        group = Path(path.lstrip("/"))
+        for folder in (group, *group.parents):
+            try:
+                numbers = [int((base / folder / name).read_text()) for name in (limit, used)]
+                statistics = dict(s.split() for s in (base / folder / "memory.stat").read_text().splitlines())
+            except (OSError, ValueError):  # no such file, or "max"
+                continue
+            yield numbers[0], numbers[1] - int(statistics.get("inactive_file", 0))
+
+
+def _text(count: float) -> str:
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"

@@ -1,0 +1,160 @@
+"""Shapes of revolution between two points: a mesh to Mitsuba, an exact quadric to ``mrt_whitted``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .intersect import Frame
+from .mesh_api import construct, keep_apart, write_buffers
+from .parameters import ParameterError, flag, integer, number, vector
+from .protocols import QuadricShape
+from .quadric_kinds import KINDS, QuadricTable
+from .unit_meshes import UnitMesh
+from .variants import first, is_jit, updatable
+
+# From some thousand sides on the triangles are slivers, between which rays slip through; more help nobody
+MOST_SEGMENTS = 65536
+
+
+def axial_mesh(kind: str, end0: str, end1: str) -> type[mi.Mesh]:
+    """Return the base class of ``mrt_KIND``, for the current variant (Mitsuba's classes take no mix-in).
+
+    Its parameters are the two points by these names, ``radius``, ``segments``, ``to_world``, and ``capped``
+    where the kind has an open twin.
+    """
+    plugin, names = f"mrt_{kind}", (end0, end1, "radius")
+
+    class AxialMesh(mi.Mesh):
+        def __init__(self, props: mi.Properties) -> None:
+            ends = vector(props, end0), vector(props, end1)
+            radius = number(props, "radius", 1.0, above=0)
+            _check_axis(plugin, end0, ends[0], end1, ends[1])
+            open_twin = KINDS[kind].open_twin
+            self.capped = open_twin is None or flag(props, "capped", True)
+            self.kind = kind if self.capped or open_twin is None else open_twin
+            self.placement = Placement(props)
+            self.unit = KINDS[self.kind].mesh(side_count(props, 256))
+            self.exact_frame = self._frame_of(vector64(ends[0]), vector64(ends[1]), radius)
+            sizes = len(self.unit.points), len(self.unit.faces)
+            construct(self, plugin, sizes, props, normals=True, texcoords=True)
+            _fill(self, self.unit, self.exact_frame)
+            self.parameters = dict(zip(names, (*map(mi.Point3f, ends), updatable(radius)), strict=True))
+            keep_apart(self, plugin, sizes[1])
+
+        def _frame_of(self, p0: Any, p1: Any, radius: Any) -> Frame:
+            return self.placement(KINDS[kind].frame(p0, p1, radius))
+
+        def frame(self) -> Frame:
+            """Return the shape's unit frame in world space, in double precision (see ``intersect``)."""
+            return self.exact_frame
+
+        def quadrics(self) -> QuadricTable:
+            """Return what ``mrt_whitted`` intersects in place of the mesh."""
+            return QuadricTable.of_one(self.kind, self.exact_frame)
+
+        def moving_frame(self) -> Frame | None:
+            """Return the unit frame with its derivatives, None where none are wanted."""
+            values = list(self.parameters.values())
+            return self._frame_of(*values) if dr.grad_enabled(values) else None
+
+        def traverse(self, callback: Any) -> None:
+            mi.Mesh.traverse(self, callback)
+            flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
+            for name, value in getattr(self, "parameters", {}).items():  # none while the mesh is being filled
+                callback.put(name, value, flags)
+
+        def parameters_changed(self, keys: Any = ()) -> None:
+            if not set(names).isdisjoint(keys):
+                p0, p1, radius = (self.parameters[name] for name in names)
+                self.exact_frame = self._frame_of(vector64(p0), vector64(p1), first(radius))
+                if is_jit():
+                    _refill(self, self.unit, self._frame_of(p0, p1, radius))
+                else:
+                    _fill(self, self.unit, self.exact_frame)
+            mi.Mesh.parameters_changed(self, keys)
+
+        def to_string(self) -> str:
+            points = ", ".join(f"{name}={list(vector64(self.parameters[name]))}" for name in names[:2])
+            radius = first(self.parameters["radius"])
+            return f"{type(self).__name__}[{points}, radius={radius:g}, capped={self.capped}]"
+
+    QuadricShape.register(AxialMesh)
+    return AxialMesh
+
+
+def _fill(mesh: Any, unit: UnitMesh, frame: Frame) -> None:
+    """Write a new mesh: positions and normals as ``frame`` places them, texture coordinates, faces."""
+    rows = np.array([list(frame.x), list(frame.y), list(frame.z)], np.float64)
+    flipped = np.linalg.det(rows) < 0
+    positions = unit.placed(frame.extent) @ np.linalg.inv(rows).T + np.array(list(frame.origin))
+    normals = unit.gradients @ rows
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    write_buffers(
+        mesh,
+        faces=(unit.faces[:, ::-1] if flipped else unit.faces).ravel(),
+        vertex_texcoords=unit.uvs.astype(np.float32).ravel(),
+        vertex_positions=positions.astype(np.float32).ravel(),
+        vertex_normals=normals.astype(np.float32).ravel(),
+    )
+
+
+def _refill(mesh: Any, unit: UnitMesh, frame: Frame) -> None:
+    """Write positions and normals anew, differentiably with respect to what ``frame`` was made of."""
+    rows = [mi.Vector3f(r) for r in (frame.x, frame.y, frame.z)]
+    # The columns of the inverse matrix are cross products of its rows
+    volume = dr.dot(rows[0], dr.cross(rows[1], rows[2]))
+    columns = [dr.cross(rows[k - 2], rows[k - 1]) / volume for k in range(3)]
+    position, normal = mi.Point3f(frame.origin), mi.Vector3f(0)
+    if np.any(unit.stretch):
+        position += columns[2] * (frame.extent * mi.Float(unit.stretch))
+    for k in range(3):
+        position += columns[k] * mi.Float(unit.points[:, k])
+        normal += rows[k] * mi.Float(unit.gradients[:, k])
+    write_buffers(mesh, vertex_positions=dr.ravel(position), vertex_normals=dr.ravel(dr.normalize(normal)))
+
+
+def side_count(props: mi.Properties, default: int) -> int:
+    """The parameter ``segments``: sides of a mesh."""
+    return integer(props, "segments", default, least=3, most=MOST_SEGMENTS)
+
+
+class Placement:
+    """What ``to_world`` does to frames. Raises ``ParameterError`` for one that flattens space."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        matrix = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, np.float64)
+        self.linear, self.offset = matrix[:3, :3], matrix[:3, 3].tolist()
+        if not np.isfinite(matrix).all() or abs(np.linalg.det(self.linear)) == 0:
+            raise ParameterError(
+                f'{props.plugin_name()}: "to_world" is not invertible; remove its zero scale'
+            )
+        self.inverse = np.linalg.inv(self.linear).tolist()
+        self.linear = self.linear.tolist()
+
+    def __call__(self, frame: Frame) -> Frame:
+        """The frame of the moved shape; works for vectors of any type."""
+
+        def row(v: Any) -> Any:
+            return type(v)([sum(v[i] * self.inverse[i][j] for i in range(3)) for j in range(3)])
+
+        o = frame.origin
+        origin = [
+            sum(m * c for m, c in zip(self.linear[i], o, strict=True)) + self.offset[i] for i in range(3)
+        ]
+        return Frame(type(o)(origin), row(frame.x), row(frame.y), row(frame.z), frame.extent)
+
+
+def vector64(v: Any) -> Any:
+    """Three numbers, or a point or vector of one entry, in double precision."""
+    return dr.scalar.Array3f64([first(c) for c in v])
+
+
+def _check_axis(plugin: str, end0: str, p0: Sequence[float], end1: str, p1: Sequence[float]) -> None:
+    """Refuse an axis of no length."""
+    if np.array_equal(np.asarray(p0, np.float32), np.asarray(p1, np.float32)):
+        raise ParameterError(f'{plugin}: "{end0}" and "{end1}" are both {list(p0)}, but must be two points')

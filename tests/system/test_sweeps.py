@@ -1,0 +1,447 @@
+"""Sweeps: the same pictures as one render at a time, whatever happens to workers, scheduler and terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.command import main as cli
+from mrt_mitsuba.errors import MrtError, OutputError, UsageError
+from mrt_mitsuba.output.files import read_exr
+
+pytest.importorskip("distributed")
+
+SMALL = {"width": 64, "height": 48, "aa": 1}
+PATIENCE = 120  # seconds for anything that processes do; a busy machine is no failure
+
+
+def wait_for(condition: Callable[[], Any], what: str) -> Any:
+    """Return what a condition gives as soon as it is true."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.02)
+    raise AssertionError(f"in vain: {what}")
+
+
+class Cluster:
+    """A scheduler and two workers, started by hand."""
+
+    def __init__(self, folder: Path) -> None:
+        file = folder / "scheduler.json"
+        common = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
+        self.scheduler = self._start(folder, "scheduler", "--port", "0", *common)
+        wait_for(lambda: file.exists() and file.read_text().endswith("}"), "a scheduler")
+        self.address = json.loads(file.read_text())["address"]
+        self.workers = [
+            self._start(folder, "worker", "--nthreads", "1", "--local-directory", str(folder), *common)
+            for _ in range(2)
+        ]
+
+    @staticmethod
+    def _start(folder: Path, *words: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "dask", *words]
+        with open(folder / "log", "ab") as log:
+            return subprocess.Popen(command, cwd=folder, stdout=log, stderr=log, start_new_session=True)
+
+    def stop(self) -> None:
+        """End all processes, also those that the workers have started."""
+        for process in (*self.workers, self.scheduler):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a cluster for tests that leave it whole."""
+    cluster = Cluster(tmp_path_factory.mktemp("cluster"))
+    yield cluster.address
+    cluster.stop()
+
+
+@pytest.fixture
+def mortal(tmp_path: Path) -> Iterator[Callable[[], Cluster]]:
+    """Starts clusters for tests that break them."""
+    started: list[Cluster] = []
+
+    def start() -> Cluster:
+        folder = tmp_path / f"cluster{len(started)}"
+        folder.mkdir()
+        started.append(Cluster(folder))
+        return started[-1]
+
+    yield start
+    for cluster in started:
+        cluster.stop()
+
+
+class Background:
+    """A sweep in a thread of its own."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self.outcome: Any = None
+        self._thread = threading.Thread(target=self._run, args=(arguments, options), daemon=True)
+        self._thread.start()
+
+    def _run(self, arguments: tuple[Any, ...], options: dict[str, Any]) -> None:
+        try:
+            self.outcome = mrt.sweep(*arguments, **options)
+        except BaseException as error:
+            self.outcome = error
+
+    def end(self) -> Any:
+        """Return what it returned or raised."""
+        self._thread.join(PATIENCE)
+        assert not self._thread.is_alive(), "the sweep does not end"
+        return self.outcome
+
+
+def pictures(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.glob("*.exr"))
+
+
+def left_over(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir() if path.name.startswith(".")]
+
+
+def written(folder: Path) -> list[dict[str, str]]:
+    with open(folder / "table.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# --------------------------------------------- What comes out ---------------------------------------------
+
+
+def test_pictures_are_those_of_render_alone(address: str, tmp_path: Path) -> None:
+    """Over options, seeds and scenes: a number, a dict with Mitsuba's types, a file."""
+    mrt.register()
+    scenes = [3, mrt.scene_dict(0, width=64, height=48), str(tmp_path / "mine.xml")]
+    assert cli.main(["export", "1", "--xml", scenes[2]]) == 0
+    grid = {"scene": scenes, "aa": [1, 2], "seed": np.arange(2)}
+    table = mrt.sweep(None, tmp_path / "out", grid=grid, cluster=address, layers=["depth"])
+    assert len(table.rows) == 12 and not table.failed and not left_over(tmp_path / "out")
+    for row in table.rows:
+        alone = mrt.render(row["scene"], aa=row["aa"], seed=row["seed"], layers=["depth"])
+        found = read_exr(tmp_path / "out" / row["file"])
+        assert found.image.tobytes() == alone.image.tobytes()
+        assert found.layers.keys() == alone.layers.keys()
+        assert row["attempts"] == 1 and row["seconds"] > 0 and row["rays"] == sum(alone.rays.values())
+    assert [row["file"] for row in table.rows][:2] == ["scene=3,aa=1,seed=0.exr", "scene=3,aa=1,seed=1.exr"]
+    assert [row["file"] for row in written(tmp_path / "out")] == [row["file"] for row in table.rows]
+    assert (tmp_path / "out" / "contact.png").stat().st_size > 2000
+
+
+def test_parameters_of_the_scene(address: str, tmp_path: Path) -> None:
+    grid = {"material_0.alpha": [0.1, 0.6], "light_0.intensity.value": [[1, 0, 0], [0, 1, 0]]}
+    table = mrt.sweep(3, tmp_path, grid=grid, cluster=address, **SMALL)
+    found = [read_exr(tmp_path / row["file"]).image.tobytes() for row in table.rows]
+    alone = [
+        mrt.render(3, params={key: row[key] for key in grid}, **SMALL).image.tobytes() for row in table.rows
+    ]
+    assert found == alone and len(set(found)) == 4
+    assert table.rows[0]["file"] == "material_0.alpha=0.1,light_0.intensity.value=1x0x0.exr"
+
+
+def test_a_second_run_renders_only_what_is_missing_or_was_made_otherwise(
+    address: str, tmp_path: Path
+) -> None:
+    def run(**options: Any) -> dict[str, int]:
+        table = mrt.sweep(3, tmp_path, grid={"seed": [1, 2, 3]}, cluster=address, **SMALL | options)
+        assert len(table.rows) == 3 and not table.failed
+        assert all(row["seconds"] > 0 and row["attempts"] == 1 for row in table.rows)
+        return {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.exr")}
+
+    first = run()
+    assert run() == first
+    (tmp_path / "seed=2.exr").unlink()
+    (tmp_path / "seed=3.exr").write_bytes((tmp_path / "seed=3.exr").read_bytes()[:100])
+    second = run(memory="1G")  # does not decide about pixels
+    assert {name for name in first if first[name] != second[name]} == {"seed=2.exr", "seed=3.exr"}
+    third = run(fresnel="dielectric")
+    assert not set(second.values()) & set(third.values())
+    assert not set(third.values()) & set(run(fresnel="dielectric", resume=False).values())
+
+
+def test_a_job_that_fails_ends_no_other(address: str, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.xml"
+    broken.write_text("<scene version='3.0.0'><bsdf type='none_such'/></scene>")
+    table = mrt.sweep(None, tmp_path / "out", grid={"scene": [0, str(broken), 1]}, cluster=address, aa=1)
+    assert [bool(row["error"]) for row in table.rows] == [False, True, False]
+    assert "none_such" in table.failed[0]["error"] and table.failed[0]["file"] == ""
+    assert pictures(tmp_path / "out") == ["scene=0.exr", "scene=1.exr"]
+    assert str(table).startswith("2 of 3 pictures")
+    again = mrt.sweep(None, tmp_path / "out", grid={"scene": [0, str(broken), 1]}, cluster=address, aa=1)
+    assert [row["error"] for row in again.rows] == [row["error"] for row in table.rows]
+
+
+def test_frames_are_numbered_for_films(address: str, tmp_path: Path) -> None:
+    grid = {"focaldist": [1.0, 2.0, 3.0], "seed": [7, 8, 9]}
+    table = mrt.sweep(3, tmp_path, grid=grid, zipped=True, png=True, cluster=address, **SMALL)
+    assert pictures(tmp_path) == [f"frame_{n:04}.exr" for n in range(3)]
+    assert sorted(path.name for path in tmp_path.glob("frame*.png")) == [
+        f"frame_{n:04}.png" for n in range(3)
+    ]
+    assert [(row["focaldist"], row["seed"]) for row in table.rows] == [(1, 7), (2, 8), (3, 9)]
+
+
+# ------------------------------------------- What is refused -------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("grid", "options", "message"),
+    [
+        ({"aaa": [1]}, {}, "aaa is no option of render: did you mean aa?"),
+        ({"aa": []}, {}, "aa is an empty list"),
+        ({"aa": 3}, {}, r"aa is 3; give a list of values, such as \[3\]"),
+        ({"aamode": "luma"}, {}, "aamode is 'luma'; give a list"),
+        ({"aa": [0]}, {}, "aa=0: must be a whole number"),
+        ({"focaldist": [1.0, float("nan")]}, {}, "focaldist=nan: give finite numbers"),
+        ({"motion": [[0, 0, float("inf")]]}, {}, "give finite numbers"),
+        ({"aa": [1, 2, 1]}, {}, "2 jobs would write the same file aa=1"),
+        ({"aa": [1]}, {"aa": 2}, "aa is given twice"),
+        ({"material_0.alpa": [0.1]}, {}, "no parameter material_0.alpa: did you mean material_0.alpha?"),
+        ({"material_0.alpha": ["rough"]}, {}, "material_0.alpha='rough': must be a Float"),
+        ({"material_0.alpha": [0.1, float("nan")]}, {}, "material_0.alpha=nan: give finite numbers"),
+        ({"scene": [1]}, {"scene": 3}, "the scene is given twice"),
+        ({"scene": [99]}, {"scene": None}, "99"),
+        ({"scene": ["none.xml"]}, {"scene": None}, "cannot read none.xml"),
+        ({"aa": [1, 2], "seed": [1]}, {"zipped": True}, "zipped axes must be of one length"),
+        ({"integrator": [object()]}, {}, "cannot be sent"),
+        ({}, {"progres": 1}, "progres is no option of render"),
+        ({}, {"width": 0}, "width=0: must be"),
+        ({}, {"workers": 0}, "workers=0: must be a whole number"),
+        ({}, {"workers": 2, "cluster": "tcp://127.0.0.1:9"}, "give one of them"),
+        ({}, {"retries": -1}, "retries=-1"),
+        ({}, {"cluster": "tcp://127.0.0.1:9"}, "no scheduler answers at tcp://127.0.0.1:9"),
+        ({}, {"cluster": "nonsense://x"}, "no scheduler answers at nonsense://x"),
+    ],
+)
+def test_a_broken_grid_is_refused_before_anything_is_rendered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: dict, options: dict, message: str
+) -> None:
+    monkeypatch.setattr("mrt_mitsuba.sweeps.cluster.CONNECTING", 0.5)
+    with pytest.raises(MrtError, match=message):
+        mrt.sweep(**{"scene": 3, "out": tmp_path / "out", "grid": grid} | options)
+    assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
+
+
+def test_a_loaded_scene_cannot_leave_its_process(tmp_path: Path, variant: str) -> None:
+    import mitsuba as mi
+
+    with pytest.raises(UsageError, match="the scene cannot be sent to other processes"):
+        mrt.sweep(mi.load_dict(mrt.scene_dict(0)), tmp_path)
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot make the folder"):
+        mrt.sweep(3, tmp_path / "file" / "out")
+    (tmp_path / "table.csv").mkdir()
+    with pytest.raises(OutputError, match=r"table.csv: it is a folder"):
+        mrt.sweep(3, tmp_path)
+
+
+# -------------------------------------------- What is survived --------------------------------------------
+
+
+def slow(count: int) -> dict[str, Any]:
+    """A grid whose jobs take a second or so each."""
+    return {"grid": {"seed": range(count)}, "width": 400, "height": 300, "aa": 8, "aamode": "none"}
+
+
+def test_a_worker_killed_in_mid_job_costs_one_retry(mortal, tmp_path: Path) -> None:
+    from distributed import Client
+
+    cluster, out = mortal(), tmp_path / "out"
+    with Client(cluster.address, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=PATIENCE)
+        numbers = client.run(os.getpid)
+        sweep = Background(3, out, cluster=client, **slow(6))
+        wait_for(lambda: out.exists() and pictures(out), "a picture")
+        busy = wait_for(lambda: next((w for w, jobs in client.processing().items() if jobs), None), "a job")
+        os.kill(numbers[busy], signal.SIGKILL)
+        table = sweep.end()
+    assert [row["error"] for row in table.rows] == [""] * 6
+    assert sorted(row["attempts"] for row in table.rows) == [1, 1, 1, 1, 1, 2]
+    assert pictures(out) == [f"seed={n}.exr" for n in range(6)] and not left_over(out)
+
+
+def test_a_scheduler_killed_ends_the_sweep_and_a_second_run_finishes_it(mortal, tmp_path: Path) -> None:
+    cluster, out = mortal(), tmp_path / "out"
+    sweep = Background(3, out, cluster=cluster.address, **slow(6))
+    wait_for(lambda: out.exists() and pictures(out), "a picture")
+    cluster.scheduler.kill()
+    outcome = sweep.end()
+    assert isinstance(outcome, MrtError) and "the scheduler is gone" in str(outcome)
+    assert "\n" not in str(outcome)
+    first = {path.name: path.stat().st_mtime_ns for path in out.glob("*.exr")}
+    assert 0 < len(first) < 6 and {row["file"] for row in written(out)} <= first.keys()
+    cluster.stop()
+    table = mrt.sweep(3, out, cluster=mortal().address, **slow(6))
+    assert len(table.rows) == 6 and not table.failed and not left_over(out)
+    assert {name: (out / name).stat().st_mtime_ns for name in first} == first
+
+
+SWEEP = """
+scene = 3
+width = 400
+height = 300
+aamode = "none"
+aa = 8
+
+[grid]
+seed = [0, 1, 2, 3, 4, 5]
+"""
+
+
+def test_interrupted_from_the_keyboard(tmp_path: Path) -> None:
+    """The whole group of processes gets the signal, as from a terminal."""
+    (tmp_path / "sweep.toml").write_text(SWEEP)
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "mrt_mitsuba.command.main", "sweep", "out", "sweep.toml", "workers=2"]
+    with subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as process:
+        try:
+            wait_for(lambda: out.exists() and pictures(out), "a picture")
+            os.killpg(process.pid, signal.SIGINT)
+            process.wait(PATIENCE)
+        finally:
+            process.kill()
+        errors = process.stderr.read()
+    assert process.returncode == 130 and errors == "mrt: interrupted\n"
+    done = pictures(out)
+    assert 0 < len(done) < 6 and {row["file"] for row in written(out)} <= set(done) and not left_over(out)
+    for name in done:
+        assert read_exr(out / name).image.shape == (300, 400, 3)
+
+
+def test_the_command_and_workers_that_are_renewed(tmp_path: Path, capsys) -> None:
+    text = SWEEP.replace("aa = 8", "aa = 1\nrenew = 2").replace("3, 4, 5", "3")
+    (tmp_path / "sweep.toml").write_text(text)
+    assert cli.main(["sweep", str(tmp_path / "out"), str(tmp_path / "sweep.toml"), "workers=1"]) == 0
+    assert capsys.readouterr().out.endswith(f"4 of 4 pictures in {tmp_path / 'out'}\n")
+    rows = written(tmp_path / "out")
+    workers = [row["worker"] for row in rows]
+    assert [workers.count(worker) for worker in dict.fromkeys(workers)] == [2, 2]
+    assert {row["attempts"] for row in rows} == {"1"}
+
+
+@pytest.mark.parametrize(
+    ("words", "text", "message"),
+    [
+        ([], "", "give a folder and a file"),
+        (["workers=x"], "", "must be a whole number"),
+        (["job=1"], "", "unknown option 'job'"),
+        ([], "a =", "cannot read"),
+        ([], "grid = 3", "grid must be a table"),
+        ([], "out = 'x'", "out cannot be set in a file"),
+        ([], "[grid]\nmaterial_0.alpha = []", "material_0.alpha is an empty list"),
+    ],
+)
+def test_a_broken_command(tmp_path: Path, capsys, words: list[str], text: str, message: str) -> None:
+    (tmp_path / "sweep.toml").write_text(text)
+    arguments = [str(tmp_path / "out"), str(tmp_path / "sweep.toml"), *words] if text or words else []
+    assert cli.main(["sweep", *arguments]) == 2
+    errors = capsys.readouterr().err
+    assert message in errors and errors.count("\n") == 1
+
+
+def test_threads_are_shared_out(address: str, tmp_path: Path) -> None:
+    """Two workers on this machine: half of its cores each."""
+    from distributed import Client
+
+    from mrt_mitsuba.cores import usable_cores
+
+    def threads() -> int:
+        import drjit
+
+        return drjit.thread_count()
+
+    with Client(address, set_as_default=False) as client:
+        mrt.sweep(3, tmp_path, grid={"seed": range(4)}, cluster=client, **SMALL)
+        assert set(client.run(threads).values()) <= {max(1, usable_cores() // 2)}
+
+
+# ------------------------------------------------- Tiles -------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"aa": 3, "focaldist": 2.0, "focalrange": 0.5, "layers": ["normal", "blur"]},
+        {"aa": 2, "aamode": "luma", "integrator": "path", "spp": 2, "seed": 3},
+    ],
+    ids=["filters", "random numbers"],
+)
+def test_tiles_make_the_same_picture(address: str, tmp_path: Path, options: dict[str, Any]) -> None:
+    size = {"width": 231, "height": 173}
+    mrt.render(3, **size, **options).save(tmp_path / "whole.exr")
+    table = mrt.sweep(3, tmp_path / "out", tiles=(3, 4), cluster=address, **size, **options)
+    assert [row["error"] for row in table.rows] == [""] and table.rows[0]["rays"] > 231 * 173
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["picture.exr", "table.csv"]
+    whole, tiled = (read_exr(path) for path in (tmp_path / "whole.exr", tmp_path / "out" / "picture.exr"))
+    assert tiled.image.tobytes() == whole.image.tobytes()
+    assert tiled.layers.keys() == whole.layers.keys()
+    for name, values in whole.layers.items():
+        assert tiled.layers[name].tobytes() == values.tobytes(), name
+    own = {"mrt:seconds", "mrt:sweep"}
+    assert tiled.header.keys() - own == whole.header.keys() - own
+    assert all(str(tiled.header[key]) == str(whole.header[key]) for key in whole.header.keys() - own)
+
+
+def test_tiles_of_an_earlier_sweep_are_kept(address: str, tmp_path: Path) -> None:
+    (tmp_path / "picture.exr").mkdir()  # in the way of the picture, when its tiles are there
+    options = {"tiles": (2, 2), "cluster": address, **SMALL}
+    first = mrt.sweep(3, tmp_path, **options)
+    assert "cannot put picture together" in first.failed[0]["error"]
+    assert sorted(path.name for path in (tmp_path / "picture.tiles").iterdir()) == [
+        f"{row},{column}.exr" for row in (0, 1) for column in (0, 1)
+    ]
+    (tmp_path / "picture.exr").rmdir()
+    (tmp_path / "picture.tiles" / "1,0.exr").unlink()
+    second = mrt.sweep(3, tmp_path, **options)
+    assert (
+        not second.failed and second.rows[0]["rays"] is None
+    )  # those of the tiles that were there are unknown
+    assert read_exr(tmp_path / "picture.exr").image.tobytes() == mrt.render(3, **SMALL).image.tobytes()
+    assert not (tmp_path / "picture.tiles").exists()
+
+
+def test_a_tile_that_fails_fails_its_picture(address: str, tmp_path: Path) -> None:
+    scenes = [str(tmp_path / name) for name in ("good.xml", "bad.xml")]
+    assert cli.main(["export", "1", "--xml", scenes[0]]) == 0
+    Path(scenes[1]).write_text(Path(scenes[0]).read_text().replace("mrt_bsdf", "none_such"))
+    size = {"width": 800, "height": 600}  # those of the file: no one looks into it before
+    grid = {"scene": scenes}
+    table = mrt.sweep(None, tmp_path / "out", grid=grid, tiles=(2, 1), cluster=address, aa=1, **size)
+    assert [bool(row["error"]) for row in table.rows] == [False, True]
+    assert "none_such" in table.failed[0]["error"]
+
+
+@pytest.mark.parametrize("tiles", [(0, 1), (2,), 3, (2.0, 2), (49, 1)])
+def test_tiles_that_cannot_be(tmp_path: Path, tiles: object) -> None:
+    with pytest.raises(UsageError, match="tiles="):
+        mrt.sweep(3, tmp_path, tiles=tiles, **SMALL)

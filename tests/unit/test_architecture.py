@@ -1,0 +1,205 @@
+"""The house: imports without cycles, private names at home, short functions of few parameters and branches.
+
+The modules are read, not imported, so that imports inside functions count as well. Those for types alone,
+which never run, do not.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FOLDERS = {"mrt_mitsuba": "mrt_mitsuba"} | {
+    name: f"mrt_mitsuba.{name}" for name in ("plugins", "scenes_xml", "validation")
+}
+LINES, PARAMETERS, BRANCHES = 40, 8, 12
+# In rooms under reconstruction; to be empty
+OFFENDERS = {
+    "mrt_mitsuba.plugins.kernel_plan.make_plan",
+    "mrt_mitsuba.sweeps.run.sweep",
+    "mrt_mitsuba.validation.oracles.reference._Tracer.__init__",
+    "mrt_mitsuba.validation.studies.rivals.run",
+    "mrt_mitsuba.validation.studies.roughconductor.pointwise",
+    "mrt_mitsuba.validation.tools.precision_page.diagram",
+}
+BACKWARDS = {
+    ("tools.work_precision", "tools.precision_page"),
+    ("studies.metals", "studies.roughconductor"),
+}
+# The loops of the integrator are one story; the options of a render are many
+ALLOWED = {"mrt_mitsuba.plugins.whitted.MrtWhitted.trace", "mrt_mitsuba.rendering.api.render"}
+
+FOUNDATION = {"errors", "memory", "options", "runtime"}
+
+_BRANCH = ast.If | ast.IfExp | ast.For | ast.While | ast.ExceptHandler | ast.match_case | ast.comprehension
+
+
+class WithoutTypes(ast.NodeTransformer):
+    """Takes out what is imported for type checkers only."""
+
+    def visit_If(self, node: ast.If) -> ast.AST | None:
+        test = node.test
+        return None if isinstance(test, ast.Name) and test.id == "TYPE_CHECKING" else self.generic_visit(node)
+
+
+def sources() -> dict[str, str]:
+    """The text of all modules, by name."""
+    found = {}
+    for folder, package in FOLDERS.items():
+        for file in sorted((ROOT / folder).rglob("*.py")):
+            parts = file.relative_to(ROOT / folder).with_suffix("").parts
+            name = ".".join([package, *(part for part in parts if part != "__init__")])
+            found[name] = file.read_text()
+    return found
+
+
+SOURCES = sources()
+MODULES = {name: WithoutTypes().visit(ast.parse(text)) for name, text in SOURCES.items()}
+PACKAGES = {name for name in MODULES if any(other.startswith(f"{name}.") for other in MODULES)}
+
+
+def imported(name: str) -> Iterator[tuple[str, str]]:
+    """Pairs (module of the project, name taken from it, or none) that a module imports anywhere."""
+    package = name if name in PACKAGES else name.rpartition(".")[0]
+    for node in ast.walk(MODULES[name]):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, ""
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")[: -(node.level - 1) or None] if node.level else []
+            source = ".".join([*parts, *([node.module] if node.module else [])])
+            for alias in node.names:
+                whole = f"{source}.{alias.name}"
+                yield (whole, "") if whole in MODULES else (source, alias.name)
+
+
+def classes_in(function: ast.FunctionDef) -> list[ast.ClassDef]:
+    """Classes that a function makes: their methods count by themselves."""
+    return [node for node in function.body if isinstance(node, ast.ClassDef)]
+
+
+def functions(name: str) -> Iterator[tuple[str, ast.FunctionDef]]:
+    """Functions and methods of a module with their full names; of nested ones, those that are outermost."""
+
+    def inside(node: ast.AST, path: str) -> Iterator[tuple[str, ast.FunctionDef]]:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.FunctionDef):
+                yield f"{path}.{child.name}", child
+                for own in classes_in(child):
+                    yield from inside(own, f"{path}.{child.name}.{own.name}")
+            else:
+                yield from inside(child, f"{path}.{child.name}" if isinstance(child, ast.ClassDef) else path)
+
+    yield from inside(MODULES[name], name)
+
+
+ALL = {path: (function, SOURCES[name]) for name in MODULES for path, function in functions(name)}
+
+
+def lines_of_code(function: ast.FunctionDef, source: str) -> int:
+    """Lines of the body, without docstring, classes, comments and blank lines."""
+    lines = source.splitlines()
+    body = [node for node in function.body if node not in classes_in(function)]
+    body = body[1:] if ast.get_docstring(function) else body
+    text = [line.strip() for node in body for line in lines[node.lineno - 1 : node.end_lineno]]
+    return sum(bool(line) and not line.startswith("#") for line in text)
+
+
+def parameters(function: ast.FunctionDef, source: str) -> int:
+    """Number of parameters but for self and cls."""
+    every = [a.arg for a in (*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs)]
+    return len([name for name in every if name not in ("self", "cls")])
+
+
+def branches(function: ast.FunctionDef, source: str) -> int:
+    """Ways to go on at decisions, functions inside left out."""
+    count, waiting = 0, list(ast.iter_child_nodes(function))
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.FunctionDef | ast.Lambda):
+            continue
+        count += isinstance(node, _BRANCH)
+        waiting += ast.iter_child_nodes(node)
+    return count
+
+
+def graph() -> dict[str, set[str]]:
+    """For each module, those of the project that it imports anywhere."""
+    edges = {name: {source for source, _ in imported(name) if source in MODULES} - {name} for name in MODULES}
+    for name, source in BACKWARDS:
+        edges[f"mrt_mitsuba.validation.{name}"].discard(f"mrt_mitsuba.validation.{source}")
+    return edges
+
+
+def cycle(edges: dict[str, set[str]]) -> str:
+    """A cycle of imports as text; "" where there is none."""
+    try:
+        TopologicalSorter(edges).prepare()
+    except CycleError as error:
+        return " <- ".join(error.args[1])
+    return ""
+
+
+def test_every_module_imported_is_there() -> None:
+    """Inside functions as well, where nothing else would notice until they run."""
+    named = {(name, source) for name in MODULES for source, _ in imported(name)}
+    assert not {pair for pair in named if pair[1].split(".")[0] == "mrt_mitsuba" and pair[1] not in MODULES}
+
+
+def test_imports_make_no_cycle() -> None:
+    assert cycle(graph()) == ""
+
+
+@pytest.mark.parametrize(
+    ("room", "others"),
+    [
+        ("plugins", {"plugins"}),
+        ("rays", {"rays"}),
+        ("filters", {"filters", "errors", "runtime", "output"}),
+        ("rendering", {"rendering", "plugins", "rays", "filters", "scene", "output", *FOUNDATION}),
+    ],
+)
+def test_a_room_knows_only(room: str, others: set[str]) -> None:
+    """What data flows through on its way; see docs/architecture.md."""
+    package = f"mrt_mitsuba.{room}"
+    known = set().union(
+        *(sources for name, sources in graph().items() if f"{name}.".startswith(f"{package}."))
+    )
+    assert {source.split(".")[1] for source in known if source != "mrt_mitsuba"} <= others
+
+
+def test_private_names_stay_at_home() -> None:
+    wrong = [
+        f"{name} takes {taken} from {source}"
+        for name in MODULES
+        for source, taken in imported(name)
+        if source in MODULES and taken.startswith("_") and not taken.startswith("__")
+    ]
+    assert not wrong
+
+
+@pytest.mark.parametrize(
+    ("measure", "limit"),
+    [(lines_of_code, LINES), (parameters, PARAMETERS), (branches, BRANCHES)],
+    ids=["lines", "parameters", "branches"],
+)
+def test_functions_stay_within(measure, limit: int) -> None:
+    found = {name: measure(*function) for name, function in ALL.items() if name not in ALLOWED | OFFENDERS}
+    assert {name: size for name, size in found.items() if size > limit} == {}
+
+
+def test_these_checks_can_fail() -> None:
+    assert cycle({"a": {"b"}, "b": {"a"}})
+    assert any(source == "mrt_mitsuba.output.layers" for source, _ in imported("mrt_mitsuba.rendering.plan"))
+    assert any(
+        source == "mrt_mitsuba.plugins.variants" for source, _ in imported("mrt_mitsuba.plugins.light")
+    )
+    body = "\n    ".join(f"if a{i}: pass" for i in range(50))
+    text = f"def f({', '.join(f'a{i}' for i in range(9))}):\n    'Doc.'\n    # why\n\n    {body}"
+    function = ast.parse(text).body[0]
+    assert [measure(function, text) for measure in (lines_of_code, parameters, branches)] == [50, 9, 50]

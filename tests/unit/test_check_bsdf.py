@@ -1,0 +1,197 @@
+"""``check_bsdf``: sound BSDFs pass, each mistake fails its own laws, and results say why."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba import runtime
+from mrt_mitsuba.validation.checks import noise
+from mrt_mitsuba.validation.checks.bsdf import LAWS
+from mrt_mitsuba.validation.studies.stability.formulas import Ours, Report
+from mrt_mitsuba.validation.studies.stability.lobes import lobes_with_truth
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def _specimens() -> Any:
+    spec = importlib.util.spec_from_file_location("specimens", Path(__file__).with_name("specimens.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+specimens = _specimens()
+
+
+@pytest.fixture
+def registered(variant: str) -> None:
+    """The specimen of a BSDF, in both kinds of variants."""
+    for name in (runtime.SLOW, variant):
+        mi.set_variant(name)
+        specimens.register()
+
+
+def holds(check: Any) -> None:
+    assert check.passed, str(check)
+
+
+def run(snippet: str) -> None:
+    """A snippet is a program by itself."""
+    before = mi.variant()
+    try:
+        exec(compile(snippet, "snippet", "exec"), {})
+    finally:
+        mi.set_variant(before)
+
+
+# ----------------------------------------------- Mistakes -------------------------------------------------
+
+
+def test_a_sound_bsdf_passes_by_other_seeds(registered) -> None:
+    for seed in range(3):
+        holds(mrt.check_bsdf({"type": "specimen"}, quick=True, seed=seed))
+
+
+@pytest.mark.parametrize("mistake", specimens.MISTAKES)
+def test_each_mistake_fails_its_own_laws(mistake: str, registered, capsys) -> None:
+    check = mrt.check_bsdf({"type": "specimen", "mistake": mistake}, quick=True)
+    assert set(check.failed) == specimens.MISTAKES[mistake], str(check)
+    for name in check.failed:
+        law = check.laws[name]
+        assert not law.holds and law.why and law.note and not law.skipped
+        run(law.snippet)
+        assert capsys.readouterr().out
+
+
+def test_the_detached_parameter_is_named(registered) -> None:
+    check = mrt.check_bsdf(
+        {"type": "specimen", "mistake": "detached gradient"}, quick=True, only=["gradients"]
+    )
+    assert "detached: alpha" in check.laws["gradients"].note
+
+
+# -------------------------------------------- Mitsuba's BSDFs ---------------------------------------------
+
+# What each of them fails is explained in docs/check_your_plugin.md
+STOCK = {
+    "diffuse": ({"reflectance": {"type": "checkerboard"}}, set()),
+    "dielectric": ({}, set()),
+    "thindielectric": ({}, set()),
+    "conductor": ({"material": "Au"}, set()),
+    "plastic": ({}, set()),
+    "roughdielectric": ({"alpha": 0.2}, set()),
+    "roughconductor": ({"distribution": "ggx"}, {"finite"}),
+    "roughplastic": ({}, {"sampling", "finite", "gradients"}),
+    "twosided": ({"nested": {"type": "diffuse"}}, {"components"}),
+    "mask": ({"opacity": 0.6, "nested": {"type": "diffuse"}}, {"components"}),
+    "blendbsdf": (
+        {"weight": 0.3, "a": {"type": "diffuse"}, "b": {"type": "dielectric"}},
+        {"weights", "components"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STOCK)
+def test_stock_bsdfs_fail_what_is_known(name: str, capsys) -> None:
+    parameters, known = STOCK[name]
+    check = mrt.check_bsdf({"type": name, **parameters}, quick=True)
+    assert set(check.failed) == known, str(check)
+    for law in check.laws.values():
+        for part in law.parts:
+            if not part.holds:
+                run(part.snippet)
+
+
+def test_a_texture_that_loading_uses_up(registered) -> None:
+    bumps = mi.TensorXf(np.random.default_rng(0).random((8, 8, 1)).astype(np.float32))
+    bumpy = {"type": "bumpmap", "texture": {"type": "bitmap", "raw": True, "data": bumps}, "scale": 0.02}
+    check = mrt.check_bsdf({**bumpy, "bsdf": {"type": "diffuse"}}, quick=True)
+    # shading normals break reciprocity whoever computes them (Veach 1997, § 5.3)
+    assert set(check.failed) <= {"reciprocity"}, str(check)
+
+
+# ---------------------------------------- Instances and variants ------------------------------------------
+
+
+def test_an_instance_skips_what_has_to_load_it(registered) -> None:
+    check = mrt.check_bsdf(mi.load_dict({"type": "specimen"}), quick=True)
+    holds(check)
+    assert "loaded object" in check.laws["variants"].skipped
+    assert not check.laws["switch"].skipped
+
+
+@pytest.mark.parametrize(
+    "variant", ["scalar_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"], indirect=True
+)
+def test_other_variants(variant: str) -> None:
+    check = mrt.check_bsdf({"type": "mrt_bsdf", "alpha": 0.3}, quick=True)
+    holds(check)
+    assert check.variant == variant == mi.variant()
+
+
+def test_a_plugin_of_one_variant_only() -> None:
+    class Once(mi.BSDF):
+        def __init__(self, props: Any) -> None:
+            mi.BSDF.__init__(self, props)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return mi.Spectrum(0)
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return mi.Float(0)
+
+        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
+            return dr.zeros(mi.BSDFSample3f), mi.Spectrum(0)
+
+    mi.register_bsdf("once", Once)
+    law = mrt.check_bsdf({"type": "once"}, quick=True, only=["variants"]).laws["variants"]
+    assert "does not know the plugin" in law.skipped
+
+
+def test_wrong_usage() -> None:
+    with pytest.raises(mrt.UsageError, match="is no BSDF"):
+        mrt.check_bsdf(mi.load_dict({"type": "sphere"}))
+    with pytest.raises(mrt.UsageError, match="unknown law 'colour'"):
+        mrt.check_bsdf({"type": "diffuse"}, only=["colour"])
+
+
+def test_what_a_check_leaves(tmp_path: Path) -> None:
+    check = mrt.check_bsdf({"type": "twosided", "nested": {"type": "diffuse"}}, quick=True)
+    check.save(tmp_path)
+    assert list(check.laws) == list(LAWS) and check.failed == ["components"]
+    page, html = (tmp_path / "index.html").read_text(), check._repr_html_()
+    assert all(name in page and name in html for name in LAWS)
+    assert "mi.load_dict" in page and "mi.load_dict" in html
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["passed"] is False
+    assert {path.suffix for path in tmp_path.iterdir()} >= {".html", ".json", ".csv"}
+
+
+# ------------------------------------------- Noise of rounding --------------------------------------------
+
+
+@pytest.mark.parametrize(("formula", "alpha"), [(Report, 0.1), (Report, 0.01), (Ours, 0.1), (Ours, 0.01)])
+def test_noise_is_found_without_a_reference(formula: Any, alpha: float) -> None:
+    """Against 50 digits: the estimate is a deviation, 1.5 medians of an error, within a factor of 3."""
+    lobes, truth = lobes_with_truth(2)
+    here = np.isclose(lobes.alpha, alpha) & (lobes.cell[:, 1] < 5) & (lobes.steepness < 16)
+    few, form = lobes.only(here), formula()
+
+    def density(x: np.ndarray) -> np.ndarray:
+        wi, wo = (mi.Vector3f(np.ascontiguousarray(v.T)) for v in (x[:, :3], x[:, 3:]))
+        alphas, iors = (mi.Float(np.tile(v, len(x) // len(few))) for v in (few.alpha, few.ior))
+        return np.array(dr.detach(form.terms(wi, wo, alphas, iors).d))
+
+    found = noise.measure(density, np.concatenate([few.wi, few.wo], axis=1))
+    error = np.abs(found.value / truth.d[here] - 1) / noise.ROUNDING
+    assert 1 / 3 < np.median(found.noise) / (1.5 * np.median(error)) < 3
+    assert (np.quantile(found.lost(noise.ALLOWANCE), 0.9) > noise.LOST) == (formula is Report)

@@ -1,0 +1,203 @@
+"""Derivatives of ``mi.render`` under ``mrt_whitted`` at ``max_depth`` 1, against finite differences.
+
+Each render has a scene and an integrator of its own: what one has kept must not serve another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+# Finite differences are taken over the rays that the derivatives are: Mitsuba draws others for the picture
+RAYS = {"spp": 16, "seed": 2}
+WITH_GRADIENTS = {"spp": 16, "seed": 1, "seed_grad": 2}
+
+
+def rgb(*values: float) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(values)}
+
+
+MATERIAL = {
+    "type": "mrt_bsdf",
+    "alpha": 0.3,
+    "int_ior": 1.6,
+    "diffuse_reflectance": rgb(0.2, 0.3, 0.4),
+    "specular_reflectance": rgb(0.5, 0.6, 0.7),
+}
+
+
+def scene(**more: Any) -> mi.Scene:
+    """A sphere that fills the picture, so that no silhouette moves in it, before another one behind the camera."""
+    look = mi.ScalarTransform4f().look_at([0, 0.5, 3], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 12, "component_format": "float32"}
+    film["rfilter"] = {"type": "box"}
+    return mi.load_dict({
+        "type": "scene",
+        "integrator": {"type": "mrt_whitted", "max_depth": 1},
+        "sensor": {"type": "perspective", "fov": 25, "to_world": look, "film": film},
+        "light": {"type": "mrt_light", "position": [2, 3, 5], "intensity": rgb(1.1, 1.0, 0.9)},
+        "lamp": {"type": "point", "position": [-2, 2, 4], "intensity": rgb(5, 4, 3)},
+        "sky": {"type": "constant", "radiance": 0.3},
+        "ball": {"type": "sphere", "bsdf": MATERIAL},
+        "other": {"type": "sphere", "center": [0, 0, 9], "radius": 0.1, "bsdf": {"type": "mrt_bsdf"}},
+        **more,
+    })  # fmt: skip
+
+
+def moved(parameters: Any, key: str, by: Any) -> None:
+    """Add a number to a parameter, to the first component of a vector or colour, or to the x of a place."""
+    value = parameters[key]
+    if key.endswith("to_world"):
+        parameters[key] = mi.Transform4f().translate(mi.Vector3f(by, 0, 0)) @ mi.Transform4f(value)
+    elif dr.depth_v(value) > 1:
+        parameters[key] = type(value)(value[0] + by, *list(value)[1:])
+    else:
+        parameters[key] = value + by
+    parameters.update()
+
+
+def mean(image: Any) -> float:
+    return float(np.array(image, np.float64).mean())
+
+
+def difference(key: str, step: float, make: Callable[[], mi.Scene] = scene) -> float:
+    means = []
+    for sign in (1, -1):
+        loaded = make()
+        parameters = mi.traverse(loaded)
+        moved(parameters, key, sign * step)
+        means.append(mean(mi.render(loaded, **RAYS)))
+    return (means[0] - means[1]) / (2 * step)
+
+
+def rendered(key: str, others: tuple[str, ...] = (), make: Callable[[], mi.Scene] = scene) -> tuple:
+    """A picture, a number that moves the parameter, and what Mitsuba needs alive until it has differentiated.
+
+    Derivatives of others are wanted, too.
+    """
+    loaded = make()
+    parameters, by = mi.traverse(loaded), mi.Float(0)
+    dr.enable_grad(by)
+    for other in others:
+        dr.enable_grad(parameters[other])
+    moved(parameters, key, by)
+    return mi.render(loaded, parameters, **WITH_GRADIENTS), by, parameters
+
+
+def backward(*arguments: Any) -> float:
+    image, by, _alive = rendered(*arguments)
+    dr.backward(dr.mean(image.array))
+    return float(dr.grad(by)[0])
+
+
+def forward(*arguments: Any) -> float:
+    image, by, _alive = rendered(*arguments)
+    dr.forward(by)
+    return mean(dr.grad(image))
+
+
+KEYS = {
+    "ball.bsdf.alpha": 1e-2,
+    "ball.bsdf.int_ior": 2e-2,
+    "ball.bsdf.ext_ior": 2e-2,
+    "ball.bsdf.diffuse_reflectance.value": 2e-2,
+    "ball.bsdf.specular_reflectance.value": 2e-2,
+    "light.intensity.value": 2e-2,
+    "lamp.intensity.value": 0.1,
+    "light.position": 5e-2,
+    "lamp.position": 5e-2,
+    "ball.to_world": 1e-2,
+}
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_derivatives_are_those_of_finite_differences(key: str) -> None:
+    exact = difference(key, KEYS[key])
+    assert abs(exact) > 1e-4
+    other = "ball.bsdf.alpha" if key.startswith("light.intensity") else "light.intensity.value"
+    for found in (backward(key), backward(key, (other,)), forward(key)):
+        # The error of a central difference falls with the square of the step: below 0.5 % here
+        assert found == pytest.approx(exact, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"fresnel": "dielectric"}, "ball.bsdf.int_ior"),
+        ({"f0": rgb(0.5, 0.4, 0.3)}, "ball.bsdf.f0.value"),
+        ({"alpha": {"type": "checkerboard", "color0": 0.2, "color1": 0.4}}, "ball.bsdf.alpha.color0.value"),
+    ],
+    ids=["dielectric", "f0", "textured"],
+)
+def test_materials_of_every_form(change: dict[str, Any], key: str) -> None:
+    def make() -> mi.Scene:
+        return scene(ball={"type": "sphere", "bsdf": MATERIAL | change})
+
+    assert backward(key, (), make) == pytest.approx(difference(key, 4e-3, make), rel=1e-2)
+
+
+def test_sky_of_the_integrator() -> None:
+    def make() -> mi.Scene:
+        ball = {"type": "sphere", "radius": 0.2, "bsdf": MATERIAL}
+        return scene(integrator={"type": "mrt_whitted", "max_depth": 1, "sky": rgb(0.3, 0.2, 0.1)}, ball=ball)
+
+    # A parameter of an integrator is none of the scene; it must not be lost among those that are
+    assert backward("ball.bsdf.alpha", (), make) == pytest.approx(
+        difference("ball.bsdf.alpha", 1e-2, make), rel=1e-2
+    )
+
+
+@pytest.mark.parametrize("update", [True, False])
+def test_derivatives_by_enable_grad(update: bool) -> None:
+    """In place, with and without an update of the parameters, after a render without derivatives."""
+    loaded = scene()
+    parameters = mi.traverse(loaded)
+    mi.render(loaded, spp=1)
+    alpha = parameters["ball.bsdf.alpha"]
+    dr.enable_grad(alpha)
+    if update:
+        parameters.update()
+    dr.backward(dr.mean(mi.render(loaded, parameters, **WITH_GRADIENTS).array))
+    assert float(dr.grad(alpha)[0]) == pytest.approx(difference("ball.bsdf.alpha", 1e-2), rel=1e-2)
+
+
+def test_an_optimiser_finds_roughness_and_light() -> None:
+    wanted = scene()
+    target = mi.render(wanted, **RAYS)
+    loaded = scene()
+    parameters = mi.traverse(loaded)
+    optimiser = mi.ad.Adam(lr=0.02)
+    optimiser["ball.bsdf.alpha"] = mi.Float(0.4)
+    optimiser["light.intensity.value"] = mi.Color3f(0.8)
+    for _ in range(60):
+        parameters.update(optimiser)
+        image = mi.render(loaded, parameters, **WITH_GRADIENTS)
+        dr.backward(dr.mean(dr.square(image - target).array))
+        optimiser.step()
+        optimiser["ball.bsdf.alpha"] = dr.clip(optimiser["ball.bsdf.alpha"], 0.05, 1)
+    assert float(optimiser["ball.bsdf.alpha"][0]) == pytest.approx(0.3, abs=0.01)
+    assert np.array(optimiser["light.intensity.value"]).ravel() == pytest.approx([1.1, 1.0, 0.9], abs=0.02)
+
+
+@pytest.mark.parametrize("kind", ["cone", "cylinder", "capsule"])
+def test_places_of_exact_shapes(kind: str) -> None:
+    """Those of the exact surface; those of a cone's mesh, which other integrators see, are a third off."""
+    names = ("apex", "base_center") if kind == "cone" else ("p0", "p1")
+    points = dict(zip(names, ([0, 4, 0], [0, -4, 0]), strict=True))
+
+    def make() -> mi.Scene:
+        shape = {"type": f"mrt_{kind}", **points, "radius": 2.0 if kind == "cone" else 1.0, "segments": 8}
+        return scene(ball={**shape, "bsdf": MATERIAL})
+
+    for key in ("ball.radius", f"ball.{names[0]}", f"ball.{names[1]}"):
+        exact = difference(key, 1e-2, make)
+        assert abs(exact) > 1e-4
+        for found in (backward(key, (), make), forward(key, (), make)):
+            assert found == pytest.approx(exact, rel=1e-2)

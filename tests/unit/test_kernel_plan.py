@@ -1,0 +1,143 @@
+"""The kernel plan: what is decided from the facts, and that the kernels obey every decision."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mrt_mitsuba.plugins.kernel_plan import KernelPlan, Reason
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+TEXTURE = {"type": "checkerboard", "color0": 0.2, "color1": 0.8}
+MESH = {
+    "type": "mrt_mesh",
+    "positions": mi.Bitmap(np.array([[(-1, 0, -1), (1, 0, -1), (0, 1, -1)]], np.float32)),
+    "faces": mi.Bitmap(np.array([[(0, 1, 2)]], np.uint32)),
+}
+SPHERE: dict[str, Any] = {"type": "sphere", "radius": 0.7, "bsdf": {"type": "mrt_bsdf"}}
+CONE = {"type": "mrt_cone", "apex": [0, 1, 1], "base_center": [0, 0, 1], "radius": 0.4}
+LIGHT = {"type": "mrt_light", "position": [2, 4, 3]}
+LAMP = {"type": "sphere", "center": [0, 3, 0], "radius": 0.2, "emitter": {"type": "area"}}
+GLASS = {"type": "sphere", "radius": 0.7, "bsdf": {"type": "dielectric"}}
+MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
+
+
+def smooth_mesh() -> mi.Mesh:
+    """A triangle whose corners have normals of their own."""
+    mesh = mi.Mesh("smooth", 3, 1, has_vertex_normals=True)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float([-1, 0, -1, 1, 0, -1, 0, 1, -1])
+    parameters["vertex_normals"] = mi.Float([-0.6, 0, 0.8, 0.6, 0, 0.8, 0, 0, 1])
+    parameters["faces"] = mi.UInt32([0, 1, 2])
+    parameters.update()
+    return mesh
+
+
+def scene(**content: Any) -> mi.Scene:
+    look = mi.ScalarTransform4f().look_at([0, 1, 6], [0, 0.4, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 24, "height": 16, "component_format": "float32"}
+    sensor = {"type": "perspective", "fov": 40, "to_world": look, "film": film}
+    return mi.load_dict({"type": "scene", "integrator": {"type": "mrt_whitted"}, "sensor": sensor, **content})
+
+
+def plan_of(**content: Any) -> KernelPlan:
+    loaded = scene(**content)
+    integrator = loaded.integrator()
+    return integrator.kernel_plan(integrator.scene_facts(loaded))
+
+
+def kernel(loaded: mi.Scene) -> tuple[np.ndarray, list[str]]:
+    """The picture, and what identifies the kernels that traced it."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        image = np.array(mi.render(loaded, spp=4, seed=1))
+        return image, [k["hash"] for k in dr.kernel_history([dr.KernelType.JIT])]
+
+
+# For each decision: what a scene holds that has it, another choice, and whether the picture stays the same
+CHOICES = {
+    "bvh": ({"a": SPHERE, "light": LIGHT}, None, True),
+    "coherent": ({"a": MESH, "light": LIGHT}, False, True),
+    "spheres": ({"a": SPHERE, "light": LIGHT}, "corrected", True),
+    "quadrics": ({"a": CONE, "b": SPHERE, "light": LIGHT}, (), False),
+    "planes": ({"a": {"type": "mrt_plane", "normal": [0, 1, 0]}, "b": SPHERE, "light": LIGHT}, False, False),
+    "lights": ({"a": SPHERE, "light": LIGHT}, "loop", True),
+    "random": ({"a": SPHERE, "lamp": LAMP}, False, False),
+    "emission": ({"a": SPHERE, "lamp": LAMP}, False, False),
+    "sky": ({"a": SPHERE, "sky": {"type": "constant"}, "light": LIGHT}, "none", False),
+    "mirrors": ({"a": SPHERE, "sky": {"type": "constant"}, "light": LIGHT}, False, False),
+    "textures": (
+        {"a": {**SPHERE, "bsdf": {"type": "diffuse", "reflectance": TEXTURE}}, "light": LIGHT},
+        False,
+        False,
+    ),
+    "shading_frames": ({"b": SPHERE, "light": LIGHT}, False, False),
+    "merged": ({"a": SPHERE, "b": {**CONE, "bsdf": {"type": "mrt_bsdf"}}, "light": LIGHT}, False, True),
+    "two_sided": ({"a": GLASS, "light": LIGHT}, False, True),
+}
+
+
+def test_every_decision_is_tried() -> None:
+    assert {*CHOICES, "reasons"} == {f.name for f in fields(KernelPlan)}
+
+
+@pytest.mark.parametrize("name", CHOICES)
+def test_kernel_obeys(name: str) -> None:
+    content, other, same = CHOICES[name]
+    content = content | ({"a": smooth_mesh()} if name == "shading_frames" else {})
+    loaded = scene(**content)
+    integrator = loaded.integrator()
+    plan = integrator.prepare(loaded).plan
+    if other is None:
+        with pytest.raises(ValueError, match="untraced: set its bvh to True"):
+            integrator.prepare(loaded, replace(plan, **{name: False}))
+        return
+    assert getattr(plan, name) != other and plan.reason(name) is None
+    image, kernels = kernel(loaded)
+    assert integrator.prepare(loaded, replace(plan, **{name: other})).plan != plan
+    changed, other_kernels = kernel(loaded)
+    assert kernels != other_kernels
+    if same:
+        assert np.allclose(image, changed, atol=1e-5)  # the same formulas in another order
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "reason"),
+    [
+        ({"a": CONE}, "bvh", Reason.NO_NATIVE_SHAPES),
+        ({"a": SPHERE}, "coherent", Reason.NO_MESHES),
+        ({"a": MESH}, "spheres", Reason.NO_SPHERES),
+        ({"a": SPHERE, "b": MESH}, "spheres", Reason.NATIVE_SHAPES),
+        ({"a": SPHERE}, "quadrics", Reason.NO_QUADRICS),
+        ({"a": SPHERE}, "planes", Reason.NO_PLANES),
+        ({"a": SPHERE}, "lights", Reason.NO_LIGHTS),
+        ({"a": SPHERE, "light": LIGHT}, "random", Reason.DELTA_LIGHTS),
+        ({"a": SPHERE}, "emission", Reason.NO_SURFACE_EMITTERS),
+        ({"a": SPHERE}, "sky", Reason.NO_SKY),
+        ({"a": {**SPHERE, "bsdf": MATTE}}, "mirrors", Reason.NO_MIRRORS),
+        ({"a": SPHERE, "integrator": {"type": "mrt_whitted", "max_depth": 1}}, "mirrors", Reason.MAX_DEPTH),
+        ({"a": SPHERE}, "textures", Reason.UNIFORM),
+        ({"a": SPHERE}, "two_sided", Reason.ONE_SIDED),
+        ({"a": {"type": "sphere"}}, "merged", Reason.OTHER_BSDF),
+        ({"a": {**SPHERE, "bsdf": {"type": "mrt_bsdf", "alpha": TEXTURE}}}, "merged", Reason.VARYING),
+    ],
+)
+def test_reasons(content: dict[str, Any], name: str, reason: Reason) -> None:
+    assert plan_of(**content).reason(name) is reason
+
+
+def test_a_plan_holds_until_the_scene_changes() -> None:
+    loaded = scene(a=SPHERE, light=LIGHT)
+    integrator = loaded.integrator()
+    own = replace(integrator.prepare(loaded).plan, mirrors=False)
+    assert integrator.prepare(loaded, own).plan == integrator.prepare(loaded).plan == own
+    parameters = mi.traverse(loaded)
+    parameters["a.bsdf.alpha"] = mi.Float(0.3)
+    parameters.update()
+    assert integrator.prepare(loaded).plan.mirrors

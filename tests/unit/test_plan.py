@@ -1,0 +1,203 @@
+"""The plan decides: what it shows is what the kernels hold and which passes run, no more and no less."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import fields
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.plugins.kernel_plan import KernelPlan
+from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.rendering.settings import RenderSettings
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+# ------------------------------------------------ Kernels ------------------------------------------------
+
+MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
+GLOSSY = {"type": "mrt_bsdf", "specular_reflectance": 0.9, "int_ior": 3.0}
+DIFFUSE = {"type": "diffuse"}
+LIGHT = {"type": "mrt_light", "position": [3, 5, 2], "intensity": 1.0}
+BALL = {"type": "sphere", "center": [0, 0, -4], "bsdf": MATTE}
+CONE = {"type": "mrt_cone", "apex": [0, 1, -4], "base_center": [0, 0, -4], "radius": 0.5, "bsdf": MATTE}
+ROD = {"type": "mrt_cylinder", "p0": [0, 1, -4], "p1": [0, 0, -4], "radius": 0.5, "bsdf": MATTE}
+PANE = {"type": "rectangle", "bsdf": MATTE}
+LAMP = {"type": "sphere", "center": [0, 4, -4], "emitter": {"type": "area", "radiance": 5.0}}
+FLOOR = {"type": "mrt_plane", "normal": [0, 1, 0], "distance": 1.0, "bsdf": MATTE}
+
+
+def scene(**nodes: Any) -> dict[str, Any]:
+    """Two balls under a lamp and the sky, with nodes put in, or taken out where they are None."""
+    base = {
+        "type": "scene",
+        "integrator": {"type": "mrt_whitted"},
+        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 16, "height": 12}},
+        "sky": {"type": "constant", "radiance": 0.3},
+        "light": LIGHT,
+        "ball": BALL,
+        "second": {**BALL, "center": [2, 0, -5]},  # a lookup among one needs no code
+    }
+    return {name: node for name, node in (base | nodes).items() if node is not None}
+
+
+class Watch(Progress):
+    """Keeps the kernel that traced the rays: the longest."""
+
+    operations, kernel = 0, ""
+
+    def kernels(self, records: Any) -> None:
+        for record in records:
+            if record["type"] == dr.KernelType.JIT and record["operation_count"] > self.operations:
+                self.operations, self.kernel = record["operation_count"], record["ir"].getvalue()
+
+
+def planned(nodes: dict[str, Any], **options: Any) -> tuple[mrt.Result, str]:
+    """Render; return the result and the kernel that traced the rays."""
+    watch = Watch()
+    result = mrt.render(nodes, aa=1, aamode="none", progress=watch, **options)
+    return result, watch.kernel
+
+
+def painted() -> dict[str, Any]:
+    return {"type": "envmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), 0.3, np.float32))}
+
+
+def textured() -> dict[str, Any]:
+    picture = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32)), "raw": True}
+    return {**BALL, "bsdf": {**MATTE, "diffuse_reflectance": picture}}
+
+
+# Each decision with a change of the scene that turns it
+CHANGES: dict[str, tuple[str, dict[str, Any]]] = {
+    "bvh": ("bvh", {"ball": None, "second": None, "cone": CONE}),
+    "coherent": ("coherent", {"box": {"type": "cube", "bsdf": MATTE}}),
+    "shading normals": ("shading_frames", {"box": {"type": "cube", "bsdf": MATTE}}),
+    "a sphere facing inwards": ("spheres", {"ball": {**BALL, "flip_normals": True}}),
+    "no sphere": ("spheres", {"ball": PANE, "second": PANE}),
+    "a cone": ("quadrics", {"cone": CONE}),
+    "an open cone": ("quadrics", {"cone": {**CONE, "capped": False}}),
+    "two kinds of quadrics": ("quadrics", {"cone": CONE, "rod": ROD}),
+    "planes": ("planes", {"floor": FLOOR}),
+    "no light": ("lights", {"light": None}),
+    "many lights": ("lights", {f"light_{i}": {**LIGHT, "position": [i, 5, 2]} for i in range(8)}),
+    "random": ("random", {"lamp": LAMP}),
+    "emission": ("emission", {"lamp": LAMP}),
+    "no sky": ("sky", {"sky": None}),
+    "mirrors": ("mirrors", {"ball": {**BALL, "bsdf": GLOSSY}}),
+    "textures": ("textures", {"ball": textured}),
+    "merged": ("merged", {"ball": {**BALL, "bsdf": DIFFUSE}}),
+    "two-sided": ("two_sided", {"ball": {**BALL, "bsdf": {"type": "twosided", "bsdf": DIFFUSE}}}),
+    "a sky of the integrator": ("sky", {"integrator": {"type": "mrt_whitted", "sky": 0.3}}),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_decision_that_the_plan_shows_changes_the_kernel(change: str) -> None:
+    decision, nodes = CHANGES[change]
+    # a sky of one colour is the same code wherever it comes from
+    common = {"sky": painted()} if "integrator" in nodes else {}
+    nodes = {name: node() if callable(node) else node for name, node in nodes.items()}
+    before, after = planned(scene(**common)), planned(scene(**common, **nodes))
+    plans = before[0].plan, after[0].plan
+    assert getattr(plans[0].kernel, decision) != getattr(plans[1].kernel, decision)
+    shown = [set(str(plan).splitlines()) for plan in plans]
+    assert shown[0] - shown[1] and shown[1] - shown[0]
+    assert before[1] != after[1]
+
+
+def test_every_decision_is_turned() -> None:
+    decisions = {field.name for field in fields(KernelPlan)} - {"reasons"}
+    assert {decision for decision, _ in CHANGES.values()} == decisions
+
+
+@pytest.fixture
+def base() -> tuple[mrt.Result, str]:
+    return planned(scene())
+
+
+@pytest.mark.parametrize(
+    ("nodes", "options"),
+    [
+        ({"ball": {**BALL, "radius": 0.5}, "light": {**LIGHT, "intensity": 3.0}}, {}),
+        ({"third": {**BALL, "center": [4, 0, -5], "bsdf": {**MATTE, "alpha": 0.3}}}, {}),
+        ({"sky": {"type": "constant", "radiance": 0.9}}, {"seed": 3}),
+        ({}, {"focaldist": 0.0}),
+    ],
+)
+def test_what_no_decision_depends_on_leaves_the_kernel(
+    nodes: dict[str, Any], options: dict[str, Any], base: tuple[mrt.Result, str]
+) -> None:
+    """Numbers are data: places, colours, how many spheres."""
+    result, kernel = planned(scene(**nodes), **options)
+    assert result.plan.kernel == base[0].plan.kernel
+    assert kernel == base[1]
+
+
+@pytest.mark.parametrize(
+    "options", [{"layers": ["depth"]}, {"layers": ["normal"]}, {"motion": [0.1, 0, 0]}, {"count_rays": True}]
+)
+def test_options_that_change_the_kernel_change_the_passes(
+    options: dict[str, Any], base: tuple[mrt.Result, str]
+) -> None:
+    result, kernel = planned(scene(), **options)
+    assert kernel != base[1]
+    assert (result.plan.passes, result.plan.motion) != (base[0].plan.passes, base[0].plan.motion)
+
+
+def test_what_the_integrator_does_not_say_is_not_made_up() -> None:
+    plan = planned(scene(), integrator="direct")[0].plan
+    assert plan.kernel is None and not any("shadow" in omission.what for omission in plan.left_out)
+
+
+# ------------------------------------------------ Passes -------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "passes"),
+    [
+        ({"aamode": "none", "focaldist": 0}, ["16 samples a pixel"]),
+        (
+            {"aamode": "none", "lattice": "centered"},
+            [
+                "first hits: 1 ray through the centre of a pixel, with depth",
+                "16 samples a pixel",
+                "depth of field: report",
+            ],
+        ),
+        ({"aamode": "none"}, ["16 samples a pixel, with depth", "depth of field: report"]),
+        (
+            {"focaldist": 0, "aa": 2},
+            ["1 sample a pixel", "edges: sobel", "3 further samples in edge pixels"],
+        ),
+        (
+            {"focaldist": 0, "aa": 2, "lattice": "centered", "aamode": "geometry"},
+            [
+                "1 sample a pixel, with depth, normal",
+                "edges: geometry",
+                "4 further samples in edge pixels",
+            ],
+        ),
+        ({"focaldist": 0, "aa": 1}, ["1 sample a pixel"]),
+        ({"focaldist": 0, "aa": 1, "layers": ["edges"]}, ["1 sample a pixel", "edges: sobel"]),
+    ],
+)
+def test_the_plan_shows_the_passes_that_run(options: dict[str, Any], passes: list[str]) -> None:
+    result = mrt.render(3, width=16, height=12, **options)
+    assert [
+        line.removeprefix("  pass    ") for line in str(result.plan).splitlines() if "  pass" in line
+    ] == passes
+    assert list(result.timings.passes) == [step.name for step in result.plan.passes]
+
+
+def test_settings_are_the_options_of_render() -> None:
+    """One table: what ``render`` takes is what ``RenderSettings`` checks, with the same defaults."""
+    taken = dict(inspect.signature(mrt.render).parameters)
+    assert {name: taken.pop(name).default for name in ("scene", "progress")} == {"scene": 0, "progress": None}
+    held = {field.name: field.default for field in fields(RenderSettings)}
+    assert {name: parameter.default for name, parameter in taken.items()} == held

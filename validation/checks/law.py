@@ -1,0 +1,185 @@
+"""A law that a plugin must obey, and the result of checking several: figures, limits, reasons, snippets."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.validation.tools import report
+from mrt_mitsuba.validation.tools.study import Bound, Study
+
+TITLE = "Laws of plugins"
+
+
+class Skip(Exception):
+    """Raised by the check of a law that makes no sense for its subject; the text is the reason."""
+
+
+@dataclass(frozen=True)
+class Part(Bound):
+    """One figure of a law; the note is the reason for its limit, the snippet shows its worst case."""
+
+    snippet: str = ""
+
+    @property
+    def severity(self) -> float:
+        """Return how much of the limit is used: above 1 it is exceeded."""
+        if math.isnan(self.measured):
+            return math.inf
+        over, under = (self.measured, self.limit) if self.at_most else (self.limit, self.measured)
+        return over / under if under > 0 else (math.inf if over > under else 0.0)
+
+
+@dataclass
+class Law:
+    """One law: its figures, or why it was skipped. ``measured``, ``limit``, ``why`` are of the worst one."""
+
+    name: str
+    parts: list[Part] = field(default_factory=list)
+    skipped: str = ""
+    notes: list[str] = field(default_factory=list)
+
+    def at_most(self, what: str, measured: float, limit: float, why: str, snippet: str = "") -> None:
+        """Hold a figure to an upper bound."""
+        self.parts.append(Part(what, float(measured), float(limit), True, why, snippet))
+
+    def at_least(self, what: str, measured: float, limit: float, why: str, snippet: str = "") -> None:
+        """Hold a figure to a lower bound."""
+        self.parts.append(Part(what, float(measured), float(limit), False, why, snippet))
+
+    @property
+    def worst(self) -> Part:
+        """Return the figure that uses most of its limit."""
+        return max(
+            self.parts, key=lambda part: (not part.holds, part.severity), default=Part("", math.nan, math.nan)
+        )
+
+    @property
+    def holds(self) -> bool:
+        """Return whether every figure is within its limit; a skipped law does not fail."""
+        return bool(self.skipped) or (bool(self.parts) and all(part.holds for part in self.parts))
+
+    @property
+    def measured(self) -> float:
+        return self.worst.measured
+
+    @property
+    def limit(self) -> float:
+        return self.worst.limit
+
+    @property
+    def why(self) -> str:
+        return self.worst.note
+
+    @property
+    def snippet(self) -> str:
+        return self.worst.snippet
+
+    @property
+    def note(self) -> str:
+        """Return what the worst figure is, and remarks."""
+        return "; ".join([*([self.worst.name] if self.parts else []), *self.notes])
+
+    @property
+    def verdict(self) -> str:
+        return "skipped" if self.skipped else "holds" if self.holds else "FAILS"
+
+    def __str__(self) -> str:
+        if self.skipped:
+            return f"{self.verdict:<7} {self.name}: {self.skipped}"
+        sign = "<=" if self.worst.at_most else ">="
+        return f"{self.verdict:<7} {self.name}: {self.measured:.4g} {sign} {self.limit:.4g}, {self.note}"
+
+
+@dataclass(frozen=True)
+class Check:
+    """What a check of one plugin found: its laws by name."""
+
+    subject: str
+    variant: str
+    laws: Mapping[str, Law]
+    seconds: float
+    quick: bool = False
+
+    @property
+    def failed(self) -> list[str]:
+        """Return the names of the laws that do not hold."""
+        return [name for name, law in self.laws.items() if not law.holds]
+
+    @property
+    def passed(self) -> bool:
+        """Return whether something was checked and every law that was holds."""
+        return not self.failed and any(not law.skipped for law in self.laws.values())
+
+    def __str__(self) -> str:
+        verdict = "passed" if self.passed else f"FAILED {', '.join(self.failed)}"
+        lines = [f"{self.subject} in {self.variant}: {verdict} ({self.seconds:.1f} s)"]
+        return "\n".join(lines + [f"  {law}" for law in self.laws.values()])
+
+    def study(self) -> Study:
+        """Return the findings in the form that pages are made of."""
+        study = Study(self.subject, f"{self.subject}, {self.variant}", seconds=self.seconds)
+        for law in self.laws.values():
+            for part in law.parts:
+                name = f"{law.name}: {part.name}"
+                study.bounds.append(Bound(name, part.measured, part.limit, part.at_most, part.note))
+        rows = [[law.name, law.verdict, law.skipped or law.note] for law in self.laws.values()]
+        study.table("laws", "Laws", ["law", "verdict", "note"], rows, first=True)
+        worst = [[law.name, law.snippet] for law in self.laws.values() if law.snippet and not law.holds]
+        if worst:
+            study.table("snippets", "Worst cases, to run by themselves", ["law", "snippet"], worst)
+        return study
+
+    def save(self, folder: str | Path) -> None:
+        """Write the page (``index.html``), ``summary.json`` and CSV files. Raises ``OutputError``."""
+        report.save(folder, self.study(), title=TITLE, quick=self.quick)
+
+    def _repr_html_(self) -> str:
+        return report.notebook(self.study(), title=TITLE)
+
+
+def class_name(plugin: Any) -> str:
+    """Return the name of a plugin's class: Mitsuba calls all those in Python by that of their base."""
+    python = type(plugin).__module__.split(".")[0] != "mitsuba"
+    return type(plugin).__name__ if python or not hasattr(plugin, "class_name") else plugin.class_name()
+
+
+def examine(
+    subject: str,
+    case: Any,
+    laws: Mapping[str, Callable[[Law, Any], None]],
+    *,
+    only: Iterable[str] | None = None,
+    quick: bool = False,
+) -> Check:
+    """Check laws one by one; what a plugin raises fails the law during which it did."""
+    import mitsuba as mi
+
+    chosen = list(laws if only is None else only)
+    unknown = [name for name in chosen if name not in laws]
+    if unknown:
+        raise UsageError(f"unknown law {unknown[0]!r}: choose from {', '.join(laws)}")
+    start, variant, found = time.perf_counter(), mi.variant(), {}
+    for name in laws:
+        if name in chosen:
+            law = found[name] = Law(name)
+            try:
+                laws[name](law, case)
+            except Skip as reason:
+                law.skipped = str(reason)
+            except Exception as error:
+                lines = str(error).strip().splitlines() or [""]
+                # of an error in a plugin in Python, Mitsuba quotes the way there, and the error last
+                line = lines[-1] if lines[0].startswith("Traceback") else lines[0]
+                law.at_most(
+                    f"it raised {type(error).__name__}: {line}", math.inf, 0, "a plugin must not raise"
+                )
+            finally:
+                if mi.variant() != variant:
+                    mi.set_variant(variant)
+    return Check(subject, variant, found, time.perf_counter() - start, quick)

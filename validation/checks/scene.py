@@ -1,0 +1,330 @@
+"""``check_scene``: every BSDF, shape and emitter of a scene by its laws, and a hunt for NaN pixels."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.command.words import words
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
+from mrt_mitsuba.scene.open import open_scene
+from mrt_mitsuba.validation.checks import emitter
+from mrt_mitsuba.validation.checks.bsdf import check_bsdf
+from mrt_mitsuba.validation.checks.law import TITLE, Check, Law, class_name, examine
+from mrt_mitsuba.validation.checks.shape import check_shape
+from mrt_mitsuba.validation.tools import report
+
+ALIKE = 6  # of one kind of plugin, so many are checked, spread over all
+DEPTH = 12  # bounces that the hunt follows
+MOST_SAMPLES = 2**14  # of one pixel, to see a fault again
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A pixel that is no number: the smallest crop of the film that shows it, and what makes it."""
+
+    pixels: int  # how many there are in the whole picture
+    crop: tuple[int, int, int, int]  # x, y, width, height
+    spp: int  # samples of a pixel at which the crop shows it
+    culprit: str
+
+    def __str__(self) -> str:
+        x, y, width, height = self.crop
+        return (
+            f"{self.pixels} pixels are not finite; the smallest crop: {width}x{height} at ({x}, {y}), "
+            f"with {self.spp} samples a pixel. Made by {self.culprit}"
+        )
+
+
+@dataclass(frozen=True)
+class SceneCheck:
+    """What a check of a scene found: of each plugin, by name, and of the picture."""
+
+    name: str
+    checks: Mapping[str, Check]
+    fault: Fault | None
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def failed(self) -> list[str]:
+        """Return what does not hold, as "name: law", and "pixels" where some are not finite."""
+        laws = [f"{name}: {law}" for name, check in self.checks.items() for law in check.failed]
+        return laws + (["pixels"] if self.fault else [])
+
+    @property
+    def passed(self) -> bool:
+        return not self.failed
+
+    def __str__(self) -> str:
+        lines = [str(check) if check.failed else str(check).splitlines()[0] for check in self.checks.values()]
+        lines += [*self.left_out, str(self.fault or "every pixel is finite")]
+        return "\n".join([*lines, f"{self.name}: {'passed' if self.passed else 'FAILED'}"])
+
+    def save(self, folder: str | Path) -> None:
+        """Write the page (``index.html``), ``summary.json`` and CSV files. Raises ``OutputError``."""
+        report.prepare(Path(folder), "summary.json", "index.html")
+        outcomes = [
+            report.Outcome(check.study(), check.seconds) for check in (*self.checks.values(), self._pixels())
+        ]
+        report.write(Path(folder), outcomes, report.header(quick=False), title=f"{TITLE}: {self.name}")
+
+    def _pixels(self) -> Check:
+        law = Law("pixels", notes=[str(self.fault)] if self.fault else [])
+        law.at_most(
+            "pixels that are not finite", self.fault.pixels if self.fault else 0, 0, "a picture is of numbers"
+        )
+        return Check(
+            "picture", next(iter(self.checks.values())).variant if self.checks else "", {"pixels": law}, 0.0
+        )
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        return f"<pre>{escape(str(self))}</pre>"
+
+
+def check_scene(
+    scene: Any, *, quick: bool = False, seed: int = 0, progress: Progress | None = None, **options: Any
+) -> SceneCheck:
+    """Check every BSDF, shape and emitter of a scene, and hunt for pixels that are not finite.
+
+    ``scene`` and ``options`` (such as ``integrator``) are those of ``render``. Of many plugins of one kind,
+    some are checked. Raises ``SceneError`` or ``UsageError`` for a scene that cannot be opened.
+    """
+    runtime.use()
+    source = open_scene(scene, **options)
+    plugins = _plugins(source.scene)
+    checks: dict[str, Check] = {}
+    with (progress or Progress()).stage("Laws", len(plugins)) as advance:
+        for name, (kind, plugin) in plugins.items():
+            checks[name] = _examine(kind, name, plugin, source.scene, quick, seed)
+            advance(1)
+    left = Counter(kind for kind, _ in _all(source.scene)) - Counter(kind for kind, _ in plugins.values())
+    left_out = tuple(
+        f"{count} more of {kind} are like those that were checked" for kind, count in left.items()
+    )
+    return SceneCheck(source.name, checks, _hunt(source, quick, seed), left_out)
+
+
+def _all(scene: Any) -> Iterator[tuple[str, Any]]:
+    """Each BSDF, shape and emitter once, after its kind."""
+    shapes = list(scene.shapes())
+    bsdfs = {str(id(b)): b for b in (shape.bsdf() for shape in shapes) if b is not None}
+    for word, plugins in (("BSDF", bsdfs.values()), ("shape", shapes), ("emitter", scene.emitters())):
+        yield from ((f"{word} {class_name(plugin)}", plugin) for plugin in plugins)
+
+
+def _plugins(scene: Any) -> dict[str, tuple[str, Any]]:
+    """Return plugins by a name of their own; a few of each kind."""
+    kinds: dict[str, list[Any]] = {}
+    for kind, plugin in _all(scene):
+        kinds.setdefault(kind, []).append(plugin)
+    found: dict[str, tuple[str, Any]] = {}
+    for kind, plugins in kinds.items():
+        step = max(len(plugins) // ALIKE, 1)
+        for number, plugin in enumerate(plugins[::step]):
+            name = f"{kind} {plugin.id() or number * step}"
+            found[name if name not in found else f"{name} ({number * step})"] = (kind, plugin)
+    return found
+
+
+def _examine(kind: str, name: str, plugin: Any, scene: Any, quick: bool, seed: int) -> Check:
+    word = kind.split()[0]
+    if word == "BSDF":
+        found = check_bsdf(plugin, quick=quick, seed=seed)
+    elif word == "shape":
+        found = check_shape(plugin, quick=quick, seed=seed)
+    else:
+        rng = np.random.default_rng(seed)
+        box = scene.bbox()
+        low, high = (np.nan_to_num(np.ravel(np.array(c)), posinf=1, neginf=-1) for c in (box.min, box.max))
+        points = rng.uniform(1.1 * low - 0.1 * high, 1.1 * high - 0.1 * low, (2**12, 3)).astype(np.float32)
+        found = examine(name, emitter.Case(plugin, points, rng), emitter.LAWS, quick=quick)
+    return Check(name, found.variant, found.laws, found.seconds, found.quick)
+
+
+# ------------------------------------------------- The hunt -----------------------------------------------
+
+
+def _hunt(source: Any, quick: bool, seed: int) -> Fault | None:
+    """Render, and narrow the film down to a crop that still shows a pixel which is no number."""
+    spp = 4 if quick else 32
+    bad = _bad(source, spp, seed)
+    if not bad.any():
+        return None
+    film = source.sensor.film()
+    offset = np.array(film.crop_offset())
+    y, x = (int(axis[0]) for axis in np.nonzero(bad))
+    crop, count = (int(offset[0]), int(offset[1]), bad.shape[1], bad.shape[0]), spp
+    width, height = 1, 1
+    while width < bad.shape[1] or height < bad.shape[0]:
+        candidate = (
+            int(offset[0]) + x // width * width,
+            int(offset[1]) + y // height * height,
+            width,
+            height,
+        )
+        seen = _seen_again(source, candidate, MOST_SAMPLES // (width * height), seed)
+        if seen:
+            crop, count = candidate, seen
+            break
+        width, height = min(2 * width, bad.shape[1]), min(2 * height, bad.shape[0])
+    with _cropped(source.sensor, crop):
+        culprit = _culprit(source, count, seed)
+    return Fault(int(bad.sum()), crop, count, culprit)
+
+
+def _bad(source: Any, spp: int, seed: int) -> np.ndarray:
+    """Return which pixels are not finite. [H, W]"""
+    import mitsuba as mi
+
+    picture = mi.render(source.scene, integrator=source.integrator, sensor=source.sensor, spp=spp, seed=seed)
+    return ~np.isfinite(np.array(picture)).all(axis=-1)
+
+
+def _seen_again(source: Any, crop: tuple[int, int, int, int], most: int, seed: int) -> int:
+    """Return the samples of a pixel at which the crop shows a fault, or 0."""
+    spp = 16
+    with _cropped(source.sensor, crop):
+        while spp <= max(most, 16):
+            if _bad(source, spp, seed).any():
+                return spp
+            spp *= 8
+    return 0
+
+
+@contextmanager
+def _cropped(sensor: Any, crop: tuple[int, int, int, int]) -> Iterator[None]:
+    """Crop the film for a while."""
+    import mitsuba as mi
+
+    params = mi.traverse(sensor)
+    before = {key: type(params[key])(params[key]) for key in ("film.crop_size", "film.crop_offset")}
+
+    def change(size: Any, offset: Any) -> None:
+        params["film.crop_size"], params["film.crop_offset"] = size, offset
+        params.update()
+        sensor.parameters_changed()
+
+    change(list(crop[2:]), list(crop[:2]))
+    try:
+        yield
+    finally:
+        change(before["film.crop_size"], before["film.crop_offset"])
+
+
+def _culprit(source: Any, spp: int, seed: int) -> str:
+    """Follow paths through the crop, and name the object whose own numbers are first not finite."""
+    import mitsuba as mi
+
+    if mi.variant().startswith("scalar"):
+        return "what is not told in scalar variants: check it in a vectorised one"
+    counts: Counter[str] = Counter()
+    for attempt in range(8):
+        counts.update(_follow(source, max(spp, 2**12), seed + attempt))
+        if counts:
+            return counts.most_common(1)[0][0]
+    return "no object's own numbers: by the integrator, or a sum that overflows"
+
+
+def _follow(source: Any, spp: int, seed: int) -> Counter[str]:
+    """Trace one batch of paths; return how often each object was the first to give a number that is none."""
+    import drjit as dr
+    import mitsuba as mi
+
+    scene, sensor = source.scene, source.sensor
+    width, height = (int(n) for n in sensor.film().crop_size())
+    x, y = (int(n) for n in sensor.film().crop_offset())
+    count = min(spp * width * height, 2**20)
+    rng = mi.PCG32(count, initstate=seed)
+    draw = rng.next_float32
+    size = mi.Point2f(*(float(n) for n in sensor.film().size()))
+    position = (mi.Point2f(x, y) + mi.Point2f(draw() * width, draw() * height)) / size
+    # a sensor's film positions are of the crop, not of the film
+    position = (position * size - mi.Point2f(x, y)) / mi.Point2f(width, height)
+    ray, _ = sensor.sample_ray(draw(), draw(), position, mi.Point2f(draw(), draw()))
+    ctx, active = mi.BSDFContext(), mi.Bool(True)
+    counts: Counter[str] = Counter()
+    shapes_of_scene = list(scene.shapes())
+
+    def note(bad: Any, what: str, shapes: Any) -> Any:
+        bad &= active
+        for shape in shapes_of_scene if dr.any(bad) else ():
+            here = int(dr.count(bad & (shapes == mi.ShapePtr(shape)))[0])
+            if here:
+                owner = f"the BSDF {_name(shape.bsdf())}, on" if what == "BSDF" else "the shape"
+                counts[f"{owner} {_name(shape)}"] += here
+        return ~bad
+
+    for _ in range(DEPTH):
+        si = scene.ray_intersect(ray, active)
+        outside = active & ~si.is_valid()
+        emitted = si.emitter(scene, active).eval(si, active)
+        dark = _not_finite(emitted) & active
+        if dr.any(dark):
+            counts["an emitter"] += int(dr.count(dark)[0])
+        active &= ~outside & ~dark
+        active &= note(_not_finite(si.p, si.n, si.sh_frame.n, si.uv), "shape", si.shape)
+        ds, light = scene.sample_emitter_direction(si, mi.Point2f(draw(), draw()), True, active)
+        dark = _not_finite(light) & active
+        if dr.any(dark):
+            counts["an emitter"] += int(dr.count(dark)[0])
+        bsdf = si.bsdf(ray)
+        value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active & (ds.pdf > 0))
+        bs, weight = bsdf.sample(ctx, si, draw(), mi.Point2f(draw(), draw()), active)
+        lit = dr.any(mi.unpolarized_spectrum(weight) != 0)
+        bad = _not_finite(mi.unpolarized_spectrum(value), pdf, mi.unpolarized_spectrum(weight))
+        active &= note(bad | (lit & _not_finite(bs.wo, bs.pdf)), "BSDF", si.shape)
+        active &= lit
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        dr.eval(ray, active, rng)
+        if not dr.any(active):
+            break
+    return counts
+
+
+def _name(plugin: Any) -> str:
+    return f"{class_name(plugin)} {plugin.id()!r}"
+
+
+def _not_finite(*values: Any) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    bad = mi.Bool(False)
+    for value in values:
+        for component in [value] if dr.depth_v(value) == 1 else value:
+            bad |= ~dr.isfinite(component)
+    return bad
+
+
+# ------------------------------------------------ The command ---------------------------------------------
+
+FORM = "mrt check SCENE|scene=PATH [out=DIR] [quick=1]"
+
+
+def command(arguments: list[str]) -> int:
+    """Run ``mrt check``: return 0 where every law holds, 1 where one does not. Raises ``UsageError``."""
+    scenes, given = words(arguments, ("scene", "out", "quick"), FORM)
+    scenes += [given["scene"]] if "scene" in given else []
+    if len(scenes) != 1:
+        raise UsageError(f"give one scene. Usage: {FORM}")
+    if given.get("quick", "0") not in ("0", "1"):
+        raise UsageError(f"quick={given['quick']}: must be 0 or 1")
+    scene: Any = int(scenes[0]) if scenes[0].isdigit() else scenes[0]
+    if "out" in given:
+        report.prepare(Path(given["out"]), "summary.json", "index.html")
+    found = check_scene(scene, quick=given.get("quick") == "1", progress=TerminalProgress(unit="plugin"))
+    print(found)
+    if "out" in given:
+        found.save(given["out"])
+        print(f"Report: {Path(given['out']) / 'index.html'}")
+    return 0 if found.passed else 1
