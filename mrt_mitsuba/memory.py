@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mrt_mitsuba.errors import UsageError
@@ -44,17 +44,18 @@ LEAST_ROWS = 24
 
 @dataclass
 class Budget:
-    """Bytes that a render may use, of which its scene has taken some."""
+    """Bytes that a render may use, of which its scene has taken some for pictures."""
 
     size: int
     taken: int = 0
+    pictures: set[str] = field(default_factory=set)  #: their paths, without symbolic links
 
     @classmethod
     def of(cls, memory: int | None) -> Budget:
         """What was asked for, by default half of what is free; never more than the machine has."""
         return cls(min(memory if memory is not None else free_memory() // 2, all_memory()))
 
-    def take_texture(self, name: str, width: int, height: int, *, around: bool = False) -> None:
+    def take_texture(self, path: str, width: int, height: int, *, around: bool = False) -> None:
         """Take the memory of a picture used as a texture; ``around``: as a map of the surroundings.
 
         Raises ``UsageError`` where there is not so much.
@@ -63,10 +64,11 @@ class Budget:
         needed = self.taken + stays + width * height * BYTES_PER_TEXEL_READ
         if needed > self.size:
             raise UsageError(
-                f"with the picture {name} of {width}x{height} texels, the scene needs {_text(needed)} of "
+                f"with the picture {path} of {width}x{height} texels, the scene needs {_text(needed)} of "
                 f"memory, and {_text(self.size)} may be used: choose a smaller picture or a larger memory="
             )
         self.taken += stays
+        self.pictures.add(os.path.realpath(path))
 
 
 @dataclass(frozen=True)

@@ -92,6 +92,20 @@ def usable_variants() -> list[str]:
     return [variant for variant in mi.variants() if obstacle(variant) is None]
 
 
+def versions() -> dict[str, str]:
+    """Return the versions of what decides about pixels."""
+    from importlib import metadata
+
+    from mrt_mitsuba import __version__
+
+    return {
+        "mrt-mitsuba": __version__,
+        "mitsuba": metadata.version("mitsuba"),
+        "drjit": metadata.version("drjit"),
+        "llvm": llvm.version_text(llvm.prepare().version),
+    }
+
+
 def _llvm_obstacle() -> str | None:
     choice = llvm.prepare()
     import drjit as dr

@@ -23,7 +23,7 @@ from typing import Any
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtError, UsageError
-from mrt_mitsuba.output.files import replacing
+from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.validation.studies import rivals
 from mrt_mitsuba.validation.tools import kernels, machine
 from mrt_mitsuba.validation.tools.costs import scene_cost

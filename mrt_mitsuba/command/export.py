@@ -18,10 +18,10 @@ def run(words: list[str]) -> int:
     number, path = parse(["export", words[0]]).scene_number, words[2]
     if not path:
         raise UsageError(f"PATH is empty: write {FORM}")
-    from mrt_mitsuba.output.files import check_target
+    from mrt_mitsuba.output.replacing import check_target
 
     check_target(path)
     from mrt_mitsuba.scene.export import write_xml
 
-    write_xml(number, path, flavor=flavor)
+    print(f"Wrote {' and '.join(write_xml(number, path, flavor=flavor))}")
     return 0

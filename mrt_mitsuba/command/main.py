@@ -109,7 +109,7 @@ def _fail(message: str, code: int) -> int:
 
 
 def _end_by_force() -> None:
-    from mrt_mitsuba.output.files import discard_unfinished
+    from mrt_mitsuba.output.replacing import discard_unfinished
 
     discard_unfinished()
     newline = "\n" if sys.stderr.isatty() else ""  # below the progress bar

@@ -33,8 +33,10 @@ class Options(RenderSettings):
     log: str = option("warn", choice(*LEVELS), "what to print: warnings; times; every kernel")
 
     def render_arguments(self) -> dict[str, Any]:
-        """Return the options that say how to render, by name, without those about files and messages."""
-        return {name: getattr(self, name) for name in (*settings.TABLE, "params")}
+        """Return the options that say how to render, by name, without those about files and messages, and
+        without those of ``model`` where there is one."""
+        of_model = self.model().keys() if is_obj(self.scene) else set()
+        return {name: getattr(self, name) for name in sorted({*settings.TABLE, "params"} - of_model)}
 
     def outputs(self) -> tuple[str, ...]:
         """Return the paths of the pictures to write."""

@@ -1,23 +1,18 @@
-"""Pictures on disk: PNG as the report writes it or in sRGB, and EXR in float32 with layers and a header.
-
-A picture replaces the file of that name only once it is complete and on the disk: it is written beside it
-under a temporary name, which also disappears if anything goes wrong.
-"""
+"""Pictures on disk: PNG as the report writes it or in sRGB, and EXR in float32 with layers and a header."""
 
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
-import stat
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, Any
 
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
 from mrt_mitsuba.output.layers import LAYERS
+from mrt_mitsuba.output.replacing import replacing_together
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,9 +20,8 @@ if TYPE_CHECKING:
 
     Image = NDArray[np.float32]
 
-log = logging.getLogger(__name__)
+Path = str | os.PathLike[str]
 
-_unfinished: set[str] = set()  # temporary files
 _PIXELS = 2**18  # converted to 8 bit at a time, to bound the memory of intermediate arrays
 
 
@@ -41,40 +35,39 @@ class Picture:
 
 
 def save(
-    path: str | os.PathLike[str],
+    paths: Path | Sequence[Path],
     image: Image,
     *,
     layers: Mapping[str, Image] | None = None,
     header: Mapping[str, Any] | None = None,
     tonemap: str = "report",
 ) -> None:
-    """Write a picture [H, W, 3] in the format that the extension of ``path`` names, .png or .exr.
+    """Write a picture [H, W, 3] in the formats that the endings of ``paths`` name, .png or .exr.
 
-    Layers and header go into an EXR only, ``tonemap`` concerns a PNG only. Raises ``OutputError``.
+    All files are replaced, or none. Layers and header go into an EXR only, ``tonemap`` concerns a PNG only.
+    Raises ``OutputError``.
     """
-    ending = os.path.splitext(os.fspath(path))[1].lower()
-    if ending == ".png":
-        write_png(path, image, tonemap=tonemap)
-    elif ending == ".exr":
-        write_exr(path, image, layers or {}, header or {})
-    else:
-        raise OutputError(f"cannot write {os.fspath(path)}: the name must end in .png or .exr")
+    paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    endings = [os.path.splitext(os.fspath(path))[1].lower() for path in paths]
+    for path, ending in zip(paths, endings, strict=True):
+        if ending not in (".png", ".exr"):
+            raise OutputError(f"cannot write {os.fspath(path)}: the name must end in .png or .exr")
+    with replacing_together(paths) as files:
+        for file, ending in zip(files, endings, strict=True):
+            if ending == ".png":
+                _write_png(file, image, tonemap)
+            else:
+                _write_exr(file, image, layers or {}, header or {})
 
 
-def write_png(path: str | os.PathLike[str], image: Image, *, tonemap: str = "report") -> None:
+def write_png(path: Path, image: Image, *, tonemap: str = "report") -> None:
     """Write a linear picture [H, W, 3] as PNG; ``tonemap`` as in ``to_8bit``. Raises ``OutputError``."""
-    from PIL import Image as PilImage
-
-    height, width = image.shape[:2]
-    picture = PilImage.new("RGB", (width, height))
-    for row, block in _blocks(image, tonemap):
-        picture.paste(PilImage.fromarray(block), (0, row))
-    with replacing(path) as file:
-        picture.save(file, format="PNG")
+    with replacing_together([path]) as (file,):
+        _write_png(file, image, tonemap)
 
 
 def write_exr(
-    path: str | os.PathLike[str],
+    path: Path,
     image: Image,
     layers: Mapping[str, Image] | None = None,
     header: Mapping[str, Any] | None = None,
@@ -85,13 +78,28 @@ def write_exr(
     with the channels of ``LAYERS``, else R, G, B or Y. Header values are text or numbers; anything else is
     written as JSON. Raises ``OutputError``.
     """
+    with replacing_together([path]) as (file,):
+        _write_exr(file, image, layers or {}, header or {})
+
+
+def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
+    from PIL import Image as PilImage
+
+    height, width = image.shape[:2]
+    picture = PilImage.new("RGB", (width, height))
+    for row, block in _blocks(image, tonemap):
+        picture.paste(PilImage.fromarray(block), (0, row))
+    picture.save(file, format="PNG")
+
+
+def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Mapping[str, Any]) -> None:
     import OpenEXR
 
-    attributes = {name: _attribute(value) for name, value in (header or {}).items()}
+    attributes = {name: _attribute(value) for name, value in header.items()}
     attributes |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     # The library does not report a full disk when it opens the file itself, so the file is ours.
-    picture = OpenEXR.File(attributes, _channels(image, layers or {}))
-    with replacing(path) as file, compressing():
+    picture = OpenEXR.File(attributes, _channels(image, layers))
+    with compressing():
         picture.write(_Stream(file))
 
 
@@ -121,7 +129,7 @@ class _Stream:
         return self._file.write(data)
 
 
-def read_exr(path: str | os.PathLike[str]) -> Picture:
+def read_exr(path: Path) -> Picture:
     """Read an EXR with the channels R, G, B; raise ``OutputError`` if there is none or it is broken."""
     import numpy as np
 
@@ -133,12 +141,12 @@ def read_exr(path: str | os.PathLike[str]) -> Picture:
     return Picture(image, planes, header)
 
 
-def read_channels(path: str | os.PathLike[str]) -> dict[str, Image]:
+def read_channels(path: Path) -> dict[str, Image]:
     """Read every channel of an EXR, [H, W] float32 by name; raise ``OutputError`` if it is none or broken."""
     return _read(path)[0]
 
 
-def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Image], dict[str, Any]]:
+def _read(path: Path) -> tuple[dict[str, Image], dict[str, Any]]:
     import numpy as np
     import OpenEXR
 
@@ -229,87 +237,3 @@ def _attribute(value: Any) -> str | int | float:
     import json
 
     return value if isinstance(value, str | int | float) else json.dumps(value)
-
-
-def check_target(path: str | os.PathLike[str]) -> None:
-    """Raise ``OutputError`` if ``path`` cannot be written; to be asked before the work. Leaves no trace."""
-    with _explained(path):
-        temporary, file = _open_beside(_target(path))
-        file.close()
-        os.unlink(temporary)
-        _unfinished.discard(temporary)
-
-
-@contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
-    """Give a binary file to write to, which takes the place of ``path`` when all went well.
-
-    A symbolic link stays and its target is replaced. Whatever is raised inside, the old file is left as it
-    was and no temporary file remains; an ``OSError`` becomes an ``OutputError``.
-    """
-    with _explained(path):
-        target = _target(path)
-        temporary, file = _open_beside(target)
-        try:
-            with file:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-            if os.path.exists(target):
-                os.chmod(temporary, stat.S_IMODE(os.stat(target).st_mode))
-            os.replace(temporary, target)
-            log.info("wrote %s", target)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
-            raise
-        finally:
-            _unfinished.discard(temporary)
-
-
-def discard_unfinished() -> None:
-    """Remove the temporary files of pictures that are being written; for a process about to end by force."""
-    for temporary in tuple(_unfinished):
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-
-
-@contextlib.contextmanager
-def _explained(path: str | os.PathLike[str]) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"cannot write {os.fspath(path)}: {error.strerror or error}") from error
-
-
-def _target(path: str | os.PathLike[str]) -> str:
-    """Return the real path to write; raise ``OutputError`` where replacing a file there would be wrong."""
-    name = os.fspath(path)
-    target = os.path.realpath(name)
-    folder = os.path.dirname(target)
-    if os.path.exists(folder) and not os.path.isdir(folder):
-        raise OutputError(f"cannot write {name}: {folder} is a file, not a folder; choose another place")
-    if not os.path.isdir(folder):
-        raise OutputError(f"cannot write {name}: the folder {folder} does not exist; create it first")
-    try:
-        mode = os.lstat(target).st_mode
-    except FileNotFoundError:
-        return target
-    if stat.S_ISLNK(mode):
-        raise OutputError(f"cannot write {name}: its symbolic links lead in a circle")
-    if stat.S_ISDIR(mode):
-        raise OutputError(f"cannot write {name}: it is a folder; choose another name")
-    if not stat.S_ISREG(mode):
-        raise OutputError(f"cannot write {name}: it is not a regular file")
-    # The superuser may write to any file; its owner's "read-only" is respected all the same.
-    if not mode & 0o222 or not os.access(target, os.W_OK):
-        raise OutputError(f"cannot write {name}: the file is read-only; remove it or choose another name")
-    return target
-
-
-def _open_beside(target: str) -> tuple[str, IO[bytes]]:
-    """Create a new file in the folder of ``target``, with the rights the user's umask gives."""
-    temporary = os.path.join(os.path.dirname(target), f".mrt-{os.urandom(8).hex()}.tmp")
-    _unfinished.add(temporary)
-    descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
-    return temporary, os.fdopen(descriptor, "w+b")

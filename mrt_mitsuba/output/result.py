@@ -5,9 +5,10 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.output.error import ErrorEstimate, Round
 
 if TYPE_CHECKING:
@@ -41,27 +42,42 @@ class Result:
     timings: Timings  #: seconds
     rays: Mapping[str, int]  #: number by kind; "mirror" and "shadow" only where they were counted
     kernel_launches: int  #: how many kernels ran
-    options: Mapping[str, Any] = field(default_factory=dict)  #: as they were given
+    options: Mapping[str, Any]  #: the values in force
+    versions: Mapping[str, str]  #: of what decides about pixels
+    camera: Mapping[str, np.ndarray]  #: float64 [4, 4], see ``rendering.view``
+    inputs: frozenset[str] = frozenset()  #: paths of the pictures that the scene was read from
     error: ErrorEstimate | None = None  #: to the converged picture; None where nothing was estimated
     rounds: tuple[Round, ...] = ()  #: what was known after each: the error over the time of this render
 
-    def save(self, path: str | os.PathLike[str], *, tonemap: str = "report") -> None:
-        """Write a .png or .exr; raise ``OutputError``. ``tonemap`` ("report" or "srgb") concerns a PNG
-        only."""
+    def save(self, *paths: str | os.PathLike[str], tonemap: str = "report") -> None:
+        """Write .png and .exr files, all or none; raise ``OutputError``.
+
+        ``tonemap`` ("report" or "srgb") concerns a PNG only.
+        """
         from mrt_mitsuba.output import files as output
 
-        output.save(path, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
+        for path in paths:
+            if os.path.realpath(path) in self.inputs:
+                raise OutputError(
+                    f"cannot write {os.fspath(path)}: the scene uses this picture; choose another name"
+                )
+        output.save(paths, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
 
     def header(self) -> dict[str, Any]:
-        """The header attributes of an EXR."""
-        import mrt_mitsuba
-
+        """The header attributes of an EXR: how the picture was made, and nothing that changes when it is made
+        again, such as seconds."""
+        version = self.versions["mrt-mitsuba"]
+        error = self.error and {"rmse": self.error.rmse, "low": self.error.low, "high": self.error.high}
+        rounds = [{"spp": each.spp, "rmse": each.rmse} for each in self.rounds]
         return {
-            "mrt:version": mrt_mitsuba.__version__,
+            "software": f"mrt-mitsuba {version}",
+            "mrt:version": version,
             "mrt:scene": self.plan.scene,
             "mrt:options": dict(self.options),
             "mrt:variant": self.plan.variant,
-            "mrt:seconds": self.timings.total,
+            **{f"mrt:{name}": self.versions[name] for name in ("mitsuba", "drjit", "llvm")},
+            **({"mrt:error": error, "mrt:rounds": rounds} if error else {}),
+            **{f"mrt:{name}": matrix.tolist() for name, matrix in self.camera.items()},
         }
 
     def _repr_png_(self) -> bytes:

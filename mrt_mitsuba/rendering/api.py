@@ -162,7 +162,7 @@ def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Res
     """Render a scene as ``render`` does."""
     start = time.perf_counter()
     with counting_kernels(progress) as kernels:
-        variant = runtime.use(settings.variant)
+        runtime.use(settings.variant)
         runtime.warn_if_slow()
         budget = Budget.of(settings.memory)
         source = open_scene(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from mrt_mitsuba.rays.bundle import Samples
 
 
@@ -53,3 +55,40 @@ class View:
         scalar = mi.variant().startswith("scalar")
         way = mi.Vector3f(self.motion) if scalar else dr.opaque(mi.Vector3f, self.motion)
         return mi.Vector3f(way) * time
+
+    def matrices(self) -> dict[str, np.ndarray]:
+        """Return the camera's matrices, float64 [4, 4] for row vectors on their left, as EXR defines them.
+
+        ``worldToCamera``: to a camera at the origin that looks along -z, with x to the right and y up.
+        ``worldToNDC``, of pinhole cameras: to the picture, x from 0 to 1 to the right and y downwards.
+        Source: OpenEXR, "Standard Attributes".
+        """
+        import mitsuba as mi
+
+        to_world = np.array(self.sensor.world_transform().matrix, np.float64).reshape(4, 4)
+        if not np.isfinite(to_world).all() or np.linalg.matrix_rank(to_world) < 4:
+            return {}
+        # Mitsuba's cameras look along +z, with x to the left
+        to_camera = np.diag([-1.0, 1.0, -1.0, 1.0]) @ np.linalg.inv(to_world)
+        found = {"worldToCamera": to_camera}
+        parameters = mi.traverse(self.sensor)
+        if "x_fov" in parameters:
+            film = self.sensor.film()
+            size, crop, start = (
+                np.array(getattr(film, name)(), float) for name in ("size", "crop_size", "crop_offset")
+            )
+            names = [f"principal_point_offset_{axis}" for axis in "xy"]  # where the plugin has them
+            shift = [np.array(parameters[name]).item() if name in parameters else 0.0 for name in names]
+            half = np.tan(np.deg2rad(np.array(parameters["x_fov"]).item()) / 2)
+            pixels = size[0] / (2 * half)  # at a distance of one
+            centre = (0.5 - np.array(shift)) * size - start
+            projection = np.array(
+                [
+                    [pixels / crop[0], 0, -centre[0] / crop[0], 0],
+                    [0, -pixels / crop[1], -centre[1] / crop[1], 0],
+                    [0, 0, 1, 0],
+                    [0, 0, -1, 0],
+                ]
+            )
+            found["worldToNDC"] = projection @ to_camera
+        return {name: matrix.T for name, matrix in found.items()}

@@ -49,15 +49,15 @@ def scene_dict(
 
 def write_xml(
     scene: int | Scene, path: str | os.PathLike[str], *, flavor: str = "mrt", fresnel: str = "schlick"
-) -> None:
-    """Write a scene as XML through Mitsuba's own writer.
+) -> list[str]:
+    """Write a scene as XML through Mitsuba's own writer; return the paths of what was written.
 
-    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file
-    beside it, named after the XML file and the shape. Raises ``OutputError`` if a file cannot be written,
-    ``SceneError`` for groups of objects (``mrt_group``), which have neither an XML form nor a stock
-    counterpart.
+    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file beside it,
+    named after the XML file and the shape; all files are replaced, or none. Raises ``OutputError`` if a file
+    cannot be written, ``SceneError`` for groups of objects (``mrt_group``), which have neither an XML form
+    nor a stock counterpart.
     """
-    from mrt_mitsuba.output.files import replacing
+    from mrt_mitsuba.output.replacing import replacing_together
 
     mine = scene_dict(scene, fresnel=fresnel)
     models = {
@@ -69,11 +69,11 @@ def write_xml(
     for name, node in models.items():
         mine[name] = _ply_node(node, os.path.basename(files[name]))
     text = _text_of(mine, scene, flavor)
-    for name, node in models.items():
-        with replacing(files[name]) as file:
+    with replacing_together([*files.values(), path]) as opened:
+        for file, node in zip(opened, models.values(), strict=False):
             file.write(_ply(node))
-    with replacing(path) as file:
-        file.write(text.encode())
+        opened[-1].write(text.encode())
+    return [*files.values(), os.fspath(path)]
 
 
 def xml_text(scene: int | Scene, *, flavor: str = "mrt", fresnel: str = "schlick") -> str:

@@ -88,7 +88,7 @@ def _make(parse: Callable[[Any], Any], name: str, budget: Budget | None) -> Any:
                 _check_data(filename)
                 size = picture_size(_resolved(filename)) if kind in _PICTURES else None
                 if budget is not None and size is not None:
-                    budget.take_texture(filename, *size, around=kind == "envmap")
+                    budget.take_texture(_resolved(filename), *size, around=kind == "envmap")
         mi.parser.transform_all(config, state)
         return mi.parser.instantiate(config, state)
     except RuntimeError as error:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import SceneError
-from mrt_mitsuba.plugins.quadric_kinds import KINDS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -212,6 +211,8 @@ class Scene:
 def _check(scene: Scene) -> None:
     """Refuse what Mitsuba would draw as nothing, or as noise, without a word. Materials, lights, planes and
     meshes are checked by their plugins."""
+    from mrt_mitsuba.plugins.quadric_kinds import KINDS  # which brings Dr.Jit
+
     problem = view_problem(scene.camera)
     if problem:
         raise SceneError(problem)

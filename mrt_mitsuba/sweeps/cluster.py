@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
+from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps import worker
 
 if TYPE_CHECKING:
@@ -146,9 +147,9 @@ def inspect(client: Client, folder: str, count: int) -> dict[str, int]:
     for name, facts in found.items():
         if not facts["sees"]:
             raise OutputError(f"the worker {name} cannot write to {folder}: choose a folder that all share")
-        if facts["versions"] != worker.versions():
+        if facts["versions"] != versions():
             raise ClusterError(
                 f"the worker {name} has {worker.named(facts['versions'])} and this process "
-                f"{worker.named(worker.versions())}: install the same everywhere"
+                f"{worker.named(versions())}: install the same everywhere"
             )
     return dict(Counter(facts["cores"] for facts in found.values()))

@@ -9,8 +9,9 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import OutputError, UsageError
-from mrt_mitsuba.output.files import check_target
+from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.progress import Advance, Progress, TerminalProgress
+from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps import cluster as clusters
 from mrt_mitsuba.sweeps.cluster import ClusterError
 from mrt_mitsuba.sweeps.grid import Job, jobs
@@ -19,7 +20,7 @@ from mrt_mitsuba.sweeps.sheet import MOST, write_sheet
 from mrt_mitsuba.sweeps.table import FILE as TABLE
 from mrt_mitsuba.sweeps.table import Table
 from mrt_mitsuba.sweeps.tiles import Mosaic, assemble_task
-from mrt_mitsuba.sweeps.worker import TOPIC, House, Task, is_fresh, named, render_task, thumbnail, versions
+from mrt_mitsuba.sweeps.worker import TOPIC, House, Task, is_fresh, named, render_task, thumbnail
 
 if TYPE_CHECKING:
     from distributed import Client, Future

@@ -15,7 +15,7 @@ def write_sheet(path: str, names: Sequence[str], pictures: Sequence[Any]) -> Non
     """Write small pictures, [h, w, 3] in 8 bit or None where one is missing, with their names as PNG."""
     from PIL import Image, ImageDraw
 
-    from mrt_mitsuba.output.files import replacing
+    from mrt_mitsuba.output.replacing import replacing
 
     if all(picture is None for picture in pictures):
         return

@@ -92,7 +92,7 @@ class Table:
 
     def write(self) -> None:
         """Write the file, which replaces the one before when it is complete."""
-        from mrt_mitsuba.output.files import replacing
+        from mrt_mitsuba.output.replacing import replacing
 
         text = io.StringIO()
         writer = csv.DictWriter(text, (*self.keys, *FACTS), lineterminator="\n")

@@ -9,12 +9,11 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import metadata
 from typing import Any
 
-from mrt_mitsuba import __version__, llvm
 from mrt_mitsuba.cores import affinity, usable_cores
 from mrt_mitsuba.errors import MrtError, OutputError
+from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps.scenes import SceneFile
 
 TOPIC = "mrt-sweep"  # of the scheduler's events, which tell a client what began
@@ -62,16 +61,6 @@ class House:
     renew: int
     local: bool
     versions: Mapping[str, str]
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what decides about pixels."""
-    return {
-        "mrt-mitsuba": __version__,
-        "mitsuba": metadata.version("mitsuba"),
-        "drjit": metadata.version("drjit"),
-        "llvm": llvm.version_text(llvm.prepare().version),
-    }
 
 
 def named(versions: Mapping[str, str]) -> str:

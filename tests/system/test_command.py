@@ -54,16 +54,25 @@ def test_picture_and_its_two_files(mrt: Mrt, tmp_path: Path) -> None:
     assert {"depth.Z", "normal.X", "normal.Y", "normal.Z"} <= exr.layers.keys()
     given = json.loads(exr.header["mrt:options"])
     assert (exr.header["mrt:scene"], exr.header["mrt:variant"]) == ("1", "llvm_ad_rgb")
-    assert (given["width"], given["aa"], given["fresnel"]) == (64, 2, "schlick")
+    assert (given["width"], given["aa"], given["fresnel"], given["seed"]) == (64, 2, "schlick", 0)
+    assert (given["integrator"], given["focaldist"]) == ("mrt_whitted", 0)
+    assert {
+        "mrt:mitsuba",
+        "mrt:drjit",
+        "mrt:llvm",
+        "software",
+        "mrt:worldToCamera",
+        "mrt:worldToNDC",
+    } <= exr.header.keys()
     with Image.open(tmp_path / "out.png") as png:
         np.testing.assert_array_equal(np.asarray(png), np.clip(np.trunc(exr.image * 255), 0, 255))
 
 
-def test_same_command_twice_gives_the_same_pixels(mrt: Mrt, tmp_path: Path) -> None:
+def test_same_command_twice_gives_the_same_bytes(mrt: Mrt, tmp_path: Path) -> None:
     for name in ("a", "b"):
         assert mrt(name, "2", *SMALL, "aa=2").returncode == 0
-    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr").image, read_exr(tmp_path / "b.exr").image)
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    for ending in ("png", "exr"):
+        assert (tmp_path / f"a.{ending}").read_bytes() == (tmp_path / f"b.{ending}").read_bytes()
 
 
 def test_plan_is_shown(mrt: Mrt) -> None:
@@ -183,7 +192,7 @@ def test_home_that_holds_no_kernel_cache(mrt: Mrt, tmp_path: Path, environ: dict
 @pytest.mark.parametrize(("flavor", "plugin"), [((), "mrt_bsdf"), (("--stock",), "roughplastic")])
 def test_exported_scene_renders(mrt: Mrt, tmp_path: Path, flavor: tuple[str, ...], plugin: str) -> None:
     done = mrt("export", "0", "--xml", "zero.xml", *flavor)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "Wrote zero.xml\n", "")
     text = (tmp_path / "zero.xml").read_text()
     assert plugin in text and ("mrt_" in text) is not bool(flavor)
     done = mrt("out", "scene=zero.xml", "aa=1", "aamode=none", "format=exr")

@@ -38,8 +38,8 @@ class Recorder:
             advance(5)
         return self
 
-    def save(self, path: str, tonemap: str) -> None:
-        output.save(path, np.full((2, 2, 3), 0.5, np.float32), tonemap=tonemap)
+    def save(self, *paths: str, tonemap: str) -> None:
+        output.save(paths, np.full((2, 2, 3), 0.5, np.float32), tonemap=tonemap)
 
 
 @pytest.fixture
@@ -59,7 +59,8 @@ def test_render_writes_and_says_what_the_report_says(renderer: Recorder, tmp_pat
     lines = text.splitlines()
     assert "Width:      80" in lines and "Height:     60" in lines and "AA:         2" in lines
     assert "AA mode:    luma" in lines and "F distance: 2.0" in lines and "F range:    2.0" in lines
-    assert lines[-2] == "Computing Anti aliasing.."
+    assert lines[-3] == "Computing Anti aliasing.."
+    assert lines[-2] == f"Wrote {out}.png and {out}.exr"
     assert lines[-1].startswith("Render time: ") and lines[-1].endswith("s")
     float(lines[-1].removeprefix("Render time: ").removesuffix("s"))
     assert "PLAN" not in text and errors == ""
@@ -213,7 +214,7 @@ IN_A_RENDER = """
 import sys, time, types
 class Result:
     def save(self, path, tonemap):
-        from mrt_mitsuba.output.files import replacing
+        from mrt_mitsuba.output.replacing import replacing
         with replacing(path) as file:
             file.write(b"half")
             file.flush()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import errno
+import fcntl
 import os
+import resource
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtWarning, OutputError
 from mrt_mitsuba.output import files as output
+from mrt_mitsuba.output.replacing import check_target
 
 
 @pytest.fixture
@@ -67,7 +71,7 @@ def test_exr_holds_every_bit(tmp_path: Path, image: np.ndarray) -> None:
     layers = {"depth.Z": image[:, :, 0], "normal": image, "albedo": image * 2, "samples": image[:, :, 1]}
     header = {
         "mrt:version": "1",
-        "mrt:seconds": 1.5,
+        "mrt:alpha": 1.5,
         "mrt:scene": "4",
         "mrt:options": {"aa": 4, "layers": ["depth"]},
     }
@@ -82,7 +86,7 @@ def test_exr_holds_every_bit(tmp_path: Path, image: np.ndarray) -> None:
     for name, values in expected.items():
         np.testing.assert_array_equal(back.layers[name], values, err_msg=name)
     assert back.header["mrt:options"] == '{"aa": 4, "layers": ["depth"]}'
-    assert back.header["mrt:seconds"] == 1.5
+    assert back.header["mrt:alpha"] == 1.5
 
 
 def test_exr_is_the_same_file_twice(tmp_path: Path, image: np.ndarray) -> None:
@@ -155,7 +159,7 @@ def test_target_that_cannot_be_written(tmp_path: Path, image: np.ndarray, kind: 
     path = make_bad_target(kind, tmp_path)
     before = sorted(tmp_path.rglob("*"))
     for attempt in (
-        output.check_target,
+        check_target,
         lambda p: output.write_png(p, image),
         lambda p: output.write_exr(p, image),
     ):
@@ -184,64 +188,72 @@ def test_extension_says_the_format(tmp_path: Path, image: np.ndarray, name: str)
         output.save(tmp_path / name, image)
 
 
-class FullDisk:
-    """A file on a disk that has room for some bytes only."""
-
-    def __init__(self, file: object, room: int, error: BaseException) -> None:
-        self._file, self._room, self._error = file, room, error
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._file, name)
-
-    def __enter__(self) -> FullDisk:
-        return self
-
-    def __exit__(self, *details: object) -> None:
-        self._file.close()
-
-    def write(self, data: bytes) -> int:
-        self._room -= len(data)
-        if self._room < 0:
-            raise self._error
-        return self._file.write(data)
+ENDINGS = (["png"], ["exr"], ["png", "exr"])
 
 
-@pytest.mark.parametrize("ending", ["png", "exr"])
-@pytest.mark.parametrize("room", [0, 100, 2000])
-@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), KeyboardInterrupt()])
-def test_failure_half_way_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, room: int, error: BaseException
+@pytest.fixture
+def old(tmp_path: Path) -> Callable[..., list[Path]]:
+    """Old files of some endings."""
+
+    def write(endings: list[str]) -> list[Path]:
+        paths = [tmp_path / f"a.{ending}" for ending in endings]
+        for path in paths:
+            path.write_bytes(b"old")
+        return paths
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("endings", "room"),
+    [(endings, room) for endings in ENDINGS for room in (0, 100, 2000)] + [(["png", "exr"], 6000)],
+)  # the last is enough for one of two
+def test_full_disk_leaves_the_old_files(tmp_path: Path, old, endings: list[str], room: int) -> None:
+    paths = old(endings)
+    noise = np.random.default_rng(0).random((40, 40, 3), np.float32)  # does not compress
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
+    try:
+        with pytest.raises(OutputError, match="File too large"):
+            output.save(paths, noise)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [path.read_bytes() for path in paths] == [b"old"] * len(paths)
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+
+
+@pytest.mark.parametrize("endings", ENDINGS)
+@pytest.mark.parametrize("step", ["fsync", "chmod", "replace"])
+def test_interrupt_leaves_all_files_old_or_makes_all_new(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image: np.ndarray, old, endings: list[str], step: str
 ) -> None:
-    path = tmp_path / f"a.{ending}"
-    path.write_bytes(b"old")
-    real = output._open_beside
+    paths = old(endings)
+    before, calls = getattr(os, step), []
 
-    def open_beside(target: str) -> tuple[str, FullDisk]:
-        temporary, file = real(target)
-        return temporary, FullDisk(file, room, error)
+    def interrupted(*words: object) -> object:
+        calls.append(words)
+        done = before(*words)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        return done
 
-    monkeypatch.setattr(output, "_open_beside", open_beside)
-    noise = np.random.default_rng(0).random((40, 40, 3), np.float32)  # does not compress: over 4000 bytes
-    expected, text = (
-        (OutputError, "No space left") if isinstance(error, OSError) else (KeyboardInterrupt, None)
-    )
-    with pytest.raises(expected, match=text):
-        output.save(path, noise)
-    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+    monkeypatch.setattr(os, step, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        output.save(paths, image)
+    assert {path.read_bytes() == b"old" for path in paths} == {step != "replace"}
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-@pytest.mark.parametrize("ending", ["png", "exr"])
-def test_disk_full_as_the_kernel_reports_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image: np.ndarray, ending: str
-) -> None:
-    """A small picture fits into Python's buffer: the error only comes with the flush."""
-    beside = tmp_path / ".beside"
-    beside.symlink_to("/dev/full")
-    monkeypatch.setattr(output, "_open_beside", lambda target: (str(beside), beside.open("wb")))
-    with pytest.raises(OutputError, match="No space left on device"):
-        output.save(tmp_path / f"a.{ending}", image)
-    assert list(tmp_path.iterdir()) == []
+def test_leftovers_of_killed_processes_are_removed(tmp_path: Path, image: np.ndarray) -> None:
+    left, alive, recent = (tmp_path / f".mrt-{name}.tmp" for name in ("left", "alive", "recent"))
+    with alive.open("wb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        for path in (left, recent):
+            path.touch()
+        for path in (left, alive):
+            os.utime(path, (0, 0))
+        output.save(tmp_path / "a.png", image)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [alive.name, recent.name, "a.png"]
 
 
 @pytest.mark.parametrize("ending", ["png", "exr"])
@@ -293,3 +305,30 @@ def test_a_forked_process_can_write_too(tmp_path: Path, image: np.ndarray) -> No
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
+SENSORS = {
+    "plain": {"type": "perspective", "fov": 40},
+    "vertical": {"type": "perspective", "fov": 30, "fov_axis": "y"},
+    "lens": {"type": "thinlens", "fov": 50, "aperture_radius": 0.1},
+    "shifted": {"type": "perspective", "principal_point_offset_x": 0.2, "principal_point_offset_y": -0.1},
+}
+
+
+@pytest.mark.parametrize("crop", [{}, {"crop_width": 10, "crop_height": 8, "crop_offset_x": 3}])
+@pytest.mark.parametrize("name", SENSORS)
+def test_matrices_of_the_header_lead_from_rays_to_the_picture(variant: str, name: str, crop: dict) -> None:
+    """A point on the ray through a place of the picture comes back to this place, and the camera sees it."""
+    import mitsuba as mi
+
+    to_world = mi.ScalarTransform4f().look_at([3, 2, 5], [0, 0.5, 0], [0.1, 1, 0])
+    film = {"type": "hdrfilm", "width": 40, "height": 20, **crop}
+    scene = {"type": "scene", "sensor": {**SENSORS[name], "to_world": to_world, "film": film}}
+    header = mrt.render(scene, aa=1, aamode="none").header()
+    sensor = mi.load_dict(scene).sensors()[0]
+    for place in ((0.5, 0.5), (0.1, 0.9), (0.8, 0.3)):
+        ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(place), mi.Point2f(0.5))
+        point = np.append(np.array(ray(7.0)).ravel(), 1.0)
+        x, y, _, w = point @ header["mrt:worldToNDC"]
+        np.testing.assert_allclose((x / w, y / w), place, atol=1e-5)  # float32
+        assert (point @ header["mrt:worldToCamera"])[2] < 0

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.tools import report
 from mrt_mitsuba.validation.tools.study import Bound, Study
 
 TITLE = "Laws of plugins"
+LEVEL = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction
+SIGMAS = 6  # the same for a normal distribution: 2e-9
 
 
 class Skip(Exception):
@@ -51,6 +56,19 @@ class Law:
     def at_least(self, what: str, measured: float, limit: float, why: str, snippet: str = "") -> None:
         """Hold a figure to a lower bound."""
         self.parts.append(Part(what, float(measured), float(limit), False, why, snippet))
+
+    def most(self, what: str, errors: Any, limit: float, why: str, show: Callable[[int], str]) -> None:
+        """Hold the largest of N errors to an upper bound; ``show(i)`` is the snippet of one."""
+        i = int(np.where(np.isnan(errors), np.inf, errors).argmax())
+        self.at_most(what, errors[i], limit, why, show(i))
+
+    def none(self, what: str, bad: Any, why: str, show: Callable[[int], str]) -> None:
+        """Count how many of N are bad: there must be none."""
+        self.at_most(what, bad.sum(), 0, why, show(int(bad.argmax())))
+
+    def share(self, what: str, bad: Any, limit: float, why: str, show: Callable[[int], str]) -> None:
+        """Hold the share of N that is bad to an upper bound."""
+        self.at_most(what, bad.mean(), limit, why, show(int(bad.argmax())))
 
     @property
     def worst(self) -> Part:
@@ -169,7 +187,10 @@ def examine(
         if name in chosen:
             law = found[name] = Law(name)
             try:
-                laws[name](law, case)
+                with warnings.catch_warnings():
+                    # Mitsuba loads its integrators anew with each variant, and Dr.Jit counts how often
+                    warnings.filterwarnings("ignore", "The AST-transforming decorator")
+                    laws[name](law, case)
             except Skip as reason:
                 law.skipped = str(reason)
             except Exception as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -228,67 +228,62 @@ def _culprit(source: Any, spp: int, seed: int) -> str:
     if mi.variant().startswith("scalar"):
         return "what is not told in scalar variants: check it in a vectorised one"
     counts: Counter[str] = Counter()
+    pixels = int(np.prod(np.array(source.sensor.film().crop_size())))
     for attempt in range(8):
-        counts.update(_follow(source, max(spp, 2**12), seed + attempt))
+        counts.update(_follow(source, min(max(spp, 2**12) * pixels, 2**20), seed + attempt))
         if counts:
             return counts.most_common(1)[0][0]
     return "no object's own numbers: by the integrator, or a sum that overflows"
 
 
-def _follow(source: Any, spp: int, seed: int) -> Counter[str]:
+def _camera_rays(source: Any, rng: Any) -> Any:
+    """Return rays through random points of the film's crop."""
+    import mitsuba as mi
+
+    draw = rng.next_float32
+    # of a cropped film, the unit square is the crop
+    ray, _ = source.sensor.sample_ray(draw(), draw(), mi.Point2f(draw(), draw()), mi.Point2f(draw(), draw()))
+    return ray
+
+
+def _follow(source: Any, count: int, seed: int) -> Counter[str]:
     """Trace one batch of paths; return how often each object was the first to give a number that is none."""
     import drjit as dr
     import mitsuba as mi
 
-    scene, sensor = source.scene, source.sensor
-    width, height = (int(n) for n in sensor.film().crop_size())
-    x, y = (int(n) for n in sensor.film().crop_offset())
-    count = min(spp * width * height, 2**20)
-    rng = mi.PCG32(count, initstate=seed)
-    draw = rng.next_float32
-    size = mi.Point2f(*(float(n) for n in sensor.film().size()))
-    position = (mi.Point2f(x, y) + mi.Point2f(draw() * width, draw() * height)) / size
-    # a sensor's film positions are of the crop, not of the film
-    position = (position * size - mi.Point2f(x, y)) / mi.Point2f(width, height)
-    ray, _ = sensor.sample_ray(draw(), draw(), position, mi.Point2f(draw(), draw()))
-    ctx, active = mi.BSDFContext(), mi.Bool(True)
+    scene, ctx, rng = source.scene, mi.BSDFContext(), mi.PCG32(count, initstate=seed)
+    ray, active, draw = _camera_rays(source, rng), mi.Bool(True), rng.next_float32
     counts: Counter[str] = Counter()
-    shapes_of_scene = list(scene.shapes())
 
-    def note(bad: Any, what: str, shapes: Any) -> Any:
+    def note(bad: Any, name: Callable[[Any], str], shapes: Any = None) -> Any:
         bad &= active
-        for shape in shapes_of_scene if dr.any(bad) else ():
-            here = int(dr.count(bad & (shapes == mi.ShapePtr(shape)))[0])
-            if here:
-                owner = f"the BSDF {_name(shape.bsdf())}, on" if what == "BSDF" else "the shape"
-                counts[f"{owner} {_name(shape)}"] += here
+        if dr.any(bad):
+            for shape in [None] if shapes is None else scene.shapes():
+                here = bad if shape is None else bad & (shapes == mi.ShapePtr(shape))
+                counts[name(shape)] += int(dr.count(here)[0])
         return ~bad
 
     for _ in range(DEPTH):
         si = scene.ray_intersect(ray, active)
-        outside = active & ~si.is_valid()
-        emitted = si.emitter(scene, active).eval(si, active)
-        dark = _not_finite(emitted) & active
-        if dr.any(dark):
-            counts["an emitter"] += int(dr.count(dark)[0])
-        active &= ~outside & ~dark
-        active &= note(_not_finite(si.p, si.n, si.sh_frame.n, si.uv), "shape", si.shape)
+        active &= note(_not_finite(si.emitter(scene, active).eval(si, active)), lambda _: "an emitter")
+        active &= si.is_valid()
+        active &= note(
+            _not_finite(si.p, si.n, si.sh_frame.n, si.uv), lambda s: f"the shape {_name(s)}", si.shape
+        )
         ds, light = scene.sample_emitter_direction(si, mi.Point2f(draw(), draw()), True, active)
-        dark = _not_finite(light) & active
-        if dr.any(dark):
-            counts["an emitter"] += int(dr.count(dark)[0])
+        active &= note(_not_finite(light), lambda _: "an emitter")
         bsdf = si.bsdf(ray)
         value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active & (ds.pdf > 0))
         bs, weight = bsdf.sample(ctx, si, draw(), mi.Point2f(draw(), draw()), active)
         lit = dr.any(mi.unpolarized_spectrum(weight) != 0)
         bad = _not_finite(mi.unpolarized_spectrum(value), pdf, mi.unpolarized_spectrum(weight))
-        active &= note(bad | (lit & _not_finite(bs.wo, bs.pdf)), "BSDF", si.shape)
-        active &= lit
+        bad |= lit & _not_finite(bs.wo, bs.pdf)
+        active &= lit & note(bad, lambda s: f"the BSDF {_name(s.bsdf())}, on {_name(s)}", si.shape)
         ray = si.spawn_ray(si.to_world(bs.wo))
         dr.eval(ray, active, rng)
         if not dr.any(active):
             break
-    return counts
+    return +counts
 
 
 def _name(plugin: Any) -> str:

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from mrt_mitsuba.errors import OutputError
-from mrt_mitsuba.output.files import check_target, replacing, to_8bit, write_exr
+from mrt_mitsuba.output.files import to_8bit, write_exr
+from mrt_mitsuba.output.replacing import check_target, replacing
 from mrt_mitsuba.validation.tools import machine
 from mrt_mitsuba.validation.tools.study import Picture, Plot, Study, Table
 

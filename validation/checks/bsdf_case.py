@@ -1,0 +1,202 @@
+"""A BSDF under examination, and what several of its laws need to know."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.validation.checks import snippets
+from mrt_mitsuba.validation.checks.law import Skip
+from mrt_mitsuba.validation.checks.probe import (
+    SCALAR_SHARE,
+    Array,
+    Probe,
+    Samples,
+    direction,
+    is_scalar,
+    unit,
+)
+from mrt_mitsuba.validation.checks.recipe import Recipe
+
+ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
+QUICK_ANGLES = (0, 50, 80, 140)
+FIT = 5e-3  # the rational fits of Smith's G₁ in use are off by up to 0.35 %, and the densities with them
+POINTWISE = 2e-3  # relative, beyond what rounding explains
+ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32
+
+
+@dataclass(frozen=True)
+class View:
+    """A direction of incidence at a texture coordinate, and samples drawn for it."""
+
+    wi: Array  # float32 [3]
+    uv: Array  # float32 [2]
+    u: Array  # the random numbers of the samples [N, 3]
+    samples: Samples
+    density: Array  # pdf() at the samples of lobes with a width that are none refused, 0 elsewhere [N]
+
+    def around(self, count: int) -> tuple[Array, Array]:
+        """Return ``wi`` and ``uv`` for so many lanes."""
+        return np.broadcast_to(self.wi, (count, 3)), np.broadcast_to(self.uv, (count, 2))
+
+
+@dataclass
+class Case:
+    """A BSDF under examination, and what several laws need to know of it."""
+
+    bsdf: Any
+    recipe: Recipe
+    quick: bool
+    seed: int
+
+    def __post_init__(self) -> None:
+        self.probe = Probe(self.bsdf)
+        self.rng = np.random.default_rng(self.seed)
+
+    def count(self, quick: int, full: int) -> int:
+        """Return how many lanes to use."""
+        number = quick if self.quick else full
+        return max(int(number * SCALAR_SHARE), 64) if is_scalar() else number
+
+    def uniform(self, count: int) -> Array:
+        return self.rng.random((count, 3), np.float32)
+
+    @cached_property
+    def views(self) -> list[View]:
+        """Samples at every angle of incidence, at random azimuths and texture coordinates."""
+        count = self.count(2**16, 2**18)
+        found = []
+        for angle in QUICK_ANGLES if self.quick else ANGLES:
+            wi = direction(np.cos(np.radians(angle)), self.rng.uniform(0, 2 * np.pi))
+            uv, u = self.rng.random(2, np.float32), self.uniform(count)
+            wis, uvs = (np.broadcast_to(x, (count, len(x))) for x in (wi, uv))
+            samples = self.probe.sample(wis, u, uvs)
+            value, pdf = self.probe.both(wis, samples.wo, uvs)
+            found.append(View(wi, uv, u, samples, np.where(live(samples, value, pdf), pdf, 0)))
+        return found
+
+    def copy(self) -> Case:
+        """Return a case whose parameters can be changed, with a BSDF of its own if it can be loaded."""
+        loaded = self.bsdf if self.recipe.description is None else self.recipe.load()
+        made = Case(loaded, self.recipe, self.quick, self.seed)
+        made.pairs = self.pairs
+        return made
+
+    @cached_property
+    def smooth(self) -> bool:
+        """Whether there is a lobe with a width."""
+        return any((view.density > 0).any() for view in self.views) or bool(self.pairs.value.any())
+
+    def need_smooth(self) -> None:
+        if not self.smooth:
+            raise Skip("all lobes are single directions (delta): eval and pdf are 0")
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """Directions of incidence over the sphere with one exitant each: some sampled, some at random."""
+        count = self.count(2**13, 2**15)
+        cos, phi = self.rng.uniform(-1, 1, count), self.rng.uniform(0, 2 * np.pi, count)
+        wi, uv = direction(cos, phi), self.rng.random((count, 2), np.float32)
+        samples = self.probe.sample(wi, self.uniform(count), uv)
+        usable = np.isfinite(samples.wo).all(axis=1) & ~samples.delta & (samples.weight != 0).any(axis=1)
+        usable &= self.rng.random(count) < 0.75
+        other = direction(self.rng.uniform(-1, 1, count), self.rng.uniform(0, 2 * np.pi, count))
+        wo = unit(np.where(usable[:, None], samples.wo, other))
+        value, pdf = self.probe.both(wi, wo, uv)
+        across = usable & (wi[:, 2] * wo[:, 2] < 0)
+        eta = np.ones(count)
+        for side in (wi[:, 2] > 0, wi[:, 2] < 0):
+            known = across & side & np.isfinite(samples.eta)
+            eta[side & (wi[:, 2] * wo[:, 2] < 0)] = np.median(samples.eta[known]) if known.any() else 1
+        return Pairs(wi, wo, uv, value, pdf, np.where(across, samples.eta, eta))
+
+    def spread(self, quantity: Any, wi: Array, wo: Array, uv: Array, *others: Array) -> Array:
+        """Return the largest change of ``quantity(wi, wo, uv, …)`` as directions move by a rounding."""
+        base = quantity(wi, wo, uv, *others)
+        largest = np.zeros_like(base)
+        for _ in range(6):
+            i, o = (v + ROUNDED * self.rng.normal(size=v.shape).astype(np.float32) for v in (wi, wo))
+            change = np.abs(quantity(i, o, uv, *others) - base)
+            largest = np.maximum(largest, np.where(np.isnan(change), np.inf, change))
+        return largest
+
+    def snippet(self, body: str, **names: Any) -> str:
+        return snippets.bsdf(self.bsdf, self.recipe.description, body, names)
+
+    def at(self, body: str, pairs: Pairs, **more: Any) -> Callable[[int], str]:
+        """Return what makes the snippet of one pair."""
+        return lambda i: self.snippet(body, wi=pairs.wi[i], uv=pairs.uv[i], wo=pairs.wo[i], **more)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """N pairs of directions, and what ``eval`` and ``pdf`` give."""
+
+    wi: Array
+    wo: Array
+    uv: Array
+    value: Array  # [N, channels]
+    pdf: Array
+    eta: Array  # index of refraction at wo over that at wi
+
+    def only(self, keep: Array | slice) -> Pairs:
+        return Pairs(*(x[keep] for x in vars(self).values()))
+
+
+def live(s: Samples, value: Array, pdf: Array) -> Array:
+    """Where samples of lobes with a width are ones that the density counts.
+
+    Weight 0 is how ``sample`` refuses: its direction is then any. It may also be that the value there is 0,
+    or that the weight is wrong; but then the stated density is that of the direction.
+    """
+    refused = (s.weight == 0).all(axis=1) & (value != 0).any(axis=1) & ~np.isclose(s.pdf, pdf, rtol=0.2)
+    return ~s.delta & np.isfinite(pdf) & (pdf > 0) & ~refused
+
+
+def excess(one: Array, other: Array, allowed: Array) -> Array:
+    """Return [N]: how far two arrays [N, …] differ beyond ``8 * allowed``, relative to the larger one.
+
+    Of several channels, the brightest counts as the size. What is not finite is left to the law ``finite``.
+    """
+    one, other, allowed = (np.reshape(x, (len(one), -1)).astype(np.float64) for x in (one, other, allowed))
+    size = np.maximum(np.abs(one), np.abs(other)).max(axis=1, keepdims=True)
+    beyond = np.maximum(np.abs(one - other) - 8 * allowed, 0) / np.where(size > 1e-30, size, np.inf)
+    return np.where(np.isfinite(beyond), beyond, 0).max(axis=1)
+
+
+def parameters(case: Case) -> list[tuple[str, Any]]:
+    """Parameters that hold floating-point numbers which say how much of something there is."""
+    import drjit as dr
+    import mitsuba as mi
+
+    params = mi.traverse(case.bsdf)
+    found = []
+    for key in params.keys():  # noqa: SIM118 - SceneParameters is no dict
+        value = params[key]
+        numeric = isinstance(value, float) or (
+            value is not None and dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)
+        )
+        if numeric and "to_uv" not in key and np.size(np.array(value)) > 0:
+            found.append((key, value))
+    return found
+
+
+@contextmanager
+def changed(case: Case, key: str, change: Any) -> Iterator[Any]:
+    """Change a parameter for a while."""
+    import mitsuba as mi
+
+    params = mi.traverse(case.bsdf)
+    before = params[key] if isinstance(params[key], float) else type(params[key])(params[key])
+    params[key] = change(before)
+    params.update()
+    try:
+        yield params[key]
+    finally:
+        params[key] = before
+        params.update()

@@ -1,0 +1,110 @@
+"""Derivatives of a BSDF's values by its parameters, against differences."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.validation.checks import snippets
+from mrt_mitsuba.validation.checks.bsdf_case import Case, Pairs, changed, parameters
+from mrt_mitsuba.validation.checks.law import Law, Skip
+from mrt_mitsuba.validation.checks.probe import Array, context, interaction, is_scalar
+
+GRADIENT = 2e-2  # relative; differences of two widths agree better
+
+
+def gradients(law: Law, case: Case) -> None:
+    """Forward derivatives of the mean value by every differentiable parameter, against differences."""
+    import mitsuba as mi
+
+    if is_scalar() or "_ad_" not in mi.variant():
+        raise Skip(f"{mi.variant()} has no derivatives")
+    case.need_smooth()
+    case = case.copy()
+    params = mi.traverse(case.bsdf)
+    keys = [k for k, _ in parameters(case) if not params.flags(k) & int(mi.ParamFlags.NonDifferentiable)]
+    if not keys:
+        raise Skip("traverse() marks no parameter as differentiable")
+    detached = []
+    for key in keys:
+        with changed(case, key, _inside):
+            found, attached = _derivatives(case, key)
+            slope, error = _differences(case, key)
+        off = np.abs(found - slope)
+        usual = off <= np.quantile(
+            off, 0.98
+        )  # where a value has a kink, such as total reflection, no slope is
+        beyond = np.maximum(off - error, 0)[usual].sum()
+        measured = beyond / max(np.abs(slope)[usual].sum(), np.abs(found)[usual].sum(), 1e-30)
+        if measured > GRADIENT and not attached:
+            detached.append(key)
+        i = int(np.where(usual, off, 0).argmax())
+        few = _lit(case)
+        law.at_most(
+            f"derivative of values by {key}{'' if attached else ' (detached)'}, relative, beyond the error "
+            "of differences",
+            measured,
+            GRADIENT,
+            "differences of two widths agree better than that, or the difference is allowed for",
+            case.snippet(snippets.GRADIENT, key=key, wi=few.wi[i], uv=few.uv[i], wo=few.wo[i]),
+        )
+    if detached:
+        law.notes.append(f"detached: {', '.join(detached)}")
+
+
+def _inside(value: Any) -> Any:
+    """Return a parameter away from the ends of its range, so that it can be varied both ways."""
+    number = float(np.mean(np.array(value)))
+    return type(value)(value * 0.9) if number == 1 else type(value)(value + 0.1) if number == 0 else value
+
+
+def _lit(case: Case) -> Pairs:
+    """Return pairs away from the horizon, over which values jump."""
+    p = case.pairs
+    up = (np.abs(p.wo[:, 2]) > 0.05) & (np.abs(p.wi[:, 2]) > 0.05)
+    return p.only(up & np.isfinite(p.value).all(axis=1) & (p.value > 0).any(axis=1))
+
+
+def _values(case: Case) -> Any:
+    """Return values at pairs as a Dr.Jit array with derivatives, each over what it is without a change."""
+    import drjit as dr
+    import mitsuba as mi
+
+    few = _lit(case)
+    wi, wo = (mi.Vector3f(np.ascontiguousarray(x.T)) for x in (few.wi, few.wo))
+    si = interaction(wi, mi.Point2f(np.ascontiguousarray(few.uv.T)))
+    scale = np.maximum(few.value.max(axis=1), 1e-3 * few.value.max())
+    value = mi.unpolarized_spectrum(case.bsdf.eval(context(), si, wo))
+    total = sum(value[i] for i in range(len(value))) / mi.Float(scale.astype(np.float32))
+    return dr.select(dr.isfinite(total), total, 0)
+
+
+def _derivatives(case: Case, key: str) -> tuple[Array, bool]:
+    """Return the derivatives by a shift of the parameter, and whether there is a way to it at all."""
+    import drjit as dr
+    import mitsuba as mi
+
+    shift = mi.Float(0)
+    dr.enable_grad(shift)
+    with changed(case, key, lambda old: type(old)(old + shift)):
+        values = _values(case)
+        if not dr.grad_enabled(values):
+            return np.zeros(dr.width(values)), False
+        dr.forward(shift)
+        return np.nan_to_num(np.array(dr.grad(values), np.float64), posinf=0, neginf=0), True
+
+
+def _differences(case: Case, key: str) -> tuple[Array, Array]:
+    """Return central differences, and their errors by others of twice the width."""
+    import mitsuba as mi
+
+    value = abs(float(np.mean(np.array(mi.traverse(case.bsdf)[key]))))
+
+    def at(shift: float) -> Array:
+        with changed(case, key, lambda old: type(old)(old + shift)):
+            return np.array(_values(case), np.float64)
+
+    step = 0.01 * max(value, 0.05)
+    wide, narrow = ((at(h) - at(-h)) / (2 * h) for h in (2 * step, step))
+    return narrow, 2 * np.abs(wide - narrow) + 1e-6 * np.abs(at(0.0)) / step

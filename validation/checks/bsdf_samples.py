@@ -1,0 +1,220 @@
+"""Laws of a BSDF's samples: their density, their weights, and the energy that they carry."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy import stats
+
+from mrt_mitsuba.validation.checks import snippets
+from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, View, excess, live
+from mrt_mitsuba.validation.checks.law import LEVEL, SIGMAS, Law, Skip
+from mrt_mitsuba.validation.checks.probe import Array, context, unit
+from mrt_mitsuba.validation.checks.sphere import DEPTH, Cells, Integrals, encode, integrate
+from mrt_mitsuba.validation.tools.image_tests import sidak
+
+
+def sampling(law: Law, case: Case) -> None:
+    """Samples against the density in whole cells of equal counts, over both hemispheres."""
+    case.need_smooth()
+    tests, blurred = [], 0
+    for view, cells in _cells(case):
+        if cells is None:
+            blurred += 1
+        else:
+            tests.append((view, *_counted(case, view, cells)))
+    if not tests:
+        raise Skip("the lobe is narrower than float32 directions can tell apart")
+    view, p, cell, _ = min(tests, key=lambda test: test[1])
+    law.at_least(
+        f"chance of such counts if samples follow pdf(), the least of {len(tests)} angles, for their number",
+        sidak(p, len(tests)),
+        LEVEL,
+        "a false alarm in a million checks",
+        case.snippet(snippets.SAMPLING, wi=view.wi, uv=view.uv, cell=cell),
+    )
+    view, _, _, share = max(tests, key=lambda test: test[3])
+    law.at_most(
+        f"integral of pdf() less the share of samples it stands for, beyond {SIGMAS} standard errors",
+        share,
+        FIT,
+        "rational fits of Smith's G1 in common use are off by 0.35 %",
+        case.snippet(snippets.NORMALISED, wi=view.wi, uv=view.uv),
+    )
+    if blurred:
+        law.notes.append(f"{blurred} angles left out: lobe narrower than float32 directions can tell apart")
+
+
+def _counted(case: Case, view: View, cells: Cells) -> tuple[float, tuple, float]:
+    """Return p of the counts, the cell that is most off, and how far the integral is from the share."""
+    count = len(view.density) - len(view.density) // 4
+    alive = view.density[-count:] > 0
+
+    def pdf(wo: Array) -> Array:
+        wis, uvs = view.around(len(wo))
+        return np.maximum(case.probe.pdf(wis, wo, uvs), 0)[:, None]
+
+    codes = encode(view.samples.wo[-count:][alive])
+    hint = np.bincount(cells.find(codes), minlength=len(cells.start))
+    found = integrate(pdf, cells, case.rng, counts=hint, samples=count)
+    off = np.sqrt(alive.var() / count + found.variance.sum())
+    share = max(abs(alive.mean() - found.mean.sum()) - SIGMAS * off, 0)
+    return (*_chi_square(found, codes, count), share)
+
+
+def _cells(case: Case) -> Iterator[tuple[View, Cells | None]]:
+    """Yield cells for each view, made from a quarter of its samples; None where a lobe is too narrow."""
+    for view in case.views:
+        pilot = view.samples.wo[: len(view.density) // 4][view.density[: len(view.density) // 4] > 0]
+        seeds = encode(np.concatenate([pilot, _mirrored(view.wi, case.rng)]))
+        most = max(len(view.density) // 4 // 1000, 8)
+        cells = Cells.around(seeds, most)
+        held = (
+            np.bincount(cells.find(encode(pilot)), minlength=len(cells.start)) if len(pilot) else np.zeros(1)
+        )
+        narrow = held[cells.level == DEPTH] if len(pilot) else held
+        yield view, (None if narrow[narrow > 4 * most].sum() > 0.01 * len(pilot) else cells)
+
+
+def _mirrored(wi: Array, rng: np.random.Generator, count: int = 600) -> Array:
+    """Directions around the mirror direction at all scales, where lobes are that nothing may have sampled."""
+    spread = 10 ** rng.uniform(-4, 0, (count, 1)) * rng.normal(size=(count, 3))
+    return unit(wi * [-1, -1, 1] + spread)
+
+
+def _chi_square(found: Integrals, codes: Array, count: int) -> tuple[float, tuple]:
+    """Return p of the counts, in groups of cells that expect 25 or more, and the cell that is most off."""
+    seen = np.bincount(found.cells.find(codes), minlength=len(found.cells.start))
+    expected, variance = count * found.mean[:, 0], count**2 * found.variance[:, 0]
+    group = np.floor(np.cumsum(expected) / 25).astype(int)
+    group = np.minimum(group, max(group[-1] - 1, 0))
+    seen_in, expected_in, variance_in = (np.bincount(group, x) for x in (seen, expected, variance))
+    used = (seen_in > 0) | (expected_in > 1e-6)
+    pull = (seen_in - expected_in)[used] ** 2 / np.maximum(expected_in + variance_in, 1e-6)[used]
+    cell = int(np.argmax(np.abs(seen - expected) / np.sqrt(expected + variance + 1)))
+    return float(stats.chi2.sf(pull.sum(), len(pull))), found.cells.bounds(cell)
+
+
+def weights(law: Law, case: Case) -> None:
+    """Density and weight of a sample against what ``pdf`` and ``eval`` say of its direction."""
+    worst: dict[str, tuple[float, View, int]] = {}
+    for view in case.views if case.smooth else ():
+        for what, error in _mismatch(case, view).items():
+            i = int(error.argmax())
+            worst[what] = max(
+                worst.get(what, (-1.0, view, 0)), (float(error[i]), view, i), key=lambda w: w[0]
+            )
+    for what, (most, view, i) in worst.items():
+        law.at_most(
+            f"{what}, relative, beyond 8 times what the rounding of directions explains",
+            most,
+            POINTWISE,
+            "the same formula, evaluated once more at a rounded direction",
+            case.snippet(snippets.WEIGHT, wi=view.wi, uv=view.uv, u=view.u[i]),
+        )
+    _discrete(law, case)
+    if not law.parts:
+        raise Skip("no direction of incidence has samples")
+
+
+def _mismatch(case: Case, view: View) -> dict[str, Array]:
+    """Return the errors of the first samples of a view, by what was compared."""
+    few = view.samples.only(slice(0, case.count(2**12, 2**13)))
+    wis, uvs = view.around(len(few.pdf))
+    wo = np.where(np.isfinite(few.wo), few.wo, 1)
+
+    def ratio(i: Array, o: Array, t: Array) -> Array:
+        value, pdf = case.probe.both(i, o, t)
+        return value / np.where(pdf > 0, pdf, np.inf)[:, None]
+
+    counts = live(few, *case.probe.both(wis, wo, uvs)) | (few.weight != 0).any(axis=1) & ~few.delta
+    return {
+        what: np.where(counts, excess(stated, function(wis, wo, uvs), case.spread(function, wis, wo, uvs)), 0)
+        for what, stated, function in (
+            ("density of a sample against pdf()", few.pdf, case.probe.pdf),
+            ("weight of a sample against eval() / pdf()", few.weight, ratio),
+        )
+    }
+
+
+def _discrete(law: Law, case: Case) -> None:
+    """Lobes that are one direction: the probability that a sample states against how often it is drawn."""
+    worst, where = -1.0, None
+    for view in case.views:
+        s = view.samples
+        for kind in np.unique(s.component[s.delta] * 4096 + s.type[s.delta]):
+            here = s.delta & (s.component * 4096 + s.type == kind)
+            stated = float(np.nan_to_num(s.pdf[here].mean()))
+            if not (s.weight[here] != 0).any():
+                continue
+            error = np.sqrt(max(stated * (1 - stated), 0) / len(here))
+            off = max(abs(here.mean() - stated) - SIGMAS * error, 0)
+            worst, where = max((worst, where), (off, view), key=lambda pair: pair[0])
+    if where is not None:
+        law.at_most(
+            f"probability of a single direction (delta) less its share, beyond {SIGMAS} standard errors",
+            worst,
+            POINTWISE,
+            "a count",
+            case.snippet(snippets.DISCRETE, wi=where.wi, uv=where.uv),
+        )
+
+
+def energy(law: Law, case: Case) -> None:
+    """Albedo by sampling and by quadrature, in the mode in which transmitted energy is not rescaled."""
+    brightest, apart = [], []
+    for view, cells in _cells(case):
+        albedo, off = _albedo(case, view, cells)
+        brightest.append((albedo, view))
+        if off is not None:
+            apart.append((off, view))
+    albedo, view = max(brightest, key=lambda found: found[0])
+    show = case.snippet(snippets.ALBEDO, wi=view.wi, uv=view.uv)
+    law.at_most(
+        f"largest albedo, less {SIGMAS} standard errors",
+        albedo,
+        1 + FIT,
+        "no more light leaves than arrives; 0.5 % for fits of G1",
+        show,
+    )
+    if apart:
+        error, view = max(apart, key=lambda found: found[0])
+        law.at_most(
+            f"albedo by quadrature of eval() against mean weight, relative, beyond {SIGMAS} standard errors",
+            error,
+            2 * FIT,
+            "0.5 % for fits of G1 in the density",
+            case.snippet(snippets.ALBEDO, wi=view.wi, uv=view.uv),
+        )
+
+
+def _albedo(case: Case, view: View, cells: Cells | None) -> tuple[float, float | None]:
+    """Return an albedo that is surely reached, and by how much sampling and quadrature differ, if known."""
+    importance = context(importance=True)
+    count = len(view.density)
+    wis, uvs = view.around(count)
+    drawn = view.samples
+    if (drawn.wo[:, 2] * view.wi[2] < 0).any():
+        drawn = case.probe.sample(wis, case.uniform(count), uvs, importance)
+    weight = np.nan_to_num(drawn.weight, posinf=0, neginf=0).astype(np.float64)
+    mean, error = weight.mean(axis=0), weight.std(axis=0) / np.sqrt(count)
+    least = float((mean - SIGMAS * error).max())
+    if cells is None:
+        return least, None
+    holes: list[float] = []
+
+    def value(wo: Array) -> Array:
+        i, t = view.around(len(wo))
+        values = case.probe.eval(i, wo, t, importance)
+        holes.append(float(np.mean(~np.isfinite(values))))
+        return values
+
+    found = integrate(value, cells, case.rng, counts=np.zeros(len(cells.start)), samples=count)
+    smooth = np.where(drawn.delta[:, None], 0, weight)
+    by_samples, error = smooth.mean(axis=0), smooth.std(axis=0) / np.sqrt(count)
+    by_cells, other = found.mean.sum(axis=0), np.sqrt(found.variance.sum(axis=0))
+    least = max(least, float((by_cells + mean - by_samples - SIGMAS * (error + other)).max()))
+    both = np.maximum(np.maximum(by_samples, by_cells), 1e-3)
+    off = np.maximum(np.abs(by_samples - by_cells) - SIGMAS * np.hypot(error, other), 0) / both
+    return least, float(off.max()) if max(holes) < 0.01 else None  # else the law ``finite`` says why

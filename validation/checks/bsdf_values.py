@@ -1,0 +1,173 @@
+"""Laws of a BSDF's values: one for each way to ask, either way along light, finite, right to its digits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.validation.checks import noise, snippets
+from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, changed, excess, parameters
+from mrt_mitsuba.validation.checks.law import Law, Skip
+from mrt_mitsuba.validation.checks.probe import Array, direction
+
+BEYOND = "relative, beyond 8 times what the rounding of directions explains"
+
+
+def eval_pdf(law: Law, case: Case) -> None:
+    """``eval_pdf`` against ``eval`` and ``pdf``."""
+    case.need_smooth()
+    p = case.pairs
+    value, pdf = case.probe.pair(p.wi, p.wo, p.uv)
+    for what, one, other, single in (
+        ("value", value, p.value, case.probe.eval),
+        ("density", pdf, p.pdf, case.probe.pdf),
+    ):
+        error = excess(one, other, case.spread(single, p.wi, p.wo, p.uv))
+        name = f"{what} of eval_pdf() against that of the single function, {BEYOND}"
+        law.most(name, error, 1e-4, "two ways to the same number", case.at(snippets.PAIR, p))
+
+
+def reciprocity(law: Law, case: Case) -> None:
+    """f(ωi, ωo) η_o² = f(ωo, ωi) η_i², with the indices of the media that the directions are in."""
+    case.need_smooth()
+    few = case.pairs.only(np.abs(case.pairs.wi[:, 2] * case.pairs.wo[:, 2]) > 1e-3)
+
+    def forth(i: Array, o: Array, t: Array, eta: Array) -> Array:
+        return case.probe.eval(i, o, t) / np.abs(o[:, 2:]) * eta[:, None] ** 2
+
+    def back(i: Array, o: Array, t: Array, eta: Array) -> Array:
+        return case.probe.eval(o, i, t) / np.abs(i[:, 2:])
+
+    arguments = few.wi, few.wo, few.uv, few.eta
+    allowed = case.spread(forth, *arguments) + case.spread(back, *arguments)
+    law.most(
+        f"f(wi, wo) against f(wo, wi), {BEYOND}",
+        excess(forth(*arguments), back(*arguments), allowed),
+        POINTWISE,
+        "light can be followed either way; transmitted radiance scales by the squared index",
+        lambda i: case.at(snippets.RECIPROCITY, few, eta=few.eta[i])(i),
+    )
+
+
+# ------------------------------------------------ Finite --------------------------------------------------
+
+# Less than 1e-7, a dot product of float32 vectors rarely is
+COSINES = (1, 1 - 6e-8, 0.5, 1e-2, 1e-4, 1e-7, 0)
+UNIFORM = (0, 2.0**-24, 0.5, 1 - 2.0**-24)
+
+
+def finite(law: Law, case: Case) -> None:
+    """No NaN, no infinity, nothing negative: extreme directions, random numbers and parameters."""
+    extremes = _extremes(case)
+    known = _finite(law, case, extremes, np.zeros((6, len(extremes[0])), bool))
+    copy = case.copy()
+    for key, value, setting in _ends(copy):
+        with setting:
+            _finite(law, copy, extremes, known, (key, value))
+    law.parts = [part for part in law.parts if not part.holds] or law.parts[:1]
+
+
+def _extremes(case: Case) -> tuple[Array, Array, Array, Array]:
+    cosines = np.array([s * c for c in COSINES for s in (1, -1)])
+    pool = direction(np.repeat(cosines, 6), np.tile([0, np.pi / 2, np.pi, -np.pi / 2, 0.7, 4], len(cosines)))
+    count = case.count(2**14, 2**17)
+    wi = pool[case.rng.integers(len(pool), size=count)]
+    mirrored, kind = wi * np.array([-1, -1, 1], np.float32), case.rng.integers(4, size=count)[:, None]
+    wo = np.where(kind == 0, pool[case.rng.integers(len(pool), size=count)], wi)
+    wo = np.where(kind == 1, mirrored, np.where(kind == 2, -wi, wo))
+    u = np.where(case.rng.random((count, 3)) < 0.6, case.rng.choice(UNIFORM, (count, 3)), case.uniform(count))
+    uv = np.where(
+        case.rng.random((count, 2)) < 0.3, case.rng.integers(0, 2, (count, 2)), case.rng.random((count, 2))
+    )
+    return wi, wo, u.astype(np.float32), uv.astype(np.float32)
+
+
+def _finite(law: Law, case: Case, extremes: tuple, known: Array, setting: tuple | None = None) -> Array:
+    """Count faults that are not known yet; return where they are, by kind. [6, N]"""
+    wi, wo, u, uv = extremes
+    value, pdf = case.probe.both(wi, wo, uv)
+    together = case.probe.pair(wi, wo, uv)
+    s = case.probe.sample(wi, u, uv)
+    lit = (s.weight != 0).any(axis=1)  # of one without, nothing else is read
+    length = np.linalg.norm(s.wo.astype(np.float64), axis=1)
+    kinds = (
+        "eval()",
+        "pdf()",
+        "eval_pdf()",
+        "weights of samples",
+        "densities of samples",
+        "directions of samples",
+    )
+    faults = np.array([
+        _bad(value),
+        _bad(pdf),
+        _bad(together[0]) | _bad(together[1]),
+        _bad(s.weight),
+        lit & _bad(s.pdf),
+        lit & ~(np.abs(length - 1) < 1e-3),
+    ])  # fmt: skip
+    new = faults & ~known
+    kind, i = np.unravel_index(int(new.argmax()), new.shape)
+    where = f" with {setting[0]} = {setting[1]:g}" if setting else ""
+    named = [f"{name} {count}" for name, count in zip(kinds, new.sum(axis=1), strict=True) if count]
+    law.at_most(
+        f"results not finite, or negative{where}: {', '.join(named) or 'none'}",
+        new.sum(),
+        0,
+        "one such number spoils a picture",
+        case.snippet(
+            snippets.FINITE_SAMPLE if kind > 2 else snippets.FINITE,
+            wi=wi[i], uv=uv[i], wo=wo[i], u=u[i], setting=setting,
+        ),
+    )  # fmt: skip
+    return faults
+
+
+def _bad(values: Array) -> Array:
+    return ~(np.isfinite(values) & (values >= 0)).reshape(len(values), -1).all(axis=1)
+
+
+def _ends(case: Case) -> Iterator[tuple[str, float, Any]]:
+    """Every number, colour or bitmap of the BSDF at the ends of its likely range, one at a time."""
+    for key, value in parameters(case):
+        number = float(np.mean(np.array(value)))
+        least = 1e-3 if "alpha" in key or "rough" in key else 0.0  # no roughness is another kind of surface
+        for end in (least, 1.0) if 0 <= number <= 1 else (1.001, 2 * number):
+            yield key, end, changed(case, key, lambda old, end=end: type(old)(old * 0 + end))
+
+
+# ----------------------------------------------- Roundoff -------------------------------------------------
+
+
+def roundoff(law: Law, case: Case) -> None:
+    """Noise of float32 evaluation beyond what the rounding of the directions explains."""
+    case.need_smooth()
+    lit = case.pairs.only((np.abs(case.pairs.wi[:, 2]) > 0.1) & (np.abs(case.pairs.wo[:, 2]) > 0.1))
+    lit = lit.only((lit.pdf > 0) & (lit.value.max(axis=1) > 1e-20))
+    few = lit.only(slice(0, case.count(500, 2000)))
+    if len(few.pdf) < 20:
+        raise Skip("too few pairs of directions with a value")
+    inputs = np.concatenate([few.wi, few.wo], axis=1)
+    for what, function in (("eval()", lambda *a: case.probe.eval(*a).max(axis=1)), ("pdf()", case.probe.pdf)):
+
+        def at(x: Array, function: Any = function) -> Array:
+            return function(x[:, :3], x[:, 3:], np.tile(few.uv, (len(x) // len(few.uv), 1)))
+
+        found = noise.measure(at, inputs, seed=case.seed)
+        lost = np.where(np.isfinite(found.lost(noise.ALLOWANCE)), found.lost(noise.ALLOWANCE), 0)
+        measured = float(np.quantile(lost, 0.9))
+        i = int(np.abs(lost - measured).argmin())
+        law.at_most(
+            f"noise of {what} over that of {noise.ALLOWANCE:g} roundings with rounded directions, 9 in 10",
+            measured,
+            noise.LOST,
+            "sound formulas stay below 1.3; beyond, digits are lost inside that could be kept",
+            case.snippet(snippets.NOISE, wi=few.wi[i], uv=few.uv[i], wo=few.wo[i], function=what[:-2]),
+        )
+        if measured > noise.LOST:
+            law.notes.append(
+                f"{what}: noise of {np.median(found.noise):.3g} roundings (2^-24), "
+                f"of which directions explain {np.median(found.explained):.3g}"
+            )

@@ -1,0 +1,173 @@
+"""A shape under examination, rays towards it, and what they meet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.validation.checks import snippets
+from mrt_mitsuba.validation.checks.law import Skip
+from mrt_mitsuba.validation.checks.noise import ROUNDING
+from mrt_mitsuba.validation.checks.probe import SCALAR_SHARE, Array, is_scalar, lanes, unit
+from mrt_mitsuba.validation.checks.recipe import Recipe
+
+OFFSET = 1500 * ROUNDING  # of the origin of a spawned ray from its surface, over 1 + max |p|
+FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
+HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
+MOST_HITS = 16  # along a line
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What N rays met."""
+
+    found: Array  # bool [N]
+    t: Array  # [N]
+    p: Array  # [N, 3], as are the others
+    n: Array
+    shading: Array
+    du: Array
+    dv: Array
+    uv: Array  # [N, 2]
+    part: Array  # index of the triangle or the like [N]
+
+    def only(self, keep: Any) -> Hits:
+        return Hits(*(getattr(self, f.name)[keep] for f in fields(self)))
+
+
+def trace(target: Any, o: Array, d: Array) -> Hits:
+    """Trace rays from float32 points [N, 3] in directions [N, 3]."""
+
+    def call(mi: Any, origin: Any, direction: Any) -> list[Any]:
+        si = target.ray_intersect(mi.Ray3f(origin, direction))
+        return [si.is_valid(), si.t, si.p, si.n, si.sh_frame.n, si.dp_du, si.dp_dv, si.uv, si.prim_index]
+
+    found, t, p, n, shading, du, dv, uv, part = lanes(call, ("Point3f", o), ("Vector3f", d))
+    return Hits(found[:, 0].astype(bool), t[:, 0], p, n, shading, du, dv, uv, part[:, 0])
+
+
+def walk(target: Any, o: Array, d: Array, first: Hits | None = None) -> Iterator[tuple[Array, Hits, Array]]:
+    """Follow N lines through all that they meet; yield which do, what they meet, and the cosine with it."""
+    line, hits = np.arange(len(o)), first or trace(target, o, d)
+    for _ in range(MOST_HITS):
+        line, d, hits = line[hits.found], d[hits.found], hits.only(hits.found)
+        if not len(line):
+            return
+        yield line, hits, (hits.n * d).sum(axis=1)
+        hits = trace(target, leave(hits.p, hits.n, d), d)
+
+
+@dataclass
+class Case:
+    """A shape under examination, rays towards it and what they meet."""
+
+    shape: Any
+    recipe: Recipe
+    quick: bool
+    seed: int
+
+    def __post_init__(self) -> None:
+        import mitsuba as mi
+
+        self.rng = np.random.default_rng(self.seed)
+        self.target = self.shape
+        if isinstance(self.shape, mi.Shape):
+            name = self.shape.id()
+            self.target = mi.load_dict({"type": "scene", "shape": self.shape})
+            self.shape.set_id(name)  # which the scene has changed
+        box = self.shape.bbox()
+        low, high = (np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max))
+        if not (np.isfinite(low).all() and np.isfinite(high).all() and (high >= low).all()):
+            raise UsageError(f"the bounding box of the shape is {low} … {high}: it must be finite")
+        self.low, self.high, self.middle = low, high, (low + high) / 2
+        self.size = float(np.linalg.norm(high - low))
+
+    def count(self, quick: int, full: int) -> int:
+        number = quick if self.quick else full
+        return max(int(number * SCALAR_SHARE), 64) if is_scalar() else number
+
+    def units(self, count: int) -> Array:
+        return unit(self.rng.normal(size=(count, 3)))
+
+    def rays(self, count: int, distance: float = 1.5) -> tuple[Array, Array]:
+        """Return rays from all around to points in the box."""
+        o = (self.middle + distance * self.size * self.units(count)).astype(np.float32)
+        extent = np.maximum(self.high - self.low, 0.01 * self.size)
+        goal = self.middle + extent * self.rng.uniform(-0.55, 0.55, (count, 3))
+        return o, unit(goal - o)
+
+    @cached_property
+    def seen(self) -> tuple[Array, Array, Hits]:
+        """Rays from outside and what they meet."""
+        o, d = self.rays(self.count(2**14, 2**17))
+        return o, d, trace(self.target, o, d)
+
+    @cached_property
+    def met(self) -> tuple[Array, Array, Hits]:
+        """Only those that meet the surface, and do not graze it."""
+        o, d, hits = self.seen
+        steep = hits.found & (np.abs((hits.n * d).sum(axis=1)) > FLAT)
+        if steep.sum() < 20:
+            raise Skip("hardly any ray towards its bounding box meets the shape")
+        return o[steep], d[steep], hits.only(steep)
+
+    @cached_property
+    def crossings(self) -> list[tuple[Array, Array, Array]]:
+        """Whole lines: hit by hit, which line, the point, and the cosine with the normal."""
+        return [(line, hits.p, cos) for line, hits, cos in walk(self.target, *self.seen)]
+
+    @cached_property
+    def closed(self) -> bool:
+        """Whether most lines enter and leave in turn: a closed surface, with holes perhaps."""
+        judged, turns = self.turns
+        return bool(judged.sum() > 20 and turns[judged].mean() > 0.75)
+
+    @cached_property
+    def turns(self) -> tuple[Array, Array]:
+        """Which lines meet something and graze nothing, and which leave and enter in turn. Both [N]
+
+        Normals may all point inwards: that is for the law of normals to say.
+        """
+        count = len(self.seen[0])
+        met, steep = np.zeros(count, bool), np.ones(count, bool)
+        turn, last = np.ones((2, count), bool), np.array([np.ones(count), -np.ones(count)])
+        for line, _, cos in self.crossings:
+            met[line] = True
+            steep[line] &= np.abs(cos) > 4 * FLAT
+            turn[:, line] &= np.sign(cos) != np.sign(last[:, line])
+            last[:, line] = cos
+        turn &= [last[0] > 0, last[1] < 0]
+        judged = met & steep
+        return judged, max(turn, key=lambda way: way[judged].mean() if judged.any() else 0)
+
+    def snippet(self, o: Array, d: Array, body: str = snippets.RAY, **names: Any) -> str:
+        return snippets.shape(self.shape, self.recipe.description, body, {"o": o, "d": d, **names})
+
+    def at(self, o: Array, d: Array, body: str = snippets.RAY, **names: Any) -> Callable[[int], str]:
+        """Return what makes the snippet of one ray of many."""
+        return lambda i: self.snippet(o[i], d[i], body, **names)
+
+
+def leave(p: Array, n: Array, d: Array) -> Array:
+    """Return origins off the surface on the side of ``d``, as ``spawn_ray`` has them."""
+    side = np.sign((n * d).sum(axis=1, keepdims=True))
+    return (p + side * n * OFFSET * (1 + np.abs(p).max(axis=1, keepdims=True))).astype(np.float32)
+
+
+def corners(shape: Any) -> Array | None:
+    """Vertices of a mesh, and middles of edges."""
+    import mitsuba as mi
+
+    if not isinstance(shape, mi.Mesh):
+        return None
+    params = mi.traverse(shape)
+    if not {"vertex_positions", "faces"} <= set(params.keys()):  # a rectangle hides that it is one
+        return None
+    vertex = np.array(params["vertex_positions"]).reshape(-1, 3)
+    face = np.array(params["faces"]).reshape(-1, 3)
+    return np.concatenate([vertex, *((vertex[face[:, k]] + vertex[face[:, k - 1]]) / 2 for k in range(3))])

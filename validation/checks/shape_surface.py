@@ -1,0 +1,228 @@
+"""Laws of what rays meet on a shape: one answer, points on the surface, normals, no holes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.validation.checks import noise, snippets
+from mrt_mitsuba.validation.checks.law import Law, Skip
+from mrt_mitsuba.validation.checks.noise import ROUNDING
+from mrt_mitsuba.validation.checks.probe import Array, lanes, unit
+from mrt_mitsuba.validation.checks.shape_case import FLAT, HIT_ROUNDINGS, OFFSET, Case, corners, leave, trace
+
+NORMAL = 1e-5  # a few roundings of a square root and a quotient
+
+
+def hits(law: Law, case: Case) -> None:
+    """``ray_test``, ``ray_intersect_preliminary`` and ``ray_intersect`` agree, and heed ``maxt``."""
+    o, d, seen = case.seen
+    steep = ~seen.found | (np.abs((seen.n * d).sum(axis=1)) > FLAT)
+    t = np.where(seen.found, seen.t, 1)
+
+    def tested(maxt: Array | None) -> Array:
+        def call(mi: Any, origin: Any, direction: Any, limit: Any) -> list[Any]:
+            ray = mi.Ray3f(origin, direction)
+            if maxt is not None:
+                ray.maxt = limit
+            return [case.target.ray_test(ray), case.target.ray_intersect(ray).is_valid()]
+
+        limit = t if maxt is None else maxt
+        return np.array(
+            [x[:, 0] for x in lanes(call, ("Point3f", o), ("Vector3f", d), ("Float", limit))], bool
+        )
+
+    for what, maxt, expected in (
+        ("without a limit", None, seen.found),
+        ("up to just before the hit", (t * (1 - 1e-3)).astype(np.float32), np.zeros(len(o), bool)),
+        ("up to just behind the hit", (t * (1 + 1e-3)).astype(np.float32), seen.found),
+    ):
+        counts = steep & seen.found if maxt is not None else steep
+        limit = np.full(len(o), np.inf, np.float32) if maxt is None else maxt
+
+        def show(i: int, limit: Array = limit) -> str:
+            return case.snippet(o[i], d[i], snippets.MAXT, maxt=limit[i])
+
+        for name, found in zip(("ray_test()", "ray_intersect()"), tested(maxt), strict=True):
+            bad = counts & (found != expected)
+            law.none(
+                f"rays on which {name} is wrong {what}",
+                bad,
+                "one question, one answer; grazing rays are left out",
+                show,
+            )
+
+
+def surface(law: Law, case: Case) -> None:
+    """Hit points lie on the ray; rays from the surface meet it no more where they start; little is lost."""
+    o, d, met = case.met
+    largest = np.maximum(np.abs(o).max(axis=1), np.abs(met.p).max(axis=1)) + met.t
+    along = o.astype(np.float64) + met.t[:, None].astype(np.float64) * d
+    error = np.abs(along - met.p).max(axis=1) / (ROUNDING * largest)
+    law.most(
+        "hit point off the ray at its distance, in roundings of the largest number",
+        error,
+        HIT_ROUNDINGS,
+        "some dozen operations",
+        case.at(o, d),
+    )
+    count = case.count(10**5, 10**6)
+    few = met.only(case.rng.integers(len(met.t), size=count))
+    away = case.units(count)
+    cos = (few.n * away).sum(axis=1)
+    start = leave(few.p, few.n, away)
+    again = trace(case.target, start, away)
+    offset = OFFSET * (1 + np.abs(few.p).max(axis=1))
+    same = (np.abs((again.n * few.n).sum(axis=1)) > 0.9) & (
+        np.linalg.norm(again.p - few.p, axis=1) < 4 * offset
+    )
+    bad = again.found & same & (np.abs(cos) > FLAT)
+    law.none(
+        f"rays from the surface, of {count}, that meet it where they start",
+        bad,
+        "self-intersections are dark spots; grazing rays are left out",
+        case.at(start, away),
+    )
+    _roundoff(law, case)
+
+
+def _roundoff(law: Law, case: Case) -> None:
+    o, d, met = case.met
+    few = slice(0, case.count(300, 1000))
+    inputs = np.concatenate([o[few], d[few]], axis=1)
+    scale = np.abs(o[few]).max(axis=1) + met.t[few]
+    for what, pick, size in (
+        ("distance", lambda h: h.t, scale),
+        ("hit point", lambda h: h.p.sum(axis=1), scale),
+        ("normal", lambda h: h.n @ np.array([0.6, 0.48, 0.64]), np.ones_like(scale)),
+    ):
+
+        def function(x: Array, pick: Any = pick) -> Array:
+            return np.asarray(pick(trace(case.target, x[:, :3], x[:, 3:])))
+
+        found = noise.measure(function, inputs, size=size, stride=64, seed=case.seed)
+        lost = np.nan_to_num(found.lost(noise.ALLOWANCE), posinf=0)
+        measured = float(np.quantile(lost, 0.9))
+        i = int(np.abs(lost - measured).argmin())
+        law.at_most(
+            f"noise of the {what} over that of {noise.ALLOWANCE:g} roundings with a rounded ray, 9 in 10",
+            measured,
+            noise.LOST,
+            "digits are lost inside that could be kept",
+            case.snippet(o[i], d[i]),
+        )
+
+
+def normals(law: Law, case: Case) -> None:
+    """Unit length, outwards, as the partial derivatives and differences have it."""
+    import mitsuba as mi
+
+    o, d, met = case.met
+    length = np.abs(np.linalg.norm(np.stack([met.n, met.shading]).astype(np.float64), axis=-1) - 1).max(
+        axis=0
+    )
+    law.most("length of a normal less 1", length, NORMAL, "a square root and a quotient", case.at(o, d))
+    flipped = isinstance(case.shape, mi.Shape) and case.shape.has_flipped_normals()
+    if case.closed:
+        o, d, seen = case.seen
+        judged, turns = case.turns
+        bad = judged & turns & (((seen.n * d).sum(axis=1) > 0) != flipped)
+        law.none(
+            f"rays from outside that meet a normal that points {'outwards' if flipped else 'inwards'}",
+            bad,
+            "a closed shape has an outside",
+            case.at(o, d),
+        )
+    else:
+        law.notes.append("open: there is no outside for normals to point to")
+    o, d, met = case.met
+    apart = (met.n * met.shading).sum(axis=1) <= 0
+    law.none("shading normals on the other side than the geometric one", apart, "one surface", case.at(o, d))
+    usable = (np.linalg.norm(met.du, axis=1) > 0) & (np.linalg.norm(met.dv, axis=1) > 0)
+    if usable.any():
+        slant = np.maximum(*(np.abs((unit(v) * met.n).sum(axis=1)) for v in (met.du, met.dv)))
+        slant = np.where(usable & np.isfinite(slant), slant, 0)
+        law.most(
+            "cosine between the normal and a partial derivative of the point",
+            slant,
+            1e-3,
+            "both are known to a few roundings; near a pole the derivatives are short",
+            case.at(o, d),
+        )
+    _differences(law, case)
+
+
+def _differences(law: Law, case: Case) -> None:
+    """Neighbouring hits against normal and partial derivatives; two widths tell curvature from error."""
+    o, d, met = case.met
+    aside = unit(np.cross(d, case.units(len(d))))
+    slopes, partials = [], []
+    for h in (2e-3, 1e-3):
+        near = trace(case.target, (o + h * case.size * aside).astype(np.float32), d)
+        step = (near.p - met.p).astype(np.float64)
+        length = np.linalg.norm(step, axis=1)
+        ok = near.found & (near.part == met.part) & (length < 40 * h * case.size) & (length > 0)
+        ok &= (near.n * met.n).sum(axis=1) > 0.9
+        du, dv = (near.uv - met.uv).T[:, :, None].astype(np.float64)
+        slopes.append(np.where(ok, (step * met.n).sum(axis=1) / length, np.nan))
+        off = np.linalg.norm(step - du * met.du - dv * met.dv, axis=1) / length
+        partials.append(np.where(ok & (np.abs([du, dv]).max(axis=(0, 2)) < 0.2), off, np.nan))
+    for what, (wide, narrow) in (
+        ("slope of the surface against its normal, by differences", np.abs(slopes)),
+        ("step along the surface less its partial derivatives", partials),
+    ):
+        error = np.maximum(2 * narrow - wide, 0)
+        if np.isfinite(error).sum() < 20 or (what.startswith("step") and not met.du.any()):
+            continue
+        measured = float(np.nanquantile(error, 0.95))
+        i = int(np.nanargmin(np.abs(error - measured)))
+        law.at_most(
+            f"{what}, 95 in 100",
+            measured,
+            1e-2,
+            "extrapolated to no step; edges may part neighbours",
+            case.snippet(o[i], d[i], snippets.NEIGHBOUR, aside=aside[i], size=case.size),
+        )
+
+
+def watertight(law: Law, case: Case) -> None:
+    """Lines enter and leave in turn, and no ray from inside gets out without a hit."""
+    if not case.closed:
+        raise Skip("the shape is open: lines do not leave it as often as they enter")
+    judged, turns = case.turns
+    bad = judged & ~turns
+    i = int(bad.argmax())
+    law.at_most(
+        f"lines, of {judged.sum()}, that do not enter and leave in turn",
+        bad.sum(),
+        0,
+        "a closed surface; grazing lines are left out",
+        case.snippet(case.seen[0][i], case.seen[1][i]),
+    )
+    inside = _inside(case)
+    if inside is None:
+        law.notes.append("no room inside to start rays in")
+        return
+    count = case.count(10**5, 10**6)
+    o = inside[case.rng.integers(len(inside), size=count)]
+    d = case.units(count)
+    bad = ~trace(case.target, o, d).found
+    law.none(f"rays from inside, of {count}, that meet nothing", bad, "a closed surface", case.at(o, d))
+    ends = corners(case.shape)
+    if ends is not None:  # the ray tracer's doing, whatever the mesh
+        out = ~trace(case.target, o, unit(ends[case.rng.integers(len(ends), size=count)] - o)).found
+        if out.any():
+            law.notes.append(
+                f"of rays aimed at vertices and edges exactly, {out.mean():.2g} pass between triangles"
+            )
+
+
+def _inside(case: Case) -> Array | None:
+    """Points well inside: middles of the longer first chords."""
+    if len(case.crossings) < 2:
+        return None
+    (first, p, _), (second, q, _) = case.crossings[:2]
+    _, i, j = np.intersect1d(first, second, return_indices=True)
+    chord = np.linalg.norm(p[i] - q[j], axis=1)
+    return ((p[i] + q[j]) / 2)[chord >= np.median(chord)].astype(np.float32) if len(chord) else None
