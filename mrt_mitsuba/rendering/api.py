@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -167,8 +167,7 @@ def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Res
         budget = Budget.of(settings.memory)
         source = open_scene(
             scene,
-            width=settings.width,
-            height=settings.height,
+            size=(settings.width, settings.height),
             fresnel=settings.fresnel,
             integrator=settings.integrator,
             budget=budget,
@@ -200,16 +199,8 @@ def _render(
     log.info("scene %s loaded in %.3f s for %s", source.name, load, plan.variant)
     view = View(source.sensor, source.width, source.height, settings.motion)
     tracer = Tracer(shader, view, job.workspace)
-    kind = FilmPasses if plan.lattice.kind == FILM else Passes
-    goal = Goal(
-        settings.rmse,
-        settings.maxspp if settings.rmse else plan.repeats,
-        settings.maxseconds,
-        settings.on_round,
-    )
     total: dict[str, np.ndarray] = {}
-    for exposure in exposures:
-        passes = kind(job, tracer, plan, exposure, goal)
+    for passes in _each_picture(job, tracer, plan, exposures, settings):
         _add(total, passes.run())
     options = settings.in_force(
         width=plan.width,
@@ -264,6 +255,16 @@ def _film_facts(source: Source, shader: Shader) -> FilmFacts:
         pixel_format(film),
         shader.aovs,
     )
+
+
+def _each_picture(
+    job: Job, tracer: Tracer, plan: Plan, exposures: Sequence[Exposure], settings: RenderSettings
+) -> Iterator[Passes]:
+    kind = FilmPasses if plan.lattice.kind == FILM else Passes
+    rays = settings.maxspp if settings.rmse else plan.repeats
+    goal = Goal(settings.rmse, rays, settings.maxseconds, settings.on_round)
+    for exposure in exposures:
+        yield kind(job, tracer, plan, exposure, goal)
 
 
 def _exposures(plan: Plan, seed: int) -> list[Exposure]:

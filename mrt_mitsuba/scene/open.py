@@ -37,8 +37,7 @@ class Source:
 def open_scene(
     scene: Any,
     *,
-    width: int | None = None,
-    height: int | None = None,
+    size: tuple[int | None, int | None] = (None, None),
     fresnel: str | None = None,
     integrator: Any = None,
     budget: Budget | None = None,
@@ -48,7 +47,7 @@ def open_scene(
 ) -> Source:
     """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``.
 
-    ``budget``: memory from which its textures take theirs; ``model``: options of ``model_scene``.
+    ``size``: width and height; ``budget``: memory from which its textures take theirs; ``model``: options of ``model_scene``.
     """
     if model and not is_obj(scene) and model.keys() != {"convention"}:
         raise UsageError(f"{next(k for k in model if k != 'convention')} is of use only with an OBJ file")
@@ -70,9 +69,9 @@ def open_scene(
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
         set_parameters(loaded, keys)
         view = _sensor(name, loaded, sensor)
-        size = _film_size(name, view, width, height)
-        return Source(name, loaded, view, _integrator(integrator, loaded), *size, own=True)
-    width, height, fresnel = width or SIZE[0], height or SIZE[1], fresnel or "schlick"
+        width, height = _film_size(name, view, *size)
+        return Source(name, loaded, view, _integrator(integrator, loaded), width, height, own=True)
+    width, height, fresnel = size[0] or SIZE[0], size[1] or SIZE[1], fresnel or "schlick"
     loaded = load_dict(own.to_dict(width=width, height=height, fresnel=fresnel), name, budget)
     set_parameters(loaded, keys)
     view, integrator = _sensor(name, loaded, sensor), _integrator(integrator, loaded)

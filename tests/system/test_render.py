@@ -131,7 +131,7 @@ def test_the_same_render_twice_is_the_same_bit_for_bit():
 
 
 def test_splitting_the_wavefront_changes_nothing():
-    source = open_scene(3, width=40, height=30)
+    source = open_scene(3, size=(40, 30))
     shader, view = shader_for(source.scene, source.integrator), View(source.sensor, 40, 30)
     bundle = Bundle(range(40 * 30), Lattice("report", 2), count=4)
     wanted = frozenset({"image", "depth", "normal", "bounces"})
