@@ -59,12 +59,12 @@ class RenderFacts:
     integrator: str  #: name of its plugin
     width: int  #: pixels
     height: int  #: pixels
-    focus: Focus  #: the scene's own, or what was asked for
-    layers: frozenset[str]  #: that can be traced
+    focus: Focus  #: what is sharp
+    traceable: frozenset[str]  #: layers that the integrator provides
     random: bool  #: does the integrator draw random numbers
-    film: FilmFacts | None = None  #: of someone's own scene
-    kernel: KernelPlan | None = None  #: decisions about the tracing kernels; None where nobody knows them
-    parts: SceneFacts | None = None  #: what they depend on
+    film: FilmFacts | None  #: of someone's own scene
+    kernel: KernelPlan | None  #: what the tracing kernels hold; None where the integrator does not say
+    parts: SceneFacts | None  #: what the kernels depend on
 
 
 @dataclass(frozen=True)
@@ -72,17 +72,17 @@ class Omission:
     """Something that exists in general, but not in this render."""
 
     name: str  #: of a pass, a layer, or a field of the ``KernelPlan``
-    reason: str  #: a word for machines
+    reason: str  #: a fixed word
 
     @property
     def what(self) -> str:
-        """The thing, in words."""
+        """What is left out, in words."""
         return "edge pass" if self.name == EDGES else kernel_text.WHAT.get(self.name, self.name)
 
     @property
     def why(self) -> str:
-        """The reason, in words."""
-        return _WHY.get(self.reason) or kernel_text.WHY[kernel_text.Reason(self.reason)]
+        """Why, in words."""
+        return _WHY.get(self.reason) or kernel_text.why(self.reason)
 
 
 @dataclass(frozen=True)
@@ -117,28 +117,19 @@ class Pass:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What a render consists of. ``str()`` shows it."""
+class Plan(RenderFacts):
+    """The facts of a render, and what was decided from them and the settings. ``str()`` shows it."""
 
-    scene: str  #: its number or name
-    variant: str  #: of Mitsuba
-    integrator: str  #: name of its plugin
-    width: int  #: pixels
-    height: int  #: pixels
     region: Region  #: that is returned
     lattice: Lattice  #: where the samples of a pixel lie
     detector: str | None  #: edge detector; None where every pixel gets all samples at once
     blur: str | None  #: depth-of-field mode
-    focus: Focus  #: what is sharp
     repeats: int  #: rays for each sample
     motion: str | None  #: "frames", "stratified", or None where the camera stands still
     motion_samples: int  #: moments while the shutter is open
     layers: frozenset[str]  #: that are returned
     passes: tuple[Pass, ...]  #: over the picture, in their order
-    kernel: KernelPlan | None  #: what the tracing kernels hold; None where the integrator does not say
-    parts: SceneFacts | None  #: what the kernels depend on
-    film: FilmFacts | None = None  #: what a scene's own film asks for
-    left_out: tuple[Omission, ...] = ()  #: what, and why
+    left_out: tuple[Omission, ...]  #: what, and why
 
     @property
     def traced(self) -> frozenset[str]:
@@ -203,24 +194,16 @@ def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
         passes += (Pass(BLUR, mode=blur),)
     made = {step.name for step in passes}
     return Plan(
-        scene=facts.scene,
-        variant=facts.variant,
-        integrator=facts.integrator,
-        width=facts.width,
-        height=facts.height,
+        **vars(facts),
         region=_region(settings.region, facts),
         lattice=lattice,
         detector=detector,
         blur=blur,
-        focus=facts.focus,
         repeats=_repeats(settings, lattice),
         motion=(FILM if lattice.kind == FILM else settings.motionmode) if settings.motion else None,
         motion_samples=settings.motionsamples if settings.motion else 1,
         layers=asked | {name for name, layer in LAYERS.items() if made & set(layer.free_with)},
         passes=passes,
-        kernel=facts.kernel,
-        parts=facts.parts,
-        film=facts.film,
         left_out=tuple(_left_out(traced, facts, made, settings)),
     )
 
@@ -239,7 +222,7 @@ def _check_layers(asked: frozenset[str], facts: RenderFacts, settings: RenderSet
         )
     if asked & {"error", "variance"} and settings.aamode != NOISE:
         raise UsageError("layers=error,variance: only rounds estimate them; give a target= or aamode=noise")
-    missing = sorted(asked - facts.layers - layers.named(DERIVED))
+    missing = sorted(asked - facts.traceable - layers.named(DERIVED))
     if missing:
         raise UsageError(
             f"layers={','.join(missing)}: {facts.integrator} does not provide these layers; use mrt_whitted"
@@ -250,7 +233,7 @@ def _traced(
     asked: frozenset[str], facts: RenderFacts, settings: RenderSettings, detector: str | None
 ) -> frozenset[str]:
     """Return the layers that must be traced: for the picture, the passes over it, and those asked for."""
-    wanted = {"image"} | asked & facts.layers
+    wanted = {"image"} | asked & facts.traceable
     if facts.focus.distance:
         wanted |= {"depth"}
     if detector:
@@ -258,7 +241,7 @@ def _traced(
         if (settings.spp or 1) > 1 and DETECTORS[detector].takes_variance:
             wanted |= {"square"}
     if settings.count_rays:
-        wanted |= {name for name, layer in TABLE.items() if layer.counts} & facts.layers
+        wanted |= {name for name, layer in TABLE.items() if layer.counts} & facts.traceable
     return frozenset(wanted)
 
 
@@ -319,7 +302,7 @@ def _left_out(
         left_out.append(Omission(BLUR, "no-focus"))
     if "depth" not in traced:
         left_out.append(Omission("depth", "not-needed"))
-    skipped = [name for name in LAYERS if name in facts.layers - traced - {"depth"}]
+    skipped = [name for name in LAYERS if name in facts.traceable - traced - {"depth"}]
     left_out += [Omission(name, "not-asked-for") for name in skipped]
     return left_out + _film_left_out(facts, settings)
 

@@ -47,7 +47,8 @@ def open_scene(
 ) -> Source:
     """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``.
 
-    ``size``: width and height; ``budget``: memory from which its textures take theirs; ``model``: options of ``model_scene``.
+    ``size``: width and height; ``budget``: memory from which its textures take theirs; ``model``: options of
+    ``model_scene``.
     """
     if model and not is_obj(scene) and model.keys() != {"convention"}:
         raise UsageError(f"{next(k for k in model if k != 'convention')} is of use only with an OBJ file")
@@ -64,13 +65,15 @@ def open_scene(
             raise UsageError(
                 "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
             )
-        name, loaded = _own(scene, budget, declared)
+        name, loaded, values = _own(scene, budget, declared)
         if keys and loaded is scene:
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
         set_parameters(loaded, keys)
         view = _sensor(name, loaded, sensor)
         width, height = _film_size(name, view, *size)
-        return Source(name, loaded, view, _integrator(integrator, loaded), width, height, own=True)
+        focus = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
+        chosen = _integrator(integrator, loaded)
+        return Source(name, loaded, view, chosen, width, height, *focus, own=True)
     width, height, fresnel = size[0] or SIZE[0], size[1] or SIZE[1], fresnel or "schlick"
     loaded = load_dict(own.to_dict(width=width, height=height, fresnel=fresnel), name, budget)
     set_parameters(loaded, keys)
@@ -121,18 +124,28 @@ def _model(scene: Any, options: Mapping[str, Any]) -> tuple[str, Scene | None]:
     return "", None
 
 
-def _own(scene: Any, budget: Budget | None, declared: Mapping[str, Any]) -> tuple[str, Any]:
-    """Return the name of someone's own scene, and the Mitsuba scene."""
+def _own(
+    scene: Any, budget: Budget | None, declared: Mapping[str, Any]
+) -> tuple[str, Any, Mapping[str, str]]:
+    """Return the name of someone's own scene, the Mitsuba scene, and the parameters of its file."""
     import mitsuba as mi
 
     if isinstance(scene, dict):
-        return "a dict", load_dict(scene, budget=budget)
+        return "a dict", load_dict(scene, budget=budget), {}
     if isinstance(scene, str | os.PathLike):
         path = os.fspath(scene)
-        return os.path.basename(path), load_file(path, budget, **declared)
+        return os.path.basename(path), *load_file(path, budget, **declared)
     if isinstance(scene, mi.Scene):
-        return "a Mitsuba scene", scene
+        return "a Mitsuba scene", scene, {}
     raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")
+
+
+def _number(values: Mapping[str, str], name: str, default: Any) -> Any:
+    """Return a parameter of a file that ``write_xml`` gives a focus."""
+    try:
+        return max(0.0, float(values[name]))
+    except (KeyError, ValueError):
+        return default
 
 
 def _sensor(name: str, scene: Any, number: int) -> Any:
@@ -166,6 +179,11 @@ def _integrator(integrator: Any, scene: Any) -> Any:
         integrator = {"type": integrator}
     if isinstance(integrator, dict):
         integrator = load_dict(integrator, f"the integrator {integrator.get('type')!r}")
+    if isinstance(integrator, mi.CppADIntegrator):
+        raise UsageError(
+            f"the integrator {type(integrator).__name__} computes derivatives, by mi.render(scene, params): "
+            "choose another for a picture, such as path or direct"
+        )
     if not isinstance(integrator, mi.SamplingIntegrator):
         raise UsageError(
             f"the integrator is {' '.join(repr(integrator).split())}: "
