@@ -17,7 +17,7 @@ from types import FrameType
 def surfacing(kinds: Mapping[int, type[KeyboardInterrupt]] | None = None) -> Iterator[None]:
     """Within the block, signals raise exceptions, and the first of them is what the block raises at last.
 
-    ``kinds``: exceptions by number; by default ``KeyboardInterrupt`` for SIGINT, unless someone else handles it.
+    ``kinds``: exceptions by number; by default ``KeyboardInterrupt`` for SIGINT, unless that is handled.
     Without effect outside the main thread, where Python sets no handlers.
     """
     if kinds is None:

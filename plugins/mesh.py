@@ -33,6 +33,8 @@ class MrtMesh(mi.Mesh):
     def __init__(self, props: mi.Properties) -> None:
         positions, faces = _array(props, "positions", 3), _array(props, "faces", 3)
         texcoords = _array(props, "texcoords", 2, 3)[:, :2] if "texcoords" in props else None
+        if (faces % 1).any():
+            raise ParameterError('mrt_mesh: "faces" holds a number that is not whole')
         if len(faces) and not (faces.min() >= 0 and faces.max() < len(positions)):
             wrong = faces.max() if faces.max() >= len(positions) else faces.min()
             raise ParameterError(f'mrt_mesh: "faces" holds {wrong}, but there are {len(positions)} positions')

@@ -99,7 +99,7 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     def __init__(self, props: mi.Properties):
         _construct(self, props)
-        self.max_depth = integer(props, "max_depth", 10, least=1)
+        self.max_depth = integer(props, "max_depth", 10, least=1, most=2**32 - 1)
         self.sky = spectrum(props, "sky", emissive=True) if "sky" in props else None
         self.clamp = flag(props, "clamp", True)
         self.min_contribution = number(props, "min_contribution", MIN_CONTRIBUTION, least=0)

@@ -40,6 +40,7 @@ STUDIES = {
     "antialiasing": Entry("antialiasing", "does refining edges give the picture of refining all", 6, 60),
     "depth-of-field": Entry("depth_of_field", "what do the blur filters get wrong against a lens", 3, 60),
     "stability": Entry("stability", "where must float32 give out, and where does it not", 8, 60),
+    "exhaustive": Entry("exhaustive", "how far off are formulas, over every float32 cosine", 2, 120),
     "error-vs-time": Entry("error_vs_time", "what does each setting buy for its time", 9, 480),
     "cost": Entry("cost", "where does the time of a render go, what does the plan save", 6, 120),
     "growth": Entry("growth", "how does time grow with pixels, objects, lights and bounces", 3, 180),

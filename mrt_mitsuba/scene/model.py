@@ -25,6 +25,7 @@ BLUE_SKY: Color = (0.2, 0.2, 0.7)
 
 
 SIZE = (800, 600)  # of the picture, in pixels, where the scene brings no film
+LARGEST = 3.4e38  # number that Mitsuba's float32 can hold
 FOCAL_RANGE = 2.0  # half-width of the sharp zone
 
 
@@ -233,7 +234,8 @@ def view_problem(camera: Camera) -> str | None:
 
     for name in ("position", "target", "up"):
         if not _all_finite(getattr(camera, name), 3):
-            return f"the camera's {name} is {getattr(camera, name)!r}, but must be three finite numbers"
+            value = getattr(camera, name)
+            return f"the camera's {name} is {value!r}, but must be three finite numbers up to 3.4e38"
     if not 0 < camera.hfov < 180:
         return f"the camera's hfov is {camera.hfov!r}, but must be more than 0 and less than 180 degrees"
     forward = np.subtract(camera.target, camera.position)
@@ -247,9 +249,9 @@ def view_problem(camera: Camera) -> str | None:
 
 
 def _all_finite(values: Sequence[float], count: int) -> bool:
-    """Return whether these are ``count`` finite numbers."""
+    """Return whether these are so many numbers that a float32 can hold."""
     try:
-        return len(values) == count and all(map(math.isfinite, values))
+        return len(values) == count and all(abs(value) <= LARGEST for value in values)
     except TypeError:
         return False
 

@@ -67,7 +67,8 @@ def run(study: Study, *, quick: bool) -> None:
             del trade, found
             gc.collect()  # scenes that stay alive slow down the kernels of later ones
             advance(1)
-    _answer(study, samplings)
+    if extent.repeats > 1:  # else a disturbance would decide
+        _answer(study, samplings)
 
 
 def fastest(points: Iterable[Point], error: float) -> Point | None:
