@@ -21,7 +21,6 @@ LINES, PARAMETERS, BRANCHES = 40, 8, 12
 # In rooms under reconstruction; to be empty
 OFFENDERS = {
     "mrt_mitsuba.plugins.kernel_plan.make_plan",
-    "mrt_mitsuba.sweeps.run.sweep",
     "mrt_mitsuba.validation.oracles.reference._Tracer.__init__",
     "mrt_mitsuba.validation.studies.rivals.run",
     "mrt_mitsuba.validation.studies.roughconductor.pointwise",
@@ -31,8 +30,12 @@ BACKWARDS = {
     ("tools.work_precision", "tools.precision_page"),
     ("studies.metals", "studies.roughconductor"),
 }
-# The loops of the integrator are one story; the options of a render are many
-ALLOWED = {"mrt_mitsuba.plugins.whitted.MrtWhitted.trace", "mrt_mitsuba.rendering.api.render"}
+# The loops of the integrator are one story; the options of a render and of a sweep are many
+ALLOWED = {
+    "mrt_mitsuba.plugins.whitted.MrtWhitted.trace",
+    "mrt_mitsuba.rendering.api.render",
+    "mrt_mitsuba.sweeps.run.sweep",
+}
 
 FOUNDATION = {"errors", "memory", "options", "runtime"}
 
