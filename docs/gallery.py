@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.command import options
+from mrt_mitsuba.command import render as renderer
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
 SIZE = "width=400 height=300"
@@ -287,7 +287,7 @@ def make(entry: Entry, folder: Path) -> None:
         if entry.language == "python":
             exec(compile(entry.code, next(iter(entry.pictures)), "exec"), {})
         else:
-            cli.render(replace(command(entry), format="png", quiet=True))
+            renderer.run(replace(command(entry), format="png", quiet=True))
 
 
 def command(entry: Entry) -> options.Options:

@@ -78,7 +78,7 @@ def __dir__() -> list[str]:
 
 
 if not _os.path.isdir(_os.path.join(_os.path.dirname(__file__), "plugins")):
-    # A source checkout: plugins and the like are folders beside this one.
+    # A source checkout: plugins and other sub-packages are folders next to this one.
     from mrt_mitsuba import _checkout
 
     _checkout.install()

@@ -1,4 +1,4 @@
-"""Makes the sub-packages that are top-level folders of a source checkout importable from there.
+"""Import the sub-packages that are top-level folders of a source checkout.
 
 An installed copy holds them inside the package and never loads this module. Without it, Python started in a
 checkout would find this package in the current folder, but not its sub-packages.
@@ -20,7 +20,7 @@ _ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 
 class CheckoutFinder:
-    """Finds ``mrt_mitsuba.<folder>`` beside the package; asked last, after an installed copy."""
+    """Find ``mrt_mitsuba.<folder>`` next to the package; asked last, after an installed copy."""
 
     @staticmethod
     def find_spec(

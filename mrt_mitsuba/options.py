@@ -31,29 +31,40 @@ class Kind:
 
 
 def integer(low: int, high: int) -> Kind:
-    """A whole number in [low, high]."""
-
-    def check(value: Any) -> int:
-        if isinstance(value, bool) or not low <= operator.index(value) <= high:
-            raise ValueError
-        return operator.index(value)
-
-    return Kind("N", f"a whole number from {low} to {high}", lambda text: int(plain(text)), check)
+    """Return the kind of whole numbers in [low, high]."""
+    allowed = f"a whole number from {low} to {high}"
+    return _numeric("N", allowed, int, operator.index, lambda value: low <= value <= high)
 
 
 def number(low: float) -> Kind:
-    """A finite number ≥ low."""
+    """Return the kind of finite numbers from ``low`` on."""
+    allowed = f"a finite number, {low:g} or more"
+    return _numeric("X", allowed, float, float, lambda value: low <= value < math.inf)
 
-    def check(value: Any) -> float:
-        if isinstance(value, bool) or not (math.isfinite(value) and value >= low):
+
+def angle() -> Kind:
+    """Return the kind of degrees between 0 and 180, excluding both."""
+    allowed = "degrees, more than 0 and less than 180"
+    return _numeric("DEGREES", allowed, float, float, lambda value: 0 < value < 180)
+
+
+def _numeric(
+    form: str,
+    allowed: str,
+    read: Callable[[str], Any],
+    convert: Callable[[Any], Any],
+    within: Callable[[Any], bool],
+) -> Kind:
+    def check(value: Any) -> Any:
+        if isinstance(value, bool | str) or not within(value):
             raise ValueError
-        return float(value)
+        return convert(value)
 
-    return Kind("X", f"a finite number, {low:g} or more", lambda text: float(plain(text)), check)
+    return Kind(form, allowed, lambda text: read(plain(text)), check)
 
 
 def choice(*names: str) -> Kind:
-    """One of some names."""
+    """Return the kind of a choice among names."""
 
     def check(value: Any) -> str:
         if value not in names:
@@ -64,7 +75,7 @@ def choice(*names: str) -> Kind:
 
 
 def switch() -> Kind:
-    """Yes or no."""
+    """Return the kind of yes or no."""
     words = {"1": True, "0": False, "yes": True, "no": False, "true": True, "false": False}
 
     def check(value: Any) -> bool:
@@ -76,7 +87,7 @@ def switch() -> Kind:
 
 
 def subset(known: Iterable[str]) -> Kind:
-    """A comma list of known names, each once, or ``all``."""
+    """Return the kind of comma lists of known names, each once, or ``all``."""
     known = tuple(known)
 
     def parse(text: str) -> tuple[str, ...]:
@@ -92,19 +103,8 @@ def subset(known: Iterable[str]) -> Kind:
     return Kind("A,B,..", f"a comma list out of {', '.join(known)}, each once, or all", parse, check)
 
 
-def angle() -> Kind:
-    """Degrees between 0 and 180, without these."""
-
-    def check(value: Any) -> float:
-        if isinstance(value, bool) or not 0 < value < 180:
-            raise ValueError
-        return float(value)
-
-    return Kind("DEGREES", "degrees, more than 0 and less than 180", lambda text: float(plain(text)), check)
-
-
 def vector(form: str = "X,Y,Z") -> Kind:
-    """Three finite numbers."""
+    """Return the kind of three finite numbers."""
 
     def check(value: Any) -> tuple[float, float, float]:
         x, y, z = (float(coordinate) for coordinate in value)
@@ -119,7 +119,7 @@ def vector(form: str = "X,Y,Z") -> Kind:
 
 
 def size() -> Kind:
-    """A number of bytes, as text with a unit: 4G, 512M."""
+    """Return the kind of numbers of bytes, in text with a unit: 4G, 512M."""
 
     def parse(text: str) -> int:
         upper = plain(text).upper().removesuffix("B").removesuffix("I")
@@ -136,7 +136,7 @@ def size() -> Kind:
 
 
 def word() -> Kind:
-    """A name made of letters, digits and underscores, such as a variant."""
+    """Return the kind of names made of letters, digits and underscores, such as variants."""
 
     def check(value: Any) -> str:
         if not (isinstance(value, str) and value.isidentifier()):
@@ -147,12 +147,12 @@ def word() -> Kind:
 
 
 def anything() -> Kind:
-    """Whatever Python gives; checked where it is used."""
+    """Return the kind of what Python gives, checked where it is used."""
     return Kind("", "anything", str, lambda value: value)
 
 
 def rectangle() -> Kind:
-    """Column and row of the first pixel, width and height."""
+    """Return the kind of rectangles: column and row of the first pixel, width and height."""
 
     def check(value: Any) -> tuple[int, int, int, int]:
         x, y, width, height = (operator.index(number) for number in value)
@@ -164,7 +164,7 @@ def rectangle() -> Kind:
 
 
 def parameters() -> Kind:
-    """Values by the keys of ``mi.traverse``."""
+    """Return the kind of dicts of values by keys of ``mi.traverse``."""
 
     def check(value: Any) -> dict[str, Any]:
         value = dict(value)
@@ -176,7 +176,7 @@ def parameters() -> Kind:
 
 
 def path() -> Kind:
-    """The path of a file."""
+    """Return the kind of paths of files."""
 
     def check(value: Any) -> str:
         value = os.fspath(value)

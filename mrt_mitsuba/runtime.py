@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import warnings
 
 from mrt_mitsuba import llvm
@@ -11,6 +12,9 @@ from mrt_mitsuba.memory import check_addresses
 
 FAST = "llvm_ad_rgb"
 SLOW = "scalar_rgb"
+
+# Held while Mitsuba is set up and while it renders: neither it nor Dr.Jit is safe with several Python threads
+one_at_a_time = threading.RLock()
 
 _warned: set[str] = set()
 
@@ -24,6 +28,11 @@ def use(variant: str | None = None) -> str:
     Raises ``UnknownVariantError`` for a name that this Mitsuba does not know, and ``VariantError`` for one
     that cannot run here.
     """
+    with one_at_a_time:
+        return _use(variant)
+
+
+def _use(variant: str | None) -> str:
     llvm.prepare()
     check_addresses()
     import mitsuba as mi

@@ -55,7 +55,7 @@ def axial_mesh(kind: str, end0: str, end1: str) -> type[mi.Mesh]:
 
         def quadrics(self) -> QuadricTable:
             """Return what ``mrt_whitted`` intersects in place of the mesh."""
-            return QuadricTable.of_one(self.kind, self.exact_frame)
+            return QuadricTable.of_one(self.kind, self.exact_frame, flipped=self.has_flipped_normals())
 
         def moving_frame(self) -> Frame | None:
             """Return the unit frame with its derivatives, None where none are wanted."""
@@ -133,8 +133,13 @@ class Placement:
             raise ParameterError(
                 f'{props.plugin_name()}: "to_world" is not invertible; remove its zero scale'
             )
+        self.mirrors = bool(np.linalg.det(self.linear) < 0)
         self.inverse = np.linalg.inv(self.linear).tolist()
         self.linear = self.linear.tolist()
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """Return the places of points [n, 3]."""
+        return points @ np.transpose(self.linear) + np.array(self.offset)
 
     def __call__(self, frame: Frame) -> Frame:
         """The frame of the moved shape; works for vectors of any type."""

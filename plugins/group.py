@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from .axial_mesh import side_count
+from .axial_mesh import Placement, side_count
 from .mesh_api import construct, keep_apart, write_buffers
 from .parameters import ParameterError, choice
 from .protocols import QuadricShape
@@ -33,6 +33,7 @@ class MrtGroup(mi.Mesh):
                                           base centre, radius, and for the others: p0, p1, radius
     ``face_NAME``   ``Bitmap``            float32 [n, 1 or 3], values of the objects that a ``mesh_attribute``
                                           texture of this name looks up
+    ``to_world``    transform  identity   any invertible affine transform of all objects
     ``segments``    integer    8          3 to 65536, sides of the stand-in; that of a
                                           sphere is an octahedron
     =============== ========== ========== ==============================================================
@@ -55,7 +56,9 @@ class MrtGroup(mi.Mesh):
         self.content = f"kind={kind}, objects={len(numbers)}"
         unit = KINDS[kind].mesh(side_count(props, 8))
         faces = len(unit.faces)
-        self.table = QuadricTable.of_numbers(kind, numbers, faces)
+        self.table = QuadricTable.of_numbers(
+            kind, numbers, faces, Placement(props), flipped=props.get("flip_normals", False)
+        )
         sizes = len(numbers) * len(unit.points), len(numbers) * faces
         construct(self, "mrt_group", sizes, props, normals=True)
         write_buffers(self, **_stand_in(unit, self.table))

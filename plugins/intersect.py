@@ -86,6 +86,13 @@ class Frame:
         """A world-space vector in the unit frame."""
         return type(v)([dr.dot(self.x, v), dr.dot(self.y, v), dr.dot(self.z, v)])
 
+    def to_world(self, v: Any) -> Any:
+        """The world-space vector whose unit-frame components are ``v``: by the inverse matrix."""
+        # Its columns are cross products of the rows
+        across = [_cross(self.y, self.z), _cross(self.z, self.x), _cross(self.x, self.y)]
+        inverse_volume = 1 / dr.dot(self.x, across[0])
+        return (across[0] * v.x + across[1] * v.y + across[2] * v.z) * inverse_volume
+
     def gradient(self, g: Any) -> Any:
         """World-space gradient of a function whose unit-frame gradient is ``g``: by the transposed matrix."""
         return self.x * g.x + self.y * g.y + self.z * g.z
@@ -141,6 +148,10 @@ def _frame_along(origin: Any, axis: Any, radius: Any) -> Frame:
     n = axis / -dr.sqrt(length2)
     s, t = tangents(n)
     return Frame(origin, s / radius, t / radius, axis / length2)
+
+
+def _cross(a: Any, b: Any) -> Any:
+    return type(a)([a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x])
 
 
 def tangents(n: Any) -> tuple[Any, Any]:
@@ -326,6 +337,51 @@ def capsule_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
     surface = _surface_point(p, q, r - 1, gradient, True, frame)
     v = 0.75 - 0.5 * along / frame.extent - dr.asin(dr.clip(gradient.z, -1, 1)) / (2 * dr.pi)
     return SurfacePoint(surface.p, surface.n, surface.u, dr.clip(v, 0, 1))
+
+
+# ------------------------------ Derivatives of a surface point by u and v -------------------------------
+
+
+def cone_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
+    """Unit-frame derivatives by u and v of a point of ``cone_surface``, given in the unit frame."""
+    x, y = _azimuth(q, dr.sqrt(dr.square(q.x) + dr.square(q.y)))
+    return _axial_derivatives(q, part, type(q)([-x, -y, -1 + 0 * x]))
+
+
+def cylinder_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
+    """Unit-frame derivatives by u and v of a point of ``cylinder_surface``, given in the unit frame."""
+    return _axial_derivatives(q, part, type(q)([0 * q.x, 0 * q.x, -1 + 0 * q.x]))
+
+
+def _axial_derivatives(q: Any, part: Any, along: Any) -> tuple[Any, Any]:
+    """Those of the side, the one by v being ``along``, or of a disc in the unit square."""
+    side, zero = part == LATERAL, 0 * q.x
+    two = 2 + zero
+    around = type(q)([-2 * dr.pi * q.y, 2 * dr.pi * q.x, zero])
+    by_u = [dr.select(side, a, b) for a, b in zip(around, (two, zero, zero), strict=True)]
+    by_v = [dr.select(side, a, b) for a, b in zip(along, (zero, two, zero), strict=True)]
+    return type(q)(by_u), type(q)(by_v)
+
+
+def sphere_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
+    """Unit-frame derivatives by u and v of a point of ``sphere_surface``, given in the unit frame."""
+    r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
+    x, y = _azimuth(q, r)
+    around = type(q)([-2 * dr.pi * q.y, 2 * dr.pi * q.x, 0 * q.x])
+    return around, type(q)([q.z * x, q.z * y, -r]) * dr.pi
+
+
+def capsule_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
+    """Unit-frame derivatives by u and v of a point of ``capsule_surface``, given in the unit frame."""
+    r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
+    x, y = _azimuth(q, r)
+    z = q.z - dr.clip(q.z, 0, frame.extent)
+    around = type(q)([-2 * dr.pi * q.y, 2 * dr.pi * q.x, 0 * q.x])
+    ball = type(q)([z * x, z * y, -r]) * (2 * dr.pi)
+    by_v = [
+        dr.select(z == 0, a, b) for a, b in zip((0 * x, 0 * x, -2 * frame.extent + 0 * x), ball, strict=True)
+    ]
+    return around, type(q)(by_v)
 
 
 @dataclass

@@ -35,6 +35,8 @@ class Reason(str, Enum):
     ONE_SIDED = "one-sided"  # no material is lit from behind
     SCALAR_VARIANT = "scalar-variant"
     SPECTRAL_VARIANT = "spectral-variant"
+    TANGENTS = "tangents"  # materials need derivatives of the surface, which the table does not have
+    ISOTROPIC = "isotropic"  # no material asks how the surface is turned
     NATIVE_SHAPES = "native-shapes"  # shapes other than plain spheres
     INSTANCES = "instances"
     OTHER_BSDF = "other-bsdf"  # a BSDF other than mrt_bsdf
@@ -67,6 +69,7 @@ class SceneFacts:
     surface_emitters: int  #: of the lights, those that are surfaces
     environment: bool  #: is there an environment emitter
     mirrors: tuple[Mirror, ...]  #: of the materials that reflect like a mirror
+    oriented: bool  #: does a material depend on tangents: anisotropy, bump and normal maps
     textured: bool  #: does a material vary over its surface
     two_sided: bool  #: is a material lit from behind
     unmergeable: Reason | None  #: why the materials cannot be looked up in one table
@@ -104,6 +107,7 @@ class KernelPlan:
     mirrors: bool  #: the loop over mirror bounces
     textures: bool  #: texture coordinates
     shading_frames: bool  #: interpolated normals
+    tangents: bool  #: derivatives of the surface by uv, and frames along them
     merged: bool  #: one BSDF with a table of materials, in place of a call to each
     two_sided: bool  #: light from behind a surface
     reasons: tuple[tuple[str, Reason], ...] = ()  #: of what was left out
@@ -129,6 +133,7 @@ def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
         (facts.spheres == 0, Reason.NO_SPHERES),
         (not facts.vectorised, Reason.SCALAR_VARIANT),
         (facts.textured, Reason.VARYING),
+        (facts.oriented, Reason.TANGENTS),
         (facts.plain_spheres < facts.native_shapes, Reason.NATIVE_SHAPES),
     )
     unrolled = facts.lights <= UNROLLED_LIGHTS or not facts.vectorised
@@ -156,6 +161,7 @@ def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
         ),
         textures=unless("textures", (not facts.textured, Reason.UNIFORM)),
         shading_frames=unless("shading_frames", (facts.meshes == 0, Reason.NO_MESHES)),
+        tangents=unless("tangents", (not facts.oriented, Reason.ISOTROPIC)),
         merged=unless("merged", (facts.unmergeable is not None, facts.unmergeable or Reason.VARYING)),
         two_sided=unless("two_sided", (not facts.two_sided, Reason.ONE_SIDED)),
         reasons=tuple(reasons),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from .axial_mesh import Placement
 from .mesh_api import construct, write_buffers
 from .parameters import ParameterError
 
@@ -18,6 +19,7 @@ class MrtMesh(mi.Mesh):
     ``positions`` ``Bitmap``  required   float32 [1, N, 3], scene units
     ``faces``     ``Bitmap``  required   uint32 [1, M, 3], corners counter-clockwise seen from outside
     ``texcoords`` ``Bitmap``             float32 [1, N, 2 or 3], of which two are used
+    ``to_world``  transform   identity   any invertible affine transform
     ============= =========== ========== ==============================================================
 
     .. code-block:: python
@@ -31,6 +33,8 @@ class MrtMesh(mi.Mesh):
     def __init__(self, props: mi.Properties) -> None:
         positions, faces = _array(props, "positions", 3), _array(props, "faces", 3)
         texcoords = _array(props, "texcoords", 2, 3)[:, :2] if "texcoords" in props else None
+        if (faces % 1).any():
+            raise ParameterError('mrt_mesh: "faces" holds a number that is not whole')
         if len(faces) and not (faces.min() >= 0 and faces.max() < len(positions)):
             wrong = faces.max() if faces.max() >= len(positions) else faces.min()
             raise ParameterError(f'mrt_mesh: "faces" holds {wrong}, but there are {len(positions)} positions')
@@ -38,6 +42,10 @@ class MrtMesh(mi.Mesh):
             raise ParameterError(
                 f'mrt_mesh: "texcoords" has {len(texcoords)} entries for {len(positions)} positions'
             )
+        if "to_world" in props:
+            placement = Placement(props)
+            positions = placement.points(positions.astype(np.float64))
+            faces = faces[:, ::-1] if placement.mirrors else faces
         sizes = len(positions), len(faces)
         construct(self, "mrt_mesh", sizes, props, texcoords=texcoords is not None)
         buffers = {"vertex_positions": positions.astype(np.float32), "faces": faces.astype(np.uint32)}

@@ -72,9 +72,9 @@ def vertex_version(shape: Any) -> int:
     return shape.positions.array.index
 
 
-def ray_flags(*, textures: bool, shading_frames: bool) -> int:
-    """Return the flags of an interaction with texture coordinates, with interpolated normals, or neither."""
-    flags = +mi.RayFlags.Minimal
+def ray_flags(*, textures: bool, shading_frames: bool, tangents: bool) -> int:
+    """Return the flags of an interaction with texture coordinates, normals, derivatives by them."""
+    flags = +mi.RayFlags.dPdUV if tangents else +mi.RayFlags.Minimal
     if hasattr(mi.RayFlags, "Shading"):
         return flags | +mi.RayFlags.Shading if textures or shading_frames else flags
     if textures:

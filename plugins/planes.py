@@ -17,7 +17,11 @@ class Planes:
     """Equations and tangents of all planes, as kernel data."""
 
     def __init__(self, shapes: Sequence[PlaneShape]) -> None:
-        self.equations = [(mi.Vector3f(s.unit_normal.tolist()), mi.Float(s.distance)) for s in shapes]
+        sides = [-1 if s.has_flipped_normals() else 1 for s in shapes]
+        self.equations = [
+            (mi.Vector3f((side * s.unit_normal).tolist()), mi.Float(side * s.distance))
+            for side, s in zip(sides, shapes, strict=True)
+        ]
         # The same kernel serves every plane of every scene: its numbers are data
         dr.make_opaque(self.equations)
         self.tangents = [Table(mi.Vector3f, [s.tangents[k] for s in shapes]) for k in range(2)]
@@ -46,7 +50,14 @@ class Planes:
         return blocked
 
     def put_into(
-        self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, index: mi.UInt32, where: mi.Bool, scale: mi.Float
+        self,
+        si: mi.SurfaceInteraction3f,
+        ray: mi.Ray3f,
+        index: mi.UInt32,
+        where: mi.Bool,
+        scale: mi.Float,
+        *,
+        tangents: bool = False,
     ) -> mi.Float:
         """Make ``si`` the interaction of ``ray`` with plane ``index`` at t = ray.maxt.
 
@@ -60,7 +71,12 @@ class Planes:
         si.p = dr.select(where, p, si.p)
         si.n = dr.select(where, mi.Normal3f(n), si.n)
         si.sh_frame.n = dr.select(where, mi.Normal3f(n), si.sh_frame.n)
-        uv = mi.Point2f(*(dr.dot(tangent(index, where), p) for tangent in self.tangents))
+        along = [tangent(index, where) for tangent in self.tangents]
+        if tangents:
+            si.dp_du, si.dp_dv = (
+                dr.select(where, *both) for both in zip(along, (si.dp_du, si.dp_dv), strict=True)
+            )
+        uv = mi.Point2f(*(dr.dot(tangent, p) for tangent in along))
         si.uv = dr.select(where, uv, si.uv)
         si.shape = dr.select(where, self.shapes(index, where), si.shape)
         return dr.select(where, dr.abs(distance), scale)

@@ -51,6 +51,10 @@ class PlaneShape(ABC):
     distance: float  # unit_normal · P + distance = 0
     tangents: np.ndarray  # float64 [2, 3]
 
+    @abstractmethod
+    def has_flipped_normals(self) -> bool:
+        """Does the plane face the other side? As every shape of Mitsuba says."""
+
 
 class QuadricShape(ABC):
     """A mesh that stands for exact quadrics."""

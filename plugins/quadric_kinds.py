@@ -14,16 +14,20 @@ from .intersect import (
     Frame,
     SurfaceHit,
     SurfacePoint,
+    capsule_derivatives,
     capsule_frame,
     capsule_surface,
+    cone_derivatives,
     cone_frame,
     cone_surface,
+    cylinder_derivatives,
     cylinder_frame,
     cylinder_surface,
     intersect_capsule,
     intersect_cone,
     intersect_cylinder,
     intersect_unit_sphere,
+    sphere_derivatives,
     sphere_frame,
     sphere_surface,
 )
@@ -48,6 +52,7 @@ class QuadricKind:
     intersect: Callable[[Any, Any, Frame], SurfaceHit]
     surface: Callable[[Any, Any, Frame], SurfacePoint]  #: puts a point onto it
     ends: tuple[tuple[int, int, int], tuple[int, int, int]]  #: at z = 0 and z = extent: point, disc or ball
+    derivatives: Callable[[Any, Any, Frame], tuple[Any, Any]]  #: of a surface point, by u and v
     mesh: Callable[[int], UnitMesh]  #: what other integrators see, of so many sides
     open_twin: str | None = None  #: name of the kind without its discs
     closed: bool = True
@@ -58,12 +63,27 @@ class QuadricKind:
         return 3 * self.points + 1
 
 
-_CONE = partial(QuadricKind, 2, cone_frame, surface=cone_surface, ends=(POINT, DISC))
-_CYLINDER = partial(QuadricKind, 2, cylinder_frame, surface=cylinder_surface, ends=(DISC, DISC))
+_CONE = partial(
+    QuadricKind, 2, cone_frame, surface=cone_surface, ends=(POINT, DISC), derivatives=cone_derivatives
+)
+_CYLINDER = partial(
+    QuadricKind,
+    2,
+    cylinder_frame,
+    surface=cylinder_surface,
+    ends=(DISC, DISC),
+    derivatives=cylinder_derivatives,
+)
 
 KINDS: dict[str, QuadricKind] = {
     "sphere": QuadricKind(
-        1, sphere_frame, intersect_unit_sphere, sphere_surface, (BALL, BALL), unit_sphere_mesh
+        1,
+        sphere_frame,
+        intersect_unit_sphere,
+        sphere_surface,
+        (BALL, BALL),
+        sphere_derivatives,
+        unit_sphere_mesh,
     ),
     "cone": _CONE(intersect_cone, mesh=unit_cone_mesh, open_twin="open cone"),
     "open cone": _CONE(
@@ -76,7 +96,13 @@ KINDS: dict[str, QuadricKind] = {
         closed=False,
     ),
     "capsule": QuadricKind(
-        2, capsule_frame, intersect_capsule, capsule_surface, (BALL, BALL), unit_capsule_mesh
+        2,
+        capsule_frame,
+        intersect_capsule,
+        capsule_surface,
+        (BALL, BALL),
+        capsule_derivatives,
+        unit_capsule_mesh,
     ),
 }
 
@@ -90,22 +116,28 @@ class QuadricTable:
     rows: np.ndarray  # float64 [n, 3, 3]
     extents: np.ndarray  # float64 [n]
     first_faces: np.ndarray  # int [n], of the stand-in of each, for textures that are looked up by face
+    flipped: bool = False  # do the normals point inwards
 
     @classmethod
-    def of_one(cls, kind: str, frame: Frame) -> QuadricTable:
+    def of_one(cls, kind: str, frame: Frame, *, flipped: bool = False) -> QuadricTable:
         """Return the table of a shape that is one object."""
         rows = np.array([[list(frame.x), list(frame.y), list(frame.z)]])
         extents = np.array([frame.extent], float)
-        return cls(kind, np.array([list(frame.origin)]), rows, extents, np.zeros(1, int))
+        return cls(kind, np.array([list(frame.origin)]), rows, extents, np.zeros(1, int), flipped)
 
     @classmethod
-    def of_numbers(cls, kind: str, numbers: np.ndarray, faces: int) -> QuadricTable:
-        """Return the table of objects given by ``numbers`` [n, width]; ``faces``: of the stand-in of each."""
+    def of_numbers(
+        cls, kind: str, numbers: np.ndarray, faces: int, place: Callable[[Frame], Frame], *, flipped: bool
+    ) -> QuadricTable:
+        """Return the table of objects given by ``numbers`` [n, width], moved by ``place``.
+
+        ``faces``: number of those of the stand-in of each.
+        """
         points = [Columns.of(numbers[:, 3 * k : 3 * k + 3]) for k in range(KINDS[kind].points)]
-        frame = KINDS[kind].frame(*points, column(numbers[:, -1]))
+        frame = place(KINDS[kind].frame(*points, column(numbers[:, -1])))
         rows = np.stack([row.array() for row in (frame.x, frame.y, frame.z)], axis=1)
         extents = np.broadcast_to(np.array(frame.extent, float), len(numbers))
-        return cls(kind, numbers[:, :3], rows, extents, faces * np.arange(len(numbers)))
+        return cls(kind, frame.origin.array(), rows, extents, faces * np.arange(len(numbers)), flipped)
 
     def boxes(self) -> np.ndarray:
         """Return the bounding boxes [n, 2, 3]."""

@@ -32,13 +32,15 @@ class Quadrics:
         boxes = np.concatenate([t.boxes() for t in tables])
         tree = self.tree = Tree(boxes)
         # Four numbers at a time: a row and a coordinate of the origin, three times; kind; size of
-        # coordinates; extent
+        # coordinates; extent; side of the normal
         table = np.zeros((tree.leaves, 4, 4), np.float32)
         table[tree.leaf_of, :3, :3] = rows
         table[tree.leaf_of, :3, 3] = origins
         table[tree.leaf_of, 3, 0] = kinds
         table[tree.leaf_of, 3, 1] = np.abs(boxes).max(axis=(1, 2))
         table[tree.leaf_of, 3, 2] = np.concatenate([t.extents for t in tables])
+        table[tree.leaf_of, 3, 3] = np.repeat([-1 if t.flipped else 1 for t in tables], counts)
+        self.flipped = any(t.flipped for t in tables)
         self.table = aligned(table)
         owner, faces = np.zeros((2, tree.leaves), np.uint32)
         owner[tree.leaf_of] = np.repeat(np.arange(len(shapes)), counts)
@@ -70,14 +72,15 @@ class Quadrics:
         state = mi.Float(ray.maxt), mi.UInt32(0), mi.Int32(LATERAL)
         return self.tree.walk(ray, active, visit, state, any_hit=any_hit)
 
-    def _frame_and_kind(self, leaf: Any, active: Any = True) -> tuple[Frame, Any]:
+    def _row(self, leaf: Any, active: Any = True) -> tuple[Frame, Any, Any]:
+        """Return frame, kind and side of the normal."""
         x, y, z, more = (dr.gather(mi.Vector4f, self.table, 4 * leaf + k, active) for k in range(4))
         origin = mi.Point3f(x.w, y.w, z.w)
         x, y, z = (mi.Vector3f(r.x, r.y, r.z) for r in (x, y, z))
-        return Frame(origin, x, y, z, more.z), more.x
+        return Frame(origin, x, y, z, more.z), more.x, more.w
 
     def _meet(self, leaf: Any, ray: Any) -> SurfaceHit:
-        frame, kind = self._frame_and_kind(leaf)
+        frame, kind, _ = self._row(leaf)
         t, part = mi.Float(dr.inf), mi.Int32(LATERAL)
         for k, name in enumerate(self.kinds):
             hit = KINDS[name].intersect(ray.o, ray.d, frame)
@@ -85,10 +88,10 @@ class Quadrics:
             t, part = dr.select(own, hit.t, t), dr.select(own, hit.part, part)
         return SurfaceHit(t, part)
 
-    def put_into(self, si: Any, ray: Any, hit: tuple, where: Any) -> None:
+    def put_into(self, si: Any, ray: Any, hit: tuple, where: Any, *, tangents: bool = False) -> None:
         """Make ``si`` the interaction of ``ray`` with what ``intersect`` found."""
         t, leaf, part = hit
-        frame, kind = self._frame_and_kind(leaf, where)
+        frame, kind, side = self._row(leaf, where)
         for number, moving in self.moving:
             own = leaf == number
             frame = Frame(
@@ -100,6 +103,16 @@ class Quadrics:
             to_surface = dr.dot(surface.p - (ray.o + ray.d * t), surface.n)
             t = dr.replace_grad(t, t + to_surface / dr.dot(ray.d, surface.n))
         surface = self._surface(dr.fma(ray.d, t, ray.o), part, frame, kind)
+        if tangents:
+            q = frame.point(surface.p)
+            derivatives = [KINDS[name].derivatives(q, part, frame) for name in self.kinds]
+            for name, by_kind in zip(("dp_du", "dp_dv"), zip(*derivatives, strict=True), strict=True):
+                chosen = by_kind[0]
+                for k, other in enumerate(by_kind[1:], start=1):
+                    chosen = dr.select(kind == k, other, chosen)
+                setattr(si, name, dr.select(where, frame.to_world(chosen), getattr(si, name)))
+        if self.flipped:
+            surface.n *= side
         _put_surface(si, t, surface, dr.gather(mi.ShapePtr, self.shapes, leaf, where), where)
         si.prim_index = dr.select(where, dr.gather(mi.UInt32, self.faces, leaf, where), si.prim_index)
 
@@ -139,11 +152,19 @@ class ScalarQuadrics:
     def occluded(self, ray: Any, active: bool) -> bool:
         return active and self.intersect(ray, active)[0] < ray.maxt
 
-    def put_into(self, si: Any, ray: Any, hit: tuple[float, int, int], where: bool) -> None:
+    def put_into(
+        self, si: Any, ray: Any, hit: tuple[float, int, int], where: bool, *, tangents: bool = False
+    ) -> None:
         t, k, part = hit
         if where:
             thing = self.objects[k]
-            _put_surface(si, t, KINDS[thing.kind].surface(ray(t), part, thing.frame), thing.shape, where)
+            kind, frame = KINDS[thing.kind], thing.frame
+            surface = kind.surface(ray(t), part, frame)
+            if tangents:
+                derivatives = kind.derivatives(frame.point(surface.p), part, frame)
+                si.dp_du, si.dp_dv = (frame.to_world(v) for v in derivatives)
+            surface.n *= thing.side
+            _put_surface(si, t, surface, thing.shape, where)
             si.prim_index = thing.first_face
 
     def scale(self, k: int, active: bool) -> float:
@@ -157,6 +178,7 @@ class _ScalarObject:
         self.shape, self.kind, self.first_face = shape, table.kind, int(table.first_faces[k])
         x, y, z = (mi.Vector3f(row.tolist()) for row in table.rows[k])
         self.frame = Frame(mi.Point3f(table.origins[k].tolist()), x, y, z, float(table.extents[k]))
+        self.side = -1 if table.flipped else 1
         self.scale = float(np.abs(table.boxes()[k]).max())
 
 

@@ -90,6 +90,7 @@ class SceneReading:
             surface_emitters=sum(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in self.lights),
             environment=self.environment is not None,
             mirrors=tuple(map(_mirror, filter(has_mirror, self.bsdfs))),
+            oriented=any(map(is_oriented, self.bsdfs)),
             textured=any(map(is_textured, self.bsdfs)),
             two_sided=any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in self.bsdfs),
             unmergeable=self.unmergeable,
@@ -117,7 +118,9 @@ class SceneData:
         self.light_pointers = pointer("Emitter", self.lights) if plan.lights == "loop" else None
         self.environment = reading.environment
         self.merged = MergedBSDF(reading.shapes, reading.materials) if plan.merged else None
-        self.ray_flags = ray_flags(textures=plan.textures, shading_frames=plan.shading_frames)
+        self.ray_flags = ray_flags(
+            textures=plan.textures, shading_frames=plan.shading_frames, tangents=plan.tangents
+        )
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 
@@ -133,14 +136,14 @@ class SceneData:
                 mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths), active
             )
             closer = active & (quadric[0] < reach)
-            self.quadrics.put_into(si, ray, quadric, closer)
+            self.quadrics.put_into(si, ray, quadric, closer, tangents=self.plan.tangents)
             scale = dr.select(closer, self.quadrics.scale(quadric[1], closer), scale)
             found = found | closer
         if self.plan.planes:
             on_plane = but_not(on_plane, found)
-            scale = self.planes.put_into(si, ray, plane, on_plane, scale)
+            scale = self.planes.put_into(si, ray, plane, on_plane, scale, tangents=self.plan.tangents)
             found = found | on_plane
-        si.sh_frame = mi.Frame3f(si.sh_frame.n)
+        si.sh_frame = _frame_along(si) if self.plan.tangents else mi.Frame3f(si.sh_frame.n)
         si.wi = si.to_local(-ray.d)
         si.time, si.wavelengths = ray.time, ray.wavelengths
         return Hit(si, found, dr.maximum(scale, dr.max(dr.abs(si.p))))
@@ -226,6 +229,27 @@ def is_textured(bsdf: Any) -> bool:
     if isinstance(bsdf, MirrorBSDF):
         return mi.has_flag(flags, mi.BSDFFlags.SpatiallyVarying)
     return any(isinstance(node, mi.Texture) and varies(node) for node in mi.traverse(bsdf).hierarchy)
+
+
+def is_oriented(bsdf: Any) -> bool:
+    """Does a BSDF depend on how the surface is turned about its normal?"""
+    if isinstance(bsdf, MirrorBSDF):
+        return False
+    names = {node.class_name() for node in mi.traverse(bsdf).hierarchy}
+    if names & {"BumpMap", "NormalMap"} or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Anisotropic):
+        return True
+    return not type(bsdf).__module__.startswith("mitsuba")  # somebody else's, which may ask for anything
+
+
+def _frame_along(si: mi.SurfaceInteraction3f) -> mi.Frame3f:
+    """Return the shading frame whose s is along dp/du; any frame where that is nothing, as at an apex."""
+    n = si.sh_frame.n
+    s = si.dp_du - n * dr.dot(n, si.dp_du)
+    length = dr.norm(s)
+    known = length > 1e-4 * dr.norm(si.dp_du)
+    s = s / dr.select(known, length, 1)
+    any_frame = mi.Frame3f(n)
+    return mi.Frame3f(dr.select(known, s, any_frame.s), dr.select(known, dr.cross(n, s), any_frame.t), n)
 
 
 def _mirror(bsdf: Any) -> Mirror:

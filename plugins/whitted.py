@@ -62,7 +62,7 @@ class MrtWhitted(mi.SamplingIntegrator):
     with r the mirror direction, and the sky where a ray meets nothing. Shading goes through ``si.bsdf()``:
     k_s F is the attribute ``mirror_reflectance`` of an ``mrt_bsdf``, and the delta reflection of any other
     BSDF. Lights are all emitters of the scene; those without a delta position take one random sample each.
-    ``mrt_plane``, ``mrt_cone``, ``mrt_cylinder`` and ``mrt_group`` shapes are intersected analytically.
+    ``mrt_plane``, ``mrt_cone``, ``mrt_cylinder``, ``mrt_capsule`` and ``mrt_group`` shapes are intersected analytically.
 
     ==================== ======== ============ ===========================================================
     name                 type     default      unit or range
@@ -98,7 +98,7 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     def __init__(self, props: mi.Properties):
         _construct(self, props)
-        self.max_depth = integer(props, "max_depth", 10, least=1)
+        self.max_depth = integer(props, "max_depth", 10, least=1, most=2**32 - 1)
         self.sky = spectrum(props, "sky", emissive=True) if "sky" in props else None
         self.clamp = flag(props, "clamp", True)
         self.min_contribution = number(props, "min_contribution", MIN_CONTRIBUTION, least=0)

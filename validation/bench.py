@@ -28,67 +28,69 @@ from mrt_mitsuba.validation.studies import rivals
 from mrt_mitsuba.validation.tools import kernels, machine
 from mrt_mitsuba.validation.tools.costs import scene_cost
 from mrt_mitsuba.validation.tools.report import prepare
+from mrt_mitsuba.validation.tools.study import Goal
 
 
-def _object(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the schema of an object that has all of these: a schema each, or what a number means."""
-    known = {
-        name: {"type": "number", "description": field} if isinstance(field, str) else dict(field)
-        for name, field in fields.items()
-    }
-    return {"type": "object", "required": list(known), "properties": known}
-
-
-def _map(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {"type": "object", "additionalProperties": dict(values)}
+def _schema(title: str, notes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the JSON schema of an object: ``notes`` has a description of each number, or a schema."""
+    known = {k: {"type": "number", "description": v} if isinstance(v, str) else v for k, v in notes.items()}
+    return {"type": "object", "title": title, "required": list(known), "properties": known}
 
 
 _TEXT, _COUNT = {"type": "string"}, {"type": "integer"}
-KERNEL = {
-    "stage": {"type": "string", "description": "pass of the render"},
-    "kind": {"type": "string", "description": "traces rays, computes, or Dr.Jit's name"},
-    "hash": _TEXT,
-    "launches": _COUNT,
-    "size": {"type": "integer", "description": "threads of all launches"},
-    "operations": {"type": "integer", "description": "length of the code"},
-    "codegen": "seconds that Dr.Jit takes to write the code, every time",
-    "compile": "seconds of the compiler, once",
-    "seconds": "running, median",
-}
-SCENE = {
-    "render": "seconds, median of warm renders",
-    "spread": "(slowest - fastest) / median",
-    "kernels": "seconds in kernels, of one warm render",
-    "compile": "seconds of the compiler in a first render",
-    "floor": "seconds of the same rays through Mitsuba's queries",
-    "render_to_floor": "median of ratios of render and floor, in turn",
-    "rays_per_second": "of all kinds",
-    "command": "seconds of the whole command, median, kernels in the cache",
-    "command_first": "seconds of the whole command, with an empty cache",
-    "rays": _map(_COUNT),
-    "each_kernel": {"type": "array", "items": _object(KERNEL)},
-}
-RIVALS = {
-    "median": "of the ratios of seconds, ours over theirs, in turn",
-    "low": "lower quartile",
-    "high": "upper quartile",
-    "seconds": "ours, median",
-    "other_seconds": "theirs, median",
-    "kernels": "ratio of the seconds in kernels",
-}
-FILE = {
-    "schema": {"const": 2},
-    "machine": _object({"cores": _COUNT, "system": _TEXT}),
-    "versions": _map(_TEXT),
-    "options": {"type": "object"},
-    "scenes": _map(_object(SCENE)),
-    "rivals": _map(_object(RIVALS)),
-}
-SCHEMA = {
-    "$schema": "https://json-schema.org/draft/2020-12/schema",
-    "title": "mrt-mitsuba benchmark",
-    **_object(FILE),
-}
+_COUNTS = {"type": "object", "additionalProperties": _COUNT}
+KERNEL = _schema(
+    "a kernel in one pass of the render",
+    {
+        "stage": _TEXT,
+        "kind": {"type": "string", "description": "traces rays, computes, or Dr.Jit's name"},
+        "hash": _TEXT,
+        "launches": _COUNT,
+        "size": {"type": "integer", "description": "threads of all launches"},
+        "operations": {"type": "integer", "description": "length of the code"},
+        "codegen": "seconds that Dr.Jit takes to write the code, every time",
+        "compile": "seconds of the compiler, once",
+        "seconds": "running, median",
+    },
+)
+SCENE = _schema(
+    "a scene, every pixel supersampled",
+    {
+        "render": "seconds, median of warm renders",
+        "spread": "(slowest - fastest) / median",
+        "kernels": "seconds in kernels, of one warm render",
+        "compile": "seconds of the compiler in a first render",
+        "floor": "seconds of the same rays through Mitsuba's queries",
+        "render_to_floor": "median of ratios of render and floor, in turn",
+        "rays_per_second": "of all kinds",
+        "command": "seconds of the whole command, median, kernels in the cache",
+        "command_first": "seconds of the whole command, with an empty cache",
+        "rays": _COUNTS,
+        "each_kernel": {"type": "array", "items": KERNEL},
+    },
+)
+RIVALS = _schema(
+    "ratios of seconds, ours over theirs, in turn",
+    {
+        "median": "of the ratios",
+        "low": "lower quartile",
+        "high": "upper quartile",
+        "seconds": "ours, median",
+        "other_seconds": "theirs, median",
+        "goal": "what the ratio is to stay below",
+    },
+)
+SCHEMA = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | _schema(
+    "mrt-mitsuba benchmark",
+    {
+        "schema": {"const": 2},
+        "machine": {"type": "object"},
+        "versions": {"type": "object"},
+        "options": {"type": "object"},
+        "scenes": {"type": "object", "additionalProperties": SCENE},
+        "rivals": {"type": "object", "additionalProperties": RIVALS},
+    },
+)
 COMPARED = ("render", "kernels", "floor", "render_to_floor", "command")
 
 
@@ -167,11 +169,9 @@ def table(now: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> st
     lines += ["", f"{'ours / theirs':<{width}}{'ratio of seconds':>20}    quartiles      goal"]
     for name, found in now["rivals"].items():
         cell = _cell(found["median"], earlier["rivals"].get(name, {}).get("median"))
-        verdict = "met" if found["high"] <= found.get("goal", 0) else "missed"
-        if found["low"] <= found.get("goal", 0) < found["high"]:
-            verdict = "not decided"
-        goal = f"  {found['goal']:g} {verdict}" if "goal" in found else ""
-        lines.append(f"{name:<{width}}{cell:>20}    {found['low']:.2f} to {found['high']:.2f}{goal}")
+        verdict = Goal(name, found["median"], found["goal"], low=found["low"], high=found["high"]).verdict
+        quartiles = f"{found['low']:.2f} to {found['high']:.2f}"
+        lines.append(f"{name:<{width}}{cell:>20}    {quartiles}  {found['goal']:g} {verdict}")
     return "\n".join(lines)
 
 
@@ -185,7 +185,7 @@ def read(path: Path) -> dict[str, Any]:
         found = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise UsageError(f"cannot compare with {path}: {error}") from error
-    whole = isinstance(found, dict) and found.keys() >= FILE.keys()
+    whole = isinstance(found, dict) and found.keys() >= set(SCHEMA["required"])
     if not whole or found["schema"] != 2:
         raise UsageError(f"cannot compare with {path}: it is no file of this benchmark (schema 2)")
     return found
@@ -194,14 +194,11 @@ def read(path: Path) -> dict[str, Any]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, write JSON, and compare."""
     parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
-    parser.add_argument(
-        "--out", type=Path, default=Path("bench.json"), help="file to write (default: bench.json)"
-    )
-    parser.add_argument("--compare", type=Path, help="an earlier file; ratios above 1 are slower")
-    parser.add_argument(
-        "--quick", action="store_true", help="small pictures: a trial of the benchmark, not a measurement"
-    )
-    parser.add_argument("--schema", action="store_true", help="print the JSON schema of the file and stop")
+    add = parser.add_argument
+    add("--out", type=Path, default=Path("bench.json"), help="file to write (default: bench.json)")
+    add("--compare", type=Path, help="an earlier file; ratios above 1 are slower")
+    add("--quick", action="store_true", help="small pictures: a trial of the benchmark, not a measurement")
+    add("--schema", action="store_true", help="print the JSON schema of the file and stop")
     given = parser.parse_args(arguments)
     if given.schema:
         print(json.dumps(SCHEMA, indent=2))

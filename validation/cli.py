@@ -28,24 +28,25 @@ class Entry(NamedTuple):
 
     module: str
     about: str
-    quick: int = 0  # seconds on two cores, about
+    quick: int = 0  # seconds on two idle cores, about
     full: int = 0
 
 
 STUDIES = {
-    "laws": Entry("bsdf_laws", "does the material obey its own laws"),
-    "roughconductor": Entry("roughconductor", "is the material the function that Mitsuba's is"),
-    "stock": Entry("stock", "are light, gloss, mirrors and anti-aliasing what Mitsuba computes"),
-    "scenes": Entry("scenes", "are the report's scenes right, with a reason for every pixel that differs"),
-    "antialiasing": Entry("antialiasing", "does refining edges give the picture of refining all"),
-    "depth-of-field": Entry("depth_of_field", "what do the blur filters get wrong against a lens"),
-    "stability": Entry("stability", "where must float32 give out, and where does it not"),
-    "error-vs-time": Entry("error_vs_time", "what does each setting buy for its time"),
-    "cost": Entry("cost", "where does the time of a render go, and what does the plan save"),
-    "growth": Entry("growth", "how does time grow with pixels, samples, objects, lights and bounces"),
-    "rivals": Entry("rivals", "how fast are our plugins against Mitsuba's own"),
-    "objects": Entry("objects", "how good are cones, exact and as meshes"),
-    "acceleration": Entry("acceleration", "how does time grow with the number of objects"),
+    "laws": Entry("bsdf_laws", "does the material obey its own laws", 6, 60),
+    "roughconductor": Entry("roughconductor", "is the material the function that Mitsuba's is", 10, 90),
+    "stock": Entry("stock", "are light, gloss, mirrors, anti-aliasing what Mitsuba computes", 15, 60),
+    "scenes": Entry("scenes", "are the report's scenes right, with a reason for each pixel off", 10, 60),
+    "antialiasing": Entry("antialiasing", "does refining edges give the picture of refining all", 6, 60),
+    "depth-of-field": Entry("depth_of_field", "what do the blur filters get wrong against a lens", 3, 60),
+    "stability": Entry("stability", "where must float32 give out, and where does it not", 8, 60),
+    "exhaustive": Entry("exhaustive", "how far off are formulas, over every float32 cosine", 2, 120),
+    "error-vs-time": Entry("error_vs_time", "what does each setting buy for its time", 9, 480),
+    "cost": Entry("cost", "where does the time of a render go, what does the plan save", 6, 120),
+    "growth": Entry("growth", "how does time grow with pixels, objects, lights and bounces", 3, 180),
+    "rivals": Entry("rivals", "how fast are our plugins against Mitsuba's own", 5, 120),
+    "objects": Entry("objects", "how good are mesh cones, what do exact ones cost", 3, 60),
+    "acceleration": Entry("acceleration", "how does time grow with the number of objects", 9, 60),
 }
 # All about speed; the first name stands for all of them
 SPEED = ("error-vs-time", "cost", "growth", "rivals")
@@ -74,38 +75,26 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="mrt-validate",
         description="Compare the renderer with Mitsuba, with exact numbers and with itself.",
-        epilog=f"studies:\n{listing()}\n\nerror-vs-time also runs the other studies of speed: "
-        f"{', '.join(SPEED[1:])}.\n"
+        epilog=f"studies:\n{listing()}\n\n{SPEED[0]} also runs {', '.join(SPEED[1:])}.\n"
         "Exit code: 0 if every bound holds, 1 if one is missed or a study fails, 2 for wrong usage.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     names = [*STUDIES, "all"]
     parser.add_argument("study", nargs="+", choices=names, metavar="STUDY", help="one or more, or all")
     parser.add_argument("--list", action="version", version=listing(), help="list the studies and stop")
-    parser.add_argument(
-        "--quick", action="store_true", help=f"fewer samples and cases: {_duration(True)} in all"
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path(FOLDER),
-        metavar="DIR",
-        help=f"folder of the report, made if need be (default: {FOLDER})",
-    )
+    parser.add_argument("--quick", action="store_true", help="fewer samples and cases")
+    parser.add_argument("--out", type=Path, default=Path(FOLDER), metavar="DIR",
+                        help=f"folder of the report, made if need be (default: {FOLDER})")  # fmt: skip
     return parser
 
 
 def listing() -> str:
-    """Return a line on each study, with how long it takes on two cores."""
-    lines = [f"  {'':<15}{'quick':>8}{'whole':>9}"]
-    for name, entry in STUDIES.items():
-        times = (_spoken(seconds) for seconds in (entry.quick, entry.full))
-        lines.append(f"  {name:<15}{next(times):>8}{next(times):>9}  {entry.about}")
-    return "\n".join([*lines, f"  {'all':<15}{_duration(True):>8}{_duration(False):>9}"])
-
-
-def _duration(quick: bool) -> str:
-    return _spoken(sum(entry.quick if quick else entry.full for entry in STUDIES.values()))
+    """Return a line on each study, with how long it takes on two idle cores."""
+    quick, full = (sum(getattr(e, name) for e in STUDIES.values()) for name in ("quick", "full"))
+    lines = [f"  {'':<15}{'quick':>7}{'full':>8}"]
+    for name, entry in {**STUDIES, "all": Entry("", "all of these", quick, full)}.items():
+        lines.append(f"  {name:<15}{_spoken(entry.quick):>7}{_spoken(entry.full):>8}  {entry.about}")
+    return "\n".join(lines)
 
 
 def _spoken(seconds: int) -> str:
@@ -113,21 +102,17 @@ def _spoken(seconds: int) -> str:
 
 
 def _validate(options: argparse.Namespace) -> int:
-    names = _named(options.study)
+    names = named(options.study)
     _check_extras()
-    print(
-        f"About {_spoken(sum(getattr(STUDIES[n], 'quick' if options.quick else 'full') for n in names))} "
-        "on two idle cores",
-        file=sys.stderr,
-    )
     report.prepare(options.out, "summary.json", "index.html")
+    seconds = sum(STUDIES[name].quick if options.quick else STUDIES[name].full for name in names)
+    print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
     # With a cache of their own, studies of speed can tell how long compilation takes
-    own = nullcontext() if options.quick or not set(names) & set(SPEED) else own_cache()
-    with own:
+    with nullcontext() if options.quick or not set(names) & set(SPEED) else own_cache():
         return _run(names, options)
 
 
-def _named(given: Sequence[str]) -> list[str]:
+def named(given: Sequence[str]) -> list[str]:
     """Return the studies that the given names stand for, each once, in the order of ``STUDIES``."""
     chosen = {*given, *(SPEED if SPEED[0] in given else ())}
     return [name for name in STUDIES if name in chosen or "all" in chosen]
@@ -158,15 +143,10 @@ def run_study(name: str, *, quick: bool, progress: Progress | None = None) -> re
     except Exception:
         failure = traceback.format_exc(limit=-4)
     seconds = time.perf_counter() - start
-    _tidy_up()
-    return report.Outcome(study, seconds, failure)
-
-
-def _tidy_up() -> None:
-    """Scenes that live on, and memory that Dr.Jit keeps for reuse, slow down the next study."""
-    gc.collect()
+    gc.collect()  # scenes that live on, and memory that Dr.Jit keeps for reuse, slow down the next study
     if "drjit" in sys.modules:
         sys.modules["drjit"].flush_malloc_cache()
+    return report.Outcome(study, seconds, failure)
 
 
 def _check_extras() -> None:

@@ -13,7 +13,8 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from types import FrameType
+
+from mrt_mitsuba.interrupts import surfacing
 
 GRACE = 1.0  # seconds; more than an orderly end takes without a kernel, and well under the two promised
 
@@ -22,15 +23,18 @@ class Terminated(KeyboardInterrupt):
     """The termination signal, raised wherever the program is."""
 
 
+SIGNALS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
+if hasattr(signal, "SIGHUP"):
+    SIGNALS[signal.SIGHUP] = Terminated  # the terminal is gone
+
+
 @contextlib.contextmanager
 def ending_soon(clean_up: Callable[[], object]) -> Iterator[None]:
-    """Within the block, SIGTERM raises ``Terminated``, and the process ends within ``GRACE`` seconds.
+    """Within the block, SIGTERM and SIGHUP raise ``Terminated``; the process ends within ``GRACE`` seconds.
 
     ``clean_up`` is called before the process is ended by force; its exit code is 128 + the number of the
     signal. Without effect outside the main thread, where Python sets no handlers, and without POSIX signals.
-
-    What the program raises at last is what the signal raised at first, also where Dr.Jit or Mitsuba made an
-    error of their own of it on the way.
+    A signal that is ignored, as in the background of a shell or under nohup, stays so.
     """
     if os.name != "posix" or threading.current_thread() is not threading.main_thread():
         yield
@@ -40,36 +44,19 @@ def ending_soon(clean_up: Callable[[], object]) -> Iterator[None]:
     ended = threading.Event()
     watcher = threading.Thread(target=_watch, args=(read_end, ended, clean_up), daemon=True)
     watcher.start()
-    raised: list[KeyboardInterrupt] = []
-    handlers = {signal.SIGTERM: signal.signal(signal.SIGTERM, _raising(raised, Terminated))}
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where Ctrl-C is to be ignored
-        handlers[signal.SIGINT] = signal.signal(signal.SIGINT, _raising(raised, KeyboardInterrupt))
+    heeded = {number: kind for number, kind in SIGNALS.items() if signal.getsignal(number) in _DEFAULTS}
     wakeup = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
     try:
-        yield
-    except Exception as error:
-        if raised:
-            raise raised[0] from error
-        raise
+        with surfacing(heeded):
+            yield
     finally:
         signal.set_wakeup_fd(wakeup)
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
         ended.set()
         os.close(write_end)  # ends the thread
         watcher.join(GRACE)
 
 
-def _raising(
-    raised: list[KeyboardInterrupt], kind: type[KeyboardInterrupt]
-) -> Callable[[int, FrameType | None], None]:
-    """A handler that raises an exception and notes it."""
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        raised.append(kind())
-        raise raised[-1]
-
-    return handle
+_DEFAULTS = (signal.SIG_DFL, signal.default_int_handler)
 
 
 def _watch(read_end: int, ended: threading.Event, clean_up: Callable[[], object]) -> None:
@@ -77,7 +64,7 @@ def _watch(read_end: int, ended: threading.Event, clean_up: Callable[[], object]
     with open(read_end, "rb", buffering=0) as numbers:
         while byte := numbers.read(1):
             number = byte[0]
-            if number in (signal.SIGINT, signal.SIGTERM) and not ended.wait(GRACE):
+            if number in SIGNALS and not ended.wait(GRACE):
                 clean_up()
                 leave_now(128 + number)
 

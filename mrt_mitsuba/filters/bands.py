@@ -1,7 +1,7 @@
-"""A picture in horizontal bands, for filters that shall not work on all of it at once.
+"""Horizontal bands of a picture, for filters that work on a part of it at a time.
 
-A filter that looks no further than some rows gives the same values for a band, bit for bit, as for the whole
-picture, if it sees these rows on either side as well: its halo.
+A filter that reads only some rows above and below a pixel, its halo, gives the same bits for a band with its
+halo as for the whole picture.
 """
 
 from __future__ import annotations
@@ -21,23 +21,22 @@ class Band:
 
     @property
     def rows(self) -> slice:
-        """The band's rows."""
+        """Rows of the band."""
         return slice(self.start, self.stop)
 
     @property
     def seen(self) -> slice:
-        """The rows that a filter must see."""
+        """Rows that a filter reads."""
         return slice(self.top, self.bottom)
 
     @property
     def inner(self) -> slice:
-        """The band's rows among those seen."""
+        """Rows of the band among those that a filter reads."""
         return slice(self.start - self.top, self.stop - self.top)
 
 
 def bands(height: int, rows: int, halo: int) -> Iterator[Band]:
-    """Cut so many rows into bands from the top to the bottom, none of which sees more than ``rows``, but for
-    as many as three halos.
+    """Yield the bands of a picture from top to bottom; each reads at most ``rows`` rows, or three halos.
 
     The halo ends at the borders of the picture.
     """

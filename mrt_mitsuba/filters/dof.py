@@ -49,7 +49,7 @@ def blur_amount(depth: Any, *, focal_distance: float | None, focal_range: float 
         focal_range: half the width of the sharp zone around it, in the same unit.
 
     Raises:
-        UsageError: for a wrong shape, or a distance or range that is no number.
+        UsageError: for a wrong shape, or a distance or range that is NaN.
     """
     grid = Grid(depth)
     distance = grid.plane(depth, "depth")
@@ -80,7 +80,7 @@ def gaussian_dof(
         mode: "report" for the original's filter, "corrected" for the one without its flaws; see the module.
 
     Raises:
-        UsageError: for a wrong shape, a distance or range that is no number, or an unknown mode.
+        UsageError: for a wrong shape, a distance or range that is NaN, or an unknown mode.
     """
     if mode not in MODES:
         raise UsageError(f"unknown depth-of-field mode {mode!r}; use one of {', '.join(MODES)}")

@@ -45,7 +45,7 @@ class EdgeMap:
     """What a detector found.
 
     ``mask``: [H, W] truth values, the pixels to refine. ``value``: [H, W] float32, the detector's own
-    measure, in the unit that its function names; infinity beside a pixel that is no finite number.
+    measure, in the unit that its function names; infinity next to a pixel that is not finite.
     """
 
     mask: Any
@@ -75,10 +75,10 @@ def luma_edges(
 
     Args:
         image: [H, W, 3], linear, top row first.
-        variance: [H, W, 3], the variance of each pixel's mean; where it is no number, nothing is an edge.
+        variance: [H, W, 3], the variance of each pixel's mean; where it is NaN, nothing is an edge.
 
     Raises:
-        UsageError: for a wrong shape, or a threshold that is no number.
+        UsageError: for a wrong shape, or a threshold that is NaN.
     """
     _check_numbers(
         contrast_offset=contrast_offset,
@@ -100,7 +100,7 @@ def luma_edges(
         # the last term keeps 0/0 out where the pixel is black and free of noise
         luma_variance = dr.square(deviation) / dr.maximum(dr.maximum(4 * sum_, deviation), 1e-30)
         noise = dr.sqrt(near.weighted_sum(luma_variance, [1 / 9] * 9))
-        # not above zero where the variance is no number
+        # not above zero where the variance is NaN
         excess = high - low - 2 * _sigmas(grid, noise_sigmas) * noise
         value = dr.select(excess > 0, excess + offset, 0)
     value = dr.select(dr.isfinite(high), value, math.inf)
@@ -123,10 +123,10 @@ def sobel_edges(
 
     Args:
         image: [H, W, 3], linear, top row first.
-        variance: [H, W, 3], the variance of each pixel's mean; where it is no number, nothing is an edge.
+        variance: [H, W, 3], the variance of each pixel's mean; where it is NaN, nothing is an edge.
 
     Raises:
-        UsageError: for a wrong shape, or a threshold that is no number.
+        UsageError: for a wrong shape, or a threshold that is NaN.
     """
     _check_numbers(threshold=threshold)
     grid = Grid(image)
@@ -155,12 +155,11 @@ def geometry_edges(
     * Step: the second difference of the inverse distance, ``|1/a + 1/b − 2/t|``, over the largest of the
       three inverse distances and ``depth_step``; the largest over the four pairs a, b of opposite neighbours.
       Inverse distance grows linearly over a flat surface in perspective, so a floor is no edge however
-      steeply it is seen. A miss has the inverse distance 0, so a hit beside a miss is always an edge.
+      steeply it is seen. A miss has the inverse distance 0, so a hit next to a miss is always an edge.
 
     Args:
         normal: [H, W, 3], unit normals in any fixed frame; ignored at a miss.
-        depth: [H, W], distances along the ray; infinity, zero or negative for a miss. NaN is no finite
-        number.
+        depth: [H, W], distances along the ray; infinity, zero or negative for a miss; NaN is not finite.
         crease_angle: degrees, above 0 and at most 180.
         depth_step: relative, above 0.
 

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Timings:
-    """Seconds of one render. ``passes`` adds up to about ``total``; ``compile`` and ``kernels`` are parts of
-    it."""
+    """Seconds of one render; ``load`` and ``passes`` add up to about ``total``."""
 
     total: float  #: all of the render
     load: float  #: scene and plan
@@ -33,7 +32,7 @@ class Timings:
 
 @dataclass(frozen=True)
 class Result:
-    """A finished picture and what became known on the way."""
+    """A finished picture, its layers, and how it was made."""
 
     image: Image  #: float32 [H, W, 3], linear, top row first
     layers: Mapping[str, Image]  #: float32 [H, W] by EXR channel name, such as "depth.Z"
@@ -61,8 +60,9 @@ class Result:
         output.save(paths, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
 
     def header(self) -> dict[str, Any]:
-        """The header attributes of an EXR: how the picture was made, and nothing that changes when it is made
-        again, such as seconds."""
+        """Return the header attributes of an EXR: how the picture was made, and nothing such as seconds that
+        changes when it is made again.
+        """
         version = self.versions["mrt-mitsuba"]
         return {
             "software": f"mrt-mitsuba {version}",

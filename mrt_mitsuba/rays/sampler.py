@@ -1,4 +1,4 @@
-"""Random numbers that belong to a ray, whichever rays are traced along with it."""
+"""Random numbers by ray: they do not depend on which other rays are traced with it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _STRIDE = 0x9E3779B9
 
 
 def ray_sampler() -> Any:
-    """A Mitsuba sampler for the current variant, to be told with ``start`` which rays it is for."""
+    """Return a Mitsuba sampler for the current variant; ``start`` says which rays it serves."""
     import mitsuba as mi
 
     return _sampler_class(mi.variant())(mi.Properties("ray_sampler"))
@@ -22,7 +22,7 @@ def _sampler_class(variant: str) -> type:
     import mitsuba as mi
 
     class RaySampler(mi.Sampler):
-        """Mitsuba's ``independent``, number for number, where the rays begin with number 0.
+        """The same numbers as Mitsuba's ``independent`` for rays that begin with number 0.
 
         ``independent`` numbers the rays of every wavefront from 0, so that pictures would depend on how they
         are cut into wavefronts.

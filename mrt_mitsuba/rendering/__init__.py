@@ -1,1 +1,1 @@
-"""A render: options, plan, passes, tracing, memory, progress."""
+"""A render: settings, plan, passes, tracing, progress."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba import runtime
+from mrt_mitsuba.interrupts import surfacing
 from mrt_mitsuba.memory import Budget, Workspace
 from mrt_mitsuba.output.layers import AVERAGED, TABLE
 from mrt_mitsuba.output.result import Result, Timings
@@ -66,29 +67,29 @@ def render(
         width, height: pixels; 800 and 600, or the film's own where the scene brings a film.
         aa: aa × aa samples in a pixel.
         aamode: "none", "luma", "sobel" or "geometry": which pixels get more than one sample.
-        lattice: "report" or "centered", see ``rays.Lattice``.
+        lattice: "report" or "centered", see ``rays.lattice.Lattice``.
         fresnel: "schlick" (default) or "dielectric", for the report's scenes.
         focaldist, focalrange: scene units; by default the scene's own; a distance of 0 turns the blur off.
         dof: "report" or "corrected", see ``filters.dof``.
-        layers: names from ``output.LAYERS`` to return beside those that are free.
+        layers: names from ``output.LAYERS`` to return; those that cost nothing are returned anyway.
         motion, motionsamples: the camera's way while the shutter is open, and the number of moments at which
             it is seen.
-        motionmode: "frames" averages so many whole renders, as the report does; "stratified" is one render
-            whose rays are spread over the time the shutter is open: at least so many to a pixel, and no more
-            than that where the lattice has as many samples.
+        motionmode: "frames" averages that many whole renders, as the report does; "stratified" is one render
+            whose rays are spread over the time while the shutter is open, ``motionsamples`` or more in a
+            pixel.
         convention: meaning of MTL files, "report" or "standard".
         variant: Mitsuba variant; by default the current one, else ``llvm_ad_rgb``.
         memory: bytes (or text such as "4G") to stay within.
-        seed: for whatever is random.
+        seed: of all random numbers.
         integrator: name, dict or instance of a sampling integrator; by default the scene's own.
         spp: rays for each sample, for integrators that draw random numbers. From 2 on, "luma" and "sobel"
-            know the variance of every pixel and take only for an edge what noise does not explain; with one
-            random ray they take noise for edges, and refine it ("geometry" does not).
+            know the variance of every pixel and ignore what noise explains; with one random ray they take
+            noise for edges ("geometry" never does).
         count_rays: count mirror and shadow rays.
         params: values of the scene's parameters by their ``mi.traverse`` key, set once it is loaded.
         region: column, row, width and height of the pixels to return, in place of all; they are the same as
             in the whole picture.
-        progress: told of plan, stages and progress.
+        progress: receives the plan, the stages and their progress.
 
     Raises:
         UsageError: for an argument of the wrong type or range.
@@ -119,7 +120,8 @@ def render(
         params=params,
         region=region,
     )
-    return render_with(scene, settings, Progress() if progress is None else progress)
+    with surfacing(), runtime.one_at_a_time:
+        return render_with(scene, settings, Progress() if progress is None else progress)
 
 
 def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Result:
@@ -186,7 +188,7 @@ def _facts(source: Source, shader: Shader, variant: str, settings: RenderSetting
         width=source.width,
         height=source.height,
         focus=settings.focus(source.focal_distance, source.focal_range),
-        layers=shader.layers,
+        traceable=shader.layers,
         random=shader.random,
         kernel=shader.kernel,
         parts=shader.facts,

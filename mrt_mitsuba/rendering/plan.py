@@ -39,11 +39,11 @@ class RenderFacts:
     integrator: str  #: name of its plugin
     width: int  #: pixels
     height: int  #: pixels
-    focus: Focus  #: the scene's own, or what was asked for
-    layers: frozenset[str]  #: that can be traced
+    focus: Focus  #: what is sharp
+    traceable: frozenset[str]  #: layers that the integrator provides
     random: bool  #: does the integrator draw random numbers
-    kernel: KernelPlan | None = None  #: decisions about the tracing kernels; None where nobody knows them
-    parts: SceneFacts | None = None  #: what they depend on
+    kernel: KernelPlan | None  #: what the tracing kernels hold; None where the integrator does not say
+    parts: SceneFacts | None  #: what the kernels depend on
 
 
 @dataclass(frozen=True)
@@ -51,16 +51,16 @@ class Omission:
     """Something that exists in general, but not in this render."""
 
     name: str  #: of a pass, a layer, or a field of the ``KernelPlan``
-    reason: str  #: a word for machines
+    reason: str  #: a fixed word
 
     @property
     def what(self) -> str:
-        """The thing, in words."""
+        """What is left out, in words."""
         return "edge pass" if self.name == EDGES else kernel_text.WHAT.get(self.name, self.name)
 
     @property
     def why(self) -> str:
-        """The reason, in words."""
+        """Why, in words."""
         return _WHY.get(self.reason) or kernel_text.WHY[kernel_text.Reason(self.reason)]
 
 
@@ -91,27 +91,19 @@ class Pass:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What a render consists of. ``str()`` shows it."""
+class Plan(RenderFacts):
+    """The facts of a render, and what was decided from them and the settings. ``str()`` shows it."""
 
-    scene: str  #: its number or name
-    variant: str  #: of Mitsuba
-    integrator: str  #: name of its plugin
-    width: int  #: pixels
-    height: int  #: pixels
     region: Region  #: that is returned
     lattice: Lattice  #: where the samples of a pixel lie
     detector: str | None  #: edge detector; None where every pixel gets all samples at once
     blur: str | None  #: depth-of-field mode
-    focus: Focus  #: what is sharp
     repeats: int  #: rays for each sample
     motion: str | None  #: "frames", "stratified", or None where the camera stands still
     motion_samples: int  #: moments while the shutter is open
     layers: frozenset[str]  #: that are returned
     passes: tuple[Pass, ...]  #: over the picture, in their order
-    kernel: KernelPlan | None  #: what the tracing kernels hold; None where the integrator does not say
-    parts: SceneFacts | None  #: what the kernels depend on
-    left_out: tuple[Omission, ...] = ()  #: what, and why
+    left_out: tuple[Omission, ...]  #: what, and why
 
     @property
     def traced(self) -> frozenset[str]:
@@ -162,23 +154,16 @@ def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
     passes = _passes(traced, lattice, detector, blur, settings.spp, facts.random)
     made = {step.name for step in passes}
     return Plan(
-        scene=facts.scene,
-        variant=facts.variant,
-        integrator=facts.integrator,
-        width=facts.width,
-        height=facts.height,
+        **vars(facts),
         region=_region(settings.region, facts),
         lattice=lattice,
         detector=detector,
         blur=blur,
-        focus=facts.focus,
         repeats=settings.spp,
         motion=settings.motionmode if settings.motion else None,
         motion_samples=settings.motionsamples if settings.motion else 1,
         layers=asked | {name for name, layer in LAYERS.items() if layer.free_with in made},
         passes=passes,
-        kernel=facts.kernel,
-        parts=facts.parts,
         left_out=tuple(_left_out(traced, facts, made, lattice.aa, settings.aamode)),
     )
 
@@ -193,7 +178,7 @@ def _region(asked: Sequence[int] | None, facts: RenderFacts) -> Region:
 def _check_layers(asked: frozenset[str], facts: RenderFacts, aamode: str) -> None:
     if "edges" in asked and aamode == "none":
         raise UsageError("layers=edges: aamode=none looks for none; choose luma, sobel or geometry")
-    missing = sorted(asked - facts.layers - layers.named(DERIVED))
+    missing = sorted(asked - facts.traceable - layers.named(DERIVED))
     if missing:
         raise UsageError(
             f"layers={','.join(missing)}: {facts.integrator} does not provide these layers; use mrt_whitted"
@@ -204,7 +189,7 @@ def _traced(
     asked: frozenset[str], facts: RenderFacts, settings: RenderSettings, detector: str | None
 ) -> frozenset[str]:
     """Return the layers that must be traced: for the picture, the passes over it, and those asked for."""
-    wanted = {"image"} | asked & facts.layers
+    wanted = {"image"} | asked & facts.traceable
     if facts.focus.distance:
         wanted |= {"depth"}
     if detector:
@@ -212,7 +197,7 @@ def _traced(
         if settings.spp > 1 and DETECTORS[detector].takes_variance:
             wanted |= {"square"}
     if settings.count_rays:
-        wanted |= {name for name, layer in TABLE.items() if layer.counts} & facts.layers
+        wanted |= {name for name, layer in TABLE.items() if layer.counts} & facts.traceable
     return frozenset(wanted)
 
 
@@ -252,5 +237,5 @@ def _left_out(
         left_out.append(Omission(BLUR, "no-focus"))
     if "depth" not in traced:
         left_out.append(Omission("depth", "not-needed"))
-    skipped = [name for name in LAYERS if name in facts.layers - traced - {"depth"}]
+    skipped = [name for name in LAYERS if name in facts.traceable - traced - {"depth"}]
     return left_out + [Omission(name, "not-asked-for") for name in skipped]

@@ -1,4 +1,4 @@
-"""Progress of a render: what runs now, and a bar with the time left where someone is watching."""
+"""Progress of a render: what runs now, and a bar with the time left."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ Advance = Callable[[int], object]
 
 
 class Progress:
-    """Receives what a render tells of its progress. This one keeps it to itself."""
+    """Receives the progress of a render; this base class ignores it."""
 
     def plan(self, plan: object) -> None:
-        """Called once, before anything is traced, with the render plan."""
+        """Receive the render plan, once, before anything is traced."""
 
     def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
-        """Called now and then with what Dr.Jit recorded of its kernels since the last call."""
+        """Receive the records of the kernels that Dr.Jit ran since the last call."""
 
     @contextlib.contextmanager
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
-        """Open a stage of ``total`` steps; the value is called with the number of steps just done.
+        """Open a stage of ``total`` steps, and give a function to call with the number of steps just done.
 
-        ``title`` names the stage on the bar, ``message`` is a line of its own.
+        ``title`` names the stage on the bar, ``message`` is printed on a line of its own.
         """
         yield lambda steps: None
 
 
 class TerminalProgress(Progress):
-    """Prints messages, and a bar if ``bar_file`` is a terminal, or in a notebook.
+    """Print messages, and a bar if ``bar_file`` is a terminal, or in a notebook.
 
     ``show_plan``: whether to print the render plan. Messages go to ``file``, bars to ``bar_file``; these
     count in ``unit``.

@@ -1,4 +1,4 @@
-"""Scenes 5 to 8: of this project's making, in the spirit of the original's, whose models are not free."""
+"""Scenes 5 to 8, made in place of the original's, whose models are not free."""
 
 from __future__ import annotations
 
@@ -25,13 +25,12 @@ NOTHING = (0.0, 0.0, 0.0)
 
 
 def matte(r: float, g: float, b: float) -> Material:
-    """A rough surface that reflects nothing mirror-like: an index of refraction of zero says so, as in the
-    report's files."""
+    """Return a rough surface without mirror reflection: index of refraction 0, as in the report's files."""
     return Material(0.0, 0.6, NOTHING, (r, g, b))
 
 
 def scene_5() -> Scene:
-    """Meshes with two glossy spheres."""
+    """Return meshes with two glossy spheres."""
     floor = Material(1.3, 0.1, (0.25, 0.25, 0.25), (0.55, 0.52, 0.5))
     copper = Material(1.4, 0.15, (0.9, 0.55, 0.35), (0.65, 0.3, 0.15))
     return Scene(
@@ -54,7 +53,7 @@ def scene_5() -> Scene:
 
 
 def scene_6() -> Scene:
-    """A camp: tents between firs, a fire of logs, and its smoke's light."""
+    """Return a camp: tents between firs, and a fire of logs that gives light."""
     grass, canvas, green = matte(0.22, 0.36, 0.12), matte(0.8, 0.62, 0.3), matte(0.08, 0.3, 0.12)
     bark = matte(0.3, 0.18, 0.1)
     flame = Material(0.0, 0.5, NOTHING, (1.6, 0.7, 0.15))
@@ -106,7 +105,7 @@ def _fireplace(bark: Material) -> tuple[list[Mesh], tuple[Cylinder, ...]]:
 
 
 def scene_7() -> Scene:
-    """A lake between hills: the size of the report's landscape of 3080 triangles, and more."""
+    """Return a lake between hills, larger than the report's landscape of 3080 triangles."""
     water = Material(1.33, 0.03, (0.7, 0.75, 0.8), (0.02, 0.08, 0.12))
     ground = ((0.08, matte(0.7, 0.62, 0.42)), (0.75, matte(0.2, 0.42, 0.12)), (1.25, matte(0.42, 0.38, 0.34)),
               (9.0, matte(0.95, 0.95, 1.0)))  # fmt: skip
@@ -124,7 +123,7 @@ def scene_7() -> Scene:
 
 
 def _hills(x: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Height of the ground: a bowl, open towards the camera, with ridges on it."""
+    """Return the height of the ground: a bowl, open towards the camera, with ridges on it."""
     bowl = 0.055 * (x**2 + 1.1 * np.maximum(-z - 0.5, 0) ** 2) - 0.35
     ridges = 0.22 * np.sin(1.7 * x + 0.6 * z) * np.cos(1.3 * z - 0.4 * x) + 0.1 * np.sin(4.1 * x - 2.3 * z)
     return (
@@ -133,13 +132,13 @@ def _hills(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _forest_place(k: int) -> Vector:
-    """The k-th of a spread-out sequence of places on the ground (Roberts' R₂ sequence)."""
+    """Return the k-th place on the ground of a low-discrepancy sequence (Roberts' R₂)."""
     x, z = (k * 0.7548776662) % 1 * 8 - 4, (k * 0.5698402910) % 1 * 8 - 5
     return x, float(_hills(np.array(x), np.array(z))), z
 
 
 def scene_8() -> Scene:
-    """A textured block on a glossy plane."""
+    """Return a textured block on a glossy plane."""
     board = Material(0.0, 0.5, (0.05, 0.05, 0.05), (0.7, 0.5, 0.3), str(models.BLOCK_PICTURE))
     return Scene(
         title="a textured block on a glossy plane",

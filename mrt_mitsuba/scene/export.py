@@ -94,14 +94,25 @@ def _text_of(mine: dict[str, Any], scene: int | Scene, flavor: str) -> str:
                 f"{name} cannot be written as XML: {kind} is made of arrays; {_WITHOUT_XML[kind]}"
             )
     mine = {name: _with_whole_path(node) for name, node in mine.items()}
+    model = scene if isinstance(scene, Scene) else report_scene(scene)
     if flavor == "stock":
-        mine = _stock(mine, scene if isinstance(scene, Scene) else report_scene(scene))
+        mine = _stock(mine, model)
     variant = runtime.use()
     # The writer looks plugins up in scalar_rgb, whatever the current variant
     runtime.use("scalar_rgb")
     runtime.use(variant)
     state = mi.parser.parse_dict(mi.parser.ParserConfig(variant), mine)
-    return mi.parser.write_string(state) + "\n"
+    return _with_focus(mi.parser.write_string(state), model) + "\n"
+
+
+def _with_focus(text: str, scene: Scene) -> str:
+    """Add what Mitsuba's cameras have no parameters for, and ``render`` reads."""
+    if scene.focal_distance is None:
+        return text
+    start = text.index(">", text.index("<scene")) + 1
+    focus = {"focaldist": scene.focal_distance, "focalrange": scene.focal_range}
+    lines = [f'\n    <default name="{name}" value="{value!r}"/>' for name, value in focus.items()]
+    return text[:start] + "".join(lines) + text[start:]
 
 
 def _with_whole_path(node: Any) -> Any:

@@ -47,8 +47,8 @@ def load_dict(scene: Mapping[str, Any], name: str = "the dict", budget: Budget |
         return _make(lambda config: mi.parser.parse_dict(config, scene), name, budget)
 
 
-def load_file(path: str, budget: Budget | None = None, **parameters: Any) -> Any:
-    """Return the scene of an XML file, with values for the ``$parameters`` that it declares.
+def load_file(path: str, budget: Budget | None = None, **parameters: Any) -> tuple[Any, Mapping[str, str]]:
+    """Return the scene of an XML file, and its ``$parameters`` with the values given or by default.
 
     Raises ``SceneError``, and ``UsageError`` for another kind of file or a texture too large for the budget.
     """
@@ -59,8 +59,8 @@ def load_file(path: str, budget: Budget | None = None, **parameters: Any) -> Any
         raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
     given = {key: str(value) for key, value in parameters.items()}
     with _resolving(os.path.dirname(path) or "."):
-        _check_xml(path, given)
-        return _make(lambda config: mi.parser.parse_file(config, path, **given), path, budget)
+        values = _check_xml(path, given)
+        return _make(lambda config: mi.parser.parse_file(config, path, **given), path, budget), values
 
 
 def _make(parse: Callable[[Any], Any], name: str, budget: Budget | None) -> Any:
@@ -173,7 +173,9 @@ def _check_dict(scene: Mapping[str, Any], name: str) -> None:
                 )
             if isinstance(value, dict):
                 waiting.append((f"{place}{key}.", value, depth + 1))
-            elif key == "type" and isinstance(value, str):
+            elif key == "type" and not isinstance(value, str):
+                raise SceneError(f"cannot load {name}: {place}type is {value!r}; give the name of a plugin")
+            elif key == "type":
                 _check_plugin(value, name)
             elif key == "filename" and isinstance(value, str):
                 _check_data(value)
@@ -184,8 +186,8 @@ _TAG_MARK = re.compile(rb"""[>"']""")
 _NO_TAGS = ((b"<!--", b"-->"), (b"<![CDATA[", b"]]>"), (b"<?", b"?>"), (b"<!", b">"))
 
 
-def _check_xml(path: str, parameters: Mapping[str, str]) -> None:
-    """Look at an XML file, and at those that it includes, before Mitsuba opens them."""
+def _check_xml(path: str, parameters: Mapping[str, str]) -> Mapping[str, str]:
+    """Look at an XML file and those that it includes before Mitsuba opens them; return its parameters."""
     values, waiting, seen = dict(parameters), [path], set()
     while waiting:
         file = waiting.pop()
@@ -211,6 +213,7 @@ def _check_xml(path: str, parameters: Mapping[str, str]) -> None:
                     _check_data(filename)
                     if tag.startswith(b"<include") and os.path.isfile(_resolved(filename)):
                         waiting.append(_resolved(filename))
+    return values
 
 
 def _tags(data: bytes) -> Iterator[bytes]:

@@ -25,6 +25,7 @@ BLUE_SKY: Color = (0.2, 0.2, 0.7)
 
 
 SIZE = (800, 600)  # of the picture, in pixels, where the scene brings no film
+LARGEST = 3.4e38  # number that Mitsuba's float32 can hold
 FOCAL_RANGE = 2.0  # half-width of the sharp zone
 
 
@@ -122,7 +123,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything a render needs, but for the picture's size and sampling."""
+    """Everything that a render needs except the size of the picture and the sampling."""
 
     camera: Camera
     sky: Color
@@ -139,7 +140,7 @@ class Scene:
     title: str = field(default="", compare=False)
 
     def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> dict[str, Any]:
-        """The scene as a Mitsuba dict of this project's plugins, materials shared by reference.
+        """Return the scene as a Mitsuba dict of this project's plugins, materials shared by reference.
 
         Raises ``SceneError`` for a camera, a sky or an object of numbers that make no sense.
         """
@@ -228,12 +229,13 @@ def _check(scene: Scene) -> None:
 
 
 def view_problem(camera: Camera) -> str | None:
-    """What keeps a camera from seeing anything, or None."""
+    """Return why a camera can see nothing, or None."""
     import numpy as np
 
     for name in ("position", "target", "up"):
         if not _all_finite(getattr(camera, name), 3):
-            return f"the camera's {name} is {getattr(camera, name)!r}, but must be three finite numbers"
+            value = getattr(camera, name)
+            return f"the camera's {name} is {value!r}, but must be three finite numbers up to 3.4e38"
     if not 0 < camera.hfov < 180:
         return f"the camera's hfov is {camera.hfov!r}, but must be more than 0 and less than 180 degrees"
     forward = np.subtract(camera.target, camera.position)
@@ -247,9 +249,9 @@ def view_problem(camera: Camera) -> str | None:
 
 
 def _all_finite(values: Sequence[float], count: int) -> bool:
-    """Whether these are so many finite numbers."""
+    """Return whether these are so many numbers that a float32 can hold."""
     try:
-        return len(values) == count and all(map(math.isfinite, values))
+        return len(values) == count and all(abs(value) <= LARGEST for value in values)
     except TypeError:
         return False
 
@@ -301,12 +303,12 @@ def _numbers(thing: Any) -> tuple[float, ...]:
 # More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape
 # and more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of
 # recursion
-_MOST_SINGLE = {Sphere: 1000, Cone: 100, Cylinder: 100, Capsule: 100}
+MOST_SINGLE = {Sphere: 1000, Cone: 100, Cylinder: 100, Capsule: 100}
 
 
 def _split(objects: tuple) -> tuple[tuple, tuple]:
-    """What becomes a shape of its own, and what goes into a group; textures need the former."""
-    if not objects or len(objects) <= _MOST_SINGLE[type(objects[0])]:
+    """Return objects that become single shapes and those for a group; textures need the former."""
+    if not objects or len(objects) <= MOST_SINGLE[type(objects[0])]:
         return objects, ()
     return (
         tuple(o for o in objects if o.material.texture is not None),
@@ -369,5 +371,5 @@ def _mrt_bsdf(m: Material, fresnel: str, texturing: str) -> dict[str, Any]:
 
 
 def _texture(path: str, texturing: str) -> dict[str, Any]:
-    """A picture as the report looks it up, or as Mitsuba does: bilinear, sRGB-aware, repeated."""
+    """Return a texture looked up as in the report, or as by Mitsuba: bilinear, sRGB-aware, repeated."""
     return {"type": {"report": "mrt_texture", "standard": "bitmap"}[texturing], "filename": path}

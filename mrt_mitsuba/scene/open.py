@@ -53,12 +53,13 @@ def open_scene(
             raise UsageError(
                 "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
             )
-        name, loaded = _own(scene, budget)
+        name, loaded, values = _own(scene, budget)
         if params and loaded is scene:
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
         set_parameters(loaded, params or {})
         size = _film_size(name, loaded, width, height)
-        return Source(name, loaded, loaded.sensors()[0], _integrator(integrator, loaded), *size)
+        focus = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
+        return Source(name, loaded, loaded.sensors()[0], _integrator(integrator, loaded), *size, *focus)
     width, height, fresnel = width or SIZE[0], height or SIZE[1], fresnel or "schlick"
     loaded = load_dict(model.to_dict(width=width, height=height, fresnel=fresnel), name, budget)
     set_parameters(loaded, params or {})
@@ -80,18 +81,26 @@ def _model(scene: Any, convention: str) -> tuple[str, Scene | None]:
     return "", None
 
 
-def _own(scene: Any, budget: Budget | None) -> tuple[str, Any]:
-    """Return the name of someone's own scene, and the Mitsuba scene."""
+def _own(scene: Any, budget: Budget | None) -> tuple[str, Any, Mapping[str, str]]:
+    """Return the name of someone's own scene, the Mitsuba scene, and the parameters of its file."""
     import mitsuba as mi
 
     if isinstance(scene, dict):
-        return "a dict", load_dict(scene, budget=budget)
+        return "a dict", load_dict(scene, budget=budget), {}
     if isinstance(scene, str | os.PathLike):
         path = os.fspath(scene)
-        return os.path.basename(path), load_file(path, budget)
+        return os.path.basename(path), *load_file(path, budget)
     if isinstance(scene, mi.Scene):
-        return "a Mitsuba scene", scene
+        return "a Mitsuba scene", scene, {}
     raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")
+
+
+def _number(values: Mapping[str, str], name: str, default: Any) -> Any:
+    """Return a parameter of a file that ``write_xml`` gives a focus."""
+    try:
+        return max(0.0, float(values[name]))
+    except (KeyError, ValueError):
+        return default
 
 
 def _film_size(name: str, scene: Any, width: int | None, height: int | None) -> tuple[int, int]:
@@ -123,6 +132,11 @@ def _integrator(integrator: Any, scene: Any) -> Any:
         integrator = {"type": integrator}
     if isinstance(integrator, dict):
         integrator = load_dict(integrator, f"the integrator {integrator.get('type')!r}")
+    if isinstance(integrator, mi.CppADIntegrator):
+        raise UsageError(
+            f"the integrator {type(integrator).__name__} computes derivatives, by mi.render(scene, params): "
+            "choose another for a picture, such as path or direct"
+        )
     if not isinstance(integrator, mi.SamplingIntegrator):
         raise UsageError(
             f"the integrator is {' '.join(repr(integrator).split())}: "

@@ -1,4 +1,4 @@
-"""The report's scenes 0 to 4 and its cone scene 9, as data, and the way to the others."""
+"""The report's scenes 0 to 4 and 9 as data, and all numbered scenes by number."""
 
 from __future__ import annotations
 
@@ -163,10 +163,10 @@ def _scene_9() -> Scene:
 
 
 def c_rand(seed: int = 1) -> Iterator[int]:
-    """The numbers of the GNU C library's ``rand()``: an additive feedback generator over 31 words.
+    """Yield the numbers of the GNU C library's ``rand()``: an additive feedback generator over 31 words.
 
     Source: the polynomial x³¹ + x³ + 1 of its manual page, started by a Lehmer generator (multiplier 16807),
-    the first 310 numbers thrown away.
+    without the first 310 numbers.
     """
     words = [seed]
     for _ in range(30):

@@ -18,13 +18,13 @@ BLOCK_PICTURE = Path(__file__).parent / "assets" / "block.png"
 
 
 def mesh(vertices: np.ndarray, faces: np.ndarray, material: Material, uvs: np.ndarray | None = None) -> Mesh:
-    """A mesh of arrays of any number type."""
+    """Return a mesh of arrays of any number type."""
     texcoords = None if uvs is None else np.asarray(uvs, np.float32)
     return Mesh(np.asarray(vertices, np.float32), np.asarray(faces, np.uint32), material, texcoords)
 
 
 def grid_faces(rows: int, columns: int, *, closed: bool = False) -> np.ndarray:
-    """Triangles over points in row-major order, two for each cell; ``closed`` joins both pairs of edges."""
+    """Return two triangles for each cell of points in row-major order; ``closed`` joins opposite edges."""
     i, j = np.meshgrid(np.arange(rows - (not closed)), np.arange(columns - (not closed)), indexing="ij")
     down, right = (i + 1) % rows, (j + 1) % columns
     a, b, c, d = (r * columns + s for r, s in ((i, j), (down, j), (down, right), (i, right)))
@@ -34,7 +34,7 @@ def grid_faces(rows: int, columns: int, *, closed: bool = False) -> np.ndarray:
 def torus(
     center: Vector, radius: float, tube: float, material: Material, *, rings: int = 48, sides: int = 16
 ) -> Mesh:
-    """A ring standing up, its axis along z, with ``tube`` the radius of its tube."""
+    """Return an upright ring with its axis along z; ``tube`` is the radius of its tube."""
     around, across = np.meshgrid(
         2 * np.pi * np.arange(rings) / rings, 2 * np.pi * np.arange(sides) / sides, indexing="ij"
     )
@@ -44,7 +44,7 @@ def torus(
 
 
 def block(center: Vector, size: Vector, material: Material, *, turn: float = 0.0) -> Mesh:
-    """A box, turned by ``turn`` degrees about y, with the whole of a texture on each side, upright."""
+    """Return a box, turned by ``turn`` degrees about y, with the texture upright on each side."""
     corners, faces, uvs = [], [], []
     # Seen from outside: right and up along the side
     sides = [
@@ -67,7 +67,7 @@ def block(center: Vector, size: Vector, material: Material, *, turn: float = 0.0
 def tent(
     center: Vector, width: float, height: float, length: float, material: Material, *, turn: float = 0.0
 ) -> Mesh:
-    """A ridge tent on the ground: a prism along x, turned about y."""
+    """Return a ridge tent on the ground: a prism along x, turned about y."""
     half = np.array([length / 2, 0, 0])
     section = np.array([[0, 0, width / 2], [0, height, 0], [0, 0, -width / 2]])
     points = np.concatenate([section - half, section + half])
@@ -76,7 +76,7 @@ def tent(
 
 
 def rock(center: Vector, radius: float, material: Material, *, seed: int) -> Mesh:
-    """An icosahedron with its corners moved in and out, sunk a little into the ground."""
+    """Return an icosahedron with its corners moved in and out, flattened."""
     golden = (1 + 5**0.5) / 2
     points: list[tuple[float, float, float]] = [(0, s, t * golden) for s in (-1, 1) for t in (-1, 1)]
     points += [(y, z, x) for x, y, z in points] + [(z, x, y) for x, y, z in points]
@@ -97,7 +97,7 @@ def rock(center: Vector, radius: float, material: Material, *, seed: int) -> Mes
 def pines(
     places: Sequence[Vector], height: float, green: Material, brown: Material, *, sides: int = 7
 ) -> tuple[Mesh, Mesh]:
-    """Fir trees of three pyramids each, of about ``height``, and their trunks."""
+    """Return fir trees of three pyramids each, of about ``height``, and their trunks."""
     crown, trunk = [], []
     for k, place in enumerate(places):
         size = height * (0.8 + 0.4 * ((k * 0.618034) % 1))
@@ -114,7 +114,7 @@ def terrain(
     cells: int,
     materials: Sequence[tuple[float, Material]],
 ) -> tuple[Mesh, ...]:
-    """Ground over [−extent, extent]² of ``2 cells²`` triangles, y = height(x, z).
+    """Return ground over [−extent, extent]² of ``2 cells²`` triangles, y = height(x, z).
 
     ``materials``: upper limits of a triangle's mean height, ascending, and what is below each; the last takes
     the rest.
@@ -134,7 +134,7 @@ def terrain(
 
 
 def block_picture(size: int = 64) -> np.ndarray:
-    """The picture of scene 8, uint8 [size, size, 3]: framed planks with an arrow that points up."""
+    """Return the picture of scene 8, uint8 [size, size, 3]: framed planks with an arrow that points up."""
     y, x = np.mgrid[0:size, 0:size] / (size - 1)
     plank = np.floor(x * 4)
     grain = 0.5 + 0.5 * np.sin(40 * (y + 0.07 * np.sin(9 * y + 3 * plank) + plank))

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -248,3 +250,75 @@ def test_messages_are_printable_short_and_few(variant: str, tmp_path: Path) -> N
         mrt.render(str(model), width=4, height=3, aa=1)
     assert len(warned) == 1 and "and so do 19999 more materials" in str(warned[0].message)
     assert str(warned[0].message).isprintable()
+
+
+# ---------------------------------------- 8, 11: threads, Ctrl-C ---------------------------------------
+
+THREADS = """
+import threading
+import mrt_mitsuba as mrt
+found, start = [], threading.Barrier(8)
+def work(number):
+    start.wait()
+    try:
+        found.append(mrt.render(number % 4, width=40, height=30, aa=2).image.sum())
+    except Exception as error:
+        found.append(repr(error))
+threads = [threading.Thread(target=work, args=(number,)) for number in range(8)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print(len(found), len(set(found)), [text for text in found if isinstance(text, str)])
+"""
+
+
+@pytest.mark.parametrize("attempt", range(2))
+def test_first_renders_from_several_threads(run_python, attempt: int) -> None:
+    done = run_python(THREADS)
+    assert (done.returncode, done.stdout) == (0, "8 4 []\n"), done.stdout + done.stderr
+
+
+INTERRUPTED = """
+import os, signal, sys, threading, time
+import mrt_mitsuba as mrt
+signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background
+options = {"width": 160, "height": 120, "aa": 2, "integrator": "path", "spp": 4}
+mrt.render(3, **options)
+start = time.perf_counter()
+mrt.render(3, **options)
+length = time.perf_counter() - start
+found = []
+for part in range(24):
+    killer = threading.Timer(length * part / 20, os.kill, (os.getpid(), signal.SIGINT))
+    try:
+        killer.start()
+        mrt.render(3, **options)
+        found.append("done")
+        killer.join()
+        time.sleep(0.01)
+    except KeyboardInterrupt:
+        found[part:] = ["KeyboardInterrupt"]
+    except Exception as error:
+        found.append(repr(error))
+    killer.join()
+print(set(found) - {"done"})
+"""
+
+
+def test_ctrl_c_in_a_render_is_always_an_interrupt(run_python) -> None:
+    done = run_python(INTERRUPTED)
+    assert (done.returncode, done.stdout) == (0, "{'KeyboardInterrupt'}\n"), done.stdout + done.stderr
+
+
+def test_hang_up_ends_the_command_as_a_termination_does(tmp_path: Path) -> None:
+    command = [MRT, "out", "3", "width=3000", "height=3000", "aamode=none", "aa=4"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.readline()  # the command has begun
+        time.sleep(0.5)
+        process.send_signal(signal.SIGHUP)
+        try:
+            assert process.wait(timeout=20) in (143, 129), process.stderr.read()
+        finally:
+            process.kill()
+    assert list(tmp_path.iterdir()) == []

@@ -38,6 +38,9 @@ NAN, INFINITE = math.nan, math.inf
         ({"variant": "scalar_rbg"}, "Did you mean scalar_rgb?"),
         ({"integrator": 3}, "the integrator is 3: it must be a sampling integrator"),
         ({"integrator": {"type": "ptracer"}}, "it must be a sampling integrator"),
+        ({"integrator": "prb"}, "the integrator PRBIntegrator computes derivatives"),
+        ({"integrator": "direct_projective"}, "computes derivatives"),
+        ({"integrator": "volprim_rf_basic"}, "computes derivatives"),
     ],
 )
 def test_render_refuses(arguments: dict[str, Any], text: str) -> None:
@@ -54,6 +57,8 @@ def test_render_refuses(arguments: dict[str, Any], text: str) -> None:
         (Path("none.obj"), "cannot read none.obj: there is no such file in"),
         ({"type": "scene"}, "a dict has no sensor: add one"),
         ({"type": "potato"}, 'Plugin "potato" not found'),
+        ({"type": "sphere"}, "a dict is a Shape, not a scene: put it into one"),
+        ({"type": 3}, "type is 3; give the name of a plugin"),
         (
             {"type": "scene", "ball": {"type": "sphere", "center": None}},
             "ball.center is None; give it a",
@@ -74,7 +79,7 @@ def test_render_refuses(arguments: dict[str, Any], text: str) -> None:
             '"faces" holds 7, but there are 3 positions',
         ),
     ],
-    ids=range(18),
+    ids=range(20),
 )
 def test_scenes_that_cannot_be_drawn(scene: Any, text: str) -> None:
     size = SMALL if isinstance(scene, Scene) else {"aa": 1}
@@ -134,7 +139,11 @@ PLUGINS: list[tuple[dict[str, Any], str]] = [
     ({"type": "mrt_light", "intensity": INFINITE}, '"intensity" is inf, but must be finite'),
     ({"type": "mrt_light", "position": [0, 1e39, 0]}, "three finite numbers"),
     ({"type": "mrt_whitted", "sky": -1.0}, '"sky" is -1.0, but must be finite and not negative'),
-    ({"type": "mrt_whitted", "max_depth": 1.5}, '"max_depth" is 1.5, but must be an integer >= 1'),
+    (
+        {"type": "mrt_whitted", "max_depth": 1.5},
+        '"max_depth" is 1.5, but must be an integer from 1 to',
+    ),
+    ({"type": "mrt_whitted", "max_depth": 2**32}, "but must be an integer from 1 to 4294967295"),
     ({"type": "mrt_texture", "filename": 3}, '"filename" is 3, but must be a text that is not empty'),
     ({"type": "mrt_texture", "bitmap": 3}, '"bitmap" is 3, but must be a mi.Bitmap'),
 ]
@@ -156,6 +165,7 @@ def test_plugins_name_the_parameter(variant: str, plugin: dict[str, Any], text: 
         ({"positions": TRIANGLE[:, :, :2]}, "must have [1, N, 3]"),
         ({"texcoords": TRIANGLE[:, :2]}, '"texcoords" has 2 entries for 3 positions'),
         ({"faces": np.array([[[0, 1, -2]]], np.float32)}, '"faces" holds -2'),
+        ({"faces": np.array([[[0, 1, 0.5]]], np.float32)}, '"faces" holds a number that is not whole'),
     ],
 )
 def test_meshes_name_the_array(variant: str, arrays: dict[str, np.ndarray], text: str) -> None:

@@ -100,7 +100,7 @@ SCENES: list[Case] = [
         xml("<integrator type='mrt_whitted'><integer name='max_depth' value='0'/></integrator>"),
         "out scene=a.xml",
         1,
-        'mrt_whitted: "max_depth" is 0, but must be an integer >= 1',
+        'mrt_whitted: "max_depth" is 0, but must be an integer from 1 to 4294967295',
     ),
     (
         xml("", SENSOR.format("<integer name='height' value='0'/>")),

@@ -179,7 +179,8 @@ def test_names_that_differ_in_numbers_are_one_curve(name, family):
 
 def test_one_repeat_gives_no_verdict():
     found = found_of(point("a", [1.0], 0.1), point("b", [9.0], 0.1), errors=(0.1, 1e-3))
-    assert "no verdict" in found.verdicts[0] and "no case" in found.verdicts[1]
+    assert found.verdicts == ["No verdict on time: a single repeat has no interval."]
+    assert "no case" in found_of(point("a", [1.0, 1.0], 0.1), errors=(1e-3,)).verdicts[0]
 
 
 def test_front_is_what_nothing_beats_in_both():
@@ -246,9 +247,10 @@ def test_command_writes_a_page(tmp_path, capsys, variant):
         (["3"], "cases = {}", "no entry 'reference'"),
         (["3"], GOOD.replace("repeats", "repeat"), "unknown entry 'repeat'"),
         (["3", "cases=none.toml"], None, "No such file"),
+        (["scene=none.xml"], GOOD, "no such file"),
     ],
 )
 def test_command_refuses(words, text, said, tmp_path, capsys):
     arguments = [cases_file(tmp_path, text)] if text else []
     assert main(["error-vs-time", *words, *arguments, f"out={tmp_path / 'out'}"]) == 2
-    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()
+    assert said in capsys.readouterr().err and not (tmp_path / "out" / "index.html").exists()

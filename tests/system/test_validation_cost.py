@@ -15,6 +15,7 @@ from mrt_mitsuba.validation.tools import kernels
 from mrt_mitsuba.validation.tools.costs import record, scene_cost
 from mrt_mitsuba.validation.tools.knobs import load
 from mrt_mitsuba.validation.tools.study import Study, Table
+from mrt_mitsuba.validation.tools.warm import measure, ratio
 
 TINY = cost.Extent((40, 30), 2, (0,), 1, (32, 24))
 
@@ -61,6 +62,19 @@ def test_small_study_holds(monkeypatch, variant):
     launches = [sum(row[i] for row in tables[name].rows) for name, i in (("passes", 5), ("kernels", 4))]
     assert launches[0] == launches[1] > 0  # no kernel is outside of the passes
     assert [row[0] for row in tables["plan"].rows] == [case.what for case in few]
+
+
+def test_runs_are_timed_in_turn():
+    order: list[str] = []
+    runs = {name: (lambda name=name: order.append(name) or name) for name in "ab"}
+    found = measure(runs, repeats=3)
+    assert order == list("ab" * 4) and found["b"].result == "b" and found["a"].seconds >= 0
+    order.clear()
+    measure(runs, repeats=9, enough=0)  # a median needs three
+    assert order == list("ab" * 4)
+    order.clear()
+    assert ratio(runs["a"], runs["b"], repeats=3).median > 0
+    assert order == list("ab" + "ab" + "ba" + "ab")
 
 
 @pytest.mark.parametrize("case", savings.forced(), ids=lambda case: case.what.split(" (")[0])

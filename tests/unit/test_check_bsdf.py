@@ -89,7 +89,7 @@ STOCK = {
     "conductor": ({"material": "Au"}, set()),
     "plastic": ({}, set()),
     "roughdielectric": ({"alpha": 0.2}, set()),
-    "roughconductor": ({"distribution": "ggx"}, {"finite"}),
+    "roughconductor": ({"distribution": "ggx"}, set()),
     "roughplastic": ({}, {"sampling", "finite", "gradients"}),
     "twosided": ({"nested": {"type": "diffuse"}}, {"components"}),
     "mask": ({"opacity": 0.6, "nested": {"type": "diffuse"}}, {"components"}),

@@ -34,7 +34,7 @@ MATERIAL = {
 
 
 def scene(**more: Any) -> mi.Scene:
-    """A sphere that fills the picture, so that no silhouette moves in it, before another one behind the camera."""
+    """A sphere that fills the picture, so that no silhouette moves in it, and one behind the camera."""
     look = mi.ScalarTransform4f().look_at([0, 0.5, 3], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 16, "height": 12, "component_format": "float32"}
     film["rfilter"] = {"type": "box"}

@@ -62,7 +62,7 @@ def test_a_group_looks_like_its_members(monkeypatch, kind: str, materials: int) 
     """The same rays: but for roundings that move a silhouette or a shadow's edge, the same picture."""
     content = crowd(kind, 40, materials)
     single = picture(content)
-    monkeypatch.setattr(scene, "_MOST_SINGLE", {Sphere: 0, Cone: 0, Cylinder: 0, Capsule: 0})
+    monkeypatch.setattr(scene, "MOST_SINGLE", {Sphere: 0, Cone: 0, Cylinder: 0, Capsule: 0})
     nodes = content.to_dict()
     assert nodes[f"{kind}s"]["type"] == "mrt_group" and f"{kind}_0" not in nodes
     grouped = picture(content)
@@ -78,14 +78,14 @@ def test_textured_members_stay_single(monkeypatch, tmp_path) -> None:
     content = crowd("sphere", 3, 3)
     red = Material(1.5, 0.1, (0, 0, 0), (1, 1, 1), str(tmp_path / "red.png"))
     spheres = (*content.spheres, Sphere((0, 1, 0), 0.5, red))
-    monkeypatch.setitem(scene._MOST_SINGLE, Sphere, 2)
+    monkeypatch.setitem(scene.MOST_SINGLE, Sphere, 2)
     nodes = Scene(camera=content.camera, sky=(0, 0, 0), lights=content.lights, spheres=spheres).to_dict()
     assert nodes["sphere_0"]["center"] == [0, 1, 0] and len(np.array(nodes["spheres"]["numbers"])) == 3
 
 
 def test_scalar_variant(monkeypatch) -> None:
     content = crowd("sphere", 12, 5)
-    monkeypatch.setattr(scene, "_MOST_SINGLE", {Sphere: 0})
+    monkeypatch.setattr(scene, "MOST_SINGLE", {Sphere: 0})
     vector = picture(content, 40, 30)
     runtime.use("scalar_rgb")
     scalar = picture(content, 40, 30)

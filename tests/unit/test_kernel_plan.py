@@ -24,6 +24,7 @@ SPHERE: dict[str, Any] = {"type": "sphere", "radius": 0.7, "bsdf": {"type": "mrt
 CONE = {"type": "mrt_cone", "apex": [0, 1, 1], "base_center": [0, 0, 1], "radius": 0.4}
 LIGHT = {"type": "mrt_light", "position": [2, 4, 3]}
 LAMP = {"type": "sphere", "center": [0, 3, 0], "radius": 0.2, "emitter": {"type": "area"}}
+BRUSHED = {"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.4}
 GLASS = {"type": "sphere", "radius": 0.7, "bsdf": {"type": "dielectric"}}
 MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
 
@@ -78,6 +79,7 @@ CHOICES = {
         False,
     ),
     "shading_frames": ({"b": SPHERE, "light": LIGHT}, False, False),
+    "tangents": ({"a": {**SPHERE, "bsdf": BRUSHED}, "light": LIGHT}, False, False),
     "merged": ({"a": SPHERE, "b": {**CONE, "bsdf": {"type": "mrt_bsdf"}}, "light": LIGHT}, False, True),
     "two_sided": ({"a": GLASS, "light": LIGHT}, False, True),
 }
@@ -123,6 +125,8 @@ def test_kernel_obeys(name: str) -> None:
         ({"a": {**SPHERE, "bsdf": MATTE}}, "mirrors", Reason.NO_MIRRORS),
         ({"a": SPHERE, "integrator": {"type": "mrt_whitted", "max_depth": 1}}, "mirrors", Reason.MAX_DEPTH),
         ({"a": SPHERE}, "textures", Reason.UNIFORM),
+        ({"a": SPHERE}, "tangents", Reason.ISOTROPIC),
+        ({"a": {**SPHERE, "bsdf": BRUSHED}}, "spheres", Reason.TANGENTS),
         ({"a": SPHERE}, "two_sided", Reason.ONE_SIDED),
         ({"a": {"type": "sphere"}}, "merged", Reason.OTHER_BSDF),
         ({"a": {**SPHERE, "bsdf": {"type": "mrt_bsdf", "alpha": TEXTURE}}}, "merged", Reason.VARYING),

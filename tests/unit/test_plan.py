@@ -201,3 +201,25 @@ def test_settings_are_the_options_of_render() -> None:
     assert {name: taken.pop(name).default for name in ("scene", "progress")} == {"scene": 0, "progress": None}
     held = {field.name: field.default for field in fields(RenderSettings)}
     assert {name: parameter.default for name, parameter in taken.items()} == held
+
+
+NEW_LAYER = """
+import mrt_mitsuba as mrt
+from mrt_mitsuba.output import layers, read_exr
+
+row = layers.Layer("position", "XYZ", layers.FIRST_HIT, "place of the first hit", lambda r: r.si.p)
+layers.TABLE["position"] = layers.LAYERS["position"] = row
+for integrator in ("mrt_whitted", "path"):
+    result = mrt.render(9, width=8, height=6, layers=["position"], integrator=integrator, seed=1)
+    result.save("a.exr")
+    assert {"position.X", "position.Y", "position.Z"} <= read_exr("a.exr").layers.keys()
+    assert "with position" in str(result.plan)
+from mrt_mitsuba.command.listings import usage
+assert "position" in usage()
+"""
+
+
+def test_a_new_layer_takes_one_row(run_python) -> None:
+    """From there, plan, tracer, files and help have it."""
+    done = run_python(NEW_LAYER)
+    assert done.returncode == 0, done.stderr

@@ -196,7 +196,7 @@ def disagreements(t: np.ndarray, exact: np.ndarray, thinner: np.ndarray) -> np.n
     return ~same & ~grazing
 
 
-def crowd(count: int, place: str, kind: str, rays: int = 20_000) -> tuple[np.ndarray, ...]:
+def crowd(count: int, place: str, kind: str, rays: int = 8_000) -> tuple[np.ndarray, ...]:
     """Overlapping objects of sizes over three decades, and rays from a place to them: ends, radii, o, d."""
     rng = np.random.default_rng(8)
     sizes = 10 ** rng.uniform(-2, 1, count)

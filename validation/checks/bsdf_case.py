@@ -77,7 +77,7 @@ class Case:
             wis, uvs = (np.broadcast_to(x, (count, len(x))) for x in (wi, uv))
             samples = self.probe.sample(wis, u, uvs)
             value, pdf = self.probe.both(wis, samples.wo, uvs)
-            found.append(View(wi, uv, u, samples, np.where(live(samples, value, pdf), pdf, 0)))
+            found.append(View(wi, uv, u, samples, np.where(live(wi, samples, value, pdf), pdf, 0)))
         return found
 
     def copy(self) -> Case:
@@ -148,13 +148,20 @@ class Pairs:
         return Pairs(*(x[keep] for x in vars(self).values()))
 
 
-def live(s: Samples, value: Array, pdf: Array) -> Array:
+def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:
     """Where samples of lobes with a width are ones that the density counts.
 
-    Weight 0 is how ``sample`` refuses: its direction is then any. It may also be that the value there is 0,
-    or that the weight is wrong; but then the stated density is that of the direction.
+    Weight 0 is how ``sample`` refuses: its direction is then any, or on the wrong side. It may also be that
+    the value is 0 there, or that the weight is wrong; but then the stated density is that of the direction.
     """
-    refused = (s.weight == 0).all(axis=1) & (value != 0).any(axis=1) & ~np.isclose(s.pdf, pdf, rtol=0.2)
+    import mitsuba as mi
+
+    across = wi[..., 2] * s.wo[:, 2] < 0
+    astray = (
+        np.where(across, s.type & int(mi.BSDFFlags.Reflection), s.type & int(mi.BSDFFlags.Transmission)) != 0
+    )
+    dark = (s.weight == 0).all(axis=1) & (value != 0).any(axis=1)
+    refused = dark & (astray | ~np.isclose(s.pdf, pdf, rtol=1e-3))
     return ~s.delta & np.isfinite(pdf) & (pdf > 0) & ~refused
 
 

@@ -128,7 +128,7 @@ def _mismatch(case: Case, view: View) -> dict[str, Array]:
         value, pdf = case.probe.both(i, o, t)
         return value / np.where(pdf > 0, pdf, np.inf)[:, None]
 
-    counts = live(few, *case.probe.both(wis, wo, uvs)) | (few.weight != 0).any(axis=1) & ~few.delta
+    counts = live(view.wi, few, *case.probe.both(wis, wo, uvs)) | (few.weight != 0).any(axis=1) & ~few.delta
     return {
         what: np.where(counts, excess(stated, function(wis, wo, uvs), case.spread(function, wis, wo, uvs)), 0)
         for what, stated, function in (

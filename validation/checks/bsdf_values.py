@@ -55,6 +55,7 @@ def reciprocity(law: Law, case: Case) -> None:
 
 # Less than 1e-7, a dot product of float32 vectors rarely is
 COSINES = (1, 1 - 6e-8, 0.5, 1e-2, 1e-4, 1e-7, 0)
+INDICES = ("eta", "k", "int_ior", "ext_ior")
 UNIFORM = (0, 2.0**-24, 0.5, 1 - 2.0**-24)
 
 
@@ -134,7 +135,11 @@ def _ends(case: Case) -> Iterator[tuple[str, float, Any]]:
     for key, value in parameters(case):
         number = float(np.mean(np.array(value)))
         least = 1e-3 if "alpha" in key or "rough" in key else 0.0  # no roughness is another kind of surface
-        for end in (least, 1.0) if 0 <= number <= 1 else (1.001, 2 * number):
+        if key.split(".")[-2 if key.endswith(".value") else -1] in INDICES and number <= 1:
+            ends = 0.5 * number, 2.0 * number  # of metals, for which 0 is no limit but nonsense
+        else:
+            ends = (least, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)
+        for end in ends:
             yield key, end, changed(case, key, lambda old, end=end: type(old)(old * 0 + end))
 
 

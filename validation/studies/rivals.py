@@ -23,7 +23,6 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.studies import roughconductor
-from mrt_mitsuba.validation.tools.kernels import seconds_in_kernels
 from mrt_mitsuba.validation.tools.knobs import load
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.warm import Ratio, ratio
@@ -87,12 +86,11 @@ class Finding:
 
     pair: Pair
     time: Ratio
-    kernels: float  # ratio of the seconds in kernels
     means: float  # of the pictures, theirs over ours
 
     def as_dict(self) -> dict[str, Any]:
         """Return what the benchmark's file has."""
-        return {"kernels": self.kernels, **asdict(self.time), "goal": self.pair.goal}
+        return {**asdict(self.time), "goal": self.pair.goal}
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -115,14 +113,13 @@ def run(study: Study, *, quick: bool) -> None:
     study.table(
         "rivals",
         f"Seconds of ours over theirs, {extent.size[0]}x{extent.size[1]}, {extent.spp} samples a pixel",
-        ("ours", "theirs", "scene", "ours, s", "theirs, s", "ratio", "quartiles", "in kernels", "goal"),
+        ("ours", "theirs", "scene", "ours, s", "theirs, s", "ratio", "quartiles", "goal"),
         [
             (p.ours, p.theirs, p.scene, t.seconds, t.other_seconds, t.median, f"{t.low:.3g} to {t.high:.3g}",
-             one.kernels, p.goal)
+             p.goal)
             for one in found for p, t in [(one.pair, one.time)]
         ],
-        "Taken in turn, medians of ratios. In kernels: the ratio without what Python and Dr.Jit do before "
-        "kernels start, which does not grow with the picture.",
+        "Taken in turn, medians of ratios.",
         first=True,
     )  # fmt: skip
 
@@ -145,9 +142,8 @@ def compare_pair(pair: Pair, repeats: int) -> Finding:
     """Time a pair in turn, and take the means of its pictures."""
     sides = (pair.render_ours, pair.render_theirs)
     time = ratio(*sides, repeats=repeats)
-    kernels = [seconds_in_kernels(run) for run in sides]
     means = [float(run().mean(dtype=np.float64)) for run in sides]
-    return Finding(pair, time, kernels[0] / kernels[1], means[1] / means[0])
+    return Finding(pair, time, means[1] / means[0])
 
 
 def direct(number: int, extent: Extent) -> Iterator[Pair]:

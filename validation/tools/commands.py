@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mrt_mitsuba.command.words import read_toml, words
-from mrt_mitsuba.errors import MrtError, UsageError
+from mrt_mitsuba.errors import MrtError, SceneError, UsageError
 from mrt_mitsuba.validation.tools.study import Bound
 
 MISSED = 1  # the exit code where a limit is missed, or a case failed
@@ -74,7 +74,10 @@ def error_vs_time(arguments: Sequence[str]) -> int:
         from mrt_mitsuba.validation.tools import report, work_precision
 
         report.prepare(folder, "summary.json", "index.html")
-        found = work_precision.error_vs_time(scene, progress=TerminalProgress(unit="render"), **settings)
+        try:
+            found = work_precision.error_vs_time(scene, progress=TerminalProgress(unit="render"), **settings)
+        except SceneError as error:  # of the scene or its reference: nothing was measured
+            raise UsageError(str(error)) from error
     print(found)
     found.save(folder)
     print(f"Report: {folder / 'index.html'}")

@@ -27,9 +27,7 @@ class Kernel:
     """All launches of a kernel in one pass of one render. Kernels are told apart by kind and hash."""
 
     stage: str
-    kind: (
-        str  # "traces rays" or "computes" of kernels made to measure, else Dr.Jit's name: "BlockReduce", ...
-    )
+    kind: str  # "traces rays", "computes", or Dr.Jit's own name: "BlockReduce", ...
     hash: str
     launches: int
     size: int  # threads of all launches
@@ -46,16 +44,13 @@ class Kernel:
 @contextmanager
 def own_cache() -> Iterator[None]:
     """Let Dr.Jit keep its kernels in a new folder, for ``forget`` to work; to be entered before it starts."""
-    before = os.environ.get(CACHE)
     with tempfile.TemporaryDirectory(prefix=PREFIX, ignore_cleanup_errors=True) as folder:
-        os.environ[CACHE] = folder
+        before, os.environ[CACHE] = os.environ.get(CACHE), folder
         try:
             yield
         finally:
-            if before is None:
-                del os.environ[CACHE]
-            else:
-                os.environ[CACHE] = before
+            del os.environ[CACHE]
+            os.environ |= {} if before is None else {CACHE: before}
 
 
 def forget() -> None:
@@ -143,19 +138,3 @@ def _kernel(key: tuple[str, str, str], entries: Sequence[Mapping[str, Any]]) -> 
     operations = entries[0].get("operation_count", 0)
     seconds = (total("codegen_time"), total("backend_time"), total("execution_time"))
     return Kernel(*key, len(entries), size, operations, *seconds)
-
-
-def seconds_in_kernels(run: Callable[[], Any], *, repeats: int = 3) -> float:
-    """Seconds that the kernels of a warm run of anything but ``mrt.render`` take, the median of some.
-
-    ``mrt.render`` keeps a history of its own, which ``profile`` takes.
-    """
-    import drjit as dr
-
-    found = []
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for _ in range(repeats):
-            dr.kernel_history_clear()
-            run()
-            found.append(sum(entry["execution_time"] for entry in dr.kernel_history()) / 1000)
-    return statistics.median(found)

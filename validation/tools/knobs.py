@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 import mrt_mitsuba as mrt
-from mrt_mitsuba.scene.model import Cone, Mesh, Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.studies.depth_of_field import fit_lens
 
 MODES = ("none", "luma", "sobel", "geometry")
 CUT_OFFS = (0.0, 1 / 16 / 255, 1 / 255, 4 / 255, 16 / 255)
 DEPTHS = (1, 2, 3, 5, 10)
-SEGMENTS = (8, 32, 128, 512)
 
 Options = dict[str, Any]
 
@@ -137,41 +131,4 @@ def lens(number: int, extent: Extent) -> Trade:
     )
 
 
-def cone(number: int, extent: Extent) -> Trade:
-    """Return cones as triangles, against analytic ones."""
-    width, height = extent.size
-    meshes = {
-        f"{n} segments": {"scene": meshed(report_scene(number), n).to_dict(width=width, height=height)}
-        for n in SEGMENTS
-    }
-    return Trade(
-        extent.scene(number),
-        "cone segments against the analytic cone",
-        "the analytic cone, the same rays",
-        {**meshes, "analytic": {}},
-        {},
-        {"aa": 2, "aamode": "none"},
-    )
-
-
-TRADES = {"sampling": sampling, "whitted": whitted, "path": path, "lens": lens, "cone": cone}
-
-
-def meshed(scene: Scene, segments: int) -> Scene:
-    """Return the scene with its cones as flat triangles, ``segments`` around, and closed below."""
-    return dataclasses.replace(scene, cones=(), meshes=tuple(_cone_mesh(c, segments) for c in scene.cones))
-
-
-def _cone_mesh(cone: Cone, segments: int) -> Mesh:
-    apex, base = np.array(cone.apex, float), np.array(cone.base_center, float)
-    axis = (apex - base) / np.linalg.norm(apex - base)
-    s = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    s /= np.linalg.norm(s)
-    angle = 2 * math.pi * np.arange(segments)[:, None] / segments
-    rim = base + cone.radius * (np.cos(angle) * s + np.sin(angle) * np.cross(axis, s))
-    i = np.arange(segments)
-    j = (i + 1) % segments
-    side = np.stack([i, j, np.full(segments, segments)], axis=1)
-    bottom = np.stack([j, i, np.full(segments, segments + 1)], axis=1)
-    vertices = np.concatenate([rim, apex[None], base[None]]).astype(np.float32)
-    return Mesh(vertices, np.concatenate([side, bottom]).astype(np.uint32), cone.material)
+TRADES = {"sampling": sampling, "whitted": whitted, "path": path, "lens": lens}

@@ -75,7 +75,7 @@ def describe(study: Study, found: WorkPrecision, name: str, title: str, truth: s
             "nothing is assumed.",
             first=not name,
         )
-    ahead = {point.name for point in front(list(found.points.values()))}
+    ahead = {point.name for point in front(list(found.points.values())) if found.repeats > 1}
     rows = [_row(number, point, point.name in ahead) for number, point in numbered(found)]
     study.table(
         f"{prefix}points",
@@ -132,11 +132,10 @@ def _interval(ends: Interval) -> str:
 
 
 def _caption(found: WorkPrecision) -> str:
-    least = front([p for p in found.points.values() if p.resolved])
-    names = "; ".join(f"{p.name} ({p.seconds:.2g} s, RMSE {p.rmse:.2g})" for p in least)
-    return "Down and to the left is better. Bars are 95 % intervals, numbers those of the table. " + (
-        f"Ahead of the others: {names}." if names else "No case is told from the reference."
-    )
+    text = "Down and to the left is better. Bars are 95 % intervals, numbers those of the table."
+    ahead = front([p for p in found.points.values() if p.resolved]) if found.repeats > 1 else []
+    names = "; ".join(f"{p.name} ({p.seconds:.2g} s, RMSE {p.rmse:.2g})" for p in ahead)
+    return f"{text} Ahead of the others: {names}." if names else text
 
 
 def diagram(found: WorkPrecision) -> Any:

@@ -12,7 +12,7 @@ import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ RESOLVED = 2.0  # times the reference's own error from which on an error is told
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?"
 STEPS = (1, 2, 5)  # of the errors that the time is asked for, times powers of ten
 MOST_ERRORS = 4
+NOTHING = 1e-15  # an RMSE of 0, as logarithms have it
 
 Options = Mapping[str, Any]
 Interval = tuple[float, float]
@@ -71,7 +72,7 @@ class Point:
 
     def rmse_of(self, index: np.ndarray) -> np.ndarray:
         """Return the RMSE over some repeats, [..., repeats] of them."""
-        return np.sqrt(np.maximum(np.diag(self.gram)[index].mean(axis=-1), 1e-30))
+        return np.sqrt(np.maximum(np.diag(self.gram)[index].mean(axis=-1), NOTHING**2))
 
     def _bias_squared_of(self, index: np.ndarray) -> np.ndarray:
         """Return the squared bias by pairs of different repeats; of one repeat, or the same one, NaN."""
@@ -90,7 +91,7 @@ class Point:
 
     @property
     def rmse(self) -> float:
-        return self.error.value
+        return self.error.value if self.error.value > NOTHING else 0.0
 
     @property
     def rmse_interval(self) -> Interval:
@@ -103,7 +104,7 @@ class Point:
 
     @property
     def bias(self) -> float:
-        """|bias| = √(MSE − variance), 0 where noise explains the whole error; NaN for one repeat."""
+        """Absolute bias, √(MSE − variance), 0 where noise explains the whole error; NaN for one repeat."""
         return float(np.sqrt(np.maximum(self.bias_squared.value, 0)))
 
     @property
@@ -168,7 +169,7 @@ class WorkPrecision:
         Between measured cases the curve is a straight line in logarithms; beyond them nothing is assumed.
         """
         return {
-            name: estimate(self.repeats, lambda index, points=points: _crossing(points, error, index))
+            name: estimate(self.repeats, partial(_crossing, points, error))
             for name, points in self.families.items()
         }
 
@@ -180,7 +181,9 @@ class WorkPrecision:
     @cached_property
     def verdicts(self) -> list[str]:
         """A sentence for each of ``errors``; it names a winner only if its interval meets no other."""
-        return [_verdict(error, self.times[error], self.repeats) for error in self.errors]
+        if self.repeats < 2:
+            return ["No verdict on time: a single repeat has no interval."]
+        return [_verdict(error, self.times[error]) for error in self.errors]
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""
@@ -214,13 +217,11 @@ def _crossing(points: Sequence[Point], error: float, index: np.ndarray) -> np.nd
     return found
 
 
-def _verdict(error: float, times: Mapping[str, Estimate], repeats: int) -> str:
+def _verdict(error: float, times: Mapping[str, Estimate]) -> str:
     where = f"RMSE of {error:g}"
     reached = sorted(((t.value, name) for name, t in times.items() if np.isfinite(t.value)))
     if not reached:
         return f"{where}: no case comes so low."
-    if repeats < 2:
-        return f"{where}: no verdict, for one repeat has no interval."
     best = reached[0][1]
     like = [name for _, name in reached[1:] if times[name].overlaps(times[best])]
     if like:

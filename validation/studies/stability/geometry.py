@@ -11,7 +11,7 @@ from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.studies.stability.cases import Cases
-from mrt_mitsuba.validation.studies.stability.shapes import shape_cases, start_cases
+from mrt_mitsuba.validation.studies.stability.shapes import shape_cases, stand_in_cases, start_cases
 from mrt_mitsuba.validation.tools.study import Study
 
 SCALES = (1e-6, 1e-4, 1e-2, 1e2, 1e4, 1e6)
@@ -35,6 +35,7 @@ def run(study: Study, *, quick: bool) -> None:
     worst: list[tuple[str, str, float, str]] = []
     shape_cases(cases, worst, quick=quick)
     start_cases(cases, quick=quick)
+    stand_in_cases(cases)
     _scenes(study, cases, quick=quick)
     cases.close("A rounding is 2⁻²⁴ = 6e-8. Truth: the same rays in float64.")
     study.table(

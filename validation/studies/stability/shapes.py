@@ -243,6 +243,46 @@ def _apex_cases(cases: Cases, count: int, rng: np.random.Generator) -> None:
             )
 
 
+SIDES = 256  # of a stand-in mesh, its default
+
+
+def stand_in_cases(cases: Cases) -> None:
+    """The meshes that stock integrators see for cones and cylinders: inscribed, facing outwards, closed.
+
+    A side is a turn of 2π / 256 wide: the mesh lies within r (π / 256)² / 2 of the surface, and its normals
+    and texture coordinates are off by half a side at most, where a triangle ends in the apex.
+    """
+    import mitsuba as mi
+
+    o, d = _rays(1.0, 4.0, 20_000)
+    axis = np.subtract(BASE, APEX) / np.linalg.norm(np.subtract(BASE, APEX))
+    across = np.cross(axis, [0.3, 0.5, 0.7])
+    across /= np.linalg.norm(across)
+    for solid in (s for s in SOLIDS if s.name in ("cone", "cylinder")):
+        scene = mi.load_dict({"type": "scene", "solid": {**solid.to_dict(1.0), "segments": SIDES}})
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T)))
+        truth = solid.hit(o, d, 1.0)
+        t = np.where(np.array(si.is_valid()), np.array(si.t), np.inf)
+        both = np.isfinite(t) & np.isfinite(truth.t)
+        gap = np.abs(t[both] - truth.t[both]) * np.abs((truth.n * d).sum(axis=1)[both])
+        angle = np.linalg.norm(np.array(si.sh_frame.n).T - truth.n, axis=1)[both]
+        p = (o + np.where(both, truth.t, 0)[:, None] * d - APEX)[both & (np.abs(truth.n @ axis) < 0.9)]
+        azimuth = np.arctan2(p @ np.cross(axis, across), p @ across)
+        u = np.array(si.uv.x)[both & (np.abs(truth.n @ axis) < 0.9)]
+        turned = [np.exp(1j * (2 * np.pi * u + sign * azimuth)) for sign in (1, -1)]
+        around = max(turned, key=lambda z: abs(z.mean()))
+        astray = np.abs(np.angle(around / around.mean())) / (2 * np.pi)
+        name, what = f"{solid.name}, stand-in", f"of 99 % of the rays that meet a mesh of {SIDES} sides"
+        half, inner = np.pi / SIDES, 1.2 * CONE_RADIUS * 0.5 * (np.pi / SIDES) ** 2
+        missed = float(np.mean(np.isfinite(t) != np.isfinite(truth.t)))
+        cases.at_most(f"{name}, place", f"distance {what}", "inscribed", np.quantile(gap, 0.99), inner)
+        cases.at_most(f"{name}, normal", f"angle {what}", "half a side", np.quantile(angle, 0.99), half)
+        cases.at_most(
+            f"{name}, u", "its place around the axis, in turns", "half a side", astray.max(), 1 / SIDES
+        )
+        cases.at_most(f"{name}, outline", "share of rays that hit one of the two only", "few", missed, 2e-3)
+
+
 # --------------------------------------------- Measuring ---------------------------------------------------
 
 

@@ -1,0 +1,46 @@
+"""Lets an interrupt surface as what it is, whatever libraries make of it on the way.
+
+A ``KeyboardInterrupt`` that is raised while Mitsuba or Dr.Jit calls Python becomes an error of theirs, or is
+lost.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from types import FrameType
+
+
+@contextlib.contextmanager
+def surfacing(kinds: Mapping[int, type[KeyboardInterrupt]] | None = None) -> Iterator[None]:
+    """Within the block, signals raise exceptions, and the first of them is what the block raises at last.
+
+    ``kinds``: exceptions by number; by default ``KeyboardInterrupt`` for SIGINT, unless that is handled.
+    Without effect outside the main thread, where Python sets no handlers.
+    """
+    if kinds is None:
+        heeded = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        kinds = {signal.SIGINT: KeyboardInterrupt} if heeded else {}
+    if not kinds or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    raised: list[KeyboardInterrupt] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        raised.append(kinds[number]())
+        raise raised[-1]
+
+    before = {number: signal.signal(number, handle) for number in kinds}
+    try:
+        yield
+    except Exception as error:
+        if raised:
+            raise raised[0] from error
+        raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if raised:
+        raise raised[0]

@@ -1,0 +1,192 @@
+"""What ``mrt_whitted`` promises about lights, surfaces and mirrors, seen along single rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mrt_mitsuba.scene.model import Cone, Cylinder, Material
+from mrt_mitsuba.validation.oracles import reference
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+WHITTED = {"type": "mrt_whitted", "clamp": False, "min_contribution": 0.0, "bounce_budget": "plain"}
+MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
+MIRROR = {"type": "mrt_bsdf", "fresnel": "unity", "diffuse_reflectance": 0.0, "alpha": 0.01}
+FLOOR = {"type": "mrt_plane", "normal": [0, 0, 1]}
+
+
+@dataclass(frozen=True)
+class Traced:
+    """What the integrator found along N rays."""
+
+    radiance: np.ndarray  # [N, 3]
+    found: np.ndarray  # [N]
+    t: np.ndarray  # [N]
+    p: np.ndarray  # [N, 3]
+
+
+def trace(nodes: dict[str, Any], o: Any, d: Any, **integrator: Any) -> Traced:
+    """Trace rays [N, 3] through a scene."""
+    scene = mi.load_dict({"type": "scene", **nodes})
+    tracer = mi.load_dict({**WHITTED, **integrator})
+    tracer.prepare(scene)
+    rays = mi.Ray3f(mi.Point3f(np.atleast_2d(o).T), mi.Vector3f(np.atleast_2d(d).T))
+    found = tracer.trace(scene, None, rays)
+    si = found.hit.si
+    return Traced(np.array(found.radiance).T, np.array(found.hit.found), np.array(si.t), np.array(si.p).T)
+
+
+def radiance(nodes: dict[str, Any], o: Any, d: Any, **integrator: Any) -> np.ndarray:
+    return trace(nodes, o, d, **integrator).radiance
+
+
+NONE = Material(1, 1, (0, 0, 0), (0, 0, 0))
+
+
+@pytest.mark.parametrize("count", [1, 8, 9, 30])
+def test_every_light_counts(count: int) -> None:
+    """However many there are: the light of all is the sum of that of each, in the code and in a loop."""
+    lights = {
+        f"light_{k}": {"type": "mrt_light", "position": [k - 3, 1, 2], "intensity": 0.5 + 0.1 * k}
+        for k in range(count)
+    }
+    floor, ray = {**FLOOR, "bsdf": MATTE}, ((0.3, 0.2, 5), (0, 0, -1))
+    each = [radiance({"floor": floor, name: light}, *ray) for name, light in lights.items()]
+    assert min(values.min() for values in each) > 1e-3
+    np.testing.assert_allclose(radiance({"floor": floor, **lights}, *ray), sum(each), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "beside",
+    [
+        {},
+        {"beside": {"type": "rectangle"}},
+        {"beside": {"type": "mrt_cylinder", "p0": [9] * 3, "p1": [9, 9, 10]}},
+    ],
+)
+def test_hits_lie_on_their_sphere(beside: dict[str, Any]) -> None:
+    """From 1e4 radii away, alone and beside other shapes: as near as float32 can write the point."""
+    center, radius = np.array([0.1, 0.2, -3.0]), 0.5
+    rng = np.random.default_rng(1)
+    d = rng.normal(size=(2000, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    sphere = {"type": "sphere", "center": center.tolist(), "radius": radius}
+    found = trace({"sphere": sphere, **beside}, center - 5000 * d + 0.2 * rng.normal(size=(2000, 3)), d)
+    distance = np.linalg.norm(found.p - center, axis=1)
+    met = found.found & (distance < 1)
+    assert met.mean() > 0.5
+    assert (
+        np.abs(distance - radius)[met].max() < 8 * 2.0**-24 * 3.5
+    )  # some roundings of coordinates below 3.5
+
+
+@pytest.mark.parametrize("above", [True, False])
+def test_two_sided_materials_are_lit_on_either_side(above: bool) -> None:
+    """Seen and lit from above or from below, a two-sided floor is the same; below, others are black."""
+    z = 1 if above else -1
+    light = {"light": {"type": "mrt_light", "position": [1, 0, 2 * z]}}
+    ray = (0.1, 0.2, 5 * z), (0, 0, -z)
+    diffuse = {"type": "diffuse", "reflectance": 0.6}
+    both = radiance({**light, "floor": {**FLOOR, "bsdf": {"type": "twosided", "bsdf": diffuse}}}, *ray)
+    one = radiance({**light, "floor": {**FLOOR, "bsdf": diffuse}}, *ray)
+    to_light = np.array([0.9, -0.2, 2])
+    expected = 0.6 / np.pi * 2 / np.linalg.norm(to_light)
+    np.testing.assert_allclose(both, expected, rtol=1e-5)
+    np.testing.assert_allclose(one, expected if above else 0, rtol=1e-5)
+
+
+def test_mirrors_follow_the_interpolated_normal() -> None:
+    """A flat triangle whose normals lean by 30°, seen from above, shows what is at 60° from the zenith."""
+    mesh = mi.Mesh("leaning", 3, 1, has_vertex_normals=True)
+    parameters = mi.traverse(mesh)
+    lean = np.radians(30)
+    parameters["vertex_positions"] = [-1.0, -1, 0, 3, -1, 0, -1, 3, 0]
+    parameters["vertex_normals"] = [np.sin(lean), 0.0, np.cos(lean)] * 3
+    parameters["faces"] = [0, 1, 2]
+    parameters.update()
+    mesh.set_bsdf(mi.load_dict(MIRROR))
+    # Two walls: the mirror ray at 60° towards +x meets the nearer one where it is lit by its own light
+    wall = {"type": "mrt_plane", "normal": [-1, 0, 0], "distance": 2.0, "bsdf": MATTE}
+    light = {"type": "mrt_light", "position": [1, 0, 2 / np.tan(np.radians(60))]}
+    found = radiance({"mesh": mesh, "wall": wall, "light": light}, (0, 0, 5), (0, 0, -1))
+    # straight across from the light: cos 0, the diffuse part alone
+    np.testing.assert_allclose(found, 0.5 / np.pi, rtol=1e-4)
+
+
+@pytest.mark.parametrize("f0", [0.0, 0.02])
+def test_schlick_mirrors_at_grazing_angles_whatever_is_reflected_at_normal_incidence(f0: float) -> None:
+    """F(θ) = f0 + (1 − f0)(1 − cos θ)⁵ of the sky, for every f0; dim paths are cut as by default."""
+    floor = {**FLOOR, "bsdf": {"type": "mrt_bsdf", "f0": f0, "diffuse_reflectance": 0.0}}
+    sky = {"type": "constant", "radiance": 0.5}
+    cos = np.array([0.05, 0.2, 0.5])
+    d = np.stack([np.sqrt(1 - cos**2), np.zeros(3), -cos], axis=1)
+    found = radiance(
+        {"floor": floor, "sky": sky}, np.tile([0.0, 0, 1], (3, 1)), d, min_contribution=1 / 16 / 255
+    )
+    np.testing.assert_allclose(found[:, 0], 0.5 * (f0 + (1 - f0) * (1 - cos) ** 5), rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["cone", "cylinder"])
+def test_grazing_rays_are_not_lost(kind: str) -> None:
+    """Rays along the sides of upright objects, a few roundings deep: each meets what float64 meets."""
+    rng = np.random.default_rng(3)
+    things = []
+    for x in range(20):
+        base, radius = np.float32([1.7 * x, 0.3 * x, 0]), float(np.float32(rng.uniform(0.2, 0.6)))
+        ends = tuple(map(float, base + np.float32([0, 0, 1]))), tuple(map(float, base))
+        things.append((Cone if kind == "cone" else Cylinder)(*ends, radius, NONE))
+    numbers = np.float32([[*a, *b, r] for a, b, r in (tuple(vars(t).values())[:3] for t in things)])
+    group = {"type": "mrt_group", "kind": kind, "numbers": mi.Bitmap(numbers)}
+    which, count = rng.integers(0, 20, 300_000), 300_000
+    # Tangents of the lowest part of the sides, along the axes, where the box and the surface touch
+    side = rng.choice([-1.0, 1.0], count) * (numbers[which, 6] * (1 - 10.0 ** rng.uniform(-6.3, -5, count)))
+    along_x = rng.random(count) < 0.5
+    height = rng.uniform(0, 2e-7 if kind == "cone" else 1, count)
+    away = np.full(count, -3.0)
+    o = numbers[which, 3:6] + np.where(along_x, [away, side, height], [side, away, height]).T
+    o = np.float32(o)
+    d = np.float32(np.where(along_x[:, None], [1.0, 0, 0], [0, 1.0, 0]))
+    with np.errstate(all="ignore"):
+        parts = np.array_split(np.arange(count), 30)
+        exact = np.concatenate([reference.Axial(things).distances(np.float64(o[k]), d[k]) for k in parts])
+    exact = exact[np.arange(count), which]
+    assert np.isfinite(exact).mean() > 0.3
+    assert np.count_nonzero(np.isfinite(exact) & ~trace({"group": group}, o, d).found) == 0
+
+
+def test_the_place_on_a_cone_is_known_to_roundings_of_the_way_to_it() -> None:
+    """From 1e5 radii away, across the surface: seven roundings of the way at worst, of 200,000 rays."""
+    rng, count, away = np.random.default_rng(4), 200_000, 1e5
+    apex, base, radius = (0.3, 0.1, 1.0), (-0.2, 0.2, -1.0), 0.5
+    d = rng.normal(size=(count, 3))
+    d = np.float32(d / np.linalg.norm(d, axis=1, keepdims=True))
+    o = np.float32(rng.uniform(-0.6, 0.6, (count, 3)) - away * d)
+    cone, length = reference.Axial([Cone(apex, base, radius, NONE)]), np.linalg.norm(np.float64(d), axis=1)
+    with np.errstate(all="ignore"):
+        t = cone.distances(np.float64(o), d / length[:, None])[:, 0] / length
+        n = cone.normals(o + t[:, None] * np.float64(d), np.zeros(count, int))
+    traced = trace({"cone": {"type": "mrt_cone", "apex": apex, "base_center": base, "radius": radius}}, o, d)
+    both = traced.found & np.isfinite(t)
+    assert both.mean() > 0.3
+    across = np.abs((traced.t[both] - t[both]) * (n * d).sum(axis=1)[both])
+    assert across.max() < 12 * 2.0**-24 * away
+
+
+def test_lobes_are_chosen_by_their_mean_reflectance() -> None:
+    """Whatever their colours: 2/3 of cyan gloss against 1/6 of red paint is four in five."""
+    colors = {"specular_reflectance": [0, 1, 1], "diffuse_reflectance": [0.5, 0, 0]}
+    rgb = {name: {"type": "rgb", "value": value} for name, value in colors.items()}
+    bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": "unity", **rgb})
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 100_000)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(0, 0, 1)
+    drawn, _ = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
+    # four standard deviations of a share of 100,000
+    assert np.mean(np.array(drawn.sampled_component) == 1) == pytest.approx(0.8, abs=0.005)
