@@ -18,6 +18,7 @@ WHAT = {
     "mirrors": "bounce loop",
     "textures": "textures",
     "shading_frames": "shading normals",
+    "tangents": "tangents",
     "merged": "merged materials",
     "two_sided": "light from behind",
 }
@@ -38,6 +39,8 @@ WHY = {
     Reason.ONE_SIDED: "no material is lit from behind",
     Reason.SCALAR_VARIANT: "a scalar variant compiles no kernel",
     Reason.SPECTRAL_VARIANT: "a spectral variant",
+    Reason.TANGENTS: "a material needs the frame along texture coordinates",
+    Reason.ISOTROPIC: "no material depends on the direction of texture coordinates",
     Reason.NATIVE_SHAPES: "other shapes, or spheres that emit or face inwards",
     Reason.INSTANCES: "instances in the scene",
     Reason.OTHER_BSDF: "a material other than mrt_bsdf",
@@ -64,7 +67,13 @@ def held(kernel: KernelPlan, facts: SceneFacts) -> list[str]:
         "mirrors": "mirror bounces",
         "textures": "textures and their coordinates",
         "shading_frames": "shading normals of meshes",
+        "tangents": "tangents along texture coordinates",
         "merged": "all materials as one, from a table",
         "two_sided": "light from behind surfaces",
     }
     return [text for name, text in lines.items() if getattr(kernel, name) not in (False, "none", ())]
+
+
+def why(reason: str) -> str:
+    """Return the reason against something in words."""
+    return WHY.get(Reason(reason), reason.replace("-", " "))

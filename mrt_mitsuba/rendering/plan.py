@@ -61,7 +61,7 @@ class Omission:
     @property
     def why(self) -> str:
         """Why, in words."""
-        return _WHY.get(self.reason) or kernel_text.WHY[kernel_text.Reason(self.reason)]
+        return _WHY.get(self.reason) or kernel_text.why(self.reason)
 
 
 @dataclass(frozen=True)

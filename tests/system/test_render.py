@@ -43,27 +43,6 @@ def test_none_traces_the_whole_lattice_in_few_kernels(number):
     assert np.isfinite(result.image).all()
 
 
-@pytest.mark.parametrize("aamode", ["luma", "sobel", "geometry"])
-@pytest.mark.parametrize("aa", [2, 3])
-def test_refined_pass_traces_the_other_samples_of_edge_pixels_only(aamode, aa):
-    result = mrt.render(1, **SMALL, aa=aa, aamode=aamode, layers=["edges"])
-    refined = result.layers["samples.Y"] > 1
-    assert 0 < refined.sum() < refined.size
-    assert set(np.unique(result.layers["samples.Y"])) == {1.0, float(aa**2)}
-    assert result.rays["primary"] == 160 * 120 + refined.sum() * (aa**2 - 1)
-
-
-@pytest.mark.parametrize("aamode", ["luma", "sobel"])
-def test_refined_pixels_equal_full_supersampling_and_the_others_one_sample(aamode):
-    adaptive = mrt.render(3, **SMALL, aamode=aamode, focaldist=0)
-    one = mrt.render(3, **SMALL, aa=1, aamode="none", focaldist=0)
-    full = mrt.render(3, **SMALL, aa=4, aamode="none", focaldist=0)
-    refined = adaptive.layers["samples.Y"] > 1
-    assert np.array_equal(adaptive.image[~refined], one.image[~refined])
-    # the same 16 values summed in another order: a few roundings of a mean below 4
-    np.testing.assert_allclose(adaptive.image[refined], full.image[refined], atol=2e-6)
-
-
 def test_rays_are_counted_as_the_scene_tells():
     """One sphere, one light, nothing reflective: shadow rays only where the light is in front."""
     scene = dataclasses.replace(report_scene(0), planes=(), lights=report_scene(0).lights[:1])
@@ -146,22 +125,6 @@ def test_splitting_the_wavefront_changes_nothing():
                 assert np.array_equal(values, expected[pixels.start : pixels.stop]), name
         start = pixels.stop
     assert start == len(bundle.pixels)
-
-
-@pytest.mark.parametrize("number", SCENES)
-def test_cutting_off_paths_costs_less_than_half_a_step(number):
-    cut = mrt.render(number, **SMALL, aa=1, aamode="none", focaldist=0)
-    whole = mrt.render(
-        number,
-        **SMALL,
-        aa=1,
-        aamode="none",
-        focaldist=0,
-        integrator={"type": "mrt_whitted", "min_contribution": 0.0},
-    )
-    error = np.abs(cut.image - whole.image)
-    assert 0 < error.max() < 0.5 / 255
-    assert error.mean() < 2e-5
 
 
 @pytest.mark.parametrize("number", SCENES)
@@ -335,24 +298,6 @@ def test_depth_is_the_distance_from_the_eye():
     descent = 0.7 / np.hypot(3, 0.7)  # for each unit along the ray
     # the eye is one unit up; float32 camera rays are good to a few 1e-7
     assert result.layers["depth.Z"][37, 50] == pytest.approx(1 / descent, rel=1e-6)
-
-
-def test_motion_blur_averages_shifted_cameras():
-    options = {**SMALL, "aa": 1, "aamode": "none", "focaldist": 0}
-    blurred = mrt.render(0, **options, motion=(0, 0, 0.4), motionsamples=4)
-    scene = report_scene(0)
-    frames = []
-    for k in range(4):
-        shift = np.array([0, 0, 0.4]) * k / 4
-        camera = dataclasses.replace(
-            scene.camera,
-            position=tuple(np.array(scene.camera.position) + shift),
-            target=tuple(np.array(scene.camera.target) + shift),
-        )
-        frames.append(mrt.render(dataclasses.replace(scene, camera=camera), **options).image)
-    difference = np.abs(blurred.image - np.mean(frames, axis=0))
-    # the same rays up to float32 rounding of their origins; edges may flip in single pixels
-    assert np.median(difference) < 1e-6 and difference.mean() < 1e-3
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def test_bounds_hold_and_everything_is_told():
     study = _run()
     assert not _missed(study)
     tables = {part.name: part for part in study.parts if isinstance(part, Table)}
-    assert tables.keys() == {"modes", "path", "noise"}
+    assert tables.keys() == {"modes", "box-filter", "path", "noise"}
     assert len(tables["modes"].rows) == 4 * 2
     picture = next(part for part in study.parts if isinstance(part, Picture))
     assert picture.image.shape == (60, 3 * 80 + 2 * 4, 3)

@@ -66,13 +66,6 @@ def test_gloss_becomes_a_mirror() -> None:
     assert found.slope > 0.9
 
 
-def test_the_centered_lattice_converges_and_the_reports_does_not() -> None:
-    found = stock.antialiasing(3, (1, 4), **SMALL, spp=256)
-    assert found.errors["centered"][1] < 0.3 * found.errors["centered"][0]
-    assert found.errors["report"][1] > found.errors["report"][0]  # its shift costs more than its samples gain
-    assert found.noise < 0.7 * found.errors["centered"][1]  # what is left is not only noise
-
-
 # ---------------------------------------- Approximations in turn ----------------------------------------
 
 

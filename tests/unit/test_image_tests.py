@@ -63,27 +63,21 @@ def test_equal_pictures_give_uniform_p_values() -> None:
     assert stats.kstest(p, "uniform").pvalue > 1e-3
 
 
-def test_a_scale_is_seen_by_the_mean() -> None:
-    """2 % on 768 pixels with 10 % √(2/8) of noise: t of 11, less for the dark ones."""
-    found = pair(1.02 * truth())
-    assert "image" in found.detected_by and found.image.p < 1e-6
-    assert "pixel" not in found.detected_by  # 0.4 standard deviations of a pixel
+SPOT, PATCH = np.ones(SHAPE), np.ones(SHAPE)
+SPOT[5, 7] = (
+    1.8  # 16 standard deviations of the difference of means: with 14 degrees of freedom it takes as many
+)
+PATCH[:16, :16] = 1.07  # one of four tiles: each of its pixels is off by 1.4 standard deviations only
 
 
-def test_a_single_pixel_is_seen_by_the_pixel_test_only() -> None:
-    changed = truth()
-    # 16 standard deviations of the difference of means: with 14 degrees of freedom it takes as many
-    changed[5, 7] *= 1.8
-    assert pair(changed).detected_by == ("pixel",)
-
-
-def test_a_patch_is_seen_by_the_tile_test_only() -> None:
-    """7 % in one of four tiles: each of its pixels is off by 1.4 standard deviations only."""
-    changed = truth()
-    changed[:16, :16] *= 1.07
-    wrong = pair(changed)
-    assert "tile" in wrong.detected_by and "pixel" not in wrong.detected_by
-    assert wrong.tile.p < wrong.image.p
+@pytest.mark.parametrize(
+    ("factor", "seen", "unseen"),
+    [(1.02, "image", "pixel"), (SPOT, "pixel", "image"), (SPOT, "pixel", "tile"), (PATCH, "tile", "pixel")],
+)
+def test_each_question_sees_what_the_others_do_not(factor, seen: str, unseen: str) -> None:
+    """A scale by the mean, a pixel by itself, a patch by its tile."""
+    found = pair(factor * truth())
+    assert seen in found.detected_by and unseen not in found.detected_by
 
 
 def test_power_grows_with_the_level() -> None:
@@ -152,32 +146,34 @@ def test_flip_takes_the_exposures_given() -> None:
     assert other.mean != own.mean
 
 
+ONES = np.ones((8, 8, 3))
+
+
 @pytest.mark.parametrize(
-    ("a", "b", "message"),
+    ("a", "b", "exposures", "message"),
     [
-        (np.ones((8, 8, 3)), np.ones((8, 9, 3)), "one size"),
-        (np.ones((8, 8)), np.ones((8, 8)), "one size"),
-        (np.ones((8, 8, 3)), -np.ones((8, 8, 3)), ">= 0; the image"),
-        (np.full((8, 8, 3), np.nan), np.ones((8, 8, 3)), ">= 0; the reference"),
-        (np.zeros((8, 8, 3)), np.ones((8, 8, 3)), "black"),
+        (ONES, np.ones((8, 9, 3)), None, "one size"),
+        (ONES[..., 0], ONES[..., 0], None, "one size"),
+        (ONES, -ONES, None, ">= 0; the image"),
+        (np.nan * ONES, ONES, None, ">= 0; the reference"),
+        (0 * ONES, ONES, None, "black"),
+        (ONES, ONES, {"tonemapper": "none"}, "tonemapper"),  # at which the library ends the process
     ],
 )
-def test_flip_says_what_it_cannot_compare(a: np.ndarray, b: np.ndarray, message: str) -> None:
+def test_flip_says_what_it_cannot_compare(a, b, exposures, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        flip(a, b)
+        flip(a, b, exposures=exposures)
 
 
-def test_flip_does_not_end_the_process() -> None:
-    with pytest.raises(UsageError, match="tonemapper"):
-        flip(truth(), truth(), exposures={"tonemapper": "none"})
-
-
-def test_wrong_estimates_are_named() -> None:
-    with pytest.raises(UsageError, match="two or more"):
-        estimate(np.ones((1, *SHAPE)))
-    with pytest.raises(UsageError, match="infinite"):
-        exact(np.full(SHAPE, np.inf))
-    with pytest.raises(UsageError, match="negative variance"):
-        Estimate(np.ones(SHAPE), -np.ones(SHAPE))
-    with pytest.raises(UsageError, match="sizes must be the same"):
-        compare(exact(np.ones(SHAPE)), exact(np.ones((3, 3, 3))))
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: estimate(np.ones((1, *SHAPE))), "two or more"),
+        (lambda: exact(np.full(SHAPE, np.inf)), "infinite"),
+        (lambda: Estimate(np.ones(SHAPE), -np.ones(SHAPE)), "negative variance"),
+        (lambda: compare(exact(np.ones(SHAPE)), exact(np.ones((3, 3, 3)))), "sizes must be the same"),
+    ],
+)
+def test_wrong_estimates_are_named(wrong, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        wrong()

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.plugins.kernel_plan import KernelPlan
+from mrt_mitsuba.plugins.kernel_plan import KernelPlan, Reason
+from mrt_mitsuba.rendering import kernel_text
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.rendering.settings import RenderSettings
 
@@ -23,6 +24,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
 GLOSSY = {"type": "mrt_bsdf", "specular_reflectance": 0.9, "int_ior": 3.0}
 DIFFUSE = {"type": "diffuse"}
+BRUSHED = {"type": "roughconductor", "alpha_u": 0.05, "alpha_v": 0.3}
 LIGHT = {"type": "mrt_light", "position": [3, 5, 2], "intensity": 1.0}
 BALL = {"type": "sphere", "center": [0, 0, -4], "bsdf": MATTE}
 CONE = {"type": "mrt_cone", "apex": [0, 1, -4], "base_center": [0, 0, -4], "radius": 0.5, "bsdf": MATTE}
@@ -91,6 +93,7 @@ CHANGES: dict[str, tuple[str, dict[str, Any]]] = {
     "no sky": ("sky", {"sky": None}),
     "mirrors": ("mirrors", {"ball": {**BALL, "bsdf": GLOSSY}}),
     "textures": ("textures", {"ball": textured}),
+    "tangents": ("tangents", {"ball": {**BALL, "bsdf": BRUSHED}}),
     "merged": ("merged", {"ball": {**BALL, "bsdf": DIFFUSE}}),
     "two-sided": ("two_sided", {"ball": {**BALL, "bsdf": {"type": "twosided", "bsdf": DIFFUSE}}}),
     "a sky of the integrator": ("sky", {"integrator": {"type": "mrt_whitted", "sky": 0.3}}),
@@ -114,6 +117,7 @@ def test_a_decision_that_the_plan_shows_changes_the_kernel(change: str) -> None:
 def test_every_decision_is_turned() -> None:
     decisions = {field.name for field in fields(KernelPlan)} - {"reasons"}
     assert {decision for decision, _ in CHANGES.values()} == decisions
+    assert kernel_text.WHAT.keys() == decisions and kernel_text.WHY.keys() == set(Reason)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Mitsuba against ours: direct light, gloss and mirrors, anti-aliasing, approximations, mistakes."""
+"""Mitsuba against ours: direct light, gloss and mirrors, approximations, mistakes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from mrt_mitsuba.validation.oracles.reference import camera_directions, referenc
 from mrt_mitsuba.validation.studies import approximations
 from mrt_mitsuba.validation.tools import mutations
 from mrt_mitsuba.validation.tools.gallery import gallery
-from mrt_mitsuba.validation.tools.image_tests import estimate
 from mrt_mitsuba.validation.tools.sensitivity import sensitivity
 from mrt_mitsuba.validation.tools.study import Study
 
@@ -38,8 +37,10 @@ def run(study: Study, *, quick: bool) -> None:
     """All comparisons with what Mitsuba brings."""
     _direct(study, quick)
     _gloss(study, quick)
-    _antialiasing(study, quick)
-    study.text("The blur is compared with Mitsuba's thinlens camera in the study depth-of-field.")
+    study.text(
+        "Lattices are compared with Mitsuba's box filter in antialiasing, the blur with its thinlens camera "
+        "in depth-of-field."
+    )
     approximations.run(study, quick=quick)
     mutations.run(study, quick=quick)
 
@@ -240,80 +241,11 @@ def _gloss(study: Study, quick: bool) -> None:
     study.plot("gloss_pictures", "Gloss, and the mirror", figure)
 
 
-# ---------------------------------------------- Anti-aliasing -----------------------------------------------
-
-
-@dataclass(frozen=True)
-class Antialiasing:
-    """Root mean square error of our lattices against Mitsuba's box filter, by lattice, per aa; and the
-    reference's own noise."""
-
-    amounts: Sequence[int]
-    errors: Mapping[str, Sequence[float]]
-    noise: float
-
-
-def antialiasing(number: int, amounts: Sequence[int], *, width: int, height: int, spp: int) -> Antialiasing:
-    """Compare lattices with random samples that Mitsuba places and filters itself."""
-    import mitsuba as mi
-
-    size: dict[str, Any] = {"width": width, "height": height}
-    scene = mi.load_dict(mrt.scene_dict(number, fresnel="dielectric", **size))
-    whitted = {"type": "mrt_whitted", "min_contribution": 0.0}
-    integrator = mi.load_dict(whitted)
-    runs = [np.array(mi.render(scene, integrator=integrator, spp=spp // 4, seed=seed)) for seed in range(4)]
-    truth = estimate(runs)
-    errors: dict[str, list[float]] = {"centered": [], "report": []}
-    for lattice, values in errors.items():
-        for aa in amounts:
-            image = mrt.render(scene, integrator=whitted, aa=aa, aamode="none", lattice=lattice).image
-            values.append(float(np.sqrt(np.mean((image - truth.mean) ** 2))))
-    return Antialiasing(tuple(amounts), errors, float(np.sqrt(truth.variance.mean())))
-
-
-def _antialiasing(study: Study, quick: bool) -> None:
-    size: dict[str, Any] = (
-        {"width": 96, "height": 72, "spp": 1024} if quick else {"width": 200, "height": 150, "spp": 8192}
-    )
-    found = antialiasing(3, (1, 2, 4, 8), **size)
-    centered = found.errors["centered"]
-    for i in range(1, len(centered)):
-        study.at_most(
-            f"error of aa={found.amounts[i]} over that of aa={found.amounts[i - 1]}, centered lattice",
-            centered[i] / centered[i - 1],
-            0.75,
-            "an edge pixel is known to 1/aa: 0.5, and noise",
-        )
-    study.at_most(
-        "error of aa=8, centered over the report's lattice",
-        centered[-1] / found.errors["report"][-1],
-        0.5,
-        "the report's lattice shifts the picture by almost half a pixel",
-    )
-    study.record("noise of the box-filtered reference", found.noise)
-    study.table(
-        "antialiasing",
-        "Error against Mitsuba's box filter",
-        ["aa", *found.errors],
-        list(zip(found.amounts, *found.errors.values(), strict=True)),
-        f"Root mean square; the reference, of {size['spp']} random samples a pixel, has {found.noise:.2g} "
-        "itself.",
-    )
-    study.plot(
-        "antialiasing",
-        "Lattices against Mitsuba's box filter",
-        _curve(found.amounts, found.errors, "aa", "root mean square error", floor=found.noise),
-        "Scene 3. The centered lattice converges, the report's keeps its shift. Dashed: noise of the "
-        "reference.",
-    )
-
-
 def _curve(
     x: Sequence[float],
     series: Mapping[str, Sequence[float]],
     xlabel: str,
     ylabel: str,
-    floor: float | None = None,
 ) -> Any:
     from matplotlib.figure import Figure
 
@@ -321,8 +253,6 @@ def _curve(
     axis = figure.subplots()
     for label, y in series.items():
         axis.loglog(x, y, marker="o", label=label)
-    if floor is not None:
-        axis.axhline(floor, color="gray", linestyle="--")
     axis.set_xticks(x, [f"{value:g}" for value in x])
     axis.minorticks_off()
     axis.set_xlabel(xlabel)

@@ -144,35 +144,20 @@ def diagram(found: WorkPrecision) -> Any:
 
     figure = Figure(figsize=(9, 6), layout="constrained")
     axes = figure.subplots()
-    positive = [p.rmse for p in found.points.values() if p.rmse > 1e-9]
-    bottom = 0.4 * min([*positive, *([found.reference_error] if found.reference_error else [])], default=1e-6)
+    points, floor = list(found.points.values()), found.reference_error
+    errors = [p.rmse for p in points if p.rmse > 0] + ([floor] if floor else [])
+    bottom = 0.4 * min(errors, default=1e-6)  # where cases without error are drawn
     numbers = {point.name: number for number, point in numbered(found)}
-    labelled = (
-        numbers.keys() if len(numbers) <= LABELLED else {p.name for p in front(list(found.points.values()))}
-    )
-    for (name, points), marker in zip(found.families.items(), cycle(MARKERS), strict=False):
-        x, y = ([max(v, low) for v in values] for values, low in (
-            ([p.seconds for p in points], 0), ([p.rmse for p in points], bottom)))  # fmt: skip
-        axes.errorbar(
-            x,
-            y,
-            xerr=_bars([p.time for p in points], x),
-            yerr=_bars([p.error for p in points], y),
-            marker=marker,
-            markersize=5,
-            linewidth=1,
-            capsize=2,
-            label=name,
-        )
-        for point, place in zip(points, zip(x, y, strict=True), strict=True):
-            if point.name in labelled:
-                text = str(numbers[point.name])
-                axes.annotate(text, place, textcoords="offset points", xytext=(4, 4), fontsize=8)
-    if found.reference_error:
-        axes.axhspan(
-            bottom / 10, found.reference_error, color="0.9", zorder=0, label="within the reference's error"
-        )
-    if len(positive) < len(found.points):
+    labelled = numbers if len(numbers) <= LABELLED else {p.name for p in front(points)}
+    for (name, curve), marker in zip(found.families.items(), cycle(MARKERS), strict=False):
+        _draw(axes, curve, bottom, label=name, marker=marker)
+    for point in points:
+        if point.name in labelled:
+            place, text = (point.seconds, max(point.rmse, bottom)), str(numbers[point.name])
+            axes.annotate(text, place, textcoords="offset points", xytext=(4, 4), fontsize=8)
+    if floor:
+        axes.axhspan(bottom / 10, floor, color="0.9", zorder=0, label="within the reference's error")
+    if any(p.rmse == 0 for p in points):
         axes.axhline(bottom, color="0.9", linewidth=8, zorder=0, label="no error")
     axes.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="RMSE")
     axes.set_ylim(bottom=0.8 * bottom)
@@ -182,6 +167,13 @@ def diagram(found: WorkPrecision) -> Any:
         _label_between_decades(axis)
     figure.legend(fontsize=8, ncols=4, loc="outside lower center")
     return figure
+
+
+def _draw(axes: Any, curve: Sequence[Point], bottom: float, **style: Any) -> None:
+    """Draw the points of a curve with their intervals."""
+    x, y = [p.seconds for p in curve], [max(p.rmse, bottom) for p in curve]
+    bars = {"xerr": _bars([p.time for p in curve], x), "yerr": _bars([p.error for p in curve], y)}
+    axes.errorbar(x, y, **bars, markersize=5, linewidth=1, capsize=2, **style)
 
 
 def _bars(estimates: Sequence[Estimate], values: Sequence[float]) -> np.ndarray:

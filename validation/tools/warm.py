@@ -20,7 +20,6 @@ class Warm:
     result: Any
     seconds: float  # the median
     spread: float  # (slowest - fastest) / median
-    first: float  # seconds of the first run, in which kernels are compiled or read from the cache
 
 
 LEAST_REPEATS = 3  # for a median that one disturbance does not move
@@ -33,16 +32,17 @@ def measure(
 
     Runs that have taken ``enough`` seconds, three times at least, are left out of further turns.
     """
-    results, first = {}, {}
-    for name, run in runs.items():
-        results[name], first[name] = _timed(run)
+    results = {name: run() for name, run in runs.items()}
     times: dict[Name, list[float]] = {name: [] for name in runs}
     for turn in range(repeats):
         for name, run in runs.items():
-            if turn >= LEAST_REPEATS and sum(times[name]) >= enough:
-                continue
-            times[name].append(_timed(run)[1])
-    return {name: _summary(results[name], times[name], first[name]) for name in runs}
+            if turn < LEAST_REPEATS or sum(times[name]) < enough:
+                times[name].append(_seconds(run))
+    found = {}
+    for name, seconds in times.items():
+        median = statistics.median(seconds)
+        found[name] = Warm(results[name], median, (max(seconds) - min(seconds)) / median)
+    return found
 
 
 @dataclass(frozen=True)
@@ -67,18 +67,13 @@ def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> 
         one()
     for number in range(repeats):
         for index in (0, 1) if number % 2 == 0 else (1, 0):
-            times[index].append(_timed(pair[index])[1])
+            times[index].append(_seconds(pair[index]))
     ratios = [a / b for a, b in zip(*times, strict=True)]
     low, median, high = (float(q) for q in np.quantile(ratios, (0.25, 0.5, 0.75)))
     return Ratio(median, low, high, *(statistics.median(t) for t in times))
 
 
-def _timed(run: Callable[[], Any]) -> tuple[Any, float]:
+def _seconds(run: Callable[[], Any]) -> float:
     start = time.perf_counter()
-    result = run()
-    return result, time.perf_counter() - start
-
-
-def _summary(result: Any, times: list[float], first: float) -> Warm:
-    median = statistics.median(times)
-    return Warm(result, median, (max(times) - min(times)) / median, first)
+    run()
+    return time.perf_counter() - start
