@@ -118,6 +118,23 @@ def vector(form: str = "X,Y,Z") -> Kind:
     return Kind(form, "three finite numbers separated by commas", parse, check)
 
 
+def error_or_place() -> Kind:
+    """A positive number, or three finite ones."""
+    place = vector()
+
+    def check(value: Any) -> Any:
+        if isinstance(value, Iterable):
+            return place.check(value)
+        if isinstance(value, bool) or not 0 < value < math.inf:
+            raise ValueError
+        return float(value)
+
+    def parse(text: str) -> Any:
+        return place.from_text(text) if "," in text else float(plain(text))
+
+    return Kind("X|X,Y,Z", "a positive number, or three separated by commas", parse, check)
+
+
 def size() -> Kind:
     """Return the kind of numbers of bytes, in text with a unit: 4G, 512M."""
 
@@ -164,15 +181,20 @@ def rectangle() -> Kind:
 
 
 def parameters() -> Kind:
-    """Return the kind of dicts of values by keys of ``mi.traverse``."""
+    """Return the kind of dicts of values by names of an XML file or keys of ``mi.traverse``."""
 
     def check(value: Any) -> dict[str, Any]:
         value = dict(value)
-        if not all(isinstance(key, str) and "." in key for key in value):
+        if not all(isinstance(key, str) and key for key in value):
             raise ValueError
         return value
 
-    return Kind("", "a dict of values by keys of mi.traverse, such as material_0.alpha", str, check)
+    return Kind(
+        "",
+        "a dict of values by names of an XML file or keys of mi.traverse, such as material_0.alpha",
+        str,
+        check,
+    )
 
 
 def path() -> Kind:

@@ -15,6 +15,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .variants import is_jit
 
@@ -70,6 +71,16 @@ def vertex_version(shape: Any) -> int:
     if hasattr(shape, "vertex_positions_buffer"):
         return shape.vertex_positions_buffer().index
     return shape.positions.array.index
+
+
+def triangles(mesh: Any) -> np.ndarray:
+    """Return the corners of a mesh's triangles, float64 [M, 3, 3]."""
+    parameters = mi.traverse(mesh)
+    points, faces = (
+        np.array(parameters[name if name in parameters else TENSORS[name]])
+        for name in ("vertex_positions", "faces")
+    )
+    return points.astype(np.float64).reshape(-1, 3)[faces.reshape(-1, 3)]
 
 
 def ray_flags(*, textures: bool, shading_frames: bool, tangents: bool) -> int:

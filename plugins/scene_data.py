@@ -10,8 +10,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .hit_errors import CURVED, HitErrors
 from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
-from .lookup import ByShape
 from .merged_bsdf import MergedBSDF, uniform_materials
 from .mesh_api import ray_flags, surface_interaction, vertex_version
 from .planes import Planes
@@ -20,21 +20,17 @@ from .quadrics import quadrics_of
 from .spheres import Spheres, is_plain_sphere, is_sphere
 from .variants import but_not, is_jit, pointer, varies
 
-# A secondary ray starts this far off its surface, relative to the size of the coordinates involved: 32
-# float32 roundings, a few times what intersection, projection and ray test lose together
-OFFSET = 32 * 2.0**-24
-
 # Reach of a mirror ray: any number that float32 holds
 FARTHEST = 2.0**127
 
 
 @dataclass
 class Hit:
-    """What a ray meets first: an interaction, valid where ``found``, and the size of its coordinates."""
+    """What a ray meets first: an interaction, valid where ``found``, and a bound of its error."""
 
     si: mi.SurfaceInteraction3f
     found: mi.Bool
-    scale: mi.Float
+    error: mi.Float  # how far the point may be off the surface
 
 
 class SceneReading:
@@ -112,7 +108,7 @@ class SceneData:
         self.bvh = _scene_of(others) if own else None
         self.planes = Planes(planes)
         self.quadrics = quadrics_of(exact)
-        self.scales = _Scales(others)
+        self.errors = HitErrors(others)
         self.spheres = Spheres(others) if plan.spheres != "none" else None
         self.lights = reading.lights if plan.lights != "none" else []
         self.light_pointers = pointer("Emitter", self.lights) if plan.lights == "loop" else None
@@ -130,6 +126,7 @@ class SceneData:
         # What lies behind a plane need not be looked for
         ray = mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths)
         si, found, scale = self._intersect_shapes(scene, ray, active)
+        flat = self._error_of_flat(si, found)
         if self.quadrics is not None:
             reach = dr.select(found, si.t, ray.maxt)
             quadric = self.quadrics.intersect(
@@ -138,15 +135,23 @@ class SceneData:
             closer = active & (quadric[0] < reach)
             self.quadrics.put_into(si, ray, quadric, closer, tangents=self.plan.tangents)
             scale = dr.select(closer, self.quadrics.scale(quadric[1], closer), scale)
+            flat = None if flat is None else dr.select(closer, dr.inf, flat)
             found = found | closer
         if self.plan.planes:
             on_plane = but_not(on_plane, found)
             scale = self.planes.put_into(si, ray, plane, on_plane, scale, tangents=self.plan.tangents)
+            flat = None if flat is None else dr.select(on_plane, dr.inf, flat)
             found = found | on_plane
         si.sh_frame = _frame_along(si) if self.plan.tangents else mi.Frame3f(si.sh_frame.n)
         si.wi = si.to_local(-ray.d)
         si.time, si.wavelengths = ray.time, ray.wavelengths
-        return Hit(si, found, dr.maximum(scale, dr.max(dr.abs(si.p))))
+        error = CURVED * dr.maximum(scale, dr.max(dr.abs(si.p)))
+        return Hit(si, found, error if flat is None else dr.minimum(error, flat))
+
+    def _error_of_flat(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Float | None:
+        if self.errors.flat is None:
+            return None
+        return self.errors.of_flat(si, found)
 
     def _intersect_shapes(
         self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
@@ -165,7 +170,7 @@ class SceneData:
         si = surface_interaction(self.bvh or scene, pi, ray, self.ray_flags, found)
         if self.spheres is not None:
             self.spheres.put_back(si, found)
-        return si, found, self.scales(si, found)
+        return si, found, self.errors.size(si, found)
 
     def occluded(self, scene: mi.Scene, hit: Hit, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Bool:
         """Does anything block the segment from ``hit`` to the light sample ``ds``?"""
@@ -194,7 +199,7 @@ class SceneData:
         """Return the point of ``hit`` moved to the side of its surface that ``d`` points to, clear of
         rounding errors.
         """
-        distance = OFFSET * hit.scale
+        distance = hit.error
         n = hit.si.n
         return hit.si.p + n * dr.select(dr.dot(n, d) >= 0, distance, -distance)
 
@@ -280,22 +285,6 @@ def _eval_bsdf(
         context.type_mask = +mi.BSDFFlags.DeltaReflection
         reflectance = mi.unpolarized_spectrum(bsdf.sample(context, si, mi.Float(0), mi.Point2f(0), active)[1])
     return values, reflectance, int_ior
-
-
-class _Scales:
-    """Size of the coordinates of the shape that was hit: the largest number in its bounding box."""
-
-    def __init__(self, shapes: list[mi.Shape]) -> None:
-        sizes = [_coordinate_size(s.bbox()) for s in shapes]
-        # The shapes inside an instance are not of the scene's own: the largest for them
-        self.by_shape = ByShape(mi.Float, shapes, sizes, max(sizes, default=0.0)) if shapes else None
-
-    def __call__(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Float:
-        return mi.Float(0) if self.by_shape is None else self.by_shape(si, found)
-
-
-def _coordinate_size(bbox: Any) -> float:
-    return max(abs(float(x)) for corner in (bbox.min, bbox.max) for x in corner)
 
 
 def _scene_of(shapes: list[mi.Shape]) -> mi.Scene | None:

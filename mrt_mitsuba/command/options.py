@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.command.logs import LEVELS
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.options import angle, checked, choice, either, from_text, option, path, plain, switch, vector
+from mrt_mitsuba.options import checked, choice, either, from_text, option, path, plain, switch
 from mrt_mitsuba.rendering import settings
-from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.rendering.settings import NOISE, RenderSettings
 from mrt_mitsuba.scene.model import is_obj
 from mrt_mitsuba.scene.report import NUMBERS
-
-# An OBJ file has neither camera nor lights; other scenes have their own
-FOR_MODELS = ("texturing", "camera", "target", "up", "fov", "light")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,23 +24,6 @@ class Options(RenderSettings):
     filename: str
     scene_number: int = 0
     scene: str | None = option(None, path(), "XML or OBJ file to render in place of a numbered scene", "none")
-    texturing: str | None = option(
-        None,
-        choice("report", "standard"),
-        "textures of an OBJ file: nearest texel, or bilinear from sRGB",
-        "as convention",
-    )
-    camera: tuple[float, float, float] | None = option(
-        None, vector(), "OBJ file: where the camera is", "by the model's size"
-    )
-    target: tuple[float, float, float] | None = option(
-        None, vector(), "OBJ file: what the camera looks at", "the model's centre"
-    )
-    up: tuple[float, float, float] | None = option(None, vector(), "OBJ file: what is up", "0,1,0")
-    fov: float | None = option(None, angle(), "OBJ file: horizontal field of view", "60")
-    light: tuple[float, float, float] | None = option(
-        None, vector(), "OBJ file: where a white light is, in place of the two", "two, by the model's size"
-    )
     format: str = option("both", choice("png", "exr", "both"), "files to write")
     tonemap: str = option(
         "report", choice("report", "srgb"), "values in the PNG: linear as in the report, or sRGB"
@@ -53,16 +33,10 @@ class Options(RenderSettings):
     log: str = option("warn", choice(*LEVELS), "what to print: warnings; times; every kernel")
 
     def render_arguments(self) -> dict[str, Any]:
-        """Return the options that say how to render, by name, without those about files and messages."""
-        return {name: getattr(self, name) for name in settings.TABLE}
-
-    def shows_model(self) -> bool:
-        """Return whether the scene is an OBJ file, which has neither camera nor lights."""
-        return is_obj(self.scene)
-
-    def model_arguments(self) -> dict[str, Any]:
-        """Return what was given about the view of an OBJ file, by name."""
-        return {name: getattr(self, name) for name in FOR_MODELS if getattr(self, name) is not None}
+        """Return the options that say how to render, by name, without those about files and messages, and
+        without those of ``model`` where there is one."""
+        of_model = self.model().keys() if is_obj(self.scene) else set()
+        return {name: getattr(self, name) for name in sorted({*settings.TABLE, "params"} - of_model)}
 
     def outputs(self) -> tuple[str, ...]:
         """Return the paths of the pictures to write."""
@@ -78,6 +52,7 @@ def parse(arguments: Sequence[str]) -> Options:
     if not arguments:
         raise UsageError("FILENAME is missing: mrt FILENAME [SCENE] [name=value ...]")
     values: dict[str, Any] = {"filename": _filename(arguments[0])}
+    params: dict[str, str] = {}
     rest = list(arguments[1:])
     if rest and "=" not in rest[0]:
         values["scene_number"] = _scene_number(rest.pop(0))
@@ -85,15 +60,41 @@ def parse(arguments: Sequence[str]) -> Options:
         name, equals, text = argument.partition("=")
         if not equals:
             raise UsageError(f"unexpected argument {argument!r}: options are written name=value")
-        if name not in TABLE:
-            raise UsageError(_unknown(name))
-        if name in values:
+        if name in params or (name in values and name in TABLE):
             raise UsageError(f"{name} is given twice")
-        values[name] = from_text(TABLE[name], text)
+        if name in TABLE:
+            values[name] = from_text(TABLE[name], text)
+        else:
+            params[name] = text
     _check_together(values)
-    if "layers=all" in rest and values.get("aamode") == "none":
-        values["layers"] = tuple(layer for layer in values["layers"] if layer != "edges")  # nothing detects
-    return Options(**values)
+    _check_declared(params, values.get("scene"))
+    if "layers=all" in rest:
+        values["layers"] = tuple(name for name in values["layers"] if name not in _not_made(values))
+    options = Options(**values, params=params or None)
+    of_models = [name for name in options.model() if name != "convention"]
+    if of_models and not is_obj(options.scene):
+        raise UsageError(f"{of_models[0]} is of use only with an OBJ file: scene=PATH.obj")
+    return options
+
+
+def _not_made(values: dict[str, Any]) -> set[str]:
+    """Return the layers that no pass makes."""
+    aamode = values.get("aamode", NOISE if isinstance(values.get("target"), float) else None)
+    return (set() if aamode == NOISE else {"error", "variance"}) | (
+        {"edges"} if aamode in ("none", NOISE) else set()
+    )
+
+
+def _check_declared(params: dict[str, str], scene: str | None) -> None:
+    """Raise ``UsageError`` for names that are neither options nor parameters of an XML file."""
+    from mrt_mitsuba.scene.loading import declared
+
+    if not params:
+        return
+    known = declared(scene) if scene and scene.lower().endswith(".xml") else {}
+    strange = next((name for name in params if name not in known), None)
+    if strange is not None:
+        raise UsageError(_unknown(strange, known))
 
 
 def _check_together(values: dict[str, Any]) -> None:
@@ -103,13 +104,6 @@ def _check_together(values: dict[str, Any]) -> None:
     for name in ("motionsamples", "motionmode"):
         if name in values and "motion" not in values:
             raise UsageError(f"{name} is of use only with motion=dx,dy,dz")
-    of_models = [name for name in FOR_MODELS if name in values]
-    if of_models and not is_obj(values.get("scene")):
-        raise UsageError(f"{of_models[0]} is of use only with an OBJ file: scene=PATH.obj")
-    if "camera" in values and values["camera"] == values.get("target"):
-        raise UsageError("camera and target are the same point: move one of them")
-    if values.get("up") == (0, 0, 0):
-        raise UsageError("up=0,0,0: up must have a length, such as up=0,1,0")
 
 
 def check(name: str, value: Any) -> Any:
@@ -147,9 +141,9 @@ def _scenes() -> str:
     return f"{either([str(number) for number in NUMBERS])} ('mrt scenes' lists them)"
 
 
-def _unknown(name: str) -> str:
+def _unknown(name: str, params: Iterable[str] = ()) -> str:
     import difflib
 
-    close = difflib.get_close_matches(name.lstrip("-").lower(), TABLE, n=1)
+    close = difflib.get_close_matches(name.lstrip("-").lower(), [*TABLE, *params], n=1)
     hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
     return f"unknown option {name!r}.{hint}"

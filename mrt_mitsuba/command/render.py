@@ -6,15 +6,14 @@ import os
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.command.options import Options
-from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
-from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE
+from mrt_mitsuba.errors import MrtWarning, OutputError
+from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, is_obj
 
 if TYPE_CHECKING:
-    from mrt_mitsuba.scene.model import Scene, Vector
+    from mrt_mitsuba.scene.model import Scene
 
 
 def run(options: Options) -> int:
@@ -41,8 +40,10 @@ def run(options: Options) -> int:
     progress = Progress() if options.quiet else TerminalProgress(show_plan=options.plan == "show")
     start = time.perf_counter()
     scene: Any = options.scene if options.scene is not None else options.scene_number
-    if options.shows_model():
-        scene = model_view(scene, convention=options.convention, **options.model_arguments())
+    if is_obj(scene):
+        from mrt_mitsuba.scene.placement import model_scene
+
+        scene = model_scene(scene, **options.model())
         _spare_textures(scene, options.outputs())
     result = render(scene, progress=progress, **options.render_arguments())
     seconds = time.perf_counter() - start
@@ -69,44 +70,15 @@ def banner(options: Options) -> str:
 
         scene = report_scene(options.scene_number)
         focus = options.focus(scene.focal_distance, scene.focal_range)
-    own_film = options.scene is not None and not options.shows_model()
+    own_film = options.scene is not None and not is_obj(options.scene)
     width, height = ("from the file", "from the file") if own_film else SIZE
     lines = {
         "Scene": options.scene if options.scene is not None else options.scene_number,
         "Width": options.width or width,
         "Height": options.height or height,
-        "AA": options.aa,
-        "AA mode": options.aamode,
+        "AA": options.aa or ("from the file" if own_film else 4),
+        "AA mode": options.aamode or ("noise" if options.rmse else "from the file" if own_film else "sobel"),
         "F distance": focus.distance or "off",
         "F range": focus.range if focus.distance else "off",
     }
     return "\n".join(f"{name + ':':<12}{value}" for name, value in lines.items())
-
-
-def model_view(
-    path: str,
-    *,
-    convention: str = "report",
-    texturing: str | None = None,
-    camera: Vector | None = None,
-    target: Vector | None = None,
-    up: Vector | None = None,
-    fov: float | None = None,
-    light: Vector | None = None,
-) -> Scene:
-    """Return the scene of an OBJ file as the options show it; what is None stays as ``obj_scene`` places it.
-
-    ``fov`` is horizontal, in degrees; ``light`` is the place of a white light. Raises ``UsageError`` for a
-    camera that sees nothing, and what ``obj_scene`` raises.
-    """
-    from mrt_mitsuba.scene.model import Light, view_problem
-    from mrt_mitsuba.scene.placement import obj_scene
-
-    lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
-    scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)
-    given: dict[str, Any] = {"position": camera, "target": target, "up": up, "hfov": fov}
-    view = replace(scene.camera, **{name: value for name, value in given.items() if value is not None})
-    problem = view_problem(view)
-    if problem:
-        raise UsageError(problem)
-    return replace(scene, camera=view)

@@ -27,7 +27,7 @@ class Layer:
     source: str  #: ``FIRST_HIT``, ``AVERAGED`` or ``DERIVED``
     doc: str
     value: Callable[[Any], Any] = _derived  #: along rays
-    free_with: str = ""  #: the pass that makes it in any case
+    free_with: tuple[str, ...] = ()  #: the passes that make it in any case
     counts: str = ""  #: the kind of rays that it counts
     internal: bool = False  #: cannot be asked for
 
@@ -39,12 +39,23 @@ class Layer:
 
 _ROWS = (
     Layer(
-        "depth", "Z", FIRST_HIT, "distance of the first hit", lambda r: r.distance, free_with="depth of field"
+        "depth",
+        "Z",
+        FIRST_HIT,
+        "distance of the first hit",
+        lambda r: r.distance,
+        free_with=("depth of field",),
     ),
     Layer("normal", "XYZ", FIRST_HIT, "geometric normal", lambda r: r.normal),
     Layer("albedo", "RGB", FIRST_HIT, "diffuse reflectance", lambda r: r.albedo),
-    Layer("edges", "Y", DERIVED, "what the edge detector measured", free_with="edges"),
-    Layer("samples", "Y", DERIVED, "samples of the pixel", free_with="edges"),
+    Layer("position", "XYZ", FIRST_HIT, "place of the first hit", lambda r: r.position),
+    Layer("uv", "UV", FIRST_HIT, "texture coordinates", lambda r: r.uv),
+    Layer("shape", "I", FIRST_HIT, "number of the shape, from 1; 0 for none", lambda r: r.shape),
+    Layer("material", "I", FIRST_HIT, "number of the material, from 1; 0 for none", lambda r: r.material),
+    Layer("edges", "Y", DERIVED, "what the edge detector measured", free_with=("edges",)),
+    Layer("samples", "Y", DERIVED, "samples of the pixel", free_with=("edges", "rounds")),
+    Layer("error", "Y", DERIVED, "standard error of the pixel", free_with=("rounds",)),
+    Layer("variance", "RGB", DERIVED, "variance of the pixel", free_with=("rounds",)),
     Layer("blur", "Y", DERIVED, "amount of blur in pixels"),
     Layer("image", "RGB", AVERAGED, "the picture", lambda r: r.image, internal=True),
     Layer("direct", "RGB", AVERAGED, "light without mirror rays", lambda r: r.direct),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.output.error import ErrorEstimate, Round
 
 if TYPE_CHECKING:
     import numpy as np
@@ -44,6 +45,8 @@ class Result:
     versions: Mapping[str, str]  #: of what decides about pixels
     camera: Mapping[str, np.ndarray]  #: float64 [4, 4], see ``rendering.view``
     inputs: frozenset[str] = frozenset()  #: paths of the pictures that the scene was read from
+    error: ErrorEstimate | None = None  #: to the converged picture; None where nothing was estimated
+    rounds: tuple[Round, ...] = ()  #: what was known after each: the error over the time of this render
 
     def save(self, *paths: str | os.PathLike[str], tonemap: str = "report") -> None:
         """Write .png and .exr files, all or none; raise ``OutputError``.
@@ -64,6 +67,8 @@ class Result:
         changes when it is made again.
         """
         version = self.versions["mrt-mitsuba"]
+        error = self.error and {"rmse": self.error.rmse, "low": self.error.low, "high": self.error.high}
+        rounds = [{"spp": each.spp, "rmse": each.rmse} for each in self.rounds]
         return {
             "software": f"mrt-mitsuba {version}",
             "mrt:version": version,
@@ -71,6 +76,7 @@ class Result:
             "mrt:options": dict(self.options),
             "mrt:variant": self.plan.variant,
             **{f"mrt:{name}": self.versions[name] for name in ("mitsuba", "drjit", "llvm")},
+            **({"mrt:error": error, "mrt:rounds": rounds} if error else {}),
             **{f"mrt:{name}": matrix.tolist() for name, matrix in self.camera.items()},
         }
 

@@ -7,6 +7,9 @@ from typing import Any
 
 from mrt_mitsuba.rays.divisor import Divisor
 
+FILM = "film"
+LATTICES = ("report", "centered", FILM)
+
 
 @dataclass(frozen=True)
 class Lattice:
@@ -15,6 +18,7 @@ class Lattice:
     ``report``: sample (i, j) is at (0.5 + i/aa, 0.5 + j/aa), y upwards, as in the original. Sample 0 is the
     pixel's centre and the others reach into the next pixels, which shifts the picture by up to half a pixel.
     ``centered``: samples are the centres of aa × aa equal cells.
+    ``film``: no grid, but aa × aa places that the sampler of a scene draws, see ``rays.film``.
     """
 
     kind: str
@@ -28,7 +32,7 @@ class Lattice:
     @property
     def holds_centre(self) -> bool:
         """Whether the pixel's centre is one of the samples; it then comes first."""
-        return self.kind == "report" or self.aa % 2 == 1
+        return self.kind == "report" or (self.kind == "centered" and self.aa % 2 == 1)
 
     def offset(self, sample: Any, aa: Divisor) -> tuple[Any, Any]:
         """Return the place of a sample, given by its number, in its pixel: (x, y), y downwards."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,15 +19,20 @@ from mrt_mitsuba.memory import Budget, Workspace
 from mrt_mitsuba.output.layers import AVERAGED, TABLE
 from mrt_mitsuba.output.result import Result, Timings
 from mrt_mitsuba.rays.exposure import Exposure
-from mrt_mitsuba.rendering.job import Job, counting_kernels
+from mrt_mitsuba.rays.film import pixel_format
+from mrt_mitsuba.rays.lattice import FILM
+from mrt_mitsuba.rendering.defaults import decided
+from mrt_mitsuba.rendering.film_passes import FilmPasses
+from mrt_mitsuba.rendering.job import Job, Kernels, counting_kernels
 from mrt_mitsuba.rendering.passes import Passes
-from mrt_mitsuba.rendering.plan import Plan, RenderFacts, make_plan
+from mrt_mitsuba.rendering.plan import FilmFacts, Plan, RenderFacts, make_plan
 from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.rendering.rounds import Goal, OnRound
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, shader_for
 from mrt_mitsuba.rendering.trace import Tracer
 from mrt_mitsuba.rendering.view import View
-from mrt_mitsuba.scene.open import Source, open_scene
+from mrt_mitsuba.scene.open import Source, open_scene, sized
 
 log = logging.getLogger(__name__)
 
@@ -37,9 +42,13 @@ def render(
     *,
     width: int | None = None,
     height: int | None = None,
-    aa: int = 4,
-    aamode: str = "sobel",
-    lattice: str = "report",
+    aa: int | None = None,
+    aamode: str | None = None,
+    target: float | Sequence[float] | None = None,
+    maxspp: int = 4096,
+    maxseconds: float | None = None,
+    on_round: OnRound | None = None,
+    lattice: str | None = None,
     fresnel: str | None = None,
     focaldist: float | None = None,
     focalrange: float | None = None,
@@ -49,11 +58,17 @@ def render(
     motionsamples: int = 16,
     motionmode: str = "frames",
     convention: str = "report",
+    texturing: str | None = None,
+    camera: Sequence[float] | None = None,
+    up: Sequence[float] | None = None,
+    fov: float | None = None,
+    light: Sequence[float] | None = None,
+    sensor: int = 0,
     variant: str | None = None,
     memory: int | str | None = None,
     seed: int = 0,
     integrator: Any = None,
-    spp: int = 1,
+    spp: int | None = None,
     count_rays: bool = False,
     params: Mapping[str, Any] | None = None,
     region: Sequence[int] | None = None,
@@ -65,9 +80,15 @@ def render(
         scene: number of a scene of the report, a ``Scene``, a Mitsuba dict, a Mitsuba scene, or the path of
             an .xml or .obj file.
         width, height: pixels; 800 and 600, or the film's own where the scene brings a film.
-        aa: aa × aa samples in a pixel.
-        aamode: "none", "luma", "sobel" or "geometry": which pixels get more than one sample.
-        lattice: "report" or "centered", see ``rays.lattice.Lattice``.
+        aa: aa × aa samples in a pixel; 4, or 1 in a scene of one's own with a random integrator.
+        aamode: which pixels get more than one sample: all ("none"), edges ("luma", "sobel", "geometry"), or
+            where noise is ("noise"). "sobel", or "none" in a scene of one's own with a random integrator.
+        target: error to render to, the RMSE to the converged picture in linear values. Rays go in rounds to
+            where they are needed. Three numbers: what the camera of an OBJ file looks at.
+        maxspp, maxseconds: where to stop short of the target: mean rays of a pixel, seconds.
+        on_round: called after each round with a ``RoundPicture``; stops the render by returning False.
+        lattice: "report" or "centered", see ``rays.lattice.Lattice``, or "film": as Mitsuba places samples
+            and filters them, which is the default for a scene of one's own.
         fresnel: "schlick" (default) or "dielectric", for the report's scenes.
         focaldist, focalrange: scene units; by default the scene's own; a distance of 0 turns the blur off.
         dof: "report" or "corrected", see ``filters.dof``.
@@ -78,15 +99,19 @@ def render(
             whose rays are spread over the time while the shutter is open, ``motionsamples`` or more in a
             pixel.
         convention: meaning of MTL files, "report" or "standard".
+        texturing, camera, up, fov, light: of an OBJ file, see ``scene.placement.model_scene``.
+        sensor: number of the sensor in a scene that has several.
         variant: Mitsuba variant; by default the current one, else ``llvm_ad_rgb``.
         memory: bytes (or text such as "4G") to stay within.
         seed: of all random numbers.
         integrator: name, dict or instance of a sampling integrator; by default the scene's own.
-        spp: rays for each sample, for integrators that draw random numbers. From 2 on, "luma" and "sobel"
-            know the variance of every pixel and ignore what noise explains; with one random ray they take
-            noise for edges ("geometry" never does).
+        spp: rays for each sample, for integrators that draw random numbers: 1, or as its sampler says in a
+            scene of one's own where ``aa`` and ``aamode`` are left out, too; the mean of a pixel's rays for
+            aamode="noise". From 2 on, "luma" and "sobel" know the variance of every pixel and ignore what
+            noise explains; with one random ray they take noise for edges ("geometry" never does).
         count_rays: count mirror and shadow rays.
-        params: values of the scene's parameters by their ``mi.traverse`` key, set once it is loaded.
+        params: values for the ``$names`` that an XML file declares, and, by keys of ``mi.traverse`` (which
+            have a dot), of a scene that is loaded here.
         region: column, row, width and height of the pixels to return, in place of all; they are the same as
             in the whole picture.
         progress: receives the plan, the stages and their progress.
@@ -101,6 +126,10 @@ def render(
         height=height,
         aa=aa,
         aamode=aamode,
+        target=target,
+        maxspp=maxspp,
+        maxseconds=maxseconds,
+        on_round=on_round,
         lattice=lattice,
         fresnel=fresnel,
         focaldist=focaldist,
@@ -111,6 +140,12 @@ def render(
         motionsamples=motionsamples,
         motionmode=motionmode,
         convention=convention,
+        texturing=texturing,
+        camera=camera,
+        up=up,
+        fov=fov,
+        light=light,
+        sensor=sensor,
         variant=variant,
         memory=memory,
         seed=seed,
@@ -128,41 +163,53 @@ def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Res
     """Render a scene as ``render`` does."""
     start = time.perf_counter()
     with counting_kernels(progress) as kernels:
-        variant = runtime.use(settings.variant)
+        runtime.use(settings.variant)
         runtime.warn_if_slow()
         budget = Budget.of(settings.memory)
         source = open_scene(
             scene,
-            width=settings.width,
-            height=settings.height,
+            size=(settings.width, settings.height),
             fresnel=settings.fresnel,
-            convention=settings.convention,
             integrator=settings.integrator,
             budget=budget,
+            sensor=settings.sensor,
             params=settings.params,
+            model=settings.model(),
         )
-        shader = shader_for(source.scene, source.integrator)
-        plan = make_plan(_facts(source, shader, variant, settings), settings)
-        exposures = _exposures(plan, settings.seed)
-        job = Job(progress, _workspace(plan, exposures, budget), kernels)
-        progress.plan(plan)
-        shader.prepare(plan.kernel)
-        load = time.perf_counter() - start
-        log.info("scene %s loaded in %.3f s for %s", source.name, load, variant)
-        view = View(source.sensor, source.width, source.height, settings.motion)
-        tracer = Tracer(shader, view, job.workspace)
-        total: dict[str, np.ndarray] = {}
-        for exposure in exposures:
-            _add(total, Passes(job, tracer, plan, exposure).run())
+        with sized(source):
+            result = _render(source, settings, budget, kernels, start)
     log.info("%d kernels: compiled in %.3f s, ran for %.3f s", kernels.launches, kernels.compile, kernels.run)
-    timings = Timings(time.perf_counter() - start, load, kernels.compile, kernels.run, job.passes)
+    total = time.perf_counter() - start
+    timings = replace(result.timings, total=total, compile=kernels.compile, kernels=kernels.run)
+    return replace(result, timings=timings, kernel_launches=kernels.launches)
+
+
+def _render(
+    source: Source, settings: RenderSettings, budget: Budget, kernels: Kernels, start: float
+) -> Result:
+    """Render an open scene; what its kernels took in all is not in the result."""
+    shader = shader_for(source.scene, source.integrator)
+    facts = _facts(source, shader, settings)
+    settings = decided(settings, facts)
+    plan = make_plan(facts, settings)
+    exposures = _exposures(plan, settings.seed)
+    job = Job(kernels.progress, _workspace(plan, exposures, budget), kernels)
+    job.progress.plan(plan)
+    shader.prepare(plan.kernel)
+    load = time.perf_counter() - start
+    log.info("scene %s loaded in %.3f s for %s", source.name, load, plan.variant)
+    view = View(source.sensor, source.width, source.height, settings.motion)
+    tracer = Tracer(shader, view, job.workspace)
+    total: dict[str, np.ndarray] = {}
+    for passes in _each_picture(job, tracer, plan, exposures, settings):
+        _add(total, passes.run())
     options = settings.in_force(
         width=plan.width,
         height=plan.height,
         fresnel=source.fresnel,
         focaldist=plan.focus.distance or 0.0,
         focalrange=plan.focus.range,
-        variant=variant,
+        variant=plan.variant,
         integrator=plan.integrator,
     )
     image, layers = _mean(total, plan)
@@ -170,29 +217,55 @@ def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Res
         image,
         layers,
         plan,
-        timings,
+        Timings(0.0, load, 0.0, 0.0, job.passes),
         tracer.rays,
-        kernels.launches,
+        0,
         options,
         runtime.versions(),
         view.matrices(),
         frozenset(budget.pictures),
+        passes.error,
+        tuple(passes.rounds),
     )
 
 
-def _facts(source: Source, shader: Shader, variant: str, settings: RenderSettings) -> RenderFacts:
+def _facts(source: Source, shader: Shader, settings: RenderSettings) -> RenderFacts:
+    import mitsuba as mi
+
     return RenderFacts(
         scene=source.name,
-        variant=variant,
+        variant=str(mi.variant()),
         integrator=shader.name,
         width=source.width,
         height=source.height,
         focus=settings.focus(source.focal_distance, source.focal_range),
         traceable=shader.layers,
         random=shader.random,
+        film=_film_facts(source, shader) if source.own else None,
         kernel=shader.kernel,
         parts=shader.facts,
     )
+
+
+def _film_facts(source: Source, shader: Shader) -> FilmFacts:
+    film, sampler = source.sensor.film(), source.sensor.sampler()
+    return FilmFacts(
+        int(sampler.sample_count()),
+        sampler.class_name(),
+        film.rfilter().class_name(),
+        pixel_format(film),
+        shader.aovs,
+    )
+
+
+def _each_picture(
+    job: Job, tracer: Tracer, plan: Plan, exposures: Sequence[Exposure], settings: RenderSettings
+) -> Iterator[Passes]:
+    kind = FilmPasses if plan.lattice.kind == FILM else Passes
+    rays = settings.maxspp if settings.rmse else plan.repeats
+    goal = Goal(settings.rmse, rays, settings.maxseconds, settings.on_round)
+    for exposure in exposures:
+        yield kind(job, tracer, plan, exposure, goal)
 
 
 def _exposures(plan: Plan, seed: int) -> list[Exposure]:
@@ -220,7 +293,7 @@ def _add(total: dict[str, np.ndarray], picture: dict[str, np.ndarray]) -> None:
     for name, values in picture.items():
         if name not in total:
             total[name] = values
-        elif TABLE[name].source == AVERAGED:
+        elif name not in TABLE or TABLE[name].source == AVERAGED:
             total[name] += values
 
 
@@ -228,9 +301,12 @@ def _mean(total: dict[str, np.ndarray], plan: Plan) -> tuple[np.ndarray, dict[st
     """Return the mean picture [H, W, 3] and its layers by EXR channel, [H, W] each; all are views."""
     shape, inside, layers = (plan.seen.height, plan.seen.width), plan.region.inside(plan.seen), {}
     for name, values in total.items():
-        if TABLE[name].source == AVERAGED and plan.frames > 1:
+        own = name not in TABLE  # a channel of the film's or the integrator's
+        if plan.frames > 1 and (own or TABLE[name].source == AVERAGED):
             values /= np.float32(plan.frames)
-        if name in plan.layers:
+        if own:
+            layers[name] = values.reshape(shape)[inside]
+        elif name in plan.layers:
             for index, letter in enumerate(TABLE[name].letters):
                 layers[f"{name}.{letter}"] = values[:, index].reshape(shape)[inside]
     return total["image"].reshape(*shape, 3)[inside], dict(sorted(layers.items()))

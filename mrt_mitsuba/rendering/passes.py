@@ -6,29 +6,37 @@ rays are independent of each other, and a filter sees as many rows around a band
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from mrt_mitsuba.output.error import ErrorEstimate, Round
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.bundle import Bundle
 from mrt_mitsuba.rays.exposure import Exposure
 from mrt_mitsuba.rendering.detectors import DETECTORS
 from mrt_mitsuba.rendering.job import Job
-from mrt_mitsuba.rendering.plan import BLUR, EDGES, FIRST_HITS, REFINEMENT, RENDERING, Pass, Plan
+from mrt_mitsuba.rendering.levels import Levels
+from mrt_mitsuba.rendering.plan import BLUR, EDGES, FIRST_HITS, REFINEMENT, RENDERING, ROUNDS, Pass, Plan
+from mrt_mitsuba.rendering.rounds import Goal, run_rounds
 from mrt_mitsuba.rendering.trace import Channels, Tracer
 
 
 class Passes:
-    """A picture in the making. ``layers``: by name, [pixels, channels] float32, row by row from the top."""
+    """A picture in the making. ``layers``: by name, [pixels, channels] float32, row by row from the top;
+    ``error`` and ``rounds``: where they were estimated."""
 
-    def __init__(self, job: Job, tracer: Tracer, plan: Plan, exposure: Exposure) -> None:
+    def __init__(self, job: Job, tracer: Tracer, plan: Plan, exposure: Exposure, goal: Goal) -> None:
         self._job, self._tracer = job, tracer
-        self._plan, self._exposure = plan, exposure
+        self._plan, self._exposure, self._goal = plan, exposure, goal
         self._shape = plan.seen.height, plan.seen.width
         self._pixels = plan.seen.pixels(plan.width)
         self.layers: dict[str, np.ndarray] = {}
+        self.channels: dict[str, np.ndarray] = {}  # [pixels], of the film's and the integrator's own
+        self.error: ErrorEstimate | None = None
+        self.rounds: Sequence[Round] = ()
 
     def run(self) -> dict[str, np.ndarray]:
         """Run the passes of the plan; return the layers."""
@@ -38,12 +46,13 @@ class Passes:
             EDGES: self._detect,
             REFINEMENT: self._refine,
             BLUR: self._blur,
+            ROUNDS: self._rounds,
         }
         for step in self._plan.passes:
             run[step.name](step)
         if "samples" in self._plan.layers and "samples" not in self.layers:
             self._add("samples")[:] = self._plan.lattice.count
-        return self.layers
+        return self.layers | self.channels
 
     # --------------------------------------------- Rays ---------------------------------------------
 
@@ -76,6 +85,26 @@ class Passes:
                         total = step.first * self.layers[name][pixels, channel] + bundle.count * plane
                         self.layers[name][pixels, channel] = total / np.float32(self._plan.lattice.count)
                     advance(len(pixels))
+
+    def _rounds(self, step: Pass) -> None:
+        """Double the lattice where that changes pixels, until the error is as small as was asked for."""
+        for name in step.layers:
+            self._add(name)
+
+        def trace(aa: int, pixels: np.ndarray) -> np.ndarray:
+            """Set pixels to the mean of a lattice; return their colours, [pixels, 3]."""
+            exposure = replace(self._exposure, samples=replace(self._plan.lattice, aa=aa))
+            bundle = exposure.lattice(np.asarray(self._pixels, np.uint32)[pixels])
+            for part, values in self._tracer.trace(bundle, step.layers, seed=exposure.seed + aa):
+                for name, channel, plane in _channels(values):
+                    self.layers[name][pixels[part], channel] = plane
+            return self.layers["image"][pixels]
+
+        levels = Levels(self._shape, self._plan.lattice.kind, trace)
+        self.rounds = run_rounds(levels, len(self._pixels), self._goal, self._job.stage)
+        self.error = levels.error()
+        _, errors, samples = levels.maps()
+        self._add("error")[:, 0], self._add("samples")[:, 0] = errors.ravel(), samples.ravel()
 
     def _edges(self) -> Iterator[np.ndarray]:
         """Yield edge pixels by their place in the layers, some rows at a time."""
@@ -111,11 +140,14 @@ class Passes:
         from mrt_mitsuba import filters
 
         read = [self._picture(name)[rows] for name in DETECTORS[detector].reads]
-        options = {}
-        if "square" in self.layers:
-            rays = self._exposure.centre(self._pixels).rays_per_pixel
-            options["variance"] = np.maximum(self._picture("square")[rows] - read[0] ** 2, 0) / (rays - 1)
+        options = {"variance": self._variance(rows)} if "square" in self.layers else {}
         return getattr(filters, f"{detector}_edges")(*read, **options)
+
+    def _variance(self, rows: slice) -> np.ndarray:
+        """Return the variance of pixels as their rays tell it, [rows, W, 3]."""
+        rays = self._exposure.centre(self._pixels).rays_per_pixel
+        square = self._picture("square")[rows] - self._picture("image")[rows] ** 2
+        return np.asarray(np.maximum(square, 0) / (rays - 1))
 
     def _blur(self, step: Pass) -> None:
         """Blur the picture in place; what the next band sees of this one is kept as it was."""

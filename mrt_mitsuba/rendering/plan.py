@@ -11,15 +11,18 @@ from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.output import layers
 from mrt_mitsuba.output.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
-from mrt_mitsuba.rays.lattice import Lattice
+from mrt_mitsuba.rays.lattice import FILM, Lattice
 from mrt_mitsuba.rays.region import Region
 from mrt_mitsuba.rendering import kernel_text
 from mrt_mitsuba.rendering.detectors import DETECTORS
-from mrt_mitsuba.rendering.settings import Focus, RenderSettings
+from mrt_mitsuba.rendering.settings import NOISE, Focus, RenderSettings
+
+# Float32 channels of a pixel that its statistics take while rounds are shared out
+ROUND_CHANNELS = 110
 
 # Passes over the picture, in the order in which they may occur
 FIRST_HITS, RENDERING, EDGES = "first hits", "rendering", "edges"
-REFINEMENT, BLUR = "anti-aliasing", "depth of field"
+REFINEMENT, BLUR, ROUNDS = "anti-aliasing", "depth of field", "rounds"
 
 _WHY = {
     "one-sample": "aa=1 has no further samples to add",
@@ -27,7 +30,24 @@ _WHY = {
     "no-focus": "no focal distance",
     "not-needed": "nothing needs it",
     "not-asked-for": "not asked for",
+    "noise": "rounds go where the variance is",
+    "linear-rgb": "pictures are linear sRGB, whose luminance or XYZ follow",
+    "spectrum": "the picture is the colour of the spectrum that the film sees",
+    "one-sequence": "rounds continue one sequence of numbers in each pixel",
+    "lattice": "the lattice that was asked for places and averages samples",
+    "arrays": "a scalar variant traces a lattice, ray by ray",
 }
+
+
+@dataclass(frozen=True)
+class FilmFacts:
+    """What the film and the sampler of someone's own scene ask for."""
+
+    rays: int  #: of each pixel, as the sampler says
+    sampler: str  #: its class
+    rfilter: str  #: class of the reconstruction filter
+    pixel_format: str  #: "rgb", "rgba", "luminance", ...; "" for a film of another kind
+    aovs: tuple[str, ...] = ()  #: channels of the integrator's own
 
 
 @dataclass(frozen=True)
@@ -42,6 +62,7 @@ class RenderFacts:
     focus: Focus  #: what is sharp
     traceable: frozenset[str]  #: layers that the integrator provides
     random: bool  #: does the integrator draw random numbers
+    film: FilmFacts | None  #: of someone's own scene
     kernel: KernelPlan | None  #: what the tracing kernels hold; None where the integrator does not say
     parts: SceneFacts | None  #: what the kernels depend on
 
@@ -75,8 +96,12 @@ class Pass:
     repeats: int = 1  #: rays for each sample
     mode: str = ""  #: of a filter
     noisy: bool = False  #: does a filter take noise for edges
+    film: bool = False  #: are samples placed by the rules of a film
 
     def __str__(self) -> str:
+        if self.film and self.name in (RENDERING, REFINEMENT):
+            where = "a pixel" if self.name == RENDERING else "and more in edge pixels"
+            return f"{self.samples * self.repeats} rays {where}, placed and filtered by the film"
         times = f", {self.repeats} rays each" if self.repeats > 1 else ""
         shown = [name for name in LAYERS if name in self.layers]
         layers = f", with {', '.join(shown)}" if shown else ""
@@ -87,6 +112,7 @@ class Pass:
             EDGES: f"edges: {self.mode}{noise}",
             REFINEMENT: f"{self.samples} further samples in edge pixels{times}",
             BLUR: f"depth of field: {self.mode}",
+            ROUNDS: f"rounds of rays, {self.mode}",
         }[self.name]
 
 
@@ -113,7 +139,17 @@ class Plan(RenderFacts):
     @property
     def channels(self) -> int:
         """Float32 channels kept for every pixel: the picture, its layers, and the detector's."""
-        return layers.channels(self.traced | self.layers)
+        channels = layers.channels(self.traced | self.layers)
+        if self.lattice.kind == FILM:
+            # sums by pixel, in double precision, while a film is exposed
+            aovs = len(self.film.aovs) if self.film else 0
+            channels += (ROUND_CHANNELS if ROUNDS in self.steps else 16) + 5 * aovs
+        return channels
+
+    @property
+    def steps(self) -> frozenset[str]:
+        """Names of the passes."""
+        return frozenset(step.name for step in self.passes)
 
     @property
     def seen(self) -> Region:
@@ -131,9 +167,10 @@ class Plan(RenderFacts):
         part = self.region
         if (part.width, part.height) != (self.width, self.height):
             lines += [f"  region  {part.width}x{part.height} from column {part.x}, row {part.y}"]
-        moments = "at least {} moments in a pixel" if self.motion == "stratified" else "{} frames"
+        moments = {"stratified": "at least {} moments in a pixel", "film": "each ray at its own moment"}
         if self.motion:
-            lines += [f"  pass    motion blur: {moments.format(self.motion_samples)}"]
+            text = moments.get(self.motion, "{} frames").format(self.motion_samples)
+            lines += [f"  pass    motion blur: {text}"]
         lines += [f"  pass    {step}" for step in self.passes]
         if self.kernel is None or self.parts is None:
             lines += [f"  kernel  {self.integrator}.sample"]
@@ -146,12 +183,15 @@ class Plan(RenderFacts):
 
 def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
     """Decide what to trace and what to leave out. Raises ``UsageError`` for layers that nothing provides."""
-    asked, lattice = frozenset(settings.layers), Lattice(settings.lattice, settings.aa)
-    _check_layers(asked, facts, settings.aamode)
-    detector = settings.aamode if settings.aamode != "none" and (lattice.aa > 1 or "edges" in asked) else None
+    asked, lattice = frozenset(settings.layers), Lattice(str(settings.lattice), int(settings.aa or 1))
+    _check_layers(asked, facts, settings)
+    aamode = str(settings.aamode)
+    detector = aamode if aamode in DETECTORS and (lattice.aa > 1 or "edges" in asked) else None
     blur = settings.dof if facts.focus.distance else None
     traced = _traced(asked, facts, settings, detector)
-    passes = _passes(traced, lattice, detector, blur, settings.spp, facts.random)
+    passes = _passes(traced, lattice, detector, facts, settings)
+    if blur:
+        passes += (Pass(BLUR, mode=blur),)
     made = {step.name for step in passes}
     return Plan(
         **vars(facts),
@@ -159,12 +199,12 @@ def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
         lattice=lattice,
         detector=detector,
         blur=blur,
-        repeats=settings.spp,
-        motion=settings.motionmode if settings.motion else None,
+        repeats=_repeats(settings, lattice),
+        motion=(FILM if lattice.kind == FILM else settings.motionmode) if settings.motion else None,
         motion_samples=settings.motionsamples if settings.motion else 1,
-        layers=asked | {name for name, layer in LAYERS.items() if layer.free_with in made},
+        layers=asked | {name for name, layer in LAYERS.items() if made & set(layer.free_with)},
         passes=passes,
-        left_out=tuple(_left_out(traced, facts, made, lattice.aa, settings.aamode)),
+        left_out=tuple(_left_out(traced, facts, made, settings)),
     )
 
 
@@ -175,9 +215,13 @@ def _region(asked: Sequence[int] | None, facts: RenderFacts) -> Region:
     return region
 
 
-def _check_layers(asked: frozenset[str], facts: RenderFacts, aamode: str) -> None:
-    if "edges" in asked and aamode == "none":
-        raise UsageError("layers=edges: aamode=none looks for none; choose luma, sobel or geometry")
+def _check_layers(asked: frozenset[str], facts: RenderFacts, settings: RenderSettings) -> None:
+    if "edges" in asked and settings.aamode not in DETECTORS:
+        raise UsageError(
+            f"layers=edges: aamode={settings.aamode} looks for none; choose luma, sobel or geometry"
+        )
+    if asked & {"error", "variance"} and settings.aamode != NOISE:
+        raise UsageError("layers=error,variance: only rounds estimate them; give a target= or aamode=noise")
     missing = sorted(asked - facts.traceable - layers.named(DERIVED))
     if missing:
         raise UsageError(
@@ -194,7 +238,7 @@ def _traced(
         wanted |= {"depth"}
     if detector:
         wanted |= set(DETECTORS[detector].reads)
-        if settings.spp > 1 and DETECTORS[detector].takes_variance:
+        if (settings.spp or 1) > 1 and DETECTORS[detector].takes_variance:
             wanted |= {"square"}
     if settings.count_rays:
         wanted |= {name for name, layer in TABLE.items() if layer.counts} & facts.traceable
@@ -205,37 +249,77 @@ def _passes(
     traced: frozenset[str],
     lattice: Lattice,
     detector: str | None,
-    blur: str | None,
-    repeats: int,
-    random: bool,
+    facts: RenderFacts,
+    settings: RenderSettings,
 ) -> tuple[Pass, ...]:
-    passes = []
+    passes, repeats, film = [], _repeats(settings, lattice), lattice.kind == FILM
     at_centre = traced & layers.named(FIRST_HIT)
-    if detector is None:
-        if at_centre and not lattice.holds_centre:
-            # layers of the first hit belong to the pixel's centre
-            passes.append(Pass(FIRST_HITS, at_centre, 1))
-            traced -= at_centre
-        passes.append(Pass(RENDERING, traced, lattice.count, repeats=repeats))
+    noise = settings.aamode == NOISE
+    if at_centre and (film or noise or (detector is None and not lattice.holds_centre)):
+        # layers of the first hit belong to the pixel's centre
+        passes.append(Pass(FIRST_HITS, at_centre, 1))
+        traced -= at_centre
+    if noise:
+        passes.append(Pass(ROUNDS, traced, mode=_goal(settings), film=film))
+    elif detector is None:
+        passes.append(Pass(RENDERING, traced, lattice.count, repeats=repeats, film=film))
     else:
-        noisy = random and repeats == 1 and DETECTORS[detector].takes_variance
-        passes += [Pass(RENDERING, traced, 1, repeats=repeats), Pass(EDGES, mode=detector, noisy=noisy)]
+        noisy = facts.random and repeats == 1 and DETECTORS[detector].takes_variance
+        passes += [
+            Pass(RENDERING, traced, 1, repeats=repeats, film=film),
+            Pass(EDGES, mode=detector, noisy=noisy),
+        ]
         if lattice.count > 1:
-            first = 1 if lattice.holds_centre else 0  # the centre is not traced again
+            first = 1 if film or lattice.holds_centre else 0  # the centre is not traced again
             averaged = traced - at_centre - {"square"}
-            passes.append(Pass(REFINEMENT, averaged, lattice.count - first, first, repeats))
-    return tuple(passes + ([Pass(BLUR, mode=blur)] if blur else []))
+            passes.append(Pass(REFINEMENT, averaged, lattice.count - first, first, repeats, film=film))
+    return tuple(passes)
+
+
+def _repeats(settings: RenderSettings, lattice: Lattice) -> int:
+    """Return the rays for each sample; on a film, each has a moment of its own."""
+    rays, moments = int(settings.spp or 1), settings.motionsamples
+    if not settings.motion or lattice.kind != FILM or settings.aamode == NOISE:
+        return rays
+    return rays * moments if settings.motionmode == "frames" else max(rays, -(-moments // lattice.count))
+
+
+def _goal(settings: RenderSettings) -> str:
+    if settings.rmse is None:
+        return f"{settings.spp} a pixel on average, where the variance is"
+    seconds = "" if settings.maxseconds is None else f" or {settings.maxseconds:g} s"
+    return f"to an error of {settings.rmse:g}, at most {settings.maxspp} a pixel{seconds}"
 
 
 def _left_out(
-    traced: frozenset[str], facts: RenderFacts, made: set[str], aa: int, aamode: str
+    traced: frozenset[str], facts: RenderFacts, made: set[str], settings: RenderSettings
 ) -> list[Omission]:
     left_out = [Omission(name, reason.value) for name, reason in facts.kernel.reasons] if facts.kernel else []
     if EDGES not in made:
-        left_out.append(Omission(EDGES, "all-samples" if aamode == "none" else "one-sample"))
+        reasons = {"none": "all-samples", NOISE: "noise"}
+        left_out.append(Omission(EDGES, reasons.get(str(settings.aamode), "one-sample")))
     if BLUR not in made:
         left_out.append(Omission(BLUR, "no-focus"))
     if "depth" not in traced:
         left_out.append(Omission("depth", "not-needed"))
     skipped = [name for name in LAYERS if name in facts.traceable - traced - {"depth"}]
-    return left_out + [Omission(name, "not-asked-for") for name in skipped]
+    left_out += [Omission(name, "not-asked-for") for name in skipped]
+    return left_out + _film_left_out(facts, settings)
+
+
+def _film_left_out(facts: RenderFacts, settings: RenderSettings) -> list[Omission]:
+    """Return what a film or a sampler asks for and does not get."""
+    film = facts.film
+    if film is None:
+        return []
+    if settings.lattice != FILM:
+        reason = "arrays" if facts.variant.startswith("scalar") else "lattice"
+        return [Omission(f"{film.rfilter} and {film.sampler}", reason)]
+    left_out = []
+    if film.pixel_format.startswith("xyz"):
+        left_out.append(Omission(f"pixel format {film.pixel_format}", "linear-rgb"))
+    if not film.pixel_format:
+        left_out.append(Omission("spectral bands of the film", "spectrum"))
+    if settings.aamode == NOISE:
+        left_out.append(Omission(film.sampler, "one-sequence"))
+    return left_out

@@ -9,9 +9,11 @@ from typing import Any
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import (
+    angle,
     anything,
     checked,
     choice,
+    error_or_place,
     integer,
     number,
     option,
@@ -24,9 +26,12 @@ from mrt_mitsuba.options import (
     word,
 )
 from mrt_mitsuba.output.layers import LAYERS
+from mrt_mitsuba.rays.lattice import LATTICES
 from mrt_mitsuba.rendering.detectors import DETECTORS
 from mrt_mitsuba.scene.model import SIZE
 
+NOISE = "noise"  # the aamode that puts rays where the variance is
+MIN_SPP = 16  # rays of a pixel that tell its variance
 LARGEST_SIDE = 65536  # pixels; whether the memory suffices is checked where it is planned
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
 
@@ -52,16 +57,28 @@ class RenderSettings:
     height: int | None = option(
         None, integer(1, LARGEST_SIDE), f"image height in pixels, up to {LARGEST_SIDE}", str(SIZE[1])
     )
-    aa: int = option(
-        4, integer(1, LARGEST_AA), f"anti-aliasing: aa x aa samples per pixel, up to {LARGEST_AA}"
+    aa: int | None = option(
+        None, integer(1, LARGEST_AA), f"anti-aliasing: aa x aa samples per pixel, up to {LARGEST_AA}", "4"
     )
-    aamode: str = option(
+    aamode: str | None = option(
+        None,
+        choice("none", *DETECTORS, NOISE),
+        "refine all pixels, only edges in brightness (luma, sobel) or shape (geometry), or where noise is",
         "sobel",
-        choice("none", *DETECTORS),
-        "refine every pixel, or only edges in brightness (luma, sobel) or in shape (geometry)",
     )
-    lattice: str = option(
-        "report", choice("report", "centered"), "samples from the pixel centre on, or around it"
+    target: float | tuple[float, float, float] | None = option(
+        None,
+        error_or_place(),
+        "error to render to (RMSE, linear); OBJ file: what the camera looks at",
+        "none",
+    )
+    maxspp: int = option(4096, integer(MIN_SPP, 2**24), "rays of a pixel at most, with a target, on average")
+    maxseconds: float | None = option(None, number(0), "seconds to spend at most, with a target", "none")
+    lattice: str | None = option(
+        None,
+        choice(*LATTICES),
+        "samples from the pixel centre on, around it, or by the rules of a scene's film",
+        "report, own scenes: film",
     )
     fresnel: str | None = option(None, choice("schlick", "dielectric"), "reflectance formula", "schlick")
     focaldist: float | None = option(
@@ -86,13 +103,34 @@ class RenderSettings:
     convention: str = option(
         "report", choice("report", "standard"), "MTL files: Ni is the roughness, or the IOR"
     )
+    texturing: str | None = option(
+        None,
+        choice("report", "standard"),
+        "textures of an OBJ file: nearest texel, or bilinear from sRGB",
+        "as convention",
+    )
+    camera: tuple[float, float, float] | None = option(
+        None, vector(), "OBJ file: where the camera is", "by the model's size"
+    )
+    up: tuple[float, float, float] | None = option(None, vector(), "OBJ file: what is up", "0,1,0")
+    fov: float | None = option(None, angle(), "OBJ file: horizontal field of view", "60")
+    light: tuple[float, float, float] | None = option(
+        None, vector(), "OBJ file: where a white light is, in place of the two", "two, by the model's size"
+    )
     variant: str | None = option(None, word(), "Mitsuba variant", "llvm_ad_rgb, without LLVM scalar_rgb")
     memory: int | None = option(
         None, size(), "memory to stay within: a number, with K, M, G or T for a unit", "half of what is free"
     )
     seed: int = option(0, integer(0, 2**32 - 1), "seed where anything is random")
     integrator: object = option(None, anything())
-    spp: int = option(1, integer(1, 65536), "rays for each sample, where the integrator is random")
+    sensor: int = option(0, integer(0, 65535), "number of the sensor, in a scene that has several")
+    on_round: object = option(None, anything())
+    spp: int | None = option(
+        None,
+        integer(1, 65536),
+        "rays for each sample, where the integrator is random; aamode=noise: mean of a pixel",
+        "1",
+    )
     count_rays: bool = option(False, switch())
     params: Mapping[str, Any] | None = option(None, parameters())
     region: tuple[int, int, int, int] | None = option(None, rectangle())
@@ -101,11 +139,30 @@ class RenderSettings:
         for field in dataclasses.fields(self):
             if "kind" in field.metadata:
                 object.__setattr__(self, field.name, checked(field, getattr(self, field.name)))
+        self.model()  # checks what shows nothing
 
     @classmethod
     def of(cls, **options: Any) -> RenderSettings:
         """Return the settings for options as Python gives them: a list for a tuple, "4G" for bytes."""
         return cls(**options)
+
+    @property
+    def rmse(self) -> float | None:
+        """The error to render to."""
+        return self.target if isinstance(self.target, float) else None
+
+    def model(self) -> dict[str, Any]:
+        """Return what is given about a model and its view, as ``placement.model_scene`` takes it.
+
+        Raises ``UsageError`` for a view that shows nothing.
+        """
+        if self.camera is not None and self.camera == self.target:
+            raise UsageError("camera and target are the same point: move one of them")
+        if self.up == (0, 0, 0):
+            raise UsageError("up=0,0,0: up must have a length, such as up=0,1,0")
+        names = ("texturing", "camera", "up", "fov", "light")
+        given = {name: getattr(self, name) for name in names} | {"target": None if self.rmse else self.target}
+        return {"convention": self.convention} | {k: v for k, v in given.items() if v is not None}
 
     def focus(self, distance: float | None, reach: float) -> Focus:
         """Return the focus, in a scene that suggests ``distance`` and ``reach``; 0 turns it off."""

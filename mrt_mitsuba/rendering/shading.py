@@ -6,7 +6,7 @@ any other sampling integrator gives the picture, and Mitsuba the first hit.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -23,11 +23,14 @@ class RayValues:
     image: Any
     si: Any  # interaction at the first hit
     found: Any  # is there one
+    valid: Any  # did the integrator find anything; Mitsuba's alpha
+    aovs: Sequence[Any] = ()  # channels of the integrator's own
 
-    def __init__(self, view: View, ray: Any, weight: Any) -> None:
+    def __init__(self, scene: Any, view: View, ray: Any, weight: Any) -> None:
         import mitsuba as mi
 
-        self.view, self.ray, self.weight = view, ray, mi.unpolarized_spectrum(weight)
+        self.scene, self.view, self.ray = scene, view, ray
+        self.weight = mi.unpolarized_spectrum(weight)
 
     @property
     def distance(self) -> Any:
@@ -43,6 +46,50 @@ class RayValues:
         import mitsuba as mi
 
         return dr.select(self.found, mi.Vector3f(self.si.n), 0)
+
+    @property
+    def position(self) -> Any:
+        """Place of the first hit; 0 for a miss."""
+        import drjit as dr
+        import mitsuba as mi
+
+        return dr.select(self.found, mi.Vector3f(self.si.p), 0)
+
+    @property
+    def uv(self) -> Any:
+        """Texture coordinates of the first hit; 0 for a miss."""
+        import drjit as dr
+        import mitsuba as mi
+
+        return dr.select(self.found, mi.Vector2f(self.si.uv), 0)
+
+    @property
+    def shape(self) -> Any:
+        """Number of the scene's shape that is hit first, from 1; 0 for a miss."""
+        import drjit as dr
+        import mitsuba as mi
+
+        from mrt_mitsuba.plugins.lookup import ByShape
+
+        hit, shapes = mi.SurfaceInteraction3f(self.si), self.scene.shapes()
+        if mi.variant().startswith("scalar"):
+            hit.shape = hit.instance or hit.shape
+        else:
+            hit.shape = dr.select(hit.instance != None, hit.instance, hit.shape)  # noqa: E711 - lane by lane
+        return ByShape(mi.Float, shapes, range(1, len(shapes) + 1), 0.0)(hit, self.found)
+
+    @property
+    def material(self) -> Any:
+        """Number of the material that is hit first, from 1 in the order of the shapes; 0 for a miss, and in
+        an instance."""
+        import mitsuba as mi
+
+        from mrt_mitsuba.plugins.lookup import ByShape
+
+        shapes, numbers = self.scene.shapes(), dict[int, int]()
+        materials = [shape.bsdf() for shape in shapes]  # kept, so that each has an id of its own
+        rows = [numbers.setdefault(id(material), len(numbers) + 1) for material in materials]
+        return ByShape(mi.Float, shapes, rows, 0.0)(self.si, self.found)
 
     @property
     def albedo(self) -> Any:
@@ -64,9 +111,12 @@ class RayValues:
 class SampledValues(RayValues):
     """Values of any sampling integrator: the picture; Mitsuba knows the first hit."""
 
-    def __init__(self, view: View, ray: Any, weight: Any, spectrum: Any, scene: Any) -> None:
-        super().__init__(view, ray, weight)
-        self.scene, self.image = scene, self.rgb(spectrum)
+    def __init__(self, scene: Any, view: View, ray: Any, weight: Any, sample: tuple[Any, Any, Any]) -> None:
+        import mitsuba as mi
+
+        super().__init__(scene, view, ray, weight)
+        spectrum, self.valid, self.aovs = sample
+        self.image = self.rgb(mi.unpolarized_spectrum(spectrum))
 
     @cached_property
     def si(self) -> Any:
@@ -82,10 +132,11 @@ class SampledValues(RayValues):
 class LayeredValues(RayValues):
     """Values of a ``LayeredIntegrator``, all from what its ``trace`` returns."""
 
-    def __init__(self, view: View, ray: Any, weight: Any, trace: Any) -> None:
-        super().__init__(view, ray, weight)
+    def __init__(self, scene: Any, view: View, ray: Any, weight: Any, trace: Any) -> None:
+        super().__init__(scene, view, ray, weight)
         self.trace, self.image = trace, self.rgb(trace.radiance)
         self.si, self.found = trace.hit.si, trace.hit.found
+        self.valid = self.found
 
     @property
     def direct(self) -> Any:
@@ -133,15 +184,20 @@ class Shader:
 
     def trace(self, names: Iterable[str], view: View, samples: Samples, sampler: Any) -> dict[str, Any]:
         """Return layers along each ray through some places on the film."""
-        ray, weight = view.rays(samples, sampler)
-        values = self._values(view, ray, weight, sampler)
+        values = self.values(view, *view.rays(samples, sampler), sampler)
         return {name: TABLE[name].value(values) for name in names}
 
-    def _values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
+    @property
+    def aovs(self) -> tuple[str, ...]:
+        """Names of the integrator's own channels."""
+        return tuple(self.integrator.aov_names())
+
+    def values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
+        """Return what is known along rays with these weights."""
         import mitsuba as mi
 
-        spectrum, _, _ = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(ray))
-        return SampledValues(view, ray, weight, mi.unpolarized_spectrum(spectrum), self.scene)
+        sample = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(ray))
+        return SampledValues(self.scene, view, ray, weight, sample)
 
 
 class LayeredShader(Shader):
@@ -161,14 +217,21 @@ class LayeredShader(Shader):
     def prepare(self, kernel: KernelPlan | None) -> None:
         self.integrator.prepare(self.scene, kernel)
 
-    def _values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
-        return LayeredValues(view, ray, weight, self.integrator.trace(self.scene, sampler, ray))
+    def values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
+        return LayeredValues(self.scene, view, ray, weight, self.integrator.trace(self.scene, sampler, ray))
 
 
 def shader_for(scene: Any, integrator: Any) -> Shader:
     """Return the shader that an integrator is capable of."""
     kind = LayeredShader if isinstance(integrator, LayeredIntegrator) else Shader
     return kind(scene, integrator)
+
+
+def components(value: Any) -> list[Any]:
+    """Return the channels of a layer's value."""
+    import drjit as dr
+
+    return list(value) if dr.depth_v(value) > 1 else [value]
 
 
 def to_rgb(spectrum: Any, ray: Any) -> Any:

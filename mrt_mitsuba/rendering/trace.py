@@ -18,7 +18,7 @@ from mrt_mitsuba.output.layers import AVERAGED, FIRST_HIT, TABLE
 from mrt_mitsuba.output.layers import channels as channel_count
 from mrt_mitsuba.rays.bundle import Bundle, Samples
 from mrt_mitsuba.rays.sampler import ray_sampler
-from mrt_mitsuba.rendering.shading import Shader
+from mrt_mitsuba.rendering.shading import Shader, components
 from mrt_mitsuba.rendering.view import View
 
 log = logging.getLogger(__name__)
@@ -77,7 +77,7 @@ class Tracer:
         values = self.shader.trace(names, self.view, samples, sampler)
         if bundle.rays_per_pixel == 1:
             dr.eval(values)
-            result = {name: _components(value) for name, value in values.items()}
+            result = {name: components(value) for name, value in values.items()}
         else:
             result = _by_pixel(values, bundle, samples)
         # LLVM's arrays are not copied
@@ -119,19 +119,13 @@ def _by_pixel(values: dict[str, Any], bundle: Bundle, samples: Samples) -> dict[
 
     averaged = {name: value for name, value in values.items() if TABLE[name].source == AVERAGED}
     pixels = {
-        name: [first(component) for component in _components(value)]
+        name: [first(component) for component in components(value)]
         for name, value in values.items()
         if TABLE[name].source == FIRST_HIT
     }
     dr.eval(averaged, pixels)  # block_reduce would evaluate each channel by itself, in a kernel of its own
     scale = dr.opaque(mi.Float, 1 / bundle.rays_per_pixel)
     for name, value in averaged.items():
-        pixels[name] = [mean(component) for component in _components(value)]
+        pixels[name] = [mean(component) for component in components(value)]
     dr.eval(pixels)
     return pixels
-
-
-def _components(value: Any) -> list[Any]:
-    import drjit as dr
-
-    return list(value) if dr.depth_v(value) > 1 else [value]

@@ -26,10 +26,14 @@ class View:
         aperture = sampler.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
         wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
         ray, weight = self.sensor.sample_ray(mi.Float(samples.time), wavelength, samples.place, aperture)
-        ray = mi.Ray3f(ray)
+        return self.moved(mi.Ray3f(ray), samples.time), weight
+
+    def moved(self, ray: Any, time: Any) -> Any:
+        """Return a ray as the camera sees it on its way, at a time from 0 to 1."""
         if self.motion is not None:
-            ray.o += self._shift(samples.time)
-        return ray, weight
+            ray.o += self._shift(time)
+            ray.time = time
+        return ray
 
     def distance(self, si: Any) -> Any:
         """Return the distance of a hit from the eye; along the ray where the sensor has no single eye."""

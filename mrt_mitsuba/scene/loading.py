@@ -63,6 +63,15 @@ def load_file(path: str, budget: Budget | None = None, **parameters: Any) -> tup
         return _make(lambda config: mi.parser.parse_file(config, path, **given), path, budget), values
 
 
+def declared(path: str) -> dict[str, str]:
+    """Return the parameters that an XML file declares, with their defaults. Raises ``SceneError``."""
+    require_file(path)
+    with open(path, "rb") as stream:
+        tags = [tag for tag in _tags(stream.read()) if tag.startswith(b"<default")]
+    found = [{key: _text(value) for key, value in _ATTRIBUTE.findall(tag)} for tag in tags]
+    return {each.get(b"name", ""): each.get(b"value", "") for each in found}
+
+
 def _make(parse: Callable[[Any], Any], name: str, budget: Budget | None) -> Any:
     """Parse, check and instantiate."""
     import mitsuba as mi

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import operator
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, is_obj
 from mrt_mitsuba.scene.parameters import set_parameters
-from mrt_mitsuba.scene.placement import obj_scene
+from mrt_mitsuba.scene.placement import model_scene
 from mrt_mitsuba.scene.report import report_scene
 
 
@@ -30,45 +31,87 @@ class Source:
     focal_distance: float | None = None
     focal_range: float = FOCAL_RANGE
     fresnel: str | None = None  #: the formula in force, where the scene leaves the choice
+    own: bool = False  #: is it someone's own, with a film and a sampler to honour
 
 
 def open_scene(
     scene: Any,
     *,
-    width: int | None = None,
-    height: int | None = None,
+    size: tuple[int | None, int | None] = (None, None),
     fresnel: str | None = None,
-    convention: str = "report",
     integrator: Any = None,
     budget: Budget | None = None,
+    sensor: int = 0,
     params: Mapping[str, Any] | None = None,
+    model: Mapping[str, Any] | None = None,
 ) -> Source:
     """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``.
 
-    ``budget``: memory from which its textures take theirs.
+    ``size``: width and height; ``budget``: memory from which its textures take theirs; ``model``: options of
+    ``model_scene``.
     """
-    name, model = _model(scene, convention)
-    if model is None:
+    if model and not is_obj(scene) and model.keys() != {"convention"}:
+        raise UsageError(f"{next(k for k in model if k != 'convention')} is of use only with an OBJ file")
+    name, own = _model(scene, model or {})
+    # a key of mi.traverse has a dot, the name of a parameter of an XML file has none
+    keys = {key: value for key, value in (params or {}).items() if "." in key}
+    declared = {key: value for key, value in (params or {}).items() if "." not in key}
+    if declared and not _is_xml(scene):
+        raise UsageError(
+            f"params: {next(iter(declared))} is no key of mi.traverse, and only an XML file declares names"
+        )
+    if own is None:
         if fresnel is not None:
             raise UsageError(
                 "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
             )
-        name, loaded, values = _own(scene, budget)
-        if params and loaded is scene:
+        name, loaded, values = _own(scene, budget, declared)
+        if keys and loaded is scene:
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
-        set_parameters(loaded, params or {})
-        size = _film_size(name, loaded, width, height)
+        set_parameters(loaded, keys)
+        view = _sensor(name, loaded, sensor)
+        width, height = _film_size(name, view, *size)
         focus = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
-        return Source(name, loaded, loaded.sensors()[0], _integrator(integrator, loaded), *size, *focus)
-    width, height, fresnel = width or SIZE[0], height or SIZE[1], fresnel or "schlick"
-    loaded = load_dict(model.to_dict(width=width, height=height, fresnel=fresnel), name, budget)
-    set_parameters(loaded, params or {})
-    sensor, integrator = loaded.sensors()[0], _integrator(integrator, loaded)
-    focus = model.focal_distance, model.focal_range
-    return Source(name, loaded, sensor, integrator, width, height, *focus, fresnel)
+        chosen = _integrator(integrator, loaded)
+        return Source(name, loaded, view, chosen, width, height, *focus, own=True)
+    width, height, fresnel = size[0] or SIZE[0], size[1] or SIZE[1], fresnel or "schlick"
+    loaded = load_dict(own.to_dict(width=width, height=height, fresnel=fresnel), name, budget)
+    set_parameters(loaded, keys)
+    view, integrator = _sensor(name, loaded, sensor), _integrator(integrator, loaded)
+    return Source(name, loaded, view, integrator, width, height, own.focal_distance, own.focal_range, fresnel)
 
 
-def _model(scene: Any, convention: str) -> tuple[str, Scene | None]:
+@contextmanager
+def sized(source: Source) -> Iterator[None]:
+    """Within the block, the film of a source's sensor has the source's size, and no crop window if that is
+    another."""
+    import mitsuba as mi
+
+    size = [source.width, source.height]
+    if list(source.sensor.film().crop_size()) == size:
+        yield
+        return
+    parameters = mi.traverse(source.sensor)
+    names = ("film.size", "film.crop_size", "film.crop_offset")
+    before = [parameters[name] for name in names]
+    try:
+        _set(parameters, zip(names, (size, size, [0, 0]), strict=True))
+        yield
+    finally:
+        _set(parameters, zip(names, before, strict=True))
+
+
+def _set(parameters: Any, values: Iterable[tuple[str, Any]]) -> None:
+    for name, value in values:
+        parameters[name] = value
+    parameters.update()
+
+
+def _is_xml(scene: Any) -> bool:
+    return isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".xml")
+
+
+def _model(scene: Any, options: Mapping[str, Any]) -> tuple[str, Scene | None]:
     """Return the name and the model of a scene in the report's terms; no model of any other."""
     if isinstance(scene, Scene):
         return scene.title or "a scene", scene
@@ -76,12 +119,14 @@ def _model(scene: Any, convention: str) -> tuple[str, Scene | None]:
         number = operator.index(scene)
         return str(number), report_scene(number)
     if is_obj(scene):
-        model = obj_scene(scene, convention=convention)
+        model = model_scene(scene, **options)
         return model.title, model
     return "", None
 
 
-def _own(scene: Any, budget: Budget | None) -> tuple[str, Any, Mapping[str, str]]:
+def _own(
+    scene: Any, budget: Budget | None, declared: Mapping[str, Any]
+) -> tuple[str, Any, Mapping[str, str]]:
     """Return the name of someone's own scene, the Mitsuba scene, and the parameters of its file."""
     import mitsuba as mi
 
@@ -89,7 +134,7 @@ def _own(scene: Any, budget: Budget | None) -> tuple[str, Any, Mapping[str, str]
         return "a dict", load_dict(scene, budget=budget), {}
     if isinstance(scene, str | os.PathLike):
         path = os.fspath(scene)
-        return os.path.basename(path), *load_file(path, budget)
+        return os.path.basename(path), *load_file(path, budget, **declared)
     if isinstance(scene, mi.Scene):
         return "a Mitsuba scene", scene, {}
     raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")
@@ -103,22 +148,24 @@ def _number(values: Mapping[str, str], name: str, default: Any) -> Any:
         return default
 
 
-def _film_size(name: str, scene: Any, width: int | None, height: int | None) -> tuple[int, int]:
+def _sensor(name: str, scene: Any, number: int) -> Any:
     import mitsuba as mi
 
     if not isinstance(scene, mi.Scene):
         raise SceneError(f"{name} is a {type(scene).__name__}, not a scene: put it into one, with a sensor")
-    if not scene.sensors():
+    sensors = scene.sensors()
+    if not sensors:
         raise SceneError(f"{name} has no sensor: add one, so that there is something to look through")
-    own_width, own_height = (int(n) for n in scene.sensors()[0].film().crop_size())
+    if number >= len(sensors):
+        raise UsageError(f"sensor={number}: {name} has {len(sensors)}, counted from 0")
+    return sensors[number]
+
+
+def _film_size(name: str, sensor: Any, width: int | None, height: int | None) -> tuple[int, int]:
+    own_width, own_height = (int(n) for n in sensor.film().crop_size())
     if own_width < 1 or own_height < 1:
         raise SceneError(f"{name} brings a film of {own_width}x{own_height}: give it one pixel at least")
-    if width not in (None, own_width) or height not in (None, own_height):
-        raise UsageError(
-            f"{name} brings a film of {own_width}x{own_height}: "
-            "change it there, or leave out width and height"
-        )
-    return own_width, own_height
+    return width or own_width, height or own_height
 
 
 def _integrator(integrator: Any, scene: Any) -> Any:

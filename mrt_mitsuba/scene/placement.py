@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Color, Light, Scene
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Color, Light, Scene, Vector, view_problem
 from mrt_mitsuba.scene.obj import read_obj
 
 
@@ -49,3 +52,29 @@ def obj_scene(
         meshes=meshes,
         texturing=texturing or convention,
     )
+
+
+def model_scene(
+    path: str | os.PathLike[str],
+    *,
+    convention: str = "report",
+    texturing: str | None = None,
+    camera: Vector | None = None,
+    target: Vector | None = None,
+    up: Vector | None = None,
+    fov: float | None = None,
+    light: Vector | None = None,
+) -> Scene:
+    """Return the scene of an OBJ file as the options show it; what is None stays as ``obj_scene`` places it.
+
+    ``fov`` is horizontal, in degrees; ``light`` is the place of a white light. Raises ``UsageError`` for a
+    camera that sees nothing, and what ``obj_scene`` raises.
+    """
+    lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
+    scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)
+    given: dict[str, Any] = {"position": camera, "target": target, "up": up, "hfov": fov}
+    view = replace(scene.camera, **{name: value for name, value in given.items() if value is not None})
+    problem = view_problem(view)
+    if problem:
+        raise UsageError(problem)
+    return replace(scene, camera=view)

@@ -87,7 +87,7 @@ def _size(task: Task) -> tuple[int, int]:
         return width, height
     runtime.use()
     scene = task.scene.load() if isinstance(task.scene, SceneFile) else task.scene
-    source = open_scene(scene, width=width, height=height)
+    source = open_scene(scene, size=(width, height))
     return source.width, source.height
 
 

@@ -177,6 +177,15 @@ def test_names_that_differ_in_numbers_are_one_curve(name, family):
     assert point(name, [1.0], 1.0).family == family
 
 
+@pytest.mark.parametrize("count", [3, 10])
+def test_equal_cases_have_no_winner(count):
+    """Log-normal times of one distribution: intervals that overlap are a test far stricter than 5 %."""
+    rng = np.random.default_rng(count)
+    times = np.exp(rng.normal(0, 0.3, (60, 2, count)))
+    verdicts = [found_of(point("a", a, 0.1), point("b", b, 0.1)).verdicts[0] for a, b in times.tolist()]
+    assert sum("not told apart" not in verdict for verdict in verdicts) <= 3
+
+
 def test_one_repeat_gives_no_verdict():
     found = found_of(point("a", [1.0], 0.1), point("b", [9.0], 0.1), errors=(0.1, 1e-3))
     assert found.verdicts == ["No verdict on time: a single repeat has no interval."]

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mrt_mitsuba.command.render import model_view
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
 from mrt_mitsuba.scene.model import Camera, Mesh
 from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, read_mtl
 from mrt_mitsuba.scene.obj import read_obj
+from mrt_mitsuba.scene.placement import model_scene as model_view
 from mrt_mitsuba.scene.placement import obj_scene
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"

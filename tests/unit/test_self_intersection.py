@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -74,3 +76,62 @@ def test_moving_a_sphere_has_the_right_derivative(variant: str) -> None:
     assert np.abs(differences).max() > 0.1
     # step² times a third derivative of about 10; with the hit held on the sphere as it was, 1e-2 are missing
     np.testing.assert_allclose(derivative, differences, atol=1e-3)
+
+
+def floor(kind: str, half: float, turn: mi.ScalarTransform4f) -> dict[str, Any]:
+    if kind == "rectangle":
+        return {"type": "rectangle", "to_world": turn.scale([half, half, 1])}
+    corners = half * np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+    faces = np.array([[(0, 1, 2), (0, 2, 3)]], np.uint32)
+    positions = mi.Bitmap(corners[np.newaxis].astype(np.float32))
+    return {"type": "mrt_mesh", "positions": positions, "faces": mi.Bitmap(faces), "to_world": turn}
+
+
+@pytest.mark.parametrize("kind", ["rectangle", "mesh"])
+@pytest.mark.parametrize("place", [(0, 0, 0), (3, 2, 1)])
+@pytest.mark.parametrize("half", [1.0, 1e3, 1e4])
+def test_a_grain_on_a_wide_floor_has_its_shadow(variant: str, kind: str, place: tuple, half: float) -> None:
+    """A ball of radius 0.005, as ``direct`` draws it."""
+    turn = mi.ScalarTransform4f().translate(list(place)).rotate([1, 0, 0], -90)
+    look = mi.ScalarTransform4f().translate(list(place)) @ mi.ScalarTransform4f().look_at(
+        [0.05, 0.06, 0.05], [0, 0.005, 0], [0, 1, 0]
+    )
+    film = {"type": "hdrfilm", "width": 160, "height": 120, "rfilter": {"type": "box"}}
+    grain = {"type": "sphere", "center": [place[0], place[1] + 0.005, place[2]], "radius": 0.005}
+    lamp = [place[0] + 0.3, place[1] + 0.5, place[2] - 0.2]
+    scene = mi.load_dict({
+        "type": "scene", "floor": floor(kind, half, turn), "grain": grain,
+        "sensor": {"type": "perspective", "fov": 25, "near_clip": 1e-3, "to_world": look, "film": film},
+        "light": {"type": "point", "position": lamp},
+    })  # fmt: skip
+    ours = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
+    both = (mi.load_dict(integrator) for integrator in (ours, {"type": "direct"}))
+    images = [np.array(mi.render(scene, integrator=i, spp=1)) for i in both]
+    dark = [(image < 1e-3 * images[1].max()).all(axis=-1) for image in images]
+    assert 700 < dark[1].sum() < 900
+    # Rays of ``direct`` start 9e-5 (1 + |p|) off, 2 to 8 % of the ball's radius, and the shadow's rim with them
+    assert (dark[0] != dark[1]).sum() < 60
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_rays_leave_triangles_of_every_form(variant: str, scale: float) -> None:
+    """From hits on single triangles, up to slivers of 1 : 1000, at and away from the origin, rays upwards
+    meet nothing."""
+    rng = np.random.default_rng(4)
+    for k in range(30):
+        corners = rng.normal(size=(3, 3)) * scale
+        corners[2] = corners[0] + 10 ** rng.uniform(-3, 0) * (corners[2] - corners[0])  # thin
+        corners = np.float32(corners + (k % 3) * 10 * scale * rng.normal(size=3))
+        faces = mi.Bitmap(np.array([[(0, 1, 2)]], np.uint32))
+        mesh = {"type": "mrt_mesh", "positions": mi.Bitmap(corners[np.newaxis]), "faces": faces}
+        scene = mi.load_dict({"type": "scene", "mesh": {**mesh, "bsdf": {"type": "mrt_bsdf"}}})
+        data = mi.load_dict({"type": "mrt_whitted"}).prepare(scene)
+        inside = rng.dirichlet([1, 1, 1], 2000) @ corners.astype(float)
+        o = inside + scale * rng.normal(size=(2000, 3))
+        ray = mi.Ray3f(mi.Point3f(o.T), dr.normalize(mi.Vector3f((inside - o).T)))
+        hit = data.intersect(scene, ray, mi.Bool(True))
+        up = dr.normalize(mi.Vector3f(rng.normal(size=(3, 2000))))
+        mirror = data.mirror_ray(mi.Ray3f(hit.si.p, up), hit)
+        mirror.o = hit.si.p + hit.si.n * dr.select(dr.dot(hit.si.n, mirror.d) >= 0, hit.error, -hit.error)
+        assert np.array(hit.found).mean() > 0.9
+        assert dr.none(hit.found & scene.ray_test(mirror))

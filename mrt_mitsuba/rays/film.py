@@ -1,0 +1,171 @@
+"""A film's rules: where the rays through its pixels start, and how their values become a picture."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.rays.divisor import Divisor
+
+LUMINANCE = np.array([0.212671, 0.715160, 0.072169])  # of linear sRGB, as in Mitsuba
+STEPS = 32  # of a pixel, where integrals over a filter are summed
+
+
+@dataclass(frozen=True)
+class Film:
+    """The film of a sensor. Pixels are numbered row by row, with the border that it samples around it."""
+
+    sensor: Any
+    width: int  #: pixels that are sampled in a row
+    height: int  #: rows that are sampled
+    border: int  #: pixels that are sampled around the picture, and are no part of it
+    reach: int  #: pixels on either side to which a ray contributes
+    alpha: bool  #: does it keep the coverage
+    grey: bool  #: does it keep the luminance only
+
+    @classmethod
+    def of(cls, sensor: Any) -> Film:
+        """Return the film of a sensor as Mitsuba would expose it."""
+        import mitsuba as mi
+
+        film = sensor.film()
+        rfilter = film.rfilter()
+        reach = 0 if rfilter.is_box_filter() else int(rfilter.border_size())
+        border = int(rfilter.border_size()) if film.sample_border() else 0
+        width, height = (int(n) + 2 * border for n in film.crop_size())
+        alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        return cls(
+            sensor, width, height, border, reach, alpha, pixel_format(film) in ("luminance", "y", "ya")
+        )
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels that are sampled."""
+        return self.width * self.height
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns that are sampled."""
+        return self.height, self.width
+
+    def picture(self, sampled: np.ndarray) -> np.ndarray:
+        """Return what lies in the picture, of an array [..., pixels or rows × columns, channels]."""
+        rows, columns = (slice(self.border, n - self.border) for n in self.shape)
+        return sampled[..., rows, columns, :]
+
+    def framed(self, picture: np.ndarray, value: object) -> np.ndarray:
+        """Return a picture [H, W] with the film's border around it, of one value."""
+        return np.pad(picture, self.border, constant_values=value)
+
+    def toned(self, colors: np.ndarray) -> np.ndarray:
+        """Return colours [..., 3] as the film keeps them."""
+        return np.repeat(colors @ LUMINANCE[:, None], 3, axis=-1) if self.grey else colors
+
+    def rays_near(self, count: int) -> int:
+        """Return the number of rays a pixel that the scene's sampler makes of a number."""
+        sampler = self.sensor.sampler().clone()
+        sampler.set_sample_count(count)
+        return int(sampler.sample_count())
+
+    def rays(self, pixel: Any, sampler: Any) -> tuple[Any, Any, Any]:
+        """Return places in the film's pixels, in pixels, and rays through them with their weights.
+
+        Draws from the sampler what Mitsuba's integrators draw, in their order.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        row, column = Divisor.opaque(self.width).divide(pixel)
+        place = mi.Point2f(mi.Float(column), mi.Float(row)) + sampler.next_2d()
+        size = [float(n - 2 * self.border) for n in (self.width, self.height)]
+        inside = (place - dr.opaque(mi.Float, self.border)) / dr.opaque(mi.Vector2f, size)
+        sensor, time = self.sensor, mi.Float(self.sensor.shutter_open())
+        aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+        if sensor.shutter_open_time() > 0:
+            time += sampler.next_1d() * sensor.shutter_open_time()
+        wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
+        return place, *sensor.sample_ray_differential(time, wavelength, inside, aperture)
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """Values of the filter along an axis, ``STEPS`` to a pixel, [2 reach + 1, STEPS]."""
+        import mitsuba as mi
+
+        places = np.arange(-self.reach, self.reach + 1)[:, None] + (np.arange(STEPS) + 0.5) / STEPS - 0.5
+        values = self.sensor.film().rfilter().eval(mi.Float(places.ravel()))
+        return np.asarray(values, np.float64).reshape(places.shape)
+
+    @cached_property
+    def spread(self) -> np.ndarray:
+        """Share that the rays of the pixels −reach to reach along an axis have in the variance of pixel 0."""
+        share = np.square(self.weights).sum(axis=1)
+        return np.asarray(share / share.sum())
+
+    @property
+    def correlation(self) -> float:
+        """Sum of the squared correlations of a pixel's error with those of all pixels, itself included."""
+        values = self.weights.ravel()
+        overlap = np.correlate(values, values, "full")[(len(values) - 1) % STEPS :: STEPS]
+        return float(np.sum(np.square(overlap / overlap.max()))) ** 2
+
+    @property
+    def averaging(self) -> float:
+        """Variance of a pixel over that of the mean of the rays that start in it."""
+        along = np.square(self.weights).mean() / np.square(self.weights.mean())
+        return float(along / len(self.weights)) ** 2
+
+    def spread_out(self, variance: np.ndarray) -> np.ndarray:
+        """Return the variance [..., H, W] of pixels, up to a factor, given that of the rays in each."""
+        for axis in (-2, -1):
+            padding = [(0, 0)] * variance.ndim
+            padding[axis] = (self.reach, self.reach)
+            windows = np.lib.stride_tricks.sliding_window_view(
+                np.pad(variance, padding, mode="edge"), len(self.spread), axis
+            )
+            variance = windows @ self.spread
+        return variance
+
+
+class Canvas:
+    """Sums of filtered values over the pixels of a film, in some pictures at once.
+
+    A film whose filter reaches into other pixels is exposed by Mitsuba's ``ImageBlock``, pictures one below
+    the other. A box needs none: there, the sums over the rays of each pixel are the picture.
+    """
+
+    def __init__(self, film: Film, pictures: int, channels: int, coalesce: bool) -> None:
+        import mitsuba as mi
+
+        self.film, self.pictures, self.rows = film, pictures, film.height + 2 * film.reach
+        self.block = mi.ImageBlock(
+            (film.width, self.rows * pictures),
+            (0, -film.reach),
+            channels,
+            rfilter=film.sensor.film().rfilter(),
+            coalesce=coalesce,
+        )
+
+    def put(self, place: Any, picture: Any, values: list[Any]) -> None:
+        """Add values at places on the film, [channels] each, to pictures of these numbers."""
+        import drjit as dr
+        import mitsuba as mi
+
+        below = mi.Float(picture) * dr.opaque(mi.Float, self.rows)
+        self.block.put(place + mi.Vector2f(0, below), values)
+
+    @property
+    def sums(self) -> np.ndarray:
+        """The sums, [pictures, H, W, channels]."""
+        sums = np.asarray(self.block.tensor(), np.float64)
+        sums = sums.reshape(self.pictures, self.rows, self.film.width, -1)
+        return sums[:, self.film.reach : self.film.reach + self.film.height]
+
+
+def pixel_format(film: Any) -> str:
+    """Return the pixel format of a film as it prints it, "rgb" or "ya"; nothing for one without."""
+    found = re.search(r"pixel_format = (\w+)", str(film))
+    return found[1] if found else ""

@@ -1,0 +1,186 @@
+"""Sampling to an error: what two half pictures say about the noise, and where further rays are worth most.
+
+Two pictures are exposed at once, each from rays of its own. Their difference estimates the error of their
+mean, whatever integrator, sampler and filter are at work. Which pixels of one get further rays is decided by
+the variance in the other alone: a value never decides how many values it is averaged with, so the mean stays
+unbiased. (A pixel that happened to miss a bright reflection would otherwise look quiet, and stay dark.)
+
+Rays are shared out in proportion to the standard deviation of a pixel (J. Neyman, 1934). A few rays estimate
+it badly, so it is smoothed over neighbours, and how far is decided by cross-validation: by which candidate,
+formed of one half, shares out rays best for the variance that the other half measures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from mrt_mitsuba.output.error import ErrorEstimate
+from mrt_mitsuba.rendering.exposing import Exposed, Exposer, Groups, Stack, box_mean
+
+HALVES = 2
+GROUP = 8  # rays that are traced together; two groups to a pixel begin
+STEP = (
+    1.25  # times the rays there are must be there after another round: a short one costs more than it brings
+)
+
+# Candidates for the smoothing of variances: half the width of a window, and how many rays its mean is worth
+_WINDOWS = ((1, 8), (1, 32), (2, 32), (2, math.inf), (4, math.inf), (8, math.inf))
+_FLOORS = (0.003, 0.03, 0.2, 1.0)  # share of the picture's mean in the variance of every pixel
+_REGION = 8  # half the width of the windows in which rays are compared with independent ones
+
+
+class Halves(Stack):
+    """Two half pictures, and the moments of the rays in each pixel, as they grow round by round."""
+
+    def __init__(self, exposer: Exposer, seed: int) -> None:
+        film = exposer.film
+        super().__init__(film, HALVES, len(exposer.names))
+        self._exposer, self._seed = exposer, seed
+        self._total, self._square = np.zeros((2, HALVES, film.pixels, 3))
+
+    # ------------------------------------------- Rounds ---------------------------------------------
+
+    def first(self) -> np.ndarray:
+        """Return one group for each pixel and half."""
+        return np.ones_like(self.rays, np.int64)
+
+    def cost(self, chosen: np.ndarray) -> int:
+        """Return the number of rays that groups for chosen pixels take, with those around them."""
+        return GROUP * int(self.widened(chosen).sum())
+
+    def trace(self, chosen: np.ndarray, advance: Callable[[int], object]) -> None:
+        """Trace numbers of groups, [2, pixels]."""
+        groups = Groups.spread(GROUP, self.widened(chosen), self.rays)
+        exposed = self._exposer.expose(
+            groups, self._seed, pictures=HALVES, progressive=True, moments=True, advance=advance
+        )
+        self.add(exposed, chosen > 0)
+
+    def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the picture [H, W, 3], and the standard error and the rays of each pixel, [H, W]."""
+        return self.mean()[..., :3], np.sqrt(self.variance().mean(-1)), self.samples()
+
+    def add(self, exposed: Exposed, chosen: np.ndarray) -> None:
+        super().add(exposed, chosen)
+        self._total += exposed.total
+        self._square += exposed.square
+
+    # ------------------------------------------- Errors ---------------------------------------------
+
+    def _squared_error(self) -> np.ndarray:
+        """Return an estimate for each pixel of the picture's squared error, mean of colours, [H, W].
+
+        The mean of two independent values has a variance of a quarter of their expected squared difference.
+        """
+        first, second = self.pictures()[..., :3]
+        return np.asarray(np.square(first - second, dtype=np.float64).mean(-1) / 4)
+
+    def error(self) -> ErrorEstimate:
+        """Return the estimated RMSE of the picture, without the border.
+
+        The mean of squares of which each is as uncertain as it is large, correlated as the filter has it; the
+        true error is a mean of as many squares, and as uncertain. The interval is that of a log-normal law.
+        """
+        squares = self._inside(self._squared_error())
+        mean = float(squares.mean())
+        if mean == 0:
+            return ErrorEstimate(0.0, 0.0, 0.0)
+        spread = math.sqrt(2 * self.film.correlation * float(np.square(squares).sum())) / float(squares.sum())
+        rmse, factor = math.sqrt(mean), math.exp(1.96 * spread / 2)
+        return ErrorEstimate(rmse, rmse / factor, rmse * factor)
+
+    def variance(self) -> np.ndarray:
+        """Return the estimated variance of each channel in the picture, [H, W, 3], without the border."""
+        moments = self._moments()
+        rays = self.rows(self.rays)[..., None]
+        each = (_smoothed(moments, rays, 1, 8) / rays).sum(0)
+        spread = np.moveaxis(self.film.spread_out(np.moveaxis(each, -1, 0)), 0, -1)
+        return self.film.picture(spread / 4 * self._better(moments.mean(-1))[..., None])
+
+    def samples(self) -> np.ndarray:
+        """Return the rays of each pixel, [H, W], without the border."""
+        return self._inside(self.rows(self.rays).sum(0))
+
+    # ------------------------------------------- Sharing --------------------------------------------
+
+    def next(self, most: float, target: float | None) -> np.ndarray:
+        """Return numbers of further groups, [2, pixels].
+
+        Enough for an RMSE of ``target``, if that takes a mean of no more than ``most`` rays a pixel in all.
+        """
+        variance = self._decisive()
+        deviation, most = np.sqrt(variance), most * self.film.pixels
+        if target is not None:
+            allowed = (variance / self.rays).sum() * (target / self.error().rmse) ** 2
+            wanted = _water(self.rays, deviation, lambda due: (variance / due).sum() <= allowed)
+            least = STEP * self.rays.sum()
+            if least <= wanted.sum() <= most:
+                return self._groups(wanted)
+            if wanted.sum() < least:
+                most = min(most, least)
+        return self._groups(_water(self.rays, deviation, lambda due: due.sum() >= most))
+
+    def _groups(self, due: np.ndarray) -> np.ndarray:
+        """Return whole numbers of groups for what is due; one at least."""
+        missing = (due - self.rays) / GROUP
+        groups = np.floor(missing + 0.5)
+        if not groups.any():
+            groups = (missing >= missing.max()) * 1.0
+        return np.asarray(groups, np.int64)
+
+    def _decisive(self) -> np.ndarray:
+        """Return the variance of a ray's value that decides in each half, [2, pixels]: the other half's."""
+        moments, rays = self._moments().mean(-1), self.rows(self.rays)
+        measured = moments * self._better(moments)
+        mean = measured.mean((1, 2))[:, None, None]
+        best, least = measured, math.inf
+        for width, worth in _WINDOWS:
+            smooth = _smoothed(measured, rays, width, worth)
+            for floor in _FLOORS:
+                candidate = (1 - floor) * smooth + floor * mean + 1e-30
+                deviation = np.sqrt(candidate)
+                cost = ((measured[::-1] / deviation).mean((1, 2)) * deviation.mean((1, 2))).sum()
+                if cost < least:
+                    best, least = candidate, cost
+        return best[::-1].reshape(HALVES, -1)
+
+    def _moments(self) -> np.ndarray:
+        """Return the variance of a ray's value in each half and channel, [2, H, W, 3]."""
+        rays = self.rays[..., None]
+        variance = (self._square - self._total**2 / rays) / np.maximum(rays - 1, 1)
+        return self.rows(np.maximum(variance, 0))
+
+    def _better(self, moments: np.ndarray) -> np.ndarray:
+        """Return the squared error over that of independent rays whose value has this variance, [H, W].
+
+        Below 1 where rays are stratified, and where a filter averages pixels.
+        """
+        found = self._squared_error()
+        expected = self.film.spread_out((moments / self.rows(self.rays)).sum(0)) / 4
+        few = 0.1  # windows without noise take the picture's ratio
+        ratio = box_mean(found, _REGION) + few * found.mean()
+        return ratio / np.maximum(box_mean(expected, _REGION) + few * expected.mean(), 1e-30)
+
+    def _inside(self, values: np.ndarray) -> np.ndarray:
+        return self.film.picture(values[..., None])[..., 0]
+
+
+def _smoothed(variance: np.ndarray, rays: np.ndarray, width: int, worth: float) -> np.ndarray:
+    """Return variances [2, H, W, ...] drawn towards their mean in a window, the less the more rays."""
+    around = np.stack([box_mean(half, width) for half in variance])
+    share = 1.0 if math.isinf(worth) else worth / (rays + worth)
+    return np.asarray(variance + share * (around - variance))
+
+
+def _water(have: np.ndarray, shape: np.ndarray, enough: Callable[[np.ndarray], bool]) -> np.ndarray:
+    """Return the least multiple of ``shape`` that is ``enough``, where there is not more already."""
+    low, high = 0.0, float((have.max() + 1) / max(shape.mean(), 1e-30))
+    while not enough(np.maximum(have, high * shape)) and high < 1e30:
+        low, high = high, 4 * high
+    while high - low > 1e-3 * high:
+        middle = (low + high) / 2
+        low, high = (low, middle) if enough(np.maximum(have, middle * shape)) else (middle, high)
+    return np.maximum(have, high * shape)

@@ -1,0 +1,92 @@
+"""How far off its surface a hit may be: secondary rays start that much away from it.
+
+With u = 2⁻²⁴, every bound has the form δ = k u (size of the numbers that are added):
+
+- Curved surfaces, analytic planes: k = 32, the largest coordinate of the shape's box or of the hit. A few
+  times what intersection, projection and ray test lose together.
+- Triangles and rectangles: k = 16, the size across the surface alone, Σᵢ |nᵢ| (|pᵢ| + wᵢ) + c with the
+  normal n, the hit p, and the largest extents wᵢ of a triangle along the axes. Derivation: docs/maths.md,
+  "Where secondary rays start". So a floor that is level or upright takes no harm from its size. The other
+  bound is kept where it is smaller: slivers make c larger than the shape.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .lookup import ByShape
+from .mesh_api import triangles
+
+# What a curved surface's hit, projection and ray test lose, in roundings of the largest coordinate
+CURVED = 32 * 2.0**-24
+
+# The same for flat ones, in roundings of the numbers across the surface: 11 are proven, in first order
+FLAT = 16 * 2.0**-24
+
+
+# A level triangle at height zero has no error at all, but a ray that starts on it exactly may meet it
+LEAST = 2.0**-12
+
+
+class HitErrors:
+    """The bounds for hits on Mitsuba's own shapes, by the shape that was hit.
+
+    The shapes inside an instance are not of the scene's own: the largest size for them.
+    """
+
+    def __init__(self, shapes: list[mi.Shape]) -> None:
+        sizes = [_size(s) for s in shapes]
+        self.sizes = ByShape(mi.Float, shapes, sizes, max(sizes)) if shapes else None
+        rows = [_flat_row(s) for s in shapes]
+        curved = [0.0, 0.0, 0.0, dr.inf]
+        self.flat = (
+            ByShape(mi.Vector4f, shapes, [row or curved for row in rows], curved) if any(rows) else None
+        )
+
+    def size(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Float:
+        """Return the largest coordinate of the shape."""
+        return mi.Float(0) if self.sizes is None else self.sizes(si, found)
+
+    def of_flat(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Float:
+        """Return the bound at a hit on a flat shape; inf on a curved one."""
+        assert self.flat is not None
+        row = self.flat(si, found)
+        width = mi.Vector3f(row.x, row.y, row.z)
+        return FLAT * (dr.dot(dr.abs(si.n), dr.abs(si.p) + width) + row.w)
+
+
+def _size(shape: Any) -> float:
+    """Return the largest coordinate of a shape's bounding box."""
+    return max(abs(float(x)) for corner in (shape.bbox().min, shape.bbox().max) for x in corner)
+
+
+def _flat_row(shape: Any) -> list[float] | None:
+    """Return w and c of a flat shape."""
+    corners = _triangles(shape)
+    if corners is None:
+        return None
+    edges = np.stack([corners[:, k] - corners[:, k - 1] for k in range(3)], axis=1)  # [n, 3, 3]
+    width = np.abs(edges).max(axis=1, initial=0.0)  # [n, 3]
+    a, b = edges[:, 0], edges[:, 1]
+    normal = np.linalg.norm(np.cross(a, b), axis=1)
+    # What the components of a cross product lose, by the extents that they are multiplied with
+    lost = sum(
+        width[:, i] * (np.abs(a[:, i - 2] * b[:, i - 1]) + np.abs(a[:, i - 1] * b[:, i - 2]))
+        for i in range(3)
+    )
+    condition = np.divide(lost, normal, out=np.zeros_like(lost), where=normal > 0)
+    width = width.max(axis=0, initial=0.0)
+    return [*width.tolist(), float(condition.max(initial=0.0) + LEAST * width.max())]
+
+
+def _triangles(shape: Any) -> np.ndarray | None:
+    """Return the corners [n, 3, 3] of a mesh's triangles, or of the two of a rectangle."""
+    if shape.shape_type() == +mi.ShapeType.Rectangle:
+        matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
+        square = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) @ matrix[:3, :3].T + matrix[:3, 3]
+        return square[[(0, 1, 2), (0, 2, 3)]]
+    return triangles(shape) if shape.is_mesh() else None
