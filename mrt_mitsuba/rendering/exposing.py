@@ -179,7 +179,7 @@ class Exposer:
             lanes = self._lanes(part, seed, start, progressive)
             planes = self._trace(part, lanes, canvas, kept, moments)
             for row, plane in zip(total, planes, strict=False):
-                row[own[0] : own[-1] + 1] += np.bincount(own - own[0], np.asarray(plane))
+                row[own[0] : own[-1] + 1] += np.bincount(own - own[0], np.broadcast_to(plane, own.shape))
             self._count("primary", len(own) * groups.size)
             for kind, plane in zip(self._counted.values(), planes[len(total) :], strict=True):
                 self._count(kind, round(np.sum(np.asarray(plane), dtype=np.float64)))
