@@ -34,8 +34,9 @@ def usage() -> str:
         for form, text in entries.items():
             if len(form) > _COLUMN - 3:
                 lines, form = [*lines, f"  {form}"], ""
-            entry = f"{form:<{_COLUMN - 3}} {text}"
-            lines += textwrap.wrap(entry, WIDTH, initial_indent="  ", subsequent_indent=" " * _COLUMN)
+            lines += textwrap.wrap(
+                f"{form:<{_COLUMN - 3}} {text}", WIDTH, initial_indent="  ", subsequent_indent=" " * _COLUMN
+            )
     return "\n".join(lines) + "\n"
 
 
