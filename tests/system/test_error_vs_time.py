@@ -120,6 +120,15 @@ def test_references_of_other_kinds(variant, tmp_path):
     assert again.points["aa=2"].rmse == pytest.approx(error, rel=1e-4) and again.reference_error == 0
 
 
+def test_renders_to_an_error_are_cases_too(scene):
+    """They come to it, and their own estimate is not what they are judged by."""
+    cases = {"target 0.01": path(1, target=0.01, maxspp=256), "noise": path(64, aamode="noise")}
+    found = mrt.error_vs_time(scene, cases, reference=path(2048, **ONE_RAY), repeats=3)
+    assert not found.failed
+    assert found.points["target 0.01"].rmse == pytest.approx(0.01, rel=0.3)
+    assert found.points["noise"].bias_interval[0] == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
