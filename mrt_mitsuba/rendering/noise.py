@@ -126,8 +126,12 @@ class Halves(Stack):
     def _within(self, most: float, deviation: np.ndarray) -> np.ndarray:
         """Return numbers of groups that make no more than so many rays in all."""
         budget = most
+
+        def spent(due: np.ndarray) -> bool:
+            return bool(due.sum() >= budget)
+
         for _ in range(4):
-            groups = self._groups(_water(self.rays, deviation, lambda due, least=budget: due.sum() >= least))
+            groups = self._groups(_water(self.rays, deviation, spent))
             excess = self.rays.sum() + self.cost(groups) - most  # by rounding, and by pixels under the filter
             if excess <= 0:
                 break
