@@ -179,20 +179,20 @@ class Exposer:
             lanes = self._lanes(part, seed, start, progressive)
             planes = self._trace(part, lanes, canvas, kept, moments)
             for row, plane in zip(total, planes, strict=False):
-                row[own[0] : own[-1] + 1] += np.bincount(own - own[0], np.asarray(plane))
+                row[own[0] : own[-1] + 1] += np.bincount(own - own[0], np.broadcast_to(plane, own.shape))
             self._count("primary", len(own) * groups.size)
             for kind, plane in zip(self._counted.values(), planes[len(total) :], strict=True):
                 self._count(kind, round(np.sum(np.asarray(plane), dtype=np.float64)))
             advance(len(own) * groups.size)
         rays = groups.size * np.bincount(pixel, minlength=pictures * film.pixels)
         rays = rays.reshape(pictures, film.pixels)
-        colors = np.moveaxis(total.reshape(-1, pictures, film.pixels), 0, -1)
+        totals = np.moveaxis(total.reshape(-1, pictures, film.pixels), 0, -1)
         if canvas is None:
-            means = colors[..., :kept] / np.maximum(rays, 1)[..., None]
+            means = totals[..., :kept] / np.maximum(rays, 1)[..., None]
             sums = np.concatenate([means, rays[..., None] > 0], axis=-1).reshape(pictures, *film.shape, -1)
         else:
             sums = canvas.sums
-        return Exposed(sums[..., :-1], sums[..., -1], rays, colors[..., :3], colors[..., kept:])
+        return Exposed(sums[..., :-1], sums[..., -1], rays, totals[..., :3], totals[..., kept:])
 
     @property
     def _counted(self) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -124,7 +124,7 @@ class RenderSettings:
     seed: int = option(0, integer(0, 2**32 - 1), "seed where anything is random")
     integrator: object = option(None, anything())
     sensor: int = option(0, integer(0, 65535), "number of the sensor, in a scene that has several")
-    on_round: Any = option(None, anything())
+    on_round: object = option(None, anything())
     spp: int | None = option(
         None,
         integer(1, 65536),

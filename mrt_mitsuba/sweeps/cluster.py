@@ -35,15 +35,51 @@ def require() -> None:
 
 
 @dataclass(frozen=True)
-class Local:
-    """Workers of this machine. ``retries``: times a job may lose its worker; ``gpus``: pin each to one."""
+class Engine:
+    """Where to render, and how the engine is to deal with jobs; see ``sweep``.
 
-    workers: int
+    Raises ``UsageError`` for numbers out of range, or both workers here and a cluster.
+    """
+
+    cluster: Any
+    workers: int | None
     retries: int
-    gpus: bool
+    renew: int
     dashboard: int | None
+    variant: str
 
-    def cluster(self) -> Any:
+    def __post_init__(self) -> None:
+        for name, least in (("workers", 1), ("retries", 0), ("renew", 1), ("dashboard", 0)):
+            number = getattr(self, name)
+            if number is not None and (type(number) is not int or number < least):
+                raise UsageError(f"{name}={number!r}: must be a whole number, {least} or more")
+        if self.workers is not None and self.cluster is not None:
+            raise UsageError("workers are for this machine, and a cluster brings its own: give one of them")
+        if self.dashboard is not None and importlib.util.find_spec("bokeh") is None:
+            raise UsageError("the dashboard needs Bokeh: pip install bokeh, or leave dashboard out")
+
+    @contextmanager
+    def connected(self, folder: str, jobs: int) -> Iterator[tuple[Client, worker.House]]:
+        """Give a client with workers that see a folder, and what they are to know.
+
+        Workers of this machine, as many as there are jobs at most, end with the block. Raises
+        ``ClusterError`` or ``OutputError`` if workers cannot be used.
+        """
+        from distributed import Client
+
+        with ExitStack() as stack:
+            client, expected = self.cluster, 1
+            if not isinstance(client, Client):
+                stack.enter_context(_quiet())
+                if self.cluster is None:
+                    expected = self.workers or min(_suitable(self.variant), jobs)
+                    client = stack.enter_context(_client(stack.enter_context(self._local(expected))))
+                else:
+                    client = stack.enter_context(_client(self.cluster))
+            sharing = inspect(client, folder, expected)
+            yield client, worker.House(sharing, self.renew, self.cluster is None, versions())
+
+    def _local(self, count: int) -> Any:
         """A scheduler in this process and workers in processes of their own, with one thread for jobs each.
 
         They are started anew, not forked, nor do they import the caller's script: it needs no
@@ -53,15 +89,13 @@ class Local:
         from distributed.deploy.subprocess import SubprocessWorker
         from distributed.system import MEMORY_LIMIT
 
-        if self.dashboard is not None and importlib.util.find_spec("bokeh") is None:
-            raise UsageError("the dashboard needs Bokeh: pip install bokeh, or leave dashboard out")
-        devices = gpus() if self.gpus else []
+        devices = gpus() if self.variant.startswith("cuda") else []
         workers = {}
-        for number in range(self.workers):
+        for number in range(count):
             pinned = {"env": {"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]}} if devices else {}
             options = {
                 "nthreads": 1,
-                "memory_limit": MEMORY_LIMIT // self.workers,
+                "memory_limit": MEMORY_LIMIT // count,
                 "dashboard": False,
                 "silence_logs": logging.CRITICAL,
             }
@@ -75,9 +109,9 @@ class Local:
         return SpecCluster(workers=workers, scheduler={"cls": Scheduler, "options": scheduler})
 
 
-def default_workers(variant: str | None) -> int:
+def _suitable(variant: str) -> int:
     """Return how many workers suit this machine: one for each GPU or core."""
-    return (len(gpus()) if (variant or "").startswith("cuda") else 0) or usable_cores()
+    return (len(gpus()) if variant.startswith("cuda") else 0) or usable_cores()
 
 
 def gpus() -> list[str]:
@@ -92,25 +126,16 @@ def gpus() -> list[str]:
     return [str(number) for number, _ in enumerate(listed.stdout.splitlines())]
 
 
-@contextmanager
-def connected(cluster: Any, local: Local) -> Iterator[Client]:
-    """Give a client of a cluster: an address, a client, or None for ``local``, which ends with the block."""
+def _client(cluster: Any) -> Client:
     from distributed import Client
 
-    if isinstance(cluster, Client):
-        yield cluster
-        return
-    with ExitStack() as stack:
-        stack.enter_context(_quiet())
-        what = cluster if cluster is not None else stack.enter_context(local.cluster())
-        try:
-            client = stack.enter_context(Client(what, timeout=CONNECTING, set_as_default=False))
-        except (OSError, ValueError, TypeError) as error:
-            raise ClusterError(
-                f"no scheduler answers at {cluster}: start one with 'dask scheduler' and give its address, "
-                "such as tcp://host:8786"
-            ) from error
-        yield client
+    try:
+        return Client(cluster, timeout=CONNECTING, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise ClusterError(
+            f"no scheduler answers at {cluster}: start one with 'dask scheduler' and give its address, "
+            "such as tcp://host:8786"
+        ) from error
 
 
 @contextmanager

@@ -119,18 +119,15 @@ def assemble(mosaic: Mosaic) -> None:
     task = mosaic.picture
     paths = [os.path.join(task.folder, tile.files[-1]) for tile in mosaic.tiles]
     path = os.path.join(task.scratch, task.files[-1])
-    tiles = [OpenEXR.InputFile(tile) for tile in paths]
-    header = _header(mosaic, tiles[0].header())
+    header = _header(mosaic, OpenEXR.InputFile(paths[0]).header())
     with compressing():
         picture = OpenEXR.OutputFile(path, header)
         try:
-            for rows, planes in _rows(mosaic, tiles, list(header["channels"])):
+            for rows, planes in _rows(mosaic, paths, list(header["channels"])):
                 picture.writePixels(planes, rows)
         finally:
             picture.close()
     _check_complete(path, mosaic.height)
-    for tile in tiles:
-        tile.close()
     os.replace(path, os.path.join(task.folder, task.files[-1]))
     shutil.rmtree(os.path.join(task.folder, mosaic.folder))
 
@@ -150,21 +147,22 @@ def _header(mosaic: Mosaic, tile: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _rows(
-    mosaic: Mosaic, tiles: Sequence[Any], channels: Sequence[str]
+    mosaic: Mosaic, paths: Sequence[str], channels: Sequence[str]
 ) -> Iterator[tuple[int, dict[str, bytes]]]:
     """Yield some rows of the picture at a time: their number, and the bytes of each channel."""
     import numpy as np
+    import OpenEXR
 
     regions = mosaic.regions
     for first in range(0, len(regions), mosaic.columns):
-        line = range(first, first + mosaic.columns)
+        tiles = [OpenEXR.InputFile(path) for path in paths[first : first + mosaic.columns]]
         for top in range(0, regions[first].height, ROWS):
             bottom = min(top + ROWS, regions[first].height)
             planes = {}
             for channel in channels:
                 parts = [
-                    np.frombuffer(tiles[n].channel(channel, scanLine1=top, scanLine2=bottom - 1), np.float32)
-                    for n in line
+                    np.frombuffer(tile.channel(channel, scanLine1=top, scanLine2=bottom - 1), np.float32)
+                    for tile in tiles
                 ]
                 planes[channel] = np.hstack([part.reshape(bottom - top, -1) for part in parts]).tobytes()
             yield bottom - top, planes

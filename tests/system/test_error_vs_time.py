@@ -120,6 +120,15 @@ def test_references_of_other_kinds(variant, tmp_path):
     assert again.points["aa=2"].rmse == pytest.approx(error, rel=1e-4) and again.reference_error == 0
 
 
+def test_renders_to_an_error_are_cases_too(scene):
+    """They come to it, and their own estimate is not what they are judged by."""
+    cases = {"target 0.01": path(1, target=0.01, maxspp=256), "noise": path(64, aamode="noise")}
+    found = mrt.error_vs_time(scene, cases, reference=path(2048, **ONE_RAY), repeats=3)
+    assert not found.failed
+    assert found.points["target 0.01"].rmse == pytest.approx(0.01, rel=0.3)
+    assert found.points["noise"].bias_interval[0] == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -175,6 +184,15 @@ def test_a_winner_is_named_only_if_intervals_are_apart(other, verdict):
 )  # fmt: skip
 def test_names_that_differ_in_numbers_are_one_curve(name, family):
     assert point(name, [1.0], 1.0).family == family
+
+
+@pytest.mark.parametrize("count", [3, 10])
+def test_equal_cases_have_no_winner(count):
+    """Log-normal times of one distribution: intervals that overlap are a test far stricter than 5 %."""
+    rng = np.random.default_rng(count)
+    times = np.exp(rng.normal(0, 0.3, (60, 2, count)))
+    verdicts = [found_of(point("a", a, 0.1), point("b", b, 0.1)).verdicts[0] for a, b in times.tolist()]
+    assert sum("not told apart" not in verdict for verdict in verdicts) <= 3
 
 
 def test_one_repeat_gives_no_verdict():

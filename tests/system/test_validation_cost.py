@@ -39,7 +39,8 @@ def test_kernels_are_those_of_the_render(variant):
     result = render()
     own = [k for k in found if k.hash]
     assert sum(k.launches for k in own) == result.kernel_launches
-    assert {k.stage for k in own} == {"rendering", "edges", "anti-aliasing"}
+    pixels = {k.stage for k in own if k.size > 1}  # a single thread reads the camera
+    assert pixels == {"rendering", "edges", "anti-aliasing"}
     tracing = [k for k in found if k.kind == "traces rays"]
     assert [k.stage for k in tracing] == ["rendering", "anti-aliasing"]
     assert tracing[0].size == 48 * 36 and tracing[1].size == result.rays["primary"] - 48 * 36

@@ -23,7 +23,6 @@ OFFENDERS = {
     "mrt_mitsuba.validation.checks",
     "mrt_mitsuba.plugins.kernel_plan.make_plan",
     "mrt_mitsuba.plugins.quadrics.Quadrics.__init__",
-    "mrt_mitsuba.sweeps.run.sweep",
     "mrt_mitsuba.validation.oracles.reference._Tracer.__init__",
     "mrt_mitsuba.validation.studies.rivals.run",
     "mrt_mitsuba.validation.studies.roughconductor.pointwise",
@@ -33,8 +32,12 @@ BACKWARDS = {
     ("tools.work_precision", "tools.precision_page"),
     ("studies.metals", "studies.roughconductor"),
 }
-# The loops of the integrator are one story; the options of a render are many
-ALLOWED = {"mrt_mitsuba.plugins.whitted.MrtWhitted.trace", "mrt_mitsuba.rendering.api.render"}
+# The loops of the integrator are one story; the options of a render and of a sweep are many
+ALLOWED = {
+    "mrt_mitsuba.plugins.whitted.MrtWhitted.trace",
+    "mrt_mitsuba.rendering.api.render",
+    "mrt_mitsuba.sweeps.run.sweep",
+}
 
 FOUNDATION = {"errors", "interrupts", "memory", "options", "runtime"}
 

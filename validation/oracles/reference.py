@@ -129,7 +129,7 @@ def specular_lobe(n: np.ndarray, to_light: np.ndarray, to_eye: np.ndarray, alpha
     h = unit(to_light + to_eye)
     cos2, sin2 = dot(n, h) ** 2, np.square(np.cross(n, h)).sum(axis=-1)
     spread = np.exp(-sin2 / cos2 / alpha**2) / (math.pi * alpha**2 * cos2**2)
-    shadowing = 1.0
+    shadowing: Any = 1.0
     for way in (to_light, to_eye):
         a = np.minimum(dot(n, way) / (alpha * np.linalg.norm(np.cross(n, way), axis=-1)), 1.6)
         fit = a * (3.535 + 2.181 * a) / (1 + a * (2.276 + 2.577 * a))
@@ -231,7 +231,7 @@ class Triangles:
         self.corner, self.edges = corners[:, 0], (corners[:, 1:] - corners[:, :1]).swapaxes(0, 1)
         self.normal = unit(np.cross(*self.edges))
         self.extent = np.abs(corners).max(axis=(1, 2))
-        self.uv = None if mesh.uvs is None else np.asarray(mesh.uvs, float)[mesh.faces]
+        self.uv: Any = None if mesh.uvs is None else np.asarray(mesh.uvs, float)[mesh.faces]
 
     def distances(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         first, second = self.edges
@@ -288,7 +288,7 @@ class _Tracer:
     def __init__(self, scene: Scene, settings: Settings) -> None:
         self.scene, self.settings = scene, settings
         self.reach = ORIGINAL_REACH if settings.start == "original" else np.inf
-        things = [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
+        things: list[Any] = [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
         groups = [(Spheres, scene.spheres), (Planes, scene.planes), (Axial, (*scene.cones, *scene.cylinders))]
         # Each with the numbers of its objects; all triangles of a mesh are one object
         self.groups: list[tuple[Any, np.ndarray]] = []
@@ -431,7 +431,7 @@ def _picture(scene: Scene, thing: Any) -> np.ndarray:
 
     if not isinstance(thing, Mesh) or thing.uvs is None or scene.texturing != "report":
         raise SceneError("the float64 reference draws textures on triangles only, looked up as in the report")
-    with Image.open(thing.material.texture) as picture:
+    with Image.open(str(thing.material.texture)) as picture:
         return np.asarray(picture.convert("RGB")) / 255
 
 

@@ -258,7 +258,7 @@ def _compare_with_mitsuba(study: Study, *, quick: bool) -> None:
     truth = np.mean(runs, axis=0)
     amounts, rows = (1, 2, 4, 8), []
     for lattice in ("centered", "report"):
-        options = {"integrator": whitted, "aamode": "none", "lattice": lattice}
+        options: dict[str, Any] = {"integrator": whitted, "aamode": "none", "lattice": lattice}
         images = [mrt.render(scene, aa=aa, **options).image for aa in amounts]
         rows.append([lattice, *(float(np.sqrt(np.mean((image - truth) ** 2))) for image in images)])
     centered, report = (np.array(row[1:]) for row in rows)

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.validation.checks.probe import is_scalar
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies import metals
 from mrt_mitsuba.validation.tools import image_tests
 from mrt_mitsuba.validation.tools.bsdf_probe import (
     Array,
     evaluate,
-    is_scalar,
     largest,
     lobe_pairs,
     relative_error,

@@ -74,9 +74,8 @@ def _crowded() -> Scene:
             kinds[kind].append(make(first, end, radius, material))
     places = 6 * rng.normal(size=(12, 3)) + [0, 6, 6]
     lights = tuple(Light(tuple(p.tolist()), (0.1, 0.1, 0.12)) for p in places)
-    return Scene(
-        Camera((0, 1, 6), (0, 0, 0)), (0.2, 0.3, 0.4), lights, **{k: tuple(v) for k, v in kinds.items()}
-    )
+    things: dict[str, Any] = {name: tuple(found) for name, found in kinds.items()}
+    return Scene(Camera((0, 1, 6), (0, 0, 0)), (0.2, 0.3, 0.4), lights, **things)
 
 
 @dataclass(frozen=True)
@@ -190,7 +189,7 @@ def run(study: Study, *, quick: bool) -> None:
     with study.stage("Scenes in float64", len(CASES)) as advance:
         for name, case in CASES.items():
             size = case.quick if quick else case.size
-            form = {"fresnel": case.fresnel}
+            form: dict[str, Any] = {"fresnel": case.fresnel}
             found = judged[name] = judge(draw(case.scene, size, **form), case.scene, **form)
             cut = np.abs(draw(case.scene, size, **form, cut=True) - found.image)
             hold(study, name, found, float(cut.max()))

@@ -10,9 +10,9 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from mrt_mitsuba.validation.checks import probe
+from mrt_mitsuba.validation.checks.probe import Array, unit
 
 
 def rgb(values: Sequence[float]) -> dict[str, Any]:
@@ -20,22 +20,10 @@ def rgb(values: Sequence[float]) -> dict[str, Any]:
     return {"type": "rgb", "value": list(values)}
 
 
-def is_scalar() -> bool:
-    """Does the current variant take one direction at a time?"""
-    import mitsuba as mi
-
-    return mi.variant().startswith("scalar")
-
-
 def at_angle(degrees: float) -> Array:
     """A direction at an angle to the normal, away from every axis and plane of symmetry."""
     theta = np.radians(degrees)
     return np.array([np.sin(theta) * 0.8, np.sin(theta) * 0.6, np.cos(theta)])
-
-
-def unit(v: Array) -> Array:
-    """Vectors [N, 3] made one unit long, in float32."""
-    return (v / np.linalg.norm(v, axis=-1, keepdims=True)).astype(np.float32)
 
 
 def lobe_pairs(count: int, alpha: float, *, least_cos: float = 0.02, seed: int = 1) -> tuple[Array, Array]:
@@ -60,46 +48,23 @@ def lobe_pairs(count: int, alpha: float, *, least_cos: float = 0.02, seed: int =
 
 
 def interaction(wi: Array, uv: Array | None = None) -> Any:
-    """A surface interaction seen from directions [N, 3] or [3], at texture coordinates [N, 2] or [2]."""
-    import drjit as dr
+    """Return a surface point seen from directions [N, 3] or [3], at texture coordinates [N, 2] or [2]."""
     import mitsuba as mi
 
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    si.wi = mi.Vector3f(np.ascontiguousarray(np.transpose(wi), np.float32))
-    if uv is not None:
-        si.uv = mi.Point2f(np.ascontiguousarray(np.transpose(uv), np.float32))
-    if mi.is_spectral:
-        si.wavelengths = type(si.wavelengths)(450, 500, 550, 600)
-    return si
+    uv = np.zeros(2) if uv is None else uv
+    columns = (np.ascontiguousarray(np.transpose(x), np.float32) for x in (wi, uv))
+    return probe.interaction(*(kind(x) for kind, x in zip((mi.Vector3f, mi.Point2f), columns, strict=True)))
 
 
 def evaluate(bsdf: Any, wi: Array, wo: Array, ctx: Any = None) -> tuple[Array, Array]:
-    """f cos θo [N, channels] and density [N] of pairs of directions [N, 3]."""
-    import mitsuba as mi
-
-    ctx = ctx or mi.BSDFContext()
-    if is_scalar():
-        pairs = [bsdf.eval_pdf(ctx, interaction(i), mi.Vector3f(o)) for i, o in zip(wi, wo, strict=True)]
-        return np.array([mi.unpolarized_spectrum(v) for v, _ in pairs]), np.array([p for _, p in pairs])
-    value, pdf = bsdf.eval_pdf(ctx, interaction(wi), mi.Vector3f(np.ascontiguousarray(np.transpose(wo))))
-    value = np.array(mi.unpolarized_spectrum(value)).T
-    return np.broadcast_to(value, (len(wi), value.shape[-1])), np.broadcast_to(np.array(pdf), len(wi))
+    """Return f cos θo [N, channels] and density [N] of pairs of directions [N, 3]."""
+    return probe.Probe(bsdf).pair(wi, wo, np.zeros((len(wi), 2)), ctx)
 
 
-def evaluate_from(bsdf: Any, wi: Array, wo: Array, ctx: Any = None) -> tuple[Array, Array]:
-    """As ``evaluate``, of one direction [3] to many [N, 3]."""
-    return evaluate(bsdf, np.broadcast_to(wi, wo.shape), wo, ctx)
-
-
-def draw(bsdf: Any, wi: Array, count: int, ctx: Any = None, *, seed: int = 0) -> tuple[Any, Array]:
-    """``count`` samples for one direction [3]: a BSDFSample3f, and weights [N, channels]."""
-    import mitsuba as mi
-
-    rng = mi.PCG32(count, initstate=seed)
-    u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-    found, weight = bsdf.sample(ctx or mi.BSDFContext(), interaction(wi), u, v)
-    weight = np.array(mi.unpolarized_spectrum(weight)).T
-    return found, np.broadcast_to(weight, (count, weight.shape[-1]))
+def draw(bsdf: Any, wi: Array, count: int, ctx: Any = None, *, seed: int = 0) -> probe.Samples:
+    """Return ``count`` samples for one direction [3]."""
+    u = np.random.default_rng(seed).random((count, 3), np.float32)
+    return probe.Probe(bsdf).sample(np.broadcast_to(wi, (count, 3)), u, np.zeros((count, 2)), ctx)
 
 
 def albedo(bsdf: Any, wi: Array, ctx: Any = None, *, resolution: int = 700) -> Array:
@@ -113,7 +78,7 @@ def albedo(bsdf: Any, wi: Array, ctx: Any = None, *, resolution: int = 700) -> A
     phi = np.arctan2(-wi[1], -wi[0]) + np.pi * s * np.abs(s)
     sin = np.sqrt(1 - cos**2)
     wo = np.stack([sin * np.cos(phi), sin * np.sin(phi), cos], axis=-1).reshape(-1, 3).astype(np.float32)
-    value, _ = evaluate_from(bsdf, wi, wo, ctx)
+    value, _ = evaluate(bsdf, np.broadcast_to(wi, wo.shape), wo, ctx)
     # dω = d cos dφ, dφ = 2π |s| ds, ds = 2 dv
     weight = np.broadcast_to(4 * np.pi * np.abs(s), (resolution, resolution)).ravel() / resolution**2
     return (value.astype(np.float64) * weight[:, None]).sum(axis=0)

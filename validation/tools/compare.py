@@ -93,6 +93,7 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
 
     The p-value needs a layer "error" (standard error) or "variance" (of the mean) next to the picture, as
     ``render(target=...)`` and ``aamode="noise"`` write it, and pixels that are independent: a box filter.
+    It is too small where a few very bright rays rule the noise.
 
     Raises ``UsageError`` for what cannot be compared: another size, no such layer, NaN.
     """

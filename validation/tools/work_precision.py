@@ -205,6 +205,7 @@ class WorkPrecision:
 
 def _crossing(points: Sequence[Point], error: float, index: np.ndarray) -> np.ndarray:
     """Return the seconds in which a curve, fastest point first, comes down to an error, by some repeats."""
+    error *= 1 + 1e-9  # an error that is met to rounding is met
     seconds = np.stack([np.median(p.times[index], axis=-1) for p in points])  # [points, ...]
     rmse = np.stack([p.rmse_of(index) for p in points])
     found = np.where(rmse[0] <= error, seconds[0], np.inf)

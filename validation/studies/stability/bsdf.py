@@ -9,7 +9,6 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies.stability.cases import Cases, hexadecimal
 from mrt_mitsuba.validation.studies.stability.formulas import Mitsuba, Ours, Report
@@ -68,10 +67,8 @@ def run(study: Study, *, quick: bool) -> None:
     study.record("pairs of directions", len(lobes))
     found = [_errors(formula, lobes, truth, angles) for formula in (Report(), Mitsuba(), Ours())]
     _hold(cases, lobes, found)
-    _compare(cases, lobes, angles, found)
     _conditioning(cases, lobes)
     _total_reflection(cases)
-    _scalar_variant(cases, lobes.only(lobes.in_bound).only(slice(None, None, 10)), truth, lobes)
     cases.close(
         "Relative errors at the same float32 numbers against 50 digits. Directions are "
         "what their components say, and "
@@ -165,40 +162,6 @@ def _hold(cases: Cases, lobes: Lobes, found: Sequence[Errors]) -> None:
         )
 
 
-def _compare(cases: Cases, lobes: Lobes, angles: FresnelGrid, found: Sequence[Errors]) -> None:
-    """Cell by cell of the grid, our largest error against that of Mitsuba's formula."""
-    mitsuba, ours = found[1], found[2]
-    cell = np.ravel_multi_index(lobes.cell.T, (len(ALPHAS), len(COSINES), len(STEEPNESS)))
-    fresnel_cell = np.unique(angles.iors, return_inverse=True)[1] * DECADES + _decade(angles.cosines)
-    for name in ("d", "g", "f", "value", "pdf"):
-        cells = fresnel_cell if name == "f" else cell
-        steepest = 0 if name == "f" else STEEPNESS[lobes.cell[:, 2] + 1]
-        excess = _largest(cells, ours.of[name]) - _largest(cells, mitsuba.of[name])
-        # Which of two sound formulas is luckier in a cell is a matter of roundings: a dozen in products,
-        # squares and quotients, and two of tan² and alpha² that exp enlarges
-        worse = excess > (12 + 2 * steepest) * ROUNDING
-        cases.study.record(
-            f"{QUANTITIES[name]}: largest excess over roughconductor in a cell, roundings",
-            excess.max() / ROUNDING,
-        )
-        cases.at_most(
-            f"{QUANTITIES[name]}, cells worse than roughconductor",
-            "largest error in a cell of the grid against that of Mitsuba's own functions, "
-            "beyond (12 + 2 tan²/alpha²) "
-            "roundings",
-            "none",
-            len(np.unique(cells[worse])),
-            0,
-        )
-
-
-def _largest(cell: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """For each point the largest error of its cell."""
-    largest = np.zeros(cell.max() + 1)
-    np.maximum.at(largest, cell, error)
-    return largest[cell]
-
-
 def _decade(cosines: np.ndarray) -> np.ndarray:
     return np.clip(np.floor(-np.log10(np.float64(cosines))), 0, DECADES - 1).astype(int)
 
@@ -240,33 +203,6 @@ def _total_reflection(cases: Cases) -> None:
     cases.at_least(
         "F at the critical angle, smallest", "the same", "reached from both sides", found.min(), 0.9
     )
-
-
-def _scalar_variant(cases: Cases, few: Lobes, truth: Truth, lobes: Lobes) -> None:
-    """The plugin and its functions in ``scalar_rgb``, where numbers are Python's and only vectors float32."""
-    import mitsuba as mi
-
-    before = mi.variant()
-    runtime.use(runtime.SLOW)
-    try:
-        formula = Ours()
-        rows = []
-        for wi, wo, alpha, ior in zip(few.wi, few.wo, few.alpha, few.ior, strict=True):
-            directions = mi.Vector3f(wi.tolist()), mi.Vector3f(wo.tolist())
-            terms = formula.terms(*directions, float(alpha), float(ior))
-            rows.append([float(getattr(terms, name)) for name in ("d", "g", "value", "pdf")])
-    finally:
-        runtime.use(before)
-    index = np.flatnonzero(lobes.in_bound)[::10]
-    for name, values in zip(("d", "g", "value", "pdf"), np.array(rows).T, strict=True):
-        error = np.abs(values / getattr(truth, name)[index] - 1)
-        cases.at_most(
-            f"{QUANTITIES[name]}, largest in scalar_rgb",
-            f"{len(few)} pairs, alpha 1e-4 … 1, D ≥ 1e-7 of its peak",
-            "a few roundings",
-            error.max(),
-            BOUND,
-        )
 
 
 # ------------------------------------------------ Tables ---------------------------------------------------

@@ -1,4 +1,4 @@
-"""Nothing that is not finite, and nothing negative: plugins in bulk, whole renders, and what is refused."""
+"""Nothing that is not finite, and nothing negative: plugins in bulk, and whole renders."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mrt_mitsuba import runtime
 from mrt_mitsuba.plugins.intersect import (
     cone_frame,
     cone_surface,
@@ -38,16 +37,13 @@ FRESNEL = ("schlick", "dielectric", "unity")
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Bulk evaluations with one in three numbers an extreme one; scenes drawn by lot; refusals."""
+    """Bulk evaluations with one in three numbers an extreme one; scenes drawn by lot."""
     cases = Cases(study, "finite", "Finite and not negative")
     count = 10**6 if quick else 10**8
     for name, what, evaluate in BULK:
         bad = _bulk(evaluate, count)
         cases.at_most(name, f"{count:.0e} random and adversarial evaluations: {what}", "none", bad, 0)
-    _scalar_variant(cases, 50 if quick else 1000)
     _random_scenes(cases, 3 if quick else 40)
-    _refusals(cases)
-    _small_alpha(cases)
     cases.close(
         "A negative alpha is allowed: D sees its square, G₁ its sign, and where the BSDF "
         "would be negative it is 0. "
@@ -273,43 +269,6 @@ BULK: Sequence[tuple[str, str, Callable[[_Draw], Any]]] = (
 )
 
 
-def _scalar_variant(cases: Cases, count: int) -> None:
-    """The BSDF, one evaluation at a time, at the extremes of its parameters."""
-    import mitsuba as mi
-
-    before = mi.variant()
-    runtime.use(runtime.SLOW)
-    rng = np.random.default_rng(3)
-    try:
-        bad = sum(_scalar_evaluation(mi, rng) for _ in range(count))
-    finally:
-        runtime.use(before)
-    cases.at_most(
-        "mrt_bsdf in scalar_rgb", f"{count} adversarial evaluations", "none, and no division by zero", bad, 0
-    )
-
-
-def _scalar_evaluation(mi: Any, rng: np.random.Generator) -> bool:
-    bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": FRESNEL[rng.integers(3)]})
-    parameters = mi.traverse(bsdf)
-    for name, extremes in (("alpha", ALPHAS), ("int_ior", IORS), ("ext_ior", IORS)):
-        parameters[name] = type(parameters[name])(float(rng.choice(extremes)))
-    parameters.update()
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    si.wi, wo = (_scalar_direction(mi, rng) for _ in range(2))
-    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo)
-    u = [float(x) for x in rng.choice(UNIFORM, 3)]
-    drawn, weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
-    found = np.array([*value, pdf, *weight, drawn.pdf, *bsdf.eval_attribute("mirror_reflectance", si)])
-    return bool((~(found >= 0) | np.isinf(found)).any())
-
-
-def _scalar_direction(mi: Any, rng: np.random.Generator) -> Any:
-    z, phi = float(rng.choice(COSINES)), float(rng.uniform(0, 2 * np.pi))
-    r = float(np.sqrt((1 - z) * (1 + z)))
-    return mi.Vector3f(r * float(np.cos(phi)), r * float(np.sin(phi)), z)
-
-
 # --------------------------------------------- Whole renders -----------------------------------------------
 
 
@@ -352,85 +311,4 @@ def _random_scene(rng: np.random.Generator) -> Scene:
         planes=(Plane(point(), 2.5, material()), Plane((0, 1e-20, 0), 1.5, material())),
         cones=tuple(Cone(point(), point(), radius(), material()) for _ in range(3)),
         cylinders=tuple(Cylinder(point(), point(), radius(), material()) for _ in range(3)),
-    )
-
-
-# ------------------------------------------------ Refusals -------------------------------------------------
-
-NAN, INF = float("nan"), float("inf")
-CONE = {"type": "mrt_cone", "apex": [0, 1, 0], "base_center": [0, 0, 0]}
-CYLINDER = {"type": "mrt_cylinder", "p0": [0, 1, 0], "p1": [0, 0, 0]}
-
-# Parameter and senseless values of it; the plugins refuse them when they are made
-REFUSED: Sequence[tuple[dict[str, Any], str, Sequence[Any]]] = (
-    ({"type": "mrt_bsdf"}, "alpha", (NAN, INF, -INF)),
-    ({"type": "mrt_bsdf"}, "int_ior", (NAN, INF, 0.0, -1.5)),
-    ({"type": "mrt_bsdf"}, "ext_ior", (NAN, INF, 0.0, -1.5)),
-    ({"type": "mrt_bsdf"}, "fresnel", ("other",)),
-    (CONE, "radius", (NAN, INF, 0.0, -1.0)),
-    (CONE, "apex", ([0, 0, 0], [NAN, 0, 0], [INF, 0, 0])),
-    (CONE, "segments", (2,)),
-    (CYLINDER, "radius", (NAN, INF, 0.0, -1.0)),
-    (CYLINDER, "p0", ([0, 0, 0], [NAN, 0, 0])),
-    ({"type": "mrt_plane", "normal": [0, 1, 0]}, "normal", ([0, 0, 0], [NAN, 0, 1], [INF, 0, 0])),
-    ({"type": "mrt_plane", "normal": [0, 1, 0]}, "distance", (NAN, INF)),
-    ({"type": "mrt_plane", "normal": [0, 1, 0]}, "extent", (NAN, 0.0, -1.0)),
-    ({"type": "mrt_light"}, "position", ([NAN, 0, 0], [INF, 0, 0])),
-    ({"type": "mrt_whitted"}, "max_depth", (0, -1)),
-    ({"type": "mrt_whitted"}, "min_contribution", (NAN, -1.0)),
-    ({"type": "mrt_whitted"}, "bounce_budget", ("other",)),
-)
-
-
-def _refusals(cases: Cases) -> None:
-    for plugin, key, values in REFUSED:
-        accepted = sum(not _refuses({**plugin, key: value}, key) for value in values)
-        cases.at_most(
-            f"{plugin['type']}, {key}",
-            f"of {', '.join(map(str, values))}: how many are accepted, or refused without "
-            f"naming the parameter",
-            "a ParameterError for each",
-            accepted,
-            0,
-        )
-
-
-def _refuses(description: dict[str, Any], key: str) -> bool:
-    """Does the plugin refuse to be made, with its typed error that names the parameter?"""
-    import mitsuba as mi
-
-    try:
-        mi.load_dict(description)
-    except RuntimeError as error:  # Mitsuba passes on what a plugin raised as text
-        return "ParameterError" in str(error) and f'"{key}"' in str(error)
-    return False
-
-
-def _small_alpha(cases: Cases) -> None:
-    """What alpha = 0 and the like do: the same as 1e-8."""
-    import mitsuba as mi
-
-    def value(alpha: float) -> float:
-        bsdf = mi.load_dict(
-            {"type": "mrt_bsdf", "alpha": alpha, "diffuse_reflectance": 0.0, "fresnel": "unity"}
-        )
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        si.wi = mi.Vector3f(0, 0, 1)
-        return float(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(1e-8, 0, 1))[0][0])
-
-    expected = value(1e-8)
-    for alpha in (0.0, TINY, 1e-20, 9e-9):
-        cases.at_most(
-            f"alpha {alpha:g}",
-            "difference of the BSDF from that of alpha 1e-8",
-            "the same value",
-            abs(value(alpha) - expected),
-            0,
-        )
-    cases.at_least(
-        "alpha 1e-8",
-        "the BSDF half an alpha off the mirror direction",
-        "1e14, the peak of D over 4",
-        expected,
-        1e14,
     )

@@ -265,7 +265,8 @@ def stand_in_cases(cases: Cases) -> None:
         t = np.where(np.array(si.is_valid()), np.array(si.t), np.inf)
         both = np.isfinite(t) & np.isfinite(truth.t)
         gap = np.abs(t[both] - truth.t[both]) * np.abs((truth.n * d).sum(axis=1)[both])
-        angle = np.linalg.norm(np.array(si.sh_frame.n).T - truth.n, axis=1)[both]
+        normals = (np.array(n).T - truth.n for n in (si.n, si.sh_frame.n))  # of faces, of corners
+        angle = np.max([np.linalg.norm(n, axis=1)[both] for n in normals], axis=0)
         p = (o + np.where(both, truth.t, 0)[:, None] * d - APEX)[both & (np.abs(truth.n @ axis) < 0.9)]
         azimuth = np.arctan2(p @ np.cross(axis, across), p @ across)
         u = np.array(si.uv.x)[both & (np.abs(truth.n @ axis) < 0.9)]

@@ -227,7 +227,8 @@ def _direct(reflectance: float, clamp: bool) -> float:
     """What one wall sends back along its normal, in float64: the light is seen at 45° from both."""
     half = np.sqrt(0.5)
     with np.errstate(divide="ignore"):
-        lobe = specular_lobe(*np.array([[[0, 0, 1.0]], [[half, 0, half]], [[0, 0, 1.0]]]), np.array([0.5]))[0]
+        up, to_light = np.array([[0, 0, 1.0]]), np.array([[half, 0, half]])
+        lobe = specular_lobe(up, to_light, up, np.array([0.5]))[0]
     value = 3.0 * half * (0.25 / np.pi + reflectance * lobe)
     return float(min(value, 1.0) if clamp else value)
 
