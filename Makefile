@@ -1,6 +1,7 @@
 # make render [SCENE=3] [ARGS="aa=2"]   render a scene to out/sceneN.png and .exr
 # make test   [ARGS="-k llvm"]          run the tests
 # make fuzz                            random inputs, ten thousand for each reader: a few minutes
+# make attack [ROUNDS=10]               hostile files, signals, threads, limits: some minutes; 100 rounds: an hour
 # make docs                            the documentation as a site: docs/_build/index.html
 # make bench  [ARGS="--compare F"]      time scenes 0-4 into out/bench.json
 # make setup                            the environment alone: .venv with the commands mrt and mrt-validate
@@ -10,12 +11,13 @@ VENV   ?= .venv
 SCENE  ?= 3
 ARGS   ?=
 OUT    ?= out
+ROUNDS ?= 10
 
 BIN  := $(VENV)/bin
 # One stamp per set of extras: installing one leaves the others as they are.
 STAMP := $(VENV)/.mrt
 
-.PHONY: setup render test fuzz bench docs lint types package clean
+.PHONY: setup render test fuzz attack bench docs lint types package clean
 setup: $(STAMP)-base
 
 render: $(STAMP)-base
@@ -28,6 +30,9 @@ test: $(STAMP)-test
 
 fuzz: $(STAMP)-test
 	$(BIN)/python -m pytest -m fuzz --hypothesis-profile=long --hypothesis-show-statistics $(ARGS)
+
+attack: $(STAMP)-test
+	MRT_ATTACK_ROUNDS=$(ROUNDS) $(BIN)/python -m pytest -m "attack or fuzz" $(ARGS)
 
 bench: $(STAMP)-test
 	$(BIN)/python -m mrt_mitsuba.validation.bench --out $(OUT)/bench.json $(ARGS)

@@ -23,7 +23,7 @@ class Terminated(KeyboardInterrupt):
     """The termination signal, raised wherever the program is."""
 
 
-SIGNALS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
+SIGNALS: dict[int, type[KeyboardInterrupt]] = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
 if hasattr(signal, "SIGHUP"):
     SIGNALS[signal.SIGHUP] = Terminated  # the terminal is gone
 

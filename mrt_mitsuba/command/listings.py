@@ -32,10 +32,11 @@ def usage() -> str:
     for title, entries in (("options", options), ("commands", commands)):
         lines += ["", f"{title}:"]
         for form, text in entries.items():
-            indent = {"initial_indent": "  ", "subsequent_indent": " " * _COLUMN}
             if len(form) > _COLUMN - 3:
                 lines, form = [*lines, f"  {form}"], ""
-            lines += textwrap.wrap(f"{form:<{_COLUMN - 3}} {text}", WIDTH, **indent)
+            lines += textwrap.wrap(
+                f"{form:<{_COLUMN - 3}} {text}", WIDTH, initial_indent="  ", subsequent_indent=" " * _COLUMN
+            )
     return "\n".join(lines) + "\n"
 
 

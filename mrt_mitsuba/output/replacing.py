@@ -115,7 +115,7 @@ def _explained(*paths: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        names = " and ".join(map(os.fspath, paths))
+        names = " and ".join(os.fspath(path) for path in paths)
         raise OutputError(f"cannot write {names}: {error.strerror or error}") from error
 
 

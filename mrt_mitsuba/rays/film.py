@@ -57,7 +57,7 @@ class Film:
         rows, columns = (slice(self.border, n - self.border) for n in self.shape)
         return sampled[..., rows, columns, :]
 
-    def framed(self, picture: np.ndarray, value: object) -> np.ndarray:
+    def framed(self, picture: np.ndarray, value: float) -> np.ndarray:
         """Return a picture [H, W] with the film's border around it, of one value."""
         return np.pad(picture, self.border, constant_values=value)
 

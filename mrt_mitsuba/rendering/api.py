@@ -263,7 +263,8 @@ def _each_picture(
 ) -> Iterator[Passes]:
     kind = FilmPasses if plan.lattice.kind == FILM else Passes
     rays = settings.maxspp if settings.rmse else plan.repeats
-    goal = Goal(settings.rmse, rays, settings.maxseconds, settings.on_round)
+    on_round: Any = settings.on_round
+    goal = Goal(settings.rmse, rays, settings.maxseconds, on_round)
     for exposure in exposures:
         yield kind(job, tracer, plan, exposure, goal)
 

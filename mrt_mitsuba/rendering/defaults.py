@@ -46,7 +46,7 @@ def _check(settings: RenderSettings, facts: RenderFacts) -> None:
         )
     if settings.rmse is None and settings.lattice != FILM:
         raise UsageError("aamode=noise: without random numbers, give the error to reach as target=")
-    if settings.rmse is None and settings.spp < MIN_SPP:
+    if settings.rmse is None and (settings.spp or 1) < MIN_SPP:
         raise UsageError(
             f"aamode=noise: give the mean of a pixel's rays as spp, {MIN_SPP} or more, or a target"
         )

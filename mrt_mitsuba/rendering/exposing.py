@@ -186,13 +186,13 @@ class Exposer:
             advance(len(own) * groups.size)
         rays = groups.size * np.bincount(pixel, minlength=pictures * film.pixels)
         rays = rays.reshape(pictures, film.pixels)
-        total = np.moveaxis(total.reshape(-1, pictures, film.pixels), 0, -1)
+        totals = np.moveaxis(total.reshape(-1, pictures, film.pixels), 0, -1)
         if canvas is None:
-            means = total[..., :kept] / np.maximum(rays, 1)[..., None]
+            means = totals[..., :kept] / np.maximum(rays, 1)[..., None]
             sums = np.concatenate([means, rays[..., None] > 0], axis=-1).reshape(pictures, *film.shape, -1)
         else:
             sums = canvas.sums
-        return Exposed(sums[..., :-1], sums[..., -1], rays, total[..., :3], total[..., kept:])
+        return Exposed(sums[..., :-1], sums[..., -1], rays, totals[..., :3], totals[..., kept:])
 
     @property
     def _counted(self) -> dict[str, str]:

@@ -30,8 +30,8 @@ def require_file(path: str | os.PathLike[str]) -> None:
             problem = f"permission denied; try chmod +r {name}"
     except (FileNotFoundError, NotADirectoryError):
         problem = f"there is no such file in {os.path.dirname(os.path.abspath(name))}"
-    except ValueError as error:  # a zero byte in the name
-        problem = str(error)
+    except ValueError:  # a zero byte in the name
+        problem = "its name holds a zero byte"
     except OSError as error:
         circle = error.errno == errno.ELOOP
         problem = "its symbolic links lead in a circle" if circle else error.strerror or str(error)

@@ -53,7 +53,7 @@ def test_render_refuses(arguments: dict[str, Any], text: str) -> None:
     ("scene", "text"),
     [
         ("", "cannot read '': there is no such file"),
-        ("a\0b.xml", "null byte"),
+        ("a\0b.xml", "its name holds a zero byte"),
         (Path("none.obj"), "cannot read none.obj: there is no such file in"),
         ({"type": "scene"}, "a dict has no sensor: add one"),
         ({"type": "potato"}, 'Plugin "potato" not found'),

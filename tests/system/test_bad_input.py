@@ -108,7 +108,6 @@ SCENES: list[Case] = [
         1,
         "768x0: give it",
     ),
-    (xml(""), "out scene=a.xml width=9", 2, "a.xml brings a film of 4x3: change it there"),
     (xml(""), "out scene=a.xml fresnel=schlick", 2, "it is a parameter of mrt_bsdf"),
 ]
 
