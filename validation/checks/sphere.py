@@ -61,7 +61,7 @@ class Cells:
             starts.append(start[~full])
             levels.append(np.full((~full).sum(), level))
             level += 1
-            start = _quarters(start[full], level)
+            start = _quarters(start[full], level) if full.any() else start[:0]
         return Cells(np.concatenate(starts), np.concatenate(levels)).sorted()
 
     def sorted(self) -> Cells:

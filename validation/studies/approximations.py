@@ -24,6 +24,10 @@ LEVEL = (
 )
 
 
+# One ray at a time through the pixel's centre, as the report's lattice has it
+AT_CENTRES: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}
+
+
 @dataclass(frozen=True)
 class Step:
     """A picture on the way, and what is new in it."""
@@ -56,7 +60,8 @@ def without_approximations(number: int, *, width: int, height: int, spp: int) ->
     ]
     return [
         Step(
-            what, mrt.render(mi.load_dict(nodes), integrator=integrator, spp=count, aa=1, aamode="none").image
+            what,
+            mrt.render(mi.load_dict(nodes), integrator=integrator, spp=count, **AT_CENTRES).image,
         )
         for what, nodes, integrator, count in scenes
     ]
@@ -88,7 +93,7 @@ def path_estimate(nodes: dict[str, Any], *, spp: int, seed: int = 0, integrator:
     scene = mi.load_dict(nodes)
     return estimate(
         [
-            mrt.render(scene, integrator=integrator, spp=spp, aa=1, aamode="none", seed=seed + i).image
+            mrt.render(scene, integrator=integrator, spp=spp, **AT_CENTRES, seed=seed + i).image
             for i in range(RENDERS)
         ]
     )
