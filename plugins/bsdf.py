@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from .emission import largest
+from .fresnel import f0_from_ior
 from .kernel_plan import Mirror, Reason
-from .lobes import Lobes, Pair
+from .lobes import ALPHA_MAX, ALPHA_MIN, Lobes, Pair
 from .merged_bsdf import UniformMaterial
 from .parameters import ParameterError, choice, flag, number, spectrum
 from .protocols import MergeableBSDF
@@ -212,18 +215,35 @@ class MrtBSDF(mi.BSDF):
         raise ParameterError(f'mrt_bsdf: no scalar attribute "{name}"; there is "int_ior"')
 
     def mirror_bound(self) -> Mirror:
-        """Return an upper bound of ``mirror_reflectance``, and ``int_ior``; inf for what varies."""
-        reflectance = self._largest(self.specular_reflectance)
-        if self.f0 is not None:
-            reflectance *= max(1, self._largest(self.f0))
+        """Return upper bounds of ``mirror_reflectance``, and ``int_ior``; inf for what varies."""
+        reflectance, f0 = largest(self.specular_reflectance), self._f0_bound()
         int_ior = float("inf") if isinstance(self.int_ior, mi.Texture) else first(self.int_ior)
-        return Mirror(reflectance, int_ior)
+        return Mirror(reflectance * max(1, f0), int_ior, reflectance * f0)
 
-    @staticmethod
-    def _largest(texture: mi.Texture) -> float:
-        if varies(texture) or mi.is_spectral:
+    def value_bound(self) -> float:
+        """Return an upper bound of f cos θ; inf where a parameter varies.
+
+        D is largest at tan²θ = 2 α² - 1, else at 0. G₁ / cos θ is 1 / cos θ up to α tan θ = 1/1.6 and at most
+        3.535 / (α sin θ) beyond. A negative α has |G₁| < 3 in place of 1, twice.
+        """
+        if isinstance(self.alpha, mi.Texture):
             return float("inf")
-        return max(abs(first(x)) for x in texture.eval(dr.zeros(mi.SurfaceInteraction3f)))
+        alpha = min(max(abs(first(self.alpha)), ALPHA_MIN), ALPHA_MAX)
+        peak = max(1, 4 * alpha**4 * math.exp(1 / alpha**2 - 2)) if 2 * alpha**2 > 1 else 1
+        shadowed = 5.66 * math.sqrt(1 + 0.4 / alpha**2) * (9 if first(self.alpha) < 0 else 1)
+        lobe = 0.25 * peak / (math.pi * alpha**2) * shadowed
+        fresnel = max(1, self._f0_bound())
+        specular = largest(self.specular_reflectance)
+        return largest(self.diffuse_reflectance) / math.pi + (specular * fresnel * lobe if specular else 0)
+
+    def _f0_bound(self) -> float:
+        """Return an upper bound of the reflectance at normal incidence."""
+        if self.f0 is not None:
+            return largest(self.f0)
+        varying = isinstance(self.int_ior, mi.Texture) or isinstance(self.ext_ior, mi.Texture)
+        if self.fresnel == "unity" or varying:
+            return 1.0
+        return f0_from_ior(first(self.ext_ior), first(self.int_ior))
 
     def to_string(self) -> str:
         names = (*NUMBERS, *COLORS, "f0")

@@ -6,6 +6,8 @@ the plan decides, the integrator obeys. A plan may be edited (``dataclasses.repl
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -42,6 +44,12 @@ class Reason(str, Enum):
     OTHER_BSDF = "other-bsdf"  # a BSDF other than mrt_bsdf
     MIXED_FRESNEL = "mixed-fresnel"
     VARYING = "varying"  # a parameter varies over the surface, or has no place in the table
+    ALONE = "alone"  # a ray that leaves the only object, which is convex, meets nothing
+    BLACK = "black"  # no material reflects
+    NO_DIFFUSE = "no-diffuse"
+    NO_SPECULAR = "no-specular"
+    UNBOUNDED = "unbounded"  # no bound of what may still arrive is known
+    BOUNDED = "bounded"  # a path's throughput stays within float32
     GRADIENTS = "gradients"  # derivatives are wanted
 
 
@@ -51,6 +59,7 @@ class Mirror:
 
     reflectance: float
     int_ior: float
+    at_normal: float = 1.0  # its reflectance at normal incidence
 
 
 @dataclass(frozen=True)
@@ -64,10 +73,17 @@ class SceneFacts:
     plain_spheres: int  #: of the spheres, those that face outwards and do not emit
     planes: int  #: shapes that are infinite planes
     quadrics: tuple[tuple[str, int], ...]  #: kinds of exact quadrics, and how many of each
-    lights: int  #: emitters but for the environment
+    alone: bool  #: is there only one object, convex and reflecting on its outside
+    lights: int  #: emitters but for the environment and what is black
     random_lights: int  #: of the lights, those that need random numbers
     surface_emitters: int  #: of the lights, those that are surfaces
     environment: bool  #: is there an environment emitter
+    sky: float  #: its largest radiance; inf where that is not known
+    arriving: float  #: the most that arrives from all lights; inf where there is no bound
+    emission: float  #: the largest radiance of a surface; inf where that is not known
+    value: float  #: the largest value of a BSDF times the cosine; inf where that is not known
+    diffuse: bool  #: has a material a diffuse lobe
+    specular: bool  #: has a material a specular lobe
     mirrors: tuple[Mirror, ...]  #: of the materials that reflect like a mirror
     oriented: bool  #: does a material depend on tangents: anisotropy, bump and normal maps
     textured: bool  #: does a material vary over its surface
@@ -82,13 +98,22 @@ class Settings:
     max_depth: int
     min_contribution: float
     bounce_budget: str
-    own_sky: bool  #: was a ``sky`` given
+    clamp: bool
+    own_sky: float | None  #: largest radiance of ``sky``; inf where that is not known, None without one
 
     def cost(self, int_ior: float) -> int:
         """Return what a bounce off a material of this index takes from the bounce budget."""
         if self.bounce_budget == "plain":
             return 1
         return max(10 - int(np.float32(10) * np.float32(min(int_ior, 1))), 1)
+
+
+@dataclass(frozen=True)
+class CutOff:
+    """What counts against ``min_contribution``, by what it is multiplied with."""
+
+    paths: float  #: a path's throughput; inf: it never ends for being too dim
+    lights: float  #: a light's share at a hit, below which it is taken for visible
 
 
 @dataclass(frozen=True)
@@ -104,7 +129,11 @@ class KernelPlan:
     random: bool  #: random numbers
     emission: bool  #: surfaces that emit
     sky: str  #: "none", "parameter" or "environment"
-    mirrors: bool  #: the loop over mirror bounces
+    mirrors: bool  #: mirror reflections
+    mirror_rays: bool  #: the loop that traces them; else they see the sky
+    cut_off: CutOff  #: what is too little to be traced
+    guarded: bool  #: throughputs kept within float32
+    lobes: tuple[str, ...]  #: of the materials: "diffuse", "specular"
     textures: bool  #: texture coordinates
     shading_frames: bool  #: interpolated normals
     tangents: bool  #: derivatives of the surface by uv, and frames along them
@@ -115,6 +144,27 @@ class KernelPlan:
     def reason(self, name: str) -> Reason | None:
         """Return why ``name`` was left out; None where it was not."""
         return dict(self.reasons).get(name)
+
+
+def _arriving(facts: SceneFacts, settings: Settings) -> float:
+    """Return a bound of the radiance from anywhere, but for what mirrors add: inf where there is none.
+
+    Each light counts for one where its share is clamped to that, and the sky for one at least.
+    """
+    lights = facts.lights if settings.clamp or facts.lights == 0 else facts.arriving * facts.value
+    sky = facts.sky if settings.own_sky is None else settings.own_sky
+    return lights + max(1, sky) + facts.emission
+
+
+def _hits(mirrors: Sequence[Mirror], settings: Settings) -> float:
+    """Return the number of hits of a path, weighted by its throughput at normal incidence.
+
+    Of materials that reflect less than a half there, it is one: what is left out at further hits adds less
+    than as much again. Where mirrors face each other, it adds up.
+    """
+    reflectance = max((m.at_normal for m in mirrors if m.at_normal < math.inf), default=0.0)
+    bounces = (settings.max_depth - 2) // min((settings.cost(m.int_ior) for m in mirrors), default=1) + 1
+    return 1.0 if reflectance <= 0.5 else sum(min(reflectance, 1.0) ** k for k in range(max(bounces, 0) + 1))
 
 
 def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
@@ -137,10 +187,29 @@ def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
         (facts.plain_spheres < facts.native_shapes, Reason.NATIVE_SHAPES),
     )
     unrolled = facts.lights <= UNROLLED_LIGHTS or not facts.vectorised
-    lit = unless("lights", (facts.lights == 0, Reason.NO_LIGHTS))
+    lobes = tuple(name for name in ("diffuse", "specular") if getattr(facts, name))
+    lit = unless("lights", (facts.lights == 0, Reason.NO_LIGHTS), (not lobes, Reason.BLACK))
     affordable = [m for m in facts.mirrors if settings.cost(m.int_ior) < settings.max_depth]
-    bright = [m for m in affordable if m.reflectance * (facts.lights + 1) > settings.min_contribution]
-    sky = "parameter" if settings.own_sky else "environment"
+    arriving = _arriving(facts, settings)
+    bright = [m for m in affordable if m.reflectance * arriving > settings.min_contribution]
+    has_sky = settings.own_sky is not None or facts.environment
+    sky = "environment" if settings.own_sky is None else "parameter"
+    mirrors = unless(
+        "mirrors",
+        (bool(facts.mirrors) and not affordable, Reason.MAX_DEPTH),
+        (not bright, Reason.NO_MIRRORS),
+        (facts.alone and not has_sky, Reason.ALONE),
+    )
+    hits = _hits(affordable, settings) if mirrors else 1.0
+    growth = max((m.reflectance for m in affordable), default=0.0)
+    unless(
+        "lobes",
+        (not lobes, Reason.BLACK),
+        (not facts.specular, Reason.NO_SPECULAR),
+        (not facts.diffuse, Reason.NO_DIFFUSE),
+    )
+    bounded = unless("cut_off", (mirrors and arriving == math.inf, Reason.UNBOUNDED))
+    paths = (arriving * hits if bounded else math.inf) if mirrors else 0.0
     return KernelPlan(
         bvh=unless("bvh", (no_native, Reason.NO_NATIVE_SHAPES)),
         # It pays where there are thousands of triangles to meet
@@ -153,12 +222,12 @@ def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
         lights=("unrolled" if unrolled else "loop") if lit else "none",
         random=unless("random", (facts.random_lights == 0, Reason.DELTA_LIGHTS)),
         emission=unless("emission", (facts.surface_emitters == 0, Reason.NO_SURFACE_EMITTERS)),
-        sky=sky if unless("sky", (not (settings.own_sky or facts.environment), Reason.NO_SKY)) else "none",
-        mirrors=unless(
-            "mirrors",
-            (bool(facts.mirrors) and not affordable, Reason.MAX_DEPTH),
-            (not bright, Reason.NO_MIRRORS),
-        ),
+        sky=sky if unless("sky", (not has_sky, Reason.NO_SKY)) else "none",
+        mirrors=mirrors,
+        mirror_rays=mirrors and unless("mirror_rays", (facts.alone, Reason.ALONE)),
+        cut_off=CutOff(paths, facts.lights * hits),
+        guarded=mirrors and unless("guarded", (growth ** (settings.max_depth - 1) < 1e30, Reason.BOUNDED)),
+        lobes=lobes,
         textures=unless("textures", (not facts.textured, Reason.UNIFORM)),
         shading_frames=unless("shading_frames", (facts.meshes == 0, Reason.NO_MESHES)),
         tangents=unless("tangents", (not facts.oriented, Reason.ISOTROPIC)),

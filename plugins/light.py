@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .parameters import spectrum, vector
+from .protocols import SteadyLight
 from .variants import first, is_jit, pointer
 
 
@@ -99,4 +100,5 @@ class MrtLight(mi.Emitter):
         return f"MrtLight[position={self.position}, intensity={self.intensity}]"
 
 
+SteadyLight.register(MrtLight)
 mi.register_emitter("mrt_light", MrtLight)

@@ -68,12 +68,20 @@ class QuadricShape(ABC):
         """Return the unit frame of the only quadric with its derivatives; None where none are wanted."""
 
 
+class SteadyLight(ABC):
+    """A light that is as bright far away as near by."""
+
+
 class MirrorBSDF(ABC):
     """A BSDF with the attributes ``mirror_reflectance`` and ``int_ior``, which drive the mirror rays."""
 
     @abstractmethod
     def mirror_bound(self) -> Mirror:
         """Return upper bounds of them."""
+
+    @abstractmethod
+    def value_bound(self) -> float:
+        """Return an upper bound of f cos θ; inf where there is none."""
 
     @abstractmethod
     def state(self) -> Any:

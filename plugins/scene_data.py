@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from .emission import arriving, brightness
 from .hit_errors import CURVED, HitErrors
 from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
 from .merged_bsdf import MergedBSDF, uniform_materials
 from .mesh_api import ray_flags, surface_interaction, vertex_version
 from .planes import Planes
 from .protocols import MirrorBSDF, PlaneShape, QuadricShape
+from .quadric_kinds import KINDS
 from .quadrics import quadrics_of
 from .spheres import Spheres, is_plain_sphere, is_sphere
 from .variants import but_not, is_jit, pointer, varies
@@ -44,13 +47,15 @@ class SceneReading:
         self.quadrics = [s for s in self.shapes if isinstance(s, QuadricShape)]
         self.native = [s for s in self.shapes if not isinstance(s, (PlaneShape, QuadricShape))]
         self.environment = scene.environment()
-        self.lights = [e for e in scene.emitters() if not e.is_environment()]
+        self.emitters = scene.emitters()
+        values = zip(self.emitters, brightness(self.emitters), strict=True)
+        self.lights = [e for e, value in values if not e.is_environment() and value != 0]
         self.bsdfs = list({id(b): b for b in (s.bsdf() for s in self.shapes)}.values())
         materials = uniform_materials(self.shapes)
         self.unmergeable = materials if isinstance(materials, Reason) else None
         self.materials = {} if isinstance(materials, Reason) else materials
         self.state = self._state()
-        self.facts = self._facts()
+        self._facts = self._read_facts()
 
     def is_of(self, scene: mi.Scene) -> bool:
         """Is it this scene that was read? The id of a scene may have passed to another one, those of objects
@@ -66,9 +71,21 @@ class SceneReading:
         """Return what changes whenever a shape was moved, a mesh edited or a material changed."""
         materials = [b.state() for b in self.bsdfs if isinstance(b, MirrorBSDF)]
         moving = [s.moving_frame() is not None for s in self.quadrics]
-        return [*map(_shape_state, self.shapes), *moving, *materials]
+        black = [value == 0 for value in brightness(self.emitters)]
+        return [*map(_shape_state, self.shapes), *moving, *materials, *black]
 
-    def _facts(self) -> SceneFacts:
+    def facts(self) -> SceneFacts:
+        """Return the facts; how bright the emitters are is read anew."""
+        largest = dict(zip(map(id, self.emitters), brightness(self.emitters), strict=True))
+        surfaces = [largest[id(e)] for e in self.lights if mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
+        return replace(
+            self._facts,
+            sky=0.0 if self.environment is None else largest[id(self.environment)],
+            arriving=sum(arriving(e, largest[id(e)]) for e in self.lights),
+            emission=max(surfaces, default=0.0),
+        )
+
+    def _read_facts(self) -> SceneFacts:
         quadrics: Counter[str] = Counter()
         for table in (s.quadrics() for s in self.quadrics):
             quadrics[table.kind] += len(table.rows)
@@ -85,6 +102,13 @@ class SceneReading:
             random_lights=sum(not mi.has_flag(e.flags(), delta) for e in self.lights),
             surface_emitters=sum(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in self.lights),
             environment=self.environment is not None,
+            sky=math.inf,
+            arriving=math.inf,
+            emission=math.inf,
+            alone=self._alone(),
+            value=max(map(_value_bound, self.bsdfs), default=0.0),
+            diffuse=self._has_lobe("diffuse"),
+            specular=self._has_lobe("specular"),
             mirrors=tuple(map(_mirror, filter(has_mirror, self.bsdfs))),
             oriented=any(map(is_oriented, self.bsdfs)),
             textured=any(map(is_textured, self.bsdfs)),
@@ -92,12 +116,25 @@ class SceneReading:
             unmergeable=self.unmergeable,
         )
 
+    def _has_lobe(self, name: str) -> bool:
+        """Has a material such a lobe? Those that are not in the table may."""
+        return self.unmergeable is not None or any(any(getattr(m, name)) for m in self.materials.values())
+
+    def _alone(self) -> bool:
+        """Is there one object only, convex, with a mirror on its outside alone?"""
+        tables = [s.quadrics() for s in self.quadrics]
+        plain = [s for s in self.native if is_plain_sphere(s)]
+        convex = [t for t in tables if KINDS[t.kind].closed and len(t.rows) == 1 and not t.flipped]
+        one_sided = all(isinstance(b, MirrorBSDF) for b in self.bsdfs)
+        return len(self.shapes) == 1 and len(plain) + len(convex) + len(self.planes) == 1 and one_sided
+
 
 class SceneData:
     """The data of the kernels for a scene, as a plan wants them, and its ray queries."""
 
-    def __init__(self, reading: SceneReading, plan: KernelPlan) -> None:
-        self.reading, self.facts, self.plan = reading, reading.facts, plan
+    def __init__(self, reading: SceneReading, facts: SceneFacts, plan: KernelPlan) -> None:
+        self.reading, self.facts = reading, facts
+        self.limit(plan)
         exact = [s for s in reading.quadrics if s.quadrics().kind in plan.quadrics]
         planes = reading.planes if plan.planes else []
         own = {id(s) for s in (*exact, *planes)}
@@ -117,6 +154,12 @@ class SceneData:
         self.ray_flags = ray_flags(
             textures=plan.textures, shading_frames=plan.shading_frames, tangents=plan.tangents
         )
+
+    def limit(self, plan: KernelPlan) -> None:
+        """Take over a plan that differs in its cut-off alone."""
+        self.plan, self.path_limit = plan, plan.cut_off.paths
+        if is_jit() and self.path_limit not in (0, math.inf, self.facts.lights + 1):
+            self.path_limit = dr.opaque(mi.Float, self.path_limit)  # a brighter sky needs no new kernel
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 
@@ -205,6 +248,15 @@ class SceneData:
 
     # -------------------------------------------- Materials -----------------------------------------------
 
+    def context(self) -> mi.BSDFContext:
+        """Return what of the materials is evaluated."""
+        context = mi.BSDFContext()
+        if self.plan.lobes == ("diffuse",):
+            context.type_mask = +mi.BSDFFlags.Diffuse
+        elif self.plan.lobes == ("specular",):
+            context.type_mask = +mi.BSDFFlags.Glossy
+        return context
+
     def eval_bsdf(
         self, hit: Hit, wos: list[mi.Vector3f], facing: list[mi.Bool], mirror: bool
     ) -> tuple[list[mi.UnpolarizedSpectrum], mi.UnpolarizedSpectrum, mi.Float]:
@@ -212,7 +264,8 @@ class SceneData:
         refraction: all of it in one call.
         """
         arguments = (hit.si, wos, facing, hit.found)
-        evaluate = partial(_eval_bsdf, mirror)  # dispatch would take a bool among the arguments for its mask
+        # Not among the arguments, where dispatch would take a bool for its mask
+        evaluate = partial(_eval_bsdf, mirror, self.context())
         if not is_jit():
             return evaluate(hit.si.bsdf() if hit.found else None, *arguments)
         if self.merged is None:
@@ -257,12 +310,17 @@ def _frame_along(si: mi.SurfaceInteraction3f) -> mi.Frame3f:
     return mi.Frame3f(dr.select(known, s, any_frame.s), dr.select(known, dr.cross(n, s), any_frame.t), n)
 
 
+def _value_bound(bsdf: Any) -> float:
+    return bsdf.value_bound() if isinstance(bsdf, MirrorBSDF) else math.inf
+
+
 def _mirror(bsdf: Any) -> Mirror:
     return bsdf.mirror_bound() if isinstance(bsdf, MirrorBSDF) else Mirror(1.0, 1.0)
 
 
 def _eval_bsdf(
     mirror: bool,
+    context: mi.BSDFContext,
     bsdf: Any,
     si: mi.SurfaceInteraction3f,
     wos: list[mi.Vector3f],
@@ -273,7 +331,6 @@ def _eval_bsdf(
     reflectance, int_ior = mi.UnpolarizedSpectrum(0), mi.Float(1)
     if bsdf is None:
         return values, reflectance, int_ior
-    context = mi.BSDFContext()
     values = [
         mi.unpolarized_spectrum(bsdf.eval(context, si, wo, seen))
         for wo, seen in zip(wos, facing, strict=True)
@@ -282,6 +339,7 @@ def _eval_bsdf(
         reflectance = bsdf.eval_attribute("mirror_reflectance", si, active)
         int_ior = bsdf.eval_attribute_1("int_ior", si, active)
     elif mirror and has_mirror(bsdf):
+        context = mi.BSDFContext()
         context.type_mask = +mi.BSDFFlags.DeltaReflection
         reflectance = mi.unpolarized_spectrum(bsdf.sample(context, si, mi.Float(0), mi.Point2f(0), active)[1])
     return values, reflectance, int_ior

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
+from .emission import largest
 from .kernel_plan import BUDGETS, KernelPlan, SceneFacts, Settings, make_plan
-from .parameters import choice, flag, integer, number, spectrum
+from .parameters import LARGEST, choice, flag, integer, number, spectrum
 from .protocols import LayeredIntegrator
 from .scene_data import Hit, SceneData, SceneReading
 from .variants import but_not
@@ -71,10 +73,9 @@ class MrtWhitted(mi.SamplingIntegrator):
     ``max_depth``        integer  10           >= 1, bounce budget: a ray at this depth is black
     ``sky``              spectrum (from scene) radiance of a miss; default the environment emitter, else 0
     ``clamp``            boolean  true         clamp each light's contribution to [0, 1], as the report does
-    ``min_contribution`` float    1/16/255     >= 0; a path ends when its throughput times the number of
-                                               lights plus one (the sky) is below, and a light is taken as
-                                               visible when what it adds, times the number of lights, is
-                                               below
+    ``min_contribution`` float    1/16/255     >= 0; a path ends when what it may still bring is below, and a
+                                               light is taken as visible when what it adds, times the number
+                                               of lights, is below; see docs/maths.md
     ``bounce_budget``    string   report       ``report``: a bounce costs max(1, 10 - int(10 int_ior));
                                                ``plain``: 1
     ==================== ======== ============ ===========================================================
@@ -150,7 +151,7 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     def scene_facts(self, scene: mi.Scene) -> SceneFacts:
         """Read what the kernels depend on; cheap where nothing has changed since the last call."""
-        return self._read(scene).facts
+        return self._read(scene).facts()
 
     def kernel_plan(self, facts: SceneFacts) -> KernelPlan:
         """Decide what the kernels for such a scene hold."""
@@ -162,10 +163,14 @@ class MrtWhitted(mi.SamplingIntegrator):
         A ``plan`` of one's own holds until the scene changes; without one, that of ``kernel_plan`` does.
         """
         reading = self._read(scene)
+        facts = reading.facts()
         self._given_plan = self._given_plan if plan is None else plan
-        plan = self._given_plan or self.kernel_plan(reading.facts)
-        if self._data is None or self._data.reading is not reading or self._data.plan != plan:
-            self._data = SceneData(reading, plan)
+        plan = self._given_plan or self.kernel_plan(facts)
+        data = self._data
+        if data is not None and data.reading is reading and replace(data.plan, cut_off=plan.cut_off) == plan:
+            data.limit(plan)
+            return data
+        self._data = SceneData(reading, facts, plan)
         return self._data
 
     def _read(self, scene: mi.Scene) -> SceneReading:
@@ -175,8 +180,8 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     @property
     def _settings(self) -> Settings:
-        own_sky = self.sky is not None
-        return Settings(self.max_depth, self.min_contribution, self.bounce_budget, own_sky)
+        own_sky = None if self.sky is None else largest(self.sky)
+        return Settings(self.max_depth, self.min_contribution, self.bounce_budget, self.clamp, own_sky)
 
     # ------------------------------------------- Tracing -----------------------------------------------
 
@@ -194,7 +199,12 @@ class MrtWhitted(mi.SamplingIntegrator):
         shading = self._shade(data, scene, sampler, ray, hit, mi.UnpolarizedSpectrum(1), active)
         if not data.plan.mirrors:
             return Trace(shading.radiance, shading.radiance, hit, mi.UInt32(0), shading.shadow_rays)
-        throughput, depth = shading.reflectance, shading.cost
+        throughput, depth = self._kept(data, shading.reflectance), shading.cost
+        goes_on = hit.found & self._continues(data, throughput, depth)
+        if not data.plan.mirror_rays:
+            reflected = self._sky(data, data.mirror_ray(ray, hit), goes_on)
+            radiance = shading.radiance + dr.select(goes_on, throughput * reflected, 0)
+            return Trace(radiance, shading.radiance, hit, mi.UInt32(0), shading.shadow_rays)
         state = {
             "radiance": shading.radiance,  # light found so far
             "throughput": throughput,  # product of the mirror reflectances along the path
@@ -202,7 +212,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             "depth": depth,  # what the bounces have cost so far
             "bounces": mi.UInt32(0),  # mirror rays traced
             "shadow_rays": shading.shadow_rays,  # shadow rays traced
-            "active": hit.found & self._continues(data, throughput, depth),  # paths that go on
+            "active": goes_on,  # paths that go on
             "sampler": sampler if data.plan.random else None,  # for lights that are no points
         }
 
@@ -211,7 +221,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             ray, active = s["ray"], s["active"]
             hit = data.intersect(scene, ray, active)
             shading = self._shade(data, scene, s["sampler"], ray, hit, s["throughput"], active)
-            throughput = s["throughput"] * shading.reflectance
+            throughput = self._kept(data, s["throughput"] * shading.reflectance)
             depth = s["depth"] + shading.cost
             return (
                 {
@@ -231,8 +241,14 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     def _continues(self, data: SceneData, throughput: mi.UnpolarizedSpectrum, depth: mi.UInt32) -> mi.Bool:
         """May a path of this throughput and depth still change the picture?"""
-        bound = data.facts.lights + 1
-        return (depth < self.max_depth) & (dr.max(throughput) * bound > self.min_contribution)
+        affordable, brightest = depth < self.max_depth, dr.max(throughput)
+        if data.plan.cut_off.paths == math.inf:
+            return affordable & (brightest > 0)
+        return affordable & (brightest * data.path_limit > self.min_contribution)
+
+    def _kept(self, data: SceneData, throughput: mi.UnpolarizedSpectrum) -> mi.UnpolarizedSpectrum:
+        """Keep a throughput finite: an infinite one times no light would be no number."""
+        return dr.minimum(throughput, LARGEST) if data.plan.guarded else throughput
 
     # ------------------------------------------- Shading -----------------------------------------------
 
@@ -308,7 +324,8 @@ class MrtWhitted(mi.SamplingIntegrator):
         value = sample.weight * bsdf_value
         if self.clamp:
             value = dr.clip(value, 0, 1)
-        matters = dr.max(dr.abs(throughput * value)) * data.facts.lights > self.min_contribution
+        share = dr.max(dr.abs(throughput * value))
+        matters = share * data.plan.cut_off.lights > self.min_contribution
         traced = sample.facing & matters
         visible = but_not(sample.facing, data.occluded(scene, hit, sample.ds, traced))
         return dr.select(visible, value, 0), dr.select(traced, mi.UInt32(1), mi.UInt32(0))

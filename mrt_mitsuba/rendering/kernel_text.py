@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, Reason, SceneFacts
 
 #: What a decision is about, by its name
@@ -16,6 +18,10 @@ WHAT = {
     "emission": "emission",
     "sky": "sky",
     "mirrors": "bounce loop",
+    "mirror_rays": "mirror rays",
+    "cut_off": "cut-off",
+    "guarded": "guard against overflow",
+    "lobes": "one of the lobes",
     "textures": "textures",
     "shading_frames": "shading normals",
     "tangents": "tangents",
@@ -46,6 +52,12 @@ WHY = {
     Reason.OTHER_BSDF: "a material other than mrt_bsdf",
     Reason.MIXED_FRESNEL: "materials of different Fresnel formulas",
     Reason.VARYING: "a material varies over its surface",
+    Reason.ALONE: "a ray that leaves the only object meets nothing",
+    Reason.BLACK: "every material is black",
+    Reason.NO_DIFFUSE: "no material has the diffuse one",
+    Reason.NO_SPECULAR: "no material has the specular one",
+    Reason.UNBOUNDED: "what may still arrive has no known bound",
+    Reason.BOUNDED: "no path gets that bright",
     Reason.GRADIENTS: "derivatives are wanted",
 }
 
@@ -64,14 +76,18 @@ def held(kernel: KernelPlan, facts: SceneFacts) -> list[str]:
         "random": "random numbers",
         "emission": "emission of surfaces",
         "sky": {"parameter": "the integrator's sky", "environment": "the scene's sky"}.get(kernel.sky, ""),
-        "mirrors": "mirror bounces",
+        "mirrors": "mirror bounces" if kernel.mirror_rays else "mirror images of the sky",
+        "cut_off": "an end of paths too dim to be seen" if 0 < kernel.cut_off.paths < math.inf else "",
+        "guarded": "throughputs kept within float32",
+        "lobes": f"lobes: {', '.join(kernel.lobes)}",
         "textures": "textures and their coordinates",
         "shading_frames": "shading normals of meshes",
         "tangents": "tangents along texture coordinates",
         "merged": "all materials as one, from a table",
         "two_sided": "light from behind surfaces",
     }
-    return [text for name, text in lines.items() if getattr(kernel, name) not in (False, "none", ())]
+    nothing = (False, "none", ())
+    return [text for name, text in lines.items() if text and getattr(kernel, name) not in nothing]
 
 
 def why(reason: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mrt_mitsuba.plugins.kernel_plan import KernelPlan, Reason
+from mrt_mitsuba.plugins.kernel_plan import CutOff, KernelPlan, Reason
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -22,6 +23,7 @@ MESH = {
 }
 SPHERE: dict[str, Any] = {"type": "sphere", "radius": 0.7, "bsdf": {"type": "mrt_bsdf"}}
 CONE = {"type": "mrt_cone", "apex": [0, 1, 1], "base_center": [0, 0, 1], "radius": 0.4}
+BRIGHT = {**SPHERE, "bsdf": {"type": "mrt_bsdf", "specular_reflectance": 1e5}}
 LIGHT = {"type": "mrt_light", "position": [2, 4, 3]}
 LAMP = {"type": "sphere", "center": [0, 3, 0], "radius": 0.2, "emitter": {"type": "area"}}
 BRUSHED = {"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.4}
@@ -73,6 +75,10 @@ CHOICES = {
     "emission": ({"a": SPHERE, "lamp": LAMP}, False, False),
     "sky": ({"a": SPHERE, "sky": {"type": "constant"}, "light": LIGHT}, "none", False),
     "mirrors": ({"a": SPHERE, "sky": {"type": "constant"}, "light": LIGHT}, False, False),
+    "mirror_rays": ({"a": SPHERE, "sky": {"type": "constant"}}, True, True),
+    "cut_off": ({"a": SPHERE, "b": CONE, "sky": {"type": "constant"}}, CutOff(math.inf, 9.0), True),
+    "guarded": ({"a": BRIGHT, "b": CONE, "light": LIGHT}, False, True),
+    "lobes": ({"a": SPHERE, "light": LIGHT}, ("diffuse",), False),
     "textures": (
         {"a": {**SPHERE, "bsdf": {"type": "diffuse", "reflectance": TEXTURE}}, "light": LIGHT},
         False,
@@ -100,7 +106,7 @@ def test_kernel_obeys(name: str) -> None:
         with pytest.raises(ValueError, match="untraced: set its bvh to True"):
             integrator.prepare(loaded, replace(plan, **{name: False}))
         return
-    assert getattr(plan, name) != other and plan.reason(name) is None
+    assert getattr(plan, name) != other
     image, kernels = kernel(loaded)
     assert integrator.prepare(loaded, replace(plan, **{name: other})).plan != plan
     changed, other_kernels = kernel(loaded)
@@ -127,6 +133,15 @@ def test_kernel_obeys(name: str) -> None:
         ({"a": SPHERE}, "textures", Reason.UNIFORM),
         ({"a": SPHERE}, "tangents", Reason.ISOTROPIC),
         ({"a": {**SPHERE, "bsdf": BRUSHED}}, "spheres", Reason.TANGENTS),
+        ({"a": {**SPHERE, "bsdf": MATTE}}, "lobes", Reason.NO_SPECULAR),
+        ({"a": SPHERE}, "mirrors", Reason.ALONE),
+        ({"a": SPHERE, "sky": {"type": "constant"}}, "mirror_rays", Reason.ALONE),
+        ({"a": SPHERE, "b": CONE, "sky": {"type": "constant"}}, "guarded", Reason.BOUNDED),
+        (
+            {"a": SPHERE, "b": CONE, "lamp": LAMP, "integrator": {"type": "mrt_whitted", "clamp": False}},
+            "cut_off",
+            Reason.UNBOUNDED,
+        ),
         ({"a": SPHERE}, "two_sided", Reason.ONE_SIDED),
         ({"a": {"type": "sphere"}}, "merged", Reason.OTHER_BSDF),
         ({"a": {**SPHERE, "bsdf": {"type": "mrt_bsdf", "alpha": TEXTURE}}}, "merged", Reason.VARYING),
@@ -139,9 +154,9 @@ def test_reasons(content: dict[str, Any], name: str, reason: Reason) -> None:
 def test_a_plan_holds_until_the_scene_changes() -> None:
     loaded = scene(a=SPHERE, light=LIGHT)
     integrator = loaded.integrator()
-    own = replace(integrator.prepare(loaded).plan, mirrors=False)
+    own = replace(integrator.prepare(loaded).plan, merged=False)
     assert integrator.prepare(loaded, own).plan == integrator.prepare(loaded).plan == own
     parameters = mi.traverse(loaded)
     parameters["a.bsdf.alpha"] = mi.Float(0.3)
     parameters.update()
-    assert integrator.prepare(loaded).plan.mirrors
+    assert integrator.prepare(loaded).plan.merged

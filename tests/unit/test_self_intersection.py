@@ -109,7 +109,7 @@ def test_a_grain_on_a_wide_floor_has_its_shadow(variant: str, kind: str, place: 
     images = [np.array(mi.render(scene, integrator=i, spp=1)) for i in both]
     dark = [(image < 1e-3 * images[1].max()).all(axis=-1) for image in images]
     assert 700 < dark[1].sum() < 900
-    # Rays of ``direct`` start 9e-5 (1 + |p|) off: 2 to 8 % of the ball's radius, as does the shadow's rim
+    # Rays of ``direct`` start 9e-5 (1 + |p|) off, 2 to 8 % of the ball's radius, and the rim moves with them
     assert (dark[0] != dark[1]).sum() < 60
 
 

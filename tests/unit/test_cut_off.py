@@ -1,0 +1,180 @@
+"""What ``mrt_whitted`` leaves out: too little to be seen, or not there at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mrt_mitsuba.plugins.kernel_plan import Reason
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+STEP = 1 / 255  # of an 8-bit picture
+
+
+def rgb(*values: float) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(values)}
+
+
+def glass(specular: float = 0.2, **more: Any) -> dict[str, Any]:
+    return {"type": "mrt_bsdf", "specular_reflectance": specular, "fresnel": "dielectric", **more}
+
+
+def balls(**more: Any) -> dict[str, Any]:
+    """Two spheres side by side, each in the other's reflection."""
+    return {
+        "left": {"type": "sphere", "center": [-1.02, 0, 0], "bsdf": glass()},
+        "right": {"type": "sphere", "center": [1.02, 0, 0], "bsdf": glass()},
+        "light": {"type": "mrt_light", "position": [1, 4, 5]},
+        **more,
+    }
+
+
+def facing_mirrors(**more: Any) -> dict[str, Any]:
+    """A corridor between two mirrors, with small lights behind a screen that nothing else is lit by."""
+    mirror = {"type": "mrt_bsdf", "fresnel": "unity", "specular_reflectance": 0.98, "alpha": 1.0}
+    scene = {
+        "front": {"type": "mrt_plane", "normal": [1, 0, 0], "distance": 1.5, "bsdf": mirror},
+        "back": {"type": "mrt_plane", "normal": [-1, 0, 0], "distance": 1.5, "bsdf": mirror},
+        "lid": {"type": "mrt_plane", "normal": [0, -1, 0], "distance": 3.0, "bsdf": glass(0.0)},
+    }
+    for k in range(6):
+        intensity = rgb(*[3.5e-4] * 3)
+        scene[f"light{k}"] = {"type": "mrt_light", "position": [0.2 * k, 4, 0], "intensity": intensity}
+    return scene | more
+
+
+def loaded(content: dict[str, Any]) -> mi.Scene:
+    look = mi.ScalarTransform4f().look_at([0.3, 1, 6], [0, 0.1, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 96, "height": 64, "component_format": "float32"}
+    film["rfilter"] = {"type": "box"}
+    sensor = {"type": "perspective", "fov": 40, "to_world": look, "film": film}
+    return mi.load_dict({"type": "scene", "sensor": sensor, **content})
+
+
+def picture(scene: mi.Scene, **options: Any) -> np.ndarray:
+    integrator = mi.load_dict({"type": "mrt_whitted", "bounce_budget": "plain", **options})
+    return np.array(mi.render(scene, integrator=integrator, spp=1, seed=3))
+
+
+@pytest.mark.parametrize(
+    ("content", "options"),
+    [
+        (balls(), {}),
+        (balls(sky={"type": "constant", "radiance": 100.0}), {}),
+        (balls(sky={"type": "constant", "radiance": 1000.0}), {}),
+        (balls(), {"sky": 1000.0}),
+        (balls(light={"type": "mrt_light", "position": [1, 4, 5], "intensity": 1e4}), {"clamp": False}),
+        (balls(light={"type": "point", "position": [1, 4, 5], "intensity": 1e5}), {"clamp": False}),
+        (balls(lamp={"type": "sphere", "center": [0, 3, 0], "radius": 0.3,
+                     "emitter": {"type": "area", "radiance": 500.0}}), {}),
+        (facing_mirrors(), {}),
+    ],
+    ids=["plain", "sky 100", "sky 1000", "own sky", "unclamped", "with falloff", "lamp", "mirrors"],
+)  # fmt: skip
+def test_what_is_cut_off_is_not_seen(content: dict[str, Any], options: dict[str, Any]) -> None:
+    scene = loaded(content)
+    whole = picture(scene, min_contribution=0.0, **options)
+    assert np.abs(whole - picture(scene, **options)).max() < STEP / 16
+
+
+def test_the_cut_off_follows_the_sky() -> None:
+    scene = loaded(balls(sky={"type": "constant", "radiance": 1.0}))
+    integrator = mi.load_dict({"type": "mrt_whitted", "bounce_budget": "plain"})
+    mi.render(scene, integrator=integrator, spp=1)
+    parameters = mi.traverse(scene)
+    parameters["sky.radiance.value"] = mi.Float(1000.0)
+    parameters.update()
+    after = np.array(mi.render(scene, integrator=integrator, spp=1, seed=3))
+    assert np.abs(after - picture(scene, min_contribution=0.0)).max() < STEP / 16
+
+
+def work(content: dict[str, Any], **plan: Any) -> tuple[np.ndarray, int, int, Any]:
+    """The picture, the operations of its kernel, the mirror rays, and the plan."""
+    scene = loaded(content)
+    integrator = mi.load_dict({"type": "mrt_whitted", "clamp": False})
+    integrator.prepare(scene, replace(integrator.prepare(scene).plan, **plan) if plan else None)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        image = np.array(mi.render(scene, integrator=integrator, spp=1, seed=3))
+        operations = max(k["operation_count"] for k in dr.kernel_history([dr.KernelType.JIT]))
+    y, x = np.mgrid[-1:1:40j, -1:1:40j]
+    ray = mi.Ray3f(mi.Point3f(0.3, 1, 6), mi.Vector3f(x.ravel() * 0.3, y.ravel() * 0.3, -1))
+    bounces = integrator.trace(scene, None, ray).bounces
+    return image, operations, int(np.sum(np.array(bounces))), integrator.prepare(scene).plan
+
+
+BALL: dict[str, Any] = {"type": "sphere", "bsdf": glass()}
+LIGHT = {"type": "mrt_light", "position": [1, 4, 5]}
+
+
+@pytest.mark.parametrize(
+    ("content", "dull", "name"),
+    [
+        ({"ball": BALL, "light": LIGHT}, {"ball": {"type": "sphere", "bsdf": glass(0.0)}}, "lobes"),
+        (
+            {"ball": {"type": "sphere", "bsdf": glass(0.0)}, "light": LIGHT},
+            {"ball": {"type": "sphere", "bsdf": glass(0.0, diffuse_reflectance=0.0)}},
+            "lights",
+        ),
+        ({"ball": BALL, "light": LIGHT}, {"light": {**LIGHT, "intensity": 0.0}}, "lights"),
+        (
+            {"ball": BALL, "light": LIGHT, "lamp": LIGHT},
+            {"lamp": {**LIGHT, "intensity": rgb(0, 0, 0)}},
+            "",
+        ),
+    ],
+    ids=["no Ks", "neither", "a black light", "one of two lights black"],
+)
+def test_black_things_leave_no_code(content: dict[str, Any], dull: dict[str, Any], name: str) -> None:
+    _, operations, _, plan = work(content)
+    image, fewer, _, dull_plan = work(content | dull)
+    assert fewer < 0.97 * operations
+    assert not name or (plan.reason(name) is None and dull_plan.reason(name) is not None)
+    if not name:
+        assert np.array_equal(image, work({"ball": BALL, "light": LIGHT})[0])
+        return
+    # No mirror image is to be seen, so ``direct`` draws the same, rounded otherwise
+    scene = loaded(content | dull)
+    direct = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=1, seed=3))
+    assert np.abs(image - direct).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"type": "sphere"},
+        {"type": "mrt_cone", "apex": [0, 1, 0], "base_center": [0, -1, 0]},
+        {"type": "mrt_plane", "normal": [0, 1, 0], "distance": 1.0},
+    ],
+    ids=lambda shape: shape["type"],
+)
+def test_a_lone_mirror_traces_nothing(shape: dict[str, Any]) -> None:
+    content = {"a": {**shape, "bsdf": glass(1.0)}, "light": LIGHT}
+    sky = {"sky": {"type": "constant", "radiance": rgb(0.2, 0.5, 0.9)}}
+    image, operations, bounces, plan = work(content | sky)
+    traced, more, traced_bounces, _ = work(content | sky, mirror_rays=True)
+    assert plan.mirrors and plan.reason("mirror_rays") is Reason.ALONE
+    assert np.array_equal(image, traced)
+    assert bounces == 0 < traced_bounces and operations < more
+    assert work(content)[3].reason("mirrors") is Reason.ALONE  # nor is there a sky to be seen
+    two = content | sky | {"b": {"type": "sphere", "center": [3, 0, 0], "bsdf": glass()}}
+    assert work(two)[3].mirror_rays
+
+
+def test_facing_planes_of_any_reflectance_give_numbers() -> None:
+    """A throughput that leaves float32, times no light, is no light."""
+    mirror = {"type": "mrt_bsdf", "fresnel": "unity", "specular_reflectance": 1e5}
+    planes = {
+        f"plane{side}": {"type": "mrt_plane", "normal": [0, 0, -side], "distance": 7.0, "bsdf": mirror}
+        for side in (1, -1)
+    }
+    image = picture(loaded(planes), max_depth=40)
+    assert (image == 0).all()
+    lit = picture(loaded(planes | {"light": LIGHT}), max_depth=40)
+    assert not np.isnan(lit).any()
