@@ -121,7 +121,22 @@ class Halves(Stack):
                 return self._groups(wanted)
             if wanted.sum() < least:
                 most = min(most, least)
-        return self._groups(_water(self.rays, deviation, lambda due: due.sum() >= most))
+        return self._within(most, deviation)
+
+    def _within(self, most: float, deviation: np.ndarray) -> np.ndarray:
+        """Return numbers of groups that make no more than so many rays in all."""
+        budget = most
+
+        def spent(due: np.ndarray) -> bool:
+            return bool(due.sum() >= budget)
+
+        for _ in range(4):
+            groups = self._groups(_water(self.rays, deviation, spent))
+            excess = self.rays.sum() + self.cost(groups) - most  # by rounding, and by pixels under the filter
+            if excess <= 0:
+                break
+            budget -= excess
+        return groups
 
     def _groups(self, due: np.ndarray) -> np.ndarray:
         """Return whole numbers of groups for what is due; one at least."""

@@ -93,7 +93,7 @@ def sized(source: Source) -> Iterator[None]:
         return
     parameters = mi.traverse(source.sensor)
     names = ("film.size", "film.crop_size", "film.crop_offset")
-    before = [parameters[name] for name in names]
+    before = [list(parameters[name]) for name in names]
     try:
         _set(parameters, zip(names, (size, size, [0, 0]), strict=True))
         yield

@@ -92,7 +92,7 @@ def compare_direct(scene: Scene, light: int, *, width: int, height: int) -> Dire
     loaded = mi.load_dict(nodes)
     whitted = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
     ours, theirs = (
-        mrt.render(loaded, integrator=integrator, aa=1, aamode="none").image
+        mrt.render(loaded, integrator=integrator, aa=1, aamode="none", lattice="report").image
         for integrator in (whitted, "direct")
     )
     exact: dict[str, Any] = {"max_depth": 1, "clamp": False, **size}
@@ -178,6 +178,7 @@ def gloss_limit(alphas: Sequence[float], *, width: int, height: int, spp: int, s
         nodes,
         aa=1,
         aamode="none",
+        lattice="report",
         layers=["depth"],
         integrator={"type": "mrt_whitted", "min_contribution": 0.0},
     )
@@ -185,9 +186,9 @@ def gloss_limit(alphas: Sequence[float], *, width: int, height: int, spp: int, s
     pictures, errors = [mirror.image], []
     for i, alpha in enumerate(alphas):
         path = {"type": "path", "max_depth": 8, "rr_depth": 100}
-        gloss = mrt.render(
-            _shiny_spheres(alpha, width, height), aa=1, aamode="none", spp=spp, seed=seed + i, integrator=path
-        ).image
+        centre: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}
+        spheres = _shiny_spheres(alpha, width, height)
+        gloss = mrt.render(spheres, **centre, spp=spp, seed=seed + i, integrator=path).image
         pictures.append(gloss)
         errors.append(float(np.abs(gloss - mirror.image)[sphere].mean() / mirror.image[sphere].mean()))
     slope = float(np.polyfit(np.log(alphas), np.log(errors), 1)[0])

@@ -280,7 +280,7 @@ def _random_scenes(cases: Cases, count: int) -> None:
             width=64, height=48, fresnel=FRESNEL[seed % 3]
         )
         described["integrator"] = {"type": "mrt_whitted", "clamp": bool(seed % 2)}
-        image = render(described, aa=1).image
+        image = render(described, aa=1, lattice="report").image
         bad += int((~(image >= 0) | np.isinf(image)).sum())
     cases.at_most(
         "scenes by lot", f"{count} pictures of extreme objects, materials and lights", "none", bad, 0

@@ -157,7 +157,7 @@ def difference(image: np.ndarray, truth: np.ndarray) -> float:
 def _render(scene: Scene, *, fresnel: str, clamp: bool) -> np.ndarray:
     described = scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=fresnel)
     described["integrator"] = {"type": "mrt_whitted", "clamp": clamp, "min_contribution": 0.0}
-    return render(described, aa=1).image
+    return render(described, aa=1, lattice="report").image
 
 
 # -------------------------------------------- Bounces in closed form ---------------------------------------
