@@ -144,8 +144,8 @@ class QuadricTable:
 
     def heights(self, p: np.ndarray) -> np.ndarray:
         """Return the distances [3, n] of a point [3] from the parts of each, inf far from their boxes."""
-        rows = (Columns.of(self.rows[:, k]) for k in range(3))
-        frame = Frame(Columns.of(self.origins), *rows, extent=column(self.extents))
+        x, y, z = (Columns.of(self.rows[:, k]) for k in range(3))
+        frame = Frame(Columns.of(self.origins), x, y, z, column(self.extents))
         point = Columns.of(np.broadcast_to(p, self.origins.shape))
         low, high = self.boxes().transpose(1, 0, 2)
         slack = 1e-6 * (high - low).max(axis=1)[:, None]

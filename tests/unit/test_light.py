@@ -217,8 +217,8 @@ def test_wrong_parameters_are_named(parameters: dict, message: str) -> None:
 SURFACES: dict[str, tuple[Any, list[float], list[float]]] = {
     "sphere": (
         lambda s: {"type": "sphere", "radius": s},
-        (np.array([1, -2, 3]) / 14**0.5).tolist(),
-        [1, -2, 3],
+        [0.26726124, -0.53452248, 0.80178373],
+        [0.27, -0.53, 0.8],
     ),
     "cone base": (
         lambda s: {"type": "mrt_cone", "apex": [0, s, 0], "base_center": [0, 0, 0], "radius": s},

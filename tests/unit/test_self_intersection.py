@@ -170,7 +170,7 @@ def test_meshes_are_drawn_at_every_size_that_is_taken(variant: str, size: float)
             "light": {"type": "mrt_light", "position": [2 * s, 3 * s, 5 * s]},
             "mesh": {
                 **mesh,
-                "faces": mi.Bitmap(faces[np.newaxis].astype(np.uint32)),
+                "faces": mi.Bitmap(np.ascontiguousarray(faces)),
                 "bsdf": {"type": "mrt_bsdf"},
             },
         }
