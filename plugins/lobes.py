@@ -16,8 +16,8 @@ from .microfacet import (
     microfacet_specular,
     sample_beckmann,
     sample_beckmann_visible,
-    smith_g1_over_cos,
     tan2_theta,
+    visible_over_cos,
 )
 
 # Roughness below this (zero included) acts as this: the lobe is then narrower than float32 directions can
@@ -154,7 +154,7 @@ class Lobes:
         """Return that of the microfacet normal over 4 ωo·h."""
         d = beckmann_d(pair.tan2_theta_h, self.alpha)
         if self.visible:
-            return 0.25 * d * smith_g1_over_cos(pair.wi, dr.abs(self.alpha))
+            return 0.25 * d * visible_over_cos(pair.wi, self.alpha)
         # D cos θh / (4 ωo·h), where h = ωi + ωo is not normalised: cos θh = h.z / |h|, ωo·h = |h|² / 2, and
         # |h|² = h.z² (1 + tan²θh). The product ωo·h itself would feel the rounding of ωo's length: by 2 % at
         # cos θ = 1e-3 in float32

@@ -63,6 +63,21 @@ def smith_g1_over_cos(v, alpha):
     return dr.select(fitted, numerator, 1) / dr.select(fitted, denominator, v.z)
 
 
+def visible_over_cos(v, alpha):
+    """``1 / ((1 + Λ) cos θ)`` for a unit vector ``v``, v.z > 0: the normaliser of the visible normals.
+
+    Λ is Beckmann's own, with the error function; the rational fit of G₁ differs by up to 0.4 %, and a density
+    with it would integrate to that much more or less. Times cos θ, no term cancels or overflows: with
+    a = 1 / (α tan θ), (1 + Λ) cos θ = cos θ (1 + erf a) / 2 + α sin θ exp(−a²) / (2 √π).
+    Source: Heitz, "Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs", 2014, eq. 72.
+    """
+    across = dr.abs(alpha) * dr.sqrt(dr.square(v.x) + dr.square(v.y))
+    normal = across <= 1e-6 * v.z  # there is nothing but the first term, which is cos θ
+    a = v.z / dr.select(normal, 1, across)
+    inclined = 0.5 * v.z * (1 + dr.erf(a)) + 0.5 / dr.sqrt(dr.pi) * across * dr.exp(-dr.square(a))
+    return 1 / dr.select(normal, v.z, inclined)
+
+
 def half_vector_angles(wi, wo):
     """(cos θd, sin²θd) between ``wi`` and the half vector of two unit vectors.
 

@@ -56,7 +56,7 @@ def jobs(scene: Any, grid: Mapping[str, Any], zipped: bool, fixed: Mapping[str, 
 def _job(name: str, scene: Any, point: dict[str, Any], shared: Mapping[str, Any]) -> Job:
     dotted = {key: value for key, value in point.items() if "." in key}
     arguments = dict(shared) | {key: value for key, value in point.items() if key not in dotted}
-    params = dict(shared.get("params", {})) | dotted
+    params = {**shared.get("params", {}), **point.get("params", {}), **dotted}
     if params:
         arguments["params"] = params
     return Job(name, arguments.pop("scene", scene), point, arguments)
@@ -126,7 +126,7 @@ def word(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "x".join(map(word, value)) or "none"
     if isinstance(value, Mapping):
-        return word(str(value.get("type", "dict")))
+        return word(value.get("type") or [f"{key}-{word(own)}" for key, own in value.items()])
     if isinstance(value, str | os.PathLike):
         text = os.fspath(value)
         value = os.path.splitext(os.path.basename(text))[0] if os.sep in text else text

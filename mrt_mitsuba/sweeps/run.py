@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -71,8 +71,9 @@ def sweep(
     """
     clusters.require()
     engine = clusters.Engine(cluster, workers, retries, renew, dashboard, options.get("variant") or "")
-    _check_tiles(tiles, png)
     planned = jobs(scene, grid or {}, zipped, options)
+    if tiles is not None:
+        _check_tiles(tiles, png, planned)
     check_parameters(planned)
     folder = _folder(out)
     table = Table(folder, tuple(grid or {}), {job.name: job.parameters for job in planned})
@@ -94,12 +95,14 @@ def sweep(
     return table
 
 
-def _check_tiles(tiles: Any, png: bool) -> None:
+def _check_tiles(tiles: Any, png: bool, planned: Sequence[Job]) -> None:
     pair = isinstance(tiles, list | tuple) and [type(number) for number in tiles] == [int, int]
-    if tiles is not None and not (pair and min(tiles) > 0):
+    if not (pair and min(tiles) > 0):
         raise UsageError(f"tiles={tiles!r}: give rows and columns, such as (4, 4)")
-    if tiles is not None and png:
-        raise UsageError("png: pictures in tiles are written as EXR only; leave one of them out")
+    if png:
+        raise UsageError("tiles: pictures in tiles are written as EXR only; leave out png")
+    if any(job.arguments.get("target") or job.arguments.get("aamode") == "noise" for job in planned):
+        raise UsageError("tiles: target and aamode=noise share the rays out over the whole picture")
 
 
 def _folder(out: str | os.PathLike[str]) -> str:

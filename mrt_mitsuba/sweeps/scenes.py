@@ -69,16 +69,19 @@ def check_parameters(jobs: Sequence[Job]) -> None:
     from mrt_mitsuba.scene.open import open_scene
     from mrt_mitsuba.scene.parameters import set_parameters
 
-    loaded: dict[int, Any] = {}
+    loaded: dict[tuple[int, str], Any] = {}
     known = set()
     for job in jobs:
-        for key, value in job.arguments.get("params", {}).items():
-            if (id(job.scene), key, repr(value)) not in known:
-                if id(job.scene) not in loaded:
-                    runtime.use()
-                    loaded[id(job.scene)] = open_scene(job.scene).scene
-                set_parameters(loaded[id(job.scene)], {key: value})
-                known.add((id(job.scene), key, repr(value)))
+        params = job.arguments.get("params", {})
+        declared = {name: value for name, value in params.items() if "." not in name}
+        which = id(job.scene), repr(declared)
+        if params and which not in loaded:
+            runtime.use()
+            loaded[which] = open_scene(job.scene, params=declared).scene
+        for key in params.keys() - declared.keys():
+            if (*which, key, repr(params[key])) not in known:
+                set_parameters(loaded[which], {key: params[key]})
+                known.add((*which, key, repr(params[key])))
 
 
 def fingerprint(*values: Any) -> str:

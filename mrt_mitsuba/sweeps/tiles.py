@@ -91,12 +91,12 @@ def _size(task: Task) -> tuple[int, int]:
     return source.width, source.height
 
 
-def assemble_task(mosaic: Mosaic, found: Sequence[Mapping[str, Any]], house: House) -> dict[str, Any]:
-    """Put the tiles of a picture together, given their facts; return those of the picture."""
+def assemble_task(mosaic: Mosaic, found: Sequence[Mapping[str, Any] | None], house: House) -> dict[str, Any]:
+    """Put the tiles of a picture together, given the facts of those just made; return the picture's."""
     from distributed import get_worker
 
     facts: dict[str, Any] = {"worker": get_worker().address}
-    errors = [tile["error"] for tile in found if tile.get("error")]
+    errors = [tile["error"] for tile in found if tile and "error" in tile]
     if errors:
         return facts | {"error": errors[0]}
     task = mosaic.picture
@@ -105,8 +105,8 @@ def assemble_task(mosaic: Mosaic, found: Sequence[Mapping[str, Any]], house: Hou
     except (OSError, RuntimeError, OutputError) as error:
         return facts | {"error": f"cannot put {task.name} together: {error}"}
     for name in ("seconds", "rays"):
-        values = [tile.get(name) for tile in found]
-        facts[name] = None if None in values else sum(values)  # an earlier sweep's tiles have none
+        # those of tiles that an earlier sweep made are not known
+        facts[name] = sum(tile[name] for tile in found if tile) if all(found) else None
     return facts | {"file": task.files[-1]}
 
 

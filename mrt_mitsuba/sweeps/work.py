@@ -42,7 +42,7 @@ class Work:
             tiles = mosaic.tiles
             there = [resume and is_fresh(tile) for tile in tiles]
             futures = iter(self._map([tile for tile, fresh in zip(tiles, there, strict=True) if not fresh]))
-            found: list[Any] = [{} if fresh else next(futures) for fresh in there]
+            found: list[Future | None] = [None if fresh else next(futures) for fresh in there]
             pending |= {tile: [] for tile in found if tile}
             key = mosaic.picture.key
             picture = self._client.submit(assemble_task, mosaic, found, key=key, **self._options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import socket
@@ -104,19 +105,29 @@ def render_task(task: Task, house: House) -> dict[str, Any]:
     from distributed import Reschedule, get_worker
 
     global _done
-    worker = get_worker()
+    worker, note = get_worker(), os.path.join(task.scratch, f"{task.name}.json")
     with _one_at_a_time:
+        if os.path.exists(note):  # done, but the worker was gone before anyone heard of it
+            with open(note) as file:
+                return dict(json.load(file))
         if _done >= house.renew and worker.nanny:
             _renew(worker)
             raise Reschedule  # to another worker, or to this one's next process
         worker.log_event(TOPIC, task.key)
         try:
             _prepare(worker, house)
-            found = _render(task, worker)
+            found = _render(task, worker) | {"worker": worker.address}
+            _write_note(note, found)
         except MrtError as error:
-            found = {"error": " ".join(str(error).split())}
+            found = {"error": " ".join(str(error).split()), "worker": worker.address}
         _done += 1
-    return found | {"worker": worker.address}
+    return found
+
+
+def _write_note(path: str, facts: Mapping[str, Any]) -> None:
+    with open(f"{path}.tmp", "w") as file:
+        json.dump(facts, file)
+    os.replace(f"{path}.tmp", path)
 
 
 def _renew(worker: Any) -> None:
@@ -164,6 +175,7 @@ def _render(task: Task, worker: Any) -> dict[str, Any]:
         "file": task.files[-1],
         "seconds": time.perf_counter() - start,
         "rays": sum(result.rays.values()),
+        "rmse": result.error.rmse if result.error else None,
     }
 
 

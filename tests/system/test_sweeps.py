@@ -159,6 +159,18 @@ def test_parameters_of_the_scene(address: str, tmp_path: Path) -> None:
     assert table.rows[0]["file"] == "material_0.alpha=0.1,light_0.intensity.value=1x0x0.exr"
 
 
+def test_parameters_that_a_file_declares(address: str, tmp_path: Path) -> None:
+    assert cli.main(["export", "0", "--xml", str(tmp_path / "mine.xml")]) == 0
+    grid = {"params": [{"resx": 40}, {"resx": 50}], "material_0.alpha": [0.1]}
+    options = {"grid": grid, "params": {"resy": 30}, "cluster": address, "aa": 1}
+    with pytest.raises(UsageError, match="params is given twice"):
+        mrt.sweep(tmp_path / "mine.xml", tmp_path / "out", **options)
+    del options["params"]
+    mrt.sweep(tmp_path / "mine.xml", tmp_path / "out", **options)
+    assert pictures(tmp_path / "out") == [f"params=resx-{n},material_0.alpha=0.1.exr" for n in (40, 50)]
+    assert [read_exr(path).image.shape[1] for path in sorted((tmp_path / "out").glob("*.exr"))] == [40, 50]
+
+
 def test_a_second_run_renders_only_what_is_missing_or_was_made_otherwise(
     address: str, tmp_path: Path
 ) -> None:
@@ -226,6 +238,8 @@ def test_frames_are_numbered_for_films(address: str, tmp_path: Path) -> None:
         ({"integrator": [object()]}, {}, "cannot be sent"),
         ({}, {"progres": 1}, "progres is no option of render"),
         ({}, {"width": 0}, "width=0: must be"),
+        ({}, {"tiles": (2, 2), "png": True}, "leave out png"),
+        ({"target": [0.1]}, {"tiles": (2, 2)}, "tiles: target and aamode=noise"),
         ({}, {"workers": 0}, "workers=0: must be a whole number"),
         ({}, {"workers": 2, "cluster": "tcp://127.0.0.1:9"}, "give one of them"),
         ({}, {"retries": -1}, "retries=-1"),
@@ -266,6 +280,11 @@ def slow(count: int) -> dict[str, Any]:
     return {"grid": {"seed": range(count)}, "width": 400, "height": 300, "aa": 8, "aamode": "none"}
 
 
+def begun(client: Any) -> set[str]:
+    """The jobs that workers have begun, by the events of the scheduler."""
+    return {job for _, job in client.get_events("mrt-sweep")}
+
+
 def test_a_worker_killed_in_mid_job_costs_one_retry(mortal, tmp_path: Path) -> None:
     from distributed import Client
 
@@ -275,7 +294,9 @@ def test_a_worker_killed_in_mid_job_costs_one_retry(mortal, tmp_path: Path) -> N
         numbers = client.run(os.getpid)
         sweep = Background(3, out, cluster=client, **slow(6))
         wait_for(lambda: out.exists() and pictures(out), "a picture")
-        busy = wait_for(lambda: next((w for w, jobs in client.processing().items() if jobs), None), "a job")
+        before = begun(client)
+        job = wait_for(lambda: begun(client) - before, "another job").pop()
+        busy = next(worker for worker, jobs in client.processing().items() if job in jobs)
         os.kill(numbers[busy], signal.SIGKILL)
         table = sweep.end()
     assert [row["error"] for row in table.rows] == [""] * 6
@@ -367,6 +388,17 @@ def test_a_broken_command(tmp_path: Path, capsys, words: list[str], text: str, m
     assert cli.main(["sweep", *arguments]) == 2
     errors = capsys.readouterr().err
     assert message in errors and errors.count("\n") == 1
+
+
+def test_a_gpu_is_pinned_to_each_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether there are some or not: what the driver will go by is in each worker's environment."""
+    from mrt_mitsuba.sweeps.cluster import Engine
+
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,GPU-7")
+    engine = Engine(None, None, 2, 1000, None, "cuda_ad_rgb")
+    with engine.connected(str(tmp_path), 9) as (client, _):
+        found = client.run(os.getenv, "CUDA_VISIBLE_DEVICES")
+    assert sorted(found.values()) == ["5", "GPU-7"]
 
 
 def test_threads_are_shared_out(address: str, tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ def test_each_approximation_changes_what_it_says() -> None:
 
 
 def test_without_what_differs_the_rest_agrees() -> None:
-    assert not approximations.compare_rest(3, **SMALL, spp=8).rejects
+    assert not approximations.compare_rest([3], **SMALL, spp=8)[0].rejects
 
 
 def test_with_diffuse_parts_the_materials_differ() -> None:

@@ -71,7 +71,9 @@ def far(law: Law, case: Case) -> None:
     distance = FAR * case.size
     error = np.linalg.norm(there.p.astype(np.float64) - here.p, axis=1) * cos / (ROUNDING * distance)
     through = ~there.found | (error > 4 * HIT_ROUNDINGS)
-    error = np.where(steep & ~through, error, 0)
+    # near an edge, a rounded origin decides which of two faces is met
+    same = (there.n * here.n).sum(axis=1) > 0.9
+    error = np.where(steep & same & ~through, error, 0)
     law.most(
         "hit point from afar against the same from nearby, in roundings of the distance",
         error,

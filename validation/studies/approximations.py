@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.errors import MrtError
+from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.model import Material, Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.tools.gallery import gallery
@@ -104,13 +110,29 @@ def finite(nodes: dict[str, Any], stock: dict[str, Any]) -> dict[str, Any]:
     return {**nodes, **{name: node for name, node in stock.items() if name.startswith(("light_", "plane_"))}}
 
 
-def compare_rest(number: int, *, width: int, height: int, spp: int) -> Comparison:
+def path_estimates(scenes: Sequence[dict[str, Any]], seeds: Sequence[int], *, spp: int) -> list[Estimate]:
+    """``path_estimate`` of each scene with its seed, by as many processes as there are cores."""
+    rows = [(nodes, seed + i) for nodes, seed in zip(scenes, seeds, strict=True) for i in range(RENDERS)]
+    grid = {"scene": [nodes for nodes, _ in rows], "seed": [seed for _, seed in rows]}
+    options: dict[str, Any] = {"integrator": PATH, "spp": spp, "aa": 1, "aamode": "none"}
+    with TemporaryDirectory() as folder:
+        table = mrt.sweep(None, folder, grid=grid, zipped=True, progress=Progress(), **options)
+        if table.failed:
+            raise MrtError(table.failed[0]["error"])
+        images = [read_exr(Path(folder, row["file"])).image for row in table.rows]
+    return [estimate(images[first : first + RENDERS]) for first in range(0, len(images), RENDERS)]
+
+
+def compare_rest(numbers: Sequence[int], *, width: int, height: int, spp: int) -> list[Comparison]:
     """Without diffuse parts, ``mrt_bsdf`` and ``roughplastic`` are one BSDF: equal renders but for noise."""
     size: dict[str, Any] = {"width": width, "height": height}
-    scene = physical(report_scene(number), least_alpha=ALPHA_FOR_TESTS, diffuse=False)
-    stock = mrt.scene_dict(scene, flavor="stock", **size)
-    ours = finite(mrt.scene_dict(scene, fresnel="dielectric", **size), stock)
-    return compare(path_estimate(ours, spp=spp), path_estimate(stock, spp=spp, seed=1000), level=LEVEL)
+    scenes = []
+    for number in numbers:
+        scene = physical(report_scene(number), least_alpha=ALPHA_FOR_TESTS, diffuse=False)
+        stock = mrt.scene_dict(scene, flavor="stock", **size)
+        scenes += [finite(mrt.scene_dict(scene, fresnel="dielectric", **size), stock), stock]
+    found = path_estimates(scenes, [0, 1000] * len(numbers), spp=spp)
+    return [compare(*pair, level=LEVEL) for pair in zip(found[::2], found[1::2], strict=True)]
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -120,9 +142,9 @@ def run(study: Study, *, quick: bool) -> None:
     spp = 64 if quick else 256
     rows, rest = [], []
     with study.stage("Approximations", len(numbers)) as advance:
-        for number in numbers:
+        comparisons = compare_rest(numbers, spp=spp // 4, **size)
+        for number, found in zip(numbers, comparisons, strict=True):
             rows += _chain(study, number, without_approximations(number, spp=spp, **size))
-            found = compare_rest(number, spp=spp // 4, **size)
             name = f"scene {number}: p that black mrt_bsdf and roughplastic make the same picture"
             study.at_least(name, found.p, LEVEL)
             rest.append([number, *(v.p for v in (found.pixel, found.tile, found.image)), found.rel_rmse])
