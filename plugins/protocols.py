@@ -68,7 +68,7 @@ class QuadricShape(ABC):
         """Return the unit frame of the only quadric with its derivatives; None where none are wanted."""
 
 
-class SteadyLight(ABC):
+class SteadyLight(ABC):  # noqa: B024 - lights join by register()
     """A light that is as bright far away as near by."""
 
 
