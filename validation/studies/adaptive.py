@@ -86,7 +86,8 @@ def _seconds(render: Callable[[], Any]) -> tuple[Any, float]:
 def _uniform(study: Study, extent: Extent, loaded: dict[str, Any], truths: dict[str, np.ndarray]) -> None:
     import mitsuba as mi
 
-    rows, plain = [], {"aa": 1, "aamode": "none", "spp": SPP}
+    rows: list[tuple[Any, ...]] = []
+    plain: dict[str, Any] = {"aa": 1, "aamode": "none", "spp": SPP}
     with study.stage("Uniform samples", len(loaded)) as advance:
         for name, scene in loaded.items():
             seeds = range(extent.repeats)
@@ -123,6 +124,7 @@ def _calibration(study: Study, extent: Extent, loaded: dict[str, Any], truths: d
                 for seed in range(extent.seeds):
                     result = mrt.render(scene, target=target * uniform, seed=seed)
                     true, error = rmse(result.image, truths[name]), result.error
+                    assert error is not None  # there was a target
                     found.append(
                         (true / error.rmse, error.low <= true <= error.high, error.high / error.rmse)
                     )
@@ -141,10 +143,10 @@ def _calibration(study: Study, extent: Extent, loaded: dict[str, Any], truths: d
 
 
 def _bias(study: Study, extent: Extent, loaded: dict[str, Any], truths: dict[str, np.ndarray]) -> None:
-    rows = []
+    rows: list[tuple[str, float, float, float]] = []
     with study.stage("Bias", len(loaded) * extent.pictures) as advance:
         for name, scene in loaded.items():
-            means, total, square = [], 0.0, 0.0
+            means, total, square = [], np.zeros_like(truths[name]), np.zeros_like(truths[name])
             for seed in range(extent.pictures):
                 image = mrt.render(scene, aamode="noise", spp=32, seed=seed).image.astype(np.float64)
                 means.append(image.mean())
@@ -153,7 +155,7 @@ def _bias(study: Study, extent: Extent, loaded: dict[str, Any], truths: dict[str
             mean, n = total / extent.pictures, extent.pictures
             spread = (square / n - mean**2) * n / (n - 1)  # variance of one picture
             off = np.mean((mean - truths[name]) ** 2 - spread / n)  # what noise does not explain
-            whole = (np.mean(means) - truths[name].mean()) / np.std(means, ddof=1)
+            whole = float(np.mean(means) - truths[name].mean()) / float(np.std(means, ddof=1))
             rows.append((name, math.sqrt(max(off, 0) / np.mean(spread)), whole, 1.96 / math.sqrt(n)))
     study.table(
         "bias",

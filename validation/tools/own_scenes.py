@@ -96,7 +96,7 @@ def _instances(to: Any) -> Node:
 
 
 def _thin_lens(to: Any) -> Node:
-    lens = {"type": "thinlens", "aperture_radius": 0.2, "focus_distance": 6.0}
+    lens: Node = {"type": "thinlens", "aperture_radius": 0.2, "focus_distance": 6.0}
     return {
         "sensor": sensor(to, [0, 1.5, 6], [0, 0.6, 0], **lens),
         "floor": _floor(to, _diffuse(_checks(to, 20))),
