@@ -11,7 +11,7 @@ from .parameters import ParameterError
 
 
 class MrtMesh(mi.Mesh):
-    r"""Flat triangles given as arrays, which a dict carries as bitmaps of one row.
+    r"""Triangles given as arrays, which a dict carries as bitmaps of one row.
 
     ============= =========== ========== ==============================================================
     name          type        default    unit or range
@@ -19,6 +19,7 @@ class MrtMesh(mi.Mesh):
     ``positions`` ``Bitmap``  required   float32 [1, N, 3], scene units
     ``faces``     ``Bitmap``  required   uint32 [1, M, 3], corners counter-clockwise seen from outside
     ``texcoords`` ``Bitmap``             float32 [1, N, 2 or 3], of which two are used
+    ``normals``   ``Bitmap``             float32 [1, N, 3], of smooth triangles; without, they are flat
     ``to_world``  transform   identity   any invertible affine transform
     ============= =========== ========== ==============================================================
 
@@ -32,30 +33,45 @@ class MrtMesh(mi.Mesh):
 
     def __init__(self, props: mi.Properties) -> None:
         positions, faces = _array(props, "positions", 3), _array(props, "faces", 3)
-        texcoords = _array(props, "texcoords", 2, 3)[:, :2] if "texcoords" in props else None
+        extras = {name: _array(props, name, *widths) for name, widths in _EXTRAS.items() if name in props}
         if (faces % 1).any():
             raise ParameterError('mrt_mesh: "faces" holds a number that is not whole')
         if len(faces) and not (faces.min() >= 0 and faces.max() < len(positions)):
             wrong = faces.max() if faces.max() >= len(positions) else faces.min()
             raise ParameterError(f'mrt_mesh: "faces" holds {wrong}, but there are {len(positions)} positions')
-        if texcoords is not None and len(texcoords) != len(positions):
-            raise ParameterError(
-                f'mrt_mesh: "texcoords" has {len(texcoords)} entries for {len(positions)} positions'
-            )
+        for name, array in extras.items():
+            if len(array) != len(positions):
+                raise ParameterError(
+                    f'mrt_mesh: "{name}" has {len(array)} entries for {len(positions)} positions'
+                )
         if "to_world" in props:
             placement = Placement(props)
             positions = placement.points(positions.astype(np.float64))
             faces = faces[:, ::-1] if placement.mirrors else faces
+            extras |= {name: extras[name] @ placement.inverse for name in ("normals",) if name in extras}
         sizes = len(positions), len(faces)
-        construct(self, "mrt_mesh", sizes, props, texcoords=texcoords is not None)
-        buffers = {"vertex_positions": positions.astype(np.float32), "faces": faces.astype(np.uint32)}
-        if texcoords is not None:
-            buffers["vertex_texcoords"] = texcoords.astype(np.float32)
-        write_buffers(self, **{name: values.ravel() for name, values in buffers.items()})
+        construct(self, "mrt_mesh", sizes, props, **{name: name in extras for name in _EXTRAS})
+        buffers = {"positions": positions} | {name: _BUFFERS[name](array) for name, array in extras.items()}
+        flat = {f"vertex_{name}": array.astype(np.float32).ravel() for name, array in buffers.items()}
+        write_buffers(self, **flat, faces=faces.astype(np.uint32).ravel())
         self.content = f"positions={len(positions)}, faces={len(faces)}"
 
     def to_string(self) -> str:
         return f"MrtMesh[{self.content}]"
+
+
+def _two(array: np.ndarray) -> np.ndarray:
+    return array[:, :2]
+
+
+def _unit(array: np.ndarray) -> np.ndarray:
+    lengths = np.linalg.norm(array, axis=1, keepdims=True)
+    return np.asarray(array / np.where(lengths == 0, 1, lengths))
+
+
+# What vertices may have: numbers in the bitmap, and what of them Mitsuba takes
+_EXTRAS = {"texcoords": (2, 3), "normals": (3,)}
+_BUFFERS = {"texcoords": _two, "normals": _unit}
 
 
 def _array(props: mi.Properties, name: str, *widths: int) -> np.ndarray:

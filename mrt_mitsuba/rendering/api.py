@@ -26,7 +26,7 @@ from mrt_mitsuba.rendering.film_passes import FilmPasses
 from mrt_mitsuba.rendering.job import Job, Kernels, counting_kernels
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import FilmFacts, Plan, RenderFacts, make_plan
-from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.rendering.progress import Progress, default
 from mrt_mitsuba.rendering.rounds import Goal, OnRound
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, shader_for
@@ -156,7 +156,7 @@ def render(
         region=region,
     )
     with surfacing(), runtime.one_at_a_time:
-        return render_with(scene, settings, Progress() if progress is None else progress)
+        return render_with(scene, settings, default() if progress is None else progress)
 
 
 def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Result:

@@ -28,6 +28,11 @@ class Progress:
         yield lambda steps: None
 
 
+def default() -> Progress:
+    """Return a progress that shows a bar in a notebook, and is silent elsewhere."""
+    return TerminalProgress() if "ipykernel" in sys.modules else Progress()
+
+
 class TerminalProgress(Progress):
     """Print messages, and a bar if ``bar_file`` is a terminal, or in a notebook.
 

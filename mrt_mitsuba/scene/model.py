@@ -113,12 +113,13 @@ class Capsule:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Flat triangles of one material; a normal is on the side from which corners run counter-clockwise."""
+    """Triangles of one material; a normal is on the side from which corners run counter-clockwise."""
 
     vertices: np.ndarray  # float32 [N, 3]
     faces: np.ndarray  # uint32 [M, 3]
     material: Material
     uvs: np.ndarray | None = None  # float32 [N, 2]
+    normals: np.ndarray | None = None  # float32 [N, 3], of smooth triangles
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ class Scene:
                 "bsdf": materials.reference(p.material),
             }
         for i, m in enumerate(self.meshes):
-            shapes[f"mesh_{i}"] = {**_mesh(m), "bsdf": materials.reference(m.material)}
+            shapes[f"mesh_{i}"] = {**_mesh(m, self.texturing), "bsdf": materials.reference(m.material)}
         lights = {
             f"light_{i}": {
                 "type": "mrt_light",
@@ -342,14 +343,18 @@ def _group(kind: str, objects: tuple, materials: _Materials, fresnel: str) -> di
     return {**shape, "bsdf": bsdf}
 
 
-def _mesh(m: Mesh) -> dict[str, Any]:
+def _mesh(m: Mesh, texturing: str) -> dict[str, Any]:
     import mitsuba as mi
     import numpy as np
 
     arrays = {"positions": m.vertices, "faces": m.faces}
     if m.uvs is not None:
+        # The report looks up the first row of a picture at v = 0; files, and Mitsuba's ``obj``, the last one
+        v = m.uvs[:, 1] if texturing == "report" else 1 - m.uvs[:, 1]
         # Bitmaps have one, three or four channels
-        arrays["texcoords"] = np.concatenate([m.uvs, np.zeros_like(m.uvs[:, :1])], axis=1)
+        arrays["texcoords"] = np.stack([m.uvs[:, 0], v, np.zeros_like(v)], axis=1)
+    if m.normals is not None:
+        arrays["normals"] = m.normals
     return {"type": "mrt_mesh", **{name: mi.Bitmap(array[np.newaxis]) for name, array in arrays.items()}}
 
 

@@ -19,6 +19,14 @@ DEFAULT_MATERIAL = Material(
     ior=1.1022, alpha=0.0579, specular=(0.286, 0.235, 0.128), diffuse=(1.0, 0.766, 0.762)
 )
 
+# What exporters write of statements that are not used, where it changes nothing
+_OPAQUE, _NOTHING = ("1", "1.0", "1.000000"), ("0", "0.0", "0.000000")
+_WITHOUT_EFFECT = {"d": _OPAQUE, "Tr": _NOTHING, "illum": ("0", "1", "2"), "sharpness": ("60",)}
+_WITHOUT_EFFECT |= {
+    name: tuple(" ".join([value] * 3) for value in values)
+    for name, values in (("Ke", _NOTHING), ("Tf", _OPAQUE))
+}
+
 # Options of a map_Kd statement, with the number of values that follow each
 _MAP_OPTIONS = {
     "-blendu": (1, 1),
@@ -65,14 +73,17 @@ def read_mtl(
 
     ``map_Kd`` names a picture that replaces Kd; it is looked for relative to ``folder`` (that of the OBJ
     file), then to the MTL file. One that is missing is named in a warning and Kd is used. Values may exceed
-    1, as in the report.
+    1, as in the report. ``standard`` warns of statements that would change the picture and are not used.
 
     Raises ``SceneError`` with file and line for what cannot be read.
     """
     path = Path(path)
-    entries = _parse(path, decode(read_text(path)).split("\n"))
+    findings = Findings()
+    # the report's reading is what it uses; of the standard's, what is left out is told
+    unused = findings if convention == "standard" else None
+    entries = _parse(path, decode(read_text(path)).split("\n"), unused)
     make = {"report": _report_material, "standard": _standard_material}[convention]
-    materials, findings = {}, Findings()
+    materials = {}
     for name, entry in entries.items():
         material = make(entry)
         if entry.map_kd is not None:
@@ -83,7 +94,7 @@ def read_mtl(
     return materials
 
 
-def _parse(path: Path, lines: list[str]) -> dict[str, _Entry]:
+def _parse(path: Path, lines: list[str], findings: Findings | None) -> dict[str, _Entry]:
     entries: dict[str, _Entry] = {}
     current: _Entry | None = None
     for number, line in enumerate(lines, 1):
@@ -99,6 +110,8 @@ def _parse(path: Path, lines: list[str]) -> dict[str, _Entry]:
             if current is None:
                 raise SceneError(f"{where}: {statement} comes before any newmtl; write newmtl NAME before it")
             _STATEMENTS[statement](current, where, number, rest)
+        elif findings is not None and rest not in _WITHOUT_EFFECT.get(statement, ()) and statement:
+            findings.add("statements", f"{where}: {statement} {rest[:40]} is not used")
     return entries
 
 

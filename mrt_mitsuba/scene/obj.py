@@ -60,8 +60,9 @@ def read_obj(path: str | os.PathLike[str], *, convention: str = "report") -> tup
     """The meshes of an OBJ file, one for each material that is used.
 
     Faces are ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``, with positive or negative indices. One with more than
-    three corners is cut into a fan around its first corner, which is right for convex faces. Normals are not
-    used: triangles are flat, their normal follows from the winding. Material libraries are looked for beside
+    three corners is cut into a fan around its first corner, which is right for convex faces. Normals are used
+    by the convention "standard" for the faces that have them; else triangles are flat, and their normal
+    follows from the winding. Material libraries are looked for beside
     the file and read by ``convention`` (see ``read_mtl``); one that is missing is named in a warning. Faces
     of no known material get ``DEFAULT_MATERIAL``.
 
@@ -77,10 +78,11 @@ def read_obj(path: str | os.PathLike[str], *, convention: str = "report") -> tup
 
 @dataclass
 class _Faces:
-    """Faces of as many corners each: vertex and texture indices from 0, texture −1 for none."""
+    """Faces of as many corners each: indices of vertex, texture and normal from 0, −1 for none."""
 
     v: np.ndarray  # int64 [F, corners]
     vt: np.ndarray  # int64 [F, corners]
+    vn: np.ndarray  # int64 [F, corners]
     material: str | None
     lines: np.ndarray  # int64 [F]
 
@@ -99,7 +101,6 @@ class _Reader:
         self.line = 1
         self.unknown_materials: set[str] = set()
         self.findings = Findings()
-        self.highest_normal = -1, 0  # index from 0, and the line that has it
 
     def fail(self, text: str, line: int | None = None) -> None:
         raise SceneError(f"{self.path}:{self.line if line is None else line}: {text}")
@@ -193,17 +194,10 @@ class _Reader:
                     else "indices count from 1, or back from -1"
                 )
                 self.fail(f"f has the {kind} index {bad}: {reason}", self.line + row)
-        if "vn" in resolved:
-            self._note_highest_normal(resolved["vn"])
         lines = np.arange(self.line, self.line + len(indices))
         none = np.full_like(resolved["v"], -1)
-        self.faces.append(_Faces(resolved["v"], resolved.get("vt", none), self.material, lines))
-
-    def _note_highest_normal(self, index: np.ndarray) -> None:
-        """Normals are not used, but an index without one means a broken file. They may still follow."""
-        top = int(index.max())
-        if top > self.highest_normal[0]:
-            self.highest_normal = top, self.line + int(np.argmax((index == top).any(axis=1)))
+        vt, vn = resolved.get("vt", none), resolved.get("vn", none)
+        self.faces.append(_Faces(resolved["v"], vt, vn, self.material, lines))
 
     # ---------------------------------------- Materials ------------------------------------------------
 
@@ -236,20 +230,25 @@ class _Reader:
         """One mesh for each material, in the order of their first use."""
         self.findings.warn()
         self._check_ranges()
-        vertices = np.concatenate(self.arrays["v"]) if self.arrays["v"] else np.empty((0, 3), np.float32)
-        uvs = np.concatenate(self.arrays["vt"]) if self.arrays["vt"] else np.empty((0, 2), np.float32)
-        by_material: dict[Material, list[_Faces]] = {}
+        points, uvs, normals = (
+            np.concatenate(self.arrays[kind] or [np.empty((0, _USED[kind]), np.float32)]) for kind in _USED
+        )
+        by_material: dict[tuple[Material, bool], list[_Faces]] = {}
         for faces in self.faces:
             material = self.materials.get(faces.material or "", DEFAULT_MATERIAL)
             if faces.vt[0, 0] < 0:
                 material = replace(material, texture=None)  # no coordinates to look it up
-            by_material.setdefault(material, []).append(faces)
+            smooth = self.convention == "standard" and faces.vn[0, 0] >= 0
+            by_material.setdefault((material, smooth), []).append(faces)
         if not by_material:
             raise SceneError(f"{self.path}: has no faces; export the model with its geometry")
-        return tuple(_mesh(vertices, uvs, faces, material) for material, faces in by_material.items())
+        return tuple(
+            _mesh(points, uvs, normals if smooth else None, faces, material)
+            for (material, smooth), faces in by_material.items()
+        )
 
     def _check_ranges(self) -> None:
-        for kind in ("v", "vt"):
+        for kind in ("v", "vt", "vn"):
             for faces in self.faces:
                 index = getattr(faces, kind)
                 beyond = index >= self.counts[kind]
@@ -258,22 +257,21 @@ class _Reader:
                     bad = int(index[row][beyond[row]][0]) + 1
                     text = f"f has the {kind} index {bad}, but the file has {self.counts[kind]}"
                     self.fail(text, int(faces.lines[row]))
-        top, line = self.highest_normal
-        if top >= self.counts["vn"]:
-            self.fail(f"f has the vn index {top + 1}, but the file has {self.counts['vn']}", line)
 
 
-def _mesh(vertices: np.ndarray, uvs: np.ndarray, faces: list[_Faces], material: Material) -> Mesh:
+def _mesh(
+    points: np.ndarray, uvs: np.ndarray, normals: np.ndarray | None, faces: list[_Faces], material: Material
+) -> Mesh:
     """The mesh of some faces, with the vertices that they use."""
-    v = np.concatenate([_triangles(f.v) for f in faces])
-    vt = np.concatenate([_triangles(f.vt) for f in faces])
-    if material.texture is None:
-        used, index = _compact(v, len(vertices))
-        return Mesh(vertices[used], index, material)
-    # Each corner becomes a vertex: a point may have other texture coordinates in another triangle
-    corners = vt.ravel()
-    index = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-    return Mesh(vertices[v.ravel()], index, material, uvs[corners])
+    v, vt, vn = (np.concatenate([_triangles(getattr(f, kind)) for f in faces]) for kind in ("v", "vt", "vn"))
+    if material.texture is None and normals is None:
+        used, index = _compact(v, len(points))
+        return Mesh(points[used], index, material)
+    # Each corner becomes a vertex: a point may have another texture or normal in another triangle
+    index = np.arange(v.size, dtype=np.uint32).reshape(-1, 3)
+    textured = None if material.texture is None else uvs[vt.ravel()]
+    smooth = None if normals is None else normals[vn.ravel()]
+    return Mesh(points[v.ravel()], index, material, textured, smooth)
 
 
 def _triangles(index: np.ndarray) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
@@ -11,9 +10,9 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.validation.tools.own_scenes import SCENES, SPP, load, sensor
 
-WIDTH, HEIGHT, SPP = 32, 24, 64
-Node = dict[str, Any]
+WIDTH, HEIGHT = 32, 24
 
 
 @pytest.fixture(autouse=True)
@@ -21,189 +20,8 @@ def _fast(variant: str) -> None:
     """The variant with arrays of rays."""
 
 
-# ------------------------------------------------ Scenes ------------------------------------------------
-
-
-def _to() -> Any:
-    return mi.ScalarTransform4f()
-
-
-def _sensor(origin: list[float], target: list[float], rfilter: str = "gaussian", **more: Any) -> Node:
-    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": rfilter}}
-    return {
-        "type": "perspective",
-        "fov": 40,
-        "to_world": _to().look_at(origin, target, [0, 1, 0]),
-        "film": film | more.pop("film", {}),
-        "sampler": {"type": more.pop("sampler", "independent"), "sample_count": SPP},
-    } | more
-
-
-def _rgb(*values: float) -> Node:
-    return {"type": "rgb", "value": list(values) if len(values) == 3 else values[0]}
-
-
-def _checks(count: int) -> Node:
-    colors = {"color0": _rgb(0.1), "color1": _rgb(0.9)}
-    return {"type": "checkerboard", "to_uv": _to().scale([count, count, 1]), **colors}
-
-
-def _diffuse(reflectance: Any) -> Node:
-    return {"type": "diffuse", "reflectance": reflectance}
-
-
-def _floor(bsdf: Node) -> Node:
-    return {"type": "rectangle", "to_world": _to().rotate([1, 0, 0], -90).scale(10), "bsdf": bsdf}
-
-
-def _ball(center: list[float], radius: float, bsdf: Node) -> Node:
-    return {"type": "sphere", "center": center, "radius": radius, "bsdf": bsdf}
-
-
-def _lamp(center: list[float], radius: float, radiance: float) -> Node:
-    emitter = {"type": "area", "radiance": _rgb(radiance)}
-    return {"type": "sphere", "center": center, "radius": radius, "emitter": emitter}
-
-
-def _sky(*color: float) -> Node:
-    return {"type": "constant", "radiance": _rgb(*color)}
-
-
-def _envmap() -> Node:
-    pixels = np.full((16, 32, 3), 0.4, np.float32)
-    pixels[3:5, 10:12] = 30
-    return {
-        "sensor": _sensor([0, 2, 6], [0, 0.5, 0]),
-        "around": {"type": "envmap", "bitmap": mi.Bitmap(pixels)},
-        "floor": _floor(_diffuse(_rgb(0.6))),
-        "ball": _ball([0, 1, 0], 1, {"type": "roughconductor", "alpha": 0.2}),
-    }
-
-
-def _instances() -> Node:
-    group = {"type": "shapegroup", "a": _ball([0, 0, 0], 0.4, _diffuse(_rgb(0.7)))}
-    places = {f"at{i}": _to().translate([i % 3 - 1, 0.4, i // 3 - 1]) for i in range(9)}
-    reference = {"type": "ref", "id": "group"}
-    return {
-        "sensor": _sensor([0, 3, 6], [0, 0.5, 0], "box"),
-        "group": group,
-        **{name: {"type": "instance", "to_world": place, "g": reference} for name, place in places.items()},
-        "floor": _floor(_diffuse(_checks(8))),
-        "sky": _sky(0.3, 0.4, 0.5),
-        "lamp": _lamp([3, 5, 3], 0.7, 20),
-    }
-
-
-def _thin_lens() -> Node:
-    lens = {"type": "thinlens", "aperture_radius": 0.2, "focus_distance": 6.0}
-    return {
-        "sensor": _sensor([0, 1.5, 6], [0, 0.6, 0], **lens),
-        "floor": _floor(_diffuse(_checks(20))),
-        "near": _ball([-1, 0.5, 3], 0.5, _diffuse(_rgb(0.7, 0.2, 0.2))),
-        "far": _ball([1, 0.5, -2], 0.5, _diffuse(_rgb(0.2, 0.2, 0.7))),
-        "sky": _sky(0.6, 0.7, 0.9),
-    }
-
-
-def _gloss() -> Node:
-    return {
-        "sensor": _sensor([0, 1.5, 5], [0, 0.7, 0], "box"),
-        "floor": _floor({"type": "roughconductor", "alpha": 0.1}),
-        "ball": _ball([0, 0.7, 0], 0.7, {"type": "roughplastic", "alpha": 0.1}),
-        "sky": _sky(0.2),
-        "lamp": _lamp([1.2, 3, -1], 0.1, 200),
-    }
-
-
-def _rough_glass() -> Node:
-    return {
-        "sensor": _sensor([0, 1.2, 5], [0, 0.8, 0]),
-        "floor": _floor(_diffuse(_checks(8))),
-        "ball": _ball([0, 0.9, 0], 0.8, {"type": "roughdielectric", "alpha": 0.3}),
-        "lamp": _lamp([0, 4, 0], 1.0, 6),
-        "sky": _sky(0.2),
-    }
-
-
-def _area_light() -> Node:
-    wall = {
-        "type": "rectangle",
-        "to_world": _to().translate([0, 2, -2]).scale(4),
-        "bsdf": _diffuse(_rgb(0.5)),
-    }
-    light = {
-        "type": "rectangle",
-        "to_world": _to().translate([0, 4, 0]).rotate([1, 0, 0], 90),
-        "emitter": {"type": "area", "radiance": _rgb(6)},
-    }
-    return {
-        "sensor": _sensor([0, 1.5, 6], [0, 1, 0], "mitchell"),
-        "floor": _floor(_diffuse(_rgb(0.8, 0.4, 0.3))),
-        "wall": wall,
-        "box": {"type": "cube", "to_world": _to().translate([0, 0.5, 0]).rotate([0, 1, 0], 30).scale(0.5)},
-        "light": light,
-    }
-
-
-def _spot() -> Node:
-    light = {"type": "spot", "intensity": _rgb(40, 36, 30), "cutoff_angle": 25}
-    return {
-        "sensor": _sensor([0, 3, 6], [0, 0.5, 0], "tent"),
-        "floor": _floor(_diffuse(_rgb(0.7))),
-        "box": {"type": "cube", "to_world": _to().translate([0, 0.5, 0]).scale(0.5)},
-        "light": light | {"to_world": _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])},
-    }
-
-
-def _crop() -> Node:
-    window = {"width": 48, "height": 40, "crop_offset_x": 9, "crop_offset_y": 11}
-    film = window | {"crop_width": WIDTH, "crop_height": HEIGHT, "sample_border": True}
-    return {
-        "sensor": _sensor([0, 2, 6], [0, 0.5, 0], film=film),
-        "floor": _floor(_diffuse(_checks(8))),
-        "ball": _ball([0, 1, 0], 1, {"type": "plastic"}),
-        "lamp": _lamp([2, 4, 2], 0.5, 15),
-    }
-
-
-def _texture_and_sky() -> Node:
-    return {
-        "sensor": _sensor([0, 1.5, 6], [0, 2.5, 0], fov=60),
-        "floor": _floor(_diffuse(_checks(30))),
-        "ball": _ball([-1, 0.6, 1], 0.6, _diffuse(_checks(12))),
-        "sky": _sky(0.5, 0.7, 1.0),
-    }
-
-
-def _stratified() -> Node:
-    return {
-        "sensor": _sensor([0, 2, 6], [0, 0.5, 0], "box", sampler="stratified"),
-        "floor": _floor(_diffuse(_checks(8))),
-        "box": {"type": "cube", "to_world": _to().translate([0, 0.5, 0]).rotate([0, 1, 0], 30).scale(0.5)},
-        "lamp": _lamp([0, 4, 1], 1.0, 5),
-    }
-
-
-SCENES: dict[str, Callable[[], Node]] = {
-    make.__name__.strip("_"): make
-    for make in (
-        _envmap,
-        _instances,
-        _thin_lens,
-        _gloss,
-        _rough_glass,
-        _area_light,
-        _spot,
-        _crop,
-        _texture_and_sky,
-        _stratified,
-    )
-}
-
-
 def _load(name: str, **more: Any) -> Any:
-    path = {"type": "path", "max_depth": 4}
-    return mi.load_dict({"type": "scene", "integrator": path} | SCENES[name]() | more)
+    return load(name, **{"width": WIDTH, "height": HEIGHT} | more)
 
 
 def _rmse(a: np.ndarray, b: np.ndarray) -> float:
@@ -239,7 +57,7 @@ def test_wavefronts_that_fit_into_memory_show_the_same():
 
 
 def test_error_falls_with_the_root_of_the_rays():
-    scene = _load("area_light", sensor=_sensor([0, 1.5, 6], [0, 1, 0], film={"width": 12, "height": 9}))
+    scene = _load("area_light", width=12, height=9)
     truth = np.array(mi.render(scene, spp=2**16, seed=99))
     counts = (16, 256, 4096)
     errors = [
@@ -269,9 +87,9 @@ def test_means_agree_by_welchs_test():
 
 
 def test_filters_alpha_and_channels_are_kept():
-    film = {"width": 24, "height": 16, "rfilter": {"type": "catmullrom"}, "pixel_format": "rgba"}
+    film = {"rfilter": {"type": "catmullrom"}, "pixel_format": "rgba"}
     integrator = {"type": "aov", "aovs": "far:depth,facing:sh_normal", "picture": {"type": "path"}}
-    scene = _load("envmap", sensor=_sensor([0, 2, 6], [0, 3, 0], film=film), integrator=integrator)
+    scene = _load("spot", width=24, height=16, film=film, integrator=integrator)
     result = mrt.render(scene, spp=16, seed=3)
     theirs = np.array(mi.render(scene, spp=16, seed=3))  # R, G, B, A, the nested picture's left out
     bitmap = scene.sensors()[0].film().bitmap()
@@ -283,11 +101,10 @@ def test_filters_alpha_and_channels_are_kept():
 
 
 def test_luminance_and_what_is_not_kept_are_said():
-    film = {"pixel_format": "luminance", "component_format": "float32"}
-    scene = _load("spot", sensor=_sensor([0, 3, 6], [0, 0.5, 0], film=film))
+    scene = _load("spot", film={"pixel_format": "luminance"})
     image = mrt.render(scene, spp=16, seed=2).image
     np.testing.assert_allclose(image, np.repeat(np.array(mi.render(scene, spp=16, seed=2)), 3, -1), atol=1e-4)
-    xyz = _load("spot", sensor=_sensor([0, 3, 6], [0, 0.5, 0], film={"pixel_format": "xyz"}))
+    xyz = _load("spot", film={"pixel_format": "xyz"})
     assert "without pixel format xyz: pictures are linear sRGB" in str(mrt.render(xyz, spp=1).plan)
     noise = str(mrt.render(_load("stratified"), aamode="noise", spp=16).plan)
     assert "without StratifiedSampler: rounds continue one sequence" in noise
@@ -299,7 +116,8 @@ def test_size_sensor_and_parameters(tmp_path):
     before = list(scene.sensors()[0].film().crop_size())
     assert mrt.render(scene, width=20, height=10, spp=4).image.shape == (10, 20, 3)
     assert list(scene.sensors()[0].film().crop_size()) == before
-    two = mi.load_dict({"type": "scene", **_spot(), "other": _sensor([0, 9, 0.1], [0, 0, 0])})
+    above = sensor(mi.ScalarTransform4f(), [0, 9, 0.1], [0, 0, 0])
+    two = _load("spot", other=above | {"film": above["film"] | {"width": WIDTH, "height": HEIGHT}})
     first, second = (mrt.render(two, integrator="direct", sensor=k, spp=4).image for k in (0, 1))
     assert _rmse(first, second) > 0.01
     with pytest.raises(mrt.UsageError, match="sensor=2: a Mitsuba scene has 2, counted from 0"):
@@ -440,7 +258,7 @@ def test_no_random_numbers_no_variance_but_a_finer_lattice():
 )
 def test_what_does_not_go_together(options, text):
     with pytest.raises(mrt.UsageError, match=text):
-        mrt.render({"type": "scene", "integrator": {"type": "path"}, **_spot()}, **options)
+        mrt.render(_load("spot"), **options)
 
 
 def test_every_pixel_has_its_place_shape_and_material():

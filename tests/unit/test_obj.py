@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
 from mrt_mitsuba.scene.model import Camera, Mesh
 from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, read_mtl
@@ -425,3 +426,49 @@ def test_view_of_nothing_is_refused(tmp_path, given: dict, text: str) -> None:
     path.write_text(TRIANGLE)
     with pytest.raises(UsageError, match=text):
         model_view(path, **given)
+
+
+# ------------------------------------------- The standard's reading -------------------------------------
+
+
+def test_standard_textures_stand_upright_and_the_reports_upside_down(tmp_path):
+    from PIL import Image
+
+    halves = np.zeros((4, 4, 3), np.uint8)
+    halves[:2, :, 0] = halves[2:, :, 2] = 255  # red above blue
+    Image.fromarray(halves).save(tmp_path / "halves.png")
+    (tmp_path / "quad.mtl").write_text("newmtl m\nKd 1 1 1\nKs 0 0 0\nmap_Kd halves.png\n")
+    corners = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    (tmp_path / "quad.obj").write_text(f"mtllib quad.mtl\n{corners}usemtl m\nf 1/1 2/2 3/3 4/4\n")
+    view = {"camera": (0, 0, 3), "fov": 40, "light": (0, 0, 9), "width": 8, "height": 8, "aa": 1}
+    for convention, above in (("standard", 0), ("report", 2)):
+        image = mrt.render(tmp_path / "quad.obj", convention=convention, **view).image
+        assert image[2, 4].argmax() == above and image[5, 4].argmax() == 2 - above
+
+
+def test_the_standard_uses_normals_and_the_report_does_not(tmp_path):
+    """A coarse ball: with the normals of a sphere, it is shaded as one."""
+    long, wide = 8, 5
+    angle, height = np.meshgrid(np.arange(long) * 2 * np.pi / long, np.linspace(-1.4, 1.4, wide))
+    points = np.stack([np.cos(height) * np.sin(angle), np.sin(height), np.cos(height) * np.cos(angle)], -1)
+    text = "".join(f"v {x} {y} {z}\nvn {x} {y} {z}\n" for x, y, z in points.reshape(-1, 3))
+    for row in range(wide - 1):
+        for k in range(long):
+            low, right = row * long + 1, (k + 1) % long
+            around = [low + k, low + right, low + long + right, low + long + k]
+            text += "f " + " ".join(f"{i}//{i}" for i in around) + "\n"
+    (tmp_path / "ball.mtl").write_text("newmtl m\nKd 1 1 1\nKs 0 0 0\n")
+    (tmp_path / "ball.obj").write_text("mtllib ball.mtl\nusemtl m\n" + text)
+    view = {"light": (600, 0, 1000), "camera": (0, 0, 4), "fov": 30, "width": 32, "height": 32, "aa": 1}
+    steps = []
+    for convention in ("report", "standard"):
+        image = mrt.render(tmp_path / "ball.obj", convention=convention, **view).image[16, 8:24, 0]
+        steps.append(np.abs(np.diff(image)).max())
+    assert steps[1] < steps[0] / 2
+
+
+def test_what_the_standard_drops_is_said_once(tmp_path):
+    (tmp_path / "a.mtl").write_text("newmtl m\nKd 1 1 1\nillum 2\nd 0.5\nd 1.0\nmap_bump x.png\n")
+    with pytest.warns(MrtWarning, match=r"a.mtl:4: d 0.5 is not used \(and so do 1 more statements\)"):
+        read_mtl(tmp_path / "a.mtl", convention="standard")
+    read_mtl(tmp_path / "a.mtl")  # the report's reading is what it uses
