@@ -41,11 +41,11 @@ def facing_mirrors(**more: Any) -> dict[str, Any]:
     scene = {
         "front": {"type": "mrt_plane", "normal": [1, 0, 0], "distance": 1.5, "bsdf": mirror},
         "back": {"type": "mrt_plane", "normal": [-1, 0, 0], "distance": 1.5, "bsdf": mirror},
-        "lid": {"type": "mrt_plane", "normal": [0, -1, 0], "distance": 3.0, "bsdf": glass(0.0)},
+        "lid": {"type": "sphere", "center": [0, 8, 0], "radius": 5.0, "bsdf": glass(0.0)},
     }
     for k in range(6):
         intensity = rgb(*[3.5e-4] * 3)
-        scene[f"light{k}"] = {"type": "mrt_light", "position": [0.2 * k, 4, 0], "intensity": intensity}
+        scene[f"light{k}"] = {"type": "mrt_light", "position": [0.2 * k, 8, 0], "intensity": intensity}
     return scene | more
 
 
