@@ -145,7 +145,7 @@ class SceneReading:
         balls = np.array([center_and_radius(s) for s in self.native if is_sphere(s)]).reshape(-1, 4)
         if any(near(np.linalg.norm(b[:3] - p) - b[3], np.abs(b[:3]).max() + b[3]) for b in balls):
             return True
-        return any(near(table.heights(p), float(np.abs(table.boxes()).max())) for table in self._tables)
+        return any(near(table.heights(place), float(np.abs(table.boxes()).max())) for table in self._tables)
 
     def _alone(self) -> bool:
         """Is there one object only, convex, with a mirror on its outside alone?"""
