@@ -16,7 +16,7 @@ from typing import Any
 from mrt_mitsuba.cores import affinity, usable_cores
 from mrt_mitsuba.errors import MrtError, OutputError
 from mrt_mitsuba.runtime import versions
-from mrt_mitsuba.sweeps.scenes import SceneFile
+from mrt_mitsuba.sweeps.scenes import Opener, SceneFile
 
 TOPIC = "mrt-sweep"  # of the scheduler's events, which tell a client what began
 MADE_WITH = "mrt:sweep"  # header attribute: fingerprint of scene, settings and versions
@@ -24,6 +24,7 @@ THUMBNAIL = 160  # pixels, the longer side
 PAUSE = 0.5  # seconds before a worker ends, in which the client fetches the facts about its last job
 
 _one_at_a_time = threading.Lock()  # Dr.Jit is not safe with several Python threads
+_open = Opener()
 _versions = functools.cache(versions)  # takes a millisecond
 _done = 0  # jobs since this process began
 _ending = threading.Event()  # it is about to be replaced
@@ -163,16 +164,19 @@ def _prepare(worker: Any, house: House) -> None:
 def _render(task: Task, worker: Any) -> dict[str, Any]:
     import numpy as np
 
-    from mrt_mitsuba import render, runtime
+    from mrt_mitsuba import runtime
     from mrt_mitsuba.output.files import save
+    from mrt_mitsuba.rendering.api import render_with
+    from mrt_mitsuba.rendering.progress import Progress
+    from mrt_mitsuba.rendering.settings import RenderSettings
 
     start = time.perf_counter()
-    arguments = {"memory": _memory(worker), **task.arguments}
+    settings = RenderSettings.of(**{"memory": _memory(worker), **task.arguments})
     scene = task.scene
     if isinstance(scene, SceneFile):
-        runtime.use(arguments.get("variant"))
+        runtime.use(settings.variant)
         scene = scene.load()
-    result = render(scene, **arguments)
+    result = render_with(scene, settings, Progress(), opener=_open)
     header = result.header() | {MADE_WITH: task.made_with}
     for file in task.files:
         path, target = os.path.join(task.scratch, file), os.path.join(task.folder, file)
