@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -159,14 +159,16 @@ def render(
         return render_with(scene, settings, default() if progress is None else progress)
 
 
-def render_with(scene: Any, settings: RenderSettings, progress: Progress) -> Result:
-    """Render a scene as ``render`` does."""
+def render_with(
+    scene: Any, settings: RenderSettings, progress: Progress, *, opener: Callable[..., Source] = open_scene
+) -> Result:
+    """Render a scene as ``render`` does; ``opener`` takes the place of ``open_scene``."""
     start = time.perf_counter()
     with counting_kernels(progress) as kernels:
         runtime.use(settings.variant)
         runtime.warn_if_slow()
         budget = Budget.of(settings.memory)
-        source = open_scene(
+        source = opener(
             scene,
             size=(settings.width, settings.height),
             fresnel=settings.fresnel,

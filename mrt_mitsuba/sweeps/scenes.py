@@ -9,9 +9,9 @@ import operator
 import os
 import pickle
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.sweeps.grid import Job
@@ -82,6 +82,42 @@ def check_parameters(jobs: Sequence[Job]) -> None:
             if (*which, key, repr(params[key])) not in known:
                 set_parameters(loaded[which], {key: params[key]})
                 known.add((*which, key, repr(params[key])))
+
+
+class Opener:
+    """Opens scenes as ``open_scene`` does, and keeps the last: where the next differs in nothing but the
+    values of parameters that both set, these are set once more."""
+
+    def __init__(self) -> None:
+        self._kind, self._source = "", cast(Any, None)
+
+    def __call__(
+        self, scene: Any, *, budget: Any = None, params: Mapping[str, Any] | None = None, **how: Any
+    ) -> Any:
+        import mitsuba as mi
+
+        from mrt_mitsuba.scene.open import open_scene
+        from mrt_mitsuba.scene.parameters import set_parameters
+
+        values = {key: value for key, value in (params or {}).items() if "." in key}
+        # names that a file declares; and a film's size is read when the scene is opened
+        fixed = {key: value for key, value in (params or {}).items() if key not in values or "film" in key}
+        kind = fingerprint(_state(scene), sorted(values), sorted(fixed.items()), how, mi.variant())
+        if kind != self._kind:
+            self._kind, self._source = "", None  # free before the next one is loaded
+            self._source = open_scene(scene, budget=budget, params=params, **how)
+            self._kind = kind
+        elif values:
+            set_parameters(self._source.scene, values)
+        return self._source
+
+
+def _state(scene: Any) -> Any:
+    """Return what changes with a scene; of a file its date, as it may name others that change."""
+    if isinstance(scene, str):
+        found = os.stat(scene)
+        return scene, found.st_mtime_ns, found.st_size
+    return scene
 
 
 def fingerprint(*values: Any) -> str:

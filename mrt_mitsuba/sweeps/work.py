@@ -73,11 +73,19 @@ class Work:
 
     def write_sheet(self, path: str, tasks: Sequence[Task]) -> None:
         """Write the pictures of some tasks, small, as one."""
+        import numpy as np
+
         tasks = tasks[:MOST]
-        paths = [os.path.join(task.folder, task.files[-1]) for task in tasks]
+        paths = {
+            task.name: os.path.join(task.folder, task.files[-1])
+            for task in tasks
+            if not os.path.exists(task.thumbnail)  # of an earlier sweep
+        }
         with _explained():
-            pictures = self._client.gather(self._client.map(thumbnail, paths, pure=False))
-        write_sheet(path, [task.name for task in tasks], pictures)
+            older = self._client.gather(self._client.map(thumbnail, list(paths.values()), pure=False))
+        pictures = dict(zip(paths, older, strict=True))
+        pictures |= {task.name: np.load(task.thumbnail) for task in tasks if task.name not in pictures}
+        write_sheet(path, [task.name for task in tasks], [pictures[task.name] for task in tasks])
 
 
 def _facts(future: Future) -> dict[str, Any]:

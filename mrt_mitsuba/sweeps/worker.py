@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 import os
@@ -15,7 +16,7 @@ from typing import Any
 from mrt_mitsuba.cores import affinity, usable_cores
 from mrt_mitsuba.errors import MrtError, OutputError
 from mrt_mitsuba.runtime import versions
-from mrt_mitsuba.sweeps.scenes import SceneFile
+from mrt_mitsuba.sweeps.scenes import Opener, SceneFile
 
 TOPIC = "mrt-sweep"  # of the scheduler's events, which tell a client what began
 MADE_WITH = "mrt:sweep"  # header attribute: fingerprint of scene, settings and versions
@@ -23,6 +24,8 @@ THUMBNAIL = 160  # pixels, the longer side
 PAUSE = 0.5  # seconds before a worker ends, in which the client fetches the facts about its last job
 
 _one_at_a_time = threading.Lock()  # Dr.Jit is not safe with several Python threads
+_open = Opener()
+_versions = functools.cache(versions)  # takes a millisecond
 _done = 0  # jobs since this process began
 _ending = threading.Event()  # it is about to be replaced
 
@@ -43,6 +46,11 @@ class Task:
     def key(self) -> str:
         """Names the task among those of all clients of a scheduler."""
         return f"{os.path.basename(self.scratch)}/{self.name}"
+
+    @property
+    def thumbnail(self) -> str:
+        """The path of the picture for the contact sheet, as an array."""
+        return os.path.join(self.scratch, f"{self.name}.npy")
 
     @property
     def files(self) -> list[str]:
@@ -141,8 +149,8 @@ def _renew(worker: Any) -> None:
 
 def _prepare(worker: Any, house: House) -> None:
     """Choose Dr.Jit's cache, before it is imported, and its share of the cores; check the versions."""
-    if versions() != house.versions:
-        raise MrtError(f"the worker has {named(versions())}; the sweep began with {named(house.versions)}")
+    if _versions() != house.versions:
+        raise MrtError(f"the worker has {named(_versions())}; the sweep began with {named(house.versions)}")
     if not house.local:  # homes of clusters are often far away
         near = os.path.join(os.path.dirname(worker.local_directory), "drjit")
         os.environ.setdefault("DRJIT_CACHE_DIR", near)
@@ -154,16 +162,21 @@ def _prepare(worker: Any, house: House) -> None:
 
 
 def _render(task: Task, worker: Any) -> dict[str, Any]:
-    from mrt_mitsuba import render, runtime
+    import numpy as np
+
+    from mrt_mitsuba import runtime
     from mrt_mitsuba.output.files import save
+    from mrt_mitsuba.rendering.api import render_with
+    from mrt_mitsuba.rendering.progress import Progress
+    from mrt_mitsuba.rendering.settings import RenderSettings
 
     start = time.perf_counter()
-    arguments = {"memory": _memory(worker), **task.arguments}
+    settings = RenderSettings.of(**{"memory": _memory(worker), **task.arguments})
     scene = task.scene
     if isinstance(scene, SceneFile):
-        runtime.use(arguments.get("variant"))
+        runtime.use(settings.variant)
         scene = scene.load()
-    result = render(scene, **arguments)
+    result = render_with(scene, settings, Progress(), opener=_open)
     header = result.header() | {MADE_WITH: task.made_with}
     for file in task.files:
         path, target = os.path.join(task.scratch, file), os.path.join(task.folder, file)
@@ -171,6 +184,8 @@ def _render(task: Task, worker: Any) -> dict[str, Any]:
             os.makedirs(os.path.dirname(place), exist_ok=True)
         save(path, result.image, layers=result.layers, header=header)
         os.replace(path, target)
+    if "region" not in task.arguments:
+        np.save(task.thumbnail, shrunk(result.image))
     return {
         "file": task.files[-1],
         "seconds": time.perf_counter() - start,
@@ -189,15 +204,22 @@ def _memory(worker: Any) -> int | None:
 
 
 def thumbnail(path: str) -> Any:
-    """Return a picture in sRGB, 8 bit, no larger than ``THUMBNAIL``; None where it cannot be read."""
+    """Return a picture as ``shrunk`` does; None where it cannot be read."""
+    from mrt_mitsuba.output.files import read_exr
+
+    try:
+        return shrunk(read_exr(path).image)
+    except OutputError:
+        return None
+
+
+def shrunk(image: Any) -> Any:
+    """Return a picture [H, W, 3] in sRGB, 8 bit, no larger than ``THUMBNAIL``."""
     import numpy as np
     from PIL import Image
 
-    from mrt_mitsuba.output.files import read_exr, to_8bit
+    from mrt_mitsuba.output.files import to_8bit
 
-    try:
-        picture = Image.fromarray(to_8bit(np.nan_to_num(read_exr(path).image), "srgb"))
-    except OutputError:
-        return None
+    picture = Image.fromarray(to_8bit(np.nan_to_num(image), "srgb"))
     picture.thumbnail((THUMBNAIL, THUMBNAIL))
     return np.asarray(picture)

@@ -149,14 +149,17 @@ def test_pictures_are_those_of_render_alone(address: str, tmp_path: Path) -> Non
 
 
 def test_parameters_of_the_scene(address: str, tmp_path: Path) -> None:
+    """Jobs that follow each other in a worker set them in a scene that it has loaded once."""
+    places = [[[0.5, 0, 0, x], [0, 0.5, 0, 1], [0, 0, 0.5, 1], [0, 0, 0, 1]] for x in (1.0, 2.0)]
     grid = {"material_0.alpha": [0.1, 0.6], "light_0.intensity.value": [[1, 0, 0], [0, 1, 0]]}
-    table = mrt.sweep(3, tmp_path, grid=grid, cluster=address, **SMALL)
-    found = [read_exr(tmp_path / row["file"]).image.tobytes() for row in table.rows]
-    alone = [
-        mrt.render(3, params={key: row[key] for key in grid}, **SMALL).image.tobytes() for row in table.rows
-    ]
-    assert found == alone and len(set(found)) == 4
-    assert table.rows[0]["file"] == "material_0.alpha=0.1,light_0.intensity.value=1x0x0.exr"
+    for more in ({}, {"sphere_0.to_world": places}):
+        axes = grid | more
+        table = mrt.sweep(3, tmp_path, grid=axes, cluster=address, zipped=bool(more), **SMALL)
+        found = [read_exr(tmp_path / row["file"]).image.tobytes() for row in table.rows]
+        values = [{key: row[key] for key in axes} for row in table.rows]
+        assert found == [mrt.render(3, params=params, **SMALL).image.tobytes() for params in values]
+        assert len(set(found)) == len(found) == (2 if more else 4)
+    assert (tmp_path / "material_0.alpha=0.1,light_0.intensity.value=1x0x0.exr").exists()
 
 
 def test_parameters_that_a_file_declares(address: str, tmp_path: Path) -> None:
