@@ -42,6 +42,18 @@ def _brightness(emitter: Any) -> float:
     return max(values, default=math.inf)
 
 
+def places(emitters: list[Any]) -> list[tuple[float, ...] | None]:
+    """Return where each emitter is a point; None for one that is none, or beyond ``MOST_EMITTERS``."""
+    if len(emitters) > MOST_EMITTERS:
+        return [None] * len(emitters)
+    return [_place(e) if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else None for e in emitters]
+
+
+def _place(emitter: Any) -> tuple[float, ...] | None:
+    parameters = mi.traverse(emitter)
+    return tuple(first(x) for x in parameters["position"]) if "position" in parameters else None
+
+
 def largest(texture: Any) -> float:
     """Return the largest value of a texture; inf where it is not known."""
     if varies(texture) or (mi.is_spectral and not is_jit()):

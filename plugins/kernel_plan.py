@@ -44,6 +44,7 @@ class Reason(str, Enum):
     OTHER_BSDF = "other-bsdf"  # a BSDF other than mrt_bsdf
     MIXED_FRESNEL = "mixed-fresnel"
     VARYING = "varying"  # a parameter varies over the surface, or has no place in the table
+    APART = "apart"  # no point light is on a surface
     ALONE = "alone"  # a ray that leaves the only object, which is convex, meets nothing
     BLACK = "black"  # no material reflects
     NO_DIFFUSE = "no-diffuse"
@@ -74,6 +75,7 @@ class SceneFacts:
     planes: int  #: shapes that are infinite planes
     quadrics: tuple[tuple[str, int], ...]  #: kinds of exact quadrics, and how many of each
     alone: bool  #: is there only one object, convex and reflecting on its outside
+    touching: bool  #: is a point light on a surface
     lights: int  #: emitters but for the environment and what is black
     random_lights: int  #: of the lights, those that need random numbers
     surface_emitters: int  #: of the lights, those that are surfaces
@@ -126,6 +128,7 @@ class KernelPlan:
     quadrics: tuple[str, ...]  #: kinds of exact quadrics; others are traced as meshes
     planes: bool  #: analytic planes, else they are traced as meshes
     lights: str  #: "none", "unrolled" or "loop"
+    touching: bool  #: shadow rays that end short of lights on surfaces
     random: bool  #: random numbers
     emission: bool  #: surfaces that emit
     sky: str  #: "none", "parameter" or "environment"
@@ -220,6 +223,7 @@ def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
         else (),
         planes=unless("planes", (facts.planes == 0, Reason.NO_PLANES)),
         lights=("unrolled" if unrolled else "loop") if lit else "none",
+        touching=unless("touching", (not facts.touching, Reason.APART)),
         random=unless("random", (facts.random_lights == 0, Reason.DELTA_LIGHTS)),
         emission=unless("emission", (facts.surface_emitters == 0, Reason.NO_SURFACE_EMITTERS)),
         sky=sky if unless("sky", (not has_sky, Reason.NO_SKY)) else "none",

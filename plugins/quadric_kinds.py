@@ -11,6 +11,9 @@ import numpy as np
 
 from .columns import Columns, column
 from .intersect import (
+    BASE,
+    LATERAL,
+    TOP,
     Frame,
     SurfaceHit,
     SurfacePoint,
@@ -138,6 +141,20 @@ class QuadricTable:
         rows = np.stack([row.array() for row in (frame.x, frame.y, frame.z)], axis=1)
         extents = np.broadcast_to(np.array(frame.extent, float), len(numbers))
         return cls(kind, frame.origin.array(), rows, extents, faces * np.arange(len(numbers)), flipped)
+
+    def heights(self, p: np.ndarray) -> np.ndarray:
+        """Return the distances [3, n] of a point [3] from the parts of each, inf far from their boxes."""
+        x, y, z = (Columns.of(self.rows[:, k]) for k in range(3))
+        frame = Frame(Columns.of(self.origins), x, y, z, column(self.extents))
+        point = Columns.of(np.broadcast_to(p, self.origins.shape))
+        low, high = self.boxes().transpose(1, 0, 2)
+        slack = 1e-6 * (high - low).max(axis=1)[:, None]
+        heights = []
+        for part in (LATERAL, BASE, TOP):
+            foot = KINDS[self.kind].surface(point, part, frame).p.array()
+            inside = ((foot >= low - slack) & (foot <= high + slack)).all(axis=1)
+            heights.append(np.where(inside, np.linalg.norm(foot - p, axis=1), np.inf))
+        return np.array(heights)
 
     def boxes(self) -> np.ndarray:
         """Return the bounding boxes [n, 2, 3]."""

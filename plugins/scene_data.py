@@ -10,18 +10,27 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from .emission import arriving, brightness
+from .emission import arriving, brightness, places
 from .hit_errors import CURVED, HitErrors
 from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
 from .merged_bsdf import MergedBSDF, uniform_materials
 from .mesh_api import ray_flags, surface_interaction, vertex_version
+from .parameters import ParameterError
 from .planes import Planes
 from .protocols import MirrorBSDF, PlaneShape, QuadricShape
 from .quadric_kinds import KINDS
 from .quadrics import quadrics_of
-from .spheres import Spheres, is_plain_sphere, is_sphere
+from .spheres import Spheres, center_and_radius, is_plain_sphere, is_sphere
 from .variants import but_not, is_jit, pointer, varies
+
+# Beyond these sizes, Embree's products of three lengths leave float32
+SMALLEST_MESH, LARGEST_MESH = 1e-8, 1e10
+
+# Where a light lies on a surface, shadow rays end by this share of their way short of it: it shines to both
+# sides
+TOUCHING = 2.0**-10
 
 # Reach of a mirror ray: any number that float32 holds
 FARTHEST = 2.0**127
@@ -46,6 +55,9 @@ class SceneReading:
         self.planes = [s for s in self.shapes if isinstance(s, PlaneShape)]
         self.quadrics = [s for s in self.shapes if isinstance(s, QuadricShape)]
         self.native = [s for s in self.shapes if not isinstance(s, (PlaneShape, QuadricShape))]
+        for mesh in (s for s in self.native if s.is_mesh()):
+            _check_size(mesh)
+        self._tables = [s.quadrics() for s in self.quadrics]
         self.environment = scene.environment()
         self.emitters = scene.emitters()
         values = zip(self.emitters, brightness(self.emitters), strict=True)
@@ -72,7 +84,7 @@ class SceneReading:
         materials = [b.state() for b in self.bsdfs if isinstance(b, MirrorBSDF)]
         moving = [s.moving_frame() is not None for s in self.quadrics]
         black = [value == 0 for value in brightness(self.emitters)]
-        return [*map(_shape_state, self.shapes), *moving, *materials, *black]
+        return [*map(_shape_state, self.shapes), *moving, *materials, *black, *places(self.emitters)]
 
     def facts(self) -> SceneFacts:
         """Return the facts; how bright the emitters are is read anew."""
@@ -87,7 +99,7 @@ class SceneReading:
 
     def _read_facts(self) -> SceneFacts:
         quadrics: Counter[str] = Counter()
-        for table in (s.quadrics() for s in self.quadrics):
+        for table in self._tables:
             quadrics[table.kind] += len(table.rows)
         delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
         return SceneFacts(
@@ -106,6 +118,7 @@ class SceneReading:
             arriving=math.inf,
             emission=math.inf,
             alone=self._alone(),
+            touching=any(self._touches(place) for place in places(self.lights) if place is not None),
             value=max(map(_value_bound, self.bsdfs), default=0.0),
             diffuse=self._has_lobe("diffuse"),
             specular=self._has_lobe("specular"),
@@ -120,11 +133,24 @@ class SceneReading:
         """Has a material such a lobe? Those that are not in the table may."""
         return self.unmergeable is not None or any(any(getattr(m, name)) for m in self.materials.values())
 
+    def _touches(self, place: tuple[float, ...]) -> bool:
+        """Is a point as near to a plane, sphere or quadric as rounding is?"""
+        p = np.array(place)
+
+        def near(height: np.ndarray | float, size: float) -> bool:
+            return bool(np.any(np.abs(height) <= CURVED * max(size, np.abs(p).max())))
+
+        if any(near(s.unit_normal @ p + s.distance, abs(s.distance)) for s in self.planes):
+            return True
+        balls = np.array([center_and_radius(s) for s in self.native if is_sphere(s)]).reshape(-1, 4)
+        if any(near(np.linalg.norm(b[:3] - p) - b[3], np.abs(b[:3]).max() + b[3]) for b in balls):
+            return True
+        return any(near(table.heights(p), float(np.abs(table.boxes()).max())) for table in self._tables)
+
     def _alone(self) -> bool:
         """Is there one object only, convex, with a mirror on its outside alone?"""
-        tables = [s.quadrics() for s in self.quadrics]
         plain = [s for s in self.native if is_plain_sphere(s)]
-        convex = [t for t in tables if KINDS[t.kind].closed and len(t.rows) == 1 and not t.flipped]
+        convex = [t for t in self._tables if KINDS[t.kind].closed and len(t.rows) == 1 and not t.flipped]
         one_sided = all(isinstance(b, MirrorBSDF) for b in self.bsdfs)
         return len(self.shapes) == 1 and len(plain) + len(convex) + len(self.planes) == 1 and one_sided
 
@@ -218,10 +244,10 @@ class SceneData:
     def occluded(self, scene: mi.Scene, hit: Hit, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Bool:
         """Does anything block the segment from ``hit`` to the light sample ``ds``?"""
         o = self._off_surface(hit, ds.d)
-        blocked = self.planes.separate(o, ds.p)
+        to_light = (ds.p - o) * (1 - TOUCHING) if self.plan.touching else ds.p - o
+        blocked = self.planes.separate(o, o + to_light if self.plan.touching else ds.p)
         if not self.plan.bvh and self.quadrics is None:
             return blocked
-        to_light = ds.p - o
         # Stop short of a light that has a surface of its own
         reach = 1 - mi.math.ShadowEpsilon if self.plan.emission else 1
         ray = mi.Ray3f(o, to_light, reach, hit.si.time, hit.si.wavelengths)
@@ -273,6 +299,17 @@ class SceneData:
         # A branch only to keep the code together: mixed with that of shadow rays, it runs out of registers
         return dr.if_stmt(
             arguments, hit.found, partial(evaluate, self.merged), partial(evaluate, None), label="bsdf"
+        )
+
+
+def _check_size(mesh: mi.Shape) -> None:
+    """Refuse a mesh that float32 cannot trace."""
+    low, high = (np.array(corner, float).ravel() for corner in (mesh.bbox().min, mesh.bbox().max))
+    extent, farthest = (high - low).max(), np.abs([low, high]).max()
+    if np.isfinite(farthest) and extent > 0 and not (extent >= SMALLEST_MESH and farthest <= LARGEST_MESH):
+        raise ParameterError(
+            f'mrt_whitted: the mesh "{mesh.id()}" is {extent:.3g} across and reaches to {farthest:.3g}; '
+            f"rays meet meshes from {SMALLEST_MESH:g} to {LARGEST_MESH:g}: scale the scene"
         )
 
 

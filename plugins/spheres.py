@@ -19,7 +19,7 @@ class Spheres:
     """
 
     def __init__(self, shapes: Sequence[mi.Shape]) -> None:
-        self.by_shape = ByShape(mi.Vector4f, shapes, [_center_and_radius(s) for s in shapes], [0.0] * 4)
+        self.by_shape = ByShape(mi.Vector4f, shapes, [center_and_radius(s) for s in shapes], [0.0] * 4)
 
     def interaction(
         self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, found: mi.Bool
@@ -61,7 +61,7 @@ def is_plain_sphere(shape: Any) -> bool:
     return is_sphere(shape) and not (shape.has_flipped_normals() or shape.is_emitter())
 
 
-def _center_and_radius(shape: Any) -> list[float]:
+def center_and_radius(shape: Any) -> list[float]:
     """Return those of a sphere, zeros for another shape."""
     if not is_sphere(shape):
         return [0.0] * 4

@@ -10,8 +10,10 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import Any
 
+from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.output.layers import FIRST_HIT, TABLE, named
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
+from mrt_mitsuba.plugins.parameters import ParameterError
 from mrt_mitsuba.plugins.protocols import LayeredIntegrator
 from mrt_mitsuba.rays.bundle import Samples
 from mrt_mitsuba.rendering.view import View
@@ -205,7 +207,10 @@ class LayeredShader(Shader):
 
     def __init__(self, scene: Any, integrator: Any) -> None:
         super().__init__(scene, integrator)
-        self.facts = integrator.scene_facts(scene)
+        try:
+            self.facts = integrator.scene_facts(scene)
+        except ParameterError as error:
+            raise SceneError(str(error)) from None
         self.kernel = integrator.kernel_plan(self.facts)
         self.random = self.kernel.random
         self.name = integrator.plugin_name

@@ -20,6 +20,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtWarning, SceneError, UsageError
 from mrt_mitsuba.scene.open import open_scene
 
@@ -120,6 +121,32 @@ def test_any_scene_file_is_read_or_refused(
             assert "Traceback" not in str(error)
             return
     assert source.width > 0 and source.height > 0 and source.sensor is not None
+
+
+NUMBERS = [i for i, part in enumerate(PARTS) if part.replace(".", "").replace(",", "").isdigit()]
+
+
+@settings(one_folder, max_examples=60)  # each is compiled
+@given(
+    changes=st.dictionaries(
+        st.sampled_from(NUMBERS),
+        st.sampled_from(["0", "1", "-1", "1e-30", "1e-9", "1e5", "1e20", "3e38", "0.5", "2"]),
+        min_size=1,
+        max_size=3,
+    )
+)
+def test_any_scene_file_that_is_read_is_drawn(tmp_path: Path, variant: str, changes: dict[int, str]) -> None:
+    """Whatever its numbers, the picture is made of numbers, or one clear error says why there is none."""
+    path = tmp_path / "a.xml"
+    path.write_text("".join(changes.get(i, part) for i, part in enumerate(PARTS)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MrtWarning)
+        try:
+            image = mrt.render(path, aa=1, aamode="none").image
+        except (SceneError, UsageError) as error:
+            assert "Traceback" not in str(error)
+            return
+    assert not np.isnan(image).any()
 
 
 # ------------------------------------------------- PNG --------------------------------------------------

@@ -122,7 +122,7 @@ DENSITY = lobes.Lobes.density
         ),
         (
             geometry,
-            [(scene_data, "OFFSET", 0.0)],
+            [(scene_data, "CURVED", 0.0)],
             {"Geometry: sphere, shadow rays", "Geometry: cone, shadow rays"},
         ),
         (

@@ -212,3 +212,54 @@ def test_wrong_parameters_are_named(parameters: dict, message: str) -> None:
     with pytest.raises(RuntimeError) as raised:
         light(**parameters)
     assert message in str(raised.value) and "mrt_light" in str(raised.value)
+
+
+SURFACES: dict[str, tuple[Any, list[float], list[float]]] = {
+    "sphere": (
+        lambda s: {"type": "sphere", "radius": s},
+        [0.26726124, -0.53452248, 0.80178373],
+        [0.27, -0.53, 0.8],
+    ),
+    "cone base": (
+        lambda s: {"type": "mrt_cone", "apex": [0, s, 0], "base_center": [0, 0, 0], "radius": s},
+        [0.3, 0, 0.2],
+        [0, -1, 0],
+    ),
+    "cylinder end": (
+        lambda s: {"type": "mrt_cylinder", "p0": [0, s, 0], "p1": [0, 0, 0], "radius": s},
+        [0.3, 1, 0.2],
+        [0, 1, 0],
+    ),
+    "cylinder side": (
+        lambda s: {"type": "mrt_cylinder", "p0": [0, s, 0], "p1": [0, 0, 0], "radius": s},
+        [0.6, 0.5, 0.8],
+        [0.6, 0, 0.8],
+    ),
+    "plane": (lambda s: {"type": "sphere", "radius": s}, [2, -2, 1], [0, 1, 0]),
+}
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_a_light_on_a_surface_shines_at_every_scale(name: str) -> None:
+    """As one that lies a thousandth outside, without speckles, whatever the unit of length."""
+    shape, position, out = SURFACES[name]
+
+    def picture(s: float, lift: float = 0.0) -> np.ndarray:
+        look = mi.ScalarTransform4f().look_at([2 * s, 3 * s, 6 * s], [0, 0.3 * s, 0], [0, 1, 0])
+        film = {"type": "hdrfilm", "width": 96, "height": 72, "rfilter": {"type": "box"}}
+        sensor = {"type": "perspective", "fov": 40, "near_clip": 0.01 * s, "far_clip": 1e4 * s}
+        place = s * (np.array(position) + lift * np.array(out))
+        scene = mi.load_dict({
+            "type": "scene", "shape": shape(s), "sensor": {**sensor, "to_world": look, "film": film},
+            "light": {"type": "mrt_light", "position": place.tolist()},
+            "floor": {"type": "mrt_plane", "normal": [0, 1, 0], "distance": 2 * s},
+            "wall": {"type": "mrt_plane", "normal": [1, 0, 0], "distance": 4 * s},
+        })  # fmt: skip
+        integrator = mi.load_dict({"type": "mrt_whitted", "max_depth": 1})
+        return np.array(mi.render(scene, integrator=integrator, spp=1)) > 1e-3
+
+    image = picture(1.0)
+    for scale in (0.37, 1e-4, 7e5):
+        assert (picture(scale) != image).any(axis=-1).mean() < 1e-3  # a pixel at a shadow's edge
+    # From that much higher, the sphere's horizon is 0.045 radii away
+    assert (picture(1.0, lift=1e-3) != image).any(axis=-1).mean() < 0.03

@@ -88,6 +88,7 @@ CHANGES: dict[str, tuple[str, dict[str, Any]]] = {
     "planes": ("planes", {"floor": FLOOR}),
     "no light": ("lights", {"light": None}),
     "many lights": ("lights", {f"light_{i}": {**LIGHT, "position": [i, 5, 2]} for i in range(8)}),
+    "a light on a sphere": ("touching", {"ball": BALL, "light": {**LIGHT, "position": [0, 1, -4]}}),
     "random": ("random", {"lamp": LAMP}),
     "emission": ("emission", {"lamp": LAMP}),
     "no sky": ("sky", {"sky": None}),

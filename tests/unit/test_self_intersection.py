@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.rendering.api import render
 
 
@@ -135,3 +136,46 @@ def test_rays_leave_triangles_of_every_form(variant: str, scale: float) -> None:
         mirror.o = hit.si.p + hit.si.n * dr.select(dr.dot(hit.si.n, mirror.d) >= 0, hit.error, -hit.error)
         assert np.array(hit.found).mean() > 0.9
         assert dr.none(hit.found & scene.ray_test(mirror))
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-12, 1e11, 1e15])
+def test_meshes_that_rays_cannot_meet_are_refused(variant: str, size: float) -> None:
+    look = mi.ScalarTransform4f().look_at([0, 0, 6 * size], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 4, "height": 3}
+    scene = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "to_world": look, "film": film},
+        "floor": floor("mesh", 0.5 * size, mi.ScalarTransform4f()),
+    }
+    with pytest.raises(SceneError, match=r'the mesh "floor" is .* across .*: scale the scene'):
+        render(scene, aa=1)
+
+
+@pytest.mark.parametrize("size", [1e-7, 1e9])
+def test_meshes_are_drawn_at_every_size_that_is_taken(variant: str, size: float) -> None:
+    """As at size 1, triangles in all directions."""
+    rng = np.random.default_rng(1)
+    corners = rng.normal(size=(1, 60, 3))
+    faces = rng.permuted(np.tile(np.arange(60, dtype=np.uint32), (40, 1)), axis=1)[np.newaxis, :, :3]
+
+    def picture(s: float) -> np.ndarray:
+        look = mi.ScalarTransform4f().look_at([0, 0, 6 * s], [0, 0, 0], [0, 1, 0])
+        film = {"type": "hdrfilm", "width": 48, "height": 36, "rfilter": {"type": "box"}}
+        sensor = {"type": "perspective", "fov": 30, "near_clip": 0.01 * s, "far_clip": 1e4 * s}
+        mesh = {"type": "mrt_mesh", "positions": mi.Bitmap((corners * s).astype(np.float32))}
+        scene = {
+            "type": "scene",
+            "embree_use_robust_intersections": True,
+            "sensor": {**sensor, "to_world": look, "film": film},
+            "light": {"type": "mrt_light", "position": [2 * s, 3 * s, 5 * s]},
+            "mesh": {
+                **mesh,
+                "faces": mi.Bitmap(np.ascontiguousarray(faces)),
+                "bsdf": {"type": "mrt_bsdf"},
+            },
+        }
+        return render(scene, aa=1).image
+
+    unit = picture(1.0)
+    assert unit.std() > 0.01
+    assert (np.abs(picture(size) - unit) > 1e-3).any(axis=-1).mean() < 2e-3

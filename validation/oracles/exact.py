@@ -78,6 +78,17 @@ def smith_g1(v: Sequence[Any], alpha: Any) -> mpf:
 
 
 @mp.workdps(DIGITS)
+def visible_cos(v: Sequence[Any], alpha: Any) -> mpf:
+    """(1 + Λ) cos θ of a direction above the surface, with Beckmann's own Λ (Heitz 2014, eq. 72)."""
+    x, y, z = (number(c) for c in v)
+    across = number(alpha) * mp.sqrt(x * x + y * y)
+    if across == 0:
+        return z
+    a = z / across
+    return z + (mp.exp(-a * a) * across / mp.sqrt(mp.pi) - z * mp.erfc(a)) / 2
+
+
+@mp.workdps(DIGITS)
 def fresnel(form: str, cos_theta: Any, ext_ior: Any, int_ior: Any) -> mpf:
     """One of ``FRESNEL_FORMS``; Schlick's with F₀ from the indices."""
     if form == "dielectric":

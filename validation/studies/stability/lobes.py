@@ -131,7 +131,8 @@ def _exact(wi: np.ndarray, wo: np.ndarray, alpha: float, ior: float) -> tuple[fl
     steep = tan2 / a**2
     logarithmic = 2 * (steep - 1) / a + slope_i / g_i + slope_o / g_o
     size = 2 * (steep + 1) / a + abs(slope_i) / g_i + abs(slope_o) / g_o
-    return tuple(map(float, (d, g_i * g_o, value, d * g_i / (4 * z_i), value * logarithmic, value * size)))
+    density = d / (4 * exact.visible_cos(wi, a))
+    return tuple(map(float, (d, g_i * g_o, value, density, value * logarithmic, value * size)))
 
 
 def _g1_and_slope(v: np.ndarray, alpha: mpf) -> tuple[mpf, mpf]:

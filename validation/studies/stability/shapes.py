@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -365,7 +365,9 @@ def _trace(solid: Solid, size: float, o: np.ndarray, d: np.ndarray) -> _Traced:
         }
     )
     integrator = mi.load_dict({"type": "mrt_whitted", "min_contribution": 0.0, "bounce_budget": "plain"})
-    integrator.prepare(scene)
+    # Its mirror rays meet nothing and would be left out; here they are to show that they do not meet it
+    facts = replace(integrator.scene_facts(scene), alone=False)
+    integrator.prepare(scene, integrator.kernel_plan(facts))
     found = integrator.trace(scene, None, mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T)))
     si, hit = found.hit.si, np.array(found.hit.found)
     t = np.where(hit, np.array(si.t, np.float64), np.inf)
