@@ -225,7 +225,7 @@ def _channels(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
             raise OutputError(f"layer {name} of shape {array.shape} does not fit the picture")
         array = np.atleast_3d(array)
         letters = LAYERS[name].letters if name in LAYERS else "RGB" if array.shape[2] == 3 else "Y"
-        names = [name] if "." in name else [f"{name}.{letter}" for letter in letters]
+        names = [name] if "." in name or name == "A" else [f"{name}.{letter}" for letter in letters]
         if len(names) != array.shape[2]:
             raise OutputError(f"layer {name} has {array.shape[2]} channels in place of {len(names)}")
         for index, channel in enumerate(names):

@@ -86,7 +86,7 @@ def test_means_agree_by_welchs_test():
     assert least > 1 - 0.99 ** (1 / a.shape[1])
 
 
-def test_filters_alpha_and_channels_are_kept():
+def test_filters_alpha_and_channels_are_kept(tmp_path):
     film = {"rfilter": {"type": "catmullrom"}, "pixel_format": "rgba"}
     integrator = {"type": "aov", "aovs": "far:depth,facing:sh_normal", "picture": {"type": "path"}}
     scene = _load("spot", width=24, height=16, film=film, integrator=integrator)
@@ -98,6 +98,10 @@ def test_filters_alpha_and_channels_are_kept():
     assert {"A", "far.T", "facing.X", "picture.G"} <= result.layers.keys() and theirs.shape[:2] == (16, 24)
     for name in result.layers:
         np.testing.assert_allclose(result.layers[name], values[..., names.index(name)], atol=2e-3)
+    from mrt_mitsuba.output import read_exr
+
+    result.save(tmp_path / "kept.exr")
+    assert read_exr(tmp_path / "kept.exr").layers.keys() == result.layers.keys()
 
 
 def test_luminance_and_what_is_not_kept_are_said():
