@@ -8,11 +8,13 @@ parser would end the process are refused as well.
 
 Objects are made one after the other. In parallel, Mitsuba makes Python objects inside each other, to the
 limit of the stack, and Dr.Jit's messages may wait for each other for ever; one by one takes no longer.
+``one_by_one`` makes that the default of Mitsuba's own loaders, where a scene has this project's plugins.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import html
 import os
 import re
@@ -70,6 +72,57 @@ def declared(path: str) -> dict[str, str]:
         tags = [tag for tag in _tags(stream.read()) if tag.startswith(b"<default")]
     found = [{key: _text(value) for key, value in _ATTRIBUTE.findall(tag)} for tag in tags]
     return {each.get(b"name", ""): each.get(b"value", "") for each in found}
+
+
+def one_by_one() -> None:
+    """Let ``mi.load_dict``, ``mi.load_file`` and ``mi.load_string`` make this project's objects one by one.
+
+    Scenes without them, and calls that say ``parallel``, go on as before. Idempotent.
+    """
+    import mitsuba as mi
+
+    for name, mentions in _MENTIONS.items():
+        loader = getattr(mi, name)
+        if not hasattr(loader, "__wrapped__"):
+            setattr(mi, name, _in_turn(loader, mentions))
+
+
+def _in_turn(loader: Callable[..., Any], mentions: Callable[[Any], bool]) -> Callable[..., Any]:
+    @functools.wraps(loader)
+    def load(source: Any, parallel: bool | None = None, optimize: bool = True, **parameters: Any) -> Any:
+        parallel = not mentions(source) if parallel is None else parallel
+        return loader(source, parallel, optimize, **parameters)
+
+    return load
+
+
+def _is_mentioned(scene: Any) -> bool:
+    """Whether a dict has a plugin of this project; Mitsuba itself refuses what is no dict."""
+    waiting, seen = [scene], set()
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, dict) and id(node) not in seen:
+            seen.add(id(node))
+            if str(node.get("type", "")).startswith(_OURS):
+                return True
+            waiting += node.values()
+    return False
+
+
+def _is_mentioned_in(path: Any) -> bool:
+    """Whether an XML file, or perhaps one that it includes, has one; Mitsuba reports what it cannot read."""
+    text = b""
+    with contextlib.suppress(OSError, TypeError), open(path, "rb") as file:
+        text = file.read()
+    return _OURS.encode() in text or b"<include" in text
+
+
+_OURS = "mrt_"
+_MENTIONS: dict[str, Callable[[Any], bool]] = {
+    "load_dict": _is_mentioned,
+    "load_file": _is_mentioned_in,
+    "load_string": lambda text: _OURS in text or "<include" in text,
+}
 
 
 def _make(parse: Callable[[Any], Any], name: str, budget: Budget | None) -> Any:

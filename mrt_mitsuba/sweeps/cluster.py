@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 CONNECTING = 10  # seconds to reach a scheduler, and for its first worker to be there
 STARTING = 120  # seconds for worker processes of this machine; a busy one takes its time
-# For workers of this machine: the engine's profiler stops a job a hundred times a second, and takes a fifth of it
+# For workers of this machine: the engine's profiler stops a job a hundred times a second
 LOCAL = {"distributed.worker.profile.enabled": False}
 
 
