@@ -158,7 +158,7 @@ def _unknown(variant: str, known: list[str]) -> str:
 
 def _register_plugins() -> None:
     from mrt_mitsuba import plugins
-    from mrt_mitsuba.scene.loading import mitsuba_first
+    from mrt_mitsuba.resolver import mitsuba_first
 
     mitsuba_first()
     plugins.register()
