@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 CONNECTING = 10  # seconds to reach a scheduler, and for its first worker to be there
 STARTING = 120  # seconds for worker processes of this machine; a busy one takes its time
+# Workers of this machine: the engine's profiler stops a job a hundred times a second, and takes a fifth of it
+LOCAL = {"distributed.worker.profile.enabled": False}
 
 
 class ClusterError(MrtError):
@@ -65,6 +67,7 @@ class Engine:
         Workers of this machine, as many as there are jobs at most, end with the block. Raises
         ``ClusterError`` or ``OutputError`` if workers cannot be used.
         """
+        import dask
         from distributed import Client
 
         with ExitStack() as stack:
@@ -73,6 +76,7 @@ class Engine:
                 stack.enter_context(_quiet())
                 if self.cluster is None:
                     expected = self.workers or min(_suitable(self.variant), jobs)
+                    stack.enter_context(dask.config.set(LOCAL))
                     client = stack.enter_context(_client(stack.enter_context(self._local(expected))))
                 else:
                     client = stack.enter_context(_client(self.cluster))
