@@ -8,6 +8,7 @@ parser would end the process are refused as well.
 
 Objects are made one after the other. In parallel, Mitsuba makes Python objects inside each other, to the
 limit of the stack, and Dr.Jit's messages may wait for each other for ever; one by one takes no longer.
+``loaders.one_by_one`` makes that the default of Mitsuba's own loaders, where a scene has this project's plugins.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.loaders import mitsuba_first, mitsuba_home
 from mrt_mitsuba.memory import Budget
-from mrt_mitsuba.resolver import mitsuba_first, mitsuba_home
 from mrt_mitsuba.scene.files import picture_size, require_file
 
 DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from about 3000 on

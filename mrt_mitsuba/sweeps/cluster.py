@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 CONNECTING = 10  # seconds to reach a scheduler, and for its first worker to be there
 STARTING = 120  # seconds for worker processes of this machine; a busy one takes its time
-# Workers of this machine: the engine's profiler stops a job a hundred times a second, and takes a fifth of it
+# For workers of this machine: the engine's profiler stops a job a hundred times a second
 LOCAL = {"distributed.worker.profile.enabled": False}
 
 
@@ -67,7 +67,6 @@ class Engine:
         Workers of this machine, as many as there are jobs at most, end with the block. Raises
         ``ClusterError`` or ``OutputError`` if workers cannot be used.
         """
-        import dask
         from distributed import Client
 
         with ExitStack() as stack:
@@ -76,7 +75,6 @@ class Engine:
                 stack.enter_context(_quiet())
                 if self.cluster is None:
                     expected = self.workers or min(_suitable(self.variant), jobs)
-                    stack.enter_context(dask.config.set(LOCAL))
                     client = stack.enter_context(_client(stack.enter_context(self._local(expected))))
                 else:
                     client = stack.enter_context(_client(self.cluster))
@@ -101,6 +99,7 @@ class Engine:
                 "nthreads": 1,
                 "memory_limit": MEMORY_LIMIT // count,
                 "dashboard": False,
+                "config": LOCAL,
                 "silence_logs": logging.CRITICAL,
             }
             workers[number] = {"cls": SubprocessWorker, "options": {"worker_kwargs": options | pinned}}

@@ -23,7 +23,7 @@ ALLOWED = {
     "mrt_mitsuba.sweeps.run.sweep",  # the same
 }
 
-FOUNDATION = {"errors", "interrupts", "memory", "options", "resolver", "runtime"}
+FOUNDATION = {"errors", "interrupts", "loaders", "memory", "options", "runtime"}
 
 _BRANCH = ast.If | ast.IfExp | ast.For | ast.While | ast.ExceptHandler | ast.match_case | ast.comprehension
 
