@@ -8,7 +8,7 @@ from typing import Any
 
 LABEL = 14  # pixels below a picture, for its name
 GAP = 4  # pixels between pictures
-MOST = 1000  # pictures; of more, nobody sees a thing
+MOST = 1000  # pictures; more would be too small to see
 
 
 def write_sheet(path: str, names: Sequence[str], pictures: Sequence[Any]) -> None:

@@ -18,7 +18,7 @@ from mrt_mitsuba.errors import MrtError, OutputError
 from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps.scenes import Opener, SceneFile
 
-TOPIC = "mrt-sweep"  # of the scheduler's events, which tell a client what began
+TOPIC = "mrt-sweep"  # of the scheduler's events, by which a client learns what has begun
 MADE_WITH = "mrt:sweep"  # header attribute: fingerprint of scene, settings and versions
 THUMBNAIL = 160  # pixels, the longer side
 PAUSE = 0.5  # seconds before a worker ends, in which the client fetches the facts about its last job
@@ -93,7 +93,7 @@ def facts(path: str) -> dict[str, Any]:
 
 
 def is_fresh(task: Task) -> bool:
-    """Whether the pictures are there and were made with the same scene, settings and versions."""
+    """Return whether the pictures are there and were made with the same scene, settings and versions."""
     import OpenEXR
 
     paths = [os.path.join(task.folder, file) for file in task.files]
@@ -116,7 +116,7 @@ def render_task(task: Task, house: House) -> dict[str, Any]:
     global _done
     worker, note = get_worker(), os.path.join(task.scratch, f"{task.name}.json")
     with _one_at_a_time:
-        if found := _read_note(note):  # done, but the worker was gone before anyone heard of it
+        if found := _read_note(note):  # done, but the worker was gone before it could report
             return found
         if _done >= house.renew and worker.nanny:
             _renew(worker)
