@@ -3,7 +3,7 @@
 Every function takes Python floats or Dr.Jit arrays of any precision and returns the same kind. Cosines and
 sines belong to the angle between a direction and the (micro-)normal, on the side of ``ext_ior``.
 
-``sin2_theta`` may be given beside ``cos_theta`` where the caller knows it better than ``1 - cos_theta**2``
+``sin2_theta`` may be given with ``cos_theta`` where the caller knows it better than ``1 - cos_theta**2``
 does: near the normal that difference cancels.
 """
 

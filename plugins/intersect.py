@@ -354,7 +354,7 @@ def cylinder_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
 
 
 def _axial_derivatives(q: Any, part: Any, along: Any) -> tuple[Any, Any]:
-    """Those of the side, the one by v being ``along``, or of a disc in the unit square."""
+    """Return the derivatives of the side, ``along`` by v, or of a disc in the unit square."""
     side, zero = part == LATERAL, 0 * q.x
     two = 2 + zero
     around = type(q)([-2 * dr.pi * q.y, 2 * dr.pi * q.x, zero])
@@ -400,7 +400,7 @@ def _line(o: Any, d: Any, frame: Frame) -> _Line:
     u = d / length
     along = dr.dot(o, u)
     p = type(d)(o) - u * along
-    rest = dr.dot(p, u)  # from far away, the rounding of the first step is not small beside the shape
+    rest = dr.dot(p, u)  # from far away, the rounding of the first step is not small against the shape
     return _Line(p - u * rest, u, -(along + rest), length)
 
 

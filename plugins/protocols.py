@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from .intersect import Frame
-    from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
-    from .merged_bsdf import UniformMaterial
+    from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts, UniformMaterial
     from .quadric_kinds import QuadricTable
 
 

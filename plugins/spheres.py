@@ -1,4 +1,4 @@
-"""Mitsuba's spheres: their centres and radii, and the hits on them put right."""
+"""Mitsuba's spheres: their centres and radii, and corrected hits on them."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ def _validate(options: argparse.Namespace) -> int:
     report.prepare(options.out, "summary.json", "index.html")
     seconds = sum(STUDIES[name].quick if options.quick else STUDIES[name].full for name in names)
     print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
-    # With a cache of their own, studies of speed can tell how long compilation takes
+    # With a cache of their own, studies of speed see how long compilation takes
     with nullcontext() if options.quick or not set(names) & set(SPEED) else own_cache():
         return _run(names, options)
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.rendering.settings import check
-from mrt_mitsuba.scene.model import Scene
+from mrt_mitsuba.options import check
+from mrt_mitsuba.scene.model import FRESNEL, OBJECTS, SIDE, Scene
 from mrt_mitsuba.scene.report import report_scene
 
 FLAVORS = ("mrt", "stock")
@@ -39,11 +39,11 @@ def scene_dict(
     """
     if flavor not in FLAVORS:
         raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
-    given: dict[str, Any] = {"width": width, "height": height, "fresnel": fresnel}
-    given = {name: check(name, value) for name, value in given.items() if value is not None}
+    given = {"width": (SIDE, width), "height": (SIDE, height), "fresnel": (FRESNEL, fresnel)}
+    options = {name: check(name, kind, value) for name, (kind, value) in given.items() if value is not None}
     runtime.use()
     scene = scene if isinstance(scene, Scene) else report_scene(scene)
-    result = scene.to_dict(**given)
+    result = scene.to_dict(**options)
     return result if flavor == "mrt" else _stock(result, scene)
 
 
@@ -52,7 +52,7 @@ def write_xml(
 ) -> list[str]:
     """Write a scene as XML through Mitsuba's own writer; return the paths of what was written.
 
-    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file beside it,
+    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file next to it,
     named after the XML file and the shape; all files are replaced, or none. Raises ``OutputError`` if a file
     cannot be written, ``SceneError`` for groups of objects (``mrt_group``), which have neither an XML form
     nor a stock counterpart.
@@ -77,7 +77,7 @@ def write_xml(
 
 
 def xml_text(scene: int | Scene, *, flavor: str = "mrt", fresnel: str = "schlick") -> str:
-    """Return the XML of a scene. Raises ``SceneError`` for what needs files beside it; see ``write_xml``."""
+    """Return the XML of a scene. Raises ``SceneError`` for what needs files next to it; see ``write_xml``."""
     if flavor not in FLAVORS:
         raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
     return _text_of(scene_dict(scene, fresnel=fresnel), scene, flavor)
@@ -148,7 +148,7 @@ def _stock(scene_as_dict: dict[str, Any], scene: Scene) -> dict[str, Any]:
             raise SceneError(
                 f"{name} has no counterpart among Mitsuba's plugins: {kind} {_WITHOUT_STOCK[kind]}"
             )
-        if kind in ("mrt_cylinder", "mrt_capsule"):
+        if kind in _TUBES:
             result |= {f"{name}_{part}": child for part, child in _stock_tube(node).items()}
         else:
             result[name] = _REPLACEMENTS[kind](node, scene) if kind in _REPLACEMENTS else node
@@ -236,14 +236,17 @@ _REPLACEMENTS: dict[str, Callable[[dict[str, Any], Scene], dict[str, Any]]] = {
     "mrt_plane": _stock_plane,
 }
 
-# Shapes that are written as files beside the XML
-_IN_FILES = {"mrt": ("mrt_mesh",), "stock": ("mrt_mesh", "mrt_cone")}
+_TUBES = ("mrt_cylinder", "mrt_capsule")
+# Solids that Mitsuba's own plugins show as meshes
+_AS_MESHES = {f"mrt_{kind}" for kind in OBJECTS} - {"mrt_sphere", *_TUBES}
+# Shapes that are written as files next to the XML
+_IN_FILES = {"mrt": {"mrt_mesh"}, "stock": {"mrt_mesh", *_AS_MESHES}}
 _WITHOUT_XML = {
-    "mrt_mesh": "write_xml, or mrt export, puts it into a file beside the XML",
+    "mrt_mesh": "write_xml, or mrt export, puts it into a file next to the XML",
     "mrt_group": "render it from Python, or write at most 1000 spheres or 100 objects of another kind",
 }
 _WITHOUT_STOCK = {
-    "mrt_mesh": "is made of arrays, and ply reads a file; write_xml, or mrt export, puts it beside the XML",
-    "mrt_cone": "is a mesh to them; write_xml, or mrt export, puts it into a file beside the XML",
+    **dict.fromkeys(_AS_MESHES, "is a mesh to them; write_xml, or mrt export, puts it into a file"),
+    "mrt_mesh": "is made of arrays, and ply reads a file; write_xml, or mrt export, writes it",
     "mrt_group": "is one shape of many objects; use the flavor mrt",
 }

@@ -137,7 +137,7 @@ print(json.dumps(found))
 """
 
 
-@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs Linux to tell the memory used")
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs Linux to measure memory")
 def test_peak_memory_stays_within_the_budget(run_python) -> None:
     """With room for it, the same picture takes much more: the bound is kept by the parts, not by luck."""
     done = run_python(PEAK)
@@ -164,7 +164,7 @@ def run(folder: Path, code: str, *words: str) -> subprocess.Popen[str]:
 # Only the picture's file may not grow: Dr.Jit keeps kernels in files, too
 LIMITED = """
 import resource, sys
-from mrt_mitsuba.output.result import Result
+from mrt_mitsuba.rendering.result import Result
 save = Result.save
 def limited(self, *path, **options):
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))

@@ -38,7 +38,7 @@ class View:
     uv: Array  # float32 [2]
     u: Array  # the random numbers of the samples [N, 3]
     samples: Samples
-    density: Array  # pdf() at the samples of lobes with a width that are none refused, 0 elsewhere [N]
+    density: Array  # pdf() at the samples that count: of lobes with a width, not refused; 0 elsewhere [N]
 
     def around(self, count: int) -> tuple[Array, Array]:
         """Return ``wi`` and ``uv`` for so many lanes."""
@@ -149,7 +149,7 @@ class Pairs:
 
 
 def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:
-    """Where samples of lobes with a width are ones that the density counts.
+    """Return where samples come from lobes with a width and count for the density.
 
     Weight 0 is how ``sample`` refuses: its direction is then any, or on the wrong side. It may also be that
     the value is 0 there, or that the weight is wrong; but then the stated density is that of the direction.
@@ -177,13 +177,13 @@ def excess(one: Array, other: Array, allowed: Array) -> Array:
 
 
 def parameters(case: Case) -> list[tuple[str, Any]]:
-    """Parameters that hold floating-point numbers which say how much of something there is."""
+    """Return the parameters that hold floating-point numbers which are amounts."""
     import drjit as dr
     import mitsuba as mi
 
     params = mi.traverse(case.bsdf)
     found = []
-    for key in params.keys():  # noqa: SIM118 - SceneParameters is no dict
+    for key in params.keys():  # noqa: SIM118 - SceneParameters is not a dict
         value = params[key]
         numeric = isinstance(value, float) or (
             value is not None and dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)

@@ -67,7 +67,7 @@ QUICK = Extent((0, 3), ("report",), (2, 4), 16, (120, 90), 1, (80, 60), 16, (4, 
 
 @dataclass(frozen=True)
 class Row:
-    """One setting, beside full supersampling at the same aa."""
+    """One setting, compared with full supersampling at the same aa."""
 
     mode: str
     aa: int

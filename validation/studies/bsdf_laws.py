@@ -237,7 +237,7 @@ def published(study: Study, *, quick: bool) -> None:
 
 
 def never_negative(study: Study, *, quick: bool) -> None:
-    """Of a negative roughness, which the report's scenes hold, G₁ may be negative; the light may not."""
+    """Hold that a negative roughness, as in the report's scenes, gives no negative light, whatever G₁ is."""
     least = np.inf
     for alpha in (-0.0432, -0.0099, -0.5):
         wi, wo = lobe_pairs(5_000 if quick else 100_000, abs(alpha), least_cos=0.001)

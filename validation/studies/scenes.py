@@ -23,7 +23,7 @@ from mrt_mitsuba.validation.tools.study import Study
 
 TITLE = "Pictures of the scenes, judged in float64"
 
-STEP = 1 / 255  # of an 8-bit picture: what nobody sees
+STEP = 1 / 255  # of an 8-bit picture: invisible
 
 # Float32 places a ray of such a picture to about 1e-5 of a pixel; a mirror ray off a small sphere diverges a
 # hundred times as much. Where so small a move changes what is met, float32 may meet the other
@@ -177,9 +177,9 @@ def hold(study: Study, name: str, judgement: Judgement, cut: float) -> None:
 
 
 def original_renders() -> Path | None:
-    """The folder of the original program's renders, if at hand: in MRT_REFERENCE or beside the checkout."""
-    beside = Path(__file__).resolve().parents[3] / "shared" / "reference"
-    folder = Path(os.environ.get("MRT_REFERENCE", beside)) / "renders"
+    """The folder of the original program's renders, if at hand: in MRT_REFERENCE or next to the checkout."""
+    sibling = Path(__file__).resolve().parents[3] / "shared" / "reference"
+    folder = Path(os.environ.get("MRT_REFERENCE", sibling)) / "renders"
     return folder if folder.is_dir() else None
 
 

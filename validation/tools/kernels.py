@@ -1,7 +1,6 @@
 """The kernels of a render, one by one: in which pass they run, what they cost to compile and to run.
 
-Dr.Jit keeps a history of them; a render's stages, of which it tells its ``Progress``, say where in it they
-belong.
+Dr.Jit keeps a history of them; the stages that a render reports to its ``Progress`` say where they belong.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ OUTSIDE = "outside of passes"
 
 @dataclass(frozen=True)
 class Kernel:
-    """All launches of a kernel in one pass of one render. Kernels are told apart by kind and hash."""
+    """All launches of a kernel in one pass of one render. Kind and hash identify a kernel."""
 
     stage: str
     kind: str  # "traces rays", "computes", or Dr.Jit's own name: "BlockReduce", ...

@@ -172,7 +172,7 @@ def _hold(cases: Cases, lobes: Lobes, found: Sequence[Errors], wrong: Errors) ->
         cases.at_least(
             f"the report's form, median at alpha {alpha:g}",
             "relative error of D by cosines of normalised vectors",
-            "lost to cancellation: a study that could not tell would be blind",
+            "lost to cancellation: a study that cannot see this would be blind",
             np.median(report.of["d"][here]),
             10 * BOUND,
         )
@@ -195,7 +195,7 @@ def _conditioning(cases: Cases, lobes: Lobes) -> None:
             f"D of a neighbouring direction, alpha {alpha:g}",
             "largest relative change of D at 60° when x and y of one direction move by one float32 step",
             float(change[here].max()) if here.any() else np.inf,
-            "directions are float32: two that a renderer cannot tell apart have values this far apart",
+            "directions are float32: neighbouring ones, equal to a renderer, have values this far apart",
         )
 
 

@@ -37,7 +37,7 @@ FRESNEL = ("schlick", "dielectric", "unity")
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Bulk evaluations with one in three numbers an extreme one; scenes drawn by lot."""
+    """Bulk evaluations with one in three numbers an extreme one; random scenes."""
     cases = Cases(study, "finite", "Finite and not negative")
     count = 10**6 if quick else 10**8
     for name, what, evaluate in BULK:
@@ -197,7 +197,7 @@ def _sphere(draw: _Draw) -> Any:
 
 
 def _quadric(to_frame: Any, intersect: Any, surface: Any) -> Callable[[_Draw], Any]:
-    """Distance and normal of a shape by lot for each lane, with rays from its end among them."""
+    """Return a check of distance and normal of a random shape in each lane; some rays start at its end."""
 
     def evaluate(draw: _Draw) -> Any:
         import mitsuba as mi
@@ -218,7 +218,7 @@ def _quadric(to_frame: Any, intersect: Any, surface: Any) -> Callable[[_Draw], A
 
 
 def _whitted(draw: _Draw) -> Any:
-    """Rays by lot through a scene of every kind of shape, from inside of them too."""
+    """Random rays through a scene of every kind of shape, some from inside."""
     import mitsuba as mi
 
     scene = mi.load_dict(_everything().to_dict())
@@ -273,7 +273,7 @@ BULK: Sequence[tuple[str, str, Callable[[_Draw], Any]]] = (
 
 
 def _random_scenes(cases: Cases, count: int) -> None:
-    """Scenes of extreme objects, materials and lights by lot."""
+    """Random scenes of extreme objects, materials and lights."""
     bad = 0
     for seed in range(count):
         described = _random_scene(np.random.default_rng(seed)).to_dict(
@@ -283,7 +283,7 @@ def _random_scenes(cases: Cases, count: int) -> None:
         image = render(described, aa=1, lattice="report").image
         bad += int((~(image >= 0) | np.isinf(image)).sum())
     cases.at_most(
-        "scenes by lot", f"{count} pictures of extreme objects, materials and lights", "none", bad, 0
+        "random scenes", f"{count} pictures of extreme objects, materials and lights", "none", bad, 0
     )
 
 

@@ -1,7 +1,7 @@
 """Light paths that are long, bright, dark or start in odd places, against the float64 tracer.
 
-Each case comes with a fault, a scene or setting almost like its own. The tracer draws that as well, and the
-bound of the case must tell the two apart by a factor of two: so each states what it can see, measured.
+Each case comes with a fault, a scene or setting almost like its own. The tracer draws that as well, and it
+must exceed the bound of the case by a factor of two: so each states, by measurement, what it can detect.
 """
 
 from __future__ import annotations
