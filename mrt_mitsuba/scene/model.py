@@ -142,6 +142,7 @@ class Scene:
     focal_distance: float | None = None
     focal_range: float = FOCAL_RANGE
     title: str = field(default="", compare=False)
+    pictures: frozenset[str] = field(default=frozenset(), compare=False)  #: paths that its files name
 
     def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> dict[str, Any]:
         """Return the scene as a Mitsuba dict of this project's plugins, materials shared by reference.

@@ -69,11 +69,19 @@ def read_obj(path: str | os.PathLike[str], *, convention: str = "report") -> tup
     Raises ``SceneError`` with file and line for what cannot be read, ``UsageError`` for an unknown
     convention.
     """
+    return read_model(path, convention=convention)[0]
+
+
+def read_model(
+    path: str | os.PathLike[str], *, convention: str = "report"
+) -> tuple[tuple[Mesh, ...], frozenset[str]]:
+    """Return what ``read_obj`` does, and the pictures that the material libraries name, used or not."""
     if convention not in CONVENTIONS:
         raise UsageError(f"convention={convention!r}: must be {' or '.join(CONVENTIONS)}")
     reader = _Reader(Path(path), convention)
     reader.read()
-    return reader.meshes()
+    textures = {material.texture for material in reader.materials.values()}
+    return reader.meshes(), frozenset(texture for texture in textures if texture is not None)
 
 
 @dataclass

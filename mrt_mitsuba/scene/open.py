@@ -74,6 +74,8 @@ def open_scene(
         focus = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
         chosen = _integrator(integrator, loaded)
         return Source(name, loaded, view, chosen, width, height, *focus, own=True)
+    if budget is not None:  # those that no face uses, too: a render must not overwrite them
+        budget.pictures.update(map(os.path.realpath, own.pictures))
     width, height, fresnel = size[0] or SIZE[0], size[1] or SIZE[1], fresnel or "schlick"
     loaded = load_dict(own.to_dict(width=width, height=height, fresnel=fresnel), name, budget)
     set_parameters(loaded, keys)
