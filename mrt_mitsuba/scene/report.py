@@ -38,7 +38,7 @@ def _scene_0() -> Scene:
 
 
 def _row(i: int) -> float:
-    """Return the place of the i-th of ten spheres in [-1.5, 1.5], to nine digits as in the original's file."""
+    """Return the place of the i-th of ten spheres in [-1.5, 1.5], to nine digits as in the original."""
     return round(-1.5 + i / 3, 9)
 
 
