@@ -23,7 +23,7 @@ MOST_LOOKED_AT = 64
 
 
 def any_touching(shapes: Sequence[Any], points: Sequence[tuple[float, ...]]) -> bool:
-    """Is one of the points on a plane, sphere, quadric, rectangle or mesh?"""
+    """Return whether one of the points is on a plane, sphere, quadric, rectangle or mesh."""
     if not points:
         return False
     p = np.array(points)  # [n, 3]
@@ -78,7 +78,7 @@ def _on_quadrics(table: QuadricTable, boxes: np.ndarray, p: np.ndarray) -> bool:
 
 
 def _on_triangles(corners: np.ndarray, p: np.ndarray) -> bool:
-    """Is a point on one of the triangles [n, 3, 3]? What counts is rounding across them."""
+    """Return whether a point is on one of the triangles [n, 3, 3]; what counts is rounding across them."""
     a, b, c = corners.swapaxes(0, 1)
     normal, off = np.cross(b - a, c - a), p - a
     area = np.linalg.norm(normal, axis=1)

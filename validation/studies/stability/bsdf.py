@@ -94,7 +94,7 @@ class FresnelGrid:
 
     @staticmethod
     def make(per_ior: int) -> FresnelGrid:
-        """Cosines over all decades from 1e-7 to 1."""
+        """Return cosines over all decades from 1e-7 to 1."""
         cosines = 10 ** np.random.default_rng(4).uniform(-7, 0, (len(FRESNEL_IORS), per_ior))
         cosines[:, 0] = 1
         iors = np.repeat(FRESNEL_IORS, per_ior)
@@ -296,14 +296,14 @@ def _heat_maps(study: Study, lobes: Lobes, angles: FresnelGrid, found: Sequence[
 
 
 def _grid(row: np.ndarray, column: np.ndarray, error: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Largest errors by cell; NaN in empty ones."""
+    """Return the largest errors by cell; NaN in empty ones."""
     largest = np.full(shape, np.nan)
     np.fmax.at(largest, (row, column), error)
     return largest
 
 
 def _figure(maps: Sequence[np.ndarray], titles: Sequence[str], x: tuple, y: tuple) -> Any:
-    """Heat maps side by side on one logarithmic scale from a rounding to 1."""
+    """Return heat maps side by side on one logarithmic scale from a rounding to 1."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 

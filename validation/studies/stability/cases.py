@@ -72,5 +72,5 @@ class Cases:
 
 
 def hexadecimal(values: Iterable[float]) -> str:
-    """Numbers in Python's exact notation, which ``float.fromhex`` reads back."""
+    """Return numbers in Python's exact notation, which ``float.fromhex`` reads back."""
     return " ".join(float(value).hex() for value in values)

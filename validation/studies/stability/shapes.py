@@ -348,7 +348,7 @@ def _measure(solid: Solid, size: float, *, rays: int) -> list[_Cell]:
 
 
 def _rays(size: float, distance: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rays (o [N, 3], d [N, 3]) from a distance to all parts of an object, a third to its outline."""
+    """Return rays (o [N, 3], d [N, 3]) from a distance to all parts of an object, a third to its outline."""
     rng = np.random.default_rng(7)
     towards = _units(rng, count)
     o = (distance * towards).astype(np.float32)

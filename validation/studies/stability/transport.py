@@ -61,7 +61,7 @@ def _ball(**changes: Any) -> Scene:
 
 
 def _shiny(**changes: Any) -> Scene:
-    """Nothing but the lobe: no diffuse part to hide it."""
+    """Return a material without a diffuse part, which would hide the lobe."""
     return replace(_ball(diffuse=(0, 0, 0), specular=(1, 1, 1), **changes), sky=(0, 0, 0))
 
 
@@ -79,7 +79,7 @@ def _lit(position: tuple[float, float, float], color: float = 1.0) -> Scene:
 
 
 def _hall(specular: float, light: float = 1.0) -> Scene:
-    """Two mirrors face each other, a ball and the camera between them."""
+    """Return two mirrors that face each other, with a ball and the camera between them."""
     material = replace(MIRROR, specular=(specular, 0.95 * specular, 0.9 * specular))
     walls = (Plane((0, 0, 1), 2.0, material), Plane((0, 0, -1), 2.0, material), Plane((0, 1, 0), 1.0, GREY))
     ball, lamp = Sphere((0.3, -0.2, -0.5), 0.4, GREY), Light((0.5, 1.5, 0.3), (light,) * 3)
@@ -244,7 +244,7 @@ def _to_and_fro(scene: Any, clamp: bool, depth: int) -> float:
 
 
 def _direct(reflectance: float, clamp: bool) -> float:
-    """What one wall sends back along its normal, in float64: the light is seen at 45° from both."""
+    """Return what one wall sends back along its normal, in float64: the light is seen at 45° from both."""
     half = np.sqrt(0.5)
     with np.errstate(divide="ignore"):
         up, to_light = np.array([[0, 0, 1.0]]), np.array([[half, 0, half]])
