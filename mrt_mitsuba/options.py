@@ -119,7 +119,7 @@ def vector(form: str = "X,Y,Z") -> Kind:
 
 
 def error_or_place() -> Kind:
-    """A positive number, or three finite ones."""
+    """Return the kind of one positive number, or three finite ones."""
     place = vector()
 
     def check(value: Any) -> Any:

@@ -10,7 +10,7 @@ from .variants import is_jit, pointer
 
 
 def aligned(values: np.ndarray):
-    """Numbers as a flat float32 array at a multiple of 64 bytes.
+    """Return numbers as a flat float32 array at a multiple of 64 bytes.
 
     Dr.Jit uses arrays of numpy where they lie, and most lie elsewhere. Only from aligned ones does a kernel
     read several numbers in a row in one go, which makes one that searches a tree half as fast again; and both

@@ -42,8 +42,7 @@ def construct(
 
 
 def keep_apart(mesh: Any, name: str, faces: int) -> None:
-    """Mitsuba merges meshes that share a BSDF when it loads a scene, but leaves those with attributes
-    alone."""
+    """Keep Mitsuba from merging the mesh with others of its BSDF: it leaves those with attributes alone."""
     mesh.add_attribute(f"face_{name}", 1, [0.0] * faces)
 
 

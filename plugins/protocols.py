@@ -52,7 +52,7 @@ class PlaneShape(ABC):
 
     @abstractmethod
     def has_flipped_normals(self) -> bool:
-        """Does the plane face the other side? As every shape of Mitsuba says."""
+        """Return whether the plane faces the other side; every shape of Mitsuba says so."""
 
 
 class QuadricShape(ABC):

@@ -240,7 +240,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         return Trace(final["radiance"], shading.radiance, hit, final["bounces"], final["shadow_rays"])
 
     def _continues(self, data: SceneData, throughput: mi.UnpolarizedSpectrum, depth: mi.UInt32) -> mi.Bool:
-        """May a path of this throughput and depth still change the picture?"""
+        """Return whether a path of this throughput and depth may still change the picture."""
         affordable, brightest = depth < self.max_depth, dr.max(throughput)
         if data.plan.cut_off.paths == math.inf:
             return affordable & (brightest > 0)
@@ -342,8 +342,7 @@ class MrtWhitted(mi.SamplingIntegrator):
 
 
 def _construct(integrator, props) -> None:
-    """Mitsuba logs a warning about every Python integrator in a scalar variant; ``mrt.render`` gives its
-    own."""
+    """Construct the base class without Mitsuba's warning about scalar variants; ``mrt.render`` gives one."""
     level = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)
     try:

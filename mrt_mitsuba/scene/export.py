@@ -84,7 +84,7 @@ def xml_text(scene: int | Scene, *, flavor: str = "mrt", fresnel: str = "schlick
 
 
 def _text_of(mine: dict[str, Any], scene: int | Scene, flavor: str) -> str:
-    """The XML of a dict of this project's plugins."""
+    """Return the XML of a dict of this project's plugins."""
     import mitsuba as mi
 
     for name, node in mine.items():
@@ -116,7 +116,7 @@ def _with_focus(text: str, scene: Scene) -> str:
 
 
 def _with_whole_path(node: Any) -> Any:
-    """A material whose picture is found from wherever the XML lies."""
+    """Return a material whose picture is found from wherever the XML lies."""
     picture = node.get("diffuse_reflectance", {}) if isinstance(node, dict) else {}
     if "filename" not in picture:
         return node
@@ -124,13 +124,13 @@ def _with_whole_path(node: Any) -> Any:
 
 
 def _ply_node(node: dict[str, Any], filename: str) -> dict[str, Any]:
-    """A shape that reads the file; triangles of ``mrt_mesh`` are flat."""
+    """Return a shape that reads the file; triangles of ``mrt_mesh`` are flat."""
     flat = {"face_normals": True} if node["type"] == "mrt_mesh" else {}
     return {"type": "ply", "filename": filename, **flat, "bsdf": node["bsdf"]}
 
 
 def _ply(node: dict[str, Any]) -> bytes:
-    """The mesh of a shape as a binary PLY file."""
+    """Return the mesh of a shape as a binary PLY file."""
     import mitsuba as mi
 
     stream = mi.MemoryStream()
@@ -160,7 +160,7 @@ def _stock_integrator(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
 
 
 def _stock_bsdf(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
-    """The same lobes over a diffuse base; colours above one and negative roughness have no stock
+    """Return the same lobes over a diffuse base; colours above one and negative roughness have no stock
     counterpart."""
 
     def clipped(color: dict[str, Any]) -> dict[str, Any]:
@@ -182,7 +182,7 @@ def _stock_bsdf(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
 
 
 def _stock_light(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
-    """A light with falloff, of the same irradiance at the camera's target."""
+    """Return a light with falloff, of the same irradiance at the camera's target."""
     squared = sum((a - b) ** 2 for a, b in zip(node["position"], scene.camera.target, strict=True))
     color = {**node["intensity"], "value": [c * squared for c in node["intensity"]["value"]]}
     return {"type": "point", "position": node["position"], "intensity": color}
@@ -196,7 +196,7 @@ def _stock_plane(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
 
 
 def _stock_tube(node: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """An open tube, and at each end a disc that faces away from the other, or a ball."""
+    """Return an open tube, and at each end a disc that faces away from the other, or a ball."""
     p0, p1, radius = node["p0"], node["p1"], node["radius"]
 
     def disc(center: list[float], opposite: list[float]) -> dict[str, Any]:
@@ -211,7 +211,7 @@ def _stock_tube(node: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
-    """What takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
+    """Return what takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
     import mitsuba as mi
 
     length = sum(c * c for c in normal) ** 0.5
@@ -223,7 +223,7 @@ def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
 
 
 def _stock_texture(node: dict[str, Any]) -> dict[str, Any]:
-    """The nearest texel as stored; half a texel off the report's look-up, which shrinks the picture so
+    """Return the nearest texel as stored; half a texel off the report's look-up, which shrinks the picture so
     far."""
     stored = {"raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
     return {"type": "bitmap", "filename": os.path.abspath(node["filename"]), **stored}

@@ -8,7 +8,7 @@ parser would end the process are refused as well.
 
 Objects are made one after the other. In parallel, Mitsuba makes Python objects inside each other, to the
 limit of the stack, and Dr.Jit's messages may wait for each other for ever; one by one takes no longer.
-``loaders.one_by_one`` makes that the default of Mitsuba's own loaders, where a scene has this project's plugins.
+``loaders.one_by_one`` makes that the default of Mitsuba's own loaders for scenes with our plugins.
 """
 
 from __future__ import annotations
@@ -203,7 +203,7 @@ def _check_xml(path: str, parameters: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def _tags(data: bytes) -> Iterator[bytes]:
-    """Opening and closing tags of XML, up to the first that has no end."""
+    """Yield opening and closing tags of XML, up to the first that has no end."""
     start = data.find(b"<")
     while start >= 0:
         closing = next((end for begin, end in _NO_TAGS if data.startswith(begin, start)), None)
@@ -216,7 +216,7 @@ def _tags(data: bytes) -> Iterator[bytes]:
 
 
 def _end_of_tag(data: bytes, position: int) -> int:
-    """Place of the next ``>`` outside quotes, or -1."""
+    """Return the place of the next ``>`` outside quotes, or -1."""
     while mark := _TAG_MARK.search(data, position):
         if mark[0] == b">":
             return mark.start()

@@ -278,7 +278,7 @@ class _Materials:
 
 
 def _ray_options(meshes: tuple[Mesh, ...]) -> dict[str, bool]:
-    """Embree lets rays through between slivers unless asked not to; what has no mesh needs no care."""
+    """Return options of the scene for meshes: by default, Embree lets rays through between slivers."""
     return {"embree_use_robust_intersections": True} if meshes else {}
 
 
@@ -322,7 +322,7 @@ def _split(objects: tuple) -> tuple[tuple, tuple]:
 
 
 def _group(kind: str, objects: tuple, materials: _Materials, fresnel: str) -> dict[str, Any]:
-    """One shape of many objects. Where their materials differ, one BSDF looks their values up by object."""
+    """Return one shape of many objects, with one BSDF that looks up values by object if they differ."""
     import mitsuba as mi
     import numpy as np
 

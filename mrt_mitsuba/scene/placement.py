@@ -23,8 +23,7 @@ def obj_scene(
     lights: Sequence[Light] | None = None,
     sky: Color = BLUE_SKY,
 ) -> Scene:
-    """A scene of an OBJ file, which has neither camera nor lights: what is not given is placed by the model's
-    size.
+    """Return a scene of an OBJ file; camera and lights that are not given are placed by the model's size.
 
     The camera stands in front, towards +z, a little above and to the right, and sees all of it; a light is up
     on each side, the right one brighter. ``texturing`` follows ``convention`` unless given. Raises as
@@ -36,7 +35,7 @@ def obj_scene(
     center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
 
     def place(x: float, y: float, z: float) -> tuple[float, float, float]:
-        """A point in radii from the centre."""
+        """Return a point in radii from the centre."""
         px, py, pz = (center + radius * np.array([x, y, z])).tolist()
         return px, py, pz
 

@@ -82,7 +82,7 @@ class Engine:
             yield client, worker.House(sharing, self.renew, self.cluster is None, versions())
 
     def _local(self, count: int) -> Any:
-        """A scheduler in this process and workers in processes of their own, with one thread for jobs each.
+        """Return a scheduler in this process, and workers in processes of their own with one thread for jobs.
 
         They are started anew, not forked, nor do they import the caller's script: it needs no
         ``if __name__ == "__main__"``.

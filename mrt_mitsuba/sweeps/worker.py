@@ -199,7 +199,7 @@ def _render(task: Task, worker: Any) -> dict[str, Any]:
 
 
 def _memory(worker: Any) -> int | None:
-    """Half of what is free or, where less, of what the worker may take: others take theirs."""
+    """Return half of what is free or, if that is less, of what the worker may take; others need theirs."""
     from mrt_mitsuba.memory import free_memory
     from mrt_mitsuba.options import SMALLEST_MEMORY
 

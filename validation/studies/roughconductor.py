@@ -299,7 +299,7 @@ def compare_roughconductor(
 def _render_both(
     bsdfs: Sequence[Mapping[str, Any]], *, size: int, spp: int, renders: int, seed: int, studio: bool = False
 ) -> tuple[list[Array], list[float]]:
-    """Renders [N, H, W, 3] of each material, all with different seeds, in turn, and their median seconds."""
+    """Return renders [N, H, W, 3] of each material, with other seeds, in turn, and their median seconds."""
     import mitsuba as mi
 
     scenes = [ball_scene(bsdf, size=size, studio=studio) for bsdf in bsdfs]

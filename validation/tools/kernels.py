@@ -63,12 +63,12 @@ def forget() -> None:
 
 
 def has_own_cache() -> bool:
-    """Are seconds of compilation those of the compiler, and not of reading a cache?"""
+    """Return whether seconds of compilation are those of the compiler, not of reading a cache."""
     return Path(os.environ.get(CACHE, "")).name.startswith(PREFIX)
 
 
 def profile(render: Callable[..., Any], *, repeats: int = 3) -> list[Kernel]:
-    """The kernels of ``render(progress=...)``: compiled in a first run, timed as medians of ``repeats`` more.
+    """Return the kernels of ``render(progress=...)``, compiled first, then timed as medians of ``repeats``.
 
     They come in the order in which they first ran.
     """

@@ -194,7 +194,7 @@ def _check_size(image: np.ndarray, truth: _Truth) -> None:
 
 
 def _seconds(result: Result) -> float:
-    """Seconds of a render but for loading its scene."""
+    """Return seconds of a render but for loading its scene."""
     return result.timings.total - result.timings.load
 
 
