@@ -22,7 +22,8 @@ from .planes import Planes
 from .protocols import MirrorBSDF, PlaneShape, QuadricShape
 from .quadric_kinds import KINDS
 from .quadrics import quadrics_of
-from .spheres import Spheres, center_and_radius, is_plain_sphere, is_sphere
+from .spheres import Spheres, is_plain_sphere, is_sphere
+from .touching import any_touching
 from .variants import but_not, is_jit, pointer, varies
 
 # Beyond these sizes, Embree's products of three lengths leave float32
@@ -119,7 +120,7 @@ class SceneReading:
             arriving=math.inf,
             emission=math.inf,
             alone=self._alone(),
-            touching=any(self._touches(place) for place in places(self.lights) if place is not None),
+            touching=any_touching(self.shapes, [place for place in places(self.lights) if place is not None]),
             value=max(map(_value_bound, self.bsdfs), default=0.0),
             diffuse=self._has_lobe("diffuse"),
             specular=self._has_lobe("specular"),
@@ -133,20 +134,6 @@ class SceneReading:
     def _has_lobe(self, name: str) -> bool:
         """Return whether a material may have such a lobe; those outside the table may."""
         return self.unmergeable is not None or any(any(getattr(m, name)) for m in self.materials.values())
-
-    def _touches(self, place: tuple[float, ...]) -> bool:
-        """Return whether a point is as near to a plane, sphere or quadric as rounding."""
-        p = np.array(place)
-
-        def near(height: np.ndarray | float, size: float) -> bool:
-            return bool(np.any(np.abs(height) <= CURVED * max(size, np.abs(p).max())))
-
-        if any(near(s.unit_normal @ p + s.distance, abs(s.distance)) for s in self.planes):
-            return True
-        balls = np.array([center_and_radius(s) for s in self.native if is_sphere(s)]).reshape(-1, 4)
-        if any(near(np.linalg.norm(b[:3] - p) - b[3], np.abs(b[:3]).max() + b[3]) for b in balls):
-            return True
-        return any(near(table.heights(place), float(np.abs(table.boxes()).max())) for table in self._tables)
 
     def _alone(self) -> bool:
         """Return whether there is one object only, convex, which reflects on its outside."""

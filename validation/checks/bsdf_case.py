@@ -24,7 +24,7 @@ from mrt_mitsuba.validation.checks.probe import (
 from mrt_mitsuba.validation.checks.recipe import Recipe
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
-QUICK_ANGLES = (0, 50, 80, 140)
+QUICK_ANGLES = (0, 50, 85, 140)
 FIT = 5e-3  # the rational fits of Smith's G₁ in use are off by up to 0.35 %, and the densities with them
 POINTWISE = 2e-3  # relative, beyond what rounding explains
 ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32

@@ -39,6 +39,7 @@ MATERIALS: dict[str, dict[str, Any]] = {
     "narrow": {**COLORS, "alpha": 0.01, "fresnel": "dielectric"},
     "unity, alpha 1": {"alpha": 1.0, "fresnel": "unity", "diffuse_reflectance": 0.0},
     "textured": {"alpha": CHECKER, "diffuse_reflectance": CHECKER, "specular_reflectance": 0.3},
+    "negative": {"alpha": -0.3, "specular_reflectance": rgb((0.5, 0.3, 0.2)), "diffuse_reflectance": 0.0},
     "with f0": {"f0": rgb((0.9, 0.5, 0.1)), "diffuse_reflectance": 0.0, "alpha": 0.2},
 }
 
