@@ -47,6 +47,7 @@ STUDIES = {
     "growth": Entry("growth", "how does time grow with pixels, objects, lights and bounces", 3, 180),
     "rivals": Entry("rivals", "how fast are our plugins against Mitsuba's own", 5, 120),
     "objects": Entry("objects", "how good are mesh cones, what do exact ones cost", 3, 60),
+    "workers": Entry("workers", "how fast are sweeps on several processes, and are they equal", 5, 120),
     "acceleration": Entry("acceleration", "how does time grow with the number of objects", 9, 60),
 }
 # All about speed; the first name stands for all of them
