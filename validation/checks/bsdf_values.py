@@ -71,10 +71,10 @@ def _delta_either_way(law: Law, case: Case) -> None:
     met &= (np.abs(back.wo - wi) < 1e-3).all(axis=1) & (np.abs(wi[:, 2] * wo[:, 2]) > 1e-3)
     if met.sum() < 20:
         return
-    flux = [s.weight * (s.pdf * s.eta.astype(np.float64) ** 2)[:, None] for s in (there, back)]
+    forth, back_again = (s.weight * (s.pdf * s.eta.astype(np.float64) ** 2)[:, None] for s in (there, back))
     law.most(
         "probability x weight x eta^2 of a single direction (delta) against that of the way back, relative",
-        np.where(met, excess(*flux, np.zeros_like(flux[0])), 0),
+        np.where(met, excess(forth, back_again, np.zeros_like(forth)), 0),
         POINTWISE,
         EITHER_WAY,
         lambda i: case.snippet(

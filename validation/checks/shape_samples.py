@@ -40,6 +40,13 @@ def sampling(law: Law, case: Case) -> None:
             "the same number",
             snippets.positions(case.shape, case.recipe.description),
         )
+    _on_the_surface(law, case, p, n)
+    _area(law, case, p, area)
+    _directions(law, case, u)
+
+
+def _on_the_surface(law: Law, case: Case, p: Array, n: Array) -> None:
+    """Sampled positions, and their normals, as rays meet them."""
     start = (p + n * 0.01 * case.size).astype(np.float32)
     back = trace(case.target, start, unit(-n))
     away = np.where(back.found, np.linalg.norm(back.p - p, axis=1), np.inf) / case.size
@@ -61,8 +68,6 @@ def sampling(law: Law, case: Case) -> None:
         "one surface",
         case.snippet(start[0], -n[0]),
     )
-    _area(law, case, p, area)
-    _directions(law, case, u)
 
 
 def _area(law: Law, case: Case, p: Array, area: float) -> None:
@@ -157,15 +162,19 @@ def _directions(law: Law, case: Case, u: Array) -> None:
         case.snippet(o[i], d[i]),
     )
     visible = drawn & met.found & (met.t > dist[:, 0] * (1 - 1e-3))
-    sampled = _moments(case, o, d, met.p, np.where(visible, 1 / np.where(drawn, pdf[:, 0], 1), 0))
+    weight = np.where(visible, 1 / np.where(drawn, pdf[:, 0], 1), 0)
+    _solid_angle(law, case, *_moments(case, o, d, met.p, weight))
+
+
+def _solid_angle(law: Law, case: Case, mean: Array, variance: Array) -> None:
+    """Hold moments of what is visible, by samples, to those by uniform directions."""
     o = case.around(case.count(2**17, 2**19))
     away = _cone(case, o)
     met = trace(case.target, o, away)
-    counted = _moments(case, o, away, met.p, np.where(met.found, CONE, 0))
-    (mean, variance), (expected, other) = sampled, counted
+    expected, other = _moments(case, o, away, met.p, np.where(met.found, CONE, 0))
     off = np.abs(mean - expected) - SIGMAS * np.sqrt(variance + other)
     law.at_most(
-        f"solid angle of what is visible, or its middle or width, by samples against uniform directions, "
+        "solid angle of what is visible, or its middle or width, by samples against uniform directions, "
         f"beyond {SIGMAS} standard errors",
         max(off.max(), 0) / expected[0],
         1e-2,
