@@ -24,7 +24,7 @@ REACHES = tuple(2**k for k in (2, 5, 8, 11, 13))  # float32 steps to either side
 
 @dataclass(frozen=True)
 class Noise:
-    """What rounding does to a function at N points; all [N], and in roundings (2⁻²⁴) of its value."""
+    """The effect of rounding on a function at N points; all [N], and in roundings (2⁻²⁴) of its value."""
 
     value: Array
     noise: Array  # found by differences
