@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
 
 import numpy as np
 
@@ -91,6 +92,7 @@ class SceneFacts:
     textured: bool  #: does a material vary over its surface
     two_sided: bool  #: is a material lit from behind
     unmergeable: Reason | None  #: why the materials cannot be looked up in one table
+    tabled: bool  #: can the lights be
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,7 @@ class KernelPlan:
     spheres: str  #: "none", "corrected": hits moved onto them, "table": and no call to the shape
     quadrics: tuple[str, ...]  #: kinds of exact quadrics; others are traced as meshes
     planes: bool  #: analytic planes, else they are traced as meshes
-    lights: str  #: "none", "unrolled" or "loop"
+    lights: str  #: "none", "unrolled", "loop" that calls each, or "table": a loop over their numbers
     touching: bool  #: shadow rays that end short of lights on surfaces
     random: bool  #: random numbers
     emission: bool  #: surfaces that emit
@@ -170,6 +172,7 @@ def _hits(mirrors: Sequence[Mirror], settings: Settings) -> float:
     return 1.0 if reflectance <= 0.5 else sum(min(reflectance, 1.0) ** k for k in range(max(bounces, 0) + 1))
 
 
+@lru_cache(maxsize=16)  # asked twice in each render
 def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
     """Decide what the kernels for a scene hold."""
     reasons: list[tuple[str, Reason]] = []
@@ -222,7 +225,7 @@ def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
         if unless("quadrics", (not facts.quadrics, Reason.NO_QUADRICS))
         else (),
         planes=unless("planes", (facts.planes == 0, Reason.NO_PLANES)),
-        lights=("unrolled" if unrolled else "loop") if lit else "none",
+        lights=("unrolled" if unrolled else "table" if facts.tabled else "loop") if lit else "none",
         touching=unless("touching", (not facts.touching, Reason.APART)),
         random=unless("random", (facts.random_lights == 0, Reason.DELTA_LIGHTS)),
         emission=unless("emission", (facts.surface_emitters == 0, Reason.NO_SURFACE_EMITTERS)),

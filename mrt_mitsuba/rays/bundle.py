@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from mrt_mitsuba.rays.divisor import Divisor
+from mrt_mitsuba.rays.divisor import Divisor, opaque
 from mrt_mitsuba.rays.lattice import Lattice
 from mrt_mitsuba.rays.shutter import Number, Shutter
 
@@ -40,44 +40,59 @@ class Bundle:
         """Return the bundle of the pixels ``start`` to ``stop − 1``."""
         return replace(self, pixels=self.pixels[start:stop])
 
-    def samples(self, width: int, height: int) -> Samples:
+    @property
+    def form(self) -> tuple[Any, ...]:
+        """What shapes the code of ``samples``; all else is data."""
+        phase = None if self.shutter is None else self.shutter.phase is None
+        return self.lattice, self.ray_count, self.rays_per_pixel, isinstance(self.pixels, range), phase
+
+    def numbers(self, width: int, height: int) -> Numbers:
+        """Return the data of ``samples``: another picture size needs no other kernel."""
+        import mitsuba as mi
+
+        first = isinstance(self.pixels, range)
+        pixels = opaque(mi.UInt32, self.pixels.start) if first else mi.UInt32(self.pixels)
+        return self._numbers(width, height, opaque, Divisor.opaque, pixels)
+
+    def samples(self, numbers: Numbers) -> Samples:
         """Return where every ray of the bundle starts. Vectorised variants only."""
         import drjit as dr
         import mitsuba as mi
 
         lane = dr.arange(mi.UInt32, self.ray_count)
-        order, rest = Divisor.opaque(self.rays_per_pixel).divide(lane)
+        order, rest = numbers.rays.divide(lane)
         if isinstance(self.pixels, range):
-            pixel = order + dr.opaque(mi.UInt32, self.pixels.start)
+            pixel = order + numbers.pixels
         else:
-            pixel = dr.gather(mi.UInt32, mi.UInt32(self.pixels), order)
-        # Sizes are data, not constants: another picture size needs no other kernel
-        numbers = self._numbers(width, height, dr.opaque, Divisor.opaque)
+            pixel = dr.gather(mi.UInt32, numbers.pixels, order)
         return self._samples(order, pixel, rest, numbers)
 
     def each_sample(self, width: int, height: int) -> Iterator[Samples]:
         """Yield the same, one ray at a time, for scalar variants."""
-        numbers = self._numbers(width, height, lambda kind, value: kind(value), Divisor)
+        numbers = self._numbers(width, height, lambda kind, value: kind(value), Divisor, None)
         for lane in range(self.ray_count):
             order, rest = divmod(lane, self.rays_per_pixel)
             yield self._samples(order, int(self.pixels[order]), rest, numbers)
 
     def _numbers(
-        self, width: int, height: int, number: Number, divisor: Callable[[int], Divisor]
-    ) -> _Numbers:
+        self, width: int, height: int, number: Number, divisor: Callable[[int], Divisor], pixels: Any
+    ) -> Numbers:
         import mitsuba as mi
 
-        return _Numbers(
+        return Numbers(
             width=divisor(width),
             height=number(mi.UInt32, height),
             repeats=divisor(self.repeats),
             first=number(mi.UInt32, self.first),
+            rays=divisor(self.rays_per_pixel),
             rays_per_pixel=number(mi.UInt64, self.rays_per_pixel),
+            share=number(mi.Float, 1 / self.rays_per_pixel),
             aa=divisor(self.lattice.aa),
             shutter=self.shutter.numbers(number) if self.shutter else (),
+            pixels=pixels,
         )
 
-    def _samples(self, order: Any, pixel: Any, rest: Any, numbers: _Numbers) -> Samples:
+    def _samples(self, order: Any, pixel: Any, rest: Any, numbers: Numbers) -> Samples:
         import mitsuba as mi
 
         row, column = numbers.width.divide(pixel)
@@ -92,16 +107,19 @@ class Bundle:
 
 
 @dataclass(frozen=True)
-class _Numbers:
-    """The sizes of picture and bundle as the kernel has them."""
+class Numbers:
+    """The sizes of picture and bundle, and the pixels, as the kernel has them: a PyTree of its data."""
 
     width: Divisor
     height: Any
     repeats: Divisor
     first: Any
+    rays: Divisor  #: rays_per_pixel to divide by
     rays_per_pixel: Any
+    share: Any  #: of a ray in the mean of its pixel
     aa: Divisor
     shutter: tuple[Any, ...]
+    pixels: Any  #: indices, or the first of a range
 
 
 @dataclass(frozen=True)
