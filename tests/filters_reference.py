@@ -1,6 +1,6 @@
 """The filters of the original ray tracer in plain float64 loops, as the truth for the fast ones.
 
-Written for being read beside the definitions, one pixel after the other, and for finite numbers only.
+Written to be read next to the definitions, one pixel after the other, and for finite numbers only.
 """
 
 from __future__ import annotations

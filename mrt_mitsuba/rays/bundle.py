@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
-from mrt_mitsuba.rays.divisor import Divisor, opaque
+from mrt_mitsuba.rays.divisor import Divisor
 from mrt_mitsuba.rays.lattice import Lattice
 from mrt_mitsuba.rays.shutter import Number, Shutter
 
@@ -42,20 +43,24 @@ class Bundle:
 
     @property
     def form(self) -> tuple[Any, ...]:
-        """What shapes the code of ``samples``; all else is data."""
+        """What shapes the code of ``placed``; all else is data."""
         phase = None if self.shutter is None else self.shutter.phase is None
         return self.lattice, self.ray_count, self.rays_per_pixel, isinstance(self.pixels, range), phase
 
     def numbers(self, width: int, height: int) -> Numbers:
-        """Return the data of ``samples``: another picture size needs no other kernel."""
+        """Return the data of ``placed``: another picture size needs no other kernel."""
         import mitsuba as mi
 
-        first = isinstance(self.pixels, range)
-        pixels = opaque(mi.UInt32, self.pixels.start) if first else mi.UInt32(self.pixels)
-        return self._numbers(width, height, opaque, Divisor.opaque, pixels)
+        first = self.pixels.start if isinstance(self.pixels, range) else 0
+        numbers = _opaque_numbers(replace(self, pixels=first), width, height, mi.variant())
+        return numbers if isinstance(self.pixels, range) else replace(numbers, pixels=mi.UInt32(self.pixels))
 
-    def samples(self, numbers: Numbers) -> Samples:
+    def samples(self, width: int, height: int) -> Samples:
         """Return where every ray of the bundle starts. Vectorised variants only."""
+        return self.placed(self.numbers(width, height))
+
+    def placed(self, numbers: Numbers) -> Samples:
+        """Return where every ray of the bundle starts, from the bundle's ``numbers``."""
         import drjit as dr
         import mitsuba as mi
 
@@ -69,14 +74,15 @@ class Bundle:
 
     def each_sample(self, width: int, height: int) -> Iterator[Samples]:
         """Yield the same, one ray at a time, for scalar variants."""
-        numbers = self._numbers(width, height, lambda kind, value: kind(value), Divisor, None)
+        numbers = self.numbers_by(width, height, lambda kind, value: kind(value), Divisor)
         for lane in range(self.ray_count):
             order, rest = divmod(lane, self.rays_per_pixel)
             yield self._samples(order, int(self.pixels[order]), rest, numbers)
 
-    def _numbers(
-        self, width: int, height: int, number: Number, divisor: Callable[[int], Divisor], pixels: Any
+    def numbers_by(
+        self, width: int, height: int, number: Number, divisor: Callable[[int], Divisor]
     ) -> Numbers:
+        """Return the data of ``placed``, made by ``number(type, value)`` and ``divisor(value)``."""
         import mitsuba as mi
 
         return Numbers(
@@ -89,7 +95,7 @@ class Bundle:
             share=number(mi.Float, 1 / self.rays_per_pixel),
             aa=divisor(self.lattice.aa),
             shutter=self.shutter.numbers(number) if self.shutter else (),
-            pixels=pixels,
+            pixels=number(mi.UInt32, self.pixels) if isinstance(self.pixels, int) else None,
         )
 
     def _samples(self, order: Any, pixel: Any, rest: Any, numbers: Numbers) -> Samples:
@@ -104,6 +110,13 @@ class Bundle:
         time = self.shutter.time(rest, pixel, *numbers.shutter) if self.shutter else mi.Float(0)
         number = mi.UInt64(pixel) * numbers.rays_per_pixel + mi.UInt64(rest)
         return Samples(number=number, order=order, is_first=rest == 0, place=place, time=time)
+
+
+@lru_cache(maxsize=64)  # of bundles without their pixels, of which a number says where they begin
+def _opaque_numbers(bundle: Bundle, width: int, height: int, variant: str) -> Numbers:
+    import drjit as dr
+
+    return bundle.numbers_by(width, height, dr.opaque, Divisor.opaque)
 
 
 @dataclass(frozen=True)

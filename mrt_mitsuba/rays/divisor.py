@@ -3,16 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
-
-
-@lru_cache(maxsize=256)
-def opaque(kind: Any, value: Any) -> Any:
-    """Return a number as data of a kernel, the same array for the same number: making one takes a launch."""
-    import drjit as dr
-
-    return dr.opaque(kind, value)
 
 
 @dataclass(frozen=True)
@@ -30,9 +21,10 @@ class Divisor:
     @classmethod
     def opaque(cls, number: int) -> Divisor:
         """Return a divisor for vectorised variants."""
+        import drjit as dr
         import mitsuba as mi
 
-        return cls(opaque(mi.UInt32, number), opaque(mi.Float64, 1 / number))
+        return cls(dr.opaque(mi.UInt32, number), dr.opaque(mi.Float64, 1 / number))
 
     def divide(self, n: Any) -> tuple[Any, Any]:
         """Return quotient and remainder."""

@@ -74,7 +74,7 @@ class Tracer:
         numbers, sampler = bundle.numbers(self.view.width, self.view.height), self._sampler()
 
         def trace() -> dict[str, list[Any]]:
-            samples = bundle.samples(numbers)
+            samples = bundle.placed(numbers)
             if sampler is not None:
                 sampler.start_at(seed, samples.number)
             values = self.shader.trace(names, self.view, samples, sampler)

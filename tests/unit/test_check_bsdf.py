@@ -158,7 +158,7 @@ def test_a_plugin_of_one_variant_only() -> None:
 
 
 def test_wrong_usage() -> None:
-    with pytest.raises(mrt.UsageError, match="is no BSDF"):
+    with pytest.raises(mrt.UsageError, match="is not a BSDF"):
         mrt.check_bsdf(mi.load_dict({"type": "sphere"}))
     with pytest.raises(mrt.UsageError, match="unknown law 'colour'"):
         mrt.check_bsdf({"type": "diffuse"}, only=["colour"])

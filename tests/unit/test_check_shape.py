@@ -170,5 +170,5 @@ def test_snippets_are_programs(capsys, tmp_path: Path) -> None:
 
 
 def test_wrong_usage() -> None:
-    with pytest.raises(mrt.UsageError, match="is no shape"):
+    with pytest.raises(mrt.UsageError, match="is not a shape"):
         mrt.check_shape(mi.load_dict({"type": "diffuse"}))

@@ -285,7 +285,7 @@ def test_a_sharp_foreground_keeps_its_outline(amount: float) -> None:
 
 
 def test_a_blurred_background_is_blurred_up_to_the_sharp_outline() -> None:
-    """The background's own stripes mix beside the outline; what is hidden is taken as more of the same."""
+    """The background's own stripes mix next to the outline; what is hidden is taken as more of the same."""
     image = np.zeros((40, 60, 3))
     image[::4] = image[1::4] = 1
     depth = np.full((40, 60), far(amount=8))

@@ -25,7 +25,7 @@ def sampling(law: Law, case: Case) -> None:
         else:
             tests.append((view, *_counted(case, view, cells)))
     if not tests:
-        raise Skip("the lobe is narrower than float32 directions can tell apart")
+        raise Skip("the lobe is too narrow for float32 directions to resolve")
     view, p, cell, _ = min(tests, key=lambda test: test[1])
     law.at_least(
         f"chance of such counts if samples follow pdf(), the least of {len(tests)} angles, for their number",
@@ -43,7 +43,7 @@ def sampling(law: Law, case: Case) -> None:
         case.snippet(snippets.NORMALISED, wi=view.wi, uv=view.uv),
     )
     if blurred:
-        law.notes.append(f"{blurred} angles left out: lobe narrower than float32 directions can tell apart")
+        law.notes.append(f"{blurred} angles left out: lobe too narrow for float32 directions to resolve")
 
 
 def _counted(case: Case, view: View, cells: Cells) -> tuple[float, tuple, float]:
@@ -78,7 +78,7 @@ def _cells(case: Case) -> Iterator[tuple[View, Cells | None]]:
 
 
 def _mirrored(wi: Array, rng: np.random.Generator, count: int = 600) -> Array:
-    """Directions around the mirror direction at all scales, where lobes are that nothing may have sampled."""
+    """Return directions around the mirror direction at all scales, where unsampled lobes may be."""
     spread = 10 ** rng.uniform(-4, 0, (count, 1)) * rng.normal(size=(count, 3))
     return unit(wi * [-1, -1, 1] + spread)
 

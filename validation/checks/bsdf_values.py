@@ -53,7 +53,7 @@ def reciprocity(law: Law, case: Case) -> None:
 
 # ------------------------------------------------ Finite --------------------------------------------------
 
-# Less than 1e-7, a dot product of float32 vectors rarely is
+# A dot product of float32 vectors is rarely less than 1e-7
 COSINES = (1, 1 - 6e-8, 0.5, 1e-2, 1e-4, 1e-7, 0)
 INDICES = ("eta", "k", "int_ior", "ext_ior")
 UNIFORM = (0, 2.0**-24, 0.5, 1 - 2.0**-24)
@@ -91,7 +91,7 @@ def _finite(law: Law, case: Case, extremes: tuple, known: Array, setting: tuple 
     value, pdf = case.probe.both(wi, wo, uv)
     together = case.probe.pair(wi, wo, uv)
     s = case.probe.sample(wi, u, uv)
-    lit = (s.weight != 0).any(axis=1)  # of one without, nothing else is read
+    lit = (s.weight != 0).any(axis=1)  # else nothing more is read
     length = np.linalg.norm(s.wo.astype(np.float64), axis=1)
     kinds = (
         "eval()",
@@ -131,12 +131,12 @@ def _bad(values: Array) -> Array:
 
 
 def _ends(case: Case) -> Iterator[tuple[str, float, Any]]:
-    """Every number, colour or bitmap of the BSDF at the ends of its likely range, one at a time."""
+    """Yield every number, colour or bitmap of the BSDF at the ends of its likely range, one at a time."""
     for key, value in parameters(case):
         number = float(np.mean(np.array(value)))
-        least = 1e-3 if "alpha" in key or "rough" in key else 0.0  # no roughness is another kind of surface
+        least = 1e-3 if "alpha" in key or "rough" in key else 0.0  # 0: another kind of surface
         if key.split(".")[-2 if key.endswith(".value") else -1] in INDICES and number <= 1:
-            ends = 0.5 * number, 2.0 * number  # of metals, for which 0 is no limit but nonsense
+            ends = 0.5 * number, 2.0 * number  # of metals: 0 makes no sense there
         else:
             ends = (least, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)
         for end in ends:

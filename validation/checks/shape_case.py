@@ -109,7 +109,7 @@ class Case:
 
     @cached_property
     def met(self) -> tuple[Array, Array, Hits]:
-        """Only those that meet the surface, and do not graze it."""
+        """Those rays that meet the surface and do not graze it, and what they meet."""
         o, d, hits = self.seen
         steep = hits.found & (np.abs((hits.n * d).sum(axis=1)) > FLAT)
         if steep.sum() < 20:
@@ -160,7 +160,7 @@ def leave(p: Array, n: Array, d: Array) -> Array:
 
 
 def corners(shape: Any) -> Array | None:
-    """Vertices of a mesh, and middles of edges."""
+    """Return the vertices of a mesh and the middles of its edges; None for other shapes."""
     import mitsuba as mi
 
     if not isinstance(shape, mi.Mesh):

@@ -94,7 +94,7 @@ def far(law: Law, case: Case) -> None:
 
 
 def finite(law: Law, case: Case) -> None:
-    """Rays along axes, from the surface, the middle, corners and very far: all results are numbers."""
+    """Rays along axes, from the surface, the middle, corners and very far: all results are finite."""
     _, _, met = case.met
     count = case.count(2**12, 2**15)
     pick = case.rng.integers
@@ -122,4 +122,4 @@ def finite(law: Law, case: Case) -> None:
     bad = found.found & ~(
         np.isfinite(numbers).all(axis=1) & np.isfinite(partials).all(axis=1) & (found.t >= 0)
     )
-    law.none("hits with numbers that are none", bad, "one NaN spoils a picture", case.at(o, d))
+    law.none("hits with numbers that are not finite", bad, "one NaN spoils a picture", case.at(o, d))

@@ -18,7 +18,7 @@ def sampling(law: Law, case: Case) -> None:
     import mitsuba as mi
 
     if not isinstance(case.shape, mi.Shape):
-        raise Skip("no Mitsuba shape: there is no sample_position()")
+        raise Skip("not a Mitsuba shape: it has no sample_position()")
     count = case.count(2**14, 2**17)
     u = case.rng.random((count, 2), np.float32)
 
@@ -88,7 +88,7 @@ def _uniform(law: Law, case: Case, p: Array, points: Array, bunch: float) -> Non
     A line's crossings come together: their counts vary ``bunch`` times as much.
     """
     both, cells = np.concatenate([p, points]), np.zeros(len(p) + len(points), int)
-    for level, axis in enumerate(case.units(6)):  # aslant, so that flat faces are no jumps
+    for level, axis in enumerate(case.units(6)):  # aslant, so that flat faces make no jumps
         for cell in range(2**level):
             here = cells == cell
             x = both[here] @ axis
@@ -124,7 +124,7 @@ def _directions(law: Law, case: Case, u: Array) -> None:
     try:
         d, dist, pdf, again = lanes(sample, ("Point3f", o), ("Point2f", u))
     except RuntimeError:
-        law.notes.append("sample_direction() is not there")
+        law.notes.append("the shape has no sample_direction()")
         return
     drawn = pdf[:, 0] > 0
     error = np.where(drawn, np.abs(pdf / again - 1)[:, 0], 0)

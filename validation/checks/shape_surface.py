@@ -55,7 +55,7 @@ def hits(law: Law, case: Case) -> None:
 
 
 def surface(law: Law, case: Case) -> None:
-    """Hit points lie on the ray; rays from the surface meet it no more where they start; little is lost."""
+    """Hit points lie on the ray, spawned rays do not meet the surface where they start, digits are kept."""
     o, d, met = case.met
     largest = np.maximum(np.abs(o).max(axis=1), np.abs(met.p).max(axis=1)) + met.t
     along = o.astype(np.float64) + met.t[:, None].astype(np.float64) * d
@@ -154,7 +154,7 @@ def normals(law: Law, case: Case) -> None:
 
 
 def _differences(law: Law, case: Case) -> None:
-    """Neighbouring hits against normal and partial derivatives; two widths tell curvature from error."""
+    """Neighbouring hits against normal and partial derivatives; two widths separate curvature from error."""
     o, d, met = case.met
     aside = unit(np.cross(d, case.units(len(d))))
     slopes, partials = [], []
@@ -218,7 +218,7 @@ def watertight(law: Law, case: Case) -> None:
 
 
 def _inside(case: Case) -> Array | None:
-    """Points well inside: middles of the longer first chords."""
+    """Return points well inside: middles of the longer first chords."""
     if len(case.crossings) < 2:
         return None
     (first, p, _), (second, q, _) = case.crossings[:2]
