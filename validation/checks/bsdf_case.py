@@ -184,9 +184,12 @@ def parameters(case: Case) -> list[tuple[str, Any]]:
     params = mi.traverse(case.bsdf)
     found = []
     for key in params.keys():  # noqa: SIM118 - SceneParameters is not a dict
-        value = params[key]
+        try:
+            value = params[key]
+        except TypeError:  # it was left out, and is None, which Dr.Jit cannot read
+            continue
         numeric = isinstance(value, float) or (
-            value is not None and dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)
+            dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)
         )
         if numeric and "to_uv" not in key and np.size(np.array(value)) > 0:
             found.append((key, value))

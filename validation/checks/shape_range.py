@@ -79,7 +79,7 @@ def far(law: Law, case: Case) -> None:
         error,
         HIT_ROUNDINGS,
         "the origin is rounded, and some dozen operations with it",
-        case.at(origin, d),
+        lambda i: case.snippet(origin[i], d[i], snippets.TWICE, other=closer[i]),
     )
     # a rounded origin moves the line: only what is surely met counts
     bad = steep & through & (np.linalg.norm(here.p - met.p[few], axis=1) < 20 * ROUNDING * distance)
@@ -89,7 +89,7 @@ def far(law: Law, case: Case) -> None:
         bad.mean(),
         2e-3,
         "outlines are as wide as the rounding of the distance",
-        case.snippet(origin[i], d[i]),
+        case.snippet(origin[i], d[i], snippets.TWICE, other=closer[i]),
     )
 
 
