@@ -133,11 +133,7 @@ LIGHT = {"type": "mrt_light", "position": [1, 4, 5]}
             "lights",
         ),
         ({"ball": BALL, "light": LIGHT}, {"light": {**LIGHT, "intensity": 0.0}}, "lights"),
-        (
-            {"ball": BALL, "light": LIGHT, "lamp": LIGHT},
-            {"lamp": {**LIGHT, "intensity": rgb(0, 0, 0)}},
-            "",
-        ),
+        ({"ball": BALL, "light": LIGHT, "lamp": LIGHT}, {"lamp": {**LIGHT, "intensity": rgb(0, 0, 0)}}, ""),
     ],
     ids=["no Ks", "neither", "a black light", "one of two lights black"],
 )
