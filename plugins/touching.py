@@ -40,7 +40,8 @@ def _touches(shape: Any, points: np.ndarray) -> bool:
         boxes = table.boxes()
         return any(_on_quadrics(table, boxes, p) for p in points)
     box = np.array([[list(shape.bbox().min), list(shape.bbox().max)]], float).reshape(1, 2, 3)
-    inside = [p for p in points if _holding(box, p)[0].any()]
+    known = np.isfinite(box).all()  # merged rectangles have none
+    inside = [p for p in points if not known or _holding(box, p)[0].any()]
     corners = flat_triangles(shape) if inside else None
     return corners is not None and any(_on_triangles(corners, p) for p in inside)
 

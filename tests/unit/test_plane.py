@@ -94,13 +94,8 @@ def test_stock_integrators_draw_a_rectangle(integrator: str) -> None:
             "sensor": {
                 "type": "perspective",
                 "to_world": transform.look_at([2, -6, 3], [0, 0, 0], [0, 0, 1]),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": 16,
-                    "height": 12,
-                    "component_format": "float32",
-                    "rfilter": {"type": "box"},
-                },
+                "film": {"type": "hdrfilm", "width": 16, "height": 12, "component_format": "float32"}
+                | {"rfilter": {"type": "box"}},
             },
             "light": {"type": "point", "position": [0, 0, 3], "intensity": 10.0},
             "shape": {**shape, "bsdf": {"type": "diffuse", "reflectance": 0.6}},
