@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
 
 import numpy as np
 
@@ -100,6 +101,7 @@ class SceneFacts:
     textured: bool  #: does a material vary over its surface
     two_sided: bool  #: is a material lit from behind
     unmergeable: Reason | None  #: why the materials cannot be looked up in one table
+    tabled: bool  #: can the lights be
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ class KernelPlan:
     spheres: str  #: "none", "corrected": hits moved onto them, "table": and no call to the shape
     quadrics: tuple[str, ...]  #: kinds of exact quadrics; others are traced as meshes
     planes: bool  #: analytic planes, else they are traced as meshes
-    lights: str  #: "none", "unrolled" or "loop"
+    lights: str  #: "none", "unrolled", "loop" that calls each, or "table": a loop over their numbers
     touching: bool  #: shadow rays that end short of lights on surfaces
     random: bool  #: random numbers
     emission: bool  #: surfaces that emit
@@ -182,6 +184,7 @@ def _hits(mirrors: Sequence[Mirror], settings: Settings) -> float:
 Unless = Callable[..., bool]
 
 
+@lru_cache(maxsize=16)  # asked twice in each render
 def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
     """Decide what the kernels for a scene hold."""
     reasons: list[tuple[str, Reason]] = []
@@ -238,7 +241,7 @@ def _lights(facts: SceneFacts, unless: Unless) -> str:
     black = not (facts.diffuse or facts.specular)
     lit = unless("lights", (facts.lights == 0, Reason.NO_LIGHTS), (black, Reason.BLACK))
     unrolled = facts.lights <= UNROLLED_LIGHTS or not facts.vectorised
-    return ("unrolled" if unrolled else "loop") if lit else "none"
+    return ("unrolled" if unrolled else "table" if facts.tabled else "loop") if lit else "none"
 
 
 def _mirrors(facts: SceneFacts, settings: Settings, affordable: Sequence[Mirror], unless: Unless) -> bool:
