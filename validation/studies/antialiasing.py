@@ -252,7 +252,7 @@ def _show_contours(study: Study, number: int, rows: Sequence[Row]) -> None:
 
 
 def _compare_with_mitsuba(study: Study, *, quick: bool) -> None:
-    """Lattices against random samples that Mitsuba places and filters itself, on scene 3."""
+    """Compare lattices with random samples that Mitsuba places and filters itself, on scene 3."""
     import mitsuba as mi
 
     width, height, spp = (96, 72, 1024) if quick else (200, 150, 8192)
@@ -340,7 +340,7 @@ def variance_error(detector: str, *, spp: int, lattice: str) -> float:
 
 
 def _chase_noise(study: Study, extent: Extent) -> None:
-    """Refined pixels where the converged picture is flat, and where it has an edge."""
+    """Count refined pixels where the converged picture is flat, and where it has an edge."""
     scene = _load(lit_by_a_sphere(*extent.light_size))
     centre: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}  # where the detectors look
     truth = mrt.render(scene, **centre, spp=16 * extent.light_spp, seed=78).image

@@ -35,7 +35,7 @@ WAVES = 3
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """All comparisons with what Mitsuba brings."""
+    """Make all comparisons with what Mitsuba brings."""
     _direct(study, quick)
     _gloss(study, quick)
     _materials(study)

@@ -63,7 +63,7 @@ class Errors:
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Errors of D, G, F, the whole, its density and gradient; heat maps; worst cases."""
+    """Measure errors of D, G, F, the whole, its density and gradient; heat maps; worst cases."""
     cases = Cases(study, "bsdf", "Reflectance")
     lobes, truth = lobes_with_truth(2 if quick else 12)
     angles = FresnelGrid.make(60 if quick else 600)
@@ -141,7 +141,7 @@ def _relative(found: Any, truth: np.ndarray) -> np.ndarray:
 
 
 def _wrong(lobes: Lobes, truth: Truth, angles: FresnelGrid) -> tuple[Lobes, Truth, FresnelGrid]:
-    """Alpha and index of refraction 1 in 30,000 too large."""
+    """Return alpha and index of refraction 1 in 30,000 too large."""
     factor = np.float32(1 + 1 / 30_000)
     lobes = replace(lobes, alpha=lobes.alpha * factor, ior=lobes.ior * factor)
     return lobes, truth, replace(angles, iors=angles.iors * factor)
@@ -204,7 +204,7 @@ def _conditioning(cases: Cases, lobes: Lobes) -> None:
 
 
 def _total_reflection(cases: Cases) -> None:
-    """Around the critical angle F ends in a square root: errors are those of g = 0, not of F."""
+    """Measure F around the critical angle, where it ends in a square root: errors are those of g = 0."""
     import mitsuba as mi
 
     iors = np.repeat(np.array([0.5, 0.9, 0.99, 0.9999], np.float32), 81)

@@ -30,7 +30,7 @@ EDGES: dict[str, Edges] = {
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """The table of cases, in both kinds of variants."""
+    """Make the table of cases, in both kinds of variants."""
     del quick  # all of it is quick
     cases = Cases(study, "filters", "Filters")
     import mitsuba as mi

@@ -31,7 +31,7 @@ HOLDS_TO = 100.0  # scene sizes
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Single objects, then the report's scenes scaled and moved."""
+    """Check single objects, then the report's scenes scaled and moved."""
     cases = Cases(study, "geometry", "Geometry")
     worst: list[tuple[str, str, float, str]] = []
     shape_cases(cases, worst, quick=quick)

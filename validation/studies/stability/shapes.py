@@ -149,7 +149,7 @@ SOLIDS = (
 
 
 def shape_cases(cases: Cases, worst: list[tuple[str, str, float, str]], *, quick: bool) -> None:
-    """Distance, normal and self-intersection of every solid at every size and distance."""
+    """Check distance, normal and self-intersection of every solid at every size and distance."""
     sizes = DECADES[::3] if quick else DECADES
     for solid in SOLIDS:
         cells = [cell for size in sizes for cell in _measure(solid, size, rays=300 if quick else 3000)]
@@ -197,7 +197,7 @@ def _hold(cases: Cases, solid: Solid, cells: Sequence[_Cell]) -> None:
 
 
 def start_cases(cases: Cases, *, quick: bool) -> None:
-    """Rays that start on a surface or at the apex of the cone."""
+    """Check rays that start on a surface or at the apex of the cone."""
     count = 1000 if quick else 20000
     rng = np.random.default_rng(8)
     for solid in (s for s in SOLIDS if s.closed):
@@ -265,7 +265,7 @@ SIDES = 256  # of a stand-in mesh, its default
 
 
 def stand_in_cases(cases: Cases) -> None:
-    """The meshes that stock integrators see for cones and cylinders: inscribed, facing outwards, closed.
+    """Check the meshes that stock integrators see for cones and cylinders: inscribed, outwards, closed.
 
     A side is a turn of 2π / 256 wide: the mesh lies within r (π / 256)² / 2 of the surface, and its normals
     and texture coordinates are off by half a side at most, where a triangle ends in the apex.
@@ -360,7 +360,7 @@ class _Traced:
         return _Traced(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     def with_faults(self) -> _Traced:
-        """All hits 1 in 100,000 further away, normals turned by 2; of ten rays, one is lost, one dark,
+        """Return hits 1 in 100,000 further away, normals turned by 2; of ten rays, one is lost, one dark,
         one met by its own mirror ray, and one no number."""
         ray = np.arange(len(self.t)) % 10
         return _Traced(

@@ -121,7 +121,7 @@ PATHS: Sequence[Path] = (
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Every case against the float64 tracer, sums over bounces in closed form, whole renders."""
+    """Check every case against the float64 tracer, sums over bounces in closed form, whole renders."""
     cases = Cases(study, "transport", "Light transport")
     rows = [_case(cases, path) for path in PATHS]
     _bounces(cases, (1, 3, 10) if quick else range(1, 11))
@@ -185,7 +185,7 @@ def _render(scene: Scene, *, fresnel: str, clamp: bool) -> np.ndarray:
 
 
 def _bounces(cases: Cases, depths: Sequence[int]) -> None:
-    """A ray to and fro between two mirrors: the geometric sum of what both send back."""
+    """Check a ray to and fro between two mirrors: the geometric sum of what both send back."""
     import mitsuba as mi
 
     before = mi.variant()
