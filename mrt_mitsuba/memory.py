@@ -11,7 +11,7 @@ from pathlib import Path
 
 from mrt_mitsuba.errors import UsageError
 
-# Of every pixel: what is kept, by channel, and what Pillow needs to write a PNG
+# For every pixel: what is kept, by channel, and what Pillow needs to write a PNG
 BYTES_PER_CHANNEL = 4
 BYTES_TO_WRITE = 4
 

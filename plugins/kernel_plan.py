@@ -1,4 +1,4 @@
-"""What ``mrt_whitted`` knows about a scene, and what its kernels hold because of it.
+"""Facts about a scene, and the plan of the kernels that ``mrt_whitted`` makes for them.
 
 Plain data and one pure function, ``make_plan``: nothing here knows Mitsuba. The integrator reads the facts,
 the plan decides, the integrator obeys. A plan may be edited (``dataclasses.replace``) before it is obeyed.
@@ -75,7 +75,7 @@ class UniformMaterial:
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What a scene is made of, as far as a kernel depends on it."""
+    """The content of a scene, as far as a kernel depends on it."""
 
     vectorised: bool  #: is the variant one that compiles kernels
     native_shapes: int  #: shapes that only Mitsuba can trace
@@ -123,7 +123,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class CutOff:
-    """What counts against ``min_contribution``, by what it is multiplied with."""
+    """The quantities that are compared with ``min_contribution``, by their factors."""
 
     paths: float  #: a path's throughput; inf: it never ends for being too dim
     lights: float  #: a light's share at a hit, below which it is taken for visible

@@ -1,4 +1,4 @@
-"""What a plugin declares about itself, so that nobody has to guess it from its attributes.
+"""Declarations of plugins about themselves, so that nobody has to guess from attributes.
 
 Mitsuba's classes take no mix-in; a class joins a protocol by registration: after
 ``QuadricShape.register(MrtCone)``, ``isinstance(shape, QuadricShape)`` holds. Others' plugins may join.

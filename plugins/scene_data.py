@@ -1,4 +1,4 @@
-"""What ``mrt_whitted`` reads from a scene: first the facts, then, by a plan, the data of its kernels."""
+"""Reading a scene for ``mrt_whitted``: first the facts, then, by a plan, the data of its kernels."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ FARTHEST = 2.0**127
 
 @dataclass
 class Hit:
-    """What a ray meets first: an interaction, valid where ``found``, and a bound of its error."""
+    """The first hit of a ray: an interaction, valid where ``found``, and a bound of its error."""
 
     si: mi.SurfaceInteraction3f
     found: mi.Bool

@@ -49,7 +49,7 @@ class LightSample:
 
 @dataclass
 class Shading:
-    """What a surface adds to a path."""
+    """The contribution of a surface to a path."""
 
     radiance: mi.UnpolarizedSpectrum
     shadow_rays: mi.UInt32

@@ -1,4 +1,4 @@
-"""What an integrator returns along camera rays, and what the layers are made of.
+"""Values of integrators along camera rays, from which the layers are made.
 
 ``shader_for`` chooses by capability: a ``LayeredIntegrator`` plans its kernels and knows layers of its own;
 any other sampling integrator gives the picture, and Mitsuba the first hit.

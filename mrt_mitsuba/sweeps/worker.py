@@ -1,4 +1,4 @@
-"""What runs on a worker: one job at a time; variant, scene, render, file."""
+"""The code that runs on a worker: one job at a time; variant, scene, render, file."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Task:
 
 @dataclass(frozen=True)
 class House:
-    """What all jobs ask of a worker.
+    """The rules that all jobs of a worker share.
 
     ``sharing``: how many workers share cores, by ``cores_of``; ``renew``: jobs after which a worker gets a
     new process; ``local``: do workers share this machine's home, and so its cache of kernels.

@@ -1,4 +1,4 @@
-"""What files, signals, threads and small machines may try: nothing breaks, hangs, or runs code of theirs."""
+"""Hostile files, signals, threads and small machines: nothing breaks, hangs, or runs code of theirs."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ PNG = _png()
 
 
 def _mended(data: bytes) -> bytes:
-    """The same chunks with right checksums, so that what is wrong in them is looked at."""
+    """Return the chunks with right checksums, so that faults in their content are reached."""
     result, at = data[:8], 8
     while at + 12 <= len(data):
         (length,) = struct.unpack(">I", data[at : at + 4])

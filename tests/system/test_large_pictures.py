@@ -165,7 +165,7 @@ COMMAND = "from mrt_mitsuba.command import main as cli\nsys.exit(cli.main())\n"
 
 @pytest.mark.parametrize("ending", ["png", "exr"])
 def test_a_file_that_may_not_grow_leaves_the_old_one(run_python, tmp_path: Path, ending: str) -> None:
-    """As on a full disk, the system refuses to write on half way."""
+    """The system refuses to write on half way, as on a full disk."""
     target = tmp_path / f"out.{ending}"
     target.write_bytes(b"old")
     words = ("out", "3", "width=160", "height=120", "aa=1", f"format={ending}", "quiet=1")
@@ -212,7 +212,7 @@ TerminalProgress.stage = stage
     ids=["png", "exr", "blur"],
 )
 def test_a_signal_in_the_middle_ends_it_in_order(start, tmp_path, code: str, words: tuple[str, ...]) -> None:
-    """In order, and not by force: Python comes to act on the signal while it writes and between bands."""
+    """It ends in order, not by force: Python comes to act on the signal while it writes and between bands."""
     patient = "from mrt_mitsuba.command import interrupt\ninterrupt.GRACE = 20.0\n"  # on a busy machine
     with start(sys.executable, "-c", patient + code + COMMAND, "out", *words) as process:
         while "working" not in (line := process.stdout.readline()):

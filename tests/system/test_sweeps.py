@@ -130,7 +130,7 @@ def written(folder: Path) -> list[dict[str, str]]:
 
 
 def test_pictures_are_those_of_render_alone(address: str, tmp_path: Path) -> None:
-    """Over options, seeds and scenes: a number, a dict with Mitsuba's types, a file."""
+    """All combinations of options, seeds and scenes: a number, a dict with Mitsuba's types, a file."""
     mrt.register()
     scenes = [3, mrt.scene_dict(0, width=64, height=48), str(tmp_path / "mine.xml")]
     assert cli.main(["export", "1", "--xml", scenes[2]]) == 0

@@ -1,4 +1,4 @@
-"""What ``mrt_whitted`` leaves out: too little to be seen, or not there at all."""
+"""Work that ``mrt_whitted`` leaves out: too little to be seen, or not there at all."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ def test_axis_aligned_planes_stay_so(normal: Any) -> None:
 
 @pytest.mark.parametrize("integrator", ["direct", "path"])
 def test_stock_integrators_draw_a_rectangle(integrator: str) -> None:
-    """The same picture as with a stock rectangle in the same place: both are two triangles."""
+    """They draw it as a stock rectangle in the same place: both are two triangles."""
     transform = mi.ScalarTransform4f()
 
     def image(shape: dict[str, Any]) -> np.ndarray:

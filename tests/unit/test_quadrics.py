@@ -250,7 +250,7 @@ def test_search_against_float64(kind: str, count: int, scale: float, place: str)
 
 
 def test_capsule_is_a_tube_and_two_balls() -> None:
-    """From outside, over three decades of sizes: the nearest of the three, which are tested above."""
+    """Rays from outside meet the nearest of the three, over three decades of sizes."""
     ends, radii, _, _ = crowd(30, "among", "cylinder")
     numbers = np.concatenate([ends.reshape(-1, 6), radii[:, None]], axis=1).astype(np.float32)
     d = np.random.default_rng(9).normal(size=(3, 50_000)).astype(np.float32)

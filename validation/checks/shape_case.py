@@ -24,7 +24,7 @@ MOST_HITS = 16  # along a line
 
 @dataclass(frozen=True)
 class Hits:
-    """What N rays met."""
+    """The hits of N rays."""
 
     found: Array  # bool [N]
     t: Array  # [N]
@@ -78,12 +78,21 @@ class Case:
         self.target = self.shape
         if isinstance(self.shape, mi.Shape):
             name = self.shape.id()
-            self.target = mi.load_dict({"type": "scene", "shape": self.shape})
-            self.shape.set_id(name)  # which the scene has changed
+            if self.shape.class_name() == "Instance":
+                if self.recipe.description is None:
+                    raise UsageError("a loaded instance does not give its group away: give a dict of both")
+                self.target = self.recipe.scene()
+            else:
+                self.target = mi.load_dict({"type": "scene", "shape": self.shape})
+                self.shape.set_id(name)  # which the scene has changed
         box = self.shape.bbox()
         low, high = (np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max))
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (high >= low).all()):
             raise UsageError(f"the bounding box of the shape is {low} … {high}: it must be finite")
+        self.box = low, high  # as the shape has it, which may be wrong
+        ends = corners(self.shape)
+        if ends is not None:
+            low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
         self.low, self.high, self.middle = low, high, (low + high) / 2
         self.size = float(np.linalg.norm(high - low))
 
@@ -113,7 +122,7 @@ class Case:
 
     @cached_property
     def met(self) -> tuple[Array, Array, Hits]:
-        """Those rays that meet the surface and do not graze it, and what they meet."""
+        """Return the rays that meet the surface and do not graze it, and their hits."""
         o, d, hits = self.seen
         steep = hits.found & (np.abs((hits.n * d).sum(axis=1)) > FLAT)
         if steep.sum() < 20:
@@ -122,7 +131,7 @@ class Case:
 
     @cached_property
     def behind(self) -> Hits:
-        """What rays meet that come back from just behind ``met``."""
+        """Return the hits of rays that come back from just behind ``met``."""
         _, d, hits = self.met
         return trace(self.target, leave(hits.p, hits.n, d), -d)
 
@@ -139,7 +148,7 @@ class Case:
 
     @cached_property
     def lines(self) -> tuple[Array, Array]:
-        """Which lines are fit to be judged, and which cross the surface an even number of times. Both [N]"""
+        """Return which lines can be judged, and which cross the surface an even number of times; both [N]."""
         count = len(self.seen[0])
         met, even, clear = np.zeros(count, bool), np.ones(count, bool), np.ones(count, bool)
         last = np.full((count, 3), np.inf)

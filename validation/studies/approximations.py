@@ -1,4 +1,4 @@
-"""From the report's picture of a scene to that of its stock flavour, one approximation at a time."""
+"""The way from the report's picture of a scene to its stock flavour, one approximation at a time."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def compare_rest(numbers: Sequence[int], *, width: int, height: int, spp: int) -
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Where the report's pictures and those of the stock flavour differ, and by what."""
+    """Show where the report's pictures and those of the stock flavour differ, and by what."""
     numbers = (0, 1, 3) if quick else (0, 1, 2, 3, 4)
     size: dict[str, Any] = {"width": 64, "height": 48} if quick else {"width": 160, "height": 120}
     spp = 64 if quick else 256
