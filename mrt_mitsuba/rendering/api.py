@@ -213,6 +213,7 @@ def _render(
         focalrange=plan.focus.range,
         variant=plan.variant,
         integrator=plan.integrator,
+        layers=tuple(name for name in settings.layers if name in plan.layers),
     )
     image, layers = _mean(total, plan)
     return Result(
