@@ -83,7 +83,7 @@ def sections() -> list[Section]:
         ),
         Section(
             "Layers",
-            "What an EXR can hold beside the picture. Direct light and reflection add up to the picture.",
+            "What an EXR can hold next to the picture. Direct light and reflection add up to the picture.",
             (LAYERS,),
         ),
         Section(

@@ -34,7 +34,7 @@ Version = tuple[int, ...]
 class Choice:
     """What was chosen, and why.
 
-    ``path``: the library, or None. ``version``: its version, or None where nobody knows before it is loaded.
+    ``path``: the library, or None. ``version``: its version, or None where it is unknown before it is loaded.
     ``source``: "user", "wheel", "system", "none", or "drjit" where Dr.Jit is left to search by itself (macOS
     and Windows). ``rejected``: one line for each library that was passed over.
     """
@@ -54,7 +54,7 @@ class Choice:
 
     @property
     def usable(self) -> bool:
-        """Whether LLVM variants can be expected to work."""
+        """Return whether LLVM variants can be expected to work."""
         return self.source != "none"
 
     def describe(self) -> str:
@@ -204,7 +204,7 @@ def version_in_name(path: str) -> Version | None:
 def version_of(library: str) -> Version | None:
     """Return the version of a library, given by path or by a name for the dynamic linker; None: unusable.
 
-    Where neither the name nor the target of a symbolic link tells it, the library is asked, in a process of
+    Where neither the name nor the target of a symbolic link holds it, the library is asked, in a process of
     its own.
     """
     path = library
@@ -251,9 +251,9 @@ _drjit_came_first = False
 
 
 def prepare() -> Choice:
-    """Choose once per process and tell Dr.Jit through the environment; return the choice.
+    """Choose once per process and set Dr.Jit's environment variable; return the choice.
 
-    Warns where the user's own setting is not followed, and where Dr.Jit was imported too early to be told.
+    Warns where the user's own setting is not followed, and where Dr.Jit was imported before the choice.
     """
     global _prepared, _drjit_came_first
     if _prepared is None:

@@ -15,8 +15,8 @@ BYTES_TO_WRITE = 4
 
 # A wavefront's arrays, per ray and channel: what the kernel writes, what is formed of it, and the part before
 BYTES_PER_CHANNEL_OF_RAY = 12
-# What filters need for every pixel under work; measured: 131 at most by the blur, 21 by the detectors, beside
-# copies of what they read
+# What filters need for every pixel under work; measured: 131 at most by the blur, 21 by the detectors,
+# copies of what they read apart
 BYTES_PER_PIXEL_OF_FILTER = 192
 
 # Kernels: what their compilation takes for a moment, and their code
@@ -33,7 +33,7 @@ ADDRESSES_TO_START = 2**29
 ADDRESSES_AT_WORK = 2**27
 ADDRESSES_PER_THREAD = 72 * 2**20
 
-# Rays of one wavefront at most: more gain no speed, and progress is told by the wavefront
+# Rays of one wavefront at most: more bring no speed, and progress is reported by the wavefront
 MOST_RAYS = 2**23
 # and at least: fewer, and starting the kernels costs more than running them
 LEAST_RAYS = 2**16
@@ -52,7 +52,7 @@ class Budget:
 
     @classmethod
     def of(cls, memory: int | None) -> Budget:
-        """What was asked for, by default half of what is free; never more than the machine has."""
+        """Return what was asked for, by default half of what is free; never more than the machine has."""
         return cls(min(memory if memory is not None else free_memory() // 2, all_memory()))
 
     def take_texture(self, path: str, width: int, height: int, *, around: bool = False) -> None:
@@ -73,12 +73,12 @@ class Budget:
 
 @dataclass(frozen=True)
 class Workspace:
-    """Memory for the rays and the filters at work, beside the picture: ``size`` bytes."""
+    """Memory for the rays and the filters at work, without that of the picture: ``size`` bytes."""
 
     size: int
 
     @classmethod
-    def beside(
+    def next_to(
         cls,
         width: int,
         height: int,
@@ -88,7 +88,7 @@ class Workspace:
         pictures: int = 1,
         rays_per_pixel: int = 1,
     ) -> Workspace:
-        """What a budget leaves beside a picture of so many float32 channels, held ``pictures`` times over.
+        """Return what a budget leaves next to a picture of so many float32 channels, held ``pictures`` times.
 
         ``rays_per_pixel``: which are traced at once. Raises ``UsageError`` where that does not suffice.
         """
@@ -108,25 +108,25 @@ class Workspace:
         return cls(budget.size - finished)
 
     def rays_at_once(self, channels: int) -> int:
-        """Rays of one wavefront, which returns so many channels."""
+        """Return the rays of one wavefront, which returns so many channels."""
         return max(1, min(self.size // (channels * BYTES_PER_CHANNEL_OF_RAY), MOST_RAYS))
 
     def rows_at_once(self, width: int) -> int:
-        """Rows of a picture that a filter works on at once."""
+        """Return the rows of a picture that a filter works on at once."""
         return max(1, min(self.size // BYTES_PER_PIXEL_OF_FILTER, MOST_PIXELS) // width)
 
     def after_rays(self, rays: int, channels: int) -> None:
-        """To be called after a pass that traced so many rays at once."""
+        """Give memory back after a pass that traced so many rays at once."""
         self._give_back(rays * channels * BYTES_PER_CHANNEL_OF_RAY)
 
     def after_filter(self, pixels: int) -> None:
-        """To be called after a pass that filtered so many pixels at once."""
+        """Give memory back after a pass that filtered so many pixels at once."""
         self._give_back(pixels * BYTES_PER_PIXEL_OF_FILTER)
 
     def _give_back(self, used: int) -> None:
         """Give the system what Dr.Jit keeps for reuse, after a pass that used much.
 
-        A frame has up to four passes, and one seldom reuses another's arrays: they differ in size.
+        A picture takes up to four passes, which seldom reuse each other's arrays: they differ in size.
         """
         import drjit as dr
 
@@ -135,7 +135,7 @@ class Workspace:
 
 
 def free_memory(root: Path = Path("/")) -> int:
-    """Bytes that can be had without swapping; where the system does not tell, all there are.
+    """Return the bytes that are free without swapping; where the system does not say, all there are.
 
     ``root``: where the system's folders ``proc`` and ``sys`` are.
     """
@@ -150,7 +150,7 @@ def free_memory(root: Path = Path("/")) -> int:
 
 
 def all_memory(root: Path = Path("/")) -> int:
-    """Bytes that the machine has, or that its control groups and the limit of addresses leave."""
+    """Return the bytes that the machine has, or that control groups and the limit of addresses leave."""
     machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     limits = [machine, *(limit for limit, _ in _group_limits(root))]
     addresses = _free_addresses()
@@ -165,12 +165,12 @@ def check_addresses() -> None:
     if free is not None and free < ADDRESSES_TO_START:
         raise UsageError(
             f"the limit of addresses (ulimit -v) leaves {_text(free)}, but Mitsuba and its compiler need "
-            f"{_text(ADDRESSES_TO_START)} beside memory=: raise it, and limit memory= instead"
+            f"{_text(ADDRESSES_TO_START)} in addition to memory=: raise it, and limit memory= instead"
         )
 
 
 def _free_addresses() -> int | None:
-    """Bytes of addresses that are left, or None without a limit."""
+    """Return the bytes of addresses that are left, or None without a limit."""
     try:
         import resource
 
@@ -184,7 +184,7 @@ def _free_addresses() -> int | None:
 
 
 def _group_limits(root: Path) -> Iterator[tuple[int, int]]:
-    """Limit and use, in bytes, of each control group (version 1 or 2) that this process is in."""
+    """Yield limit and use, in bytes, of each control group (version 1 or 2) that this process is in."""
     try:
         groups = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:

@@ -119,7 +119,7 @@ def vector(form: str = "X,Y,Z") -> Kind:
 
 
 def error_or_place() -> Kind:
-    """A positive number, or three finite ones."""
+    """Return the kind of one positive number, or three finite ones."""
     place = vector()
 
     def check(value: Any) -> Any:
@@ -247,10 +247,15 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
     """
     if value is None and field.default is None:
         return None
+    return check(field.name, field.metadata["kind"], value)
+
+
+def check(name: str, kind: Kind, value: Any) -> Any:
+    """Return a value from Python as its kind holds it; raise ``UsageError`` if it is not allowed."""
     try:
-        return field.metadata["kind"].check(value)
+        return kind.check(value)
     except (TypeError, ValueError, OverflowError):
-        raise UsageError(f"{field.name}={value!r}: must be {field.metadata['kind'].allowed}") from None
+        raise UsageError(f"{name}={value!r}: must be {kind.allowed}") from None
 
 
 def from_text(field: dataclasses.Field[Any], text: str) -> Any:

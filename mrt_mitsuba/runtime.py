@@ -158,7 +158,8 @@ def _unknown(variant: str, known: list[str]) -> str:
 
 def _register_plugins() -> None:
     from mrt_mitsuba import plugins
-    from mrt_mitsuba.scene.loading import mitsuba_first
+    from mrt_mitsuba.loaders import mitsuba_first, one_by_one
 
     mitsuba_first()
+    one_by_one()
     plugins.register()

@@ -17,7 +17,7 @@ from .quadric_kinds import KINDS, QuadricTable
 from .unit_meshes import UnitMesh
 from .variants import first, is_jit, updatable
 
-# From some thousand sides on the triangles are slivers, between which rays slip through; more help nobody
+# From some thousand sides on the triangles are slivers, between which rays slip through; more would not help
 MOST_SEGMENTS = 65536
 
 
@@ -119,7 +119,7 @@ def _refill(mesh: Any, unit: UnitMesh, frame: Frame) -> None:
 
 
 def side_count(props: mi.Properties, default: int) -> int:
-    """The parameter ``segments``: sides of a mesh."""
+    """Return the parameter ``segments``: sides of a mesh."""
     return integer(props, "segments", default, least=3, most=MOST_SEGMENTS)
 
 
@@ -142,7 +142,7 @@ class Placement:
         return points @ np.transpose(self.linear) + np.array(self.offset)
 
     def __call__(self, frame: Frame) -> Frame:
-        """The frame of the moved shape; works for vectors of any type."""
+        """Return the frame of the moved shape; works for vectors of any type."""
 
         def row(v: Any) -> Any:
             return type(v)([sum(v[i] * self.inverse[i][j] for i in range(3)) for j in range(3)])
@@ -155,7 +155,7 @@ class Placement:
 
 
 def vector64(v: Any) -> Any:
-    """Three numbers, or a point or vector of one entry, in double precision."""
+    """Return three numbers, or a point or vector of one entry, in double precision."""
     return dr.scalar.Array3f64([first(c) for c in v])
 
 

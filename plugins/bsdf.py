@@ -11,9 +11,8 @@ import mitsuba as mi
 
 from .emission import largest
 from .fresnel import f0_from_ior
-from .kernel_plan import Mirror, Reason
+from .kernel_plan import Mirror, Reason, UniformMaterial
 from .lobes import ALPHA_MAX, ALPHA_MIN, Lobes, Pair
-from .merged_bsdf import UniformMaterial
 from .parameters import ParameterError, choice, flag, number, spectrum
 from .protocols import MergeableBSDF
 from .variants import first, is_jit, updatable, varies

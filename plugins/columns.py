@@ -48,14 +48,14 @@ class Columns(Vector3):
 
     @classmethod
     def of(cls, array: np.ndarray) -> Columns:
-        """The columns of an array [n, 3]."""
+        """Return the columns of an array [n, 3]."""
         return cls(column(array[:, k]) for k in range(3))
 
     def array(self) -> np.ndarray:
-        """The array [n, 3] of the columns."""
+        """Return the array [n, 3] of the columns."""
         return np.stack([np.array(c) for c in self], axis=1)
 
 
 def column(values: np.ndarray) -> Any:
-    """One column of float64 numbers."""
+    """Return one column of float64 numbers."""
     return drjit.scalar.ArrayXf64(np.ascontiguousarray(values, np.float64))

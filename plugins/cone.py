@@ -12,7 +12,7 @@ class MrtCone(axial_mesh("cone", "apex", "base_center")):  # type: ignore[misc]
 
     ``mrt_whitted`` intersects the quadric and the disc themselves. To every other integrator the shape is a
     mesh of ``segments`` sides with smooth normals, inscribed in the cone; its distance error falls with
-    segments⁻². Under them, thousands of segments need ``'embree_use_robust_intersections': True`` beside the
+    segments⁻². Under them, thousands of segments need ``'embree_use_robust_intersections': True`` next to the
     scene's ``'type'`` (in XML, a ``boolean`` of this name): without it, Embree lets rays through between
     slivers (about 1e-8 of them per segment). It has no effect on the exact surface.
 

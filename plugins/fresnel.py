@@ -3,7 +3,7 @@
 Every function takes Python floats or Dr.Jit arrays of any precision and returns the same kind. Cosines and
 sines belong to the angle between a direction and the (micro-)normal, on the side of ``ext_ior``.
 
-``sin2_theta`` may be given beside ``cos_theta`` where the caller knows it better than ``1 - cos_theta**2``
+``sin2_theta`` may be given with ``cos_theta`` where the caller knows it better than ``1 - cos_theta**2``
 does: near the normal that difference cancels.
 """
 
@@ -17,12 +17,12 @@ ETA_MAX = 1e9
 
 
 def f0_from_ior(ext_ior, int_ior):
-    """Reflectance at normal incidence, ``((η₂ − η₁) / (η₂ + η₁))²``, unitless."""
+    """Return the reflectance at normal incidence, ``((η₂ − η₁) / (η₂ + η₁))²``, unitless."""
     return dr.square((int_ior - ext_ior) / (int_ior + ext_ior))
 
 
 def fresnel_schlick(cos_theta, f0, sin2_theta=None):
-    """Schlick's approximation ``F = F₀ + (1 − F₀)(1 − cos θ)⁵``.
+    """Return Schlick's approximation ``F = F₀ + (1 − F₀)(1 − cos θ)⁵``.
 
     ``f0`` may be a scalar or a colour. Source: Schlick, "An Inexpensive BRDF Model for Physically-based
     Rendering", 1994, eq. 15.
@@ -33,7 +33,7 @@ def fresnel_schlick(cos_theta, f0, sin2_theta=None):
 
 
 def fresnel_dielectric(cos_theta, ext_ior, int_ior, sin2_theta=None):
-    """Unpolarised reflectance of a dielectric interface, in [0, 1]; 1 under total internal reflection.
+    """Return the unpolarised reflectance of a dielectric interface, in [0, 1]; 1 in total reflection.
 
     The textbook form ``½(Rs + Rp)`` (Snell and Fresnel; see e.g. Pharr, Jakob and Humphreys, PBR 4th ed.,
     §9.3) with both numerators expanded by their conjugates, so that the factor ``1 − η²`` stands alone and

@@ -69,7 +69,7 @@ class MrtGroup(mi.Mesh):
         keep_apart(self, "mrt_group", sizes[1])
 
     def quadrics(self) -> QuadricTable:
-        """What ``mrt_whitted`` intersects in place of the mesh."""
+        """Return what ``mrt_whitted`` intersects in place of the mesh."""
         return self.table
 
     def moving_frame(self) -> None:
@@ -80,7 +80,7 @@ class MrtGroup(mi.Mesh):
 
 
 def _table(props: mi.Properties, name: str, width: int | None = None) -> np.ndarray:
-    """A bitmap parameter as float32 [n, width]."""
+    """Return a bitmap parameter as float32 [n, width]."""
     if name not in props or not isinstance(props[name], mi.Bitmap):
         raise ParameterError(f'mrt_group: "{name}" must be a mi.Bitmap of an array [n, values]')
     table = np.array(props[name])
@@ -110,7 +110,7 @@ def _check(numbers: np.ndarray) -> None:
 
 
 def _stand_in(unit: UnitMesh, table: QuadricTable) -> dict[str, Any]:
-    """Buffers of the mesh of all objects; the frames of some kinds are left-handed."""
+    """Return the buffers of the mesh of all objects; the frames of some kinds are left-handed."""
     columns = np.linalg.inv(table.rows).transpose(0, 2, 1)
     positions = unit.placed(table.extents[:, None]) @ columns + table.origins[:, None]
     normals = unit.gradients[None] @ table.rows

@@ -66,7 +66,7 @@ def _size(shape: Any) -> float:
 
 def _flat_row(shape: Any) -> list[float] | None:
     """Return w and c of a flat shape."""
-    corners = _triangles(shape)
+    corners = flat_triangles(shape)
     if corners is None:
         return None
     edges = np.stack([corners[:, k] - corners[:, k - 1] for k in range(3)], axis=1)  # [n, 3, 3]
@@ -83,8 +83,8 @@ def _flat_row(shape: Any) -> list[float] | None:
     return [*width.tolist(), float(condition.max(initial=0.0) + LEAST * width.max())]
 
 
-def _triangles(shape: Any) -> np.ndarray | None:
-    """Return the corners [n, 3, 3] of a mesh's triangles, or of the two of a rectangle."""
+def flat_triangles(shape: Any) -> np.ndarray | None:
+    """Return the corners [n, 3, 3] of a mesh's triangles, or of the two of a rectangle; None for others."""
     if shape.shape_type() == +mi.ShapeType.Rectangle:
         matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
         square = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) @ matrix[:3, :3].T + matrix[:3, 3]

@@ -15,7 +15,7 @@ import drjit as dr
 
 
 def intersect_plane(o, d, normal, distance):
-    """Distance t > 0 at which the ray meets the plane ``normal · P + distance = 0``; inf for none.
+    """Return the distance t > 0 at which the ray meets the plane ``normal · P + distance = 0``; inf for none.
 
     The normal need not be a unit vector, only the ratio is used. Parallel rays miss.
     """
@@ -26,7 +26,7 @@ def intersect_plane(o, d, normal, distance):
 
 
 def intersect_sphere(o, d, center, radius):
-    """Distance t > 0 at which the ray meets the sphere of ``radius`` > 0 around ``center``; inf for none.
+    """Return the distance t > 0 at which the ray meets the sphere around ``center``; inf for none.
 
     Both roots without cancellation: the discriminant from the distance s of the line to the centre, as
     (r − s)(r + s), instead of b² − ac; the root that b ∓ √… would lose from the product of the roots, c/q;
@@ -79,22 +79,22 @@ class Frame:
     extent: Any = 1.0  # length of the axis in the unit frame
 
     def point(self, p: Any) -> Any:
-        """A world-space point in the unit frame."""
+        """Return a world-space point in the unit frame."""
         return self.vector(p - self.origin)
 
     def vector(self, v: Any) -> Any:
-        """A world-space vector in the unit frame."""
+        """Return a world-space vector in the unit frame."""
         return type(v)([dr.dot(self.x, v), dr.dot(self.y, v), dr.dot(self.z, v)])
 
     def to_world(self, v: Any) -> Any:
-        """The world-space vector whose unit-frame components are ``v``: by the inverse matrix."""
+        """Return the world-space vector whose unit-frame components are ``v``: by the inverse matrix."""
         # Its columns are cross products of the rows
         across = [_cross(self.y, self.z), _cross(self.z, self.x), _cross(self.x, self.y)]
         inverse_volume = 1 / dr.dot(self.x, across[0])
         return (across[0] * v.x + across[1] * v.y + across[2] * v.z) * inverse_volume
 
     def gradient(self, g: Any) -> Any:
-        """World-space gradient of a function whose unit-frame gradient is ``g``: by the transposed matrix."""
+        """Return the world-space gradient of a function, given that in the unit frame: by the transpose."""
         return self.x * g.x + self.y * g.y + self.z * g.z
 
 
@@ -117,24 +117,24 @@ class SurfacePoint:
 
 
 def cone_frame(apex: Any, base_center: Any, radius: Any) -> Frame:
-    """Unit frame of a right circular cone."""
+    """Return the unit frame of a right circular cone."""
     return _frame_along(apex, base_center - apex, radius)
 
 
 def cylinder_frame(p0: Any, p1: Any, radius: Any) -> Frame:
-    """Unit frame of a right circular cylinder from ``p0`` (z = 0) to ``p1`` (z = 1)."""
+    """Return the unit frame of a right circular cylinder from ``p0`` (z = 0) to ``p1`` (z = 1)."""
     return _frame_along(p0, p1 - p0, radius)
 
 
 def capsule_frame(p0: Any, p1: Any, radius: Any) -> Frame:
-    """Unit frame of a capsule: the points within ``radius`` of the segment from ``p0`` to ``p1``."""
+    """Return the unit frame of a capsule: all within ``radius`` of the segment from ``p0`` to ``p1``."""
     frame = _frame_along(p0, p1 - p0, radius)
     extent = dr.norm(p1 - p0) / radius
     return Frame(frame.origin, frame.x, frame.y, frame.z * extent, extent)
 
 
 def sphere_frame(center: Any, radius: Any) -> Frame:
-    """Unit frame of a sphere."""
+    """Return the unit frame of a sphere."""
     inverse = 1 / radius
     zero = 0 * inverse
     make = type(center)
@@ -143,7 +143,7 @@ def sphere_frame(center: Any, radius: Any) -> Frame:
 
 
 def _frame_along(origin: Any, axis: Any, radius: Any) -> Frame:
-    """The frame whose z runs along ``axis``; seen against it, u grows counter-clockwise."""
+    """Return the frame whose z runs along ``axis``; seen against it, u grows counter-clockwise."""
     length2 = dr.squared_norm(axis)
     n = axis / -dr.sqrt(length2)
     s, t = tangents(n)
@@ -155,7 +155,7 @@ def _cross(a: Any, b: Any) -> Any:
 
 
 def tangents(n: Any) -> tuple[Any, Any]:
-    """Two unit vectors that make a right-handed frame with the unit vector ``n``.
+    """Return two unit vectors that make a right-handed frame with the unit vector ``n``.
 
     Source: Duff et al., "Building an Orthonormal Basis, Revisited", 2017.
     """
@@ -167,7 +167,7 @@ def tangents(n: Any) -> tuple[Any, Any]:
 
 
 def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> SurfaceHit:
-    """First intersection at t > 0 of a ray with a cone: lateral surface and, if ``capped``, base disc.
+    """Return the first hit at t > 0 of a ray with a cone: lateral surface and, if ``capped``, base disc.
 
     Seen from inside, the far side is met. With p the point of the line nearest to the apex, u its unit
     direction and ⟨a, b⟩ = a.x b.x + a.y b.y − a.z b.z, the lateral surface is at the roots of ⟨u,u⟩ s² +
@@ -205,7 +205,7 @@ def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> Surf
 
 
 def intersect_cylinder(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> SurfaceHit:
-    """First intersection at t > 0 of a ray with a cylinder: lateral surface and, if ``capped``, two discs.
+    """Return the first hit at t > 0 of a ray with a cylinder: lateral surface and, if ``capped``, two discs.
 
     As ``intersect_cone``, for the form a.x b.x + a.y b.y: the discriminant is ρ² − (p × u).z², ρ² = u.x² +
     u.y².
@@ -264,7 +264,7 @@ def cylinder_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
 
 
 def intersect_unit_sphere(o: Any, d: Any, frame: Frame) -> SurfaceHit:
-    """First intersection at t > 0 of a ray with the sphere of radius 1 around the origin of ``frame``."""
+    """Return the first hit at t > 0 of a ray with the sphere of radius 1 around the origin of ``frame``."""
     o = frame.point(o)
     t = intersect_sphere(o, frame.vector(d), type(o)([0.0, 0.0, 0.0]), 1.0)
     return SurfaceHit(t, LATERAL)
@@ -288,7 +288,7 @@ def sphere_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
 
 
 def intersect_capsule(o: Any, d: Any, frame: Frame) -> SurfaceHit:
-    """First intersection at t > 0 of a ray with a capsule.
+    """Return the first hit at t > 0 of a ray with a capsule.
 
     A line's interval inside is that of the tube between the ends and of the two balls, taken together.
     """
@@ -343,18 +343,18 @@ def capsule_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
 
 
 def cone_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
-    """Unit-frame derivatives by u and v of a point of ``cone_surface``, given in the unit frame."""
+    """Return derivatives by u and v of a point of ``cone_surface``; both are in the unit frame."""
     x, y = _azimuth(q, dr.sqrt(dr.square(q.x) + dr.square(q.y)))
     return _axial_derivatives(q, part, type(q)([-x, -y, -1 + 0 * x]))
 
 
 def cylinder_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
-    """Unit-frame derivatives by u and v of a point of ``cylinder_surface``, given in the unit frame."""
+    """Return derivatives by u and v of a point of ``cylinder_surface``; both are in the unit frame."""
     return _axial_derivatives(q, part, type(q)([0 * q.x, 0 * q.x, -1 + 0 * q.x]))
 
 
 def _axial_derivatives(q: Any, part: Any, along: Any) -> tuple[Any, Any]:
-    """Those of the side, the one by v being ``along``, or of a disc in the unit square."""
+    """Return the derivatives of the side, ``along`` by v, or of a disc in the unit square."""
     side, zero = part == LATERAL, 0 * q.x
     two = 2 + zero
     around = type(q)([-2 * dr.pi * q.y, 2 * dr.pi * q.x, zero])
@@ -364,7 +364,7 @@ def _axial_derivatives(q: Any, part: Any, along: Any) -> tuple[Any, Any]:
 
 
 def sphere_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
-    """Unit-frame derivatives by u and v of a point of ``sphere_surface``, given in the unit frame."""
+    """Return derivatives by u and v of a point of ``sphere_surface``; both are in the unit frame."""
     r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
     x, y = _azimuth(q, r)
     around = type(q)([-2 * dr.pi * q.y, 2 * dr.pi * q.x, 0 * q.x])
@@ -372,7 +372,7 @@ def sphere_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
 
 
 def capsule_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
-    """Unit-frame derivatives by u and v of a point of ``capsule_surface``, given in the unit frame."""
+    """Return derivatives by u and v of a point of ``capsule_surface``; both are in the unit frame."""
     r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
     x, y = _azimuth(q, r)
     z = q.z - dr.clip(q.z, 0, frame.extent)
@@ -400,17 +400,17 @@ def _line(o: Any, d: Any, frame: Frame) -> _Line:
     u = d / length
     along = dr.dot(o, u)
     p = type(d)(o) - u * along
-    rest = dr.dot(p, u)  # from far away, the rounding of the first step is not small beside the shape
+    rest = dr.dot(p, u)  # from far away, the rounding of the first step is not small against the shape
     return _Line(p - u * rest, u, -(along + rest), length)
 
 
 def off_zero(x: Any, least: float = _TINY) -> Any:
-    """``x``, or ``least`` with the same sign where it is smaller."""
+    """Return ``x``, or ``least`` with the same sign where it is smaller."""
     return dr.select(dr.abs(x) >= least, x, dr.select(x < 0, -least, least))
 
 
 def _roots(a: Any, half_b: Any, c: Any, discriminant: Any) -> tuple[Any, Any]:
-    """The roots of a s² + 2 half_b s + c in ascending order; where a vanishes, one of them is huge.
+    """Return the roots of a s² + 2 half_b s + c in ascending order; where a vanishes, one of them is huge.
 
     Source: the cancellation-free form, e.g. Press et al., Numerical Recipes, §5.6.
     """
@@ -423,7 +423,7 @@ def _roots(a: Any, half_b: Any, c: Any, discriminant: Any) -> tuple[Any, Any]:
 def _first_boundary(
     line: _Line, inside: Any, near: Any, near_part: Any, far: Any, far_part: Any, capped: bool
 ) -> SurfaceHit:
-    """The first end at t > 0 of the interval [near, far] of s, and what is hit there."""
+    """Return the first end at t > 0 of the interval [near, far] of s, and what is hit there."""
     inside = inside & (near <= far)
     near_t, far_t = (near + line.start) / line.length, (far + line.start) / line.length
     if not capped:
@@ -436,7 +436,7 @@ def _first_boundary(
 
 
 def _azimuth(q: Any, r: Any) -> tuple[Any, Any]:
-    """Cosine and sine of the azimuth of ``q`` at distance r from the axis; on the axis, those of 0."""
+    """Return cosine and sine of the azimuth of ``q`` at distance r from the axis; on the axis, those of 0."""
     on_axis = r == 0
     inverse = 1 / dr.select(on_axis, 1, r)
     return dr.select(on_axis, 1, q.x * inverse), q.y * inverse

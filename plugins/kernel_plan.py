@@ -7,7 +7,7 @@ the plan decides, the integrator obeys. A plan may be edited (``dataclasses.repl
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -61,6 +61,15 @@ class Mirror:
     reflectance: float
     int_ior: float
     at_normal: float = 1.0  # its reflectance at normal incidence
+
+
+@dataclass(frozen=True)
+class UniformMaterial:
+    """Parameters of an ``mrt_bsdf`` that are the same everywhere, as plain numbers."""
+
+    numbers: tuple[float, ...]  # alpha, int_ior, ext_ior
+    diffuse: tuple[float, ...]  # of each channel
+    specular: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -170,6 +179,9 @@ def _hits(mirrors: Sequence[Mirror], settings: Settings) -> float:
     return 1.0 if reflectance <= 0.5 else sum(min(reflectance, 1.0) ** k for k in range(max(bounces, 0) + 1))
 
 
+Unless = Callable[..., bool]
+
+
 def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
     """Decide what the kernels for a scene hold."""
     reasons: list[tuple[str, Reason]] = []
@@ -180,7 +192,37 @@ def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
         reasons.extend((name, reason) for reason in found[:1])
         return not found
 
-    no_native = facts.native_shapes == 0
+    spheres, lights = _spheres(facts, unless), _lights(facts, unless)
+    affordable = [m for m in facts.mirrors if settings.cost(m.int_ior) < settings.max_depth]
+    mirrors = _mirrors(facts, settings, affordable, unless)
+    lobes = _lobes(facts, unless)
+    return KernelPlan(
+        spheres=spheres,
+        lights=lights,
+        mirrors=mirrors,
+        lobes=lobes,
+        cut_off=_cut_off(facts, settings, affordable if mirrors else None, unless),
+        bvh=unless("bvh", (facts.native_shapes == 0, Reason.NO_NATIVE_SHAPES)),
+        # It pays where there are thousands of triangles to meet
+        coherent=unless("coherent", (facts.meshes == 0, Reason.NO_MESHES)),
+        quadrics=_quadrics(facts, unless),
+        planes=unless("planes", (facts.planes == 0, Reason.NO_PLANES)),
+        touching=unless("touching", (not facts.touching, Reason.APART)),
+        random=unless("random", (facts.random_lights == 0, Reason.DELTA_LIGHTS)),
+        emission=unless("emission", (facts.surface_emitters == 0, Reason.NO_SURFACE_EMITTERS)),
+        sky=_sky(facts, settings, unless),
+        mirror_rays=mirrors and unless("mirror_rays", (facts.alone, Reason.ALONE)),
+        guarded=mirrors and unless("guarded", (_bounded(affordable, settings), Reason.BOUNDED)),
+        textures=unless("textures", (not facts.textured, Reason.UNIFORM)),
+        shading_frames=unless("shading_frames", (facts.meshes == 0, Reason.NO_MESHES)),
+        tangents=unless("tangents", (not facts.oriented, Reason.ISOTROPIC)),
+        merged=unless("merged", (facts.unmergeable is not None, facts.unmergeable or Reason.VARYING)),
+        two_sided=unless("two_sided", (not facts.two_sided, Reason.ONE_SIDED)),
+        reasons=tuple(reasons),
+    )
+
+
+def _spheres(facts: SceneFacts, unless: Unless) -> str:
     table = unless(
         "spheres",
         (facts.spheres == 0, Reason.NO_SPHERES),
@@ -189,53 +231,60 @@ def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
         (facts.oriented, Reason.TANGENTS),
         (facts.plain_spheres < facts.native_shapes, Reason.NATIVE_SHAPES),
     )
+    return "table" if table else "corrected" if facts.spheres else "none"
+
+
+def _lights(facts: SceneFacts, unless: Unless) -> str:
+    black = not (facts.diffuse or facts.specular)
+    lit = unless("lights", (facts.lights == 0, Reason.NO_LIGHTS), (black, Reason.BLACK))
     unrolled = facts.lights <= UNROLLED_LIGHTS or not facts.vectorised
-    lobes = tuple(name for name in ("diffuse", "specular") if getattr(facts, name))
-    lit = unless("lights", (facts.lights == 0, Reason.NO_LIGHTS), (not lobes, Reason.BLACK))
-    affordable = [m for m in facts.mirrors if settings.cost(m.int_ior) < settings.max_depth]
-    arriving = _arriving(facts, settings)
+    return ("unrolled" if unrolled else "loop") if lit else "none"
+
+
+def _mirrors(facts: SceneFacts, settings: Settings, affordable: Sequence[Mirror], unless: Unless) -> bool:
+    arriving, has_sky = _arriving(facts, settings), settings.own_sky is not None or facts.environment
     bright = [m for m in affordable if m.reflectance * arriving > settings.min_contribution]
-    has_sky = settings.own_sky is not None or facts.environment
-    sky = "environment" if settings.own_sky is None else "parameter"
-    mirrors = unless(
+    return unless(
         "mirrors",
         (bool(facts.mirrors) and not affordable, Reason.MAX_DEPTH),
         (not bright, Reason.NO_MIRRORS),
         (facts.alone and not has_sky, Reason.ALONE),
     )
-    hits = _hits(affordable, settings) if mirrors else 1.0
-    growth = max((m.reflectance for m in affordable), default=0.0)
+
+
+def _lobes(facts: SceneFacts, unless: Unless) -> tuple[str, ...]:
+    lobes = tuple(name for name in ("diffuse", "specular") if getattr(facts, name))
     unless(
         "lobes",
         (not lobes, Reason.BLACK),
         (not facts.specular, Reason.NO_SPECULAR),
         (not facts.diffuse, Reason.NO_DIFFUSE),
     )
-    bounded = unless("cut_off", (mirrors and arriving == math.inf, Reason.UNBOUNDED))
-    paths = (arriving * hits if bounded else math.inf) if mirrors else 0.0
-    return KernelPlan(
-        bvh=unless("bvh", (no_native, Reason.NO_NATIVE_SHAPES)),
-        # It pays where there are thousands of triangles to meet
-        coherent=unless("coherent", (facts.meshes == 0, Reason.NO_MESHES)),
-        spheres="table" if table else "corrected" if facts.spheres else "none",
-        quadrics=tuple(kind for kind, _ in facts.quadrics)
-        if unless("quadrics", (not facts.quadrics, Reason.NO_QUADRICS))
-        else (),
-        planes=unless("planes", (facts.planes == 0, Reason.NO_PLANES)),
-        lights=("unrolled" if unrolled else "loop") if lit else "none",
-        touching=unless("touching", (not facts.touching, Reason.APART)),
-        random=unless("random", (facts.random_lights == 0, Reason.DELTA_LIGHTS)),
-        emission=unless("emission", (facts.surface_emitters == 0, Reason.NO_SURFACE_EMITTERS)),
-        sky=sky if unless("sky", (not has_sky, Reason.NO_SKY)) else "none",
-        mirrors=mirrors,
-        mirror_rays=mirrors and unless("mirror_rays", (facts.alone, Reason.ALONE)),
-        cut_off=CutOff(paths, facts.lights * hits),
-        guarded=mirrors and unless("guarded", (growth ** (settings.max_depth - 1) < 1e30, Reason.BOUNDED)),
-        lobes=lobes,
-        textures=unless("textures", (not facts.textured, Reason.UNIFORM)),
-        shading_frames=unless("shading_frames", (facts.meshes == 0, Reason.NO_MESHES)),
-        tangents=unless("tangents", (not facts.oriented, Reason.ISOTROPIC)),
-        merged=unless("merged", (facts.unmergeable is not None, facts.unmergeable or Reason.VARYING)),
-        two_sided=unless("two_sided", (not facts.two_sided, Reason.ONE_SIDED)),
-        reasons=tuple(reasons),
-    )
+    return lobes
+
+
+def _cut_off(
+    facts: SceneFacts, settings: Settings, mirrors: Sequence[Mirror] | None, unless: Unless
+) -> CutOff:
+    """Return the limits for paths off these mirrors; None where nothing is reflected."""
+    arriving, hits = _arriving(facts, settings), 1.0 if mirrors is None else _hits(mirrors, settings)
+    bounded = unless("cut_off", (mirrors is not None and arriving == math.inf, Reason.UNBOUNDED))
+    paths = 0.0 if mirrors is None else arriving * hits if bounded else math.inf
+    return CutOff(paths, facts.lights * hits)
+
+
+def _bounded(mirrors: Sequence[Mirror], settings: Settings) -> bool:
+    """Return whether throughputs stay below 1e30."""
+    growth = max((m.reflectance for m in mirrors), default=0.0)
+    return growth <= 1 or (settings.max_depth - 1) * math.log10(growth) < 30
+
+
+def _quadrics(facts: SceneFacts, unless: Unless) -> tuple[str, ...]:
+    unless("quadrics", (not facts.quadrics, Reason.NO_QUADRICS))
+    return tuple(kind for kind, _ in facts.quadrics)
+
+
+def _sky(facts: SceneFacts, settings: Settings, unless: Unless) -> str:
+    given = settings.own_sky is not None
+    found = unless("sky", (not given and not facts.environment, Reason.NO_SKY))
+    return ("parameter" if given else "environment") if found else "none"

@@ -72,7 +72,7 @@ class MrtLight(mi.Emitter):
         return ds, mi.depolarizer(self.irradiance(it, active))
 
     def irradiance(self, it, active=True):
-        """The light's colour at the wavelengths of ``it``, as an unpolarised spectrum."""
+        """Return the light's colour at the wavelengths of ``it``, as an unpolarised spectrum."""
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wavelengths = it.wavelengths
         return self.intensity.eval(si, active)

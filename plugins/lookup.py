@@ -10,11 +10,11 @@ from .variants import is_jit, pointer
 
 
 def aligned(values: np.ndarray):
-    """Numbers as a flat float32 array at a multiple of 64 bytes.
+    """Return numbers as a flat float32 array at a multiple of 64 bytes.
 
     Dr.Jit uses arrays of numpy where they lie, and most lie elsewhere. Only from aligned ones does a kernel
-    read several numbers in a row in one go, which makes one that searches a tree half as fast again; and the
-    two kernels would be compiled, and kept, one beside the other.
+    read several numbers in a row in one go, which makes one that searches a tree half as fast again; and both
+    kernels would be compiled and kept.
     """
     size = np.size(values)
     room = np.empty(size + 16, np.float32)

@@ -1,7 +1,7 @@
 """Many ``mrt_bsdf`` evaluated as one, whose parameters are those of the shape that was hit.
 
 Mitsuba calls each BSDF of a scene in turn, and the Python code of each runs to record the call: 1 ms for an
-instance, at every render. This one is recorded once, for any number of materials. It is no ``mi.BSDF``:
+instance, at every render. This one is recorded once, for any number of materials. It is not an ``mi.BSDF``:
 Dr.Jit would record its calls in the kernels of every scene, and only Python calls it.
 """
 
@@ -14,20 +14,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .kernel_plan import Reason
+from .kernel_plan import Reason, UniformMaterial
 from .lobes import Lobes, Pair
 from .lookup import ByShape
 from .protocols import MergeableBSDF
 from .variants import is_jit
-
-
-@dataclass(frozen=True)
-class UniformMaterial:
-    """Parameters of an ``mrt_bsdf`` that are the same everywhere, as plain numbers."""
-
-    numbers: tuple[float, ...]  # alpha, int_ior, ext_ior
-    diffuse: tuple[float, ...]  # of each channel
-    specular: tuple[float, ...]
 
 
 def uniform_materials(shapes: Sequence[mi.Shape]) -> dict[int, UniformMaterial] | Reason:
@@ -84,7 +75,7 @@ class MergedBSDF:
         return mi.depolarizer(self.lobes(si).value(ctx, Pair.above(si.wi, wo, active)))
 
     def has_attribute(self, name: str) -> bool:
-        """As every BSDF of the table has."""
+        """Return whether the BSDFs of the table have an attribute."""
         return name in ("mirror_reflectance", "int_ior")
 
     def eval_attribute(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Any:

@@ -42,8 +42,7 @@ def construct(
 
 
 def keep_apart(mesh: Any, name: str, faces: int) -> None:
-    """Mitsuba merges meshes that share a BSDF when it loads a scene, but leaves those with attributes
-    alone."""
+    """Keep Mitsuba from merging the mesh with others of its BSDF: it leaves those with attributes alone."""
     mesh.add_attribute(f"face_{name}", 1, [0.0] * faces)
 
 
@@ -51,7 +50,7 @@ def write_buffers(mesh: Any, **buffers: Any) -> None:
     """Give a mesh its ``faces``, ``vertex_positions``, ... as flat arrays."""
     if is_jit():
         # Scenes are loaded by several threads. The update evaluates the material of the mesh, too, which may
-        # come from another one; Dr.Jit wants to be told of such a handover
+        # come from another one; Dr.Jit must know of such a handover
         dr.detail.new_scope(dr.backend_v(mi.Float))
     parameters = mi.traverse(mesh)
     for name, values in buffers.items():
@@ -65,7 +64,7 @@ def write_buffers(mesh: Any, **buffers: Any) -> None:
 
 
 def vertex_version(shape: Any) -> int:
-    """Return what changes when the vertices of a mesh do; 0 where nothing tells."""
+    """Return what changes when the vertices of a mesh do; 0 where nothing says so."""
     if not is_jit() or not isinstance(shape, mi.Mesh):
         return 0
     if hasattr(shape, "vertex_positions_buffer"):

@@ -15,7 +15,7 @@ TAN2_MAX = 1e18
 
 
 def tan2_theta(v):
-    """tan² of the angle to +z of ``v`` (any length), clamped to ``TAN2_MAX``; sign of z ignored."""
+    """Return tan² of the angle to ±z of ``v`` (any length), clamped to ``TAN2_MAX``."""
     z2 = dr.square(v.z)
     r2 = dr.square(v.x) + dr.square(v.y)
     horizontal = r2 >= TAN2_MAX * z2
@@ -23,7 +23,7 @@ def tan2_theta(v):
 
 
 def beckmann_d(tan2_theta_h, alpha):
-    """Beckmann's normal distribution ``D = exp(−tan²θ/α²) / (π α² cos⁴θ)`` in 1/sr, for θ < 90°.
+    """Return Beckmann's normal distribution ``D = exp(−tan²θ/α²) / (π α² cos⁴θ)`` in 1/sr, for θ < 90°.
 
     Takes tan²θ of the half vector, not cos θ: with cos⁻²θ = 1 + tan²θ the only subtraction is gone.
     Source: Beckmann and Spizzichino 1963; Walter et al., "Microfacet Models for Refraction", 2007, eq. 25.
@@ -33,7 +33,7 @@ def beckmann_d(tan2_theta_h, alpha):
 
 
 def _smith_fit(v, alpha):
-    """Numerator over cos θ, and denominator, of the rational fit of Smith's G₁, and where it applies.
+    """Return numerator over cos θ and denominator of the rational fit of Smith's G₁, and where it applies.
 
     With b = 1/(α tan θ) = z/a, a = α √(x² + y²), the fit (3.535 b + 2.181 b²)/(1 + 2.276 b + 2.577 b²) is
     multiplied through by a²: no division by tan θ, and the factor z = cos θ can be left out.
@@ -46,7 +46,7 @@ def _smith_fit(v, alpha):
 
 
 def smith_g1(v, alpha):
-    """Smith shadowing of the Beckmann distribution towards ``v`` (any length, v.z > 0), by rational fit.
+    """Return Smith's shadowing for Beckmann towards ``v`` (any length, v.z > 0), by a rational fit.
 
     b < 1.6: (3.535 b + 2.181 b²)/(1 + 2.276 b + 2.577 b²) with b = 1/(α tan θ), else 1 (relative error of the
     fit 0.35 %). The factor χ⁺((v·h)/(v·n)) is the caller's: it is 1 wherever both directions are above the
@@ -58,13 +58,13 @@ def smith_g1(v, alpha):
 
 
 def smith_g1_over_cos(v, alpha):
-    """``smith_g1(v) / cos θ`` for a unit vector ``v``, finite down to grazing directions."""
+    """Return ``smith_g1(v) / cos θ`` for a unit vector ``v``, finite down to grazing directions."""
     numerator, denominator, fitted = _smith_fit(v, alpha)
     return dr.select(fitted, numerator, 1) / dr.select(fitted, denominator, v.z)
 
 
 def visible_over_cos(v, alpha):
-    """``1 / ((1 + Λ) cos θ)`` for a unit vector ``v``, v.z > 0: the normaliser of the visible normals.
+    """Return ``1 / ((1 + Λ) cos θ)`` for a unit vector ``v``, v.z > 0: the normaliser of the visible normals.
 
     Λ is Beckmann's own, with the error function; the rational fit of G₁ differs by up to 0.4 %, and a density
     with it would integrate to that much more or less. Times cos θ, no term cancels or overflows: with
@@ -79,7 +79,7 @@ def visible_over_cos(v, alpha):
 
 
 def half_vector_angles(wi, wo):
-    """(cos θd, sin²θd) between ``wi`` and the half vector of two unit vectors.
+    """Return (cos θd, sin²θd) between ``wi`` and the half vector of two unit vectors.
 
     Taken from |wi + wo| and |wi − wo| instead of a dot product with a normalised half vector, so that each
     stays accurate where it is small: |wi ± wo|² = 2 ± 2 cos 2θd.
@@ -88,7 +88,7 @@ def half_vector_angles(wi, wo):
 
 
 def microfacet_specular(wi, wo, tan2_theta_h, alpha):
-    """``D G / (4 cos θi cos θo)`` times cos θo, without Fresnel, in 1/sr; both z must be positive.
+    """Return ``D G / (4 cos θi cos θo)`` times cos θo, without Fresnel, in 1/sr; both z must be positive.
 
     The cosine of ``wi`` is divided out inside G₁ and that of ``wo`` never appears.
     Source: Walter et al. 2007, eq. 20.
@@ -98,7 +98,7 @@ def microfacet_specular(wi, wo, tan2_theta_h, alpha):
 
 
 def sample_beckmann(alpha, u1, u2, like):
-    """Local microfacet normal with density D cos θ; ``u1, u2`` in [0, 1), ``like`` the vector type to build.
+    """Return a microfacet normal with density D cos θ for ``u1, u2`` in [0, 1); ``like``: the type of vector.
 
     Source: Walter et al. 2007, eq. 28, 29.
     """
@@ -108,7 +108,7 @@ def sample_beckmann(alpha, u1, u2, like):
 
 
 def sample_beckmann_visible(wi, alpha, u, slopes, like):
-    """Local microfacet normal distributed as the normals visible from ``wi`` (unit, wi.z > 0).
+    """Return a microfacet normal distributed as those visible from ``wi`` (unit, wi.z > 0).
 
     ``slopes(cos_theta, u)`` draws a visible slope for α = 1: ``mi.MicrofacetDistribution.sample_visible_11``.
     Source: Heitz and d'Eon, "Importance Sampling Microfacet-Based BSDFs using the Distribution of Visible

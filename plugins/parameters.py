@@ -25,7 +25,7 @@ def _without_tiny(value: float) -> float:
 
 
 def number(props, name: str, default: float, *, above: float = -math.inf, least: float = -math.inf) -> float:
-    """A finite float parameter, > ``above`` and >= ``least``."""
+    """Return a finite float parameter, > ``above`` and >= ``least``."""
     value = props.get(name, default)
     bounds = ((">", above), (">=", least))
     limits = "".join(f" {sign} {bound:g}" for sign, bound in bounds if bound > -math.inf)
@@ -38,7 +38,7 @@ def number(props, name: str, default: float, *, above: float = -math.inf, least:
 
 
 def integer(props, name: str, default: int, *, least: int, most: int | None = None) -> int:
-    """An integer parameter >= ``least`` and, if given, <= ``most``."""
+    """Return an integer parameter >= ``least`` and, if given, <= ``most``."""
     value = props.get(name, default)
     limits = f">= {least}" if most is None else f"from {least} to {most}"
     right = isinstance(value, int) and not isinstance(value, bool)
@@ -48,7 +48,7 @@ def integer(props, name: str, default: int, *, least: int, most: int | None = No
 
 
 def flag(props, name: str, default: bool) -> bool:
-    """A boolean parameter."""
+    """Return a boolean parameter."""
     value = props.get(name, default)
     if not isinstance(value, bool):
         _fail(props, name, value, "true or false")
@@ -56,7 +56,7 @@ def flag(props, name: str, default: bool) -> bool:
 
 
 def choice(props, name: str, allowed: Sequence[str]) -> str:
-    """One of a few strings; the first is the default."""
+    """Return one of a few strings; the first is the default."""
     value = props.get(name, allowed[0])
     if not isinstance(value, str) or value not in allowed:
         _fail(props, name, value, "one of " + ", ".join(allowed))
@@ -64,7 +64,7 @@ def choice(props, name: str, allowed: Sequence[str]) -> str:
 
 
 def vector(props, name: str, default: Sequence[float] | None = None, *, nonzero: bool = False) -> list[float]:
-    """Three finite numbers; ``nonzero`` refuses the null vector. Without a default the key is required."""
+    """Return three finite numbers, not all 0 if ``nonzero``. Without a default the key is required."""
     if name not in props and default is None:
         raise ParameterError(f'{props.plugin_name()}: "{name}" is missing; give three numbers')
     value = props.get(name, default)
@@ -80,7 +80,7 @@ def vector(props, name: str, default: Sequence[float] | None = None, *, nonzero:
 
 
 def spectrum(props, name: str, default: float | None = None, *, emissive: bool = False):
-    """A spectrum or texture as a Mitsuba texture; numbers and colours have to be finite and not negative.
+    """Return a spectrum or texture as a texture; numbers and colours must be finite and not negative.
 
     ``emissive``: one for lights, with the spectrum of daylight where a variant renders spectra.
     """
@@ -97,7 +97,7 @@ def spectrum(props, name: str, default: float | None = None, *, emissive: bool =
 
 
 def text(props, name: str) -> str:
-    """A string parameter."""
+    """Return a string parameter."""
     value = props[name]
     if not isinstance(value, str) or not value:
         _fail(props, name, value, "a text that is not empty")

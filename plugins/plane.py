@@ -69,7 +69,7 @@ class MrtPlane(mi.Mesh):
 
 
 def _tangents(n: np.ndarray) -> np.ndarray:
-    """Two unit vectors [2, 3] that make a right-handed frame with the unit vector ``n`` [3].
+    """Return two unit vectors [2, 3] that make a right-handed frame with the unit vector ``n`` [3].
 
     Crossing with the axis that ``n`` has least of keeps axis-aligned planes axis-aligned.
     """

@@ -42,7 +42,7 @@ class Planes:
         return t, index, found
 
     def separate(self, p: mi.Point3f, q: mi.Point3f) -> mi.Bool:
-        """Is there a plane between two points?"""
+        """Return whether there is a plane between two points."""
         blocked = mi.Bool(False)
         for equation in self.equations:
             # Opposite sides: no distance is computed, so none can be wrong

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from .intersect import Frame
-    from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
-    from .merged_bsdf import UniformMaterial
+    from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts, UniformMaterial
     from .quadric_kinds import QuadricTable
 
 
@@ -53,7 +52,7 @@ class PlaneShape(ABC):
 
     @abstractmethod
     def has_flipped_normals(self) -> bool:
-        """Does the plane face the other side? As every shape of Mitsuba says."""
+        """Return whether the plane faces the other side; every shape of Mitsuba says so."""
 
 
 class QuadricShape(ABC):

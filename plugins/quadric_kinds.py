@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from .columns import Columns, Vector3, column
+from .columns import Columns, column
 from .intersect import (
-    BASE,
-    LATERAL,
-    TOP,
     Frame,
     SurfaceHit,
     SurfacePoint,
@@ -44,10 +41,6 @@ from .unit_meshes import (
 
 POINT, DISC, BALL = (0, 0, 0), (1, 1, 0), (1, 1, 1)
 """What the ends of a quadric are, by the squared semi-axes of their unit frame that span them."""
-
-
-# Lights are not held against the surfaces of groups larger than this
-MOST_LOOKED_AT = 64
 
 
 @dataclass(frozen=True)
@@ -145,23 +138,6 @@ class QuadricTable:
         rows = np.stack([row.array() for row in (frame.x, frame.y, frame.z)], axis=1)
         extents = np.broadcast_to(np.array(frame.extent, float), len(numbers))
         return cls(kind, frame.origin.array(), rows, extents, faces * np.arange(len(numbers)), flipped)
-
-    def heights(self, p: Sequence[float]) -> np.ndarray:
-        """Return the distances [n, 3] of a point from the parts of each, inf far from their boxes.
-
-        Of more than ``MOST_LOOKED_AT`` objects, none is looked at: [0, 3].
-        """
-        count = len(self.rows) if len(self.rows) <= MOST_LOOKED_AT else 0
-        heights = np.full((count, 3), np.inf)
-        for k, (low, high) in enumerate(self.boxes()[:count]):
-            x, y, z = (Vector3(row.tolist()) for row in self.rows[k])
-            frame = Frame(Vector3(self.origins[k].tolist()), x, y, z, float(self.extents[k]))
-            slack = 1e-6 * (high - low).max()
-            for part in (LATERAL, BASE, TOP):
-                foot = np.array(KINDS[self.kind].surface(Vector3(p), part, frame).p)
-                if ((foot >= low - slack) & (foot <= high + slack)).all():
-                    heights[k, part] = np.linalg.norm(foot - p)
-        return heights
 
     def boxes(self) -> np.ndarray:
         """Return the bounding boxes [n, 2, 3]."""

@@ -26,21 +26,11 @@ class Quadrics:
         counts = [len(t.rows) for t in tables]
         self.count = sum(counts)
         self.kinds = sorted({t.kind for t in tables})  # the kernel holds these only
-        kinds = np.repeat([self.kinds.index(t.kind) for t in tables], counts)
-        origins = np.concatenate([t.origins for t in tables])  # [n, 3]
-        rows = np.concatenate([t.rows for t in tables])  # [n, 3, 3]
+        self.flipped = any(t.flipped for t in tables)
         boxes = np.concatenate([t.boxes() for t in tables])
         tree = self.tree = Tree(boxes)
-        # Four numbers at a time: a row and a coordinate of the origin, three times; kind; size of
-        # coordinates; extent; side of the normal
         table = np.zeros((tree.leaves, 4, 4), np.float32)
-        table[tree.leaf_of, :3, :3] = rows
-        table[tree.leaf_of, :3, 3] = origins
-        table[tree.leaf_of, 3, 0] = kinds
-        table[tree.leaf_of, 3, 1] = np.abs(boxes).max(axis=(1, 2))
-        table[tree.leaf_of, 3, 2] = np.concatenate([t.extents for t in tables])
-        table[tree.leaf_of, 3, 3] = np.repeat([-1 if t.flipped else 1 for t in tables], counts)
-        self.flipped = any(t.flipped for t in tables)
+        table[tree.leaf_of] = _numbers(tables, self.kinds, boxes)
         self.table = aligned(table)
         owner, faces = np.zeros((2, tree.leaves), np.uint32)
         owner[tree.leaf_of] = np.repeat(np.arange(len(shapes)), counts)
@@ -48,18 +38,16 @@ class Quadrics:
         self.shapes = dr.gather(mi.ShapePtr, pointer("Shape", shapes), mi.UInt32(owner))
         self.faces = mi.UInt32(faces)
         dr.eval(self.shapes, self.faces)
+        leaves = tree.leaf_of[np.cumsum([0, *counts[:-1]])].tolist()  # of the first quadric of each shape
         frames = [s.moving_frame() for s in shapes]
-        first = np.cumsum([0, *counts])
-        self.moving = [
-            (int(tree.leaf_of[k]), f) for k, f in zip(first, frames, strict=False) if f is not None
-        ]
+        self.moving = [(k, f) for k, f in zip(leaves, frames, strict=True) if f is not None]
 
     def intersect(self, ray: Any, active: Any) -> tuple[Any, Any, Any]:
-        """Distance, place in the tables and part of the nearest quadric; distance ``ray.maxt`` for none."""
+        """Return distance, place in the tables and part of the nearest quadric; ``ray.maxt`` for none."""
         return self._walk(ray, active, any_hit=False)
 
     def occluded(self, ray: Any, active: Any) -> Any:
-        """Is there a quadric before ``ray.maxt``?"""
+        """Return whether there is a quadric before ``ray.maxt``."""
         return active & (self._walk(ray, active, any_hit=True)[0] < ray.maxt)
 
     def _walk(self, ray: Any, active: Any, *, any_hit: bool) -> tuple[Any, Any, Any]:
@@ -127,12 +115,27 @@ class Quadrics:
         return surface
 
     def scale(self, leaf: Any, active: Any) -> Any:
-        """Size of the coordinates of a quadric: the largest number in its box."""
+        """Return the size of the coordinates of a quadric: the largest number in its box."""
         return dr.gather(mi.Float, self.table, 16 * leaf + 13, active)
 
 
+def _numbers(tables: list[QuadricTable], kinds: list[str], boxes: np.ndarray) -> np.ndarray:
+    """Return what a kernel reads of each quadric, [n, 4, 4]: four numbers at a time.
+
+    A row and a coordinate of the origin, three times; kind, size of coordinates, extent, side of the normal.
+    """
+    numbers = np.zeros((len(boxes), 4, 4))
+    numbers[:, :3, :3] = np.concatenate([t.rows for t in tables])
+    numbers[:, :3, 3] = np.concatenate([t.origins for t in tables])
+    numbers[:, 3, 0] = np.concatenate([np.full(len(t.rows), kinds.index(t.kind)) for t in tables])
+    numbers[:, 3, 1] = np.abs(boxes).max(axis=(1, 2))
+    numbers[:, 3, 2] = np.concatenate([t.extents for t in tables])
+    numbers[:, 3, 3] = np.concatenate([np.full(len(t.rows), -1 if t.flipped else 1) for t in tables])
+    return numbers
+
+
 class ScalarQuadrics:
-    """The same for scalar variants, where a loop in Python over all quadrics is one cost among many."""
+    """``Quadrics`` for scalar variants, where a loop in Python over all quadrics is one cost among many."""
 
     def __init__(self, shapes: list) -> None:
         self.objects = [
@@ -183,7 +186,7 @@ class _ScalarObject:
 
 
 def quadrics_of(shapes: list) -> Quadrics | ScalarQuadrics | None:
-    """What traces these quadrics; None where there is none."""
+    """Return what traces these quadrics; None without any."""
     if not shapes:
         return None
     return Quadrics(shapes) if is_jit() else ScalarQuadrics(shapes)

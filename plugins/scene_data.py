@@ -22,7 +22,8 @@ from .planes import Planes
 from .protocols import MirrorBSDF, PlaneShape, QuadricShape
 from .quadric_kinds import KINDS
 from .quadrics import quadrics_of
-from .spheres import Spheres, center_and_radius, is_plain_sphere, is_sphere
+from .spheres import Spheres, is_plain_sphere, is_sphere
+from .touching import any_touching
 from .variants import but_not, is_jit, pointer, varies
 
 # Beyond these sizes, Embree's products of three lengths leave float32
@@ -70,13 +71,14 @@ class SceneReading:
         self._facts = self._read_facts()
 
     def is_of(self, scene: mi.Scene) -> bool:
-        """Is it this scene that was read? The id of a scene may have passed to another one, those of objects
-        held here cannot.
+        """Return whether this scene was read.
+
+        The id of a scene may have passed to another one, those of objects held here cannot.
         """
         return _objects(scene) == self.objects
 
     def is_stale(self, scene: mi.Scene) -> bool:
-        """Is it another scene, or changed since?"""
+        """Return whether it is another scene, or was changed since."""
         return not self.is_of(scene) or self._state() != self.state
 
     def _state(self) -> list[Any]:
@@ -118,7 +120,7 @@ class SceneReading:
             arriving=math.inf,
             emission=math.inf,
             alone=self._alone(),
-            touching=any(self._touches(place) for place in places(self.lights) if place is not None),
+            touching=any_touching(self.shapes, [place for place in places(self.lights) if place is not None]),
             value=max(map(_value_bound, self.bsdfs), default=0.0),
             diffuse=self._has_lobe("diffuse"),
             specular=self._has_lobe("specular"),
@@ -130,25 +132,11 @@ class SceneReading:
         )
 
     def _has_lobe(self, name: str) -> bool:
-        """Has a material such a lobe? Those that are not in the table may."""
+        """Return whether a material may have such a lobe; those outside the table may."""
         return self.unmergeable is not None or any(any(getattr(m, name)) for m in self.materials.values())
 
-    def _touches(self, place: tuple[float, ...]) -> bool:
-        """Is a point as near to a plane, sphere or quadric as rounding is?"""
-        p = np.array(place)
-
-        def near(height: np.ndarray | float, size: float) -> bool:
-            return bool(np.any(np.abs(height) <= CURVED * max(size, np.abs(p).max())))
-
-        if any(near(s.unit_normal @ p + s.distance, abs(s.distance)) for s in self.planes):
-            return True
-        balls = np.array([center_and_radius(s) for s in self.native if is_sphere(s)]).reshape(-1, 4)
-        if any(near(np.linalg.norm(b[:3] - p) - b[3], np.abs(b[:3]).max() + b[3]) for b in balls):
-            return True
-        return any(near(table.heights(place), float(np.abs(table.boxes()).max())) for table in self._tables)
-
     def _alone(self) -> bool:
-        """Is there one object only, convex, with a mirror on its outside alone?"""
+        """Return whether there is one object only, convex, which reflects on its outside."""
         plain = [s for s in self.native if is_plain_sphere(s)]
         convex = [t for t in self._tables if KINDS[t.kind].closed and len(t.rows) == 1 and not t.flipped]
         one_sided = all(isinstance(b, MirrorBSDF) for b in self.bsdfs)
@@ -242,7 +230,7 @@ class SceneData:
         return si, found, self.errors.size(si, found)
 
     def occluded(self, scene: mi.Scene, hit: Hit, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Bool:
-        """Does anything block the segment from ``hit`` to the light sample ``ds``?"""
+        """Return whether anything blocks the segment from ``hit`` to the light sample ``ds``."""
         o = self._off_surface(hit, ds.d)
         to_light = (ds.p - o) * (1 - TOUCHING) if self.plan.touching else ds.p - o
         blocked = self.planes.separate(o, o + to_light if self.plan.touching else ds.p)
@@ -314,12 +302,12 @@ def _check_size(mesh: mi.Shape) -> None:
 
 
 def has_mirror(bsdf: Any) -> bool:
-    """Does a BSDF reflect like a mirror?"""
+    """Return whether a BSDF reflects like a mirror."""
     return bsdf.has_attribute("mirror_reflectance") or mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
 
 
 def is_textured(bsdf: Any) -> bool:
-    """Does a BSDF vary over its surface? Mitsuba's own do not say so by their flags."""
+    """Return whether a BSDF varies over its surface; the flags of Mitsuba's own do not say so."""
     flags = bsdf.flags()
     if isinstance(bsdf, MirrorBSDF):
         return mi.has_flag(flags, mi.BSDFFlags.SpatiallyVarying)
@@ -327,7 +315,7 @@ def is_textured(bsdf: Any) -> bool:
 
 
 def is_oriented(bsdf: Any) -> bool:
-    """Does a BSDF depend on how the surface is turned about its normal?"""
+    """Return whether a BSDF depends on how the surface is turned about its normal."""
     if isinstance(bsdf, MirrorBSDF):
         return False
     names = {node.class_name() for node in mi.traverse(bsdf).hierarchy}

@@ -1,4 +1,4 @@
-"""Mitsuba's spheres: their centres and radii, and the hits on them put right."""
+"""Mitsuba's spheres: their centres and radii, and corrected hits on them."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ class Spheres:
 
 
 def is_sphere(shape: Any) -> bool:
-    """Is it Mitsuba's ``sphere``?"""
+    """Return whether a shape is Mitsuba's ``sphere``."""
     return shape.shape_type() == +mi.ShapeType.Sphere
 
 
 def is_plain_sphere(shape: Any) -> bool:
-    """Is it a sphere that faces outwards and does not emit?"""
+    """Return whether a shape is a sphere that faces outwards and does not emit."""
     return is_sphere(shape) and not (shape.has_flipped_normals() or shape.is_emitter())
 
 

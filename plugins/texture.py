@@ -72,7 +72,7 @@ class MrtTexture(mi.Texture):
 
 
 def _read(props: mi.Properties) -> mi.Bitmap:
-    """The picture in floats, marked as linear."""
+    """Return the picture in floats, marked as linear."""
     if ("filename" in props) == ("bitmap" in props):
         raise ParameterError('mrt_texture: give one of "filename" and "bitmap"')
     if "bitmap" in props:

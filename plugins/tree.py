@@ -86,7 +86,7 @@ class Tree:
         return dr.while_loop(start, goes_on, to_next_leaf, label="tree")[2]
 
     def _children(self, node: Any, inverse: list, shift: list, rows: list) -> tuple[list, list]:
-        """Where a ray enters and leaves the boxes of both children."""
+        """Return where a ray enters and leaves the boxes of both children."""
         near, far = [mi.Float(0), mi.Float(0)], [mi.Float(dr.inf), mi.Float(dr.inf)]
         for axis in range(3):
             first0, first1, last0, last1 = dr.gather(mi.Vector4f, self.boxes, 6 * node + rows[axis])
@@ -97,14 +97,14 @@ class Tree:
 
 
 def _to_next(node: Any, waiting: Any) -> tuple[Any, Any]:
-    """Up to the next child that waits; node 0 if none does."""
+    """Return the next child that waits, and what waits then; node 0 if none does."""
     levels = dr.tzcnt(waiting)
     done = waiting == 0
     return dr.select(done, 0, (node >> levels) ^ 1), dr.select(done, 0, (waiting >> levels) ^ 1)
 
 
 def _sort(centers: np.ndarray, depth: int) -> np.ndarray:
-    """The objects in the order of the leaves: segments of them, halved along their longest side."""
+    """Return the objects in the order of the leaves: segments of them, halved along their longest side."""
     order = np.arange(len(centers))
     for level in range(depth):
         segment = (np.arange(len(centers)) << level) // len(centers)
@@ -117,9 +117,10 @@ def _sort(centers: np.ndarray, depth: int) -> np.ndarray:
 
 
 def _heap(boxes: np.ndarray, leaf_of: np.ndarray, leaves: int) -> np.ndarray:
-    """Boxes of the children of all nodes, float32 [leaves, 3, 2, 4]: along each axis both lower ends and both
-    upper ends; then, for rays that run backwards, the upper ends first. Empty boxes are inside out, which no
-    ray meets.
+    """Return the boxes of the children of all nodes, float32 [leaves, 3, 2, 4].
+
+    Along each axis both lower ends and both upper ends; then, for rays that run backwards, the upper ends
+    first. Empty boxes are inside out, which no ray meets.
     """
     low, high = np.full((2 * leaves, 3), np.inf), np.full((2 * leaves, 3), -np.inf)
     margin = _SLACK * np.abs(boxes).max(axis=(1, 2))[:, None]

@@ -26,7 +26,7 @@ class UnitMesh:
 
 
 def unit_sphere_mesh(segments: int = 0) -> UnitMesh:
-    """An octahedron, whatever ``segments``."""
+    """Return an octahedron, whatever ``segments``."""
     points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
     octants = [(x, y, z) for x in (0, 1) for y in (2, 3) for z in (4, 5)]
     turned = [(sum(octant) % 2) == 1 for octant in octants]  # an odd number of mirrored axes
@@ -35,7 +35,7 @@ def unit_sphere_mesh(segments: int = 0) -> UnitMesh:
 
 
 def unit_cone_mesh(segments: int, *, capped: bool = True) -> UnitMesh:
-    """A fan from the apex, which has a vertex and a normal for each triangle, and the base disc."""
+    """Return a fan from the apex, which has a vertex and a normal for each triangle, and the base disc."""
     azimuth = 2 * np.pi * np.arange(segments + 1) / segments
     middle = 0.5 * (azimuth[1:] + azimuth[:-1])
     zero = np.zeros(segments)
@@ -52,7 +52,7 @@ def unit_cone_mesh(segments: int, *, capped: bool = True) -> UnitMesh:
 
 
 def unit_cylinder_mesh(segments: int, *, capped: bool = True) -> UnitMesh:
-    """A strip of quads split in two, and two discs."""
+    """Return a strip of quads split in two, and two discs."""
     azimuth = 2 * np.pi * np.arange(segments + 1) / segments
     top, base = _ring(azimuth, 0.0, slope=0.0, v=1.0), _ring(azimuth, 1.0, slope=0.0, v=0.0)
     i = np.arange(segments, dtype=np.uint32)
@@ -63,7 +63,7 @@ def unit_cylinder_mesh(segments: int, *, capped: bool = True) -> UnitMesh:
 
 
 def unit_capsule_mesh(segments: int) -> UnitMesh:
-    """Two half spheres of radius 1 around z = 0 and z = extent, and the tube between their rims."""
+    """Return two half spheres of radius 1 around z = 0 and z = extent, and the tube between their rims."""
     azimuth = 2 * np.pi * np.arange(segments + 1) / segments
     angles = np.linspace(0, np.pi / 2, max(segments // 4, 2) + 1)
     heights = np.concatenate([-np.cos(angles), np.cos(angles[::-1])])
@@ -90,7 +90,7 @@ def _ring(azimuth: np.ndarray, z: float, *, slope: float, v: float, radius: floa
 
 
 def _disc(segments: int, z: float) -> UnitMesh:
-    """A fan around the centre, facing away from z = 1/2."""
+    """Return a fan around the centre, facing away from z = 1/2."""
     rim = _ring(2 * np.pi * np.arange(segments) / segments, z, slope=0, v=0)
     points = np.concatenate([rim.points, [[0, 0, z]]])
     i = np.arange(segments, dtype=np.uint32)
@@ -100,7 +100,7 @@ def _disc(segments: int, z: float) -> UnitMesh:
 
 
 def _join(parts: Sequence[UnitMesh], more_faces: np.ndarray | None = None) -> UnitMesh:
-    """One mesh of several; ``more_faces`` index the joined vertices."""
+    """Return one mesh of several; ``more_faces`` index the joined vertices."""
     first = np.cumsum([0] + [len(p.points) for p in parts])
     faces = [p.faces + np.uint32(start) for p, start in zip(parts, first, strict=False)]
     return UnitMesh(

@@ -240,20 +240,20 @@ class MrtWhitted(mi.SamplingIntegrator):
         return Trace(final["radiance"], shading.radiance, hit, final["bounces"], final["shadow_rays"])
 
     def _continues(self, data: SceneData, throughput: mi.UnpolarizedSpectrum, depth: mi.UInt32) -> mi.Bool:
-        """May a path of this throughput and depth still change the picture?"""
+        """Return whether a path of this throughput and depth may still change the picture."""
         affordable, brightest = depth < self.max_depth, dr.max(throughput)
         if data.plan.cut_off.paths == math.inf:
             return affordable & (brightest > 0)
         return affordable & (brightest * data.path_limit > self.min_contribution)
 
     def _kept(self, data: SceneData, throughput: mi.UnpolarizedSpectrum) -> mi.UnpolarizedSpectrum:
-        """Keep a throughput finite: an infinite one times no light would be no number."""
+        """Keep a throughput finite: an infinite one times no light would be NaN."""
         return dr.minimum(throughput, LARGEST) if data.plan.guarded else throughput
 
     # ------------------------------------------- Shading -----------------------------------------------
 
     def _shade(self, data, scene, sampler, ray, hit, throughput, active) -> Shading:
-        """Light that leaves ``hit`` back along ``ray``, and its mirror reflection; or the sky.
+        """Return the light that leaves ``hit`` back along ``ray``, and its mirror reflection; or the sky.
 
         ``throughput`` is that of the path up to ``hit``.
         """
@@ -290,7 +290,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         return Shading(radiance, shadow_rays, reflectance, self._cost(int_ior))
 
     def _cost(self, int_ior):
-        """What a bounce off a material of this index takes from the bounce budget."""
+        """Return what a bounce off a material of this index takes from the bounce budget."""
         if self.bounce_budget == "plain":
             return mi.UInt32(1)
         return mi.UInt32(dr.maximum(10 - mi.Int32(dr.minimum(10 * int_ior, 10)), 1))
@@ -310,7 +310,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         return state[1], state[2]
 
     def _light_sample(self, data, light, sampler, hit) -> LightSample:
-        """The direction to a light and what arrives from it, if nothing is in between."""
+        """Return the direction to a light and what arrives from it, if nothing is in between."""
         u = sampler.next_2d(hit.found) if data.plan.random else mi.Point2f(0.5)
         ds, weight = light.sample_direction(hit.si, u, hit.found)
         wo = hit.si.to_local(ds.d)
@@ -320,7 +320,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         return LightSample(ds, wo, mi.unpolarized_spectrum(weight), facing)
 
     def _visible_part(self, data, scene, hit, throughput, sample, bsdf_value):
-        """A light's contribution where nothing blocks it, and the number of shadow rays that took to know."""
+        """Return a light's contribution where nothing blocks it, and the shadow rays traced for it."""
         value = sample.weight * bsdf_value
         if self.clamp:
             value = dr.clip(value, 0, 1)
@@ -342,8 +342,7 @@ class MrtWhitted(mi.SamplingIntegrator):
 
 
 def _construct(integrator, props) -> None:
-    """Mitsuba logs a warning about every Python integrator in a scalar variant; ``mrt.render`` gives its
-    own."""
+    """Construct the base class without Mitsuba's warning about scalar variants; ``mrt.render`` gives one."""
     level = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)
     try:

@@ -47,8 +47,8 @@ def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]
 @pytest.fixture(scope="session")
 def original_data() -> Path:
     """The folder of the original program's scenes, tables and renders; skips where it is not at hand."""
-    beside = Path(__file__).resolve().parents[2] / "shared" / "reference"
-    folder = Path(os.environ.get("MRT_REFERENCE", beside))
+    sibling = Path(__file__).resolve().parents[2] / "shared" / "reference"
+    folder = Path(os.environ.get("MRT_REFERENCE", sibling))
     if not folder.is_dir():
         pytest.skip("no data of the original program: set MRT_REFERENCE to its folder")
     return folder

@@ -187,7 +187,7 @@ def read(path: Path) -> dict[str, Any]:
         raise UsageError(f"cannot compare with {path}: {error}") from error
     whole = isinstance(found, dict) and found.keys() >= set(SCHEMA["required"])
     if not whole or found["schema"] != 2:
-        raise UsageError(f"cannot compare with {path}: it is no file of this benchmark (schema 2)")
+        raise UsageError(f"cannot compare with {path}: it is not a file of this benchmark (schema 2)")
     return found
 
 

@@ -47,6 +47,7 @@ STUDIES = {
     "growth": Entry("growth", "how does time grow with pixels, objects, lights and bounces", 3, 180),
     "rivals": Entry("rivals", "how fast are our plugins against Mitsuba's own", 5, 120),
     "objects": Entry("objects", "how good are mesh cones, what do exact ones cost", 3, 60),
+    "workers": Entry("workers", "how fast are sweeps on several processes, and are they equal", 5, 120),
     "acceleration": Entry("acceleration", "how does time grow with the number of objects", 9, 60),
 }
 # All about speed; the first name stands for all of them
@@ -108,7 +109,7 @@ def _validate(options: argparse.Namespace) -> int:
     report.prepare(options.out, "summary.json", "index.html")
     seconds = sum(STUDIES[name].quick if options.quick else STUDIES[name].full for name in names)
     print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
-    # With a cache of their own, studies of speed can tell how long compilation takes
+    # With a cache of their own, studies of speed see how long compilation takes
     with nullcontext() if options.quick or not set(names) & set(SPEED) else own_cache():
         return _run(names, options)
 

@@ -1,4 +1,4 @@
-"""What a render tells of itself beside progress: log records of ``mrt_mitsuba``, on the error output."""
+"""Logging for this package, Mitsuba and Dr.Jit."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Putting files in the place of others: all of one result, or none.
 
-New files are written beside the old ones under temporary names. Once all are complete and on the disk, they
+New files are written next to the old ones under temporary names. Once all are complete and on the disk, they
 take the places of the old; if anything goes wrong before, they disappear. Those of a process that was killed
 are removed by the next one that writes to the folder: a lock says whether their writer still lives.
 """
@@ -31,7 +31,7 @@ _tidied: set[str] = set()  # folders
 def check_target(path: Path) -> None:
     """Raise ``OutputError`` if ``path`` cannot be written; to be asked before the work. Leaves no trace."""
     with _explained(path):
-        temporary, file = _open_beside(_target(path))
+        temporary, file = _open_next_to(_target(path))
         file.close()
         _discard(temporary)
 
@@ -57,7 +57,7 @@ def replacing_together(paths: Sequence[Path]) -> Iterator[list[IO[bytes]]]:
             for path in paths:
                 with _explained(path):
                     target = _target(path)
-                    temporary, file = _open_beside(target)
+                    temporary, file = _open_next_to(target)
                     stack.callback(_close, file)
                     written.append((temporary, target))
                     files.append(file)
@@ -150,11 +150,11 @@ def _target(path: Path) -> str:
 
 
 def _is_kept_by(owner: int, folder: os.stat_result) -> bool:
-    """Whether a folder such as /tmp (with a sticky bit) lets nobody but others replace a file in it."""
+    """Return whether a folder such as /tmp (with a sticky bit) forbids this user to replace a file in it."""
     return bool(folder.st_mode & stat.S_ISVTX) and os.geteuid() not in (0, owner, folder.st_uid)
 
 
-def _open_beside(target: str) -> tuple[str, IO[bytes]]:
+def _open_next_to(target: str) -> tuple[str, IO[bytes]]:
     """Create and lock a new file in the folder of ``target``, with the rights the user's umask gives."""
     folder = os.path.dirname(target)
     _tidy(folder)

@@ -18,7 +18,6 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.interrupts import surfacing
 from mrt_mitsuba.memory import Budget, Workspace
 from mrt_mitsuba.output.layers import AVERAGED, TABLE
-from mrt_mitsuba.output.result import Result, Timings
 from mrt_mitsuba.rays.exposure import Exposure
 from mrt_mitsuba.rays.film import pixel_format, spectral_bands
 from mrt_mitsuba.rays.lattice import FILM
@@ -28,6 +27,7 @@ from mrt_mitsuba.rendering.job import Job, Kernels, counting_kernels
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import FilmFacts, Plan, RenderFacts, make_plan
 from mrt_mitsuba.rendering.progress import Progress, default
+from mrt_mitsuba.rendering.result import Result, Timings
 from mrt_mitsuba.rendering.rounds import Goal, OnRound
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, shader_for
@@ -286,7 +286,7 @@ def _exposures(plan: Plan, seed: int) -> list[Exposure]:
 
 
 def _workspace(plan: Plan, exposures: Sequence[Exposure], budget: Budget) -> Workspace:
-    return Workspace.beside(
+    return Workspace.next_to(
         plan.seen.width,
         plan.seen.height,
         plan.channels,

@@ -11,7 +11,7 @@ class Detector:
 
     name: str
     reads: tuple[str, ...]  #: layers, in the order of the filter's arguments
-    takes_variance: bool  #: can it tell noise from edges
+    takes_variance: bool  #: can it distinguish noise from edges
 
 
 DETECTORS = {

@@ -1,7 +1,7 @@
 """Refining a lattice to an error: it is doubled in the pixels that doubling it still changed.
 
-A picture without random numbers has no variance. What doubling the lattice changes tells the error instead:
-along edges it falls with aa (by the report's lattice, which is off centre) or with the power 3/2 of aa.
+A picture without random numbers has no variance. Its error is estimated from what doubling the lattice
+changes: along edges it falls with aa (by the report's lattice, which is off centre) or with its power 3/2.
 """
 
 from __future__ import annotations

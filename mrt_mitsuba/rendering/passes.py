@@ -144,7 +144,7 @@ class Passes:
         return getattr(filters, f"{detector}_edges")(*read, **options)
 
     def _variance(self, rows: slice) -> np.ndarray:
-        """Return the variance of pixels as their rays tell it, [rows, W, 3]."""
+        """Return the variance of pixels, estimated from their rays, [rows, W, 3]."""
         rays = self._exposure.centre(self._pixels).rays_per_pixel
         square = self._picture("square")[rows] - self._picture("image")[rows] ** 2
         return np.asarray(np.maximum(square, 0) / (rays - 1))

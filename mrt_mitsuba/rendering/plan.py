@@ -173,6 +173,8 @@ class Plan(RenderFacts):
             text = moments.get(self.motion, "{} frames").format(self.motion_samples)
             lines += [f"  pass    motion blur: {text}"]
         lines += [f"  pass    {step}" for step in self.passes]
+        if self.film and self.lattice.kind == FILM:
+            lines += [f"  film    {self.film.rfilter}, {self.film.pixel_format or 'spectral bands'}"]
         if self.kernel is None or self.parts is None:
             lines += [f"  kernel  {self.integrator}.sample"]
         else:

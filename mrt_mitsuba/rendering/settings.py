@@ -29,12 +29,11 @@ from mrt_mitsuba.options import (
 from mrt_mitsuba.output.layers import LAYERS
 from mrt_mitsuba.rays.lattice import LATTICES
 from mrt_mitsuba.rendering.detectors import DETECTORS
-from mrt_mitsuba.scene.model import SIZE
+from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE
 
 NOISE = "noise"  # the aamode that puts rays where the variance is
-MIN_SPP = 16  # rays of a pixel that tell its variance
+MIN_SPP = 16  # rays of a pixel from which its variance is known
 MAX_SPP = 4096  # of a pixel on average, where a target alone would ask for more
-LARGEST_SIDE = 65536  # pixels; whether the memory suffices is checked where it is planned
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
 
 
@@ -53,12 +52,8 @@ class RenderSettings:
     Raises ``UsageError`` for a value of the wrong type or range.
     """
 
-    width: int | None = option(
-        None, integer(1, LARGEST_SIDE), f"image width in pixels, up to {LARGEST_SIDE}", str(SIZE[0])
-    )
-    height: int | None = option(
-        None, integer(1, LARGEST_SIDE), f"image height in pixels, up to {LARGEST_SIDE}", str(SIZE[1])
-    )
+    width: int | None = option(None, SIDE, "image width in pixels, up to 65536", str(SIZE[0]))
+    height: int | None = option(None, SIDE, "image height in pixels, up to 65536", str(SIZE[1]))
     aa: int | None = option(
         None, integer(1, LARGEST_AA), f"anti-aliasing: aa x aa samples per pixel, up to {LARGEST_AA}", "4"
     )
@@ -84,7 +79,7 @@ class RenderSettings:
         "samples from the pixel centre on, around it, or by the rules of a scene's film",
         "report, own scenes: film",
     )
-    fresnel: str | None = option(None, choice("schlick", "dielectric"), "reflectance formula", "schlick")
+    fresnel: str | None = option(None, FRESNEL, "reflectance formula", "schlick")
     focaldist: float | None = option(
         None, number(0), "distance in focus, from the camera; 0: no depth of field", "from the scene"
     )

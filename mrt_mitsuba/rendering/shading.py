@@ -107,7 +107,7 @@ class RayValues:
         return to_rgb(dr.select(self.found, albedo, 0), self.ray)
 
     def rgb(self, spectrum: Any) -> Any:
-        """Linear sRGB of a radiance along the rays, with the sensor's weight."""
+        """Return the linear sRGB of a radiance along the rays, with the sensor's weight."""
         return to_rgb(spectrum * self.weight, self.ray)
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.rendering.settings import check
-from mrt_mitsuba.scene.model import Scene
+from mrt_mitsuba.options import check
+from mrt_mitsuba.scene.model import FRESNEL, OBJECTS, SIDE, Scene
 from mrt_mitsuba.scene.report import report_scene
 
 FLAVORS = ("mrt", "stock")
@@ -39,11 +39,11 @@ def scene_dict(
     """
     if flavor not in FLAVORS:
         raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
-    given: dict[str, Any] = {"width": width, "height": height, "fresnel": fresnel}
-    given = {name: check(name, value) for name, value in given.items() if value is not None}
+    given = {"width": (SIDE, width), "height": (SIDE, height), "fresnel": (FRESNEL, fresnel)}
+    options = {name: check(name, kind, value) for name, (kind, value) in given.items() if value is not None}
     runtime.use()
     scene = scene if isinstance(scene, Scene) else report_scene(scene)
-    result = scene.to_dict(**given)
+    result = scene.to_dict(**options)
     return result if flavor == "mrt" else _stock(result, scene)
 
 
@@ -52,7 +52,7 @@ def write_xml(
 ) -> list[str]:
     """Write a scene as XML through Mitsuba's own writer; return the paths of what was written.
 
-    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file beside it,
+    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file next to it,
     named after the XML file and the shape; all files are replaced, or none. Raises ``OutputError`` if a file
     cannot be written, ``SceneError`` for groups of objects (``mrt_group``), which have neither an XML form
     nor a stock counterpart.
@@ -77,14 +77,14 @@ def write_xml(
 
 
 def xml_text(scene: int | Scene, *, flavor: str = "mrt", fresnel: str = "schlick") -> str:
-    """Return the XML of a scene. Raises ``SceneError`` for what needs files beside it; see ``write_xml``."""
+    """Return the XML of a scene. Raises ``SceneError`` for what needs files next to it; see ``write_xml``."""
     if flavor not in FLAVORS:
         raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
     return _text_of(scene_dict(scene, fresnel=fresnel), scene, flavor)
 
 
 def _text_of(mine: dict[str, Any], scene: int | Scene, flavor: str) -> str:
-    """The XML of a dict of this project's plugins."""
+    """Return the XML of a dict of this project's plugins."""
     import mitsuba as mi
 
     for name, node in mine.items():
@@ -116,7 +116,7 @@ def _with_focus(text: str, scene: Scene) -> str:
 
 
 def _with_whole_path(node: Any) -> Any:
-    """A material whose picture is found from wherever the XML lies."""
+    """Return a material whose picture is found from wherever the XML lies."""
     picture = node.get("diffuse_reflectance", {}) if isinstance(node, dict) else {}
     if "filename" not in picture:
         return node
@@ -124,13 +124,13 @@ def _with_whole_path(node: Any) -> Any:
 
 
 def _ply_node(node: dict[str, Any], filename: str) -> dict[str, Any]:
-    """A shape that reads the file; triangles of ``mrt_mesh`` are flat."""
+    """Return a shape that reads the file; triangles of ``mrt_mesh`` are flat."""
     flat = {"face_normals": True} if node["type"] == "mrt_mesh" else {}
     return {"type": "ply", "filename": filename, **flat, "bsdf": node["bsdf"]}
 
 
 def _ply(node: dict[str, Any]) -> bytes:
-    """The mesh of a shape as a binary PLY file."""
+    """Return the mesh of a shape as a binary PLY file."""
     import mitsuba as mi
 
     stream = mi.MemoryStream()
@@ -148,7 +148,7 @@ def _stock(scene_as_dict: dict[str, Any], scene: Scene) -> dict[str, Any]:
             raise SceneError(
                 f"{name} has no counterpart among Mitsuba's plugins: {kind} {_WITHOUT_STOCK[kind]}"
             )
-        if kind in ("mrt_cylinder", "mrt_capsule"):
+        if kind in _TUBES:
             result |= {f"{name}_{part}": child for part, child in _stock_tube(node).items()}
         else:
             result[name] = _REPLACEMENTS[kind](node, scene) if kind in _REPLACEMENTS else node
@@ -160,7 +160,7 @@ def _stock_integrator(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
 
 
 def _stock_bsdf(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
-    """The same lobes over a diffuse base; colours above one and negative roughness have no stock
+    """Return the same lobes over a diffuse base; colours above one and negative roughness have no stock
     counterpart."""
 
     def clipped(color: dict[str, Any]) -> dict[str, Any]:
@@ -182,7 +182,7 @@ def _stock_bsdf(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
 
 
 def _stock_light(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
-    """A light with falloff, of the same irradiance at the camera's target."""
+    """Return a light with falloff, of the same irradiance at the camera's target."""
     squared = sum((a - b) ** 2 for a, b in zip(node["position"], scene.camera.target, strict=True))
     color = {**node["intensity"], "value": [c * squared for c in node["intensity"]["value"]]}
     return {"type": "point", "position": node["position"], "intensity": color}
@@ -196,7 +196,7 @@ def _stock_plane(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
 
 
 def _stock_tube(node: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """An open tube, and at each end a disc that faces away from the other, or a ball."""
+    """Return an open tube, and at each end a disc that faces away from the other, or a ball."""
     p0, p1, radius = node["p0"], node["p1"], node["radius"]
 
     def disc(center: list[float], opposite: list[float]) -> dict[str, Any]:
@@ -211,7 +211,7 @@ def _stock_tube(node: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
-    """What takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
+    """Return what takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
     import mitsuba as mi
 
     length = sum(c * c for c in normal) ** 0.5
@@ -223,7 +223,7 @@ def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
 
 
 def _stock_texture(node: dict[str, Any]) -> dict[str, Any]:
-    """The nearest texel as stored; half a texel off the report's look-up, which shrinks the picture so
+    """Return the nearest texel as stored; half a texel off the report's look-up, which shrinks the picture so
     far."""
     stored = {"raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
     return {"type": "bitmap", "filename": os.path.abspath(node["filename"]), **stored}
@@ -236,14 +236,17 @@ _REPLACEMENTS: dict[str, Callable[[dict[str, Any], Scene], dict[str, Any]]] = {
     "mrt_plane": _stock_plane,
 }
 
-# Shapes that are written as files beside the XML
-_IN_FILES = {"mrt": ("mrt_mesh",), "stock": ("mrt_mesh", "mrt_cone")}
+_TUBES = ("mrt_cylinder", "mrt_capsule")
+# Solids that Mitsuba's own plugins show as meshes
+_AS_MESHES = {f"mrt_{kind}" for kind in OBJECTS} - {"mrt_sphere", *_TUBES}
+# Shapes that are written as files next to the XML
+_IN_FILES = {"mrt": {"mrt_mesh"}, "stock": {"mrt_mesh", *_AS_MESHES}}
 _WITHOUT_XML = {
-    "mrt_mesh": "write_xml, or mrt export, puts it into a file beside the XML",
+    "mrt_mesh": "write_xml, or mrt export, puts it into a file next to the XML",
     "mrt_group": "render it from Python, or write at most 1000 spheres or 100 objects of another kind",
 }
 _WITHOUT_STOCK = {
-    "mrt_mesh": "is made of arrays, and ply reads a file; write_xml, or mrt export, puts it beside the XML",
-    "mrt_cone": "is a mesh to them; write_xml, or mrt export, puts it into a file beside the XML",
+    **dict.fromkeys(_AS_MESHES, "is a mesh to them; write_xml, or mrt export, puts it into a file"),
+    "mrt_mesh": "is made of arrays, and ply reads a file; write_xml, or mrt export, writes it",
     "mrt_group": "is one shape of many objects; use the flavor mrt",
 }

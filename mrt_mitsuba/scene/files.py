@@ -13,7 +13,7 @@ from pathlib import Path
 from mrt_mitsuba.errors import MrtWarning, SceneError
 
 LONGEST_LINE = 2**18  # bytes, about 40,000 corners of a face
-MISSING = "is missing or may not be read in"  # what is said of a file that was not found
+MISSING = "is missing or may not be read in"  # what messages say about a file that was not found
 
 
 def require_file(path: str | os.PathLike[str]) -> None:
@@ -88,7 +88,7 @@ def _check_lengths(path: Path, data: bytes) -> None:
 
 
 def decode(data: bytes) -> str:
-    """Text of unknown encoding: UTF-8, else the Latin letters that older exporters wrote."""
+    """Return text of unknown encoding: UTF-8, else the Latin letters that older exporters wrote."""
     try:
         return data.decode()
     except UnicodeDecodeError:
@@ -109,7 +109,7 @@ def find(name: str, folders: list[Path]) -> Path | None:
 
 
 def picture_size(path: str) -> tuple[int, int] | None:
-    """Return width and height of a picture without reading its pixels; None if its header does not tell."""
+    """Return width and height of a picture without reading its pixels; None if its header does not say."""
     import OpenEXR
     from PIL import Image
 
@@ -126,7 +126,7 @@ def picture_size(path: str) -> tuple[int, int] | None:
                     return picture.size
             finally:
                 Image.MAX_IMAGE_PIXELS = limit
-    except Exception:  # whatever libraries raise of broken files; who reads the pixels reports it
+    except Exception:  # whatever libraries raise on broken files; reading the pixels reports it
         return None
 
 
@@ -148,7 +148,7 @@ class Findings:
 
 
 def numbers(where: str, statement: str, words: list[str], least: int, most: int) -> list[float]:
-    """``least`` to ``most`` finite numbers. Raises ``SceneError`` that names the statement."""
+    """Return ``least`` to ``most`` finite numbers. Raises ``SceneError`` that names the statement."""
     if not least <= len(words) <= most:
         wanted = f"{least}" if least == most else f"{least} to {most}"
         raise SceneError(f"{where}: {statement} has {len(words)} numbers, but must have {wanted}")

@@ -8,6 +8,7 @@ parser would end the process are refused as well.
 
 Objects are made one after the other. In parallel, Mitsuba makes Python objects inside each other, to the
 limit of the stack, and Dr.Jit's messages may wait for each other for ever; one by one takes no longer.
+``loaders.one_by_one`` makes that the default of Mitsuba's own loaders for scenes with our plugins.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.loaders import mitsuba_first, mitsuba_home
 from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.scene.files import picture_size, require_file
 
@@ -80,7 +82,7 @@ def _make(parse: Callable[[Any], Any], name: str, budget: Budget | None) -> Any:
     config.parallel = False
     try:
         state = parse(config)
-        mi.set_file_resolver(_mitsuba_first())  # a <path> of the file puts its folder before
+        mitsuba_first()  # a <path> of the file puts its folder before
         for node in state.nodes:
             kind, filename = node.props.plugin_name(), node.props.get("filename", None)
             _check_plugin(kind, name)
@@ -106,36 +108,11 @@ def _resolving(folder: str | None) -> Iterator[None]:
     import mitsuba as mi
 
     before = mi.file_resolver()
-    mi.set_file_resolver(_mitsuba_first(folder))
+    mitsuba_first(folder)
     try:
         yield
     finally:
         mi.set_file_resolver(before)
-
-
-def mitsuba_first() -> None:
-    """Let Mitsuba find its own plugins before files of their names in other folders."""
-    import mitsuba as mi
-
-    mi.set_file_resolver(_mitsuba_first())
-
-
-def _mitsuba_first(folder: str | None = None) -> Any:
-    import mitsuba as mi
-
-    home, current = _home(), mi.file_resolver()
-    folders = [home, *([folder] if folder else []), *(str(current[i]) for i in range(len(current)))]
-    resolver = mi.FileResolver()
-    resolver.clear()
-    for each in dict.fromkeys(folders):
-        resolver.append(each)
-    return resolver
-
-
-def _home() -> str:
-    import mitsuba as mi
-
-    return os.path.dirname(os.path.abspath(mi.__file__))
 
 
 def _resolved(path: str) -> str:
@@ -153,11 +130,11 @@ def _check_plugin(plugin: str, name: str) -> None:
         return
     for ending in _NATIVE:
         file = os.path.join("plugins", plugin + ending)
-        strange = "/" in plugin or not os.path.isfile(os.path.join(_home(), file))
+        strange = "/" in plugin or not os.path.isfile(os.path.join(mitsuba_home(), file))
         if strange and os.path.exists(_resolved(file)):
             raise SceneError(
                 f"cannot load {name}: the plugin {plugin!r} is {_resolved(file)}, native code that is not "
-                f"Mitsuba's; move it away or, if you trust it, into {_home()}/plugins"
+                f"Mitsuba's; move it away or, if you trust it, into {mitsuba_home()}/plugins"
             )
 
 
@@ -226,7 +203,7 @@ def _check_xml(path: str, parameters: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def _tags(data: bytes) -> Iterator[bytes]:
-    """Opening and closing tags of XML, up to the first that has no end."""
+    """Yield opening and closing tags of XML, up to the first that has no end."""
     start = data.find(b"<")
     while start >= 0:
         closing = next((end for begin, end in _NO_TAGS if data.startswith(begin, start)), None)
@@ -239,7 +216,7 @@ def _tags(data: bytes) -> Iterator[bytes]:
 
 
 def _end_of_tag(data: bytes, position: int) -> int:
-    """Place of the next ``>`` outside quotes, or -1."""
+    """Return the place of the next ``>`` outside quotes, or -1."""
     while mark := _TAG_MARK.search(data, position):
         if mark[0] == b">":
             return mark.start()

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import SceneError
+from mrt_mitsuba.options import choice, integer
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,6 +26,8 @@ BLUE_SKY: Color = (0.2, 0.2, 0.7)
 
 
 SIZE = (800, 600)  # of the picture, in pixels, where the scene brings no film
+SIDE = integer(1, 65536)  # of a picture, in pixels; whether the memory suffices is checked later
+FRESNEL = choice("schlick", "dielectric")
 LARGEST = 3.4e38  # number that Mitsuba's float32 can hold
 FOCAL_RANGE = 2.0  # half-width of the sharp zone
 
@@ -139,6 +142,7 @@ class Scene:
     focal_distance: float | None = None
     focal_range: float = FOCAL_RANGE
     title: str = field(default="", compare=False)
+    pictures: frozenset[str] = field(default=frozenset(), compare=False)  #: paths that its files name
 
     def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> dict[str, Any]:
         """Return the scene as a Mitsuba dict of this project's plugins, materials shared by reference.
@@ -274,7 +278,7 @@ class _Materials:
 
 
 def _ray_options(meshes: tuple[Mesh, ...]) -> dict[str, bool]:
-    """Embree lets rays through between slivers unless asked not to; what has no mesh needs no care."""
+    """Return options of the scene for meshes: by default, Embree lets rays through between slivers."""
     return {"embree_use_robust_intersections": True} if meshes else {}
 
 
@@ -304,7 +308,7 @@ def _numbers(thing: Any) -> tuple[float, ...]:
 # More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape
 # and more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of
 # recursion
-MOST_SINGLE = {Sphere: 1000, Cone: 100, Cylinder: 100, Capsule: 100}
+MOST_SINGLE = dict.fromkeys(OBJECTS.values(), 100) | {Sphere: 1000}
 
 
 def _split(objects: tuple) -> tuple[tuple, tuple]:
@@ -318,7 +322,7 @@ def _split(objects: tuple) -> tuple[tuple, tuple]:
 
 
 def _group(kind: str, objects: tuple, materials: _Materials, fresnel: str) -> dict[str, Any]:
-    """One shape of many objects. Where their materials differ, one BSDF looks their values up by object."""
+    """Return one shape of many objects, with one BSDF that looks up values by object if they differ."""
     import mitsuba as mi
     import numpy as np
 

@@ -61,7 +61,7 @@ class _Entry:
 def read_mtl(
     path: str | os.PathLike[str], *, convention: str = "report", folder: Path | None = None
 ) -> dict[str, Material]:
-    """The materials of an MTL file by name.
+    """Return the materials of an MTL file by name.
 
     ``convention``:
 
@@ -79,7 +79,7 @@ def read_mtl(
     """
     path = Path(path)
     findings = Findings()
-    # the report's reading is what it uses; of the standard's, what is left out is told
+    # the report's reading defines itself; from the standard's, statements may be missing
     unused = findings if convention == "standard" else None
     entries = _parse(path, decode(read_text(path)).split("\n"), unused)
     make = {"report": _report_material, "standard": _standard_material}[convention]
@@ -176,7 +176,7 @@ def _standard_material(entry: _Entry) -> Material:
 
 
 def _texture(path: Path, line: int, rest: str, folder: Path | None, findings: Findings) -> str | None:
-    """The picture that a map_Kd statement names, or None, with a warning, where there is none."""
+    """Return the picture that a map_Kd statement names, or None, with a warning, where there is none."""
     folders = [path.parent] if folder is None else [folder, path.parent]
     name = rest
     found = find(name, folders)
@@ -191,7 +191,7 @@ def _texture(path: Path, line: int, rest: str, folder: Path | None, findings: Fi
 
 
 def _without_options(rest: str) -> str:
-    """The file name of a map statement behind its options."""
+    """Return the file name of a map statement, which follows its options."""
     words = rest.split()
     while words and words[0] in _MAP_OPTIONS:
         least, most = _MAP_OPTIONS[words.pop(0)]

@@ -39,7 +39,7 @@ _CORNERS = {
 
 
 def _run(keyword: bytes, word: bytes, count: int) -> bytes:
-    """Pattern of up to some thousand lines of a keyword and ``count`` words."""
+    """Return the pattern of up to some thousand lines of a keyword and ``count`` words."""
     return b"(?:%s%s%s){1,%d}" % (keyword, (_GAP + word) * count, _END, _LINES_AT_ONCE)
 
 
@@ -57,23 +57,31 @@ _NUMBERS_ONLY = bytes(32 if chr(i) in "vtnf/\n" else i for i in range(256))
 
 
 def read_obj(path: str | os.PathLike[str], *, convention: str = "report") -> tuple[Mesh, ...]:
-    """The meshes of an OBJ file, one for each material that is used.
+    """Return the meshes of an OBJ file, one for each material that is used.
 
     Faces are ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``, with positive or negative indices. One with more than
     three corners is cut into a fan around its first corner, which is right for convex faces. Normals are used
     by the convention "standard" for the faces that have them; else triangles are flat, and their normal
-    follows from the winding. Material libraries are looked for beside
-    the file and read by ``convention`` (see ``read_mtl``); one that is missing is named in a warning. Faces
-    of no known material get ``DEFAULT_MATERIAL``.
+    follows from the winding. Material libraries are looked for next to the file and read by ``convention``
+    (see ``read_mtl``); one that is missing is named in a warning. Faces of no known material get
+    ``DEFAULT_MATERIAL``.
 
     Raises ``SceneError`` with file and line for what cannot be read, ``UsageError`` for an unknown
     convention.
     """
+    return read_model(path, convention=convention)[0]
+
+
+def read_model(
+    path: str | os.PathLike[str], *, convention: str = "report"
+) -> tuple[tuple[Mesh, ...], frozenset[str]]:
+    """Return what ``read_obj`` does, and the pictures that the material libraries name, used or not."""
     if convention not in CONVENTIONS:
         raise UsageError(f"convention={convention!r}: must be {' or '.join(CONVENTIONS)}")
     reader = _Reader(Path(path), convention)
     reader.read()
-    return reader.meshes()
+    textures = {material.texture for material in reader.materials.values()}
+    return reader.meshes(), frozenset(texture for texture in textures if texture is not None)
 
 
 @dataclass
@@ -126,7 +134,7 @@ class _Reader:
             self.line += lines
 
     def _statement(self, text: bytes) -> None:
-        """One line of a form that is not covered by the runs."""
+        """Read one line of a form that is not covered by the runs."""
         words = decode(text.split(b"#", 1)[0]).split()
         if not words:
             return
@@ -163,7 +171,7 @@ class _Reader:
     # ------------------------------------------ Faces --------------------------------------------------
 
     def _face(self, words: list[str]) -> None:
-        """A face of any number of corners, in any of the four forms."""
+        """Read a face of any number of corners, in any of the four forms."""
         if len(words) < 3:
             self.fail(f"f has {len(words)} corners, but must have 3 or more")
         corners, forms = [], set()
@@ -179,7 +187,7 @@ class _Reader:
         self._add_faces(np.array([corners], np.int64), forms.pop())
 
     def _add_faces(self, indices: np.ndarray, kinds: tuple[str, ...]) -> None:
-        """Faces [F, corners, kinds of index]; makes indices count from 0."""
+        """Add faces [F, corners, kinds of index], their indices counted from 0."""
         resolved = {}
         for k, kind in enumerate(kinds):
             index = indices[:, :, k]
@@ -227,7 +235,7 @@ class _Reader:
     # ------------------------------------------ Result -------------------------------------------------
 
     def meshes(self) -> tuple[Mesh, ...]:
-        """One mesh for each material, in the order of their first use."""
+        """Return one mesh for each material, in the order of their first use."""
         self.findings.warn()
         self._check_ranges()
         points, uvs, normals = (
@@ -262,7 +270,7 @@ class _Reader:
 def _mesh(
     points: np.ndarray, uvs: np.ndarray, normals: np.ndarray | None, faces: list[_Faces], material: Material
 ) -> Mesh:
-    """The mesh of some faces, with the vertices that they use."""
+    """Return the mesh of some faces, with the vertices that they use."""
     v, vt, vn = (np.concatenate([_triangles(getattr(f, kind)) for f in faces]) for kind in ("v", "vt", "vn"))
     if material.texture is None and normals is None:
         used, index = _compact(v, len(points))
@@ -275,7 +283,7 @@ def _mesh(
 
 
 def _triangles(index: np.ndarray) -> np.ndarray:
-    """Fans [F (n − 2), 3] around the first corners of faces [F, n]."""
+    """Return fans [F (n − 2), 3] around the first corners of faces [F, n]."""
     corners = index.shape[1]
     if corners == 3:
         return index
@@ -284,7 +292,7 @@ def _triangles(index: np.ndarray) -> np.ndarray:
 
 
 def _compact(index: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices used, in their order, and the faces in terms of them."""
+    """Return the vertices used, in their order, and the faces in terms of them."""
     used = np.zeros(count, bool)
     used[index] = True
     new = np.cumsum(used, dtype=np.uint32) - np.uint32(1)
@@ -292,5 +300,5 @@ def _compact(index: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rest(text: bytes, keyword: str) -> str:
-    """What follows a keyword, blanks inside it included."""
+    """Return what follows a keyword, blanks inside it included."""
     return decode(text).strip()[len(keyword) :].strip()

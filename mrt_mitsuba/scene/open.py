@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, SupportsIndex
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.memory import Budget
@@ -58,7 +58,7 @@ def open_scene(
     declared = {key: value for key, value in (params or {}).items() if "." not in key}
     if declared and not _is_xml(scene):
         raise UsageError(
-            f"params: {next(iter(declared))} is no key of mi.traverse, and only an XML file declares names"
+            f"params: {next(iter(declared))} is not a key of mi.traverse, and only an XML file declares names"
         )
     if own is None:
         if fresnel is not None:
@@ -74,6 +74,8 @@ def open_scene(
         focus = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
         chosen = _integrator(integrator, loaded)
         return Source(name, loaded, view, chosen, width, height, *focus, own=True)
+    if budget is not None:  # those that no face uses, too: a render must not overwrite them
+        budget.pictures.update(map(os.path.realpath, own.pictures))
     width, height, fresnel = size[0] or SIZE[0], size[1] or SIZE[1], fresnel or "schlick"
     loaded = load_dict(own.to_dict(width=width, height=height, fresnel=fresnel), name, budget)
     set_parameters(loaded, keys)
@@ -115,7 +117,7 @@ def _model(scene: Any, options: Mapping[str, Any]) -> tuple[str, Scene | None]:
     """Return the name and the model of a scene in the report's terms; no model of any other."""
     if isinstance(scene, Scene):
         return scene.title or "a scene", scene
-    if hasattr(scene, "__index__"):
+    if isinstance(scene, SupportsIndex):
         number = operator.index(scene)
         return str(number), report_scene(number)
     if is_obj(scene):

@@ -11,7 +11,7 @@ import numpy as np
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Color, Light, Scene, Vector, view_problem
-from mrt_mitsuba.scene.obj import read_obj
+from mrt_mitsuba.scene.obj import read_model
 
 
 def obj_scene(
@@ -23,20 +23,19 @@ def obj_scene(
     lights: Sequence[Light] | None = None,
     sky: Color = BLUE_SKY,
 ) -> Scene:
-    """A scene of an OBJ file, which has neither camera nor lights: what is not given is placed by the model's
-    size.
+    """Return a scene of an OBJ file; camera and lights that are not given are placed by the model's size.
 
     The camera stands in front, towards +z, a little above and to the right, and sees all of it; a light is up
     on each side, the right one brighter. ``texturing`` follows ``convention`` unless given. Raises as
     ``read_obj`` does.
     """
-    meshes = read_obj(path, convention=convention)
+    meshes, pictures = read_model(path, convention=convention)
     low = np.min([m.vertices.min(axis=0) for m in meshes], axis=0).astype(float)
     high = np.max([m.vertices.max(axis=0) for m in meshes], axis=0).astype(float)
     center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
 
     def place(x: float, y: float, z: float) -> tuple[float, float, float]:
-        """A point in radii from the centre."""
+        """Return a point in radii from the centre."""
         px, py, pz = (center + radius * np.array([x, y, z])).tolist()
         return px, py, pz
 
@@ -51,6 +50,7 @@ def obj_scene(
         else (Light(place(4, 5, 4), (2.5, 2.5, 2.5)), Light(place(-4, 3, 5), (1.0, 1.0, 1.2))),
         meshes=meshes,
         texturing=texturing or convention,
+        pictures=pictures,
     )
 
 

@@ -38,7 +38,7 @@ def _scene_0() -> Scene:
 
 
 def _row(i: int) -> float:
-    """Place of the i-th of ten spheres between -1.5 and 1.5, to the nine digits of the original's file."""
+    """Return the place of the i-th of ten spheres in [-1.5, 1.5], to nine digits as in the original."""
     return round(-1.5 + i / 3, 9)
 
 

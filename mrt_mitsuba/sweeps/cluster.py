@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 CONNECTING = 10  # seconds to reach a scheduler, and for its first worker to be there
 STARTING = 120  # seconds for worker processes of this machine; a busy one takes its time
+# For workers of this machine: the engine's profiler stops a job a hundred times a second
+LOCAL = {"distributed.worker.profile.enabled": False}
 
 
 class ClusterError(MrtError):
@@ -80,7 +82,7 @@ class Engine:
             yield client, worker.House(sharing, self.renew, self.cluster is None, versions())
 
     def _local(self, count: int) -> Any:
-        """A scheduler in this process and workers in processes of their own, with one thread for jobs each.
+        """Return a scheduler in this process, and workers in processes of their own with one thread for jobs.
 
         They are started anew, not forked, nor do they import the caller's script: it needs no
         ``if __name__ == "__main__"``.
@@ -97,6 +99,7 @@ class Engine:
                 "nthreads": 1,
                 "memory_limit": MEMORY_LIMIT // count,
                 "dashboard": False,
+                "config": LOCAL,
                 "silence_logs": logging.CRITICAL,
             }
             workers[number] = {"cls": SubprocessWorker, "options": {"worker_kwargs": options | pinned}}

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.scene.model import Scene
 
 LONGEST_NAME = 200  # characters of a file's name without its ending; file systems take 255 bytes
 # Arguments of ``render`` that stay in this process, or that are given otherwise
@@ -27,7 +28,7 @@ class Job:
     name: str
     scene: Any
     parameters: Mapping[str, Any]
-    arguments: Mapping[str, Any]  #: of ``render``, beside the scene
+    arguments: Mapping[str, Any]  #: of ``render``, without the scene
 
 
 def jobs(scene: Any, grid: Mapping[str, Any], zipped: bool, fixed: Mapping[str, Any]) -> list[Job]:
@@ -88,7 +89,7 @@ def _check(key: str, value: Any) -> Any:
     if key not in known:
         close = difflib.get_close_matches(key, known, n=1)
         hint = f"did you mean {close[0]}?" if close else "a parameter of the scene has a dot in its key"
-        raise UsageError(f"{key} is no option of render: {hint}")
+        raise UsageError(f"{key} is not an option of render: {hint}")
     if not isinstance(value, str | bytes | bool | int | float | Mapping | Sequence | None):
         raise UsageError(f"{key}={value!r} cannot be sent elsewhere; give a name, a number or a dict")
     return settings.check(key, value) if key in settings.TABLE else value
@@ -106,7 +107,7 @@ def _finite(value: Any) -> bool:
 
 
 def _frames(count: int) -> list[str]:
-    """Names as programs that make films expect them, numbered from 0."""
+    """Return names as programs that make films expect them, numbered from 0."""
     digits = max(4, len(str(count - 1)))
     return [f"frame_{number:0{digits}}" for number in range(count)]
 
@@ -130,13 +131,13 @@ def word(value: Any) -> str:
     if isinstance(value, str | os.PathLike):
         text = os.fspath(value)
         value = os.path.splitext(os.path.basename(text))[0] if os.sep in text else text
-    elif hasattr(value, "title"):  # a Scene
+    elif isinstance(value, Scene):
         value = value.title or "scene"
     return re.sub(r"[^\w.+-]+", "-", str(value))
 
 
 def _refuse_same(names: Sequence[str]) -> None:
-    counts = Counter(name.casefold() for name in names)  # not all file systems tell capitals apart
+    counts = Counter(name.casefold() for name in names)  # some file systems ignore case
     same = next((name for name in names if counts[name.casefold()] > 1), None)
     if same is not None:
         raise UsageError(

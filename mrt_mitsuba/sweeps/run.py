@@ -43,7 +43,7 @@ def sweep(
 ) -> Table:
     """Render every combination of a grid's values on several processes or machines.
 
-    Each picture is an EXR in ``out``, named by its values; beside them are ``table.csv``, written as jobs
+    Each picture is an EXR in ``out``, named by its values; next to them are ``table.csv``, written as jobs
     end, and ``contact.png``. A job that fails leaves a row with the reason, and the others go on.
 
     Args:

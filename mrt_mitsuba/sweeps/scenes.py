@@ -1,4 +1,4 @@
-"""Scenes on their way to other processes, and what tells them apart."""
+"""Scenes on their way to other processes, and their fingerprints."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pickle
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, SupportsIndex, cast
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.sweeps.grid import Job
@@ -19,7 +19,7 @@ from mrt_mitsuba.sweeps.grid import Job
 
 @dataclass(frozen=True)
 class SceneFile:
-    """A scene in a file beside the pictures, from which each worker reads it once."""
+    """A scene in a file next to the pictures, from which each worker reads it once."""
 
     path: str
 
@@ -37,8 +37,8 @@ def _load(path: str) -> Any:
 def send(scene: Any, folder: str) -> tuple[Any, str]:
     """Return what a worker is given in place of a scene, and a fingerprint of the scene.
 
-    Numbers and paths go as they are, anything else through a file in ``folder``. A file is told apart by its
-    contents, not by those of the files that it names.
+    Numbers and paths go as they are, anything else through a file in ``folder``. The fingerprint
+    of a file covers its contents, not those of the files that it names.
 
     Raises ``UsageError`` for a number without a scene and for what cannot leave this process, and
     ``SceneError`` for a file that cannot be read.
@@ -50,7 +50,7 @@ def send(scene: Any, folder: str) -> tuple[Any, str]:
                 return path, fingerprint(file.read())
         except OSError as error:
             raise SceneError(f"cannot read {os.fspath(scene)}: {error.strerror}") from error
-    if hasattr(scene, "__index__"):
+    if isinstance(scene, SupportsIndex):
         from mrt_mitsuba.scene.report import report_scene
 
         number = operator.index(scene)
@@ -145,7 +145,7 @@ class _Pickler(pickle.Pickler):
 
     def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file, protocol=5)
-        self.fast = True  # no references to what came before: they tell equal from identical
+        self.fast = True  # no references to what came before: they would distinguish equal from identical
 
     def reducer_override(self, value: Any) -> Any:
         import numpy as np

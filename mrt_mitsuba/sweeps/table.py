@@ -44,8 +44,8 @@ class Table:
         """A dict for each job that ended, in the order of the grid.
 
         Its parameters by key, then "file" (its name in the folder, "" without one), "error" ("" without one),
-        "seconds", "rays", "rmse", "attempts", "worker" and "versions". None stands for what nobody knows:
-        what an earlier sweep did not say, an error that the render did not estimate.
+        "seconds", "rays", "rmse", "attempts", "worker" and "versions". None stands for the
+        unknown: what an earlier sweep did not record, an error that the render did not estimate.
         """
         return [self._ended[name] for name in self.jobs if name in self._ended]
 

@@ -169,7 +169,7 @@ def _rows(
 
 
 def _check_complete(path: str, height: int) -> None:
-    """Read the last row and let the file reach the disk: the library does not tell of a full one."""
+    """Read the last row and let the file reach the disk: the library does not report a full one."""
     import OpenEXR
 
     OpenEXR.InputFile(path).channel("R", scanLine1=height - 1, scanLine2=height - 1)

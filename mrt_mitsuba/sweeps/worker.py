@@ -18,14 +18,15 @@ from mrt_mitsuba.errors import MrtError, OutputError
 from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps.scenes import Opener, SceneFile
 
-TOPIC = "mrt-sweep"  # of the scheduler's events, which tell a client what began
+TOPIC = "mrt-sweep"  # of the scheduler's events, by which a client learns what has begun
 MADE_WITH = "mrt:sweep"  # header attribute: fingerprint of scene, settings and versions
 THUMBNAIL = 160  # pixels, the longer side
 PAUSE = 0.5  # seconds before a worker ends, in which the client fetches the facts about its last job
 
 _one_at_a_time = threading.Lock()  # Dr.Jit is not safe with several Python threads
 _open = Opener()
-_versions = functools.cache(versions)  # takes a millisecond
+_versions = functools.cache(versions)  # these take a millisecond
+_cores = functools.cache(usable_cores)
 _done = 0  # jobs since this process began
 _ending = threading.Event()  # it is about to be replaced
 
@@ -92,7 +93,7 @@ def facts(path: str) -> dict[str, Any]:
 
 
 def is_fresh(task: Task) -> bool:
-    """Whether the pictures are there and were made with the same scene, settings and versions."""
+    """Return whether the pictures are there and were made with the same scene, settings and versions."""
     import OpenEXR
 
     paths = [os.path.join(task.folder, file) for file in task.files]
@@ -115,9 +116,8 @@ def render_task(task: Task, house: House) -> dict[str, Any]:
     global _done
     worker, note = get_worker(), os.path.join(task.scratch, f"{task.name}.json")
     with _one_at_a_time:
-        if os.path.exists(note):  # done, but the worker was gone before anyone heard of it
-            with open(note) as file:
-                return dict(json.load(file))
+        if found := _read_note(note):  # done, but the worker was gone before it could report
+            return found
         if _done >= house.renew and worker.nanny:
             _renew(worker)
             raise Reschedule  # to another worker, or to this one's next process
@@ -125,17 +125,21 @@ def render_task(task: Task, house: House) -> dict[str, Any]:
         try:
             _prepare(worker, house)
             found = _render(task, worker) | {"worker": worker.address}
-            _write_note(note, found)
+            with open(note, "w") as file:
+                json.dump(found, file)
         except MrtError as error:
             found = {"error": " ".join(str(error).split()), "worker": worker.address}
         _done += 1
     return found
 
 
-def _write_note(path: str, facts: Mapping[str, Any]) -> None:
-    with open(f"{path}.tmp", "w") as file:
-        json.dump(facts, file)
-    os.replace(f"{path}.tmp", path)
+def _read_note(path: str) -> dict[str, Any]:
+    """Return what a worker wrote about a job that it has done; nothing where it did not come so far."""
+    try:
+        with open(path) as file:
+            return dict(json.load(file))
+    except (FileNotFoundError, json.JSONDecodeError):
+        return {}
 
 
 def _renew(worker: Any) -> None:
@@ -156,7 +160,7 @@ def _prepare(worker: Any, house: House) -> None:
         os.environ.setdefault("DRJIT_CACHE_DIR", near)
     import drjit as dr
 
-    threads = max(1, usable_cores() // house.sharing.get(cores_of(), 1))
+    threads = max(1, _cores() // house.sharing.get(cores_of(), 1))
     if dr.thread_count() != threads:
         dr.set_thread_count(threads)
 
@@ -195,7 +199,7 @@ def _render(task: Task, worker: Any) -> dict[str, Any]:
 
 
 def _memory(worker: Any) -> int | None:
-    """Half of what is free or, where less, of what the worker may take: others take theirs."""
+    """Return half of what is free or, if that is less, of what the worker may take; others need theirs."""
     from mrt_mitsuba.memory import free_memory
     from mrt_mitsuba.options import SMALLEST_MEMORY
 

@@ -1,7 +1,7 @@
 """The detectors against renders of the original ray tracer, where those are at hand.
 
 A render with a detector is the unrefined one, except where the detector fired: there it is the fully
-supersampled one. So it tells, of each pixel whose unrefined and supersampled colours differ, which it was.
+supersampled one. So wherever the two differ, it shows which pixels were refined.
 """
 
 from __future__ import annotations
@@ -37,5 +37,5 @@ def test_the_same_pixels_are_refined(scene: int, detector: str) -> None:
     # stored numbers, compared as such: no tolerance
     np.testing.assert_array_equal(adaptive, np.where(mask[..., None], full, plain))
     telling = (plain != full).any(axis=-1)
-    assert telling.mean() > 0.99  # the rest is alike in both, and tells nothing
+    assert telling.mean() > 0.99  # the rest is alike in both, and shows nothing
     assert mask[telling].any() and not mask[telling].all()

@@ -47,7 +47,7 @@ def test_any_amount_refines_to_full_supersampling(aa, lattice):
         return
     refined = adaptive.layers["samples.Y"] > 1
     assert 0 < refined.sum() < refined.size
-    # a centered lattice of even size does not hold the pixel's centre: its first sample is traced beside them
+    # a centered lattice of even size does not hold the pixel's centre: its first sample is traced in addition
     further = aa**2 - 1 if lattice == "report" or aa % 2 else aa**2
     assert adaptive.rays["primary"] == 33 * 21 + refined.sum() * further
     one = mrt.render(1, **{**options, "aa": 1}, aamode="none").image
@@ -71,7 +71,7 @@ def test_any_focus_is_the_filter_over_the_sharp_picture(dof, distance, reach):
     np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
-class _Told(Progress):
+class _Recorded(Progress):
     def __init__(self):
         self.stages = {}
 
@@ -85,8 +85,8 @@ class _Told(Progress):
         yield advance
 
 
-def test_every_pass_tells_its_progress_to_the_end():
-    progress = _Told()
+def test_every_pass_reports_its_progress_to_the_end():
+    progress = _Recorded()
     result = mrt.render(3, width=40, height=30, aa=2, aamode="sobel", progress=progress)
     refined = int((result.layers["samples.Y"] > 1).sum())
     assert progress.stages == {
@@ -130,7 +130,7 @@ def test_noise_on_a_flat_wall_is_not_chased(aamode):
     assert seeing < 0.08
 
 
-def test_plan_says_that_one_random_ray_cannot_tell_noise():
+def test_plan_says_that_one_random_ray_takes_noise_for_edges():
     scene = _grey_wall()
     one, two = (str(mrt.render(scene, aa=2, aamode="sobel", spp=spp).plan) for spp in (1, 2))
     assert "noise will count as edges" in one and "noise will" not in two

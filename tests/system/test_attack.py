@@ -13,6 +13,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import pytest
 from PIL import Image
 
@@ -103,10 +104,16 @@ def test_no_native_code_from_the_folders_of_process_and_scene(run_python, tmp_pa
 
 def test_hundreds_of_python_shapes_load(variant: str, tmp_path: Path) -> None:
     """Loaded in parallel, 300 of them overflowed the stack each time."""
-    (tmp_path / "cones.xml").write_text(scene_xml(cones(700 if ROUNDS == 1 else 10_000)))
+    count = 700 if ROUNDS == 1 else 10_000
+    (tmp_path / "cones.xml").write_text(scene_xml(cones(count)))
+    assert len(mi.load_file(str(tmp_path / "cones.xml")).shapes()) == count
+    assert len(mi.load_string(scene_xml(cones(count))).shapes()) == count
+    cone = {"type": "mrt_cone", "apex": [0, 1, 0], "base_center": [0, 0, 0], "segments": 3}
+    inside = {"type": "scene", "group": {"type": "shapegroup"} | {f"c{i}": cone for i in range(count)}}
+    mi.load_dict(inside)
     assert mrt.render(str(tmp_path / "cones.xml"), aa=1).image.shape == (3, 4, 3)
     lines = ["mtllib m.mtl", "v 0 0 0", "v 1 0 0", "v 0 1 0"]
-    names = [f"m{i}" for i in range(700 if ROUNDS == 1 else 10_000)]
+    names = [f"m{i}" for i in range(count)]
     (tmp_path / "m.mtl").write_text("".join(f"newmtl {n}\nKd 0.5 0.5 0.{n[1:]}\n" for n in names))
     (tmp_path / "m.obj").write_text("\n".join(lines + [f"usemtl {n}\nf 1 2 3" for n in names]) + "\n")
     assert mrt.render(str(tmp_path / "m.obj"), width=4, height=3, aa=1).image.shape == (3, 4, 3)

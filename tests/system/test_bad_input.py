@@ -6,6 +6,7 @@ that the installed command does the same.
 
 from __future__ import annotations
 
+import base64
 import os
 import resource
 import shutil
@@ -27,6 +28,9 @@ LARGE = SENSOR.format("<integer name='width' value='99999'/><integer name='heigh
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
 MODEL = "mtllib a.mtl\n" + TRIANGLE
 PICTURE = "newmtl m\nKd 1 1 1\nmap_Kd p.png\n"
+WHITE = base64.b64decode(  # one pixel
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4//8/AAX+Av4N70a4AAAAAElFTkSuQmCC"
+)
 
 
 def xml(inside: str, sensor: str = SMALL) -> dict[str, Content]:
@@ -62,6 +66,8 @@ OUTPUTS: list[Case] = [
     ({}, "export 0 --xml none/a.xml", 1, "does not exist; create it first"),
     ({"a.xml": None}, "export 0 --xml a.xml", 1, "a.xml: it is a folder"),
     ({}, "export 0 --xml a.xml --stock --stock", 2, "write mrt export SCENE --xml PATH [--stock]"),
+    (textured(WHITE), "p scene=a.obj aa=1", 1, "cannot write p.png: the scene uses this picture"),
+    (textured(WHITE) | {"a.obj": MODEL.replace("/1", "")}, "p scene=a.obj aa=1", 1, "cannot write p.png"),
     ({}, "out.png", 2, "write out format=png"),
     ({}, "help me", 2, "unexpected argument 'me' after mrt help"),
 ]

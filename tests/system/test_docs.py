@@ -30,7 +30,7 @@ def code(path: Path) -> str:
 
 @pytest.fixture
 def examples(tmp_path: Path) -> Path:
-    """The folder of examples, as pages find it: beside them."""
+    """The folder of examples, as pages find it: next to them."""
     return Path(shutil.copytree(DOCS / "examples", tmp_path / "examples"))
 
 

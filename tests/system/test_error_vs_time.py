@@ -11,8 +11,8 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
 from mrt_mitsuba.validation.tools.intervals import Estimate, estimate
+from mrt_mitsuba.validation.tools.precision import Findings, Point
 from mrt_mitsuba.validation.tools.precision_page import front
-from mrt_mitsuba.validation.tools.work_precision import Point, WorkPrecision
 
 for needed in ("matplotlib", "jinja2", "scipy", "flip_evaluator"):
     pytest.importorskip(needed)
@@ -152,9 +152,9 @@ def point(name: str, times: list[float], rmse: float) -> Point:
     return Point(name, {}, np.array(times), gram, 1.0, 0.5, {}, image, mrt.compare(image, image), 0.0)
 
 
-def found_of(*points: Point, errors: tuple[float, ...] = (0.1,)) -> WorkPrecision:
+def found_of(*points: Point, errors: tuple[float, ...] = (0.1,)) -> Findings:
     repeats = len(points[0].times)
-    return WorkPrecision("test", {p.name: p for p in points}, {}, np.zeros((2, 2, 3)), 0.0, repeats, errors)
+    return Findings("test", {p.name: p for p in points}, {}, np.zeros((2, 2, 3)), 0.0, repeats, errors)
 
 
 def test_time_to_an_error_is_read_off_the_curve():
@@ -168,7 +168,7 @@ def test_time_to_an_error_is_read_off_the_curve():
     ("other", "verdict"),
     [
         ([2.0, 2.1, 1.9, 2.05], "RMSE of 0.1: a is the fastest, 1"),
-        ([0.9, 1.3, 0.8, 1.4], "not told apart, for their intervals overlap: a, b"),
+        ([0.9, 1.3, 0.8, 1.4], "no winner, for the intervals overlap: a, b"),
         (None, "only a comes so low"),
     ],
 )
@@ -192,7 +192,7 @@ def test_equal_cases_have_no_winner(count):
     rng = np.random.default_rng(count)
     times = np.exp(rng.normal(0, 0.3, (60, 2, count)))
     verdicts = [found_of(point("a", a, 0.1), point("b", b, 0.1)).verdicts[0] for a, b in times.tolist()]
-    assert sum("not told apart" not in verdict for verdict in verdicts) <= 3
+    assert sum("no winner" not in verdict for verdict in verdicts) <= 3
 
 
 def test_one_repeat_gives_no_verdict():

@@ -1,4 +1,4 @@
-"""``log=``: what a render tells of itself on the error output."""
+"""``log=``: records on the error output."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mrt_mitsuba.command.logs import LEVELS
 from mrt_mitsuba.command.options import Options, parse
 
 
-def told(folder: Path, *options: str) -> list[str]:
+def logged(folder: Path, *options: str) -> list[str]:
     command = [
         sys.executable,
         "-m",
@@ -28,8 +28,8 @@ def told(folder: Path, *options: str) -> list[str]:
     return done.stderr.splitlines()
 
 
-def test_levels_tell_more_and_more(tmp_path: Path) -> None:
-    silent, info, debug = (told(tmp_path, f"log={level}") for level in ("warn", "info", "debug"))
+def test_levels_log_more_and_more(tmp_path: Path) -> None:
+    silent, info, debug = (logged(tmp_path, f"log={level}") for level in ("warn", "info", "debug"))
     assert not silent
     for what in ("scene 0 loaded in", "rendering: 192 pixels in", "kernels: compiled in", "wrote"):
         assert sum(what in line for line in info) >= 1

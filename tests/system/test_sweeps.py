@@ -37,7 +37,7 @@ def wait_for(condition: Callable[[], Any], what: str) -> Any:
         if found:
             return found
         time.sleep(0.02)
-    raise AssertionError(f"in vain: {what}")
+    raise AssertionError(f"waited in vain for {what}")
 
 
 class Cluster:
@@ -222,7 +222,7 @@ def test_frames_are_numbered_for_films(address: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("grid", "options", "message"),
     [
-        ({"aaa": [1]}, {}, "aaa is no option of render: did you mean aa?"),
+        ({"aaa": [1]}, {}, "aaa is not an option of render: did you mean aa?"),
         ({"aa": []}, {}, "aa is an empty list"),
         ({"aa": 3}, {}, r"aa is 3; give a list of values, such as \[3\]"),
         ({"aamode": "luma"}, {}, "aamode is 'luma'; give a list"),
@@ -239,7 +239,7 @@ def test_frames_are_numbered_for_films(address: str, tmp_path: Path) -> None:
         ({"scene": ["none.xml"]}, {"scene": None}, "cannot read none.xml"),
         ({"aa": [1, 2], "seed": [1]}, {"zipped": True}, "zipped axes must be of one length"),
         ({"integrator": [object()]}, {}, "cannot be sent"),
-        ({}, {"progres": 1}, "progres is no option of render"),
+        ({}, {"progres": 1}, "progres is not an option of render"),
         ({}, {"width": 0}, "width=0: must be"),
         ({}, {"tiles": (2, 2), "png": True}, "leave out png"),
         ({"target": [0.1]}, {"tiles": (2, 2)}, "tiles: target and aamode=noise"),

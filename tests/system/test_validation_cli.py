@@ -199,7 +199,7 @@ def test_folder_is_checked_before_the_work(tmp_path: Path, capsys) -> None:
     (tmp_path / "index.html").mkdir()
     for folder in (tmp_path / "file", tmp_path):
         assert cli.main(["laws", "--out", str(folder)]) == 1
-        assert str(folder) in (told := capsys.readouterr().err) and "laws:" not in told
+        assert str(folder) in (errors := capsys.readouterr().err) and "laws:" not in errors
 
 
 def test_interrupt_leaves_the_report_as_it_was(validate, tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.studies import error_vs_time
 from mrt_mitsuba.validation.tools import knobs
+from mrt_mitsuba.validation.tools.precision import Point
 from mrt_mitsuba.validation.tools.study import Plot, Study, Table
-from mrt_mitsuba.validation.tools.work_precision import Point
 
 SETTINGS = knobs.Extent((40, 30), (1, 4), 24, (1, 16), 256)
 

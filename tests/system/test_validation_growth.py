@@ -29,9 +29,9 @@ def test_exponents_are_recovered_with_an_interval():
     [
         (0.301, 0.1, "2 times as long: less than"),
         (1.3, 0.1, "more than in proportion"),
-        (0.95, 0.1, "not told apart from growth in proportion"),
-        (-0.3, 0.6, "not told apart from no growth"),
-        (0.1, 0.2, "not told apart from no growth"),
+        (0.95, 0.1, "consistent with growth in proportion"),
+        (-0.3, 0.6, "consistent with no growth"),
+        (0.1, 0.2, "consistent with no growth"),
         (0.1, 1.5, "too uncertain"),
     ],
 )

@@ -8,7 +8,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import filters_reference
 import numpy as np
 import pytest
 
@@ -17,6 +16,7 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.oracles import filters
 from mrt_mitsuba.validation.oracles.reference import reference_render
 from mrt_mitsuba.validation.studies import scenes
 from mrt_mitsuba.validation.tools.study import Plot, Study, Table
@@ -145,7 +145,7 @@ def test_four_samples_a_pixel(number: int) -> None:
 def test_adaptive(number: int, aamode: str) -> None:
     """The detector of the truth, too, looks at the picture in float64."""
     every = samples(number)
-    edges = getattr(filters_reference, f"{aamode}_edges")(every[0]).mask
+    edges = getattr(filters, f"{aamode}_edges")(every[0]).mask
     result = ours(number, aamode=aamode)
     # grey levels are truncated: a picture off by one rounding may refine a few pixels more or less
     refined = result.layers["samples.Y"] > 1

@@ -63,21 +63,21 @@ def test_every_light_counts(count: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "beside",
+    "others",
     [
         {},
-        {"beside": {"type": "rectangle"}},
-        {"beside": {"type": "mrt_cylinder", "p0": [9] * 3, "p1": [9, 9, 10]}},
+        {"other": {"type": "rectangle"}},
+        {"other": {"type": "mrt_cylinder", "p0": [9] * 3, "p1": [9, 9, 10]}},
     ],
 )
-def test_hits_lie_on_their_sphere(beside: dict[str, Any]) -> None:
-    """From 1e4 radii away, alone and beside other shapes: as near as float32 can write the point."""
+def test_hits_lie_on_their_sphere(others: dict[str, Any]) -> None:
+    """From 1e4 radii away, alone and with other shapes: as near as float32 can write the point."""
     center, radius = np.array([0.1, 0.2, -3.0]), 0.5
     rng = np.random.default_rng(1)
     d = rng.normal(size=(2000, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     sphere = {"type": "sphere", "center": center.tolist(), "radius": radius}
-    found = trace({"sphere": sphere, **beside}, center - 5000 * d + 0.2 * rng.normal(size=(2000, 3)), d)
+    found = trace({"sphere": sphere, **others}, center - 5000 * d + 0.2 * rng.normal(size=(2000, 3)), d)
     distance = np.linalg.norm(found.p - center, axis=1)
     met = found.found & (distance < 1)
     assert met.mean() > 0.5

@@ -24,8 +24,111 @@ MISTAKES = {
 }
 
 
+DIFFUSE, GLASS, MIRROR = {"type": "diffuse"}, {"type": "dielectric"}, {"type": "conductor"}
+GLOSSY, DELTA = (+flag for flag in (mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DeltaReflection))
+
+
+def _member(name, change):
+    """A change of samples: of one of their members."""
+
+    def apply(bs, weight, u, ctx):
+        setattr(bs, name, change(getattr(bs, name)))
+        return bs, weight
+
+    return apply
+
+
+def _weight(change):
+    return lambda bs, weight, u, ctx: (bs, change(bs, weight, u, ctx))
+
+
+def _unscaled(bs, weight, u, ctx):
+    return weight * bs.eta**2 if ctx.mode == mi.TransportMode.Radiance else weight
+
+
+def _brighter(value, wi, wo):
+    return 1.8 * value * (1 + 0.56 * (1 - abs(wi.z)) ** 8) * (1 + 0.56 * (1 - abs(wo.z)) ** 8)
+
+
+def _stairs(value, wi, wo):
+    if not is_jit():
+        return value
+    step = dr.exp(dr.round(dr.log(value) * 1e5) * 1e-5)
+    return value * dr.detach(dr.select(value > 0, step / value, 0))
+
+
+def _steep(value, wi, wo):
+    return value + dr.sqrt(dr.maximum(0, dr.select(wo.x > 0.7, value - dr.detach(value), 0)))
+
+
+def _other_in_scalar(value, wi, wo):
+    return value if is_jit() else 1.01 * value
+
+
+def _below(pdf, wi, wo):
+    return pdf + dr.select((wi.z > 0) & (wo.z < 0), -0.1 * wo.z, 0)
+
+
+def _nan_at_the_end(bs, weight, u, ctx):
+    return dr.select(u.x > 0.9999999, dr.nan, weight)
+
+
+# Sound BSDFs whose answers are changed: the BSDF, what is changed and how, and the laws that this breaks
+CHANGES = {
+    "no eta^2 in single directions": (GLASS, "sample", _weight(_unscaled), {"reciprocity"}),
+    "eta inverted": (GLASS, "sample", _member("eta", lambda eta: 1 / eta), {"reciprocity"}),
+    "directions not of length 1": (MIRROR, "sample", _member("wo", lambda wo: 1.01 * wo), {"finite"}),
+    "mirror called glossy": (
+        MIRROR,
+        "sample",
+        _member("sampled_type", lambda kind: kind - DELTA + GLOSSY),
+        {"weights", "energy", "components"},
+    ),
+    "next component": (DIFFUSE, "sample", _member("sampled_component", lambda i: i + 1), {"components"}),
+    "NaN at the end of random numbers": (DIFFUSE, "sample", _weight(_nan_at_the_end), {"finite"}),
+    "albedo 1.02 near the horizon": (DIFFUSE, "value", _brighter, {"energy"}),
+    "stairs": ({"type": "roughconductor"}, "value", _stairs, {"roundoff"}),
+    "derivatives that are NaN": ({"type": "specimen"}, "value", _steep, {"gradients"}),
+    "other values in scalar variants": (DIFFUSE, "value", _other_in_scalar, {"variants"}),
+    "density below the horizon": (DIFFUSE, "pdf", _below, {"sampling"}),
+}
+
+
 def register() -> None:
-    """Define the class anew for the current variant."""
+    """Define the classes anew for the current variant."""
+
+    class Changed(mi.BSDF):
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            self.nested, name = props["nested"], props["change"]
+            self.kind, self.change = CHANGES[name][1:3] if name else ("", None)
+            self.m_components = [int(self.nested.flags(i)) for i in range(self.nested.component_count())]
+            self.m_flags = int(self.nested.flags())
+
+        def traverse(self, callback):
+            callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
+
+        def eval(self, ctx, si, wo, active=True):
+            value = self.nested.eval(ctx, si, wo, active)
+            return self.change(value, si.wi, wo) if self.kind == "value" else value
+
+        def pdf(self, ctx, si, wo, active=True):
+            pdf = self.nested.pdf(ctx, si, wo, active)
+            return self.change(pdf, si.wi, wo) if self.kind == "pdf" else pdf
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            bs, weight = self.nested.sample(ctx, si, sample1, sample2, active)
+            if self.kind == "value":
+                weight = self.change(weight, si.wi, bs.wo)
+            return self.change(bs, weight, sample2, ctx) if self.kind == "sample" else (bs, weight)
+
+        def to_string(self):
+            return f"Changed[{self.kind}]"
+
+    mi.register_bsdf("changed", Changed)
 
     class Specimen(mi.BSDF):
         def __init__(self, props):

@@ -66,6 +66,8 @@ LAWFUL = {
     "schlick": {},
     "dielectric": {"alpha": 0.4, "fresnel": "dielectric"},
     "plain sampling": {"alpha": 0.05, "diffuse_reflectance": 0.0, "sample_visible": False},
+    "narrow": {"alpha": 0.01, "fresnel": "dielectric", "diffuse_reflectance": 0.0},
+    "negative": {"alpha": -0.3, "specular_reflectance": 0.4, "diffuse_reflectance": 0.0},
     "coloured": {"diffuse_reflectance": rgb(KD), "specular_reflectance": rgb((0.5, 0.6, 0.2))},
     "textured": {
         "alpha": {"type": "checkerboard", "color0": 0.1, "color1": 0.5},

@@ -72,6 +72,13 @@ def test_each_mistake_fails_its_own_laws(mistake: str, registered, capsys) -> No
         assert capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", specimens.CHANGES)
+def test_each_change_of_a_sound_bsdf_fails_its_own_laws(name: str, registered) -> None:
+    nested, _, _, laws = specimens.CHANGES[name]
+    check = mrt.check_bsdf({"type": "changed", "change": name, "nested": nested}, quick=True)
+    assert set(check.failed) == laws, str(check)
+
+
 def test_the_detached_parameter_is_named(registered) -> None:
     check = mrt.check_bsdf(
         {"type": "specimen", "mistake": "detached gradient"}, quick=True, only=["gradients"]
@@ -158,7 +165,7 @@ def test_a_plugin_of_one_variant_only() -> None:
 
 
 def test_wrong_usage() -> None:
-    with pytest.raises(mrt.UsageError, match="is no BSDF"):
+    with pytest.raises(mrt.UsageError, match="is not a BSDF"):
         mrt.check_bsdf(mi.load_dict({"type": "sphere"}))
     with pytest.raises(mrt.UsageError, match="unknown law 'colour'"):
         mrt.check_bsdf({"type": "diffuse"}, only=["colour"])

@@ -101,6 +101,24 @@ def rounded(si: Any, ray: Any) -> Any:
     return si
 
 
+def facing(si: Any, ray: Any) -> Any:
+    """Normals that are the ray's doing."""
+    side = dr.select(dr.dot(si.n, ray.d) > 0, mi.Float(-1), 1)
+    si.n, si.sh_frame.n = side * si.n, side * si.sh_frame.n
+    return si
+
+
+def from_outside(si: Any, ray: Any) -> Any:
+    si.t = dr.select(dr.dot(si.n, ray.d) > 0, dr.inf, si.t)
+    return si
+
+
+def not_near(si: Any, ray: Any) -> Any:
+    """Hits are lost within a fixed distance."""
+    si.t = dr.select(si.t < 0.02, dr.inf, si.t)
+    return si
+
+
 MISTAKES: dict[str, tuple[dict[str, Callable[..., Any]], set[str]]] = {
     "none": ({}, set()),
     "flipped normal": ({"hit": flipped}, {"normals"}),
@@ -110,6 +128,9 @@ MISTAKES: dict[str, tuple[dict[str, Callable[..., Any]], set[str]]] = {
         {"normals"},
     ),
     "wrong derivative": ({"hit": changed(dp_du=lambda si: 1.5 * si.dp_du)}, {"normals"}),
+    "normal towards the ray": ({"hit": facing}, {"normals"}),
+    "met from outside only": ({"hit": from_outside}, {"watertight"}),
+    "a fixed least distance": ({"hit": not_near}, {"surface", "watertight"}),
     "a box that is too small": ({"bbox": half}, {"bbox"}),
     "ray_test unlike ray_intersect": ({"test": lambda found, ray: found & (ray.d.x < 0.7)}, {"hits"}),
     "no heed of maxt": (
@@ -170,5 +191,5 @@ def test_snippets_are_programs(capsys, tmp_path: Path) -> None:
 
 
 def test_wrong_usage() -> None:
-    with pytest.raises(mrt.UsageError, match="is no shape"):
+    with pytest.raises(mrt.UsageError, match="is not a shape"):
         mrt.check_shape(mi.load_dict({"type": "diffuse"}))

@@ -49,6 +49,15 @@ def facing_mirrors(**more: Any) -> dict[str, Any]:
     return scene | more
 
 
+def hidden_lights() -> dict[str, Any]:
+    """Many lights behind a lid, each of a third of what is cut off."""
+    scene = {name: thing for name, thing in facing_mirrors().items() if name == "lid"}
+    for k in range(8):
+        light = {"type": "mrt_light", "position": [0.2 * k, 8, 0], "intensity": rgb(*[5e-4] * 3)}
+        scene[f"light{k}"] = light
+    return scene | {"floor": {"type": "mrt_plane", "normal": [0, 1, 0], "distance": 1.0, "bsdf": glass(0.0)}}
+
+
 def loaded(content: dict[str, Any]) -> mi.Scene:
     look = mi.ScalarTransform4f().look_at([0.3, 1, 6], [0, 0.1, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 96, "height": 64, "component_format": "float32"}
@@ -74,8 +83,9 @@ def picture(scene: mi.Scene, **options: Any) -> np.ndarray:
         (balls(lamp={"type": "sphere", "center": [0, 3, 0], "radius": 0.3,
                      "emitter": {"type": "area", "radiance": 500.0}}), {}),
         (facing_mirrors(), {}),
+        (hidden_lights(), {}),
     ],
-    ids=["plain", "sky 100", "sky 1000", "own sky", "unclamped", "with falloff", "lamp", "mirrors"],
+    ids=["plain", "sky 100", "sky 1000", "own sky", "unclamped", "with falloff", "lamp", "mirrors", "lights"],
 )  # fmt: skip
 def test_what_is_cut_off_is_not_seen(content: dict[str, Any], options: dict[str, Any]) -> None:
     scene = loaded(content)

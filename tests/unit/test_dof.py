@@ -9,7 +9,6 @@ from itertools import pairwise
 from typing import Any
 
 import drjit as dr
-import filters_reference as reference
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,6 +16,7 @@ from hypothesis import strategies as st
 
 from mrt_mitsuba import UsageError, runtime
 from mrt_mitsuba.filters import blur_amount, gaussian_dof
+from mrt_mitsuba.validation.oracles import filters as reference
 
 needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, reason="no LLVM to run kernels")
 BACKENDS = [pytest.param("llvm", marks=needs_llvm), pytest.param("llvm.ad", marks=needs_llvm), "scalar"]
@@ -252,6 +252,27 @@ def test_wrong_arguments_are_named(change: dict[str, Any], message: str) -> None
 # ---- the corrected filter ----
 
 
+@given(
+    size=st.one_of(st.just((37, 41)), st.tuples(st.integers(1, 30), st.integers(1, 20))),
+    seed=st.integers(0, 2**32 - 1),
+    focal_distance=SIXTEENTH.filter(bool),
+    focal_range=SIXTEENTH,
+)
+@settings(max_examples=25)
+def test_corrected_equals_the_loops(
+    size: tuple[int, int], seed: int, focal_distance: float, focal_range: float
+) -> None:
+    """Discs of all sizes on both sides of the focus, layers near and far apart, borders."""
+    image, depth = colours(size, seed), depths(size, seed)
+    found = gaussian_dof(
+        image, depth, focal_distance=focal_distance, focal_range=focal_range, mode="corrected"
+    )
+    radius = reference.disc_radius(reference.blur_amount(depth, focal_distance, focal_range))
+    radius[(depth > 0) & (depth < focal_distance)] *= -1
+    # float32 sums of up to 81 terms, and quotients of them
+    np.testing.assert_allclose(found, reference.corrected_dof(image, radius), atol=5e-6)
+
+
 def disc_share(distance: float, radius: float) -> float:
     """The share of a disc beyond a straight line at a distance from its centre (negative: most of it)."""
     ratio = np.clip(distance / radius, -1, 1)
@@ -285,7 +306,7 @@ def test_a_sharp_foreground_keeps_its_outline(amount: float) -> None:
 
 
 def test_a_blurred_background_is_blurred_up_to_the_sharp_outline() -> None:
-    """The background's own stripes mix beside the outline; what is hidden is taken as more of the same."""
+    """The background's own stripes mix next to the outline; what is hidden is taken as more of the same."""
     image = np.zeros((40, 60, 3))
     image[::4] = image[1::4] = 1
     depth = np.full((40, 60), far(amount=8))

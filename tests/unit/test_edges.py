@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import filters_reference as reference
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,6 +18,7 @@ from PIL import Image
 from mrt_mitsuba import UsageError, filters, runtime
 from mrt_mitsuba.filters import edges_image, geometry_edges, luma_edges, sobel_edges
 from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.validation.oracles import filters as reference
 
 needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, reason="no LLVM to run kernels")
 BACKENDS = [pytest.param("llvm", marks=needs_llvm), pytest.param("llvm.ad", marks=needs_llvm), "scalar"]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+
+import mrt_mitsuba as mrt
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -214,52 +217,84 @@ def test_wrong_parameters_are_named(parameters: dict, message: str) -> None:
     assert message in str(raised.value) and "mrt_light" in str(raised.value)
 
 
-SURFACES: dict[str, tuple[Any, list[float], list[float]]] = {
+def upright(kind: str) -> Callable[[float], dict[str, Any]]:
+    ends = ("apex", "base_center") if kind == "cone" else ("p0", "p1")
+    return lambda s: {"type": f"mrt_{kind}", ends[0]: [0, s, 0], ends[1]: [0, 0, 0], "radius": s}
+
+
+def board(s: float) -> dict[str, Any]:
+    turn = mi.ScalarTransform4f().rotate([1, 0, 0], -60)
+    return {"type": "rectangle", "to_world": turn.scale(s)}
+
+
+def wedge(s: float) -> dict[str, Any]:
+    corners = s * np.array([[(-1, 0, 1), (1, 0, 1), (0, 1, 0), (0, 0, -1)]])
+    faces = np.array([[(0, 1, 2), (1, 3, 2), (3, 0, 2)]], np.uint32)
+    return {"type": "mrt_mesh", "positions": mi.Bitmap(np.float32(corners)), "faces": mi.Bitmap(faces)}
+
+
+# A shape of size s, where on it the light is, and the direction off it
+SURFACES: dict[str, tuple[Callable[[float], dict[str, Any]], list[float], list[float]]] = {
     "sphere": (
         lambda s: {"type": "sphere", "radius": s},
-        [0.26726124, -0.53452248, 0.80178373],
-        [0.27, -0.53, 0.8],
+        [-0.26726124, -0.53452248, -0.80178373],
+        [-0.27, -0.53, -0.8],
     ),
-    "cone base": (
-        lambda s: {"type": "mrt_cone", "apex": [0, s, 0], "base_center": [0, 0, 0], "radius": s},
-        [0.3, 0, 0.2],
-        [0, -1, 0],
-    ),
-    "cylinder end": (
-        lambda s: {"type": "mrt_cylinder", "p0": [0, s, 0], "p1": [0, 0, 0], "radius": s},
-        [0.3, 1, 0.2],
-        [0, 1, 0],
-    ),
-    "cylinder side": (
-        lambda s: {"type": "mrt_cylinder", "p0": [0, s, 0], "p1": [0, 0, 0], "radius": s},
-        [0.6, 0.5, 0.8],
-        [0.6, 0, 0.8],
-    ),
+    "cone apex": (upright("cone"), [0, 1, 0], [0, 1, 0]),
+    "cone base": (upright("cone"), [0.3, 0, 0.2], [0, -1, 0]),
+    "cone side": (upright("cone"), [-0.3, 0.5, -0.4], [-0.42, 0.71, -0.57]),
+    "cylinder end": (upright("cylinder"), [0.3, 1, 0.2], [0, 1, 0]),
+    "cylinder side": (upright("cylinder"), [-0.6, 0.5, -0.8], [-0.6, 0, -0.8]),
     "plane": (lambda s: {"type": "sphere", "radius": s}, [2, -2, 1], [0, 1, 0]),
+    "rectangle": (board, [0.3, 0.1, 3**0.5 * -0.1], [0, 0.75**0.5, 0.5]),
+    "triangle": (wedge, [0.1, 0.4, 0.6], [0, 0.71, 0.71]),
+    "corner": (wedge, [0, 1, 0], [0, 1, 0]),
 }
+
+
+def lit_from_a_surface(name: str, s: float, lift: float = 0.0, size: tuple = (96, 72)) -> dict[str, Any]:
+    """A shape of size s over a floor, before two walls; its light lies on it, or so many sizes above it."""
+    shape, position, out = SURFACES[name]
+    look = mi.ScalarTransform4f().look_at([2 * s, 3 * s, 6 * s], [0, 0.3 * s, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "fov": 40, "near_clip": 0.01 * s, "far_clip": 1e4 * s}
+    place = s * (np.array(position) + lift * np.array(out))
+    return {
+        "type": "scene", "shape": shape(s), "sensor": {**sensor, "to_world": look, "film": film},
+        "integrator": {"type": "mrt_whitted", "max_depth": 1},
+        "light": {"type": "mrt_light", "position": place.tolist()},
+        "floor": {"type": "mrt_plane", "normal": [0, 1, 0], "distance": 2 * s},
+        "wall": {"type": "mrt_plane", "normal": [1, 0, 0], "distance": 4 * s},
+        "back": {"type": "mrt_plane", "normal": [0, 0, 1], "distance": 4 * s},
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", SURFACES)
 def test_a_light_on_a_surface_shines_at_every_scale(name: str) -> None:
-    """As one that lies a thousandth outside, without speckles, whatever the unit of length."""
-    shape, position, out = SURFACES[name]
+    """To both sides, as one a thousandth above it and one below, without speckles, whatever the unit."""
 
     def picture(s: float, lift: float = 0.0) -> np.ndarray:
-        look = mi.ScalarTransform4f().look_at([2 * s, 3 * s, 6 * s], [0, 0.3 * s, 0], [0, 1, 0])
-        film = {"type": "hdrfilm", "width": 96, "height": 72, "rfilter": {"type": "box"}}
-        sensor = {"type": "perspective", "fov": 40, "near_clip": 0.01 * s, "far_clip": 1e4 * s}
-        place = s * (np.array(position) + lift * np.array(out))
-        scene = mi.load_dict({
-            "type": "scene", "shape": shape(s), "sensor": {**sensor, "to_world": look, "film": film},
-            "light": {"type": "mrt_light", "position": place.tolist()},
-            "floor": {"type": "mrt_plane", "normal": [0, 1, 0], "distance": 2 * s},
-            "wall": {"type": "mrt_plane", "normal": [1, 0, 0], "distance": 4 * s},
-        })  # fmt: skip
-        integrator = mi.load_dict({"type": "mrt_whitted", "max_depth": 1})
-        return np.array(mi.render(scene, integrator=integrator, spp=1)) > 1e-3
+        return np.array(mi.render(mi.load_dict(lit_from_a_surface(name, s, lift)), spp=1)) > 1e-3
 
     image = picture(1.0)
-    for scale in (0.37, 1e-4, 7e5):
+    assert 0.1 < image.mean() < 0.95
+    for scale in (0.37, 1e-3, 1e3, 1e-4, 7e5):
         assert (picture(scale) != image).any(axis=-1).mean() < 1e-3  # a pixel at a shadow's edge
     # From that much higher, the sphere's horizon is 0.045 radii away
-    assert (picture(1.0, lift=1e-3) != image).any(axis=-1).mean() < 0.03
+    assert (picture(1.0, lift=1e-3) | picture(1.0, lift=-1e-3) != image).any(axis=-1).mean() < 0.03
+
+
+@pytest.mark.filterwarnings("ignore:.*one ray at a time")
+@pytest.mark.parametrize("name", SURFACES)
+def test_a_light_on_a_surface_shines_in_both_kinds_of_variants(name: str) -> None:
+    found = []
+    for variant in ("llvm_ad_rgb", "scalar_rgb"):
+        mi.set_variant(variant)
+        for s in (1.0, 1e3):
+            scene = lit_from_a_surface(name, s, size=(24, 18))
+            found.append(
+                mrt.render(scene, aa=1, aamode="none", lattice="report", variant=variant).image > 1e-3
+            )
+    assert 0.1 < found[0].mean() < 0.95
+    for other in found[1:]:
+        assert (other != found[0]).any(axis=-1).sum() <= 2  # pixels at a shadow's edge

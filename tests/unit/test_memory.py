@@ -12,14 +12,14 @@ GIB = 2**30
 
 
 def test_plenty_of_memory_gives_the_largest_parts():
-    space = Workspace.beside(800, 600, 4, budget=Budget(64 * GIB))
+    space = Workspace.next_to(800, 600, 4, budget=Budget(64 * GIB))
     assert space.rays_at_once(4) == MOST_RAYS
     assert space.rows_at_once(1024) == MOST_PIXELS // 1024
 
 
 def test_less_memory_gives_smaller_parts():
     spaces = [
-        Workspace.beside(800, 600, 4, budget=Budget(memory)) for memory in (GIB // 8, GIB // 12, GIB // 16)
+        Workspace.next_to(800, 600, 4, budget=Budget(memory)) for memory in (GIB // 8, GIB // 12, GIB // 16)
     ]
     rays = [space.rays_at_once(4) for space in spaces]
     assert MOST_RAYS > rays[0] > rays[1] > rays[2] >= LEAST_RAYS
@@ -40,7 +40,7 @@ def test_less_memory_gives_smaller_parts():
 )
 def test_a_picture_that_does_not_fit_is_refused_with_both_sizes(more, needed):
     with pytest.raises(UsageError, match=f"16384x16384 pixels needs {needed} of memory, and 4.0 GiB may be"):
-        Workspace.beside(16384, 16384, 3, budget=Budget(4 * GIB), **more)
+        Workspace.next_to(16384, 16384, 3, budget=Budget(4 * GIB), **more)
 
 
 def test_by_default_half_of_what_is_free(monkeypatch):
@@ -49,7 +49,7 @@ def test_by_default_half_of_what_is_free(monkeypatch):
 
 
 def test_tiny_pictures_need_no_full_wavefront():
-    space = Workspace.beside(1, 1, 3, budget=Budget(2**26))
+    space = Workspace.next_to(1, 1, 3, budget=Budget(2**26))
     assert space.rays_at_once(3) >= 1 and space.rows_at_once(1) >= 1
 
 
@@ -66,7 +66,7 @@ def test_what_a_large_pass_used_is_given_back(monkeypatch, filtered, flushed):
 def test_more_than_the_machine_has_is_never_used(monkeypatch):
     monkeypatch.setattr(memory, "all_memory", lambda: 8 * GIB)
     with pytest.raises(UsageError, match=r"and 8\.0 GiB may be used"):
-        Workspace.beside(65536, 65536, 3, budget=Budget.of(10**6 * GIB))
+        Workspace.next_to(65536, 65536, 3, budget=Budget.of(10**6 * GIB))
 
 
 def test_free_memory_is_believable():
@@ -103,7 +103,7 @@ def test_textures_are_taken_from_the_budget():
     budget = Budget(GIB)
     budget.take_texture("a.png", 4000, 4000)
     assert 300e6 < budget.taken < 400e6
-    room = Workspace.beside(100, 100, 3, budget=Budget(GIB)).size
-    assert Workspace.beside(100, 100, 3, budget=budget).size == room - budget.taken
+    room = Workspace.next_to(100, 100, 3, budget=Budget(GIB)).size
+    assert Workspace.next_to(100, 100, 3, budget=budget).size == room - budget.taken
     with pytest.raises(UsageError, match=r"b\.png of 6000x6000 texels, the scene needs .*memory="):
         budget.take_texture("b.png", 6000, 6000)

@@ -38,7 +38,7 @@ PAINTED = MTL + "map_Kd picture.png\n"
 
 @pytest.fixture
 def model(tmp_path: Path):
-    """Write an OBJ file, and an MTL file beside it, and read them."""
+    """Write an OBJ file, and an MTL file next to it, and read them."""
 
     def read(obj: str | bytes, mtl: str | None = None, **options) -> tuple[Mesh, ...]:
         if mtl is not None:

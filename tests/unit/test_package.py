@@ -115,5 +115,5 @@ def test_unknown_name() -> None:
 )
 def test_version_is_told_everywhere(name: str, pattern: str) -> None:
     """The package holds the version; the citation repeats it, the changelog may be ahead of it."""
-    told = re.findall(pattern, (ROOT / name).read_text(), re.MULTILINE)
-    assert told[0] in (mrt_mitsuba.__version__, "Unreleased")
+    dated = re.findall(pattern, (ROOT / name).read_text(), re.MULTILINE)
+    assert dated[0] in (mrt_mitsuba.__version__, "Unreleased")

@@ -33,7 +33,7 @@ def test_a_render_with_params_is_that_of_the_scene_changed_by_hand(variant: str)
         ({"x.y": 1}, r"no parameter x.y: print\(mi.traverse\(scene\)\) lists all"),
         ({"material_0.alpha": "rough"}, "material_0.alpha='rough': must be a Float"),
         ({"light_0.intensity.value": [1, 2]}, "must be a Color3f"),
-        ({"alpha": 1}, "alpha is no key of mi.traverse"),
+        ({"alpha": 1}, "alpha is not a key of mi.traverse"),
         (3, "must be a dict of values"),
     ],
 )

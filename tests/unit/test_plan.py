@@ -14,6 +14,7 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, Reason
 from mrt_mitsuba.rendering import kernel_text
+from mrt_mitsuba.rendering.plan import Plan
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.rendering.settings import RenderSettings
 
@@ -49,21 +50,26 @@ def scene(**nodes: Any) -> dict[str, Any]:
 
 
 class Watch(Progress):
-    """Keeps the kernel that traced the rays: the longest."""
+    """Keeps the text of each kernel, by its number of operations."""
 
-    operations, kernel = 0, ""
+    def __init__(self) -> None:
+        self.found: dict[str, int] = {}
 
     def kernels(self, records: Any) -> None:
-        for record in records:
-            if record["type"] == dr.KernelType.JIT and record["operation_count"] > self.operations:
-                self.operations, self.kernel = record["operation_count"], record["ir"].getvalue()
+        own = (record for record in records if record["type"] == dr.KernelType.JIT)
+        self.found |= {record["ir"].getvalue(): record["operation_count"] for record in own}
+
+
+def watched(nodes: dict[str, Any], **options: Any) -> tuple[mrt.Result, dict[str, int]]:
+    """Render; return the result and the kernels with their numbers of operations."""
+    watch = Watch()
+    return mrt.render(nodes, **{"aa": 1, "aamode": "none", "progress": watch} | options), watch.found
 
 
 def planned(nodes: dict[str, Any], **options: Any) -> tuple[mrt.Result, str]:
-    """Render; return the result and the kernel that traced the rays."""
-    watch = Watch()
-    result = mrt.render(nodes, aa=1, aamode="none", progress=watch, **options)
-    return result, watch.kernel
+    """Render; return the result and the kernel that traced the rays: the longest."""
+    result, kernels = watched(nodes, **options)
+    return result, max(kernels, key=lambda text: kernels[text])
 
 
 def painted() -> dict[str, Any]:
@@ -148,15 +154,56 @@ def test_what_no_decision_depends_on_leaves_the_kernel(
     assert kernel == base[1]
 
 
-@pytest.mark.parametrize(
-    "options", [{"layers": ["depth"]}, {"layers": ["normal"]}, {"motion": [0.1, 0, 0]}, {"count_rays": True}]
-)
-def test_options_that_change_the_kernel_change_the_passes(
-    options: dict[str, Any], base: tuple[mrt.Result, str]
+BOX = {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}}
+
+# What turns fields of the plan and, with them, kernels: nodes, options, and the fields
+TURNS: list[tuple[dict[str, Any], dict[str, Any], set[str]]] = [
+    ({}, {"layers": ["depth"]}, {"layers", "passes"}),
+    ({}, {"layers": ["normal"]}, {"layers", "passes"}),
+    ({}, {"count_rays": True}, {"passes"}),
+    ({}, {"motion": [0.1, 0, 0]}, {"motion"}),
+    ({}, {"focaldist": 3.0}, {"focus", "blur", "passes"}),
+    ({}, {"aamode": "geometry", "aa": 2}, {"detector", "passes"}),
+    ({}, {"lattice": "report"}, {"lattice"}),
+    ({}, {"integrator": "direct"}, {"integrator", "traceable", "random", "kernel"}),
+    ({}, {"variant": "llvm_ad_mono"}, {"variant"}),
+    ({"sensor": {"type": "perspective", "film": BOX}}, {}, {"film"}),
+    (
+        {},
+        {"width": 20, "height": 14},
+        {"width", "height"},
+    ),  # Mitsuba's ``ImageBlock`` takes them as constants
+]
+# Numbers that kernels take as data, and what follows from other fields
+DATA = {"scene", "region", "repeats", "motion_samples", "parts", "left_out"}
+
+
+@pytest.mark.parametrize(("nodes", "options", "turned"), TURNS, ids=lambda x: ",".join(x))
+def test_what_turns_the_plan_turns_kernels(
+    nodes: dict[str, Any], options: dict[str, Any], turned: set[str]
 ) -> None:
-    result, kernel = planned(scene(), **options)
-    assert kernel != base[1]
-    assert (result.plan.passes, result.plan.motion) != (base[0].plan.passes, base[0].plan.motion)
+    (before, kernels), (after, other_kernels) = watched(scene()), watched(scene(**nodes), **options)
+    assert kernels.keys() != other_kernels.keys()
+    assert all(getattr(before.plan, name) != getattr(after.plan, name) for name in turned)
+    assert str(before.plan) != str(after.plan)
+
+
+@pytest.mark.parametrize(
+    ("common", "change"),
+    [
+        ({}, {"region": (2, 2, 8, 6)}),
+        ({"motion": [0.1, 0, 0]}, {"motionsamples": 5}),
+        ({}, {"spp": 2}),
+    ],
+)
+def test_numbers_of_the_plan_are_data(common: dict[str, Any], change: dict[str, Any]) -> None:
+    before, after = planned(scene(), **common), planned(scene(), **common | change)
+    assert before[0].plan != after[0].plan and before[1] == after[1]
+
+
+def test_every_field_of_the_plan_turns_a_kernel_or_is_data() -> None:
+    turned = set().union(*(names for _, _, names in TURNS))
+    assert turned.isdisjoint(DATA) and turned | DATA == {field.name for field in fields(Plan)}
 
 
 def test_what_the_integrator_does_not_say_is_not_made_up() -> None:
@@ -216,15 +263,15 @@ NEW_LAYER = """
 import mrt_mitsuba as mrt
 from mrt_mitsuba.output import layers, read_exr
 
-row = layers.Layer("position", "XYZ", layers.FIRST_HIT, "place of the first hit", lambda r: r.si.p)
-layers.TABLE["position"] = layers.LAYERS["position"] = row
+row = layers.Layer("tangent", "XYZ", layers.FIRST_HIT, "tangent along u", lambda r: r.si.sh_frame.s)
+layers.TABLE["tangent"] = layers.LAYERS["tangent"] = row
 for integrator in ("mrt_whitted", "path"):
-    result = mrt.render(9, width=8, height=6, layers=["position"], integrator=integrator, seed=1)
+    result = mrt.render(9, width=8, height=6, layers=["tangent"], integrator=integrator, seed=1)
     result.save("a.exr")
-    assert {"position.X", "position.Y", "position.Z"} <= read_exr("a.exr").layers.keys()
-    assert "with position" in str(result.plan)
+    assert {"tangent.X", "tangent.Y", "tangent.Z"} <= read_exr("a.exr").layers.keys()
+    assert "with tangent" in str(result.plan)
 from mrt_mitsuba.command.listings import usage
-assert "position" in usage()
+assert "tangent" in usage()
 """
 
 

@@ -24,7 +24,7 @@ def check_bsdf(bsdf: Any, *, quick: bool = False, seed: int = 0, only: Iterable[
     """Check the laws of a BSDF in the current variant: a dict for ``mi.load_dict``, or a loaded one.
 
     ``quick``: fewer angles and samples. ``only``: names of ``LAWS``. A loaded BSDF skips what has to load it
-    again. Raises ``UsageError`` for what is no BSDF, and whatever Mitsuba raises for a dict it cannot load.
+    again. Raises ``UsageError`` for anything else, and what Mitsuba raises for a dict it cannot load.
     """
     import mitsuba as mi
 
@@ -33,16 +33,16 @@ def check_bsdf(bsdf: Any, *, quick: bool = False, seed: int = 0, only: Iterable[
     loaded = bsdf if recipe.description is None else recipe.load()
     if not isinstance(loaded, mi.BSDF):
         raise UsageError(
-            f"{type(loaded).__name__} is no BSDF of {mi.variant()}: give a dict or a loaded BSDF"
+            f"{type(loaded).__name__} is not a BSDF of {mi.variant()}: give a dict or a loaded BSDF"
         )
     case = Case(loaded, recipe, quick, seed)
     name = recipe.description["type"] if recipe.description else class_name(loaded)
-    with np.errstate(all="ignore"):  # what is not finite is the law ``finite``'s business
+    with np.errstate(all="ignore"):  # the law ``finite`` deals with what is not finite
         return examine(name, case, LAWS, only=only, quick=quick)
 
 
 def variants(law: Law, case: Case) -> None:
-    """The same values in the scalar variant, and in the spectral one where colours are grey."""
+    """Values in the scalar variant, and in the spectral one where colours are grey."""
     import mitsuba as mi
 
     here = mi.variant()
@@ -69,7 +69,7 @@ def variants(law: Law, case: Case) -> None:
 
 
 def _there(law: Law, case: Case, other: str, few: Any) -> tuple[Array, Array] | None:
-    """Return value and density in another variant; None where it or the plugin is not to be had."""
+    """Return value and density in another variant; None where it or the plugin is not available."""
     import mitsuba as mi
 
     if runtime.obstacle(other):
@@ -105,7 +105,7 @@ def _others(here: str, grey: bool, law: Law) -> list[str]:
 
 
 def switch(law: Law, case: Case) -> None:
-    """The same values after the variant was switched to another one and back, loaded anew and as it was."""
+    """Values after a switch to another variant and back, of the BSDF as it was and loaded anew."""
     import mitsuba as mi
 
     here = mi.variant()

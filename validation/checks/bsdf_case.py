@@ -24,7 +24,7 @@ from mrt_mitsuba.validation.checks.probe import (
 from mrt_mitsuba.validation.checks.recipe import Recipe
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
-QUICK_ANGLES = (0, 50, 80, 140)
+QUICK_ANGLES = (0, 50, 85, 140)
 FIT = 5e-3  # the rational fits of Smith's G₁ in use are off by up to 0.35 %, and the densities with them
 POINTWISE = 2e-3  # relative, beyond what rounding explains
 ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32
@@ -38,7 +38,7 @@ class View:
     uv: Array  # float32 [2]
     u: Array  # the random numbers of the samples [N, 3]
     samples: Samples
-    density: Array  # pdf() at the samples of lobes with a width that are none refused, 0 elsewhere [N]
+    density: Array  # pdf() at the samples that count: of lobes with a width, not refused; 0 elsewhere [N]
 
     def around(self, count: int) -> tuple[Array, Array]:
         """Return ``wi`` and ``uv`` for so many lanes."""
@@ -149,7 +149,7 @@ class Pairs:
 
 
 def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:
-    """Where samples of lobes with a width are ones that the density counts.
+    """Return where samples come from lobes with a width and count for the density.
 
     Weight 0 is how ``sample`` refuses: its direction is then any, or on the wrong side. It may also be that
     the value is 0 there, or that the weight is wrong; but then the stated density is that of the direction.
@@ -177,16 +177,19 @@ def excess(one: Array, other: Array, allowed: Array) -> Array:
 
 
 def parameters(case: Case) -> list[tuple[str, Any]]:
-    """Parameters that hold floating-point numbers which say how much of something there is."""
+    """Return the parameters that hold floating-point numbers which are amounts."""
     import drjit as dr
     import mitsuba as mi
 
     params = mi.traverse(case.bsdf)
     found = []
-    for key in params.keys():  # noqa: SIM118 - SceneParameters is no dict
-        value = params[key]
+    for key in params.keys():  # noqa: SIM118 - SceneParameters is not a dict
+        try:
+            value = params[key]
+        except TypeError:  # it was left out, and is None, which Dr.Jit cannot read
+            continue
         numeric = isinstance(value, float) or (
-            value is not None and dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)
+            dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)
         )
         if numeric and "to_uv" not in key and np.size(np.array(value)) > 0:
             found.append((key, value))

@@ -29,7 +29,7 @@ def gradients(law: Law, case: Case) -> None:
     detached = []
     for key in keys:
         with changed(case, key, _inside):
-            found, attached = _derivatives(case, key)
+            found, attached, broken = _derivatives(case, key)
             slope, error = _differences(case, key)
         off = np.abs(found - slope)
         usual = off <= np.quantile(
@@ -48,6 +48,12 @@ def gradients(law: Law, case: Case) -> None:
             GRADIENT,
             "differences of two widths agree better than that, or the difference is allowed for",
             case.snippet(snippets.GRADIENT, key=key, wi=few.wi[i], uv=few.uv[i], wo=few.wo[i]),
+        )
+        law.none(
+            f"derivatives by {key} that are not finite, of finite values",
+            broken,
+            "one of them spoils a whole gradient",
+            case.at(snippets.GRADIENT, few, key=key),
         )
     if detached:
         law.notes.append(f"detached: {', '.join(detached)}")
@@ -80,8 +86,8 @@ def _values(case: Case) -> Any:
     return dr.select(dr.isfinite(total), total, 0)
 
 
-def _derivatives(case: Case, key: str) -> tuple[Array, bool]:
-    """Return the derivatives by a shift of the parameter, and whether there is a way to it at all."""
+def _derivatives(case: Case, key: str) -> tuple[Array, bool, Array]:
+    """Return derivatives by a shift of the parameter, if there is a way to it at all, and which are none."""
     import drjit as dr
     import mitsuba as mi
 
@@ -90,9 +96,11 @@ def _derivatives(case: Case, key: str) -> tuple[Array, bool]:
     with changed(case, key, lambda old: type(old)(old + shift)):
         values = _values(case)
         if not dr.grad_enabled(values):
-            return np.zeros(dr.width(values)), False
+            none = np.zeros(dr.width(values))
+            return none, False, none.astype(bool)
         dr.forward(shift)
-        return np.nan_to_num(np.array(dr.grad(values), np.float64), posinf=0, neginf=0), True
+        found = np.array(dr.grad(values), np.float64)
+        return np.nan_to_num(found, posinf=0, neginf=0), True, ~np.isfinite(found)
 
 
 def _differences(case: Case, key: str) -> tuple[Array, Array]:

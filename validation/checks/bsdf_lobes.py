@@ -68,7 +68,7 @@ def _updated(law: Law, case: Case, count: int) -> None:
             abs(copy.component_count() - count),
             0,
             "an update says nothing about lobes",
-            case.snippet(snippets.UPDATED),
+            case.snippet(snippets.UPDATED, keys=[key for key, _ in parameters(case)]),
         )
 
 

@@ -12,6 +12,7 @@ from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, changed, ex
 from mrt_mitsuba.validation.checks.law import Law, Skip
 from mrt_mitsuba.validation.checks.probe import Array, direction
 
+EITHER_WAY = "light can be followed either way; transmitted radiance scales by the squared index"
 BEYOND = "relative, beyond 8 times what the rounding of directions explains"
 
 
@@ -31,7 +32,14 @@ def eval_pdf(law: Law, case: Case) -> None:
 
 def reciprocity(law: Law, case: Case) -> None:
     """f(ωi, ωo) η_o² = f(ωo, ωi) η_i², with the indices of the media that the directions are in."""
-    case.need_smooth()
+    if case.smooth:
+        _smooth_either_way(law, case)
+    _delta_either_way(law, case)
+    if not law.parts:
+        raise Skip("no light was followed either way")
+
+
+def _smooth_either_way(law: Law, case: Case) -> None:
     few = case.pairs.only(np.abs(case.pairs.wi[:, 2] * case.pairs.wo[:, 2]) > 1e-3)
 
     def forth(i: Array, o: Array, t: Array, eta: Array) -> Array:
@@ -46,14 +54,38 @@ def reciprocity(law: Law, case: Case) -> None:
         f"f(wi, wo) against f(wo, wi), {BEYOND}",
         excess(forth(*arguments), back(*arguments), allowed),
         POINTWISE,
-        "light can be followed either way; transmitted radiance scales by the squared index",
+        EITHER_WAY,
         lambda i: case.at(snippets.RECIPROCITY, few, eta=few.eta[i])(i),
     )
 
 
+def _delta_either_way(law: Law, case: Case) -> None:
+    """Lobes of one direction: probability × weight × η² of a sample, and of the one that goes back."""
+    count = case.count(2**13, 2**15)
+    wi = direction(case.rng.uniform(-1, 1, count), case.rng.uniform(0, 2 * np.pi, count))
+    uv, first, second = case.rng.random((count, 2), np.float32), case.uniform(count), case.uniform(count)
+    there = case.probe.sample(wi, first, uv)
+    wo = np.where(np.isfinite(there.wo), there.wo, 1)
+    back = case.probe.sample(wo, second, uv)
+    met = there.delta & (there.type == back.type) & (there.component == back.component)
+    met &= (np.abs(back.wo - wi) < 1e-3).all(axis=1) & (np.abs(wi[:, 2] * wo[:, 2]) > 1e-3)
+    if met.sum() < 20:
+        return
+    forth, back_again = (s.weight * (s.pdf * s.eta.astype(np.float64) ** 2)[:, None] for s in (there, back))
+    law.most(
+        "probability x weight x eta^2 of a single direction (delta) against that of the way back, relative",
+        np.where(met, excess(forth, back_again, np.zeros_like(forth)), 0),
+        POINTWISE,
+        EITHER_WAY,
+        lambda i: case.snippet(
+            snippets.DELTA_RECIPROCITY, wi=wi[i], uv=uv[i], u=first[i], back=second[i]
+        ),
+    )  # fmt: skip
+
+
 # ------------------------------------------------ Finite --------------------------------------------------
 
-# Less than 1e-7, a dot product of float32 vectors rarely is
+# A dot product of float32 vectors is rarely less than 1e-7
 COSINES = (1, 1 - 6e-8, 0.5, 1e-2, 1e-4, 1e-7, 0)
 INDICES = ("eta", "k", "int_ior", "ext_ior")
 UNIFORM = (0, 2.0**-24, 0.5, 1 - 2.0**-24)
@@ -63,9 +95,9 @@ def finite(law: Law, case: Case) -> None:
     """No NaN, no infinity, nothing negative: extreme directions, random numbers and parameters."""
     extremes = _extremes(case)
     known = _finite(law, case, extremes, np.zeros((6, len(extremes[0])), bool))
-    copy = case.copy()
-    for key, value, setting in _ends(copy):
-        with setting:
+    for key, value in _ends(case):
+        copy = case.copy()
+        with changed(copy, key, lambda old, value=value: type(old)(old * 0 + value)):
             _finite(law, copy, extremes, known, (key, value))
     law.parts = [part for part in law.parts if not part.holds] or law.parts[:1]
 
@@ -91,7 +123,7 @@ def _finite(law: Law, case: Case, extremes: tuple, known: Array, setting: tuple 
     value, pdf = case.probe.both(wi, wo, uv)
     together = case.probe.pair(wi, wo, uv)
     s = case.probe.sample(wi, u, uv)
-    lit = (s.weight != 0).any(axis=1)  # of one without, nothing else is read
+    lit = (s.weight != 0).any(axis=1)  # else nothing more is read
     length = np.linalg.norm(s.wo.astype(np.float64), axis=1)
     kinds = (
         "eval()",
@@ -130,17 +162,17 @@ def _bad(values: Array) -> Array:
     return ~(np.isfinite(values) & (values >= 0)).reshape(len(values), -1).all(axis=1)
 
 
-def _ends(case: Case) -> Iterator[tuple[str, float, Any]]:
-    """Every number, colour or bitmap of the BSDF at the ends of its likely range, one at a time."""
+def _ends(case: Case) -> Iterator[tuple[str, float]]:
+    """Yield every number, colour or bitmap of the BSDF at the ends of its likely range, one at a time."""
     for key, value in parameters(case):
         number = float(np.mean(np.array(value)))
-        least = 1e-3 if "alpha" in key or "rough" in key else 0.0  # no roughness is another kind of surface
+        least = 1e-3 if "alpha" in key or "rough" in key else 0.0  # 0: another kind of surface
         if key.split(".")[-2 if key.endswith(".value") else -1] in INDICES and number <= 1:
-            ends = 0.5 * number, 2.0 * number  # of metals, for which 0 is no limit but nonsense
+            ends = 0.5 * number, 2.0 * number  # of metals: 0 makes no sense there
         else:
             ends = (least, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)
         for end in ends:
-            yield key, end, changed(case, key, lambda old, end=end: type(old)(old * 0 + end))
+            yield key, end
 
 
 # ----------------------------------------------- Roundoff -------------------------------------------------
@@ -169,7 +201,14 @@ def roundoff(law: Law, case: Case) -> None:
             measured,
             noise.LOST,
             "sound formulas stay below 1.3; beyond, digits are lost inside that could be kept",
-            case.snippet(snippets.NOISE, wi=few.wi[i], uv=few.uv[i], wo=few.wo[i], function=what[:-2]),
+            case.snippet(
+                snippets.NOISE,
+                wi=few.wi[i],
+                uv=few.uv[i],
+                wo=few.wo[i],
+                function=what[:-2],
+                stride=int(found.stride[i]),
+            ),
         )
         if measured > noise.LOST:
             law.notes.append(

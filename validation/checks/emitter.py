@@ -75,7 +75,7 @@ def finite(law: Law, case: Case) -> None:
         axis=1
     )
     bad |= lit & ~(np.isfinite(d).all(axis=1) & np.isfinite(dist) & (pdf >= 0))
-    law.at_most("samples with numbers that are none, or negative", bad.sum(), 0, "one NaN spoils a picture")
+    law.at_most("samples that are not finite, or negative", bad.sum(), 0, "one NaN spoils a picture")
 
 
 LAWS = {"density": density, "weights": weights, "finite": finite}

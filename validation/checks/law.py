@@ -195,7 +195,7 @@ def examine(
                 law.skipped = str(reason)
             except Exception as error:
                 lines = str(error).strip().splitlines() or [""]
-                # of an error in a plugin in Python, Mitsuba quotes the way there, and the error last
+                # Mitsuba quotes the traceback of an error in a Python plugin, with the error last
                 line = lines[-1] if lines[0].startswith("Traceback") else lines[0]
                 law.at_most(
                     f"it raised {type(error).__name__}: {line}", math.inf, 0, "a plugin must not raise"

@@ -8,7 +8,7 @@ SIAM J. Sci. Comput. 33(3), 2011, §§ 3 and 5: with T_k the differences of orde
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ ROUNDING = 2.0**-24
 ALLOWANCE = 8.0  # roundings that a formula of some dozen operations may make of its own
 LOST = 2.5  # sound formulas stay below 1.3, in a hundred runs each
 POINTS = 9  # of each line; Moré and Wild find seven to nine enough
+STRIDES = (2, 64, 2**11, 2**15)  # the most float32 steps from one to the next
 REACHES = tuple(2**k for k in (2, 5, 8, 11, 13))  # float32 steps to either side, for the slope
 
 
@@ -28,6 +29,7 @@ class Noise:
     value: Array
     noise: Array  # found by differences
     explained: Array  # what rounding of the inputs alone would do
+    stride: Array  # the most float32 steps between points of its line
 
     def lost(self, allowance: float) -> Array:
         """Return noise over what inputs and ``allowance`` roundings of the function's own explain."""
@@ -66,30 +68,35 @@ def measure(
     inputs: Array,
     *,
     size: Array | None = None,
-    stride: int = 2,
+    strides: Sequence[int] = STRIDES,
     seed: int = 0,
 ) -> Noise:
     """Estimate the noise of ``function([M, K]) -> [M]`` at float32 inputs [N, K], and what they explain.
 
-    ``size`` [N]: what roundings are of, the value itself if left out. ``stride``: the most float32 steps
-    between points of a line; noise that is coarser than the whole line is not seen. A slope is a central
+    ``size`` [N]: what roundings are of, the value itself if left out. ``strides``: the most float32 steps
+    between points of a line, in ascending order; the first counts along which the value changes at half of
+    them, since digits that are lost leave stairs, flat where a line is short. A slope is a central
     difference; of several widths, the one that agrees best with its neighbour counts.
     """
     count, width = inputs.shape
     inputs = inputs.astype(np.float32)
-    strides = np.random.default_rng(seed).integers(-stride, stride + 1, (count, width))
-    offsets = np.arange(POINTS)[:, None, None] * strides
+    rng = np.random.default_rng(seed)
+    steps = [np.arange(POINTS)[:, None, None] * rng.integers(-s, s + 1, (count, width)) for s in strides]
     axes = np.eye(width, dtype=int)[:, None, :]
     sides = np.concatenate([s * reach * axes for reach in REACHES for s in (1, -1)])
-    everything = np.concatenate([offsets, np.broadcast_to(sides, (len(sides), count, width))])
+    everything = np.concatenate([*steps, np.broadcast_to(sides, (len(sides), count, width))])
     moved = steps_away(np.broadcast_to(inputs, everything.shape), everything)
     values = function(moved.reshape(-1, width)).reshape(len(everything), count).astype(np.float64)
-    lines, ends = values[:POINTS], values[POINTS:].reshape(len(REACHES), 2, width, count)
+    lines = values[: POINTS * len(strides)].reshape(len(strides), POINTS, count)
+    ends = values[POINTS * len(strides) :].reshape(len(REACHES), 2, width, count)
+    flat = (np.diff(lines, axis=1) == 0).mean(axis=1) > 0.5
+    chosen = np.where(flat.all(axis=0), len(strides) - 1, flat.argmin(axis=0))
+    line = np.take_along_axis(lines, chosen[None, None], axis=0)[0]
     slope = (ends[:, 0] - ends[:, 1]) / (2 * np.array(REACHES)[:, None, None])  # change per step
     apart = np.abs(np.diff(slope, axis=0))
     best = np.take_along_axis(slope[1:], apart.argmin(axis=0)[None], axis=0)[0]
     # a rounded input is anywhere within half a step: a variance of 1/12
     explained = np.sqrt((best**2).sum(axis=0) / 12)
     with np.errstate(divide="ignore", invalid="ignore"):
-        unit = ROUNDING * np.abs(lines[0] if size is None else size)
-        return Noise(lines[0], ecnoise(lines) / unit, explained / unit)
+        unit = ROUNDING * np.abs(line[0] if size is None else size)
+        return Noise(line[0], ecnoise(line) / unit, explained / unit, np.take(strides, chosen))

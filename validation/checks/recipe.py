@@ -35,7 +35,7 @@ class Recipe:
         return Recipe(_kept(given) if isinstance(given, dict) else None)
 
     def load(self) -> Any:
-        """Load it in the current variant. Raises ``Skip`` where there is no dict."""
+        """Load it in the current variant. Raises ``Skip`` without a dict."""
         import mitsuba as mi
 
         if self.description is None:

@@ -29,7 +29,7 @@ MOST_SAMPLES = 2**14  # of one pixel, to see a fault again
 
 @dataclass(frozen=True)
 class Fault:
-    """A pixel that is no number: the smallest crop of the film that shows it, and what makes it."""
+    """A pixel that is not finite: the smallest crop of the film that shows it, and what makes it."""
 
     pixels: int  # how many there are in the whole picture
     crop: tuple[int, int, int, int]  # x, y, width, height
@@ -115,7 +115,7 @@ def check_scene(
 
 
 def _all(scene: Any) -> Iterator[tuple[str, Any]]:
-    """Each BSDF, shape and emitter once, after its kind."""
+    """Yield each BSDF, shape and emitter once, after its kind."""
     shapes = list(scene.shapes())
     bsdfs = {str(id(b)): b for b in (shape.bsdf() for shape in shapes) if b is not None}
     for word, plugins in (("BSDF", bsdfs.values()), ("shape", shapes), ("emitter", scene.emitters())):
@@ -155,7 +155,7 @@ def _examine(kind: str, name: str, plugin: Any, scene: Any, quick: bool, seed: i
 
 
 def _hunt(source: Any, quick: bool, seed: int) -> Fault | None:
-    """Render, and narrow the film down to a crop that still shows a pixel which is no number."""
+    """Render, and narrow the film down to a crop that still shows a pixel that is not finite."""
     spp = 4 if quick else 32
     bad = _bad(source, spp, seed)
     if not bad.any():
@@ -226,7 +226,7 @@ def _culprit(source: Any, spp: int, seed: int) -> str:
     import mitsuba as mi
 
     if mi.variant().startswith("scalar"):
-        return "what is not told in scalar variants: check it in a vectorised one"
+        return "something that scalar variants do not reveal: check it in a vectorised one"
     counts: Counter[str] = Counter()
     pixels = int(np.prod(np.array(source.sensor.film().crop_size())))
     for attempt in range(8):
@@ -241,13 +241,13 @@ def _camera_rays(source: Any, rng: Any) -> Any:
     import mitsuba as mi
 
     draw = rng.next_float32
-    # of a cropped film, the unit square is the crop
+    # the unit square covers the crop of a cropped film
     ray, _ = source.sensor.sample_ray(draw(), draw(), mi.Point2f(draw(), draw()), mi.Point2f(draw(), draw()))
     return ray
 
 
 def _follow(source: Any, count: int, seed: int) -> Counter[str]:
-    """Trace one batch of paths; return how often each object was the first to give a number that is none."""
+    """Trace one batch of paths; return how often each object was the first to give an infinity or NaN."""
     import drjit as dr
     import mitsuba as mi
 

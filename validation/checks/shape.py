@@ -24,7 +24,7 @@ def check_shape(
 ) -> Check:
     """Check the laws of a shape in the current variant: a dict for ``mi.load_dict``, or a loaded one.
 
-    An object that is no Mitsuba shape but has ``ray_intersect``, ``ray_test`` and ``bbox`` will do as well.
+    Any other object that has ``ray_intersect``, ``ray_test`` and ``bbox`` will do as well.
     ``quick``: fewer rays. ``only``: names of ``LAWS``. Raises ``UsageError`` for anything else.
     """
     import mitsuba as mi
@@ -34,7 +34,7 @@ def check_shape(
     loaded = shape if recipe.description is None else recipe.load()
     if not all(hasattr(loaded, name) for name in ("ray_intersect", "ray_test", "bbox")):
         raise UsageError(
-            f"{type(loaded).__name__} is no shape of {mi.variant()}: give a dict or a loaded shape"
+            f"{type(loaded).__name__} is not a shape of {mi.variant()}: give a dict or a loaded shape"
         )
     name = recipe.description["type"] if recipe.description else class_name(loaded)
     with np.errstate(all="ignore"):
@@ -43,14 +43,12 @@ def check_shape(
 
 def bbox(law: Law, case: Case) -> None:
     """Whatever is hit or sampled lies in the bounding box."""
-    import mitsuba as mi
-
     o, d, met = case.met
     points = [met.p]
     ends = corners(case.shape)
     if ends is not None:
         points.append(ends)
-    elif isinstance(case.shape, mi.Shape):
+    elif hasattr(case.shape, "sample_position"):
         try:
             u = case.rng.random((len(o), 2), np.float32)
             points += lanes(lambda mi, x: [case.shape.sample_position(0, x).p], ("Point2f", u))
@@ -69,7 +67,7 @@ def bbox(law: Law, case: Case) -> None:
 
 
 def variants(law: Law, case: Case) -> None:
-    """The same hits in the scalar variant, or of a scalar one in the vectorised."""
+    """Hits in the scalar variant against those in the vectorised one."""
     import mitsuba as mi
 
     case.recipe.with_()

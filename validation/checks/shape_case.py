@@ -94,9 +94,13 @@ class Case:
     def units(self, count: int) -> Array:
         return unit(self.rng.normal(size=(count, 3)))
 
+    def around(self, count: int, distance: float = 1.5) -> Array:
+        """Return points that look at the shape, from so many sizes away."""
+        return (self.middle + distance * self.size * self.units(count)).astype(np.float32)
+
     def rays(self, count: int, distance: float = 1.5) -> tuple[Array, Array]:
         """Return rays from all around to points in the box."""
-        o = (self.middle + distance * self.size * self.units(count)).astype(np.float32)
+        o = self.around(count, distance)
         extent = np.maximum(self.high - self.low, 0.01 * self.size)
         goal = self.middle + extent * self.rng.uniform(-0.55, 0.55, (count, 3))
         return o, unit(goal - o)
@@ -109,12 +113,18 @@ class Case:
 
     @cached_property
     def met(self) -> tuple[Array, Array, Hits]:
-        """Only those that meet the surface, and do not graze it."""
+        """Those rays that meet the surface and do not graze it, and what they meet."""
         o, d, hits = self.seen
         steep = hits.found & (np.abs((hits.n * d).sum(axis=1)) > FLAT)
         if steep.sum() < 20:
             raise Skip("hardly any ray towards its bounding box meets the shape")
         return o[steep], d[steep], hits.only(steep)
+
+    @cached_property
+    def behind(self) -> Hits:
+        """What rays meet that come back from just behind ``met``."""
+        _, d, hits = self.met
+        return trace(self.target, leave(hits.p, hits.n, d), -d)
 
     @cached_property
     def crossings(self) -> list[tuple[Array, Array, Array]]:
@@ -123,27 +133,22 @@ class Case:
 
     @cached_property
     def closed(self) -> bool:
-        """Whether most lines enter and leave in turn: a closed surface, with holes perhaps."""
-        judged, turns = self.turns
-        return bool(judged.sum() > 20 and turns[judged].mean() > 0.75)
+        """Whether most lines cross the surface an even number of times: it is closed, with holes perhaps."""
+        judged, even = self.lines
+        return bool(judged.sum() > 20 and even[judged].mean() > 0.75)
 
     @cached_property
-    def turns(self) -> tuple[Array, Array]:
-        """Which lines meet something and graze nothing, and which leave and enter in turn. Both [N]
-
-        Normals may all point inwards: that is for the law of normals to say.
-        """
+    def lines(self) -> tuple[Array, Array]:
+        """Which lines are fit to be judged, and which cross the surface an even number of times. Both [N]"""
         count = len(self.seen[0])
-        met, steep = np.zeros(count, bool), np.ones(count, bool)
-        turn, last = np.ones((2, count), bool), np.array([np.ones(count), -np.ones(count)])
-        for line, _, cos in self.crossings:
+        met, even, clear = np.zeros(count, bool), np.ones(count, bool), np.ones(count, bool)
+        last = np.full((count, 3), np.inf)
+        for line, p, cos in self.crossings:
             met[line] = True
-            steep[line] &= np.abs(cos) > 4 * FLAT
-            turn[:, line] &= np.sign(cos) != np.sign(last[:, line])
-            last[:, line] = cos
-        turn &= [last[0] > 0, last[1] < 0]
-        judged = met & steep
-        return judged, max(turn, key=lambda way: way[judged].mean() if judged.any() else 0)
+            clear[line] &= (np.abs(cos) > 4 * FLAT) & ~near(p, last[line])
+            even[line] ^= True
+            last[line] = p
+        return met & clear, even
 
     def snippet(self, o: Array, d: Array, body: str = snippets.RAY, **names: Any) -> str:
         return snippets.shape(self.shape, self.recipe.description, body, {"o": o, "d": d, **names})
@@ -153,14 +158,24 @@ class Case:
         return lambda i: self.snippet(o[i], d[i], body, **names)
 
 
+def offset(p: Array) -> Array:
+    """Return how far off the surface ``spawn_ray`` starts from points [N, 3]."""
+    return OFFSET * (1 + np.abs(p).max(axis=1))
+
+
+def near(p: Array, q: Array) -> Array:
+    """Return whether points [N, 3] are one, for all that a spawned ray can tell."""
+    return np.linalg.norm(p - q, axis=1) < 4 * offset(p)
+
+
 def leave(p: Array, n: Array, d: Array) -> Array:
     """Return origins off the surface on the side of ``d``, as ``spawn_ray`` has them."""
     side = np.sign((n * d).sum(axis=1, keepdims=True))
-    return (p + side * n * OFFSET * (1 + np.abs(p).max(axis=1, keepdims=True))).astype(np.float32)
+    return (p + side * n * offset(p)[:, None]).astype(np.float32)
 
 
 def corners(shape: Any) -> Array | None:
-    """Vertices of a mesh, and middles of edges."""
+    """Return the vertices of a mesh and the middles of its edges; None for other shapes."""
     import mitsuba as mi
 
     if not isinstance(shape, mi.Mesh):

@@ -79,7 +79,7 @@ def far(law: Law, case: Case) -> None:
         error,
         HIT_ROUNDINGS,
         "the origin is rounded, and some dozen operations with it",
-        case.at(origin, d),
+        lambda i: case.snippet(origin[i], d[i], snippets.TWICE, other=closer[i]),
     )
     # a rounded origin moves the line: only what is surely met counts
     bad = steep & through & (np.linalg.norm(here.p - met.p[few], axis=1) < 20 * ROUNDING * distance)
@@ -89,12 +89,12 @@ def far(law: Law, case: Case) -> None:
         bad.mean(),
         2e-3,
         "outlines are as wide as the rounding of the distance",
-        case.snippet(origin[i], d[i]),
+        case.snippet(origin[i], d[i], snippets.TWICE, other=closer[i]),
     )
 
 
 def finite(law: Law, case: Case) -> None:
-    """Rays along axes, from the surface, the middle, corners and very far: all results are numbers."""
+    """Rays along axes, from the surface, the middle, corners and very far: all results are finite."""
     _, _, met = case.met
     count = case.count(2**12, 2**15)
     pick = case.rng.integers
@@ -122,4 +122,4 @@ def finite(law: Law, case: Case) -> None:
     bad = found.found & ~(
         np.isfinite(numbers).all(axis=1) & np.isfinite(partials).all(axis=1) & (found.t >= 0)
     )
-    law.none("hits with numbers that are none", bad, "one NaN spoils a picture", case.at(o, d))
+    law.none("hits with numbers that are not finite", bad, "one NaN spoils a picture", case.at(o, d))

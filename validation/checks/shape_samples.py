@@ -15,10 +15,8 @@ from mrt_mitsuba.validation.checks.shape_case import FLAT, Case, trace, walk
 
 def sampling(law: Law, case: Case) -> None:
     """Positions by area, judged by where lines cross the surface; directions, and the densities of both."""
-    import mitsuba as mi
-
-    if not isinstance(case.shape, mi.Shape):
-        raise Skip("no Mitsuba shape: there is no sample_position()")
+    if not hasattr(case.shape, "sample_position"):
+        raise Skip("there is no sample_position()")
     count = case.count(2**14, 2**17)
     u = case.rng.random((count, 2), np.float32)
 
@@ -42,6 +40,13 @@ def sampling(law: Law, case: Case) -> None:
             "the same number",
             snippets.positions(case.shape, case.recipe.description),
         )
+    _on_the_surface(law, case, p, n)
+    _area(law, case, p, area)
+    _directions(law, case, u)
+
+
+def _on_the_surface(law: Law, case: Case, p: Array, n: Array) -> None:
+    """Sampled positions, and their normals, as rays meet them."""
     start = (p + n * 0.01 * case.size).astype(np.float32)
     back = trace(case.target, start, unit(-n))
     away = np.where(back.found, np.linalg.norm(back.p - p, axis=1), np.inf) / case.size
@@ -54,8 +59,15 @@ def sampling(law: Law, case: Case) -> None:
         "a few roundings",
         case.snippet(start[0], -n[0]),
     )
-    _area(law, case, p, area)
-    _directions(law, case, u)
+    alike = np.maximum((n * back.shading).sum(axis=1), (n * back.n).sum(axis=1))
+    turned = 1 - alike / np.linalg.norm(n, axis=1)
+    law.at_most(
+        "normals of sampled positions against those of rays, 1 - cosine, 9 in 10",
+        np.quantile(turned[back.found], 0.9) if back.found.any() else 0,
+        1e-3,
+        "one surface",
+        case.snippet(start[0], -n[0]),
+    )
 
 
 def _area(law: Law, case: Case, p: Array, area: float) -> None:
@@ -88,7 +100,7 @@ def _uniform(law: Law, case: Case, p: Array, points: Array, bunch: float) -> Non
     A line's crossings come together: their counts vary ``bunch`` times as much.
     """
     both, cells = np.concatenate([p, points]), np.zeros(len(p) + len(points), int)
-    for level, axis in enumerate(case.units(6)):  # aslant, so that flat faces are no jumps
+    for level, axis in enumerate(case.units(6)):  # aslant, so that flat faces make no jumps
         for cell in range(2**level):
             here = cells == cell
             x = both[here] @ axis
@@ -111,7 +123,7 @@ def _uniform(law: Law, case: Case, p: Array, points: Array, bunch: float) -> Non
 def _directions(law: Law, case: Case, u: Array) -> None:
     """``sample_direction`` from outside: meets the shape, and states its own density."""
     count = len(u)
-    o = (case.middle + 1.5 * case.size * case.units(count)).astype(np.float32)
+    o = case.around(count)
 
     def sample(mi: Any, origin: Any, second: Any) -> list[Any]:
         import drjit as dr
@@ -124,7 +136,7 @@ def _directions(law: Law, case: Case, u: Array) -> None:
     try:
         d, dist, pdf, again = lanes(sample, ("Point3f", o), ("Point2f", u))
     except RuntimeError:
-        law.notes.append("sample_direction() is not there")
+        law.notes.append("the shape has no sample_direction()")
         return
     drawn = pdf[:, 0] > 0
     error = np.where(drawn, np.abs(pdf / again - 1)[:, 0], 0)
@@ -145,7 +157,48 @@ def _directions(law: Law, case: Case, u: Array) -> None:
     law.at_most(
         "share of sampled directions that miss the shape, or reach it behind the sampled point",
         (bad | lost).mean(),
-        1e-3,
-        "outlines hang on roundings",
+        1e-2,
+        "outlines hang on roundings; small leaks are watertight's business",
         case.snippet(o[i], d[i]),
     )
+    visible = drawn & met.found & (met.t > dist[:, 0] * (1 - 1e-3))
+    weight = np.where(visible, 1 / np.where(drawn, pdf[:, 0], 1), 0)
+    _solid_angle(law, case, *_moments(case, o, d, met.p, weight))
+
+
+def _solid_angle(law: Law, case: Case, mean: Array, variance: Array) -> None:
+    """Hold moments of what is visible, by samples, to those by uniform directions."""
+    o = case.around(case.count(2**17, 2**19))
+    away = _cone(case, o)
+    met = trace(case.target, o, away)
+    expected, other = _moments(case, o, away, met.p, np.where(met.found, CONE, 0))
+    off = np.abs(mean - expected) - SIGMAS * np.sqrt(variance + other)
+    law.at_most(
+        "solid angle of what is visible, or its middle or width, by samples against uniform directions, "
+        f"beyond {SIGMAS} standard errors",
+        max(off.max(), 0) / expected[0],
+        1e-2,
+        "the mean of 1 / density over what is seen; lines that graze are left room for",
+        snippets.positions(case.shape, case.recipe.description),
+    )
+
+
+SINE = 1 / 3  # of the angle between the middle and the rim of the sphere around, from 1.5 sizes away
+CONE = 2 * np.pi * (1 - np.sqrt(1 - SINE**2))  # solid angle
+
+
+def _cone(case: Case, o: Array) -> Array:
+    """Return a random direction from each point into the cone that holds the shape."""
+    axis = unit(case.middle - o)
+    across = unit(np.cross(axis, case.units(len(o))))
+    cos = 1 - case.rng.random((len(o), 1)) * CONE / (2 * np.pi)
+    return unit(cos * axis + np.sqrt(1 - cos**2) * across)
+
+
+def _moments(case: Case, o: Array, d: Array, p: Array, weight: Array) -> tuple[Array, Array]:
+    """Return means [8] of weights, alone and times place, its squares and the angle, and their variances."""
+    place = (p - case.middle) / case.size
+    angle = (1 - (d * unit(case.middle - o)).sum(axis=1, keepdims=True)) * 2 * np.pi / CONE
+    factors = np.concatenate([np.ones_like(angle), place, 4 * place**2, angle], axis=1)
+    found = np.where(weight[:, None] > 0, weight[:, None] * factors, 0)
+    return found.mean(axis=0), found.var(axis=0) / len(found)

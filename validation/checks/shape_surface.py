@@ -10,7 +10,16 @@ from mrt_mitsuba.validation.checks import noise, snippets
 from mrt_mitsuba.validation.checks.law import Law, Skip
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import Array, lanes, unit
-from mrt_mitsuba.validation.checks.shape_case import FLAT, HIT_ROUNDINGS, OFFSET, Case, corners, leave, trace
+from mrt_mitsuba.validation.checks.shape_case import (
+    FLAT,
+    HIT_ROUNDINGS,
+    Case,
+    corners,
+    leave,
+    near,
+    offset,
+    trace,
+)
 
 NORMAL = 1e-5  # a few roundings of a square root and a quotient
 
@@ -55,7 +64,7 @@ def hits(law: Law, case: Case) -> None:
 
 
 def surface(law: Law, case: Case) -> None:
-    """Hit points lie on the ray; rays from the surface meet it no more where they start; little is lost."""
+    """Hit points lie on the ray, spawned rays do not meet the surface where they start, digits are kept."""
     o, d, met = case.met
     largest = np.maximum(np.abs(o).max(axis=1), np.abs(met.p).max(axis=1)) + met.t
     along = o.astype(np.float64) + met.t[:, None].astype(np.float64) * d
@@ -73,16 +82,24 @@ def surface(law: Law, case: Case) -> None:
     cos = (few.n * away).sum(axis=1)
     start = leave(few.p, few.n, away)
     again = trace(case.target, start, away)
-    offset = OFFSET * (1 + np.abs(few.p).max(axis=1))
-    same = (np.abs((again.n * few.n).sum(axis=1)) > 0.9) & (
-        np.linalg.norm(again.p - few.p, axis=1) < 4 * offset
-    )
+    turn = np.abs((again.n * few.n).sum(axis=1))
+    # another part may truly be that near, in a hollow edge
+    same = near(few.p, again.p) & (turn > np.where(again.part == few.part, 0.9, 0.9999))
     bad = again.found & same & (np.abs(cos) > FLAT)
     law.none(
         f"rays from the surface, of {count}, that meet it where they start",
         bad,
         "self-intersections are dark spots; grazing rays are left out",
         case.at(start, away),
+    )
+    before = met.p - 1e-3 * case.size * d
+    close = trace(case.target, before.astype(np.float32), d)
+    law.share(
+        "share of rays from a thousandth of the size before the surface that do not meet it there",
+        ~(close.found & (np.linalg.norm(close.p - met.p, axis=1) < 1e-3 * case.size)),
+        2e-3,
+        "no absolute limits; outlines hang on roundings",
+        case.at(before.astype(np.float32), d),
     )
     _roundoff(law, case)
 
@@ -101,7 +118,7 @@ def _roundoff(law: Law, case: Case) -> None:
         def function(x: Array, pick: Any = pick) -> Array:
             return np.asarray(pick(trace(case.target, x[:, :3], x[:, 3:])))
 
-        found = noise.measure(function, inputs, size=size, stride=64, seed=case.seed)
+        found = noise.measure(function, inputs, size=size, strides=(64,), seed=case.seed)
         lost = np.nan_to_num(found.lost(noise.ALLOWANCE), posinf=0)
         measured = float(np.quantile(lost, 0.9))
         i = int(np.abs(lost - measured).argmin())
@@ -123,15 +140,15 @@ def normals(law: Law, case: Case) -> None:
         axis=0
     )
     law.most("length of a normal less 1", length, NORMAL, "a square root and a quotient", case.at(o, d))
-    flipped = isinstance(case.shape, mi.Shape) and case.shape.has_flipped_normals()
     if case.closed:
         o, d, seen = case.seen
-        judged, turns = case.turns
-        bad = judged & turns & (((seen.n * d).sum(axis=1) > 0) != flipped)
-        law.none(
-            f"rays from outside that meet a normal that points {'outwards' if flipped else 'inwards'}",
-            bad,
-            "a closed shape has an outside",
+        judged, even = case.lines
+        flipped = isinstance(case.shape, mi.Shape) and case.shape.has_flipped_normals()
+        law.share(
+            f"share of rays from outside whose normal points {'outwards' if flipped else 'inwards'}",
+            judged & even & (((seen.n * d).sum(axis=1) > 0) != flipped),
+            1e-3,
+            "a closed shape has an outside; what edges hide is left room for",
             case.at(o, d),
         )
     else:
@@ -139,6 +156,7 @@ def normals(law: Law, case: Case) -> None:
     o, d, met = case.met
     apart = (met.n * met.shading).sum(axis=1) <= 0
     law.none("shading normals on the other side than the geometric one", apart, "one surface", case.at(o, d))
+    _two_sides(law, case)
     usable = (np.linalg.norm(met.du, axis=1) > 0) & (np.linalg.norm(met.dv, axis=1) > 0)
     if usable.any():
         slant = np.maximum(*(np.abs((unit(v) * met.n).sum(axis=1)) for v in (met.du, met.dv)))
@@ -153,8 +171,23 @@ def normals(law: Law, case: Case) -> None:
     _differences(law, case)
 
 
+def _two_sides(law: Law, case: Case) -> None:
+    """The normal is the surface's, not the ray's: the same for a ray that comes back from behind."""
+    o, d, met = case.met
+    back = case.behind
+    same = back.found & near(met.p, back.p)
+    if same.sum() > 20:
+        law.share(
+            "share of normals that turn where the same point is met from behind",
+            same & ((back.n * met.n).sum(axis=1) < -0.5),
+            1e-3,
+            "a surface has one normal; thin parts are left room for",
+            case.at(o, d, snippets.BEHIND),
+        )
+
+
 def _differences(law: Law, case: Case) -> None:
-    """Neighbouring hits against normal and partial derivatives; two widths tell curvature from error."""
+    """Neighbouring hits against normal and partial derivatives; two widths separate curvature from error."""
     o, d, met = case.met
     aside = unit(np.cross(d, case.units(len(d))))
     slopes, partials = [], []
@@ -188,12 +221,20 @@ def _differences(law: Law, case: Case) -> None:
 
 def watertight(law: Law, case: Case) -> None:
     """Lines enter and leave in turn, and no ray from inside gets out without a hit."""
+    o, d, met = case.met
+    # else such a ray may fall off an edge, or its offset be larger than the shape
+    steep = (np.abs((met.n * d).sum(axis=1)) > 0.5) & (offset(met.p) < 1e-3 * case.size)
+    blind = steep & ~case.behind.found
+    if blind.mean() > 1e-2:
+        what = "share of rays that pass the surface from behind"
+        law.share(what, blind, 1e-2, "it has two sides; edges have room", case.at(o, d, snippets.BEHIND))
+        return
     if not case.closed:
         raise Skip("the shape is open: lines do not leave it as often as they enter")
-    judged, turns = case.turns
+    judged, even = case.lines
     law.share(
-        f"share of lines, of {judged.sum()}, that do not enter and leave in turn",
-        judged & ~turns,
+        f"share of lines, of {judged.sum()}, that cross the surface an odd number of times",
+        judged & ~even,
         1e-3,
         "near sharp edges, the offset of a ray that goes on leads out again; grazing lines are left out",
         case.at(*case.seen[:2]),
@@ -218,7 +259,7 @@ def watertight(law: Law, case: Case) -> None:
 
 
 def _inside(case: Case) -> Array | None:
-    """Points well inside: middles of the longer first chords."""
+    """Return points well inside: middles of the longer first chords."""
     if len(case.crossings) < 2:
         return None
     (first, p, _), (second, q, _) = case.crossings[:2]

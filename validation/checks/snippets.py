@@ -105,6 +105,15 @@ back = bsdf.eval(ctx, si, wo) / dr.abs(wo.z)
 print(forth, "should be", back)
 """
 )
+DELTA_RECIPROCITY = (
+    _POINT
+    + """
+for u in ({u}, {back}):
+    bs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))
+    print("probability x weight x eta^2:", bs.pdf * weight * bs.eta**2, "the way back should have the same")
+    si.wi = bs.wo
+"""
+)
 _SETTING = """
 setting = {setting}  # a parameter and its value
 if setting:
@@ -129,9 +138,8 @@ NOISE = (
     _POINT
     + _WO
     + """
-for k in range(9):  # steps of float32 in one component: a smooth function would change evenly
-    x = np.array([{wo}], np.float32)
-    x[:1] = (x[:1].view(np.int32) + k).view(np.float32)
+for k in range(9):  # float32 steps in all components: a smooth function would change evenly
+    x = (np.array([{wo}], np.float32).view(np.int32) + {stride} * k).view(np.float32)
     print(np.ravel(bsdf.{function}(ctx, si, mi.Vector3f(*map(float, x)))))
 """
 )
@@ -161,9 +169,9 @@ print("flags of the whole:", hex(int(bsdf.flags())))
 """
 UPDATED = """
 params = mi.traverse(bsdf)
-for key in params.keys():
-    params[key] = type(params[key])(params[key])
 print("components before:", bsdf.component_count())
+for key in {keys}:
+    params[key] = 0.9 * params[key]
 params.update()
 print("and after params.update():", bsdf.component_count())
 """
@@ -260,6 +268,21 @@ scene = mi.load_dict({{"type": "scene", "shape": shape}})
 o, d = mi.Point3f({o}), mi.Vector3f({d})
 dr.make_opaque(o, d)
 print(scene.ray_intersect(mi.Ray3f(o, d)))
+"""
+BEHIND = """
+scene = mi.load_dict({{"type": "scene", "shape": shape}})
+o, d = mi.Point3f({o}), mi.Vector3f({d})
+dr.make_opaque(o, d)
+si = scene.ray_intersect(mi.Ray3f(o, d))
+back = scene.ray_intersect(mi.Ray3f(si.spawn_ray(d).o, -d))
+print("from the front:", si.n, "and from just behind:", back.n, "at", back.t)
+"""
+TWICE = """
+scene = mi.load_dict({{"type": "scene", "shape": shape}})
+d = mi.Vector3f({d})
+for o in (mi.Point3f({o}), mi.Point3f({other})):
+    dr.make_opaque(o, d)
+    print("from", o, "it is met at", scene.ray_intersect(mi.Ray3f(o, d)).p)
 """
 MAXT = """
 scene = mi.load_dict({{"type": "scene", "shape": shape}})

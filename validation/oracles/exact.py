@@ -17,12 +17,12 @@ FRESNEL_FORMS = ("dielectric", "schlick", "unity")
 
 
 def number(x: Any) -> mpf:
-    """A float of any precision, an integer or a decimal string as ``mpf``; binary numbers are not rounded."""
+    """Return a number or decimal string as ``mpf``; binary numbers of any precision are not rounded."""
     return mpf(x) if isinstance(x, (str, mpf)) else mpf(float(x))
 
 
 def unit(v: Sequence[Any]) -> list[mpf]:
-    """A vector made one unit long."""
+    """Return a vector made one unit long."""
     components = [number(x) for x in v]
     length = mp.sqrt(sum(x * x for x in components))
     return [x / length for x in components]
@@ -30,7 +30,7 @@ def unit(v: Sequence[Any]) -> list[mpf]:
 
 @mp.workdps(DIGITS)
 def half_vector(a: Sequence[Any], b: Sequence[Any]) -> list[mpf]:
-    """The unit vector halfway between two directions."""
+    """Return the unit vector halfway between two directions."""
     return unit([x + y for x, y in zip(unit(a), unit(b), strict=True)])
 
 
@@ -47,7 +47,7 @@ def fresnel_schlick(cos_theta: Any, f0: Any) -> mpf:
 
 @mp.workdps(DIGITS)
 def fresnel_dielectric(cos_theta: Any, ext_ior: Any, int_ior: Any) -> mpf:
-    """½(Rs + Rp) by Snell's law; 1 under total reflection."""
+    """Return ½(Rs + Rp) by Snell's law; 1 under total reflection."""
     c, n1, n2 = number(cos_theta), number(ext_ior), number(int_ior)
     sin2_t = (n1 / n2) ** 2 * (1 - c * c)
     if sin2_t > 1:
@@ -66,7 +66,7 @@ def beckmann_d(cos_theta_h: Any, alpha: Any) -> mpf:
 
 @mp.workdps(DIGITS)
 def smith_g1(v: Sequence[Any], alpha: Any) -> mpf:
-    """The rational fit of Walter et al. for a direction above the surface, whose normal is +z."""
+    """Return the rational fit of Walter et al. for a direction above the surface, whose normal is +z."""
     x, y, z = (number(c) for c in v)
     tan_theta = mp.sqrt(x * x + y * y) / z
     if tan_theta == 0:
@@ -79,7 +79,7 @@ def smith_g1(v: Sequence[Any], alpha: Any) -> mpf:
 
 @mp.workdps(DIGITS)
 def visible_cos(v: Sequence[Any], alpha: Any) -> mpf:
-    """(1 + Λ) cos θ of a direction above the surface, with Beckmann's own Λ (Heitz 2014, eq. 72)."""
+    """Return (1 + Λ) cos θ of a direction above the surface, with Beckmann's own Λ (Heitz 2014, eq. 72)."""
     x, y, z = (number(c) for c in v)
     across = number(alpha) * mp.sqrt(x * x + y * y)
     if across == 0:
@@ -90,7 +90,7 @@ def visible_cos(v: Sequence[Any], alpha: Any) -> mpf:
 
 @mp.workdps(DIGITS)
 def fresnel(form: str, cos_theta: Any, ext_ior: Any, int_ior: Any) -> mpf:
-    """One of ``FRESNEL_FORMS``; Schlick's with F₀ from the indices."""
+    """Return one of ``FRESNEL_FORMS``; Schlick's with F₀ from the indices."""
     if form == "dielectric":
         return fresnel_dielectric(cos_theta, ext_ior, int_ior)
     if form == "schlick":
@@ -100,7 +100,7 @@ def fresnel(form: str, cos_theta: Any, ext_ior: Any, int_ior: Any) -> mpf:
 
 @mp.workdps(DIGITS)
 def specular_bsdf(wi: Sequence[Any], wo: Sequence[Any], alpha: Any, *, form: str, int_ior: Any = 1) -> mpf:
-    """D F G / (4 cos θi cos θo) for directions above the surface, whose normal is +z; outside index 1."""
+    """Return D F G / (4 cos θi cos θo) for directions above the surface with normal +z; outside index 1."""
     i, o, h = unit(wi), unit(wo), half_vector(wi, wo)
     cos_d = sum(a * b for a, b in zip(i, h, strict=True))
     f = fresnel(form, cos_d, 1, int_ior)

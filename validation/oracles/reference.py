@@ -288,25 +288,18 @@ class _Tracer:
     def __init__(self, scene: Scene, settings: Settings) -> None:
         self.scene, self.settings = scene, settings
         self.reach = ORIGINAL_REACH if settings.start == "original" else np.inf
-        things: list[Any] = [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
-        groups = [(Spheres, scene.spheres), (Planes, scene.planes), (Axial, (*scene.cones, *scene.cylinders))]
         # Each with the numbers of its objects; all triangles of a mesh are one object
-        self.groups: list[tuple[Any, np.ndarray]] = []
-        for kind, members in groups:
-            if members:
-                first = sum(len(numbers) for _, numbers in self.groups)
-                self.groups.append((kind(members), first + np.arange(len(members))))
-        for k, mesh in enumerate(scene.meshes):
-            number = len(things) - len(scene.meshes) + k
-            self.groups.append((Triangles(mesh), np.full(len(mesh.faces), number)))
+        self.groups: list[tuple[Any, np.ndarray]] = list(_groups(scene))
+        things: list[Any] = [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
         materials = [thing.material for thing in things]
-        self.ior = np.array([m.ior for m in materials])
-        self.alpha = np.array([m.alpha for m in materials])
-        self.specular = np.array([m.specular for m in materials], float).reshape(-1, 3)
-        self.diffuse = np.array([m.diffuse for m in materials], float).reshape(-1, 3)
+        self.ior, self.alpha = (np.array([getattr(m, name) for m in materials]) for name in ("ior", "alpha"))
+        self.specular, self.diffuse = (
+            np.array([getattr(m, name) for m in materials], float).reshape(-1, 3)
+            for name in ("specular", "diffuse")
+        )
         self.pictures = {i: _picture(scene, things[i]) for i, m in enumerate(materials) if m.texture}
-        spent = [max(1, 10 - int(10 * m.ior)) for m in materials]
-        self.cost = np.array([1] * len(spent) if settings.bounce_budget == "plain" else spent, int)
+        plain = settings.bounce_budget == "plain"
+        self.cost = np.array([1 if plain else max(1, 10 - int(10 * m.ior)) for m in materials], int)
 
     def film(self, o: np.ndarray, d: np.ndarray) -> dict[str, np.ndarray]:
         """Return the layers of ``ReferenceResult`` for rays, one each, in their order."""
@@ -423,6 +416,19 @@ class _Tracer:
         depth = hits.depth + self.cost[hits.thing]
         on = (cos > 0) & (depth < self.settings.max_depth) & (throughput != 0).any(axis=1)
         return hits.pixel[on], o[on], d[on], throughput[on], depth[on]
+
+
+def _groups(scene: Scene) -> Iterator[tuple[Any, np.ndarray]]:
+    """Yield objects that are intersected together, with their numbers among all of the scene."""
+    axial = (*scene.cones, *scene.cylinders)
+    kinds: list[tuple[Any, Any]] = [(Spheres, scene.spheres), (Planes, scene.planes), (Axial, axial)]
+    first = 0
+    for kind, members in kinds:
+        if members:
+            yield kind(members), first + np.arange(len(members))
+        first += len(members)
+    for number, mesh in enumerate(scene.meshes, first):
+        yield Triangles(mesh), np.full(len(mesh.faces), number)
 
 
 def _picture(scene: Scene, thing: Any) -> np.ndarray:

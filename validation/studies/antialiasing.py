@@ -67,7 +67,7 @@ QUICK = Extent((0, 3), ("report",), (2, 4), 16, (120, 90), 1, (80, 60), 16, (4, 
 
 @dataclass(frozen=True)
 class Row:
-    """One setting, beside full supersampling at the same aa."""
+    """One setting, compared with full supersampling at the same aa."""
 
     mode: str
     aa: int
@@ -133,7 +133,7 @@ def _load(scene: dict[str, Any]) -> Any:
 def _rows(
     scene: Any, extent: Extent, *, reference_aa: int = 0, reference_spp: int = 1, **options: Any
 ) -> list[Row]:
-    """Every mode and amount on a scene; the options are those of ``mrt.render``."""
+    """Return the figures of every mode and amount on a scene; the options are those of ``mrt.render``."""
     shared = {"integrator": options.pop("integrator", None), "lattice": options.pop("lattice")}
     reference = mrt.render(
         scene, aa=reference_aa or extent.reference_aa, aamode="none", spp=reference_spp, seed=77, **shared
@@ -277,7 +277,7 @@ def _compare_with_mitsuba(study: Study, *, quick: bool) -> None:
 
 
 def lit_by_a_sphere(width: int, height: int) -> dict[str, Any]:
-    """Scene 0 in Mitsuba's own plugins, lit by a small sphere instead of two points."""
+    """Return scene 0 in Mitsuba's own plugins, lit by a small sphere instead of two points."""
     scene = mrt.scene_dict(0, width=width, height=height, flavor="stock")
     kept = {name: node for name, node in scene.items() if not name.startswith(("light", "sky", "integrator"))}
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": 30.0}}
@@ -344,7 +344,7 @@ def _chase_noise(study: Study, extent: Extent) -> None:
 
 
 def _contrast(image: np.ndarray) -> np.ndarray:
-    """Largest less smallest luma of the 3x3 neighbourhood, the border left out, [H - 2, W - 2]."""
+    """Return the largest less smallest luma of the 3x3 neighbourhood, the border left out, [H - 2, W - 2]."""
     luma = np.sqrt(image @ np.array(filters.edges.LUMA_WEIGHTS, np.float32))
     windows = np.lib.stride_tricks.sliding_window_view(luma, (3, 3))
     return windows.max(axis=(2, 3)) - windows.min(axis=(2, 3))

@@ -43,7 +43,7 @@ class Step:
 
 
 def without_approximations(number: int, *, width: int, height: int, spp: int) -> list[Step]:
-    """The report's picture, then each approximation switched off as well; the last is the stock flavour."""
+    """Return the report's picture and those with ever fewer approximations, down to the stock flavour."""
     import mitsuba as mi
 
     size: dict[str, Any] = {"width": width, "height": height}
@@ -74,7 +74,7 @@ def without_approximations(number: int, *, width: int, height: int, spp: int) ->
 
 
 def physical(scene: Scene, *, least_alpha: float = 1e-4, diffuse: bool = True) -> Scene:
-    """A scene within what Mitsuba's plugins take: colours up to 1, positive roughness; Kd if ``diffuse``."""
+    """Return a scene that Mitsuba's plugins take: colours up to 1, positive roughness; Kd if ``diffuse``."""
 
     def material(m: Material) -> Material:
         clipped: dict[str, Any] = {
@@ -93,7 +93,7 @@ def physical(scene: Scene, *, least_alpha: float = 1e-4, diffuse: bool = True) -
 
 
 def path_estimate(nodes: dict[str, Any], *, spp: int, seed: int = 0, integrator: Any = PATH) -> Estimate:
-    """The mean of RENDERS independent renders through the pixels' centres."""
+    """Return the mean of RENDERS independent renders through the pixels' centres."""
     import mitsuba as mi
 
     scene = mi.load_dict(nodes)
@@ -106,12 +106,12 @@ def path_estimate(nodes: dict[str, Any], *, spp: int, seed: int = 0, integrator:
 
 
 def finite(nodes: dict[str, Any], stock: dict[str, Any]) -> dict[str, Any]:
-    """Our scene with the lights and the finite planes of the stock flavour."""
+    """Return our scene with the lights and the finite planes of the stock flavour."""
     return {**nodes, **{name: node for name, node in stock.items() if name.startswith(("light_", "plane_"))}}
 
 
 def path_estimates(scenes: Sequence[dict[str, Any]], seeds: Sequence[int], *, spp: int) -> list[Estimate]:
-    """``path_estimate`` of each scene with its seed, by as many processes as there are cores."""
+    """Return ``path_estimate`` of each scene with its seed, by as many processes as there are cores."""
     rows = [(nodes, seed + i) for nodes, seed in zip(scenes, seeds, strict=True) for i in range(RENDERS)]
     grid = {"scene": [nodes for nodes, _ in rows], "seed": [seed for _, seed in rows]}
     options: dict[str, Any] = {"integrator": PATH, "spp": spp, "aa": 1, "aamode": "none"}
@@ -124,7 +124,7 @@ def path_estimates(scenes: Sequence[dict[str, Any]], seeds: Sequence[int], *, sp
 
 
 def compare_rest(numbers: Sequence[int], *, width: int, height: int, spp: int) -> list[Comparison]:
-    """Without diffuse parts, ``mrt_bsdf`` and ``roughplastic`` are one BSDF: equal renders but for noise."""
+    """Compare without diffuse parts: there ``mrt_bsdf`` and ``roughplastic`` are equal but for noise."""
     size: dict[str, Any] = {"width": width, "height": height}
     scenes = []
     for number in numbers:

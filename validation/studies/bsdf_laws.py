@@ -39,6 +39,7 @@ MATERIALS: dict[str, dict[str, Any]] = {
     "narrow": {**COLORS, "alpha": 0.01, "fresnel": "dielectric"},
     "unity, alpha 1": {"alpha": 1.0, "fresnel": "unity", "diffuse_reflectance": 0.0},
     "textured": {"alpha": CHECKER, "diffuse_reflectance": CHECKER, "specular_reflectance": 0.3},
+    "negative": {"alpha": -0.3, "specular_reflectance": rgb((0.5, 0.3, 0.2)), "diffuse_reflectance": 0.0},
     "with f0": {"f0": rgb((0.9, 0.5, 0.1)), "diffuse_reflectance": 0.0, "alpha": 0.2},
 }
 
@@ -81,7 +82,7 @@ def run(study: Study, *, quick: bool) -> None:
 
 
 def load(**parameters: Any) -> Any:
-    """An ``mrt_bsdf``."""
+    """Return an ``mrt_bsdf``."""
     import mitsuba as mi
 
     return mi.load_dict({"type": "mrt_bsdf", **parameters})
@@ -138,7 +139,7 @@ def furnace(study: Study, *, quick: bool) -> None:
 
 
 def _report_albedo() -> float:
-    """Their Kd and Ks promise nothing: some add up to more than 1."""
+    """Return the largest albedo of the report's materials, some of which add up to more than 1."""
     from mrt_mitsuba.scene.report import SCENE_4_MATERIALS
 
     bsdfs = [
@@ -193,7 +194,7 @@ def dielectric_terms(study: Study, *, quick: bool) -> None:
 
 
 def _factors(alpha: float, ior: float, wi: Any, wo: Any) -> dict[str, float]:
-    """Ratios of values that differ in one factor only, so that each is seen through the BSDF."""
+    """Return ratios of values that differ in one factor only, so that each is seen through the BSDF."""
     import mitsuba as mi
 
     i, o = mi.Vector3f(wi.T), mi.Vector3f(wo.T)
@@ -236,7 +237,7 @@ def published(study: Study, *, quick: bool) -> None:
 
 
 def never_negative(study: Study, *, quick: bool) -> None:
-    """Of a negative roughness, which the report's scenes hold, G₁ may be negative; the light may not."""
+    """Hold that a negative roughness, as in the report's scenes, gives no negative light, whatever G₁ is."""
     least = np.inf
     for alpha in (-0.0432, -0.0099, -0.5):
         wi, wo = lobe_pairs(5_000 if quick else 100_000, abs(alpha), least_cos=0.001)

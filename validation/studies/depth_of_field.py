@@ -67,7 +67,7 @@ class Comparison:
     noise: float  # RMSE of the picture through the lens
 
     def error(self, name: str, region: str = "all") -> float:
-        """RMSE to the lens."""
+        """Return the RMSE to the lens."""
         difference = self.pictures[name] - self.pictures["thinlens"]
         return float(np.sqrt(np.mean(np.square(difference[self.regions[region]]))))
 
@@ -117,7 +117,7 @@ def compare(scene: Scene, extent: Extent) -> Comparison:
 
 
 def fit_lens(scene: Scene, depth: np.ndarray) -> Lens:
-    """The lens whose discs are nearest to the report's blur of these hit distances [H, W]."""
+    """Return the lens whose discs are nearest to the report's blur of these hit distances [H, W]."""
     amount = filters.blur_amount(depth, focal_distance=scene.focal_distance, focal_range=scene.focal_range)
     radius = disc_radius(np.asarray(amount, np.float64))
     hit = np.isfinite(depth)
@@ -128,7 +128,7 @@ def fit_lens(scene: Scene, depth: np.ndarray) -> Lens:
 
 
 def disc_radius(amount: np.ndarray) -> np.ndarray:
-    """Radius of the disc as wide as the report's blur, pixels.
+    """Return the radius of the disc as wide as the report's blur, pixels.
 
     The Pascal line of 2k entries has the variance (2k − 1)/4 on each axis, a disc of radius r one of r²/4.
     The whole amount k is continued to all numbers, and by a² below 1, where the report does not blur.

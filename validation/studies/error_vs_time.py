@@ -1,4 +1,4 @@
-"""Error against run time, for every setting of ours that trades one for the other."""
+"""Error against run time, for every setting that trades one for the other."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from mrt_mitsuba.validation.tools import knobs
+from mrt_mitsuba.validation.tools.precision import Findings, Point
 from mrt_mitsuba.validation.tools.precision_page import describe
 from mrt_mitsuba.validation.tools.study import Study
-from mrt_mitsuba.validation.tools.work_precision import Point, WorkPrecision, error_vs_time
+from mrt_mitsuba.validation.tools.work_precision import error_vs_time
 
 TITLE = "Error against run time"
 
@@ -46,7 +47,7 @@ def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
     extent = QUICK if quick else FULL
     jobs = [(name, number) for name, numbers in extent.scenes.items() for number in numbers]
-    samplings: dict[int, WorkPrecision] = {}
+    samplings: dict[int, Findings] = {}
     with study.stage("Error against time", len(jobs)) as advance:
         for name, number in jobs:
             trade = knobs.TRADES[name](number, extent.settings)
@@ -84,7 +85,7 @@ def for_all(samplings: Sequence[Mapping[str, Point]], error: float) -> str:
     return f"{best}: {1000 * seconds[best]:.3g} ms" if best else "none of these"
 
 
-def _answer(study: Study, samplings: Mapping[int, WorkPrecision]) -> None:
+def _answer(study: Study, samplings: Mapping[int, Findings]) -> None:
     """Add which settings to take for which error: in each scene, and one that does for all of them."""
     rows = []
     for number, found in samplings.items():
@@ -107,7 +108,7 @@ def _answer(study: Study, samplings: Mapping[int, WorkPrecision]) -> None:
 # ------------------- What must hold: facts that no load on the machine changes -------------------
 
 
-def _rmse(found: WorkPrecision, name: str) -> float:
+def _rmse(found: Findings, name: str) -> float:
     return found.points[name].rmse
 
 
@@ -118,7 +119,7 @@ def _of_number(names: Iterable[str], pattern: str) -> list[str]:
     return sorted(words, key=lambda n: float(n[len(before) : len(n) - len(after)]))
 
 
-def _hold_reference(study: Study, where: str, found: WorkPrecision, least: float) -> None:
+def _hold_reference(study: Study, where: str, found: Findings, least: float) -> None:
     study.at_most(
         f"{where}: error of the reference / least error it judges",
         found.reference_error / least,
@@ -127,7 +128,7 @@ def _hold_reference(study: Study, where: str, found: WorkPrecision, least: float
     )
 
 
-def _hold_sampling(study: Study, where: str, found: WorkPrecision) -> None:
+def _hold_sampling(study: Study, where: str, found: Findings) -> None:
     few, *_, many = _of_number(found.points, "none aa={} centered")
     amounts = [float(name.split()[1][3:]) for name in (few, many)]
     study.at_most(
@@ -139,7 +140,7 @@ def _hold_sampling(study: Study, where: str, found: WorkPrecision) -> None:
     _hold_reference(study, where, found, _rmse(found, many))
 
 
-def _hold_whitted(study: Study, where: str, found: WorkPrecision) -> None:
+def _hold_whitted(study: Study, where: str, found: Findings) -> None:
     cut_off = f"min_contribution={255 * knobs.CUT_OFFS[1]:g}/255"
     study.at_most(
         f"{where}: largest error of the default cut-off",
@@ -156,7 +157,7 @@ def _hold_whitted(study: Study, where: str, found: WorkPrecision) -> None:
     )
 
 
-def _hold_path(study: Study, where: str, found: WorkPrecision) -> None:
+def _hold_path(study: Study, where: str, found: Findings) -> None:
     few, *_, many = _of_number(found.points, "path spp={}")
     spp = [float(name.split("=")[1]) for name in (few, many)]
     study.at_most(
@@ -168,7 +169,7 @@ def _hold_path(study: Study, where: str, found: WorkPrecision) -> None:
     _hold_reference(study, where, found, _rmse(found, many))
 
 
-def _hold_lens(study: Study, where: str, found: WorkPrecision) -> None:
+def _hold_lens(study: Study, where: str, found: Findings) -> None:
     ratio = _rmse(found, "filter corrected") / _rmse(found, "filter report")
     study.at_most(f"{where}: RMSE of corrected / report", ratio, 1, "the corrected filter is no worse")
 

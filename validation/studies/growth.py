@@ -50,7 +50,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Exponent:
-    """Of time over size: a straight line through the logarithms."""
+    """How time grows with size: the slope of a straight line through the logarithms."""
 
     value: float
     half_width: float  # of its confidence interval
@@ -66,12 +66,12 @@ class Exponent:
         return self.value + self.half_width
 
     def reading(self) -> str:
-        """Return what the interval allows to say."""
+        """Return what can be concluded from the interval."""
         if self.low <= 0:
-            unknown = "too uncertain to tell from no growth, or from growth in proportion"
-            return "not told apart from no growth" if self.high < 1 else unknown
+            unknown = "too uncertain: it may not grow, or grow in proportion"
+            return "consistent with no growth" if self.high < 1 else unknown
         if self.low <= 1 <= self.high:
-            return "not told apart from growth in proportion"
+            return "consistent with growth in proportion"
         than = "less" if self.high < 1 else "more"
         return f"ten times as much takes {10**self.value:.2g} times as long: {than} than in proportion"
 

@@ -79,7 +79,7 @@ def _scene(alpha: float, kd: tuple[float, float, float]) -> Any:
 
 
 def _descend(scene: Any, target: Any, *, spp: int) -> np.ndarray:
-    """Alpha and Kd at each evaluation of L-BFGS-B, [evaluations, 4]; the scene is left with the last ones.
+    """Return alpha and Kd at each evaluation of L-BFGS-B, [evaluations, 4]; the scene keeps the last ones.
 
     Every picture has the same seed, and one light leaves no noise but that of the points in a pixel: the
     difference is a smooth function of the parameters.

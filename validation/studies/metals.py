@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mrt_mitsuba.validation.tools.ball import ball_scene, side_by_side
 from mrt_mitsuba.validation.tools.bsdf_probe import interaction, rgb
 from mrt_mitsuba.validation.tools.study import Study
 
@@ -54,12 +55,12 @@ class Metal:
 
 
 def f0_of_conductor(eta: Array, k: Array) -> Array:
-    """Reflectance at normal incidence from air: ((η − 1)² + k²) / ((η + 1)² + k²)."""
+    """Return the reflectance at normal incidence from air: ((η − 1)² + k²) / ((η + 1)² + k²)."""
     return ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)
 
 
 def preset_names() -> list[str]:
-    """Every material preset of this Mitsuba that ``roughconductor`` takes."""
+    """Return every material preset of this Mitsuba that ``roughconductor`` takes."""
     import mitsuba as mi
 
     folder = Path(mi.__file__).parent / "data" / "ior"
@@ -85,7 +86,7 @@ def measure(name: str) -> Metal:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """Keep Mitsuba from saying that some of these spectra have no colour in RGB: it is their nearest one."""
+    """Silence Mitsuba about spectra without a colour in RGB: it takes the nearest."""
     import mitsuba as mi
 
     before = mi.log_level()
@@ -97,7 +98,7 @@ def _silent() -> Iterator[None]:
 
 
 def exact_reflectance(cos_theta: Array, eta: Array, k: Array) -> Array:
-    """Mitsuba's Fresnel term of conductors, [angles, channels]."""
+    """Return Mitsuba's Fresnel term of conductors, [angles, channels]."""
     import mitsuba as mi
 
     cosine = mi.Float(cos_theta)
@@ -201,8 +202,6 @@ def _curves(metal: Metal) -> Any:
 def _picture(study: Study, metal: Metal, quick: bool) -> None:
     """A ball of the metal, both ways, and the difference."""
     import mitsuba as mi
-
-    from mrt_mitsuba.validation.studies.roughconductor import ball_scene, side_by_side
 
     size, spp = QUICK_PICTURE if quick else PICTURE
     common = {"alpha": 0.1}

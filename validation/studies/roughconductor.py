@@ -18,13 +18,13 @@ from mrt_mitsuba.validation.checks.probe import is_scalar
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies import metals
 from mrt_mitsuba.validation.tools import image_tests
+from mrt_mitsuba.validation.tools.ball import ball_scene, side_by_side
 from mrt_mitsuba.validation.tools.bsdf_probe import (
     Array,
     evaluate,
     largest,
     lobe_pairs,
     relative_error,
-    rgb,
 )
 from mrt_mitsuba.validation.tools.image_tests import Comparison
 from mrt_mitsuba.validation.tools.study import Study
@@ -61,7 +61,7 @@ def run(study: Study, *, quick: bool) -> None:
 
 
 def ours(alpha: float, *, visible: bool = True, **more: Any) -> dict[str, Any]:
-    """``mrt_bsdf`` with F = 1 and no diffuse part."""
+    """Return ``mrt_bsdf`` with F = 1 and no diffuse part."""
     return {
         "type": "mrt_bsdf",
         "alpha": alpha,
@@ -73,7 +73,7 @@ def ours(alpha: float, *, visible: bool = True, **more: Any) -> dict[str, Any]:
 
 
 def theirs(alpha: float, *, visible: bool = True) -> dict[str, Any]:
-    """``roughconductor`` with F = 1."""
+    """Return ``roughconductor`` with F = 1."""
     return {
         "type": "roughconductor",
         "material": "none",
@@ -122,7 +122,7 @@ def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> Pointwise:
 
 
 def renormalised(density: Array, wi: Array, alpha: float) -> Array:
-    """``roughconductor``'s density of visible normals, brought to integrate to one.
+    """Return ``roughconductor``'s density of visible normals, brought to integrate to one.
 
     It takes the rational fit of G₁(ωi) for the normaliser 1 / (1 + Λ(ωi)), and is off by up to 0.4 %.
     """
@@ -136,7 +136,7 @@ def renormalised(density: Array, wi: Array, alpha: float) -> Array:
 
 
 def _judge(wi: Array, wo: Array, alpha: float, one: float, other: float) -> tuple[float, float]:
-    """Relative errors of two densities of plain D sampling, D cos θh / (4 ωo·h), against 50 digits.
+    """Return relative errors of two densities of plain D sampling, D cos θh / (4 ωo·h), against 50 digits.
 
     h is the half vector of the directions as they are given, on which D depends; ωo·h is that of directions
     of length 1.
@@ -149,51 +149,46 @@ def _judge(wi: Array, wo: Array, alpha: float, one: float, other: float) -> tupl
 
 
 def pointwise(study: Study, *, quick: bool) -> None:
-    """Values and densities, over roughness and in every variant that can run here."""
+    """Compare values and densities, over roughness and in every variant that can run here."""
     variants = runtime.usable_variants()
     if quick:  # every colour mode once, and one scalar variant
         variants = [name for name in variants if not name.startswith("scalar") or name == runtime.SLOW]
-    before = runtime.use()
-    rows: list[list[Any]] = []
-    judged: list[tuple[float, float]] = []
-    with study.stage("points", len(variants) * len(ALPHAS)) as advance:
-        for variant in variants:
-            runtime.use(variant)
-            count = SCALAR_PAIRS if is_scalar() else 5_000 if quick else 200_000
-            for alpha in ALPHAS:
-                found = compare_pointwise(alpha, count=count)
-                rows.append(
-                    [
-                        variant,
-                        alpha,
-                        count,
-                        found.value,
-                        found.pdf_visible,
-                        found.pdf_plain,
-                        len(found.judged),
-                    ]
-                )
-                judged += found.judged
-                advance(1)
-    runtime.use(before)
-    columns = ["variant", "alpha", "pairs", "value", "density, visible", "density, D", "judged"]
+    found = _measure_pointwise(study, variants, 5_000 if quick else 200_000)
+    rows: list[list[Any]] = [
+        [*where, p.value, p.pdf_visible, p.pdf_plain, len(p.judged)] for where, p in found
+    ]
     study.table(
         "pointwise",
         "Largest relative differences from roughconductor",
-        columns,
+        ["variant", "alpha", "pairs", "value", "density, visible", "density, D", "judged"],
         rows,
         "Judged: pairs at grazing angles whose densities of plain D sampling differ by more, up to 10.",
     )
-    why = "exp of up to 16, of arguments right to a few roundings"
     names = ("value", "density of visible normals", "density of plain D sampling")
     for column, name in enumerate(names, start=3):
         study.at_most(
             f"{name}, relative, {len(variants)} variants",
             largest(row[column] for row in rows),
             POINTWISE,
-            why,
+            "exp of up to 16, of arguments right to a few roundings",
         )
-    _hold_judged(study, judged)
+    _hold_judged(study, [judged for _, p in found for judged in p.judged])
+
+
+def _measure_pointwise(
+    study: Study, variants: Sequence[str], count: int
+) -> list[tuple[tuple[str, float, int], Pointwise]]:
+    """Return variant, roughness and number of pairs of each comparison, and what it found."""
+    before, found = runtime.use(), []
+    with study.stage("points", len(variants) * len(ALPHAS)) as advance:
+        for variant in variants:
+            runtime.use(variant)
+            pairs = SCALAR_PAIRS if is_scalar() else count
+            for alpha in ALPHAS:
+                found.append(((variant, alpha, pairs), compare_pointwise(alpha, count=pairs)))
+                advance(1)
+    runtime.use(before)
+    return found
 
 
 def _hold_judged(study: Study, judged: Sequence[tuple[float, float]]) -> None:
@@ -212,57 +207,6 @@ def _hold_judged(study: Study, judged: Sequence[tuple[float, float]]) -> None:
 # --------------------------------------------- Pictures ---------------------------------------------
 
 
-def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96, studio: bool = False) -> Any:
-    """A ball of the material on a floor under a sky and a point light, ``size`` × ¾ ``size`` pixels.
-
-    In the ``studio`` it is alone under a sky of bright and dark fields: all noise is then that of its
-    samples, and no light comes back from a floor in rare bright ones.
-    """
-    import mitsuba as mi
-
-    look = mi.ScalarTransform4f().look_at([0, -4, 1.6], [0, 0, 0.6], [0, 0, 1])
-    film = {
-        "type": "hdrfilm",
-        "width": size,
-        "height": size * 3 // 4,
-        "rfilter": {"type": "box"},
-        "pixel_format": "rgb",
-        "component_format": "float32",
-    }
-    ground = {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().scale(4),
-        "bsdf": {"type": "diffuse", "reflectance": rgb((0.5, 0.4, 0.3))},
-    }
-    around = {
-        "sky": {"type": "constant", "radiance": rgb((0.3, 0.4, 0.6))},
-        "lamp": {"type": "point", "position": [1.5, -2, 3], "intensity": rgb((12, 10, 8))},
-        "floor": ground,
-    }
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": 5},
-            "sensor": {"type": "perspective", "fov": 32, "to_world": look, "film": film},
-            "ball": {"type": "sphere", "center": [0, 0, 0.7], "radius": 0.7, "bsdf": dict(bsdf)},
-            **({"sky": _fields()} if studio else around),
-        }
-    )
-
-
-def _fields() -> dict[str, Any]:
-    """A sky of 16 × 8 fields with random brightness, a decade from the median to the brighter ones."""
-    import mitsuba as mi
-
-    fields = 10 ** np.random.default_rng(0).normal(-0.5, 0.5, (8, 16, 1)) * np.ones(3)
-    return {"type": "envmap", "bitmap": mi.Bitmap(fields.astype(np.float32))}
-
-
-def side_by_side(one: Array, other: Array, *, gain: float) -> Array:
-    """Two pictures [H, W, 3] and their absolute difference, enlarged, in a row."""
-    return np.concatenate([one, other, gain * np.abs(one - other)], axis=1)
-
-
 @dataclass(frozen=True)
 class RoughconductorComparison:
     """Ours against Mitsuba's, of one roughness. ``images``: "ours", "theirs", "difference" [H, W, 3]."""
@@ -276,7 +220,7 @@ class RoughconductorComparison:
 
     @property
     def equal(self) -> bool:
-        """Can they be told apart neither point by point nor by their pictures?"""
+        """Return whether neither single points nor the pictures distinguish them."""
         named = ("value", "density of visible normals", "density of plain D sampling")
         return not self.test.rejects and all(self.errors[name] <= POINTWISE for name in named)
 
@@ -355,7 +299,7 @@ def compare_roughconductor(
 def _render_both(
     bsdfs: Sequence[Mapping[str, Any]], *, size: int, spp: int, renders: int, seed: int, studio: bool = False
 ) -> tuple[list[Array], list[float]]:
-    """Renders [N, H, W, 3] of each material, all with different seeds, in turn, and their median seconds."""
+    """Return renders [N, H, W, 3] of each material, with other seeds, in turn, and their median seconds."""
     import mitsuba as mi
 
     scenes = [ball_scene(bsdf, size=size, studio=studio) for bsdf in bsdfs]
@@ -373,7 +317,7 @@ def _render_both(
 
 
 def same_numbers(alpha: float, *, size: int = 96, spp: int = 16) -> float:
-    """Share of pixels that differ by more than 1e-4 when both renders draw the same random numbers.
+    """Return the share of pixels that differ by more than 1e-4 when both draw the same random numbers.
 
     Drawn from D, whose density is the same in both; that of visible normals is not (``renormalised``). A path
     that rounding sends past the other side of an edge goes on differently; anything else would show in most
@@ -387,7 +331,7 @@ def same_numbers(alpha: float, *, size: int = 96, spp: int = 16) -> float:
 
 
 def rendered(study: Study, *, quick: bool) -> None:
-    """Pictures: equal with equal random numbers, not told apart with others, while small errors are."""
+    """Pictures: equal with equal random numbers, indistinguishable with others, while small errors show."""
     settings: dict[str, Any] = (
         {"size": 64, "spp": 8, "renders": 64} if quick else {"size": 128, "spp": 8, "renders": 96}
     )
@@ -427,7 +371,7 @@ def _hold_pictures(study: Study, found: RoughconductorComparison) -> None:
 
 
 def _hold_power(study: Study, name: str, change: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
-    """The same test of pictures must reject a small error of ours."""
+    """Hold that the same test of pictures rejects a small error of ours."""
     broken = {**ours(POWER_ALPHA), **change}
     stacks, _ = _render_both([broken, theirs(POWER_ALPHA)], seed=100, **settings)
     test = image_tests.compare(*(image_tests.estimate(stack) for stack in stacks), level=LEVEL)
@@ -455,13 +399,13 @@ class Efficiency:
 def measure_efficiency(
     alpha: float, *, size: int, spp: int, renders: int
 ) -> dict[tuple[str, bool], Efficiency]:
-    """Both plugins with both samplings, rendered in turn; keys are ("ours" or "theirs", visible)."""
+    """Return noise and time of both plugins and samplings, by ("ours" or "theirs", visible); in turn."""
     keys = [(name, visible) for visible in (True, False) for name in ("ours", "theirs")]
     bsdfs = [(ours if name == "ours" else theirs)(alpha, visible=visible) for name, visible in keys]
     stacks, seconds = _render_both(bsdfs, size=size, spp=spp, renders=renders, seed=500, studio=True)
     spreads = [stack.var(axis=0, ddof=1) for stack in stacks]
     noisy = np.min(spreads, axis=0) > 0  # the ball, not the sky around it
-    # the geometric mean: of the mean, a few bright pixels would make a figure of luck
+    # the geometric mean: a few bright pixels would turn the mean into chance
     variances = [float(np.exp(np.log(spread[noisy]).mean())) for spread in spreads]
     return {key: Efficiency(v, s) for key, v, s in zip(keys, variances, seconds, strict=True)}
 

@@ -23,7 +23,7 @@ from mrt_mitsuba.validation.tools.study import Study
 
 TITLE = "Pictures of the scenes, judged in float64"
 
-STEP = 1 / 255  # of an 8-bit picture: what nobody sees
+STEP = 1 / 255  # of an 8-bit picture: invisible
 
 # Float32 places a ray of such a picture to about 1e-5 of a pixel; a mirror ray off a small sphere diverges a
 # hundred times as much. Where so small a move changes what is met, float32 may meet the other
@@ -44,7 +44,7 @@ SHINY = Material(1.5, 0.1, (0.9, 0.8, 0.7), (0.1, 0.1, 0.1))
 
 
 def _hovering() -> Scene:
-    """Closed cones and cylinders in the air, seen level with the base of one and from below the others."""
+    """Return cones and cylinders in the air, seen level with the base of one and from below the others."""
     cones = (
         Cone((0, 1.2, 0), (0, 0.5, 0), 0.5, GREY),
         Cone((1.3, 0.6, -0.3), (1.0, 1.5, 0.2), 0.4, SHINY),
@@ -60,7 +60,7 @@ def _hovering() -> Scene:
 
 
 def _crowded() -> Scene:
-    """A few hundred objects of all kinds, looked up in trees, under more lights than are unrolled."""
+    """Return a few hundred objects of all kinds, looked up in trees, under more lights than are unrolled."""
     rng = np.random.default_rng(5)
     kinds: dict[str, list[Any]] = {"spheres": [], "cones": [], "cylinders": []}
     for i in range(330):
@@ -127,7 +127,7 @@ class Judgement:
         return float(np.mean(self.error > STEP))
 
     def count(self, reason: str) -> int:
-        """Number of pixels that are off for a reason."""
+        """Return the number of pixels that are off for a reason."""
         return int(np.sum(self.reason == REASONS.index(reason)))
 
 
@@ -177,9 +177,9 @@ def hold(study: Study, name: str, judgement: Judgement, cut: float) -> None:
 
 
 def original_renders() -> Path | None:
-    """The folder of the original program's renders, if at hand: in MRT_REFERENCE or beside the checkout."""
-    beside = Path(__file__).resolve().parents[3] / "shared" / "reference"
-    folder = Path(os.environ.get("MRT_REFERENCE", beside)) / "renders"
+    """Return the folder of the original's renders, if at hand: MRT_REFERENCE, or next to the checkout."""
+    sibling = Path(__file__).resolve().parents[3] / "shared" / "reference"
+    folder = Path(os.environ.get("MRT_REFERENCE", sibling)) / "renders"
     return folder if folder.is_dir() else None
 
 

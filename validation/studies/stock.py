@@ -106,7 +106,7 @@ def compare_direct(scene: Scene, light: int, *, width: int, height: int) -> Dire
 
 
 def _beyond_stand_in(scene: Scene, reference: Any, extent: float = 100.0) -> np.ndarray:
-    """Where a ray meets a plane outside the circle in its stand-in; ``extent`` is the default of
+    """Return where a ray meets a plane outside the circle in its stand-in; ``extent`` is the default of
     ``mrt_plane``."""
     height, width = reference.depth.shape
     rows, columns = np.mgrid[:height, :width]

@@ -16,18 +16,18 @@ from mrt_mitsuba.validation.checks.probe import Array, unit
 
 
 def rgb(values: Sequence[float]) -> dict[str, Any]:
-    """A colour as a Mitsuba dict."""
+    """Return a colour as a Mitsuba dict."""
     return {"type": "rgb", "value": list(values)}
 
 
 def at_angle(degrees: float) -> Array:
-    """A direction at an angle to the normal, away from every axis and plane of symmetry."""
+    """Return a direction at an angle to the normal, away from every axis and plane of symmetry."""
     theta = np.radians(degrees)
     return np.array([np.sin(theta) * 0.8, np.sin(theta) * 0.6, np.cos(theta)])
 
 
 def lobe_pairs(count: int, alpha: float, *, least_cos: float = 0.02, seed: int = 1) -> tuple[Array, Array]:
-    """Pairs of random directions above the surface whose half vector lies within a slope of 4 alpha.
+    """Return pairs of random directions above the surface whose half vector lies within a slope of 4 alpha.
 
     Both cosines are at least ``least_cos``. Beyond that slope the lobe is below e^-16 of its peak.
     """
@@ -68,7 +68,7 @@ def draw(bsdf: Any, wi: Array, count: int, ctx: Any = None, *, seed: int = 0) ->
 
 
 def albedo(bsdf: Any, wi: Array, ctx: Any = None, *, resolution: int = 700) -> Array:
-    """∫ f cos θo dωo [channels] by the midpoint rule in (cos θo, φo), refined around the mirror azimuth.
+    """Return ∫ f cos θo dωo [channels] by the midpoint rule in cos θo and φo, finer at the mirror azimuth.
 
     With 700² points the error is below 1e-4 for alpha >= 0.1.
     """
@@ -85,12 +85,12 @@ def albedo(bsdf: Any, wi: Array, ctx: Any = None, *, resolution: int = 700) -> A
 
 
 def largest(values: Iterable[float]) -> float:
-    """The largest number; NaN if there is none, or if one is NaN, which Python's ``max`` would overlook."""
+    """Return the largest number; NaN without any, or if one is NaN, which Python's ``max`` would overlook."""
     found = np.fromiter(values, float)
     return float(found.max()) if len(found) else float("nan")
 
 
 def relative_error(found: Array, expected: Array) -> Array:
-    """|found / expected − 1| where the expected value is above 1e-7 of the largest, else 0."""
+    """Return |found / expected − 1| where the expected value is above 1e-7 of the largest, else 0."""
     counts = expected > 1e-7 * expected.max()
     return np.abs(np.where(counts, found, 1) / np.where(counts, expected, 1) - 1)

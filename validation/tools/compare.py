@@ -13,7 +13,7 @@ import numpy as np
 
 from mrt_mitsuba.errors import OutputError, UsageError
 from mrt_mitsuba.output.files import read_channels, write_exr, write_png
-from mrt_mitsuba.output.result import Result
+from mrt_mitsuba.rendering.result import Result
 from mrt_mitsuba.validation.tools import image_tests
 
 ORDER = {letter: index for index, letter in enumerate("RGBXYZUVA")}  # of channels within a layer

@@ -11,7 +11,7 @@ from mrt_mitsuba.output.files import to_8bit
 
 
 def gallery(pictures: Mapping[str, np.ndarray], *, columns: int = 2) -> Any:
-    """A matplotlib figure of linear pictures [H, W, 3] of one size, as sRGB, ``columns`` to a row."""
+    """Return a matplotlib figure of linear pictures [H, W, 3] of one size, as sRGB, ``columns`` to a row."""
     from matplotlib.figure import Figure
 
     rows = -(-len(pictures) // columns)

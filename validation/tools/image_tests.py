@@ -50,7 +50,7 @@ class Estimate:
 
 
 def estimate(renders: ArrayLike) -> Estimate:
-    """The mean of independent renders [N, H, W, C] of equal sample count, N ≥ 2, and how well it is known."""
+    """Return the mean of N ≥ 2 independent renders [N, H, W, C] of equal sample count, with its variance."""
     stack = np.asarray(renders, np.float64)
     if stack.ndim != 4 or len(stack) < 2:
         raise UsageError(f"renders of shape {stack.shape}: give two or more pictures as [N, H, W, C]")
@@ -58,7 +58,7 @@ def estimate(renders: ArrayLike) -> Estimate:
 
 
 def exact(image: ArrayLike) -> Estimate:
-    """A picture [H, W, C] without noise."""
+    """Return a picture [H, W, C] without noise."""
     mean = np.asarray(image, np.float64)
     return Estimate(mean, np.zeros_like(mean))
 
@@ -131,12 +131,12 @@ def compare(
 
 
 def sidak(p: float, count: int) -> float:
-    """Probability that the smallest of ``count`` independent p values is ``p`` or less: 1 - (1 - p)^count."""
+    """Return the probability 1 - (1 - p)^count that the smallest of ``count`` p values is ``p`` or less."""
     return 1.0 if p >= 1 else float(-np.expm1(count * np.log1p(-p)))
 
 
 def _welch(ours: Estimate, theirs: Estimate, size: int, rounding: float) -> tuple[np.ndarray, np.ndarray]:
-    """Welch's t and its degrees of freedom, of the sums over cells of ``size`` × ``size`` pixels."""
+    """Return Welch's t and its degrees of freedom, of the sums over cells of ``size`` × ``size`` pixels."""
     difference = _cell_sums(ours.mean - theirs.mean, size)
     brightness = np.maximum(np.abs(ours.mean), np.abs(theirs.mean))
     # Rounding errors of neighbours may all have the same sign: they add up in full. Where a pixel is black,
@@ -151,7 +151,7 @@ def _welch(ours: Estimate, theirs: Estimate, size: int, rounding: float) -> tupl
 
 
 def _cell_sums(values: np.ndarray, size: int) -> np.ndarray:
-    """Sums [rows, columns, C] of cells; the last ones may be smaller."""
+    """Return sums [rows, columns, C] of cells; the last ones may be smaller."""
     if size == 1:
         return values
     rows = np.add.reduceat(values, np.arange(0, values.shape[0], size), axis=0)
@@ -169,7 +169,7 @@ def _verdict(name: str, t: np.ndarray, dof: np.ndarray, level: float) -> Verdict
 
 
 def rel_rmse(image: ArrayLike, reference: ArrayLike, epsilon: float = EPSILON) -> float:
-    """Relative root mean square error √mean((a - b)² / (b² + ε))."""
+    """Return the relative root mean square error √mean((a - b)² / (b² + ε))."""
     a, b = np.asarray(image, np.float64), np.asarray(reference, np.float64)
     if a.shape != b.shape:
         raise UsageError(f"pictures of {a.shape} and {b.shape}: their sizes must be the same")
@@ -186,7 +186,7 @@ class Flip:
 
 
 def flip(reference: ArrayLike, image: ArrayLike, *, exposures: Mapping[str, float] | None = None) -> Flip:
-    """HDR-FLIP of a linear picture [H, W, 3] against a reference (Andersson et al. 2021).
+    """Return HDR-FLIP of a linear picture [H, W, 3] against a reference (Andersson et al. 2021).
 
     ``exposures``: those of an earlier result. FLIP derives them from the reference, so within a series they
     must be given, or its values cannot be compared.

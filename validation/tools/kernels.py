@@ -1,7 +1,6 @@
 """The kernels of a render, one by one: in which pass they run, what they cost to compile and to run.
 
-Dr.Jit keeps a history of them; a render's stages, of which it tells its ``Progress``, say where in it they
-belong.
+Dr.Jit keeps a history of them; the stages that a render reports to its ``Progress`` say where they belong.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ OUTSIDE = "outside of passes"
 
 @dataclass(frozen=True)
 class Kernel:
-    """All launches of a kernel in one pass of one render. Kernels are told apart by kind and hash."""
+    """All launches of a kernel in one pass of one render. Kind and hash identify a kernel."""
 
     stage: str
     kind: str  # "traces rays", "computes", or Dr.Jit's own name: "BlockReduce", ...
@@ -64,12 +63,12 @@ def forget() -> None:
 
 
 def has_own_cache() -> bool:
-    """Are seconds of compilation those of the compiler, and not of reading a cache?"""
+    """Return whether seconds of compilation are those of the compiler, not of reading a cache."""
     return Path(os.environ.get(CACHE, "")).name.startswith(PREFIX)
 
 
 def profile(render: Callable[..., Any], *, repeats: int = 3) -> list[Kernel]:
-    """The kernels of ``render(progress=...)``: compiled in a first run, timed as medians of ``repeats`` more.
+    """Return the kernels of ``render(progress=...)``, compiled first, then timed as medians of ``repeats``.
 
     They come in the order in which they first ran.
     """

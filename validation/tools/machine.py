@@ -9,12 +9,12 @@ from mrt_mitsuba.cores import usable_cores
 
 
 def machine() -> dict[str, Any]:
-    """Cores and system, without a name."""
+    """Return the number of cores and the system, without the name of the machine."""
     return {"cores": usable_cores(), "system": f"{platform.system()} {platform.machine()}"}
 
 
 def versions() -> dict[str, str]:
-    """Of everything that bears on speed or accuracy, by name."""
+    """Return the versions of everything that bears on speed or accuracy, by name."""
     import drjit as dr
     import mitsuba as mi
 

@@ -32,7 +32,7 @@ class Mistake:
 
 
 def _scaled_lights(nodes: dict[str, Any]) -> dict[str, Any]:
-    """Radiance × 1.02: of the lights and the sky."""
+    """Return the scene with lights and sky 1.02 times as bright."""
     result = dict(nodes)
     for name, node in nodes.items():
         for key in ("intensity", "radiance"):
@@ -95,7 +95,7 @@ def trials(counts: Sequence[int], *, width: int, height: int) -> list[Trial]:
 
 
 def _without_clamp(spp: int, size: dict[str, Any]) -> Comparison:
-    """``mrt_whitted`` with and without clamp, in Mitsuba's own render loop: at random places in the
+    """Return ``mrt_whitted`` with and without clamp, in Mitsuba's own render loop: at random places in the
     pixels."""
     import mitsuba as mi
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from mrt_mitsuba.output.files import to_8bit
 from mrt_mitsuba.validation.tools.intervals import Estimate
+from mrt_mitsuba.validation.tools.precision import Findings, Interval, Point, Strip
 from mrt_mitsuba.validation.tools.study import Study
-from mrt_mitsuba.validation.tools.work_precision import Interval, Point, Strip, WorkPrecision
 
 TITLE = "Error against time"
 COLUMNS = (
@@ -38,7 +38,7 @@ PANEL = (160, 120)  # pixels of a larger picture that a strip shows
 SAME = 0.02  # errors closer than this are the same: no reason to wait longer
 
 
-def study(found: WorkPrecision) -> Study:
+def study(found: Findings) -> Study:
     """Return the findings in the form that pages are made of."""
     made = Study(
         "error-vs-time",
@@ -49,7 +49,7 @@ def study(found: WorkPrecision) -> Study:
     return made
 
 
-def describe(study: Study, found: WorkPrecision, name: str, title: str, truth: str = "") -> None:
+def describe(study: Study, found: Findings, name: str, title: str, truth: str = "") -> None:
     """Add the diagram, the answers and the tables to a study; ``truth`` says what the reference is."""
     prefix = f"{name}-" if name else ""
     where = f"{name}: " if name else ""
@@ -90,19 +90,19 @@ def describe(study: Study, found: WorkPrecision, name: str, title: str, truth: s
         study.table(f"{prefix}failed", f"{title}: cases that failed", ["case", "why"], reasons)
 
 
-def _reference(found: WorkPrecision, truth: str) -> str:
-    told = f"Reference: {truth}. " if truth else ""
+def _reference(found: Findings, truth: str) -> str:
+    named = f"Reference: {truth}. " if truth else ""
     if found.reference_error == 0:
-        return f"{told}It has no error that is known of: it was rendered twice alike, or given."
+        return f"{named}No error of it is known: it was rendered twice with the same result, or given."
     own = f"{found.reference_error:.2g}"
-    return f"{told}Its own RMSE is about {own}; nothing is claimed of errors below twice that."
+    return f"{named}Its own RMSE is about {own}; no claim is made about errors below twice that."
 
 
 def _reached(time: Estimate) -> str:
     return str(time) if np.isfinite(time.value) else "not reached"
 
 
-def numbered(found: WorkPrecision) -> Iterator[tuple[int, Point]]:
+def numbered(found: Findings) -> Iterator[tuple[int, Point]]:
     """Yield the points with their numbers in diagram and table, curve by curve."""
     return enumerate((point for points in found.families.values() for point in points), 1)
 
@@ -131,14 +131,14 @@ def _interval(ends: Interval) -> str:
     return f"{ends[0]:.3g} to {ends[1]:.3g}" if np.isfinite(ends[0]) else "one repeat"
 
 
-def _caption(found: WorkPrecision) -> str:
+def _caption(found: Findings) -> str:
     text = "Down and to the left is better. Bars are 95 % intervals, numbers those of the table."
     ahead = front([p for p in found.points.values() if p.resolved]) if found.repeats > 1 else []
     names = "; ".join(f"{p.name} ({p.seconds:.2g} s, RMSE {p.rmse:.2g})" for p in ahead)
     return f"{text} Ahead of the others: {names}." if names else text
 
 
-def diagram(found: WorkPrecision) -> Any:
+def diagram(found: Findings) -> Any:
     """Return the work-precision diagram: RMSE against seconds, both with intervals, and the floor."""
     from matplotlib.figure import Figure
 
@@ -147,14 +147,9 @@ def diagram(found: WorkPrecision) -> Any:
     points, floor = list(found.points.values()), found.reference_error
     errors = [p.rmse for p in points if p.rmse > 0] + ([floor] if floor else [])
     bottom = 0.4 * min(errors, default=1e-6)  # where cases without error are drawn
-    numbers = {point.name: number for number, point in numbered(found)}
-    labelled = numbers if len(numbers) <= LABELLED else {p.name for p in front(points)}
     for (name, curve), marker in zip(found.families.items(), cycle(MARKERS), strict=False):
         _draw(axes, curve, bottom, label=name, marker=marker)
-    for point in points:
-        if point.name in labelled:
-            place, text = (point.seconds, max(point.rmse, bottom)), str(numbers[point.name])
-            axes.annotate(text, place, textcoords="offset points", xytext=(4, 4), fontsize=8)
+    _number(axes, found, bottom)
     if floor:
         axes.axhspan(bottom / 10, floor, color="0.9", zorder=0, label="within the reference's error")
     if any(p.rmse == 0 for p in points):
@@ -163,10 +158,19 @@ def diagram(found: WorkPrecision) -> Any:
     axes.set_ylim(bottom=0.8 * bottom)
     axes.margins(x=0.08, y=0.08)
     axes.grid(alpha=0.3)
-    for axis in (axes.xaxis, axes.yaxis):
-        _label_between_decades(axis)
+    _label_between_decades(axes.xaxis)
+    _label_between_decades(axes.yaxis)
     figure.legend(fontsize=8, ncols=4, loc="outside lower center")
     return figure
+
+
+def _number(axes: Any, found: Findings, bottom: float) -> None:
+    """Write the numbers of the table next to the points; of many points, only those ahead have theirs."""
+    ahead = {p.name for p in front(list(found.points.values()))}
+    for number, point in numbered(found):
+        if len(found.points) <= LABELLED or point.name in ahead:
+            place = point.seconds, max(point.rmse, bottom)
+            axes.annotate(str(number), place, textcoords="offset points", xytext=(4, 4), fontsize=8)
 
 
 def _draw(axes: Any, curve: Sequence[Point], bottom: float, **style: Any) -> None:
@@ -196,7 +200,7 @@ def _label_between_decades(axis: Any) -> None:
         axis.set_tick_params(which="minor", labelsize=8)
 
 
-def strip_figure(found: WorkPrecision, strip: Strip) -> Any:
+def strip_figure(found: Findings, strip: Strip) -> Any:
     """Return the pictures of a strip side by side, the reference last, each with its seconds and error."""
     from matplotlib.figure import Figure
 

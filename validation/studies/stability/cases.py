@@ -12,7 +12,11 @@ COLUMNS = ("case", "what", "expected", "measured", "bound", "")
 
 @dataclass
 class Cases:
-    """Rows of one table. A case with a bound is held to it; one without cannot hold, and says why."""
+    """Rows of one table. A case with a bound is held to it; one without cannot hold, and says why.
+
+    Each upper bound states the least fault that it shows. A ``fault`` is one that was made, in words, with
+    the figure that came of it, which must be twice the bound. Without one, the bound itself is the least.
+    """
 
     study: Study
     name: str
@@ -20,13 +24,26 @@ class Cases:
     rows: list[tuple[str, str, str, float, str, str]] = field(default_factory=list)
     bounds: list[Bound] = field(default_factory=list)
 
-    def at_most(self, name: str, what: str, expected: str, measured: float, limit: float) -> None:
+    def at_most(
+        self,
+        name: str,
+        what: str,
+        expected: str,
+        measured: float,
+        limit: float,
+        *,
+        fault: tuple[str, float] | None = None,
+    ) -> None:
         """A case whose figure must not exceed ``limit``."""
-        self._add(Bound(f"{self.title}: {name}", float(measured), float(limit)), name, what, expected)
+        least = fault[0] if fault else f"{limit:.3g}" if limit else "a single one"
+        title = f"{self.title}: {name}"
+        self._add(Bound(title, float(measured), float(limit), note=f"least fault: {least}"), what, expected)
+        if fault:
+            self.at_least(f"{name}, its fault", least, "seen", fault[1], 2 * limit or 1)
 
     def at_least(self, name: str, what: str, expected: str, measured: float, limit: float) -> None:
         """A case whose figure must not be below ``limit``."""
-        self._add(Bound(f"{self.title}: {name}", float(measured), float(limit), False), name, what, expected)
+        self._add(Bound(f"{self.title}: {name}", float(measured), float(limit), False), what, expected)
 
     def beyond_float32(self, name: str, what: str, measured: float, why: str) -> None:
         """A case that no float32 renderer can pass: its figure is shown, not held to anything."""
@@ -38,7 +55,8 @@ class Cases:
             self.study.bounds.append(bound)
         self.study.table(self.name, self.title, COLUMNS, self.rows, note)
 
-    def _add(self, bound: Bound, name: str, what: str, expected: str) -> None:
+    def _add(self, bound: Bound, what: str, expected: str) -> None:
+        name = bound.name.removeprefix(f"{self.title}: ")
         sign = "<=" if bound.at_most else ">="
         self.rows.append(
             (
@@ -54,5 +72,5 @@ class Cases:
 
 
 def hexadecimal(values: Iterable[float]) -> str:
-    """Numbers in Python's exact notation, which ``float.fromhex`` reads back."""
+    """Return numbers in Python's exact notation, which ``float.fromhex`` reads back."""
     return " ".join(float(value).hex() for value in values)

@@ -78,7 +78,7 @@ def _noise(shape: Sequence[int], seed: int = 1) -> np.ndarray:
 
 
 def _depths(shape: Sequence[int], seed: int = 2) -> np.ndarray:
-    """Distances on both sides of the focus, and some misses."""
+    """Return distances on both sides of the focus, and some misses."""
     depth = np.random.default_rng(seed).uniform(0.1, 12, shape).astype(np.float32)
     depth[np.random.default_rng(seed + 1).random(shape) < 0.1] = np.inf
     return depth
@@ -88,7 +88,7 @@ def _depths(shape: Sequence[int], seed: int = 2) -> np.ndarray:
 
 
 def _constant_blur(values: Sequence[float]) -> float:
-    """Largest relative change of a constant picture by the blur, over sizes, values and modes."""
+    """Return the largest relative change of a constant picture by the blur, over sizes, values and modes."""
     changes = [
         np.abs(_blurred(_constant(shape, value), _depths(shape), mode) / value - 1).max()
         for shape in SHAPES
@@ -99,7 +99,7 @@ def _constant_blur(values: Sequence[float]) -> float:
 
 
 def _constant_edges() -> float:
-    """Edge pixels in bright constant pictures of all sizes, seen at one distance."""
+    """Return the edge pixels in bright constant pictures of all sizes, seen at one distance."""
     return float(
         sum(
             np.asarray(find(_constant(shape, value), np.full(shape, 3, np.float32)).mask).sum()
@@ -111,7 +111,7 @@ def _constant_edges() -> float:
 
 
 def _outside_range() -> float:
-    """Largest amount by which blurred values leave the range of those they are made from, relative to it."""
+    """Return the largest amount by which blurred values leave the range of their sources, relative to it."""
     excess = 0.0
     for shape in SHAPES:
         for mode in MODES:
@@ -124,21 +124,21 @@ def _outside_range() -> float:
 
 
 def _spread_of_damage(value: float) -> float:
-    """Other pixels that a damaged one makes not finite, in both modes of the blur."""
+    """Return the other pixels that a damaged one makes not finite, in both modes of the blur."""
     image, depth = _noise((40, 30)), _depths((40, 30))
     image[20, 15, 1] = value
     return float(sum((~np.isfinite(_blurred(image, depth, mode)).all(axis=-1)).sum() - 1 for mode in MODES))
 
 
 def _damage_kept() -> float:
-    """1 if a damaged pixel is not returned as it is."""
+    """Return 1 if a damaged pixel is not returned as it is."""
     image, depth = _noise((40, 30)), _depths((40, 30))
     image[20, 15, 1] = np.nan
     return float(any(not np.isnan(_blurred(image, depth, mode)[20, 15, 1]) for mode in MODES))
 
 
 def _damage_reported(value: float) -> float:
-    """Pixels of the 3×3 around a damaged one that are no infinite edges, and such edges elsewhere."""
+    """Return the pixels around a damaged one that are not infinite edges, and such edges elsewhere."""
     wrong = 0
     for name, find in EDGES.items():
         image, depth = _constant((12, 10), 0.5), np.full((12, 10), 3, np.float32)
@@ -155,7 +155,7 @@ def _damage_reported(value: float) -> float:
 
 
 def _sobel_range() -> float:
-    """Largest error of Sobel's value at a step between two greys, both above 1, or one below 0."""
+    """Return the largest error of Sobel's value at a step between two greys, both above 1, or one below 0."""
     errors = []
     for low, high in ((2.0, 3.0), (10.0, 4000.0), (-1.0, 0.5), (-2.0, -1.0), (-0.001, 0.001)):
         image = _constant((5, 6), low)
@@ -169,7 +169,7 @@ def _sobel_range() -> float:
 
 
 def _no_focus() -> float:
-    """Calls without a focal distance that do not give back the very picture."""
+    """Return the calls without a focal distance that do not give back the very picture."""
     image, depth = _noise((8, 9)), _depths((8, 9))
     return float(
         sum(
@@ -181,7 +181,7 @@ def _no_focus() -> float:
 
 
 def _border() -> float:
-    """Difference at the border, where nothing is blurred, between a picture and a part of it."""
+    """Return the difference at the border, where nothing is blurred, between a picture and a part of it."""
     image, depth = _noise((40, 30)), np.full((40, 30), 2.0, np.float32)
     depth[18:22, 13:17] = 30.0
     worst = 0.0
@@ -197,7 +197,7 @@ def _border() -> float:
 
 
 def _huge_range() -> float:
-    """Values that are not finite among blurs of pictures between 1e-38 and 1e34, with any focal range."""
+    """Return the values that are not finite in blurred pictures of 1e-38 to 1e34, with any focal range."""
     image = (10 ** np.random.default_rng(5).uniform(-38, 34, (20, 20, 3))).astype(np.float32)
     depth = (10 ** np.random.default_rng(6).uniform(-30, 30, (20, 20))).astype(np.float32)
     return float(
@@ -211,7 +211,7 @@ def _huge_range() -> float:
 
 
 def _edges_finite() -> float:
-    """NaN among the values of detectors on pictures between -1e34 and 1e34."""
+    """Return the NaN among the values of detectors on pictures between -1e34 and 1e34."""
     rng = np.random.default_rng(7)
     image = (10 ** rng.uniform(-38, 34, (20, 20, 3)) * rng.choice([-1, 1], (20, 20, 3))).astype(np.float32)
     depth = (10 ** rng.uniform(-37, 37, (20, 20))).astype(np.float32)
@@ -219,7 +219,7 @@ def _edges_finite() -> float:
 
 
 def _refused() -> float:
-    """Senseless arguments that are not refused with a ``UsageError``."""
+    """Return the senseless arguments that are not refused with a ``UsageError``."""
     image, depth = _noise((4, 4)), _depths((4, 4))
     calls: Sequence[Callable[[], Any]] = (
         lambda: filters.gaussian_dof(image, depth, focal_distance=np.nan),

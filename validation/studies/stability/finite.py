@@ -37,7 +37,7 @@ FRESNEL = ("schlick", "dielectric", "unity")
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Bulk evaluations with one in three numbers an extreme one; scenes drawn by lot."""
+    """Bulk evaluations with one in three numbers an extreme one; random scenes."""
     cases = Cases(study, "finite", "Finite and not negative")
     count = 10**6 if quick else 10**8
     for name, what, evaluate in BULK:
@@ -52,7 +52,7 @@ def run(study: Study, *, quick: bool) -> None:
 
 
 def _bulk(evaluate: Callable[[_Draw], Any], count: int) -> int:
-    """Bad results among ``count`` evaluations, in kernels of ``AT_ONCE``; one trace serves all."""
+    """Return the bad results among ``count`` evaluations, in kernels of ``AT_ONCE``; one trace serves all."""
     parts = range(-(-count // AT_ONCE))
     return sum(int(np.sum(evaluate(_Draw(min(AT_ONCE, count), part)))) for part in parts)
 
@@ -81,7 +81,7 @@ class _Draw:
         return kind(self.coordinate(size), self.coordinate(size), self.coordinate(size))
 
     def unit(self) -> Any:
-        """A unit vector, often with components that are 0 or tiny."""
+        """Return a unit vector, often with components that are 0 or tiny."""
         import mitsuba as mi
 
         v = self.vector(mi.Vector3f)
@@ -90,7 +90,7 @@ class _Draw:
         return dr.select(usable, v / dr.select(usable, length, 1), mi.Vector3f(0, 0, 1))
 
     def local(self) -> Any:
-        """A direction by its cosine to +z."""
+        """Return a direction by its cosine to +z."""
         import mitsuba as mi
 
         z = self._or(COSINES, 2 * self._generator.next_float32() - 1)
@@ -108,7 +108,7 @@ class _Draw:
 
 
 def _bad(*values: Any) -> Any:
-    """Where any of several numbers or colours is not finite, or negative."""
+    """Return where any of several numbers or colours is not finite, or negative."""
     import mitsuba as mi
 
     result = mi.Bool(False)
@@ -126,7 +126,7 @@ def _not_unit(v: Any) -> Any:
 
 
 def _bsdf(form: str, visible: bool) -> Callable[[_Draw], Any]:
-    """Value, density, sample and mirror reflectance, with an alpha and indices for each lane."""
+    """Return value, density, sample and mirror reflectance, with an alpha and indices for each lane."""
 
     def evaluate(draw: _Draw) -> Any:
         import mitsuba as mi
@@ -197,7 +197,7 @@ def _sphere(draw: _Draw) -> Any:
 
 
 def _quadric(to_frame: Any, intersect: Any, surface: Any) -> Callable[[_Draw], Any]:
-    """Distance and normal of a shape by lot for each lane, with rays from its end among them."""
+    """Return a check of distance and normal of a random shape in each lane; some rays start at its end."""
 
     def evaluate(draw: _Draw) -> Any:
         import mitsuba as mi
@@ -218,7 +218,7 @@ def _quadric(to_frame: Any, intersect: Any, surface: Any) -> Callable[[_Draw], A
 
 
 def _whitted(draw: _Draw) -> Any:
-    """Rays by lot through a scene of every kind of shape, from inside of them too."""
+    """Return bad results of random rays through a scene of every kind of shape, some from inside."""
     import mitsuba as mi
 
     scene = mi.load_dict(_everything().to_dict())
@@ -273,7 +273,7 @@ BULK: Sequence[tuple[str, str, Callable[[_Draw], Any]]] = (
 
 
 def _random_scenes(cases: Cases, count: int) -> None:
-    """Scenes of extreme objects, materials and lights by lot."""
+    """Random scenes of extreme objects, materials and lights."""
     bad = 0
     for seed in range(count):
         described = _random_scene(np.random.default_rng(seed)).to_dict(
@@ -283,7 +283,7 @@ def _random_scenes(cases: Cases, count: int) -> None:
         image = render(described, aa=1, lattice="report").image
         bad += int((~(image >= 0) | np.isinf(image)).sum())
     cases.at_most(
-        "scenes by lot", f"{count} pictures of extreme objects, materials and lights", "none", bad, 0
+        "random scenes", f"{count} pictures of extreme objects, materials and lights", "none", bad, 0
     )
 
 

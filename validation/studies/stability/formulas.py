@@ -18,13 +18,13 @@ from mrt_mitsuba.plugins import fresnel, microfacet
 
 
 def report_tan2_theta(v: Any) -> Any:
-    """tan² from the cosine of the vector made one unit long."""
+    """Return tan² from the cosine of the vector made one unit long."""
     c2 = dr.square(dr.normalize(v).z)
     return (1 - c2) / c2
 
 
 def report_smith_g1(v: Any, alpha: Any) -> Any:
-    """Smith's G₁ from b = 1 / (alpha tan θ), with tan θ from the cosine."""
+    """Return Smith's G₁ from b = 1 / (alpha tan θ), with tan θ from the cosine."""
     tan_theta = dr.sqrt(dr.maximum(1 - dr.square(v.z), 0)) / v.z
     steep = tan_theta * alpha <= 0
     b = dr.select(steep, 2, 1 / dr.select(steep, 1, alpha * tan_theta))
@@ -33,7 +33,7 @@ def report_smith_g1(v: Any, alpha: Any) -> Any:
 
 
 def report_fresnel(cos_theta: Any, ext_ior: Any, int_ior: Any, sin2_theta: Any = None) -> Any:
-    """½(Rs + Rp) from Snell's law; what is known of the sine is not used."""
+    """Return ½(Rs + Rp) from Snell's law; what is known of the sine is not used."""
     sin2_t = dr.square(ext_ior / int_ior) * (1 - dr.square(cos_theta))
     total = sin2_t > 1
     cos_t = dr.sqrt(dr.select(total, 0, 1 - sin2_t))
@@ -108,7 +108,7 @@ class Ours:
         return Terms(d, g, value, pdf)
 
     def _plugin(self, wi: Any, wo: Any, alpha: Any, ior: Any) -> tuple[Any, Any]:
-        """The plugin itself, given one alpha and index for each pair of directions."""
+        """Return the plugin itself, given one alpha and index for each pair of directions."""
         import mitsuba as mi
 
         parameters = mi.traverse(self.bsdf)

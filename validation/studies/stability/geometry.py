@@ -84,7 +84,7 @@ def _scenes(study: Study, cases: Cases, *, quick: bool) -> None:
 
 
 def scaled(scene: Scene, factor: float) -> Scene:
-    """The scene with all lengths multiplied."""
+    """Return the scene with all lengths multiplied."""
 
     def by(p: Any) -> tuple[float, float, float]:
         x, y, z = (c * factor for c in p)
@@ -101,7 +101,7 @@ def scaled(scene: Scene, factor: float) -> Scene:
 
 
 def moved(scene: Scene, sizes: float) -> Scene:
-    """The scene shifted by a multiple of its size, along no axis."""
+    """Return the scene shifted by a multiple of its size, along no axis."""
     way = np.array([0.48, -0.6, 0.64]) * sizes * size(scene)
 
     def by(p: Any) -> tuple[float, float, float]:
@@ -123,7 +123,7 @@ def moved(scene: Scene, sizes: float) -> Scene:
 
 
 def size(scene: Scene) -> float:
-    """The distance from the camera to what it looks at."""
+    """Return the distance from the camera to what it looks at."""
     return float(np.linalg.norm(np.subtract(scene.camera.position, scene.camera.target)))
 
 

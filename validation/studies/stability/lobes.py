@@ -47,7 +47,7 @@ class Lobes:
 
 
 def draw_lobes(per_cell: int, seed: int = 1) -> Lobes:
-    """Up to ``per_cell`` pairs in every cell of the grid that float32 directions reach."""
+    """Return up to ``per_cell`` pairs in every cell of the grid that float32 directions reach."""
     rng = np.random.default_rng(seed)
     parts = [_draw(rng, a, c, per_cell) for a in range(len(ALPHAS)) for c in range(len(COSINES))]
     return Lobes(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Lobes)))
@@ -80,7 +80,7 @@ def _anywhere(rng: np.random.Generator) -> np.ndarray:
 
 
 def _mirrored(rng: np.random.Generator, wi: np.ndarray, alpha: float) -> np.ndarray:
-    """``wi`` mirrored in normals of all steepnesses."""
+    """Return ``wi`` mirrored in normals of all steepnesses."""
     tan = alpha * np.sqrt(rng.uniform(0, STEEPNESS[-1], len(wi)) * rng.random(len(wi)))
     psi = rng.uniform(0, 2 * np.pi, len(wi))
     m = np.stack([tan * np.cos(psi), tan * np.sin(psi), np.ones(len(wi))], axis=1)
@@ -105,7 +105,7 @@ class Truth:
 
 @lru_cache(maxsize=4)
 def lobes_with_truth(per_cell: int, seed: int = 1) -> tuple[Lobes, Truth]:
-    """``draw_lobes`` and what they should give."""
+    """Return ``draw_lobes`` and what they should give."""
     lobes = draw_lobes(per_cell, seed)
     rows = [_exact(*pair) for pair in zip(lobes.wi, lobes.wo, lobes.alpha, lobes.ior, strict=True)]
     return lobes, Truth(*np.array(rows).T)
@@ -136,7 +136,7 @@ def _exact(wi: np.ndarray, wo: np.ndarray, alpha: float, ior: float) -> tuple[fl
 
 
 def _g1_and_slope(v: np.ndarray, alpha: mpf) -> tuple[mpf, mpf]:
-    """G₁ and its derivative with respect to alpha, by a difference far finer than float64."""
+    """Return G₁ and its derivative with respect to alpha, by a difference far finer than float64."""
     g = exact.smith_g1(v, alpha)
     if g == 1:
         return g, mpf(0)

@@ -1,12 +1,13 @@
-"""The filters of the original ray tracer in plain float64 loops, as the truth for the fast ones.
+"""The filters in plain float64, as the truth for the fast ones.
 
-Written for being read beside the definitions, one pixel after the other, and for finite numbers only.
+Written to be read next to the definitions, and for finite numbers only: those of the original ray tracer one
+pixel after the other, the corrected blur one neighbour after the other.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,6 +98,51 @@ def gaussian_dof(image: np.ndarray, amount: np.ndarray) -> np.ndarray:
             if weights > 0:
                 result[y, x] = total / weights
     return result[::-1]
+
+
+def disc_radius(amount: np.ndarray) -> np.ndarray:
+    """Radii of the discs of the corrected blur."""
+    small = amount**2 / (8 - 4 * np.minimum(amount, 1) ** 2)
+    return np.where(amount < 1, small, np.sqrt(np.maximum(2 * amount - 23 / 16, 0)) - 0.5)
+
+
+def corrected_dof(image: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Blur with discs of signed radii, negative before the focus; see ``mrt_mitsuba.filters.lens``.
+
+    A neighbour is in front, in the same layer and behind by parts that add up to one. What is in front, or
+    level, spreads over its own disc; what is behind is seen through the pixel's, and in the same layer only
+    through the narrower of both.
+    """
+    steps = [(dx, dy) for dx in range(-5, 6) for dy in range(-5, 6)]
+    padded = np.pad(np.dstack([image, np.ones(radius.shape), radius]), ((5, 5), (5, 5), (0, 0)), mode="edge")
+    front, same, behind = np.zeros((3, *radius.shape, 4))
+    for dx, dy in steps:
+        there = padded[5 + dy : 5 + dy + len(radius), 5 + dx : 5 + dx + radius.shape[1]]
+        theirs, light, order = np.abs(there[..., 4]), there[..., :4], there[..., 4] - radius
+        own_disc = (_cover(np.abs(radius), dx, dy) / _light(np.abs(radius), steps))[..., None]
+        their_disc = (_cover(theirs, dx, dy) / _light(theirs, steps))[..., None]
+        nearer, level, farther = (
+            np.maximum(part, 0)[..., None]
+            for part in (np.minimum(-order, 1), 1 - abs(order), np.minimum(order, 1))
+        )
+        wider_behind = ((order > 0) & (theirs > np.abs(radius)))[..., None]
+        front += nearer * their_disc * light
+        same += level * np.where(wider_behind, own_disc, their_disc) * light
+        behind += farther * own_disc * light
+    hidden, solid = np.minimum(front[..., 3:], 1), np.minimum(same[..., 3:], 1)
+    gap = np.minimum(1 - solid, behind[..., 3:])
+    colors = [layer[..., :3] / np.maximum(layer[..., 3:], 1e-300) for layer in (front, same, behind)]
+    return hidden * colors[0] + (1 - hidden) * (solid * colors[1] + gap * colors[2]) / (solid + gap)
+
+
+def _cover(radius: np.ndarray, dx: int, dy: int) -> np.ndarray:
+    """How much of a pixel so far away a disc covers."""
+    return np.clip(radius + 1 - math.hypot(dx, dy), 0, 1)
+
+
+def _light(radius: np.ndarray, steps: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Pixels that a disc covers in all."""
+    return np.asarray(sum(_cover(radius, dx, dy) for dx, dy in steps))
 
 
 def _empty(shape: tuple[int, ...]) -> ReferenceEdges:

@@ -6,18 +6,17 @@ import io
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.output import files
 from mrt_mitsuba.output.error import ErrorEstimate, Round
+from mrt_mitsuba.rendering.plan import Plan
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from mrt_mitsuba.rendering.plan import Plan
-
-    Image = NDArray[np.float32]
+Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -53,14 +52,12 @@ class Result:
 
         ``tonemap`` ("report" or "srgb") concerns a PNG only.
         """
-        from mrt_mitsuba.output import files as output
-
         for path in paths:
             if os.path.realpath(path) in self.inputs:
                 raise OutputError(
                     f"cannot write {os.fspath(path)}: the scene uses this picture; choose another name"
                 )
-        output.save(paths, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
+        files.save(paths, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
 
     def header(self) -> dict[str, Any]:
         """Return the header attributes of an EXR: how the picture was made, and nothing such as seconds that
@@ -84,8 +81,6 @@ class Result:
         """Show the picture in a notebook, in sRGB as screens expect it."""
         from PIL import Image as PilImage
 
-        from mrt_mitsuba.output.files import to_8bit
-
         buffer = io.BytesIO()
-        PilImage.fromarray(to_8bit(self.image, "srgb")).save(buffer, format="PNG")
+        PilImage.fromarray(files.to_8bit(self.image, "srgb")).save(buffer, format="PNG")
         return buffer.getvalue()

@@ -1,0 +1,189 @@
+"""Many renders on several processes: how much faster, at what cost for each, and equal to the bit?"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.cores import usable_cores
+from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.validation.tools.study import Study
+
+TITLE = "Many renders on several processes"
+
+SCENE = 3
+ALPHA = "material_0.alpha"
+FASTER = 0.6  # of the loop's time, on two workers and more
+GROWTH = 1.1  # of a worker's memory after its first jobs
+FIRST_JOBS = 10  # of each worker, in which it loads code and compiles
+OVERHEAD = 10.0  # milliseconds of a job outside its render
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How many renders, of what size, how often."""
+
+    alphas: int
+    size: tuple[int, int]
+    turns: int
+    small: int  #: pictures by which the cost of a job is measured
+
+
+FULL = Extent(100, (160, 120), 3, 300)
+QUICK = Extent(3, (32, 24), 0, 0)
+AA = (1, 2, 3, 4)
+
+
+@dataclass
+class Watch(Progress):
+    """Sees how much memory the processes of a sweep hold, job by job."""
+
+    memory: dict[int, list[tuple[int, int]]] = field(default_factory=dict)  #: jobs and bytes, by process
+
+    @contextlib.contextmanager
+    def stage(self, title: str, total: int, message: str = "") -> Iterator[Callable[[int], None]]:
+        """Look at all processes below this one after each job."""
+        import psutil
+
+        done = itertools.count(1)
+
+        def advance(steps: int) -> None:
+            count = next(done)
+            for child in psutil.Process().children(recursive=True):
+                with contextlib.suppress(psutil.Error):
+                    self.memory.setdefault(child.pid, []).append((count, child.memory_info().rss))
+
+        yield advance
+
+    def growth(self, warm: int) -> float:
+        """Return by how much the process that grew most did after ``warm`` jobs."""
+        grown = [1.0]
+        for found in self.memory.values():
+            later = [size for count, size in found if count >= warm]
+            grown.append(max(later, default=1) / later[0] if later else 1.0)
+        return max(grown)
+
+
+def run(study: Study, *, quick: bool) -> None:
+    """Fill the study. A quick one gives no times."""
+    extent = QUICK if quick else FULL
+    counts = sorted({1, 2, usable_cores()})
+    watch = Watch()
+    with TemporaryDirectory() as folder:
+        alone, swept = Path(folder, "alone"), Path(folder, "swept")
+        alone.mkdir()
+        loop(alone, extent)
+        sweep(swept, extent, 2, watch)
+        names = sorted(path.name for path in swept.glob("*.exr"))
+        differ = sum(not same(alone / name, swept / name) for name in names)
+        study.at_most("pictures that differ from those of a loop", differ, 0, "to the bit")
+        study.at_least("pictures", len(names), extent.alphas * len(AA))
+        if extent.turns:
+            warm = 2 * FIRST_JOBS
+            study.at_most("memory of a worker over that after its first jobs", watch.growth(warm), GROWTH)
+            _times(study, Path(folder), extent, counts)
+
+
+def _times(study: Study, folder: Path, extent: Extent, counts: Sequence[int]) -> None:
+    taken: dict[int, list[float]] = {count: [] for count in (0, *counts)}
+    with study.stage("Workers", extent.turns * len(taken)) as advance:
+        for turn in range(extent.turns):
+            for count, seconds in taken.items():
+                out = folder / f"{turn}-{count}"
+                out.mkdir()
+                start = time.perf_counter()
+                sweep(out, extent, count) if count else loop(out, extent)
+                seconds.append(time.perf_counter() - start)
+                advance(1)
+    ratios = {n: [own / one for own, one in zip(taken[n], taken[0], strict=True)] for n in counts}
+    jobs = extent.alphas * len(AA)
+    study.table(
+        "workers",
+        f"{jobs} renders of scene {SCENE}, {extent.size[0]}x{extent.size[1]}, on {usable_cores()} cores",
+        ("workers", "seconds", "fastest", "slowest", "of the loop's time"),
+        [
+            (n or "a loop", statistics.median(s), min(s), max(s), statistics.median(ratios[n]) if n else 1.0)
+            for n, s in taken.items()
+        ],
+        "A loop: the same renders and files in this process, one after the other. The seconds of a sweep "
+        "hold the start of its workers and its contact sheet.",
+        first=True,
+    )
+    if usable_cores() > 1:
+        best = ratios[usable_cores()]
+        study.goal(
+            "time of a sweep / a loop", statistics.median(best), FASTER, interval=(min(best), max(best))
+        )
+    costs = [_overhead(folder / f"small-{turn}", extent.small) for turn in range(extent.turns)]
+    study.goal(
+        "milliseconds of a job outside its render",
+        statistics.median(costs),
+        OVERHEAD,
+        "one worker, 64x48: the time of a long sweep less that of a short one",
+        interval=(min(costs), max(costs)),
+    )
+
+
+def loop(folder: Path, extent: Extent) -> None:
+    """Render the pictures of a sweep in this process, to files of the same names."""
+    width, height = extent.size
+    for alpha, aa in itertools.product(alphas(extent), AA):
+        result = mrt.render(SCENE, width=width, height=height, aa=aa, params={ALPHA: alpha})
+        result.save(folder / f"{ALPHA}={alpha},aa={aa}.exr")
+
+
+def sweep(folder: Path, extent: Extent, workers: int, progress: Progress | None = None) -> None:
+    """Render them by so many workers."""
+    width, height = extent.size
+    grid = {ALPHA: alphas(extent), "aa": list(AA)}
+    progress = progress or Progress()
+    mrt.sweep(SCENE, folder, grid=grid, workers=workers, progress=progress, width=width, height=height)
+
+
+def alphas(extent: Extent) -> list[float]:
+    """Return the values of alpha."""
+    return [round(float(alpha), 4) for alpha in np.linspace(0.02, 0.5, extent.alphas)]
+
+
+def same(a: Path, b: Path) -> bool:
+    """Whether two files hold the same picture and layers."""
+    one, other = read_exr(a), read_exr(b)
+    pairs: list[tuple[Mapping[str, Any], Mapping[str, Any]]] = [
+        ({"": one.image}, {"": other.image}),
+        (one.layers, other.layers),
+    ]
+    return all(
+        p.keys() == q.keys() and all(np.array_equal(p[name], q[name], equal_nan=True) for name in p)
+        for p, q in pairs
+    )
+
+
+def _overhead(folder: Path, count: int) -> float:
+    """Milliseconds of a job beyond what its render and its file take."""
+    few, spans = max(1, count // 10), []
+    for number in (few, count):
+        start = time.perf_counter()
+        table = mrt.sweep(
+            SCENE,
+            folder / str(number),
+            grid={"seed": range(number)},
+            workers=1,
+            progress=Progress(),
+            width=64,
+            height=48,
+            aa=1,
+        )
+        spans.append(time.perf_counter() - start)
+    job = statistics.median(row["seconds"] for row in table.rows)
+    return 1e3 * ((spans[1] - spans[0]) / (count - few) - job)

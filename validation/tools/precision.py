@@ -1,0 +1,212 @@
+"""What measuring error against time found: the figures of each case, what they answer, and how sure it is.
+
+The pictures x₁ … x_R of a case and two independent halves h₁, h₂ of the reference give the matrix G[r, s] =
+mean (x_r − h₁)(x_s − h₂), in which the reference's own noise cancels. The mean of its diagonal is the squared
+error, that of the rest the squared bias; the difference is the variance.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.validation.tools.compare import Difference
+from mrt_mitsuba.validation.tools.intervals import Estimate, estimate
+
+RESOLVED = 2.0  # times the reference's own error from which on an error can be distinguished from it
+NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?"
+NOTHING = 1e-15  # an RMSE of 0, as logarithms have it
+
+Options = Mapping[str, Any]
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Point:
+    """One case: what it costs and how far off it is."""
+
+    name: str
+    options: Options
+    times: np.ndarray  #: seconds of each repeat, warm, without loading the scene
+    gram: np.ndarray  #: G[r, s], see above
+    cold: float  #: seconds of a first run, its kernels compiled or read from a cache
+    compile: float  #: seconds of that in the compiler
+    rays: Mapping[str, int]
+    image: np.ndarray  #: of the first repeat
+    difference: Difference  #: of it from the reference
+    reference_error: float
+
+    @property
+    def family(self) -> str:
+        """The name without its numbers: cases that differ in these alone are one curve."""
+        bare = re.sub(rf"(\w+=)?{NUMBER}", " ", self.name).split()
+        return " ".join(bare or re.sub(f"=?{NUMBER}", " ", self.name).split()) or self.name
+
+    @cached_property
+    def time(self) -> Estimate:
+        return estimate(len(self.times), lambda index: np.median(self.times[index], axis=-1))
+
+    @cached_property
+    def error(self) -> Estimate:
+        return estimate(len(self.times), self.rmse_of)
+
+    @cached_property
+    def bias_squared(self) -> Estimate:
+        return estimate(len(self.times), self._bias_squared_of, log=False)
+
+    def rmse_of(self, index: np.ndarray) -> np.ndarray:
+        """Return the RMSE over some repeats, [..., repeats] of them."""
+        return np.sqrt(np.maximum(np.diag(self.gram)[index].mean(axis=-1), NOTHING**2))
+
+    def _bias_squared_of(self, index: np.ndarray) -> np.ndarray:
+        """Return the squared bias by pairs of different repeats; of one repeat, or the same one, NaN."""
+        other = index[..., :, None] != index[..., None, :]
+        total = np.where(other, self.gram[index[..., :, None], index[..., None, :]], 0).sum(axis=(-2, -1))
+        count = other.sum(axis=(-2, -1))
+        return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+
+    @property
+    def seconds(self) -> float:
+        return self.time.value
+
+    @property
+    def seconds_interval(self) -> Interval:
+        return self.time.low, self.time.high
+
+    @property
+    def rmse(self) -> float:
+        return self.error.value if self.error.value > NOTHING else 0.0
+
+    @property
+    def rmse_interval(self) -> Interval:
+        return self.error.low, self.error.high
+
+    @property
+    def variance(self) -> float:
+        """Mean variance of a pixel between repeats; NaN for one repeat."""
+        return max(0.0, float(np.diag(self.gram).mean()) - self.bias_squared.value)
+
+    @property
+    def bias(self) -> float:
+        """Absolute bias, √(MSE − variance), 0 where noise explains the whole error; NaN for one repeat."""
+        return float(np.sqrt(np.maximum(self.bias_squared.value, 0)))
+
+    @property
+    def bias_interval(self) -> Interval:
+        low, high = np.sqrt(np.maximum((self.bias_squared.low, self.bias_squared.high), 0))
+        return float(low), float(high)
+
+    @property
+    def efficiency(self) -> float:
+        """1 / (variance × seconds); NaN where nothing is random or there is one repeat."""
+        product = self.variance * self.seconds
+        return 1 / product if product > 1e-12 * self.rmse**2 * self.seconds else float("nan")
+
+    @property
+    def resolved(self) -> bool:
+        """Return whether the error can be distinguished from the reference's own."""
+        return self.rmse > RESOLVED * self.reference_error
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A picture of an equal-time strip."""
+
+    name: str
+    seconds: float
+    image: np.ndarray
+
+
+@dataclass(frozen=True)
+class Strip:
+    """What each curve reaches in about the same time."""
+
+    seconds: float
+    panels: Sequence[Panel]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was found about several cases."""
+
+    scene: str
+    points: Mapping[str, Point]
+    failed: Mapping[str, str]  #: why, by case
+    reference: np.ndarray
+    reference_error: float  #: RMSE of the reference itself, below which nothing is claimed; 0: exact
+    repeats: int
+    errors: Sequence[float]  #: for which the time is given
+    strips: Sequence[Strip] = field(default_factory=list)
+    took: float = 0.0
+
+    @property
+    def families(self) -> dict[str, list[Point]]:
+        """The points of each curve, fastest first."""
+        groups: dict[str, list[Point]] = {}
+        for point in sorted(self.points.values(), key=lambda p: p.seconds):
+            groups.setdefault(point.family, []).append(point)
+        return {name: groups[name] for name in dict.fromkeys(p.family for p in self.points.values())}
+
+    def time_to(self, error: float) -> dict[str, Estimate]:
+        """Return the seconds in which each curve comes down to an RMSE; infinite where it never does.
+
+        Between measured cases the curve is a straight line in logarithms; beyond them nothing is assumed.
+        """
+        return {
+            name: estimate(self.repeats, partial(_crossing, points, error))
+            for name, points in self.families.items()
+        }
+
+    @cached_property
+    def times(self) -> dict[float, dict[str, Estimate]]:
+        """``time_to`` of each of ``errors``."""
+        return {error: self.time_to(error) for error in self.errors}
+
+    @cached_property
+    def verdicts(self) -> list[str]:
+        """A sentence for each of ``errors``; it names a winner only if its interval meets no other."""
+        if self.repeats < 2:
+            return ["No verdict on time: a single repeat has no interval."]
+        return [_verdict(error, self.times[error]) for error in self.errors]
+
+    def __str__(self) -> str:
+        width = max(map(len, [*self.points, *self.failed]), default=0)
+        lines = [f"{p.name:<{width}}  {p.time} s, RMSE {p.error}" for p in self.points.values()]
+        lines += [f"{name:<{width}}  FAILED {why}" for name, why in self.failed.items()]
+        return "\n".join([*lines, f"the reference's own error: {self.reference_error:.2g}", *self.verdicts])
+
+
+def _crossing(points: Sequence[Point], error: float, index: np.ndarray) -> np.ndarray:
+    """Return the seconds in which a curve, fastest point first, comes down to an error, by some repeats."""
+    error *= 1 + 1e-9  # an error that is met to rounding is met
+    seconds = np.stack([np.median(p.times[index], axis=-1) for p in points])  # [points, ...]
+    rmse = np.stack([p.rmse_of(index) for p in points])
+    found = np.where(rmse[0] <= error, seconds[0], np.inf)
+    for i in range(1, len(points)):
+        ends = np.log([rmse[i - 1], rmse[i]])
+        steps = np.where(ends[0] > ends[1], ends[0] - ends[1], 1)
+        share = np.clip((ends[0] - np.log(error)) / steps, 0, 1)
+        between = seconds[i - 1] ** (1 - share) * seconds[i] ** share
+        found = np.where(np.isinf(found) & (rmse[i] <= error), between, found)
+    return found
+
+
+def _verdict(error: float, times: Mapping[str, Estimate]) -> str:
+    where = f"RMSE of {error:g}"
+    reached = sorted(((t.value, name) for name, t in times.items() if np.isfinite(t.value)))
+    if not reached:
+        return f"{where}: no case comes so low."
+    best = reached[0][1]
+    like = [name for _, name in reached[1:] if times[name].overlaps(times[best])]
+    if like:
+        return f"{where}: no winner, for the intervals overlap: {', '.join([best, *like])}."
+    if len(reached) == 1:
+        return f"{where}: only {best} comes so low, in {times[best]} s."
+    value, second = reached[1]
+    ratio = value / reached[0][0]
+    return f"{where}: {best} is the fastest, {times[best]} s; {second} takes {ratio:.2g} times as long."
