@@ -22,6 +22,7 @@ from mrt_mitsuba.output.error import ErrorEstimate
 from mrt_mitsuba.rendering.exposing import Exposed, Exposer, Groups, Stack, box_mean
 
 HALVES = 2
+TILE = 16  # pixels, under a filter
 GROUP = 8  # rays that are traced together; two groups to a pixel begin
 STEP = (
     1.25  # times the rays there are must be there after another round: a short one costs more than it brings
@@ -152,10 +153,21 @@ class Halves(Stack):
     def _groups(self, due: np.ndarray) -> np.ndarray:
         """Return whole numbers of groups for what is due; one at least."""
         missing = (due - self.rays) / GROUP
-        groups = np.floor(missing + 0.5)
+        groups = np.floor(missing + self._rounding())
         if not groups.any():
             groups = (missing >= missing.max()) * 1.0
         return np.asarray(groups, np.int64)
+
+    def _rounding(self) -> float | np.ndarray:
+        """Return what to add before numbers are rounded down: alike in a tile, under a filter.
+
+        There, a lone pixel would have rays traced all around it.
+        """
+        if not self.film.reach:
+            return 0.5
+        rows, columns = (np.arange(n) // TILE for n in self.film.shape)
+        random = np.random.default_rng((self._seed, int(self.rays.sum())))
+        return random.random((rows[-1] + 1, columns[-1] + 1))[rows[:, None], columns].ravel()
 
     def _decisive(self) -> np.ndarray:
         """Return the variance of a ray's value that decides in each half, [2, pixels]: the other half's."""
@@ -166,6 +178,8 @@ class Halves(Stack):
         judges, other = (slice(None), *[slice(None, None, step)] * 2), measured[::-1, ::step, ::step]
         best, least, lowest = measured, math.inf, 0.0
         for width, worths in _WINDOWS.items():
+            if width < self.film.reach:
+                continue
             around = box_mean(measured, width, (1, 2))
             for worth in worths:
                 smooth = _smoothed(measured, around, rays, worth)

@@ -246,6 +246,15 @@ def test_kernels_are_compiled_once(tmp_path):
     assert len(result.rounds) > 2 and len(set(tracing)) == 1
 
 
+@pytest.mark.parametrize("name", ["area_light", "spot"])
+def test_few_rounds_are_enough(name):
+    """Under a wide filter, a lone pixel that needs rays takes many around it; so they must go by regions."""
+    scene = _load(name, width=64, height=48, film={"rfilter": {"type": "mitchell"}})
+    error = mrt.render(scene, aamode="noise", spp=16).error.rmse
+    for share in (0.95, 0.86):
+        assert len(mrt.render(scene, target=share * error).rounds) <= 3
+
+
 def test_rounds_report_and_stop():
     seen: list[Any] = []
 
