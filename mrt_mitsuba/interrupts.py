@@ -15,7 +15,7 @@ from types import FrameType
 
 @contextlib.contextmanager
 def surfacing(kinds: Mapping[int, type[KeyboardInterrupt]] | None = None) -> Iterator[None]:
-    """Within the block, signals raise exceptions, and the first of them is what the block raises at last.
+    """Raise exceptions on signals in the block; the first of them is what the block raises at last.
 
     ``kinds``: exceptions by number; by default ``KeyboardInterrupt`` for SIGINT, unless that is handled.
     Without effect outside the main thread, where Python sets no handlers.

@@ -32,7 +32,7 @@ Version = tuple[int, ...]
 
 
 class Choice:
-    """What was chosen, and why.
+    """The chosen library, and the reason.
 
     ``path``: the library, or None. ``version``: its version, or None where it is unknown before it is loaded.
     ``source``: "user", "wheel", "system", "none", or "drjit" where Dr.Jit is left to search by itself (macOS

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from mrt_mitsuba.errors import UsageError
 
-# Of every pixel: what is kept, by channel, and what Pillow needs to write a PNG
+# For every pixel: what is kept, by channel, and what Pillow needs to write a PNG
 BYTES_PER_CHANNEL = 4
 BYTES_TO_WRITE = 4
 
@@ -52,8 +54,13 @@ class Budget:
 
     @classmethod
     def of(cls, memory: int | None) -> Budget:
-        """Return what was asked for, by default half of what is free; never more than the machine has."""
-        return cls(min(memory if memory is not None else free_memory() // 2, all_memory()))
+        """Return what was asked for, by default half of what is free; never more than the machine has.
+
+        Of renders in quick succession, only one in a tenth of a second looks at the machine.
+        """
+        moment = int(10 * time.monotonic())
+        wanted = _look(free_memory, moment) // 2 if memory is None else memory
+        return cls(min(wanted, _look(all_memory, moment)))
 
     def take_texture(self, path: str, width: int, height: int, *, around: bool = False) -> None:
         """Take the memory of a picture used as a texture; ``around``: as a map of the surroundings.
@@ -69,6 +76,12 @@ class Budget:
             )
         self.taken += stays
         self.pictures.add(os.path.realpath(path))
+
+
+@functools.lru_cache(maxsize=2)
+def _look(function: Callable[[], int], moment: int) -> int:
+    """Return what a function does, looked up once in a moment."""
+    return function()
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import warnings
 
@@ -103,16 +104,17 @@ def usable_variants() -> list[str]:
 
 def versions() -> dict[str, str]:
     """Return the versions of what decides about pixels."""
-    from importlib import metadata
-
     from mrt_mitsuba import __version__
 
-    return {
-        "mrt-mitsuba": __version__,
-        "mitsuba": metadata.version("mitsuba"),
-        "drjit": metadata.version("drjit"),
-        "llvm": llvm.version_text(llvm.prepare().version),
-    }
+    packages = {name: _version(name) for name in ("mitsuba", "drjit")}
+    return {"mrt-mitsuba": __version__, **packages, "llvm": llvm.version_text(llvm.prepare().version)}
+
+
+@functools.cache  # it takes a millisecond
+def _version(package: str) -> str:
+    from importlib import metadata
+
+    return metadata.version(package)
 
 
 def _llvm_obstacle() -> str | None:

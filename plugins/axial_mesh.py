@@ -124,7 +124,7 @@ def side_count(props: mi.Properties, default: int) -> int:
 
 
 class Placement:
-    """What ``to_world`` does to frames. Raises ``ParameterError`` for one that flattens space."""
+    """The effect of ``to_world`` on frames. Raises ``ParameterError`` for one that flattens space."""
 
     def __init__(self, props: mi.Properties) -> None:
         matrix = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, np.float64)

@@ -81,7 +81,6 @@ class MrtBSDF(mi.BSDF):
         self.specular_reflectance = spectrum(props, "specular_reflectance", 1.0)
         self.f0 = self._read_f0(props)
         self.sample_visible = flag(props, "sample_visible", True)
-        self._updates = 0
         self._update()
 
     @staticmethod
@@ -126,15 +125,10 @@ class MrtBSDF(mi.BSDF):
 
     def parameters_changed(self, keys: Any = ()) -> None:
         self._update()
-        self._updates += 1
 
     def lobes(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Lobes:
         """Return the lobes at a surface point."""
         return Lobes(self.fresnel, _PointParameters(self, si, active), si.wi, visible=self.sample_visible)
-
-    def state(self) -> tuple[int, bool]:
-        """Return what changes whenever ``uniform`` or ``mirror_bound`` may."""
-        return self._updates, self._is_uniform() and self._needs_gradients()
 
     def uniform(self) -> UniformMaterial | Reason:
         """Return the parameters as plain numbers, or why they are none."""

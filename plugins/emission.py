@@ -12,18 +12,8 @@ import numpy as np
 from .protocols import SteadyLight
 from .variants import first, is_jit, varies
 
-# Emitters beyond this number are not looked at: reading one takes a tenth of a millisecond, at every render
+# Emitters beyond this number are not looked at one by one where one could be on a surface
 MOST_EMITTERS = 64
-
-
-def brightness(emitters: list[Any]) -> list[float]:
-    """Return the largest radiance, irradiance or intensity of each emitter; inf where it is not known.
-
-    It is not known of what varies, of spectra in scalar variants, and where derivatives are wanted.
-    """
-    if len(emitters) > MOST_EMITTERS:
-        return [math.inf] * len(emitters)
-    return [_brightness(e) for e in emitters]
 
 
 def arriving(emitter: Any, largest: float) -> float:
@@ -32,7 +22,11 @@ def arriving(emitter: Any, largest: float) -> float:
     return largest if steady or largest == 0 else math.inf
 
 
-def _brightness(emitter: Any) -> float:
+def brightness(emitter: Any) -> float:
+    """Return the largest radiance, irradiance or intensity of an emitter; inf where it is not known.
+
+    It is not known of what varies, of spectra in scalar variants, and where derivatives are wanted.
+    """
     parameters = mi.traverse(emitter)
     if emitter.class_name() == "EnvironmentMapEmitter":
         data, scale = parameters["data"], parameters["scale"]
@@ -42,14 +36,10 @@ def _brightness(emitter: Any) -> float:
     return max(values, default=math.inf)
 
 
-def places(emitters: list[Any]) -> list[tuple[float, ...] | None]:
-    """Return where each emitter is a point; None for one that is none, or beyond ``MOST_EMITTERS``."""
-    if len(emitters) > MOST_EMITTERS:
-        return [None] * len(emitters)
-    return [_place(e) if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else None for e in emitters]
-
-
-def _place(emitter: Any) -> tuple[float, ...] | None:
+def place(emitter: Any) -> tuple[float, ...] | None:
+    """Return where an emitter is a point; None for one that is none."""
+    if not mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+        return None
     parameters = mi.traverse(emitter)
     return tuple(first(x) for x in parameters["position"]) if "position" in parameters else None
 

@@ -1,4 +1,4 @@
-"""What ``mrt_whitted`` knows about a scene, and what its kernels hold because of it.
+"""Facts about a scene, and the plan of the kernels that ``mrt_whitted`` makes for them.
 
 Plain data and one pure function, ``make_plan``: nothing here knows Mitsuba. The integrator reads the facts,
 the plan decides, the integrator obeys. A plan may be edited (``dataclasses.replace``) before it is obeyed.
@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
 
 import numpy as np
 
@@ -74,7 +75,7 @@ class UniformMaterial:
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What a scene is made of, as far as a kernel depends on it."""
+    """The content of a scene, as far as a kernel depends on it."""
 
     vectorised: bool  #: is the variant one that compiles kernels
     native_shapes: int  #: shapes that only Mitsuba can trace
@@ -100,6 +101,7 @@ class SceneFacts:
     textured: bool  #: does a material vary over its surface
     two_sided: bool  #: is a material lit from behind
     unmergeable: Reason | None  #: why the materials cannot be looked up in one table
+    tabled: bool  #: can the lights be
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class CutOff:
-    """What counts against ``min_contribution``, by what it is multiplied with."""
+    """The quantities that are compared with ``min_contribution``, by their factors."""
 
     paths: float  #: a path's throughput; inf: it never ends for being too dim
     lights: float  #: a light's share at a hit, below which it is taken for visible
@@ -136,7 +138,7 @@ class KernelPlan:
     spheres: str  #: "none", "corrected": hits moved onto them, "table": and no call to the shape
     quadrics: tuple[str, ...]  #: kinds of exact quadrics; others are traced as meshes
     planes: bool  #: analytic planes, else they are traced as meshes
-    lights: str  #: "none", "unrolled" or "loop"
+    lights: str  #: "none", "unrolled", "loop" that calls each, or "table": a loop over their numbers
     touching: bool  #: shadow rays that end short of lights on surfaces
     random: bool  #: random numbers
     emission: bool  #: surfaces that emit
@@ -182,6 +184,7 @@ def _hits(mirrors: Sequence[Mirror], settings: Settings) -> float:
 Unless = Callable[..., bool]
 
 
+@lru_cache(maxsize=16)  # asked twice in each render
 def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
     """Decide what the kernels for a scene hold."""
     reasons: list[tuple[str, Reason]] = []
@@ -238,7 +241,7 @@ def _lights(facts: SceneFacts, unless: Unless) -> str:
     black = not (facts.diffuse or facts.specular)
     lit = unless("lights", (facts.lights == 0, Reason.NO_LIGHTS), (black, Reason.BLACK))
     unrolled = facts.lights <= UNROLLED_LIGHTS or not facts.vectorised
-    return ("unrolled" if unrolled else "loop") if lit else "none"
+    return ("unrolled" if unrolled else "table" if facts.tabled else "loop") if lit else "none"
 
 
 def _mirrors(facts: SceneFacts, settings: Settings, affordable: Sequence[Mirror], unless: Unless) -> bool:

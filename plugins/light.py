@@ -6,8 +6,9 @@ import drjit as dr
 import mitsuba as mi
 
 from .parameters import spectrum, vector
-from .protocols import SteadyLight
-from .variants import first, is_jit, pointer
+from .point_lights import direction_to
+from .protocols import TabledLight
+from .variants import first, is_jit, pointer, varies
 
 
 class MrtLight(mi.Emitter):
@@ -56,18 +57,7 @@ class MrtLight(mi.Emitter):
         self._update()
 
     def sample_direction(self, it, sample, active=True):
-        ds = mi.DirectionSample3f()
-        ds.p = self.position
-        ds.d = ds.p - it.p
-        ds.dist = dr.norm(ds.d)
-        # A point on the light itself has no direction to it; any will do, and scalar variants raise on 0/0
-        away = ds.dist > 0
-        ds.d = dr.select(away, ds.d * (1 / dr.select(away, ds.dist, 1)), mi.Vector3f(0, 0, 1))
-        ds.n = mi.Normal3f(-ds.d)
-        ds.uv = mi.Point2f(0)
-        ds.time = it.time
-        ds.pdf = mi.Float(1)
-        ds.delta = mi.Bool(True)
+        ds = direction_to(self.position, it)
         ds.emitter = pointer("Emitter", self)
         return ds, mi.depolarizer(self.irradiance(it, active))
 
@@ -76,6 +66,15 @@ class MrtLight(mi.Emitter):
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wavelengths = it.wavelengths
         return self.intensity.eval(si, active)
+
+    def numbers(self) -> tuple[list[float], list[float]] | None:
+        """Return position and intensity; None where that varies, or where derivatives are wanted."""
+        if varies(self.intensity):
+            return None
+        intensity = self.intensity.eval(dr.zeros(mi.SurfaceInteraction3f))
+        if dr.grad_enabled(self.position, intensity):
+            return None
+        return list(map(first, self.position)), list(map(first, intensity))
 
     def pdf_direction(self, it, ds, active=True):
         return mi.Float(0)
@@ -100,5 +99,5 @@ class MrtLight(mi.Emitter):
         return f"MrtLight[position={self.position}, intensity={self.intensity}]"
 
 
-SteadyLight.register(MrtLight)
+TabledLight.register(MrtLight)
 mi.register_emitter("mrt_light", MrtLight)

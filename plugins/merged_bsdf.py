@@ -7,7 +7,7 @@ Dr.Jit would record its calls in the kernels of every scene, and only Python cal
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,8 +21,13 @@ from .protocols import MergeableBSDF
 from .variants import is_jit
 
 
-def uniform_materials(shapes: Sequence[mi.Shape]) -> dict[int, UniformMaterial] | Reason:
-    """Return the materials by the ids of the shapes' BSDFs, or why they have no place in one table."""
+def uniform_materials(
+    shapes: Sequence[mi.Shape], read: Callable[[Callable, Any], Any]
+) -> dict[int, UniformMaterial] | Reason:
+    """Return the materials by the ids of the shapes' BSDFs, or why they have no place in one table.
+
+    ``read(function, bsdf)``: what the function returns of the BSDF, see ``watch.Notes``.
+    """
     bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
     if not is_jit():
         return Reason.SCALAR_VARIANT
@@ -37,10 +42,14 @@ def uniform_materials(shapes: Sequence[mi.Shape]) -> dict[int, UniformMaterial] 
         return Reason.MIXED_FRESNEL
     materials = {}
     for key, bsdf in bsdfs.items():
-        found = materials[key] = bsdf.uniform()
+        found = materials[key] = read(_uniform, bsdf)
         if isinstance(found, Reason):
             return found
     return materials
+
+
+def _uniform(bsdf: MergeableBSDF) -> UniformMaterial | Reason:
+    return bsdf.uniform()
 
 
 class MergedBSDF:

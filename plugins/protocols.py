@@ -1,4 +1,4 @@
-"""What a plugin declares about itself, so that nobody has to guess it from its attributes.
+"""Declarations of plugins about themselves, so that nobody has to guess from attributes.
 
 Mitsuba's classes take no mix-in; a class joins a protocol by registration: after
 ``QuadricShape.register(MrtCone)``, ``isinstance(shape, QuadricShape)`` holds. Others' plugins may join.
@@ -7,6 +7,7 @@ Mitsuba's classes take no mix-in; a class joins a protocol by registration: afte
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -42,6 +43,14 @@ class LayeredIntegrator(ABC):
     def trace(self, scene: Any, sampler: Any, ray: Any, active: Any = True) -> Any:
         """Return the radiance along rays, and what the layers are made of."""
 
+    @abstractmethod
+    def replayed(self, scene: Any, form: Hashable, inputs: Any, run: Callable[[], Any]) -> Any:
+        """Return what ``run()`` does, by launching kernels recorded before where that is known to be safe.
+
+        ``run`` calls ``trace`` on the scene it was prepared for, without a sampler. ``form`` names what in
+        Python shapes the rest of its code, ``inputs`` are the arrays that the rest reads.
+        """
+
 
 class PlaneShape(ABC):
     """A shape that stands for an infinite plane."""
@@ -71,6 +80,14 @@ class SteadyLight(ABC):  # noqa: B024 - lights join by register()
     """A light that is as bright far away as near by."""
 
 
+class TabledLight(SteadyLight):
+    """A steady point light whose numbers may be looked up in a table."""
+
+    @abstractmethod
+    def numbers(self) -> tuple[list[float], list[float]] | None:
+        """Return position and intensity; None where that varies, or where derivatives are wanted."""
+
+
 class MirrorBSDF(ABC):
     """A BSDF with the attributes ``mirror_reflectance`` and ``int_ior``, which drive the mirror rays."""
 
@@ -82,10 +99,6 @@ class MirrorBSDF(ABC):
     def value_bound(self) -> float:
         """Return an upper bound of f cos θ; inf where there is none."""
 
-    @abstractmethod
-    def state(self) -> Any:
-        """Return what changes whenever a bound may: values derived from it are then out of date."""
-
 
 class MergeableBSDF(MirrorBSDF):
     """A ``MirrorBSDF`` with the lobes of ``mrt_bsdf``, which may be looked up in a table of materials."""
@@ -94,4 +107,4 @@ class MergeableBSDF(MirrorBSDF):
 
     @abstractmethod
     def uniform(self) -> UniformMaterial | Reason:
-        """Return the parameters as plain numbers, or why they are none; ``state`` covers this, too."""
+        """Return the parameters as plain numbers, or why they are none."""

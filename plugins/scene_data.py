@@ -1,9 +1,10 @@
-"""What ``mrt_whitted`` reads from a scene: first the facts, then, by a plan, the data of its kernels."""
+"""Reading a scene for ``mrt_whitted``: first the facts, then, by a plan, the data of its kernels."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -12,19 +13,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .emission import arriving, brightness, places
+from .emission import MOST_EMITTERS, arriving, brightness, place
 from .hit_errors import CURVED, HitErrors
-from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts
+from .kernel_plan import CutOff, KernelPlan, Mirror, Reason, SceneFacts
 from .merged_bsdf import MergedBSDF, uniform_materials
 from .mesh_api import ray_flags, surface_interaction, vertex_version
 from .parameters import ParameterError
 from .planes import Planes
+from .point_lights import Lights, numbers_of
 from .protocols import MirrorBSDF, PlaneShape, QuadricShape
 from .quadric_kinds import KINDS
 from .quadrics import quadrics_of
+from .replay import held
 from .spheres import Spheres, is_plain_sphere, is_sphere
 from .touching import any_touching
-from .variants import but_not, is_jit, pointer, varies
+from .variants import but_not, is_jit, varies
+from .watch import Notes
 
 # Beyond these sizes, Embree's products of three lengths leave float32
 SMALLEST_MESH, LARGEST_MESH = 1e-8, 1e10
@@ -33,13 +37,21 @@ SMALLEST_MESH, LARGEST_MESH = 1e-8, 1e10
 # sides
 TOUCHING = 2.0**-10
 
+# What ``SceneData`` makes of the shapes, and the decisions that shape it
+OF_SHAPES = ("bvh", "planes", "quadrics", "errors", "spheres")
+
+
+def _of_shapes(plan: KernelPlan) -> tuple[Any, ...]:
+    return plan.bvh, plan.planes, plan.quadrics, plan.spheres
+
+
 # Reach of a mirror ray: any number that float32 holds
 FARTHEST = 2.0**127
 
 
 @dataclass
 class Hit:
-    """What a ray meets first: an interaction, valid where ``found``, and a bound of its error."""
+    """The first hit of a ray: an interaction, valid where ``found``, and a bound of its error."""
 
     si: mi.SurfaceInteraction3f
     found: mi.Bool
@@ -49,26 +61,31 @@ class Hit:
 class SceneReading:
     """The objects of a scene, sorted by who traces them, and the facts about them."""
 
-    def __init__(self, scene: mi.Scene) -> None:
+    def __init__(self, scene: mi.Scene, before: SceneReading | None = None) -> None:
+        """Read a scene; what has not changed since ``before`` is taken from there."""
         # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed
         self.objects = _objects(scene)
         self.shapes = scene.shapes()
+        self.environment, self.emitters = scene.environment(), scene.emitters()
+        self.bsdfs = _once(s.bsdf() for s in self.shapes)
+        known = before is not None and before.objects == self.objects and before.bsdfs == self.bsdfs
+        self.notes: Notes = before.notes if before and known else Notes(_once([*self.bsdfs, *self.emitters]))
+        self.forms = [_shape_state(s) for s in self.shapes]
         self.planes = [s for s in self.shapes if isinstance(s, PlaneShape)]
         self.quadrics = [s for s in self.shapes if isinstance(s, QuadricShape)]
         self.native = [s for s in self.shapes if not isinstance(s, (PlaneShape, QuadricShape))]
-        for mesh in (s for s in self.native if s.is_mesh()):
-            _check_size(mesh)
+        self.moving = self._moving()
+        if not (before and self.same_shapes(before)):
+            _check_sizes(self.native)
         self._tables = [s.quadrics() for s in self.quadrics]
-        self.environment = scene.environment()
-        self.emitters = scene.emitters()
-        values = zip(self.emitters, brightness(self.emitters), strict=True)
-        self.lights = [e for e, value in values if not e.is_environment() and value != 0]
-        self.bsdfs = list({id(b): b for b in (s.bsdf() for s in self.shapes)}.values())
-        materials = uniform_materials(self.shapes)
+        read = self.notes.read
+        self.brightness = [read(brightness, e) for e in self.emitters]
+        self.lights = self._lights()
+        self.numbers = numbers_of(self.lights, read)
+        materials = uniform_materials(self.shapes, read)
         self.unmergeable = materials if isinstance(materials, Reason) else None
         self.materials = {} if isinstance(materials, Reason) else materials
-        self.state = self._state()
-        self._facts = self._read_facts()
+        self.facts = self._read_facts()
 
     def is_of(self, scene: mi.Scene) -> bool:
         """Return whether this scene was read.
@@ -79,31 +96,34 @@ class SceneReading:
 
     def is_stale(self, scene: mi.Scene) -> bool:
         """Return whether it is another scene, or was changed since."""
-        return not self.is_of(scene) or self._state() != self.state
-
-    def _state(self) -> list[Any]:
-        """Return what changes whenever a shape was moved, a mesh edited or a material changed."""
-        materials = [b.state() for b in self.bsdfs if isinstance(b, MirrorBSDF)]
-        moving = [s.moving_frame() is not None for s in self.quadrics]
-        black = [value == 0 for value in brightness(self.emitters)]
-        return [*map(_shape_state, self.shapes), *moving, *materials, *black, *places(self.emitters)]
-
-    def facts(self) -> SceneFacts:
-        """Return the facts; how bright the emitters are is read anew."""
-        largest = dict(zip(map(id, self.emitters), brightness(self.emitters), strict=True))
-        surfaces = [largest[id(e)] for e in self.lights if mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
-        return replace(
-            self._facts,
-            sky=0.0 if self.environment is None else largest[id(self.environment)],
-            arriving=sum(arriving(e, largest[id(e)]) for e in self.lights),
-            emission=max(surfaces, default=0.0),
+        if not self.is_of(scene) or self.notes.refresh() or self._moving() != self.moving:
+            return True
+        return [_shape_state(s) for s in self.shapes] != self.forms or self.bsdfs != _once(
+            s.bsdf() for s in self.shapes
         )
+
+    def same_shapes(self, other: SceneReading) -> bool:
+        """Return whether no shape was moved or edited between two readings."""
+        return (self.objects, self.forms, self.moving) == (other.objects, other.forms, other.moving)
+
+    def _moving(self) -> list[bool]:
+        return [s.moving_frame() is not None for s in self.quadrics]
+
+    def _lights(self) -> list[Any]:
+        pairs = zip(self.emitters, self.brightness, strict=True)
+        return [e for e, value in pairs if not e.is_environment() and value != 0]
+
+    def _read_of_bsdfs(self, function: Callable[[Any], Any]) -> list[Any]:
+        return [self.notes.read(function, b) for b in self.bsdfs]
 
     def _read_facts(self) -> SceneFacts:
         quadrics: Counter[str] = Counter()
         for table in self._tables:
             quadrics[table.kind] += len(table.rows)
         delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
+        read, largest = self.notes.read, dict(zip(map(id, self.emitters), self.brightness, strict=True))
+        surfaces = [largest[id(e)] for e in self.lights if mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
+        of_lights = [read(place, e) for e in self.lights[:MOST_EMITTERS]]
         return SceneFacts(
             vectorised=is_jit(),
             native_shapes=len(self.native),
@@ -114,21 +134,22 @@ class SceneReading:
             quadrics=tuple(sorted(quadrics.items())),
             lights=len(self.lights),
             random_lights=sum(not mi.has_flag(e.flags(), delta) for e in self.lights),
-            surface_emitters=sum(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in self.lights),
+            surface_emitters=len(surfaces),
             environment=self.environment is not None,
-            sky=math.inf,
-            arriving=math.inf,
-            emission=math.inf,
+            sky=0.0 if self.environment is None else largest[id(self.environment)],
+            arriving=sum(arriving(e, largest[id(e)]) for e in self.lights),
+            emission=max(surfaces, default=0.0),
             alone=self._alone(),
-            touching=any_touching(self.shapes, [place for place in places(self.lights) if place is not None]),
-            value=max(map(_value_bound, self.bsdfs), default=0.0),
+            touching=any_touching(self.shapes, [p for p in of_lights if p is not None]),
+            value=max(self._read_of_bsdfs(_value_bound), default=0.0),
             diffuse=self._has_lobe("diffuse"),
             specular=self._has_lobe("specular"),
-            mirrors=tuple(map(_mirror, filter(has_mirror, self.bsdfs))),
-            oriented=any(map(is_oriented, self.bsdfs)),
-            textured=any(map(is_textured, self.bsdfs)),
+            mirrors=tuple(read(_mirror, b) for b in self.bsdfs if has_mirror(b)),
+            oriented=any(self._read_of_bsdfs(is_oriented)),
+            textured=any(self._read_of_bsdfs(is_textured)),
             two_sided=any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in self.bsdfs),
             unmergeable=self.unmergeable,
+            tabled=self.numbers is not None,
         )
 
     def _has_lobe(self, name: str) -> bool:
@@ -144,11 +165,36 @@ class SceneReading:
 
 
 class SceneData:
-    """The data of the kernels for a scene, as a plan wants them, and its ray queries."""
+    """The data of the kernels for a scene, as a plan wants them, and its ray queries.
 
-    def __init__(self, reading: SceneReading, facts: SceneFacts, plan: KernelPlan) -> None:
-        self.reading, self.facts = reading, facts
+    What depends on the shapes alone is taken from ``before`` where they are the same.
+    """
+
+    bvh: mi.Scene | None  # of the shapes that only Mitsuba can trace; None: the scene itself
+    planes: Planes
+    quadrics: Any
+    errors: HitErrors
+    spheres: Spheres | None
+
+    def __init__(self, reading: SceneReading, plan: KernelPlan, before: SceneData | None = None) -> None:
+        self.reading, self.facts = reading, reading.facts
         self.limit(plan)
+        if before and reading.same_shapes(before.reading) and _of_shapes(plan) == _of_shapes(before.plan):
+            for name in OF_SHAPES:
+                setattr(self, name, getattr(before, name))
+        else:
+            self._trace_shapes(plan)
+        self.lights = Lights(reading.lights, reading.numbers, plan.lights)
+        self.environment = reading.environment
+        self.merged = MergedBSDF(reading.shapes, reading.materials) if plan.merged else None
+        parts = self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged
+        self._arrays = held([*parts, self.environment])
+        self.ray_flags = ray_flags(
+            textures=plan.textures, shading_frames=plan.shading_frames, tangents=plan.tangents
+        )
+
+    def _trace_shapes(self, plan: KernelPlan) -> None:
+        reading = self.reading
         exact = [s for s in reading.quadrics if s.quadrics().kind in plan.quadrics]
         planes = reading.planes if plan.planes else []
         own = {id(s) for s in (*exact, *planes)}
@@ -161,19 +207,28 @@ class SceneData:
         self.quadrics = quadrics_of(exact)
         self.errors = HitErrors(others)
         self.spheres = Spheres(others) if plan.spheres != "none" else None
-        self.lights = reading.lights if plan.lights != "none" else []
-        self.light_pointers = pointer("Emitter", self.lights) if plan.lights == "loop" else None
-        self.environment = reading.environment
-        self.merged = MergedBSDF(reading.shapes, reading.materials) if plan.merged else None
-        self.ray_flags = ray_flags(
-            textures=plan.textures, shading_frames=plan.shading_frames, tangents=plan.tangents
-        )
 
     def limit(self, plan: KernelPlan) -> None:
         """Take over a plan that differs in its cut-off alone."""
         self.plan, self.path_limit = plan, plan.cut_off.paths
         if is_jit() and self.path_limit not in (0, math.inf, self.facts.lights + 1):
             self.path_limit = dr.opaque(mi.Float, self.path_limit)  # a brighter sky needs no new kernel
+
+    # ------------------------------------------- Replay ------------------------------------------------
+
+    @property
+    def form(self) -> Hashable:
+        """What shapes the code of the kernels, ``arrays`` being their data."""
+        return replace(self.plan, cut_off=CutOff(0.0, self.plan.cut_off.lights))
+
+    def arrays(self, scene: mi.Scene) -> list[Any] | None:
+        """Return all that the kernels read; None where they call plugins, which may read anything."""
+        plan, bvh = self.plan, self.bvh or scene
+        tabled = plan.merged and self.lights.known and (plan.spheres == "table" or not plan.bvh)
+        plain = self.environment is None or self.environment.class_name() == "ConstantBackgroundEmitter"
+        if not (tabled and plain and isinstance(bvh, mi.Scene)):
+            return None
+        return [*self._arrays, self.path_limit, *([bvh] if plan.bvh else [])]
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 
@@ -290,8 +345,14 @@ class SceneData:
         )
 
 
+def _check_sizes(shapes: list[mi.Shape]) -> None:
+    """Refuse meshes that float32 cannot trace."""
+    for shape in shapes:
+        if shape.is_mesh():
+            _check_size(shape)
+
+
 def _check_size(mesh: mi.Shape) -> None:
-    """Refuse a mesh that float32 cannot trace."""
     low, high = (np.array(corner, float).ravel() for corner in (mesh.bbox().min, mesh.bbox().max))
     extent, farthest = (high - low).max(), np.abs([low, high]).max()
     if np.isfinite(farthest) and extent > 0 and not (extent >= SMALLEST_MESH and farthest <= LARGEST_MESH):
@@ -378,6 +439,11 @@ def _scene_of(shapes: list[mi.Shape]) -> mi.Scene | None:
     if len(set(names)) < len(names):
         names = [f"shape_{i}" for i in range(len(shapes))]
     return mi.load_dict({"type": "scene", **dict(zip(names, shapes, strict=True))})
+
+
+def _once(things: Iterable[Any]) -> list[Any]:
+    """Return each object once."""
+    return list({id(thing): thing for thing in things}.values())
 
 
 def _objects(scene: mi.Scene) -> list[Any]:

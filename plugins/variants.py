@@ -1,4 +1,4 @@
-"""What differs between Mitsuba's scalar and vectorised variants, and what its objects do not say."""
+"""Differences between Mitsuba's scalar and vectorised variants, and what its objects do not reveal."""
 
 from __future__ import annotations
 

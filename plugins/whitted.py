@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +14,7 @@ from .emission import largest
 from .kernel_plan import BUDGETS, KernelPlan, SceneFacts, Settings, make_plan
 from .parameters import LARGEST, choice, flag, integer, number, spectrum
 from .protocols import LayeredIntegrator
+from .replay import Replay
 from .scene_data import Hit, SceneData, SceneReading
 from .variants import but_not
 
@@ -46,7 +49,7 @@ class LightSample:
 
 @dataclass
 class Shading:
-    """What a surface adds to a path."""
+    """The contribution of a surface to a path."""
 
     radiance: mi.UnpolarizedSpectrum
     shadow_rays: mi.UInt32
@@ -108,6 +111,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         self._reading: SceneReading | None = None
         self._data: SceneData | None = None
         self._given_plan: KernelPlan | None = None  # it holds until the scene changes
+        self._replay = Replay()
 
     # ------------------------------------- Mitsuba's interface ----------------------------------------
 
@@ -151,7 +155,7 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     def scene_facts(self, scene: mi.Scene) -> SceneFacts:
         """Read what the kernels depend on; cheap where nothing has changed since the last call."""
-        return self._read(scene).facts()
+        return self._read(scene).facts
 
     def kernel_plan(self, facts: SceneFacts) -> KernelPlan:
         """Decide what the kernels for such a scene hold."""
@@ -163,25 +167,32 @@ class MrtWhitted(mi.SamplingIntegrator):
         A ``plan`` of one's own holds until the scene changes; without one, that of ``kernel_plan`` does.
         """
         reading = self._read(scene)
-        facts = reading.facts()
         self._given_plan = self._given_plan if plan is None else plan
-        plan = self._given_plan or self.kernel_plan(facts)
+        plan = self._given_plan or self.kernel_plan(reading.facts)
         data = self._data
         if data is not None and data.reading is reading and replace(data.plan, cut_off=plan.cut_off) == plan:
             data.limit(plan)
             return data
-        self._data = SceneData(reading, facts, plan)
+        self._data = SceneData(reading, plan, data)
         return self._data
 
     def _read(self, scene: mi.Scene) -> SceneReading:
         if self._reading is None or self._reading.is_stale(scene):
-            self._reading, self._given_plan = SceneReading(scene), None
+            self._reading, self._given_plan = SceneReading(scene, self._reading), None
         return self._reading
 
     @property
     def _settings(self) -> Settings:
         own_sky = None if self.sky is None else largest(self.sky)
         return Settings(self.max_depth, self.min_contribution, self.bounce_budget, self.clamp, own_sky)
+
+    def replayed(self, scene: mi.Scene, form: Hashable, inputs: Any, run: Callable[[], Any]) -> Any:
+        """Return what ``run()`` does, launching recorded kernels where all that they read is known."""
+        data = self._data
+        arrays = data.arrays(scene) if data is not None and data.reading.is_of(scene) else None
+        if data is None or arrays is None or dr.grad_enabled(arrays, inputs) or scene.shapes_grad_enabled():
+            return run()
+        return self._replay((form, data.form, self._settings), [arrays, self.sky, inputs], run)
 
     # ------------------------------------------- Tracing -----------------------------------------------
 
@@ -275,8 +286,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         si, radiance = hit.si, mi.UnpolarizedSpectrum(0)
         if data.plan.emission:
             radiance += mi.unpolarized_spectrum(si.emitter(scene, hit.found).eval(si, hit.found))
-        unrolled = data.lights if data.plan.lights == "unrolled" else []
-        samples = [self._light_sample(data, light, sampler, hit) for light in unrolled]
+        samples = [self._light_sample(data, light, sampler, hit) for light in data.lights.each]
         values, reflectance, int_ior = data.eval_bsdf(
             hit, [s.wo for s in samples], [s.facing for s in samples], data.plan.mirrors
         )
@@ -285,7 +295,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             lit, traced = self._visible_part(data, scene, hit, throughput, sample, value)
             radiance += lit
             shadow_rays += traced
-        if data.plan.lights == "loop":
+        if data.plan.lights in ("loop", "table"):
             radiance, shadow_rays = self._loop_over_lights(data, scene, sampler, hit, throughput, radiance)
         return Shading(radiance, shadow_rays, reflectance, self._cost(int_ior))
 
@@ -296,17 +306,14 @@ class MrtWhitted(mi.SamplingIntegrator):
         return mi.UInt32(dr.maximum(10 - mi.Int32(dr.minimum(10 * int_ior, 10)), 1))
 
     def _loop_over_lights(self, data, scene, sampler, hit, throughput, radiance):
-        lights = data.light_pointers
-
         def step(i, radiance, shadow_rays, sampler):
-            light = dr.gather(mi.EmitterPtr, lights, i, hit.found)
-            sample = self._light_sample(data, light, sampler, hit)
+            sample = self._light_sample(data, data.lights.at(i, hit.found), sampler, hit)
             (value,), _, _ = data.eval_bsdf(hit, [sample.wo], [sample.facing], mirror=False)
             lit, traced = self._visible_part(data, scene, hit, throughput, sample, value)
             return i + 1, radiance + lit, shadow_rays + traced, sampler
 
         state = (mi.UInt32(0), radiance, mi.UInt32(0), sampler if data.plan.random else None)
-        state = dr.while_loop(state, lambda i, *_: hit.found & (i < dr.width(lights)), step, label="lights")
+        state = dr.while_loop(state, lambda i, *_: hit.found & (i < data.lights.count), step, label="lights")
         return state[1], state[2]
 
     def _light_sample(self, data, light, sampler, hit) -> LightSample:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -42,6 +46,26 @@ def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]
         )
 
     return run
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Callable[..., contextlib.AbstractContextManager[subprocess.Popen[str]]]:
+    """Start a command in the test's folder: ``with start(*words) as process``; it ends with the block.
+
+    It heeds Ctrl-C, which a shell has ignored in what it runs in the background.
+    """
+
+    @contextlib.contextmanager
+    def started(*words: object, **options: Any) -> Iterator[subprocess.Popen[str]]:
+        pipes = {name: subprocess.PIPE for name in ("stdout", "stderr")}
+        heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+        with subprocess.Popen(words, cwd=tmp_path, text=True, preexec_fn=heed, **pipes | options) as process:
+            try:
+                yield process
+            finally:
+                process.kill()
+
+    return started
 
 
 @pytest.fixture(scope="session")

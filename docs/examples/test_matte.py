@@ -1,4 +1,4 @@
-"""What a BSDF has to prove: values, samples, energy, derivatives, variants and messages."""
+"""Proofs that a BSDF owes: values, samples, energy, derivatives, variants and messages."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_it_obeys_the_laws_of_any_bsdf(sigma):
 
 
 def test_nothing_gives_back_more_than_the_model_admits():
-    """At the horizon the albedo is A + B / 2, which is largest, 1.015, between 0.1 and 0.3."""
+    """The albedo at the horizon is A + B / 2, which is largest, 1.015, between 0.1 and 0.3."""
     sigmas = (0, 0.1, 0.2, 0.5, 2)
     assert max(albedo(bsdf(sigma=sigma), at_angle(89))[0] for sigma in sigmas) < 1.016
 

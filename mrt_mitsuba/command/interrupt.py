@@ -30,7 +30,7 @@ if hasattr(signal, "SIGHUP"):
 
 @contextlib.contextmanager
 def ending_soon(clean_up: Callable[[], object]) -> Iterator[None]:
-    """Within the block, SIGTERM and SIGHUP raise ``Terminated``; the process ends within ``GRACE`` seconds.
+    """Raise ``Terminated`` on SIGTERM and SIGHUP in the block; the process ends within ``GRACE`` seconds.
 
     ``clean_up`` is called before the process is ended by force; its exit code is 128 + the number of the
     signal. Without effect outside the main thread, where Python sets no handlers, and without POSIX signals.

@@ -19,7 +19,7 @@ from mrt_mitsuba.scene.report import NUMBERS
 
 @dataclass(frozen=True, kw_only=True)
 class Options(RenderSettings):
-    """What to render, how, and what to write. None: the scene or the machine decides."""
+    """The arguments of a render and of its output. None: the scene or the machine decides."""
 
     filename: str
     scene_number: int = 0

@@ -1,4 +1,4 @@
-"""What sub-commands read: words and ``name=value``, and files in TOML."""
+"""Reading the arguments of sub-commands: words and ``name=value``, and files in TOML."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ _OFFSETS = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
 
 @dataclass(frozen=True)
 class EdgeMap:
-    """What a detector found.
+    """The findings of a detector.
 
     ``mask``: [H, W] truth values, the pixels to refine. ``value``: [H, W] float32, the detector's own
     measure, in the unit that its function names; infinity next to a pixel that is not finite.

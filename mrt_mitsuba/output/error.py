@@ -1,4 +1,4 @@
-"""What a render knows of its own error."""
+"""Estimates that a render makes of its own error."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ErrorEstimate:
 
 @dataclass(frozen=True)
 class Round:
-    """What was known after a round of a render: a point of its error over its time."""
+    """The state of a render after a round: a point of its error over its time."""
 
     seconds: float  #: since the render began
     spp: float  #: mean rays of a pixel

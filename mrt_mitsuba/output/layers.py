@@ -30,6 +30,7 @@ class Layer:
     free_with: tuple[str, ...] = ()  #: the passes that make it in any case
     counts: str = ""  #: the kind of rays that it counts
     internal: bool = False  #: cannot be asked for
+    calls: bool = False  #: do its values take calls to shapes or materials
 
     @property
     def channels(self) -> int:
@@ -47,11 +48,18 @@ _ROWS = (
         free_with=("depth of field",),
     ),
     Layer("normal", "XYZ", FIRST_HIT, "geometric normal", lambda r: r.normal),
-    Layer("albedo", "RGB", FIRST_HIT, "diffuse reflectance", lambda r: r.albedo),
+    Layer("albedo", "RGB", FIRST_HIT, "diffuse reflectance", lambda r: r.albedo, calls=True),
     Layer("position", "XYZ", FIRST_HIT, "place of the first hit", lambda r: r.position),
     Layer("uv", "UV", FIRST_HIT, "texture coordinates", lambda r: r.uv),
-    Layer("shape", "I", FIRST_HIT, "number of the shape, from 1; 0 for none", lambda r: r.shape),
-    Layer("material", "I", FIRST_HIT, "number of the material, from 1; 0 for none", lambda r: r.material),
+    Layer("shape", "I", FIRST_HIT, "number of the shape, from 1; 0 for none", lambda r: r.shape, calls=True),
+    Layer(
+        "material",
+        "I",
+        FIRST_HIT,
+        "number of the material, from 1; 0 for none",
+        lambda r: r.material,
+        calls=True,
+    ),
     Layer("edges", "Y", DERIVED, "what the edge detector measured", free_with=("edges",)),
     Layer("samples", "Y", DERIVED, "samples of the pixel", free_with=("edges", "rounds")),
     Layer("error", "Y", DERIVED, "standard error of the pixel", free_with=("rounds",)),

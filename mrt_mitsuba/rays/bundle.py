@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 from mrt_mitsuba.rays.divisor import Divisor
@@ -40,44 +41,64 @@ class Bundle:
         """Return the bundle of the pixels ``start`` to ``stop − 1``."""
         return replace(self, pixels=self.pixels[start:stop])
 
+    @property
+    def form(self) -> tuple[Any, ...]:
+        """What shapes the code of ``placed``; all else is data."""
+        phase = None if self.shutter is None else self.shutter.phase is None
+        return self.lattice, self.ray_count, self.rays_per_pixel, isinstance(self.pixels, range), phase
+
+    def numbers(self, width: int, height: int) -> Numbers:
+        """Return the data of ``placed``: another picture size needs no other kernel."""
+        import mitsuba as mi
+
+        first = self.pixels.start if isinstance(self.pixels, range) else 0
+        numbers = _opaque_numbers(replace(self, pixels=first), width, height, mi.variant())
+        return numbers if isinstance(self.pixels, range) else replace(numbers, pixels=mi.UInt32(self.pixels))
+
     def samples(self, width: int, height: int) -> Samples:
         """Return where every ray of the bundle starts. Vectorised variants only."""
+        return self.placed(self.numbers(width, height))
+
+    def placed(self, numbers: Numbers) -> Samples:
+        """Return where every ray of the bundle starts, from the bundle's ``numbers``."""
         import drjit as dr
         import mitsuba as mi
 
         lane = dr.arange(mi.UInt32, self.ray_count)
-        order, rest = Divisor.opaque(self.rays_per_pixel).divide(lane)
+        order, rest = numbers.rays.divide(lane)
         if isinstance(self.pixels, range):
-            pixel = order + dr.opaque(mi.UInt32, self.pixels.start)
+            pixel = order + numbers.pixels
         else:
-            pixel = dr.gather(mi.UInt32, mi.UInt32(self.pixels), order)
-        # Sizes are data, not constants: another picture size needs no other kernel
-        numbers = self._numbers(width, height, dr.opaque, Divisor.opaque)
+            pixel = dr.gather(mi.UInt32, numbers.pixels, order)
         return self._samples(order, pixel, rest, numbers)
 
     def each_sample(self, width: int, height: int) -> Iterator[Samples]:
         """Yield the same, one ray at a time, for scalar variants."""
-        numbers = self._numbers(width, height, lambda kind, value: kind(value), Divisor)
+        numbers = self.numbers_by(width, height, lambda kind, value: kind(value), Divisor)
         for lane in range(self.ray_count):
             order, rest = divmod(lane, self.rays_per_pixel)
             yield self._samples(order, int(self.pixels[order]), rest, numbers)
 
-    def _numbers(
+    def numbers_by(
         self, width: int, height: int, number: Number, divisor: Callable[[int], Divisor]
-    ) -> _Numbers:
+    ) -> Numbers:
+        """Return the data of ``placed``, made by ``number(type, value)`` and ``divisor(value)``."""
         import mitsuba as mi
 
-        return _Numbers(
+        return Numbers(
             width=divisor(width),
             height=number(mi.UInt32, height),
             repeats=divisor(self.repeats),
             first=number(mi.UInt32, self.first),
+            rays=divisor(self.rays_per_pixel),
             rays_per_pixel=number(mi.UInt64, self.rays_per_pixel),
+            share=number(mi.Float, 1 / self.rays_per_pixel),
             aa=divisor(self.lattice.aa),
             shutter=self.shutter.numbers(number) if self.shutter else (),
+            pixels=number(mi.UInt32, self.pixels) if isinstance(self.pixels, int) else None,
         )
 
-    def _samples(self, order: Any, pixel: Any, rest: Any, numbers: _Numbers) -> Samples:
+    def _samples(self, order: Any, pixel: Any, rest: Any, numbers: Numbers) -> Samples:
         import mitsuba as mi
 
         row, column = numbers.width.divide(pixel)
@@ -91,17 +112,27 @@ class Bundle:
         return Samples(number=number, order=order, is_first=rest == 0, place=place, time=time)
 
 
+@lru_cache(maxsize=64)  # of bundles without their pixels, of which a number says where they begin
+def _opaque_numbers(bundle: Bundle, width: int, height: int, variant: str) -> Numbers:
+    import drjit as dr
+
+    return bundle.numbers_by(width, height, dr.opaque, Divisor.opaque)
+
+
 @dataclass(frozen=True)
-class _Numbers:
-    """The sizes of picture and bundle as the kernel has them."""
+class Numbers:
+    """The sizes of picture and bundle, and the pixels, as the kernel has them: a PyTree of its data."""
 
     width: Divisor
     height: Any
     repeats: Divisor
     first: Any
+    rays: Divisor  #: rays_per_pixel to divide by
     rays_per_pixel: Any
+    share: Any  #: of a ray in the mean of its pixel
     aa: Divisor
     shutter: tuple[Any, ...]
+    pixels: Any  #: indices, or the first of a range
 
 
 @dataclass(frozen=True)

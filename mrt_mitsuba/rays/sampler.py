@@ -22,7 +22,7 @@ def _sampler_class(variant: str) -> type:
     import mitsuba as mi
 
     class RaySampler(mi.Sampler):
-        """The same numbers as Mitsuba's ``independent`` for rays that begin with number 0.
+        """Draws the numbers of Mitsuba's ``independent``, with rays that need not begin with number 0.
 
         ``independent`` numbers the rays of every wavefront from 0, so that pictures would depend on how they
         are cut into wavefronts.

@@ -1,4 +1,4 @@
-"""What a scene decides where no option does."""
+"""Choices that a scene makes where no option does."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ class Groups:
 
 @dataclass(frozen=True)
 class Exposed:
-    """What the rays of one exposure add up to."""
+    """The sums over the rays of one exposure."""
 
     sums: np.ndarray  #: [pictures, H, W, channels]: filtered values times their weights
     weights: np.ndarray  #: [pictures, H, W]: filtered weights

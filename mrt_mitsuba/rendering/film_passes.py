@@ -18,7 +18,7 @@ from mrt_mitsuba.rendering.trace import Tracer
 
 
 class FilmPasses(Passes):
-    """As ``Passes``; where those trace a lattice, these expose the film of the view's sensor."""
+    """Passes that expose the film of the view's sensor where others trace a lattice."""
 
     def __init__(self, job: Job, tracer: Tracer, plan: Plan, exposure: Exposure, goal: Goal) -> None:
         super().__init__(job, tracer, plan, exposure, goal)

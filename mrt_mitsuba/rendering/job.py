@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Kernels:
-    """What Dr.Jit did: kernels launched, and seconds that it compiled and ran them."""
+    """The work of Dr.Jit: kernels launched, and seconds that it compiled and ran them."""
 
     progress: Progress
     launches: int = 0

@@ -67,6 +67,7 @@ WHY = {
 def held(kernel: KernelPlan, facts: SceneFacts) -> list[str]:
     """Return a line for each thing that the kernels hold."""
     spheres = {"table": "spheres from a table of centres and radii", "corrected": "hits moved onto spheres"}
+    lights = {"unrolled": "unrolled", "loop": "in a loop of calls", "table": "in a loop over a table"}
     count = sum(count for kind, count in facts.quadrics if kind in kernel.quadrics)
     lines = {
         "bvh": f"{facts.native_shapes} shapes in Mitsuba's BVH",
@@ -74,7 +75,7 @@ def held(kernel: KernelPlan, facts: SceneFacts) -> list[str]:
         "spheres": spheres.get(kernel.spheres, ""),
         "quadrics": f"{count} exact objects in a tree: {', '.join(kernel.quadrics)}",
         "planes": f"{facts.planes} analytic planes",
-        "lights": f"{facts.lights} lights, {'in a loop' if kernel.lights == 'loop' else kernel.lights}",
+        "lights": f"{facts.lights} lights, {lights.get(kernel.lights)}",
         "touching": "shadow rays that end short of lights on surfaces",
         "random": "random numbers",
         "emission": "emission of surfaces",

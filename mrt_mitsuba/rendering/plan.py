@@ -41,7 +41,7 @@ _WHY = {
 
 @dataclass(frozen=True)
 class FilmFacts:
-    """What the film and the sampler of someone's own scene ask for."""
+    """The demands of the film and the sampler of someone's own scene."""
 
     rays: int  #: of each pixel, as the sampler says
     sampler: str  #: its class
@@ -53,7 +53,7 @@ class FilmFacts:
 
 @dataclass(frozen=True)
 class RenderFacts:
-    """What is known of a scene, its integrator and the variant before anything is decided."""
+    """Facts about a scene, its integrator and the variant, known before anything is decided."""
 
     scene: str  #: its number or name
     variant: str  #: of Mitsuba
@@ -77,7 +77,7 @@ class Omission:
 
     @property
     def what(self) -> str:
-        """What is left out, in words."""
+        """Return in words what is left out."""
         return "edge pass" if self.name == EDGES else kernel_text.WHAT.get(self.name, self.name)
 
     @property

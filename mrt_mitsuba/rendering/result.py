@@ -1,4 +1,4 @@
-"""What a render returns."""
+"""The result of a render."""
 
 from __future__ import annotations
 

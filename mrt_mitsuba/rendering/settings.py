@@ -1,4 +1,4 @@
-"""What a render is asked to do: the options of ``mrt.render``, checked; the command adds its own to them."""
+"""The options of ``mrt.render``, checked; the command adds its own to them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than m
 
 @dataclass(frozen=True)
 class Focus:
-    """What is sharp, in scene units."""
+    """The range of sharp distances, in scene units."""
 
     distance: float | None  #: from the camera; None for no depth of field
     range: float  #: half-width of the sharp zone around it

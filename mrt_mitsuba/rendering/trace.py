@@ -71,15 +71,22 @@ class Tracer:
     def _wavefront(self, bundle: Bundle, names: Sequence[str], seed: int) -> Channels:
         import drjit as dr
 
-        samples, sampler = bundle.samples(self.view.width, self.view.height), self._sampler()
-        if sampler is not None:
-            sampler.start_at(seed, samples.number)
-        values = self.shader.trace(names, self.view, samples, sampler)
-        if bundle.rays_per_pixel == 1:
-            dr.eval(values)
-            result = {name: components(value) for name, value in values.items()}
+        numbers, sampler = bundle.numbers(self.view.width, self.view.height), self._sampler()
+
+        def trace() -> dict[str, list[Any]]:
+            samples = bundle.placed(numbers)
+            if sampler is not None:
+                sampler.start_at(seed, samples.number)
+            values = self.shader.trace(names, self.view, samples, sampler)
+            if bundle.rays_per_pixel == 1:
+                return {name: components(value) for name, value in values.items()}
+            return _by_pixel(values, bundle, samples, numbers.share)
+
+        if sampler is None:
+            result = self.shader.replayed(self.view, bundle.form, names, numbers, trace)
         else:
-            result = _by_pixel(values, bundle, samples)
+            result = trace()
+        dr.eval(result)
         # LLVM's arrays are not copied
         return {name: [np.asarray(c, np.float32) for c in channels] for name, channels in result.items()}
 
@@ -104,8 +111,11 @@ class Tracer:
         return ray_sampler() if random else None
 
 
-def _by_pixel(values: dict[str, Any], bundle: Bundle, samples: Samples) -> dict[str, list[Any]]:
-    """Return the first value of each pixel for layers of the first hit, the mean for averaged ones."""
+def _by_pixel(values: dict[str, Any], bundle: Bundle, samples: Samples, share: Any) -> dict[str, list[Any]]:
+    """Return the first value of each pixel for layers of the first hit, the mean for averaged ones.
+
+    ``share``: of a ray in the mean.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -115,7 +125,7 @@ def _by_pixel(values: dict[str, Any], bundle: Bundle, samples: Samples) -> dict[
         return target
 
     def mean(component: Any) -> Any:
-        return dr.block_reduce(dr.ReduceOp.Add, mi.Float(component), bundle.rays_per_pixel) * scale
+        return dr.block_reduce(dr.ReduceOp.Add, mi.Float(component), bundle.rays_per_pixel) * share
 
     averaged = {name: value for name, value in values.items() if TABLE[name].source == AVERAGED}
     pixels = {
@@ -124,8 +134,6 @@ def _by_pixel(values: dict[str, Any], bundle: Bundle, samples: Samples) -> dict[
         if TABLE[name].source == FIRST_HIT
     }
     dr.eval(averaged, pixels)  # block_reduce would evaluate each channel by itself, in a kernel of its own
-    scale = dr.opaque(mi.Float, 1 / bundle.rays_per_pixel)
     for name, value in averaged.items():
         pixels[name] = [mean(component) for component in components(value)]
-    dr.eval(pixels)
     return pixels

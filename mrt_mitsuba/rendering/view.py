@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,17 @@ class View:
     width: int
     height: int
     motion: tuple[float, float, float] | None = None
+
+    @property
+    def form(self) -> Hashable | None:
+        """What shapes the code of its rays, all else being in ``arrays``; None where that is not known."""
+        if self.sensor.class_name() != "PerspectiveCamera" or self.motion is not None:
+            return None
+        return self.sensor.near_clip(), self.sensor.far_clip()
+
+    def arrays(self) -> list[Any]:
+        """Return what its rays are made of, as a PyTree."""
+        return [self.sensor]
 
     def rays(self, samples: Samples, sampler: Any) -> tuple[Any, Any]:
         """Return the rays through some places on the film, and their weights."""
@@ -56,8 +69,9 @@ class View:
         way = mi.Vector3f(self.motion) if scalar else dr.opaque(mi.Vector3f, self.motion)
         return mi.Vector3f(way) * time
 
-    def matrices(self) -> dict[str, np.ndarray]:
-        """Return the camera's matrices, float64 [4, 4] for row vectors on their left, as EXR defines them.
+    def matrices(self) -> Mapping[str, np.ndarray]:
+        """Return the camera's matrices as they are now, float64 [4, 4] for row vectors on their left, as EXR
+        defines them; computed when they are read.
 
         ``worldToCamera``: to a camera at the origin that looks along -z, with x to the right and y up.
         ``worldToNDC``, of pinhole cameras: to the picture, x from 0 to 1 to the right and y downwards.
@@ -65,22 +79,44 @@ class View:
         """
         import mitsuba as mi
 
-        to_world = np.array(self.sensor.world_transform().matrix, np.float64).reshape(4, 4)
+        film, parameters = self.sensor.film(), mi.traverse(self.sensor)
+        # copies share the numbers, and stay as they are when the sensor's change
+        numbers = {name: type(v)(v) for name in _PINHOLE if name in parameters for v in (parameters[name],)}
+        sizes = tuple(np.array(getattr(film, name)(), float) for name in ("size", "crop_size", "crop_offset"))
+        world = self.sensor.world_transform().matrix
+        return Matrices(type(world)(world), numbers, sizes)
+
+
+_PINHOLE = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
+
+
+class Matrices(Mapping[str, np.ndarray]):
+    """The matrices of a camera, computed when the first is read."""
+
+    def __init__(self, world: Any, numbers: Mapping[str, Any], sizes: Sequence[np.ndarray]) -> None:
+        self._given = world, numbers, sizes
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self._found[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._found)
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    @cached_property
+    def _found(self) -> dict[str, np.ndarray]:
+        world, numbers, (size, crop, start) = self._given
+        to_world = np.array(world, np.float64).reshape(4, 4)
         if not np.isfinite(to_world).all() or np.linalg.matrix_rank(to_world) < 4:
             return {}
         # Mitsuba's cameras look along +z, with x to the left
         to_camera = np.diag([-1.0, 1.0, -1.0, 1.0]) @ np.linalg.inv(to_world)
         found = {"worldToCamera": to_camera}
-        parameters = mi.traverse(self.sensor)
-        if "x_fov" in parameters:
-            film = self.sensor.film()
-            size, crop, start = (
-                np.array(getattr(film, name)(), float) for name in ("size", "crop_size", "crop_offset")
-            )
-            names = [f"principal_point_offset_{axis}" for axis in "xy"]  # where the plugin has them
-            shift = [np.array(parameters[name]).item() if name in parameters else 0.0 for name in names]
-            half = np.tan(np.deg2rad(np.array(parameters["x_fov"]).item()) / 2)
-            pixels = size[0] / (2 * half)  # at a distance of one
+        fov, *shift = (np.array(numbers.get(name, 0.0)).item() for name in _PINHOLE)
+        if fov:
+            pixels = size[0] / (2 * np.tan(np.deg2rad(fov) / 2))  # at a distance of one
             centre = (0.5 - np.array(shift)) * size - start
             projection = np.array(
                 [

@@ -94,7 +94,7 @@ def _make(parse: Callable[[Any], Any], name: str, budget: Budget | None) -> Any:
         mi.parser.transform_all(config, state)
         return mi.parser.instantiate(config, state)
     except RuntimeError as error:
-        # Of an error in a plugin written in Python, Mitsuba quotes the way there, too
+        # Mitsuba quotes the traceback, too, where the plugin is written in Python
         text = _CODE_PLACE.sub("", _TRACEBACK.sub("", str(error)))
         raise SceneError(f"cannot load {name}: {text}") from error
 
@@ -104,7 +104,7 @@ def _make(parse: Callable[[Any], Any], name: str, budget: Budget | None) -> Any:
 
 @contextlib.contextmanager
 def _resolving(folder: str | None) -> Iterator[None]:
-    """Within the block, plugins come from Mitsuba's own folder, data from ``folder`` as well."""
+    """Take plugins from Mitsuba's own folder within the block, and data from ``folder`` as well."""
     import mitsuba as mi
 
     before = mi.file_resolver()

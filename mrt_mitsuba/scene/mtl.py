@@ -46,7 +46,7 @@ _MAP_OPTIONS = {
 
 @dataclass
 class _Entry:
-    """What one newmtl block states; None for what it does not."""
+    """The statements of one newmtl block; None for those it does not have."""
 
     line: int
     kd: Color | None = None

@@ -85,8 +85,7 @@ def open_scene(
 
 @contextmanager
 def sized(source: Source) -> Iterator[None]:
-    """Within the block, the film of a source's sensor has the source's size, and no crop window if that is
-    another."""
+    """Give the film of a source's sensor the source's size for the block; another size has no crop window."""
     import mitsuba as mi
 
     size = [source.width, source.height]

@@ -31,7 +31,7 @@ PAUSE = 1.0  # seconds from one writing to the next, so that short jobs do not r
 
 @dataclass(repr=False)
 class Table:
-    """What became of the jobs of a sweep."""
+    """The outcome of each job of a sweep."""
 
     folder: str
     keys: tuple[str, ...]  #: of the grid

@@ -55,7 +55,7 @@ class Mosaic:
 
     @property
     def tiles(self) -> list[Task]:
-        """What to render: each tile into a file in a folder named after the picture."""
+        """Return the tasks: each tile goes into a file in a folder named after the picture."""
         task, tasks = self.picture, []
         for number, region in enumerate(self.regions):
             place = (region.x, region.y, region.width, region.height)

@@ -1,4 +1,4 @@
-"""What runs on a worker: one job at a time; variant, scene, render, file."""
+"""The code that runs on a worker: one job at a time; variant, scene, render, file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ PAUSE = 0.5  # seconds before a worker ends, in which the client fetches the fac
 
 _one_at_a_time = threading.Lock()  # Dr.Jit is not safe with several Python threads
 _open = Opener()
-_versions = functools.cache(versions)  # these take a millisecond
 _cores = functools.cache(usable_cores)
 _done = 0  # jobs since this process began
 _ending = threading.Event()  # it is about to be replaced
@@ -61,7 +60,7 @@ class Task:
 
 @dataclass(frozen=True)
 class House:
-    """What all jobs ask of a worker.
+    """The rules that all jobs of a worker share.
 
     ``sharing``: how many workers share cores, by ``cores_of``; ``renew``: jobs after which a worker gets a
     new process; ``local``: do workers share this machine's home, and so its cache of kernels.
@@ -153,8 +152,8 @@ def _renew(worker: Any) -> None:
 
 def _prepare(worker: Any, house: House) -> None:
     """Choose Dr.Jit's cache, before it is imported, and its share of the cores; check the versions."""
-    if _versions() != house.versions:
-        raise MrtError(f"the worker has {named(_versions())}; the sweep began with {named(house.versions)}")
+    if versions() != house.versions:
+        raise MrtError(f"the worker has {named(versions())}; the sweep began with {named(house.versions)}")
     if not house.local:  # homes of clusters are often far away
         near = os.path.join(os.path.dirname(worker.local_directory), "drjit")
         os.environ.setdefault("DRJIT_CACHE_DIR", near)

@@ -15,8 +15,8 @@ import pytest
 from mrt_mitsuba.filters import luma_edges, sobel_edges
 from mrt_mitsuba.output.files import read_exr
 
-BESIDE = Path(__file__).resolve().parents[3] / "shared" / "reference"
-RENDERS = Path(os.environ.get("MRT_REFERENCE", BESIDE)) / "renders"
+SIBLING = Path(__file__).resolve().parents[3] / "shared" / "reference"
+RENDERS = Path(os.environ.get("MRT_REFERENCE", SIBLING)) / "renders"
 DETECTORS = {"luma": luma_edges, "sobel": sobel_edges}
 
 pytestmark = pytest.mark.skipif(

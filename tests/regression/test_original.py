@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -25,10 +24,7 @@ NAMES = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def llvm():
-    mrt.register()
-    mi.set_variant("llvm_ad_rgb")
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 @pytest.mark.parametrize("name", NAMES)

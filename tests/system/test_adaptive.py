@@ -11,11 +11,7 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba.rendering.progress import Progress
 
-
-@pytest.fixture(autouse=True)
-def llvm():
-    mrt.register()
-    mi.set_variant("llvm_ad_rgb")
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 SIZES = [(1, 1), (2, 2), (1, 7), (7, 1), (3, 3), (5, 2), (37, 23)]

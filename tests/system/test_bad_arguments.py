@@ -36,6 +36,8 @@ NAN, INFINITE = math.nan, math.inf
         ({"motion": (1, 2)}, "motion=(1, 2): must be three finite numbers"),
         ({"memory": "1X"}, "memory='1X': must be bytes"),
         ({"variant": "scalar_rbg"}, "Did you mean scalar_rgb?"),
+        ({"spp": 0}, "spp=0: must be a whole number"),
+        ({"aamode": "none", "layers": ["edges"]}, "edges"),
         ({"integrator": 3}, "the integrator is 3: it must be a sampling integrator"),
         ({"integrator": {"type": "ptracer"}}, "it must be a sampling integrator"),
         ({"integrator": "prb"}, "the integrator PRBIntegrator computes derivatives"),
@@ -59,10 +61,7 @@ def test_render_refuses(arguments: dict[str, Any], text: str) -> None:
         ({"type": "potato"}, 'Plugin "potato" not found'),
         ({"type": "sphere"}, "a dict is a Shape, not a scene: put it into one"),
         ({"type": 3}, "type is 3; give the name of a plugin"),
-        (
-            {"type": "scene", "ball": {"type": "sphere", "center": None}},
-            "ball.center is None; give it a",
-        ),
+        ({"type": "scene", "ball": {"type": "sphere", "center": None}}, "ball.center is None; give it a"),
         ({"type": "mrt_bsdf", "alpha": "big"}, "mrt_bsdf: \"alpha\" is 'big', but must be a number"),
         (dataclasses.replace(EMPTY, sky=(0, NAN, 0)), "sky is (0, nan, 0), but must be three finite"),
         (dataclasses.replace(EMPTY, texturing="nice"), "texturing is 'nice', but must be report or standard"),
@@ -124,14 +123,11 @@ def _mesh(**arrays: np.ndarray) -> dict[str, Any]:
     return {"type": "mrt_mesh", **{name: mi.Bitmap(array) for name, array in arrays.items()}}
 
 
-# Of what the tests of each plugin do not have: parameters that all plugins read by the same functions
+# What the tests of each plugin do not have: parameters that all plugins read by the same functions
 PLUGINS: list[tuple[dict[str, Any], str]] = [
     ({"type": "mrt_bsdf", "alpha": 1e39}, '"alpha" is 1e+39, but must be a finite number'),
     ({"type": "mrt_bsdf", "int_ior": 1e-39}, '"int_ior" is 1e-39, but must be a finite number > 0'),
-    (
-        {"type": "mrt_bsdf", "diffuse_reflectance": NAN},
-        '"diffuse_reflectance" is nan, but must be finite',
-    ),
+    ({"type": "mrt_bsdf", "diffuse_reflectance": NAN}, '"diffuse_reflectance" is nan, but must be finite'),
     ({"type": "mrt_bsdf", "diffuse_reflectance": "red"}, "is 'red', but must be a number, a colour"),
     ({"type": "mrt_bsdf", "specular_reflectance": {"type": "rgb", "value": [1, -1, 1]}}, "not negative"),
     ({"type": "mrt_bsdf", "fresnel": {"type": "rgb", "value": 1}}, "one of schlick, dielectric, unity"),
@@ -139,10 +135,7 @@ PLUGINS: list[tuple[dict[str, Any], str]] = [
     ({"type": "mrt_light", "intensity": INFINITE}, '"intensity" is inf, but must be finite'),
     ({"type": "mrt_light", "position": [0, 1e39, 0]}, "three finite numbers"),
     ({"type": "mrt_whitted", "sky": -1.0}, '"sky" is -1.0, but must be finite and not negative'),
-    (
-        {"type": "mrt_whitted", "max_depth": 1.5},
-        '"max_depth" is 1.5, but must be an integer from 1 to',
-    ),
+    ({"type": "mrt_whitted", "max_depth": 1.5}, '"max_depth" is 1.5, but must be an integer from 1 to'),
     ({"type": "mrt_whitted", "max_depth": 2**32}, "but must be an integer from 1 to 4294967295"),
     ({"type": "mrt_texture", "filename": 3}, '"filename" is 3, but must be a text that is not empty'),
     ({"type": "mrt_texture", "bitmap": 3}, '"bitmap" is 3, but must be a mi.Bitmap'),

@@ -41,6 +41,10 @@ def ball(material: str) -> dict[str, Content]:
     return xml(f"<shape type='sphere'><bsdf type='mrt_bsdf'>{material}</bsdf></shape>")
 
 
+BRIGHT = "<emitter type='mrt_light'><rgb name='intensity' value='inf'/></emitter>"
+DEEP = "<integrator type='mrt_whitted'><integer name='max_depth' value='0'/></integrator>"
+PAPERED = """<texture name='diffuse_reflectance' type='mrt_texture'><string name='filename' value='no.png'/>
+</texture>"""
 ENDS = "<point name='p0' value='1 0 0'/><point name='p1' value='{} 0 0'/><float name='radius' value='{}'/>"
 
 
@@ -102,18 +106,7 @@ SCENES: list[Case] = [
     (xml("<include filename='a.xml'/>"), "out scene=a.xml", 1, "recursion depth"),
     (xml("<shape type='sphere'><ref id='none'/></shape>"), "out scene=a.xml", 1, 'reference to "none"'),
     (xml("<integrator type='ptracer'/>"), "out scene=a.xml", 2, "it must be a sampling integrator"),
-    (
-        xml("<integrator type='mrt_whitted'><integer name='max_depth' value='0'/></integrator>"),
-        "out scene=a.xml",
-        1,
-        'mrt_whitted: "max_depth" is 0, but must be an integer from 1 to 4294967295',
-    ),
-    (
-        xml("", SENSOR.format("<integer name='height' value='0'/>")),
-        "out scene=a.xml",
-        1,
-        "768x0: give it",
-    ),
+    (xml("", SENSOR.format("<integer name='height' value='0'/>")), "out scene=a.xml", 1, "768x0: give it"),
     (xml(""), "out scene=a.xml fresnel=schlick", 2, "it is a parameter of mrt_bsdf"),
 ]
 
@@ -126,27 +119,10 @@ PLUGINS: list[Case] = [
     (shape("cone", ""), "out scene=a.xml", 1, '"mrt_cone": mrt_cone: "apex" is missing; give three numbers'),
     (shape("plane", "<vector name='normal' x='0' y='0' z='0'/>"), "out scene=a.xml", 1, "non-zero length"),
     (shape("cylinder", ENDS.format(1, 1)), "out scene=a.xml", 1, "but must be two points"),
-    (
-        shape("cylinder", ENDS.format(2, -1)),
-        "out scene=a.xml",
-        1,
-        '"radius" is -1.0, but must be a finite number > 0',
-    ),
-    (
-        xml("<emitter type='mrt_light'><rgb name='intensity' value='inf'/></emitter>"),
-        "out scene=a.xml",
-        1,
-        'mrt_light: "intensity" is',
-    ),
-    (
-        ball(
-            "<texture name='diffuse_reflectance' type='mrt_texture'><string name='filename' value='no.png'/>"
-            "</texture>"
-        ),
-        "out scene=a.xml",
-        1,
-        "no.png', which cannot be read",
-    ),
+    (shape("cylinder", ENDS.format(2, -1)), "out scene=a.xml", 1, '"radius" is -1.0, but must be a finite'),
+    (xml(BRIGHT), "out scene=a.xml", 1, 'mrt_light: "intensity" is'),
+    (xml(DEEP), "out scene=a.xml", 1, 'mrt_whitted: "max_depth" is 0, but must be an integer from 1 to'),
+    (ball(PAPERED), "out scene=a.xml", 1, "no.png', which cannot be read"),
 ]
 
 MODELS: list[Case] = [
@@ -205,22 +181,23 @@ def test_refused_in_one_line(
     assert {path.name for path in tmp_path.iterdir()} == files.keys(), "files were left behind"
 
 
-@pytest.mark.parametrize("kind", ["scalar", "cuda", "nonsense"])
-def test_variant_that_cannot_be_had(tmp_path: Path, monkeypatch, capfd, kind: str) -> None:
-    """Of names that this Mitsuba does not have, and of those that this machine cannot run."""
+@pytest.mark.parametrize(
+    ("name", "code", "text"),
+    [
+        ("scalar_rbg", 2, "Did you mean scalar_rgb?"),
+        ("cuda_ad_rgb", 1, "Use llvm_ad_rgb or scalar_rgb"),
+        ("fast", 2, "This Mitsuba has scalar_rgb"),
+    ],
+)
+def test_variant_that_cannot_be_had(tmp_path, monkeypatch, capfd, name: str, code: int, text: str) -> None:
+    """Names that this Mitsuba does not have, and one that this machine cannot run."""
     from mrt_mitsuba import runtime
 
-    name = {"scalar": "scalar_rbg", "cuda": "cuda_ad_rgb", "nonsense": "fast"}[kind]
-    if kind == "cuda" and runtime.obstacle(name) is None:
+    if name == "cuda_ad_rgb" and runtime.obstacle(name) is None:
         pytest.skip("there is a GPU here")
     monkeypatch.chdir(tmp_path)
-    code, message = refusal(capfd, ["out", f"variant={name}"])
-    expected = {
-        "scalar": (2, "Did you mean scalar_rgb?"),
-        "cuda": (1, "Use llvm_ad_rgb or scalar_rgb"),
-        "nonsense": (2, "This Mitsuba has scalar_rgb"),
-    }
-    assert code == expected[kind][0] and expected[kind][1] in message
+    found, message = refusal(capfd, ["out", f"variant={name}"])
+    assert found == code and text in message
     assert list(tmp_path.iterdir()) == []
 
 

@@ -116,7 +116,7 @@ def test_model_is_seen_from_where_the_camera_is_put(mrt: Mrt, tmp_path: Path) ->
     [("out scene=a.obj", 1, "a.obj:2: v has 2 numbers"), ("out scene=a.obj fov=0", 2, "fov must be degrees")],
 )
 def test_bad_input(mrt: Mrt, tmp_path: Path, arguments: str, code: int, text: str) -> None:
-    """As in ``test_bad_input.py``, where the table of cases is."""
+    """The installed command refuses as ``test_bad_input.py`` shows, where the table of cases is."""
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0\n")
     done = mrt(*arguments.split(), "quiet=1")
     assert (done.returncode, done.stdout) == (code, "")

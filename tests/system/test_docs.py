@@ -153,7 +153,7 @@ def rows() -> list[str]:
 
 @pytest.mark.parametrize("what", rows())
 def test_every_deviation_has_a_number(module, monkeypatch, what: str) -> None:
-    """At a size at which it takes no time; the page measures at its own."""
+    """Measured at a size that takes no time; the page measures at its own."""
     ledger = module("ledger")
     small = {"width": 40, "height": 30}
     monkeypatch.setattr(ledger, "PLAIN", {**ledger.PLAIN, **small})

@@ -18,11 +18,7 @@ from mrt_mitsuba.scene.model import OBJECTS
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.scenes_xml import NUMBERS, path
 
-
-@pytest.fixture(autouse=True)
-def llvm():
-    mrt.register()
-    mi.set_variant("llvm_ad_rgb")
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 @pytest.mark.parametrize("flavor", FLAVORS)
@@ -60,7 +56,7 @@ def test_dicts_are_plain_and_share_materials():
 
 @pytest.mark.parametrize("number", NUMBERS)
 def test_stock_flavour_opens_without_our_plugins(number, run_python):
-    """In a process that never imports the package, as the ``mitsuba`` command would read it."""
+    """Read in a process that never imports the package, as the ``mitsuba`` command would do."""
     assert "mrt_" not in path(number, "stock").read_text()
     code = """
 import sys

@@ -46,41 +46,13 @@ WHOLE = """<scene version='3.0.0'>
 <shape type='mrt_plane'><vector name='normal' value='0 1 0'/><float name='distance' value='1'/>
 <ref id='a'/></shape></scene>"""
 # Words that stand where others stood; sizes of what is allocated stay small enough to be tried
-WORDS = [
-    *(
-        "",
-        "0",
-        "-1",
-        "1",
-        "3",
-        "1e39",
-        "-1e-46",
-        "nan",
-        "inf",
-        "1 2",
-        "1,2,3",
-        "0 0 0",
-        "a",
-        "é",
-        "$x",
-        "true",
-    ),
-    *(
-        "schlick",
-        "unity",
-        "none",
-        "mrt_bsdf",
-        "mrt_cone",
-        "mrt_light",
-        "mrt_plane",
-        "mrt_whitted",
-        "mrt_mesh",
-    ),
-    *("sphere", "perspective", "hdrfilm", "path", "diffuse", "scene", "a.xml", "../..", "to_world", "alpha"),
-    *("float", "integer", "rgb", "string", "point", "vector", "bsdf", "shape", "sensor", "ref", "transform"),
-    *("include", "default", "alias", "texture", "spectrum", "boolean", "translate", "scale", "id", "name"),
-    *("<", ">", "&", "&amp;", "&b;", "'", '"', "<!--", "]]>", "<a/>", "<scene version='3.0.0'/>", "\0", "\n"),
-]
+WORDS_OF_XML = """
+    0 -1 1 3 1e39 -1e-46 nan inf 1,2,3 a é $x true schlick unity none mrt_bsdf mrt_cone mrt_light
+    mrt_plane mrt_whitted mrt_mesh sphere perspective hdrfilm path diffuse scene a.xml ../.. to_world
+    alpha float integer rgb string point vector bsdf shape sensor ref transform include default alias
+    texture spectrum boolean translate scale id name < > & &amp; &b; ' " <!-- ]]> <a/>
+"""
+WORDS = [*WORDS_OF_XML.split(), "", "1 2", "0 0 0", "<scene version='3.0.0'/>", "\0", "\n"]
 WORD_ENDS = " <>=/'"
 
 
@@ -162,7 +134,7 @@ PNG = _png()
 
 
 def _mended(data: bytes) -> bytes:
-    """The same chunks with right checksums, so that what is wrong in them is looked at."""
+    """Return the chunks with right checksums, so that faults in their content are reached."""
     result, at = data[:8], 8
     while at + 12 <= len(data):
         (length,) = struct.unpack(">I", data[at : at + 4])
@@ -199,27 +171,15 @@ def test_any_picture_is_read_or_refused(
 # ---------------------------------------------- Parameters ----------------------------------------------
 
 PARAMETERS: dict[str, dict[str, Any]] = {
-    "mrt_bsdf": {
-        "alpha": 0.1,
-        "int_ior": 1.5,
-        "ext_ior": 1.0,
-        "diffuse_reflectance": 0.5,
-        "specular_reflectance": 1.0,
-        "fresnel": "schlick",
-        "f0": 0.04,
-    },
+    "mrt_bsdf": {"alpha": 0.1, "int_ior": 1.5, "ext_ior": 1.0, "fresnel": "schlick", "f0": 0.04}
+    | {"diffuse_reflectance": 0.5, "specular_reflectance": 1.0},
     "mrt_cone": {"apex": [0, 0, 1], "base_center": [0, 0, 0], "radius": 1.0, "capped": True, "segments": 8},
     "mrt_cylinder": {"p0": [0, 0, 1], "p1": [0, 0, 0], "radius": 1.0, "capped": True, "segments": 8},
     "mrt_light": {"position": [0, 0, 1], "intensity": 1.0},
     "mrt_plane": {"normal": [0, 0, 1], "distance": 0.0, "extent": 1.0},
     "mrt_texture": {"filename": "none.png"},
-    "mrt_whitted": {
-        "max_depth": 3,
-        "clamp": True,
-        "min_contribution": 0.0,
-        "bounce_budget": "plain",
-        "sky": 1.0,
-    },
+    "mrt_whitted": {"max_depth": 3, "clamp": True, "min_contribution": 0.0, "sky": 1.0}
+    | {"bounce_budget": "plain"},
 }
 numbers = st.one_of(st.floats(width=32), st.floats(), st.sampled_from([0.0, -1.0, 1e39, math.nan, math.inf]))
 values = st.one_of(

@@ -6,7 +6,6 @@ import itertools
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -151,16 +150,6 @@ def test_peak_memory_stays_within_the_budget(run_python) -> None:
 # ---------------------------------------- Full disks and signals ----------------------------------------
 
 
-def run(folder: Path, code: str, *words: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *words],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
 # Only the picture's file may not grow: Dr.Jit keeps kernels in files, too
 LIMITED = """
 import resource, sys
@@ -175,15 +164,14 @@ COMMAND = "from mrt_mitsuba.command import main as cli\nsys.exit(cli.main())\n"
 
 
 @pytest.mark.parametrize("ending", ["png", "exr"])
-def test_a_file_that_may_not_grow_leaves_the_old_one(tmp_path: Path, ending: str) -> None:
-    """As on a full disk, the system refuses to write on half way."""
+def test_a_file_that_may_not_grow_leaves_the_old_one(run_python, tmp_path: Path, ending: str) -> None:
+    """The system refuses to write on half way, as on a full disk."""
     target = tmp_path / f"out.{ending}"
     target.write_bytes(b"old")
     words = ("out", "3", "width=160", "height=120", "aa=1", f"format={ending}", "quiet=1")
-    with run(tmp_path, LIMITED + COMMAND, *words) as process:
-        assert process.wait(timeout=60) == 1
-        errors = process.stderr.read()
-    assert errors.startswith(f"mrt: cannot write out.{ending}: File too large") and errors.count("\n") == 1
+    done = run_python(LIMITED + COMMAND, *words)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert done.stderr.startswith(f"mrt: cannot write out.{ending}: File too large")
     assert target.read_bytes() == b"old" and list(tmp_path.iterdir()) == [target]
 
 
@@ -223,18 +211,14 @@ TerminalProgress.stage = stage
     ],
     ids=["png", "exr", "blur"],
 )
-def test_a_signal_in_the_middle_ends_it_in_order(tmp_path: Path, code: str, words: tuple[str, ...]) -> None:
-    """In order, and not by force: Python comes to act on the signal while it writes and between bands."""
+def test_a_signal_in_the_middle_ends_it_in_order(start, tmp_path, code: str, words: tuple[str, ...]) -> None:
+    """It ends in order, not by force: Python comes to act on the signal while it writes and between bands."""
     patient = "from mrt_mitsuba.command import interrupt\ninterrupt.GRACE = 20.0\n"  # on a busy machine
-    with run(tmp_path, patient + code + COMMAND, "out", *words) as process:
-        try:
-            while "working" not in (line := process.stdout.readline()):
-                assert line, process.stderr.read()
-            time.sleep(0.3)
-            process.send_signal(signal.SIGTERM)
-            process.wait(timeout=30)
-        finally:
-            process.kill()
-        assert process.returncode == 143, process.stderr.read()
+    with start(sys.executable, "-c", patient + code + COMMAND, "out", *words) as process:
+        while "working" not in (line := process.stdout.readline()):
+            assert line, process.stderr.read()
+        time.sleep(0.3)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=30) == 143, process.stderr.read()
         assert process.stderr.read() == "mrt: terminated\n"  # by force, it would be "interrupted"
     assert list(tmp_path.iterdir()) == []

@@ -20,10 +20,7 @@ SMALL = {"width": 96, "height": 72, "focaldist": 0}
 WAY = (0.3, 0.1, 0.4)
 
 
-@pytest.fixture(autouse=True)
-def llvm():
-    mrt.register()
-    mi.set_variant("llvm_ad_rgb")
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 def _shifted(number: int, way: tuple[float, ...]):

@@ -15,9 +15,7 @@ from mrt_mitsuba.validation.tools.own_scenes import SCENES, SPP, load, sensor
 WIDTH, HEIGHT = 32, 24
 
 
-@pytest.fixture(autouse=True)
-def _fast(variant: str) -> None:
-    """The variant with arrays of rays."""
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 def _load(name: str, **more: Any) -> Any:
@@ -91,7 +89,7 @@ def test_error_falls_with_the_root_of_the_rays():
 
 
 def test_means_agree_by_welchs_test():
-    """Of independent pictures, in blocks of 8 x 8 pixels: the largest |t| of 36, at 1 % by Šidák."""
+    """Independent pictures in blocks of 8 x 8 pixels: the largest |t| of 36, at 1 % by Šidák."""
     from scipy import stats
 
     scene, runs = _load("area_light"), 12
@@ -220,7 +218,7 @@ def test_adaptive_means_are_unbiased():
     truth = np.array(mi.render(scene, spp=2**14, seed=5), np.float64)
     pictures = np.array([mrt.render(scene, aamode="noise", spp=32, seed=k).image for k in range(runs)])
     whole = pictures.mean(axis=(1, 2, 3), dtype=np.float64)
-    # of the mean of a picture: a quarter of its standard error, plus three of what the renders leave
+    # a quarter of the standard error of a picture's mean, plus three of what the renders leave
     assert abs(whole.mean() - truth.mean()) < (0.25 + 3 / math.sqrt(runs)) * whole.std(ddof=1)
     off, spread = pictures.mean(axis=0) - truth, pictures.var(axis=0, ddof=1) / runs
     assert np.mean(off**2) < 1.25 * np.mean(spread)  # 1 without bias; the truth adds some percent

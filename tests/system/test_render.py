@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import gc
+from contextlib import nullcontext
 
 import mitsuba as mi
 import numpy as np
@@ -24,10 +25,7 @@ SMALL = {"width": 160, "height": 120}
 SCENES = (0, 1, 2, 3, 4)
 
 
-@pytest.fixture(autouse=True)
-def llvm():
-    mrt.register()
-    mi.set_variant("llvm_ad_rgb")
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 # --------------------------------------------- What is traced ---------------------------------------------
@@ -133,7 +131,7 @@ def test_scalar_variant_draws_the_same_picture(number):
     whole light."""
     size = {"width": 32, "height": 24, "aa": 1, "aamode": "none", "focaldist": 0}
     fast = mrt.render(number, **size, variant="llvm_ad_rgb")
-    with pytest.warns(mrt.MrtWarning, match="one ray at a time") if number == 0 else _nothing():
+    with pytest.warns(mrt.MrtWarning, match="one ray at a time") if number == 0 else nullcontext():
         slow = mrt.render(number, **size, variant="scalar_rgb")
     assert np.abs(fast.image - slow.image).mean() < 1e-5
 
@@ -142,14 +140,6 @@ def test_a_region_in_a_scalar_variant():
     options = {"width": 20, "height": 15, "aa": 2, "focalrange": 0.5, "variant": "scalar_rgb"}
     whole = mrt.render(3, **options).image
     np.testing.assert_array_equal(mrt.render(3, region=(3, 4, 10, 5), **options).image, whole[4:9, 3:13])
-
-
-class _nothing:
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exception):
-        return False
 
 
 def test_scene_numbers_dicts_and_mitsuba_scenes_agree():
@@ -300,29 +290,3 @@ def test_depth_is_the_distance_from_the_eye():
     descent = 0.7 / np.hypot(3, 0.7)  # for each unit along the ray
     # the eye is one unit up; float32 camera rays are good to a few 1e-7
     assert result.layers["depth.Z"][37, 50] == pytest.approx(1 / descent, rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"aamode": "none", "layers": ["edges"]}, "edges"),
-        ({"aa": 0}, "aa=0"),
-        ({"width": 0}, "width"),
-        ({"aamode": "fxaa"}, "aamode"),
-        ({"focaldist": float("nan")}, "focaldist"),
-        ({"spp": 0}, "spp"),
-        ({"integrator": "ptracer"}, "sampling integrator"),
-    ],
-)
-def test_wrong_arguments_are_named(arguments, message):
-    with pytest.raises(mrt.UsageError, match=message):
-        mrt.render(0, **{**SMALL, **arguments})
-
-
-def test_unknown_scenes_and_files_are_named():
-    with pytest.raises(mrt.UsageError, match="no scene 17"):
-        mrt.render(17)
-    with pytest.raises(mrt.SceneError, match=r"nowhere\.xml"):
-        mrt.render("nowhere.xml")
-    with pytest.raises(mrt.SceneError, match="no_such_plugin"):
-        mrt.render({"type": "scene", "a": {"type": "no_such_plugin"}})

@@ -130,7 +130,7 @@ def written(folder: Path) -> list[dict[str, str]]:
 
 
 def test_pictures_are_those_of_render_alone(address: str, tmp_path: Path) -> None:
-    """Over options, seeds and scenes: a number, a dict with Mitsuba's types, a file."""
+    """All combinations of options, seeds and scenes: a number, a dict with Mitsuba's types, a file."""
     mrt.register()
     scenes = [3, mrt.scene_dict(0, width=64, height=48), str(tmp_path / "mine.xml")]
     assert cli.main(["export", "1", "--xml", scenes[2]]) == 0
@@ -335,25 +335,15 @@ seed = [0, 1, 2, 3, 4, 5]
 """
 
 
-def test_interrupted_from_the_keyboard(tmp_path: Path) -> None:
+def test_interrupted_from_the_keyboard(start, tmp_path: Path) -> None:
     """The whole group of processes gets the signal, as from a terminal."""
     (tmp_path / "sweep.toml").write_text(SWEEP)
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "mrt_mitsuba.command.main", "sweep", "out", "sweep.toml", "workers=2"]
-    with subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    ) as process:
-        try:
-            wait_for(lambda: out.exists() and pictures(out), "a picture")
-            os.killpg(process.pid, signal.SIGINT)
-            process.wait(PATIENCE)
-        finally:
-            process.kill()
+    words = ["-m", "mrt_mitsuba.command.main", "sweep", "out", "sweep.toml", "workers=2"]
+    with start(sys.executable, *words, start_new_session=True) as process:
+        wait_for(lambda: out.exists() and pictures(out), "a picture")
+        os.killpg(process.pid, signal.SIGINT)
+        process.wait(PATIENCE)
         errors = process.stderr.read()
     assert process.returncode == 130 and errors == "mrt: interrupted\n"
     done = pictures(out)

@@ -29,9 +29,7 @@ SIZE = (80, 60)
 PLACES = {"width": 80, "height": 60}
 
 
-@pytest.fixture(autouse=True)
-def fast() -> None:
-    runtime.use(runtime.FAST)
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 def test_the_study_holds_and_tells_all_it_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -126,7 +124,7 @@ def samples(number: int) -> np.ndarray:
 
 
 def assert_equal(image: np.ndarray, truth: np.ndarray, number: int) -> None:
-    """But for dim paths that are cut, and single pixels at edges."""
+    """Compare pictures, but for dim paths that are cut and single pixels at edges."""
     error = np.abs(image - truth).max(axis=-1)
     assert np.quantile(error, 0.99) <= scenes.CASES[str(number)].most + scenes.CUT
     assert np.mean(error > scenes.STEP) <= 4 * scenes.SHARE  # four samples

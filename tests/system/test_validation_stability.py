@@ -100,35 +100,23 @@ DENSITY = lobes.Lobes.density
 @pytest.mark.parametrize(
     ("part", "changes", "expected"),
     [
-        (
-            bsdf,
-            [(microfacet, "tan2_theta", formulas.report_tan2_theta)],
-            {"Reflectance: D, largest"},
-        ),
+        (bsdf, [(microfacet, "tan2_theta", formulas.report_tan2_theta)], {"Reflectance: D, largest"}),
         (
             bsdf,  # with the report's form in the plugin alone, the whole misses its bounds
             [(lobes, "tan2_theta", formulas.report_tan2_theta)],
-            {"Reflectance: BSDF cos, p99.9", "Reflectance: pdf, p99.9", "Reflectance: BSDF cos, largest"},
+            {f"Reflectance: {name}" for name in ("BSDF cos, p99.9", "pdf, p99.9", "BSDF cos, largest")},
         ),
-        (
-            bsdf,
-            [(fresnel, "fresnel_dielectric", formulas.report_fresnel)],
-            {"Reflectance: F, largest"},
-        ),
-        (
-            bsdf,
-            [(microfacet, "beckmann_d", steep_gradient)],
-            {"Reflectance: gradient in alpha, p99.9"},
-        ),
+        (bsdf, [(fresnel, "fresnel_dielectric", formulas.report_fresnel)], {"Reflectance: F, largest"}),
+        (bsdf, [(microfacet, "beckmann_d", steep_gradient)], {"Reflectance: gradient in alpha, p99.9"}),
         (
             geometry,
             [(scene_data, "CURVED", 0.0)],
-            {"Geometry: sphere, shadow rays", "Geometry: cone, shadow rays"},
+            {f"Geometry: {name}, shadow rays" for name in ("sphere", "cone")},
         ),
         (
             filters,
             [(mrt_filters, "gaussian_dof", spreading)],
-            {"Filters: NaN in a picture, blur", "Filters: focal distance 0"},
+            {f"Filters: {name}" for name in ("NaN in a picture, blur", "focal distance 0")},
         ),
         (
             finite,

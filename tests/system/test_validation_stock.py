@@ -22,9 +22,7 @@ pytestmark = pytest.mark.skipif(
 SMALL = {"width": 64, "height": 48}
 
 
-@pytest.fixture(autouse=True)
-def fast() -> None:
-    runtime.use(runtime.FAST)
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 # -------------------------------------------- Direct light --------------------------------------------

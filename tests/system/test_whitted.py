@@ -1,4 +1,4 @@
-"""What ``mrt_whitted`` promises about lights, surfaces and mirrors, seen along single rays."""
+"""Promises of ``mrt_whitted`` about lights, surfaces and mirrors, seen along single rays."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FLOOR = {"type": "mrt_plane", "normal": [0, 0, 1]}
 
 @dataclass(frozen=True)
 class Traced:
-    """What the integrator found along N rays."""
+    """The findings of the integrator along N rays."""
 
     radiance: np.ndarray  # [N, 3]
     found: np.ndarray  # [N]
@@ -71,7 +71,7 @@ def test_every_light_counts(count: int) -> None:
     ],
 )
 def test_hits_lie_on_their_sphere(others: dict[str, Any]) -> None:
-    """From 1e4 radii away, alone and with other shapes: as near as float32 can write the point."""
+    """Hits from 1e4 radii away, alone and with other shapes, are as near as float32 can write them."""
     center, radius = np.array([0.1, 0.2, -3.0]), 0.5
     rng = np.random.default_rng(1)
     d = rng.normal(size=(2000, 3))
@@ -161,7 +161,7 @@ def test_grazing_rays_are_not_lost(kind: str) -> None:
 
 
 def test_the_place_on_a_cone_is_known_to_roundings_of_the_way_to_it() -> None:
-    """From 1e5 radii away, across the surface: seven roundings of the way at worst, of 200,000 rays."""
+    """Hits from 1e5 radii away, across the surface: seven roundings of the way at worst, of 200,000 rays."""
     rng, count, away = np.random.default_rng(4), 200_000, 1e5
     apex, base, radius = (0.3, 0.1, 1.0), (-0.2, 0.2, -1.0), 0.5
     d = rng.normal(size=(count, 3))

@@ -5,13 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.studies import acceleration
 
-
-@pytest.fixture(autouse=True)
-def _vectorised() -> None:
-    runtime.use("llvm_ad_rgb")
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 def test_methods_find_the_same_hits(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -119,7 +119,7 @@ def branches(function: ast.FunctionDef, source: str) -> int:
 
 
 def graph() -> dict[str, set[str]]:
-    """For each module, those of the project that it imports anywhere."""
+    """Return for each module the modules of the project that it imports anywhere."""
     return {name: {source for source, _ in imported(name) if source in MODULES} - {name} for name in MODULES}
 
 
@@ -154,7 +154,7 @@ def test_imports_make_no_cycle() -> None:
     ],
 )
 def test_a_room_knows_only(room: str, others: set[str]) -> None:
-    """What data flows through on its way; see docs/architecture.md."""
+    """A room imports only what its data flows through; see docs/architecture.md."""
     package = f"mrt_mitsuba.{room}"
     known = set().union(
         *(sources for name, sources in graph().items() if f"{name}.".startswith(f"{package}."))

@@ -88,7 +88,7 @@ def test_obeys_the_laws_of_any_bsdf(name: str) -> None:
 
 @in_variants
 def test_equals_roughconductor(variant: str) -> None:
-    """Without Fresnel and diffuse part, to 2e-5: exp of up to 16, of arguments right to a few roundings."""
+    """Values of the bare lobe agree to 2e-5: exp of up to 16, of arguments right to a few roundings."""
     for alpha, visible in product((0.001, 0.01, 0.1, 0.4, 1.0), (True, False)):
         wi, wo = lobe_pairs(count_for(variant, 20_000), alpha)
         ours = bsdf(alpha=alpha, fresnel="unity", diffuse_reflectance=0.0, sample_visible=visible)
@@ -131,7 +131,7 @@ def test_samples_fit_density_and_value(alpha: float, theta: float, visible: bool
     value, density = made.eval_pdf(mi.BSDFContext(), si, mi.Vector3f(wo))
     scale = np.where(cos_d > 0, 4 * cos_d / d_cos, 0)
     albedo, probability = (np.mean(np.array(x, np.float64) * scale) for x in (value[0], density))
-    # Of the grid 1e-4, of Mitsuba's drawing of slopes 1e-4; the fit of G₁ for a normaliser was 3e-3 off
+    # The grid is 1e-4 off, Mitsuba's drawing of slopes 1e-4; the fit of G₁ for a normaliser was 3e-3 off
     assert np.mean(np.array(weight[0], np.float64)) == pytest.approx(albedo, rel=4e-4)
     assert np.mean(np.array(drawn.pdf) > 0) == pytest.approx(probability, rel=4e-4)
 
@@ -489,7 +489,7 @@ def test_zero_and_tiny_roughness_act_as_the_least() -> None:
 
 
 def test_negative_roughness_stays_drawable() -> None:
-    """Of scene 2's −0.0432, D is that of 0.0432; samples follow it, and none carries negative light."""
+    """D of scene 2's −0.0432 is that of 0.0432; samples follow it, and none carries negative light."""
     wi, wo = lobe_pairs(2000, 0.04)
     one, other = (bsdf(alpha=a, fresnel="unity", diffuse_reflectance=0.0) for a in (-0.0432, 0.0432))
     np.testing.assert_array_equal(evaluate(one, wi, wo)[1], evaluate(other, wi, wo)[1])

@@ -133,7 +133,7 @@ MISTAKES: dict[str, tuple[dict[str, Callable[..., Any]], set[str]]] = {
     "a fixed least distance": ({"hit": not_near}, {"surface", "watertight"}),
     "a box that is too small": ({"bbox": half}, {"bbox"}),
     "ray_test unlike ray_intersect": ({"test": lambda found, ray: found & (ray.d.x < 0.7)}, {"hits"}),
-    "no heed of maxt": (
+    "maxt ignored": (
         {"hit": deaf_to_its_limit, "test": lambda found, ray: found | (ray.maxt < 0)},
         {"hits"},
     ),

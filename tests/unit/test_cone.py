@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from itertools import pairwise
 
 import drjit as dr
@@ -28,11 +27,7 @@ AREA = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _vectorised() -> Iterator[None]:
-    runtime.use("llvm_ad_rgb")
-    yield
-    runtime.use("llvm_ad_rgb")
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 def shape(name: str, **more):
@@ -54,7 +49,7 @@ def triangles_of(mesh) -> np.ndarray:
 
 
 def area(mesh) -> float:
-    """In float64: Mitsuba's own sum over the triangles loses 3e-5 of it."""
+    """Return the area in float64: Mitsuba's own sum over the triangles loses 3e-5 of it."""
     a, b, c = triangles_of(mesh).transpose(1, 0, 2)
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
 

@@ -1,4 +1,4 @@
-"""What ``mrt_whitted`` leaves out: too little to be seen, or not there at all."""
+"""Work that ``mrt_whitted`` leaves out: too little to be seen, or not there at all."""
 
 from __future__ import annotations
 
@@ -133,11 +133,7 @@ LIGHT = {"type": "mrt_light", "position": [1, 4, 5]}
             "lights",
         ),
         ({"ball": BALL, "light": LIGHT}, {"light": {**LIGHT, "intensity": 0.0}}, "lights"),
-        (
-            {"ball": BALL, "light": LIGHT, "lamp": LIGHT},
-            {"lamp": {**LIGHT, "intensity": rgb(0, 0, 0)}},
-            "",
-        ),
+        ({"ball": BALL, "light": LIGHT, "lamp": LIGHT}, {"lamp": {**LIGHT, "intensity": rgb(0, 0, 0)}}, ""),
     ],
     ids=["no Ks", "neither", "a black light", "one of two lights black"],
 )

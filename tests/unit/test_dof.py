@@ -162,7 +162,7 @@ def test_report_runs_only_what_is_needed() -> None:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("miss", [None, 0.0, math.inf, math.nan])
 def test_what_is_in_focus_runs_no_kernel_and_stays_bit_for_bit(mode: str, miss: float | None) -> None:
-    """From the first amount that changes a pixel on, the kernels run; a miss is as blurred as can be."""
+    """The kernels run from the first amount that changes a pixel; a miss is as blurred as can be."""
     image, depth = colours((12, 9), 1), np.full((12, 9), 4.0, np.float32)
     if miss is not None:
         depth[0, 0] = miss
@@ -297,7 +297,7 @@ def test_a_blurred_foreground_covers_and_uncovers_like_before_a_lens(amount: flo
 
 @pytest.mark.parametrize("amount", [0.5, 2.0, 8.0])
 def test_a_sharp_foreground_keeps_its_outline(amount: float) -> None:
-    """In focus before a blurred background: neither takes anything from the other."""
+    """Foreground in focus, background blurred: neither takes anything from the other."""
     image = np.zeros((21, 40, 3))
     image[:, 20:] = 1
     depth = np.full((21, 40), far(amount=amount))

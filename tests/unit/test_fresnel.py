@@ -23,7 +23,7 @@ needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, rea
 
 COSINES = st.floats(0, 1)
 INDICES = st.floats(0.2, 8)
-# Of float64: some twenty roundings of 1.1e-16 on numbers of about 1, enlarged tenfold near the critical angle
+# In float64 some twenty roundings of 1.1e-16 on numbers of about 1, enlarged tenfold near the critical angle
 ROUNDING = 2e-14
 
 
@@ -32,7 +32,7 @@ def float32(values) -> drjit.scalar.ArrayXf:
 
 
 def relative_errors(found, truth: list) -> np.ndarray:
-    """Of float32 numbers against 50-digit ones, which are not zero."""
+    """Return the errors of float32 numbers against 50-digit ones, which are not zero."""
     pairs = zip(np.array(found), truth, strict=True)
     return np.array([float(abs(exact.number(a) - b) / b) for a, b in pairs])
 
@@ -45,7 +45,7 @@ TABLE = list(product((0.1, 0.3, 0.5, 0.7, 0.9), (1.1, 1.3, 1.5, 1.7), (1.1, 1.3,
 
 
 def test_course_table_to_six_decimals() -> None:
-    """In float64 at the decimal numbers of the table, in float32 at their float32 values."""
+    """Agree in float64 at the decimal numbers of the table, in float32 at their float32 values."""
     truth = [float(exact.fresnel_dielectric(*(str(x) for x in row))) for row in TABLE]
     assert sum(t == 1 for t in truth) > 10 and sum(t < 1e-40 for t in truth) == 20  # all branches are in it
     double = [fresnel_dielectric(*row) for row in TABLE]
@@ -75,7 +75,7 @@ def test_course_file_where_at_hand(original_data: Path) -> None:
     ],
 )
 def test_float32_is_exact_to_a_few_roundings(etas: np.ndarray, bound: float) -> None:
-    """At the same float32 inputs, cos θ from 1e-7 to 1: a dozen roundings of 6e-8, squared at the end."""
+    """Errors at float32 inputs, cos θ from 1e-7 to 1: a dozen roundings of 6e-8, squared at the end."""
     rng = np.random.default_rng(1)
     etas = etas.astype(np.float32)
     cosines = np.where(rng.random(400) < 0.5, rng.random(400), 10 ** rng.uniform(-7, 0, 400))

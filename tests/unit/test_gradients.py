@@ -156,7 +156,7 @@ def test_sky_of_the_integrator() -> None:
 
 @pytest.mark.parametrize("update", [True, False])
 def test_derivatives_by_enable_grad(update: bool) -> None:
-    """In place, with and without an update of the parameters, after a render without derivatives."""
+    """Enabled in place, with and without an update of the parameters, after a render without derivatives."""
     loaded = scene()
     parameters = mi.traverse(loaded)
     mi.render(loaded, spp=1)
@@ -188,7 +188,7 @@ def test_an_optimiser_finds_roughness_and_light() -> None:
 
 @pytest.mark.parametrize("kind", ["cone", "cylinder", "capsule"])
 def test_places_of_exact_shapes(kind: str) -> None:
-    """Those of the exact surface; those of a cone's mesh, which other integrators see, are a third off."""
+    """They are the exact surface's; those of a cone's mesh, which other integrators see, are a third off."""
     names = ("apex", "base_center") if kind == "cone" else ("p0", "p1")
     points = dict(zip(names, ([0, 4, 0], [0, -4, 0]), strict=True))
 

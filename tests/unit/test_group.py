@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -12,12 +10,7 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.scene import model as scene
 from mrt_mitsuba.scene.model import Camera, Capsule, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 
-
-@pytest.fixture(autouse=True)
-def _vectorised() -> Iterator[None]:
-    runtime.use("llvm_ad_rgb")
-    yield
-    runtime.use("llvm_ad_rgb")
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 def crowd(kind: str, count: int, materials: int) -> Scene:
@@ -59,7 +52,7 @@ def picture(content: Scene, width: int = 120, height: int = 90) -> np.ndarray:
 @pytest.mark.parametrize("materials", [1, 7])
 @pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder", "capsule"])
 def test_a_group_looks_like_its_members(monkeypatch, kind: str, materials: int) -> None:
-    """The same rays: but for roundings that move a silhouette or a shadow's edge, the same picture."""
+    """Equal rays give equal pictures, but for roundings that move a silhouette or a shadow's edge."""
     content = crowd(kind, 40, materials)
     single = picture(content)
     monkeypatch.setattr(scene, "MOST_SINGLE", {Sphere: 0, Cone: 0, Cylinder: 0, Capsule: 0})
@@ -102,7 +95,7 @@ def test_ten_thousand_materials_take_one_bsdf() -> None:
 
 
 def test_reflections_are_not_left_out() -> None:
-    """What a BSDF looks up by object is not known beforehand: the bounce loop stays."""
+    """A BSDF may look up values by object, which are not known beforehand: the bounce loop stays."""
     content = crowd("sphere", 1001, 7)
     loaded = mi.load_dict(
         Scene(

@@ -81,7 +81,7 @@ def test_each_question_sees_what_the_others_do_not(factor, seen: str, unseen: st
 
 
 def test_power_grows_with_the_level() -> None:
-    """At a level of 1e-6, the scale must be larger to be seen."""
+    """A difference must be larger to be seen at a level of 1e-6."""
     seen = [sum(pair(s * truth(), seed, level=1e-6).rejects for seed in range(20)) for s in (1.002, 1.05)]
     assert seen[0] <= 1 and seen[1] == 20
 

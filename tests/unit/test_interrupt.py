@@ -1,4 +1,4 @@
-"""What a signal finds as it was, once the block that guards against it is left."""
+"""Signals meet everything as it was, once the block that guards against them is left."""
 
 from __future__ import annotations
 

@@ -63,6 +63,7 @@ def kernel(loaded: mi.Scene) -> tuple[np.ndarray, list[str]]:
         return image, [k["hash"] for k in dr.kernel_history([dr.KernelType.JIT])]
 
 
+CHECKED = {"type": "diffuse", "reflectance": TEXTURE}
 # For each decision: what a scene holds that has it, another choice, and whether the picture stays the same
 CHOICES = {
     "bvh": ({"a": SPHERE, "light": LIGHT}, None, True),
@@ -80,11 +81,7 @@ CHOICES = {
     "cut_off": ({"a": SPHERE, "b": CONE, "sky": {"type": "constant"}}, CutOff(math.inf, 9.0), True),
     "guarded": ({"a": BRIGHT, "b": CONE, "light": LIGHT}, False, True),
     "lobes": ({"a": SPHERE, "light": LIGHT}, ("diffuse",), False),
-    "textures": (
-        {"a": {**SPHERE, "bsdf": {"type": "diffuse", "reflectance": TEXTURE}}, "light": LIGHT},
-        False,
-        False,
-    ),
+    "textures": ({"a": {**SPHERE, "bsdf": CHECKED}, "light": LIGHT}, False, False),
     "shading_frames": ({"b": SPHERE, "light": LIGHT}, False, False),
     "tangents": ({"a": {**SPHERE, "bsdf": BRUSHED}, "light": LIGHT}, False, False),
     "merged": ({"a": SPHERE, "b": {**CONE, "bsdf": {"type": "mrt_bsdf"}}, "light": LIGHT}, False, True),

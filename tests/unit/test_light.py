@@ -42,7 +42,7 @@ def spectrum(value: Any) -> np.ndarray:
 
 
 def stock_spectrum(intensity: Any) -> np.ndarray:
-    """What a stock point light of that intensity sends over unit distance, in the current colour mode."""
+    """Return what a stock point light of that intensity sends over unit distance, in the current mode."""
     stock = mi.load_dict({"type": "point", "position": [0, 0, 1], "intensity": intensity})
     return spectrum(stock.sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))[1])
 
@@ -171,7 +171,7 @@ def test_parameters_can_be_updated(variant: str) -> None:
 
 
 def test_gradients() -> None:
-    """Of the cosine at a floor by the light's height, and of its light by the intensity."""
+    """Derivatives of a floor's cosine by the light's height, and of its light by the intensity."""
     it = light(position=[3, 0, 4], intensity=2.0)
     parameters = mi.traverse(it)
     position = mi.Point3f(3, 0, 4)
@@ -271,7 +271,7 @@ def lit_from_a_surface(name: str, s: float, lift: float = 0.0, size: tuple = (96
 
 @pytest.mark.parametrize("name", SURFACES)
 def test_a_light_on_a_surface_shines_at_every_scale(name: str) -> None:
-    """To both sides, as one a thousandth above it and one below, without speckles, whatever the unit."""
+    """Both sides are lit, as by one a thousandth above and one below, without speckles, in any unit."""
 
     def picture(s: float, lift: float = 0.0) -> np.ndarray:
         return np.array(mi.render(mi.load_dict(lit_from_a_surface(name, s, lift)), spp=1)) > 1e-3

@@ -118,7 +118,7 @@ def test_broken_metadata_and_folders_are_passed_over(tmp_path: Path) -> None:
 
 @linux
 def test_unfinished_installation_is_not_used(tmp_path: Path) -> None:
-    """As after an installation by the superuser, until Python first starts with the right to write there."""
+    """So it is after the superuser installed, until Python first starts with the right to write there."""
     site, path = wheel(tmp_path / "venv")
     info = next(Path(site).iterdir())
     (info / "symlinks.txt").touch()

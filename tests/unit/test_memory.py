@@ -86,7 +86,7 @@ V1, V2 = ("memory.limit_in_bytes", "memory.usage_in_bytes"), ("memory.max", "mem
     ],
 )
 def test_limits_of_control_groups_count(tmp_path, group, base, names, place):
-    """As the system shows them, in the group itself, in one above, or in a container's only one."""
+    """Limits as the system shows them: in the group itself, in one above, or in a container's only one."""
     (tmp_path / "proc/self").mkdir(parents=True)
     (tmp_path / "proc/self/cgroup").write_text(f"9:pids:/x\n{group}\n")
     for folder, size in (("", "max"), ("a", "max"), ("a/b", "max"), (place, str(GIB))):

@@ -57,7 +57,7 @@ def picture(scene: mi.Scene) -> np.ndarray:
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono"], indirect=True)
 def test_picture_is_that_of_separate_calls(variant: str) -> None:
-    """The same code on the same numbers, from a table or from each BSDF."""
+    """Code and numbers are the same, from a table or from each BSDF."""
     scene = mi.load_dict(spheres(7))
     assert merged(scene) is not None
     together = picture(scene)

@@ -64,7 +64,7 @@ TABLE = [(0.1, 0.1), *product((0.1, 0.3, 0.5, 0.7, 0.9), (0.01, 0.21, 0.41, 0.61
 
 
 def test_course_table_to_six_decimals() -> None:
-    """In float64 and float32, at the decimal numbers of the table."""
+    """Agree in float64 and float32 at the decimal numbers of the table."""
     truth = [float(exact.beckmann_d(str(c), str(alpha))) for c, alpha in TABLE]
     assert sum(t > 1e-3 for t in truth) == 9
     double = [beckmann_d(1 / c**2 - 1, alpha) for c, alpha in TABLE]
@@ -104,7 +104,7 @@ def half_tan2(wi: np.ndarray, wo: np.ndarray) -> mpf:
 
 
 def test_float32_is_exact_to_a_few_roundings() -> None:
-    """At the same float32 directions and roughness, wherever D is above 1e-7 of its peak."""
+    """Errors at the same float32 directions and roughness, wherever D is above 1e-7 of its peak."""
     wi, wo, alpha = random_lobes(800)
     half = vectors32(wi) + vectors32(wo)
     tan2 = [half_tan2(i, o) for i, o in zip(wi, wo, strict=True)]
@@ -208,7 +208,7 @@ def test_g1_is_a_fraction(cos_theta: float, alpha: float) -> None:
 
 @given(alpha=ALPHAS)
 def test_g1_hands_over_to_one_without_a_visible_step(alpha: float) -> None:
-    """At b = 1 / (alpha tan θ) = 1.6, but for the 5.7e-5 that the formula itself has there."""
+    """The step is at b = 1 / (alpha tan θ) = 1.6, none but the 5.7e-5 that the formula itself has there."""
     r = np.array([1 - 1e-12, 1 + 1e-12]) / (1.6 * alpha)
     fitted, one = (smith_g1(Vector(x, 0, 1), alpha) for x in r[::-1])
     assert one == 1

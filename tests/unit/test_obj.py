@@ -265,23 +265,15 @@ BROKEN_MTL = {
 }
 
 
-@pytest.mark.parametrize("name", BROKEN_OBJ)
-def test_broken_obj_files(model, name: str) -> None:
-    text, line, words = BROKEN_OBJ[name]
+@pytest.mark.parametrize("name", [*BROKEN_OBJ, *(f"mtl: {name}" for name in BROKEN_MTL)])
+def test_broken_files(model, name: str) -> None:
+    library = name.startswith("mtl: ")
+    text, line, words = BROKEN_MTL[name[5:]] if library else BROKEN_OBJ[name]
     with pytest.raises(SceneError) as error:
-        model(text)
+        model(*(["mtllib model.mtl\n" + SQUARE + "f 1 2 3\n", text] if library else [text]))
     message = str(error.value)
     assert words in message and "\n" not in message
-    assert "model.obj" + (f":{line}: " if line else ": ") in message
-
-
-@pytest.mark.parametrize("name", BROKEN_MTL)
-def test_broken_mtl_files(model, name: str) -> None:
-    text, line, words = BROKEN_MTL[name]
-    with pytest.raises(SceneError) as error:
-        model("mtllib model.mtl\n" + SQUARE + "f 1 2 3\n", text)
-    assert words in str(error.value)
-    assert "model.mtl" + (f":{line}: " if line else ": ") in str(error.value)
+    assert ("model.mtl" if library else "model.obj") + (f":{line}: " if line else ": ") in message
 
 
 def test_missing_files(tmp_path: Path) -> None:
@@ -294,64 +286,10 @@ def test_missing_files(tmp_path: Path) -> None:
 
 
 # What files are made of, whole and in pieces
-PIECES = [
-    *(
-        "v",
-        "vt",
-        "vn",
-        "f",
-        "usemtl",
-        "mtllib",
-        "model.mtl",
-        "o",
-        "#",
-        "\\",
-        "/",
-        "//",
-        "1/2/3",
-        "1//2",
-        "-1",
-        "0",
-    ),
-    *(
-        "1",
-        "2",
-        "3",
-        "4",
-        "1e39",
-        "nan",
-        ".5",
-        "-",
-        "\n",
-        "\n",
-        "\n",
-        "\r",
-        " ",
-        " ",
-        "\t",
-        "é",
-        "\0",
-        "9" * 30,
-    ),
-]
-MTL_PIECES = [
-    "newmtl",
-    "Kd",
-    "Ks",
-    "Ka",
-    "Ni",
-    "Ns",
-    "map_Kd",
-    "a",
-    "-s",
-    "1",
-    "0.5",
-    "nan",
-    "-1",
-    "\n",
-    "\n",
-    "#",
-]
+WORDS = "v vt vn f usemtl mtllib model.mtl o # \\ / // 1/2/3 1//2 -1 0 1 2 3 4 1e39 nan .5 - é"
+PIECES = [*WORDS.split(), *"\n\n\n\r  \t\0", "9" * 30]
+MTL_WORDS = "newmtl Kd Ks Ka Ni Ns map_Kd a -s 1 0.5 nan -1 #"
+MTL_PIECES = [*MTL_WORDS.split(), "\n", "\n"]
 
 
 @pytest.mark.fuzz

@@ -15,6 +15,8 @@ from mrt_mitsuba.command.options import Options, parse
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.output import LAYERS
 
+WITHOUT_NOISE = tuple(name for name in LAYERS if name not in ("error", "variance"))
+
 
 def test_defaults_of_the_report() -> None:
     parsed = parse(["out"])
@@ -27,54 +29,39 @@ def test_defaults_of_the_report() -> None:
 @pytest.mark.parametrize(
     ("arguments", "values"),
     [
-        (["o", "3"], {"scene_number": 3}),
-        (["o", "9", "width=1", "height=65536"], {"scene_number": 9, "width": 1, "height": 65536}),
-        (["o", "aa=2", "aamode=luma"], {"aa": 2, "aamode": "luma", "scene_number": 0}),
-        (["o", "1", "focaldist=2", "focalrange=.5"], {"focaldist": 2.0, "focalrange": 0.5}),
-        (["o", "focaldist=0"], {"focaldist": 0.0}),
+        ("o 3", {"scene_number": 3}),
+        ("o 9 width=1 height=65536", {"scene_number": 9, "width": 1, "height": 65536}),
+        ("o aa=2 aamode=luma", {"aa": 2, "aamode": "luma", "scene_number": 0}),
+        ("o 1 focaldist=2 focalrange=.5", {"focaldist": 2.0, "focalrange": 0.5}),
+        ("o focaldist=0", {"focaldist": 0.0}),
+        ("o fresnel=dielectric variant=scalar_rgb", {"fresnel": "dielectric", "variant": "scalar_rgb"}),
+        ("o layers=depth,normal", {"layers": ("depth", "normal")}),
+        ("o layers=all", {"layers": WITHOUT_NOISE}),
         (
-            ["o", "fresnel=dielectric", "variant=scalar_rgb"],
-            {"fresnel": "dielectric", "variant": "scalar_rgb"},
+            "o layers=all aamode=none",
+            {"layers": tuple(name for name in WITHOUT_NOISE if name != "edges"), "aamode": "none"},
         ),
-        (["o", "layers=depth,normal"], {"layers": ("depth", "normal")}),
-        (["o", "layers=all"], {"layers": tuple(n for n in LAYERS if n not in ("error", "variance"))}),
+        ("o motion=0.1,-2,3e-1 motionsamples=4", {"motion": (0.1, -2.0, 0.3), "motionsamples": 4}),
+        ("o memory=4G", {"memory": 4 * 2**30}),
+        ("o memory=1.5gib", {"memory": 3 * 2**29}),
+        ("o memory=512MB", {"memory": 2**29}),
+        ("o memory=100000000", {"memory": 10**8}),
+        ("o scene=a=b.xml", {"scene": "a=b.xml"}),
+        ("o scene=a.xml width=3", {"scene": "a.xml", "width": 3}),
         (
-            ["o", "layers=all", "aamode=none"],
-            {
-                "layers": tuple(n for n in LAYERS if n not in ("edges", "error", "variance")),
-                "aamode": "none",
-            },
+            "o scene=a.OBJ camera=1,2,3 target=0,0,.5 up=0,0,1 fov=45 light=0,9,0",
+            {"scene": "a.OBJ", "camera": (1, 2, 3), "target": (0, 0, 0.5), "up": (0, 0, 1)}
+            | {"fov": 45.0, "light": (0, 9, 0)},
         ),
-        (["o", "motion=0.1,-2,3e-1", "motionsamples=4"], {"motion": (0.1, -2.0, 0.3), "motionsamples": 4}),
-        (["o", "memory=4G"], {"memory": 4 * 2**30}),
-        (["o", "memory=1.5gib"], {"memory": 3 * 2**29}),
-        (["o", "memory=512MB"], {"memory": 2**29}),
-        (["o", "memory=100000000"], {"memory": 10**8}),
-        (["o", "scene=a=b.xml"], {"scene": "a=b.xml"}),
-        (["o", "scene=a.xml", "width=3"], {"scene": "a.xml", "width": 3}),
-        (
-            ["o", "scene=a.OBJ", "camera=1,2,3", "target=0,0,.5", "up=0,0,1", "fov=45", "light=0,9,0"],
-            {
-                "scene": "a.OBJ",
-                "camera": (1, 2, 3),
-                "target": (0, 0, 0.5),
-                "up": (0, 0, 1),
-                "fov": 45.0,
-                "light": (0, 9, 0),
-            },
-        ),
-        (
-            ["o", "scene=a.obj", "texturing=standard"],
-            {"scene": "a.obj", "texturing": "standard"},
-        ),
-        (["o", "quiet=1", "plan=show"], {"quiet": True, "plan": "show"}),
-        (["o", "quiet=no"], {"quiet": False}),
-        (["dir.v1/o.v2"], {"filename": "dir.v1/o.v2"}),
-        (["a=b"], {"filename": "a=b"}),
+        ("o scene=a.obj texturing=standard", {"scene": "a.obj", "texturing": "standard"}),
+        ("o quiet=1 plan=show", {"quiet": True, "plan": "show"}),
+        ("o quiet=no", {"quiet": False}),
+        ("dir.v1/o.v2", {"filename": "dir.v1/o.v2"}),
+        ("a=b", {"filename": "a=b"}),
     ],
 )
-def test_accepted(arguments: list[str], values: dict[str, object]) -> None:
-    parsed = parse(arguments)
+def test_accepted(arguments: str, values: dict[str, object]) -> None:
+    parsed = parse(arguments.split())
     assert {name: getattr(parsed, name) for name in values} == values
     others = {"filename", "scene_number", *values}
     for field in dataclasses.fields(Options):
@@ -238,27 +225,23 @@ def test_values_from_python(name: str, value: object, taken: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("name", "values"),
     [
-        ("width", 640.0),
-        ("width", True),
-        ("width", "640"),
-        ("aa", 0),
-        ("aamode", 3),
-        ("focaldist", math.nan),
-        ("focaldist", "2"),
-        ("layers", [1]),
-        ("layers", None),
-        ("motion", 3),
-        ("motion", (1, 2)),
-        ("seed", -1),
-        ("nothing", 1),
+        ("width", [640.0, True, "640"]),
+        ("aa", [0]),
+        ("aamode", [3]),
+        ("focaldist", [math.nan, "2"]),
+        ("layers", [[1], None]),
+        ("motion", [3, (1, 2)]),
+        ("seed", [-1]),
+        ("nothing", [1]),
     ],
 )
-def test_values_from_python_refused(name: str, value: object) -> None:
-    with pytest.raises(UsageError, match=name) as caught:
-        options.check(name, value)
-    assert isinstance(caught.value, ValueError)
+def test_values_from_python_refused(name: str, values: list[object]) -> None:
+    for value in values:
+        with pytest.raises(UsageError, match=name) as caught:
+            options.check(name, value)
+        assert isinstance(caught.value, ValueError)
 
 
 def test_usage_names_every_option_with_its_default() -> None:

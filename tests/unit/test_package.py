@@ -44,7 +44,7 @@ def test_submodule_imports_from_any_folder(run_python, name: str) -> None:
 
 
 def test_checkout_works_without_installation(run_python) -> None:
-    """As where the installed package is a copy, and Python is started in the checkout."""
+    """The installed package is a copy elsewhere, and Python is started in the checkout."""
     code = """
 import sys
 sys.meta_path = [finder for finder in sys.meta_path if "editable" not in getattr(finder, "__module__", "")]

@@ -168,11 +168,7 @@ TURNS: list[tuple[dict[str, Any], dict[str, Any], set[str]]] = [
     ({}, {"integrator": "direct"}, {"integrator", "traceable", "random", "kernel"}),
     ({}, {"variant": "llvm_ad_mono"}, {"variant"}),
     ({"sensor": {"type": "perspective", "film": BOX}}, {}, {"film"}),
-    (
-        {},
-        {"width": 20, "height": 14},
-        {"width", "height"},
-    ),  # Mitsuba's ``ImageBlock`` takes them as constants
+    ({}, {"width": 20, "height": 14}, {"width", "height"}),  # constants to Mitsuba's ``ImageBlock``
 ]
 # Numbers that kernels take as data, and what follows from other fields
 DATA = {"scene", "region", "repeats", "motion_samples", "parts", "left_out"}
@@ -276,6 +272,6 @@ assert "tangent" in usage()
 
 
 def test_a_new_layer_takes_one_row(run_python) -> None:
-    """From there, plan, tracer, files and help have it."""
+    """Plan, tracer, files and help read it from there."""
     done = run_python(NEW_LAYER)
     assert done.returncode == 0, done.stderr

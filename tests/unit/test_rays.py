@@ -13,7 +13,7 @@ LARGEST = 2**32 - 1
 
 @pytest.mark.parametrize("number", [1, 2, 3, 7, 16, 641, 800, 16384, 65537, 2**31 - 1, 2**31, LARGEST])
 def test_division_is_exact(number: int) -> None:
-    """Beside multiples of the divisor, where a product with the rounded inverse could fall to the wrong
+    """Next to multiples of the divisor, where a product with the rounded inverse could fall to the wrong
     side, and everywhere else."""
     mrt.register()
     import mitsuba as mi

@@ -116,30 +116,14 @@ def test_only_what_is_between_hides_a_light() -> None:
 
 CONE, TUBE = Cone((0, 1, 0), (0, 0, 0), 0.5, WOOD), Cylinder((0, -1, 0), (0, 2, 0), 0.5, WOOD)
 TRIANGLE = Mesh(np.array([(0, -1, -1), (0, -1, 3), (0, 3, -1)], float), np.array([[0, 2, 1]]), WOOD)
-
-
 NEAR, FAR = Sphere((0.5, 0, 0), 0.5, WOOD), Sphere((-2, 0, 0), 0.5, WOOD)
 
 
 @pytest.mark.parametrize(
     ("things", "position", "target", "depth", "normal", "index"),
     [
-        (
-            (Sphere((0.5, 0, 0), 0.5, WOOD), Sphere((-2, 0, 0), 0.5, WOOD)),
-            (3, 0, 0),
-            (0, 0, 0),
-            2,
-            (1, 0, 0),
-            0,
-        ),
-        (
-            (Sphere((-2, 0, 0), 0.5, WOOD), Sphere((0.5, 0, 0), 0.5, WOOD)),
-            (3, 0, 0),
-            (0, 0, 0),
-            2,
-            (1, 0, 0),
-            1,
-        ),
+        ((NEAR, FAR), (3, 0, 0), (0, 0, 0), 2, (1, 0, 0), 0),
+        ((FAR, NEAR), (3, 0, 0), (0, 0, 0), 2, (1, 0, 0), 1),
         ((Sphere((0, 0, 0), 9, WOOD),), (3, 0, 0), (0, 0, 0), 12, (-1, 0, 0), 0),
         ((Plane((2, 0, 0), 5, WOOD), TUBE), (3, 4, 0), (0, 4, 0), 8, (1, 0, 0), 0),
         ((CONE,), (0.1, -3, 0), (0.1, 0, 0), 3, (0, -1, 0), 0),

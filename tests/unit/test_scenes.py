@@ -61,7 +61,7 @@ def numbers_of(scene: Scene) -> list[float]:
     ],
 )
 def test_no_number_has_changed(number: int, checksum: str, focus: tuple, counts: tuple) -> None:
-    """To nine digits; the checksums were taken when the numbers had been compared with the original's."""
+    """Nine digits count; the checksums were taken once the numbers had been compared with the original's."""
     scene = report_scene(number)
     assert tuple(map(len, (scene.lights, scene.spheres, scene.planes, scene.cones))) == counts
     assert (scene.focal_distance, scene.focal_range) == focus
@@ -108,7 +108,7 @@ def test_there_are_ten_scenes_each_read_once_and_no_others() -> None:
 
 
 def volume(mesh: Mesh) -> float:
-    """By the divergence theorem: negative inside out, wrong where there is a hole."""
+    """Return the volume by the divergence theorem: negative inside out, wrong where there is a hole."""
     corners = mesh.vertices[mesh.faces].astype(float) - mesh.vertices.mean(axis=0)
     return float(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
 

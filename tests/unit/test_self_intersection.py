@@ -42,7 +42,7 @@ def test_a_lit_sphere_has_no_dark_spots(variant: str, distance: float) -> None:
 
 
 def test_moving_a_sphere_has_the_right_derivative(variant: str) -> None:
-    """Of the light that comes back along fixed rays, against central differences."""
+    """The derivative of the light along fixed rays is that of central differences."""
     integrator = mi.load_dict(
         {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
     )
@@ -116,8 +116,7 @@ def test_a_grain_on_a_wide_floor_has_its_shadow(variant: str, kind: str, place: 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_rays_leave_triangles_of_every_form(variant: str, scale: float) -> None:
-    """From hits on single triangles, up to slivers of 1 : 1000, at and away from the origin, rays upwards
-    meet nothing."""
+    """Rays upwards from hits on single triangles, slivers of 1 : 1000 included, meet nothing."""
     rng = np.random.default_rng(4)
     for k in range(30):
         corners = rng.normal(size=(3, 3)) * scale
@@ -153,7 +152,7 @@ def test_meshes_that_rays_cannot_meet_are_refused(variant: str, size: float) -> 
 
 @pytest.mark.parametrize("size", [1e-7, 1e9])
 def test_meshes_are_drawn_at_every_size_that_is_taken(variant: str, size: float) -> None:
-    """As at size 1, triangles in all directions."""
+    """The picture is that at size 1, with triangles in all directions."""
     rng = np.random.default_rng(1)
     corners = rng.normal(size=(1, 60, 3))
     faces = rng.permuted(np.tile(np.arange(60, dtype=np.uint32), (40, 1)), axis=1)[np.newaxis, :, :3]

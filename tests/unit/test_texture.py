@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import drjit as dr
@@ -14,12 +13,7 @@ from PIL import Image
 from mrt_mitsuba import runtime
 from mrt_mitsuba.scene.model import Camera, Light, Material, Mesh, Scene
 
-
-@pytest.fixture(autouse=True)
-def _vectorised() -> Iterator[None]:
-    runtime.use("llvm_ad_rgb")
-    yield
-    runtime.use("llvm_ad_rgb")
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 @pytest.fixture

@@ -71,7 +71,7 @@ def test_a_later_scene_is_not_taken_for_an_earlier_one() -> None:
         scene = mirror(specular_reflectance=0.0, diffuse_reflectance=reflectance)
         ids.add(id(scene))
         light = integrator.trace(scene, None, ray).radiance[0]
-        # Of a light of 1 at (0, 3, 4), over a white-grey plane: ρ/π cos θ
+        # A light of 1 at (0, 3, 4) over a white-grey plane: ρ/π cos θ
         assert float(light[0]) == pytest.approx(reflectance / np.pi * 0.8, rel=1e-4)
         del scene
     assert len(ids) < 40

@@ -103,16 +103,22 @@ def _derivatives(case: Case, key: str) -> tuple[Array, bool, Array]:
         return np.nan_to_num(found, posinf=0, neginf=0), True, ~np.isfinite(found)
 
 
+WIDTHS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  # of differences, over the parameter
+
+
 def _differences(case: Case, key: str) -> tuple[Array, Array]:
-    """Return central differences, and their errors by others of twice the width."""
+    """Return central differences of the width that agrees best with the next larger one, and their errors."""
     import mitsuba as mi
 
     value = abs(float(np.mean(np.array(mi.traverse(case.bsdf)[key]))))
+    steps = np.array(WIDTHS) * (value or 0.05)
 
     def at(shift: float) -> Array:
         with changed(case, key, lambda old: type(old)(old + shift)):
             return np.array(_values(case), np.float64)
 
-    step = 0.01 * max(value, 0.05)
-    wide, narrow = ((at(h) - at(-h)) / (2 * h) for h in (2 * step, step))
-    return narrow, 2 * np.abs(wide - narrow) + 1e-6 * np.abs(at(0.0)) / step
+    slopes = np.array([(at(step) - at(-step)) / (2 * step) for step in steps.tolist()])
+    apart = np.abs(np.diff(slopes, axis=0))
+    best = apart.argmin(axis=0)
+    slope, error = (np.take_along_axis(x, best[None], axis=0)[0] for x in (slopes[1:], apart))
+    return slope, 2 * error + 2.0**-23 * np.abs(at(0.0)) / steps[1:][best]

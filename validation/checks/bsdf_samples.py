@@ -10,7 +10,7 @@ from scipy import stats
 from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, View, excess, live
 from mrt_mitsuba.validation.checks.law import LEVEL, SIGMAS, Law, Skip
-from mrt_mitsuba.validation.checks.probe import Array, context, direction, unit
+from mrt_mitsuba.validation.checks.probe import Array, context, direction, is_scalar, unit
 from mrt_mitsuba.validation.checks.sphere import DEPTH, Cells, Integrals, encode, integrate
 from mrt_mitsuba.validation.tools.image_tests import sidak
 
@@ -71,7 +71,7 @@ def _cells(case: Case) -> Iterator[tuple[View, Cells | None]]:
         pilot = view.samples.wo[: len(view.density) // 4][view.density[: len(view.density) // 4] > 0]
         seeds = encode(np.concatenate([pilot, _mirrored(view.wi, case.rng)]))
         most = max(len(view.density) // 4 // 1000, 8)
-        cells = Cells.around(seeds, most)
+        cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
         held = (
             np.bincount(cells.find(encode(pilot)), minlength=len(cells.start)) if len(pilot) else np.zeros(1)
         )

@@ -116,7 +116,7 @@ class Law:
 
 @dataclass(frozen=True)
 class Check:
-    """What a check of one plugin found: its laws by name."""
+    """The findings of a check of one plugin: its laws by name."""
 
     subject: str
     variant: str

@@ -17,6 +17,7 @@ Array = np.ndarray
 ROUNDING = 2.0**-24
 ALLOWANCE = 8.0  # roundings that a formula of some dozen operations may make of its own
 LOST = 2.5  # sound formulas stay below 1.3, in a hundred runs each
+STEEP = 0.05
 POINTS = 9  # of each line; Moré and Wild find seven to nine enough
 STRIDES = (2, 64, 2**11, 2**15)  # the most float32 steps from one to the next
 REACHES = tuple(2**k for k in (2, 5, 8, 11, 13))  # float32 steps to either side, for the slope
@@ -24,7 +25,7 @@ REACHES = tuple(2**k for k in (2, 5, 8, 11, 13))  # float32 steps to either side
 
 @dataclass(frozen=True)
 class Noise:
-    """What rounding does to a function at N points; all [N], and in roundings (2⁻²⁴) of its value."""
+    """The effect of rounding on a function at N points; all [N], and in roundings (2⁻²⁴) of its value."""
 
     value: Array
     noise: Array  # found by differences
@@ -40,7 +41,8 @@ def ecnoise(lines: Array) -> Array:
     """Return the noise [N] of values along lines [P, N], in their own unit; 0 where nothing is noise.
 
     The first order k counts from which on three estimates agree to a factor of four and whose differences
-    have both signs; the smallest of all, if none is so.
+    have both signs. If none is so, it is the smallest of all; or NaN where the line is too long to tell, for
+    the values change along it by more than ``STEEP`` of the largest.
     """
     table, gamma, levels, signs = lines.astype(np.float64), 1.0, [], []
     for k in range(1, len(lines)):
@@ -48,7 +50,8 @@ def ecnoise(lines: Array) -> Array:
         levels.append(np.sqrt(gamma * (table**2).mean(axis=0)))
         signs.append((table.min(axis=0) < 0) & (table.max(axis=0) > 0))
     level = np.array(levels)
-    found = level[:-2].min(axis=0)
+    steep = np.ptp(lines, axis=0) > STEEP * np.abs(lines).max(axis=0)
+    found = np.where(steep, np.nan, level[:-2].min(axis=0))
     for k in reversed(range(len(level) - 2)):
         three = level[k : k + 3]
         found = np.where(signs[k] & (three.max(axis=0) <= 4 * three.min(axis=0)), level[k], found)

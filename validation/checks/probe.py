@@ -21,7 +21,7 @@ def is_scalar() -> bool:
 
 @dataclass(frozen=True)
 class Samples:
-    """What ``sample`` returned for N lanes."""
+    """The returned values of ``sample`` for N lanes."""
 
     wo: Array  # [N, 3]
     pdf: Array  # [N]

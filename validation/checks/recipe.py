@@ -1,4 +1,4 @@
-"""What a plugin is loaded from, so that it can be loaded more than once, and in other variants."""
+"""Recipes of plugins, which can be loaded more than once and in other variants."""
 
 from __future__ import annotations
 

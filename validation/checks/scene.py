@@ -46,7 +46,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class SceneCheck:
-    """What a check of a scene found: of each plugin, by name, and of the picture."""
+    """The findings of a check of a scene: for each plugin, by name, and for the picture."""
 
     name: str
     checks: Mapping[str, Check]

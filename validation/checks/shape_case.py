@@ -24,7 +24,7 @@ MOST_HITS = 16  # along a line
 
 @dataclass(frozen=True)
 class Hits:
-    """What N rays met."""
+    """The hits of N rays."""
 
     found: Array  # bool [N]
     t: Array  # [N]
@@ -113,7 +113,7 @@ class Case:
 
     @cached_property
     def met(self) -> tuple[Array, Array, Hits]:
-        """Those rays that meet the surface and do not graze it, and what they meet."""
+        """Return the rays that meet the surface and do not graze it, and their hits."""
         o, d, hits = self.seen
         steep = hits.found & (np.abs((hits.n * d).sum(axis=1)) > FLAT)
         if steep.sum() < 20:
@@ -122,7 +122,7 @@ class Case:
 
     @cached_property
     def behind(self) -> Hits:
-        """What rays meet that come back from just behind ``met``."""
+        """Return the hits of rays that come back from just behind ``met``."""
         _, d, hits = self.met
         return trace(self.target, leave(hits.p, hits.n, d), -d)
 
@@ -139,7 +139,7 @@ class Case:
 
     @cached_property
     def lines(self) -> tuple[Array, Array]:
-        """Which lines are fit to be judged, and which cross the surface an even number of times. Both [N]"""
+        """Return which lines can be judged, and which cross the surface an even number of times; both [N]."""
         count = len(self.seen[0])
         met, even, clear = np.zeros(count, bool), np.ones(count, bool), np.ones(count, bool)
         last = np.full((count, 3), np.inf)

@@ -59,7 +59,7 @@ def scale(law: Law, case: Case) -> None:
 
 
 def far(law: Law, case: Case) -> None:
-    """From ten thousand sizes away: hit where the same line is hit from nearby, to some roundings."""
+    """Hits from ten thousand sizes away are those of the same lines from nearby, to some roundings."""
     _, d, met = case.met
     few = slice(0, case.count(2**12, 2**15))
     goal, d = met.p[few].astype(np.float64), d[few]

@@ -24,7 +24,7 @@ from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Mesh, Plane, Scene, 
 # the point: far above the rounding of float64, far below anything a float32 picture can show
 OFFSET = 1e-10
 
-# Of Mitsuba's own integrators, relative to 1 + the largest coordinate: 1500 half roundings of float32
+# That of Mitsuba's integrators, relative to 1 + the largest coordinate: 1500 half roundings of float32
 MITSUBA_OFFSET = 1500 * 2.0**-24
 
 # The original's absolute constants

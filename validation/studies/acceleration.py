@@ -1,5 +1,4 @@
-"""With and without an acceleration structure: Mitsuba's BVH and this project's tree against a loop over all
-objects.
+"""Mitsuba's BVH and this project's tree against a loop over all objects.
 
 The report has this table for its kd-tree, in seconds a picture. Here it is rays per second over the number of
 objects, for random rays through random spheres, so that nothing but the search for the nearest hit is timed.

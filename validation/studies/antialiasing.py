@@ -182,7 +182,7 @@ def _cells(scene: str, lattice: str, rows: Sequence[Row]) -> list[tuple[Any, ...
 
 
 def _hold(study: Study, name: str, rows: Sequence[Row]) -> None:
-    """What must be true on any machine: rays, and errors."""
+    """Bound what holds on any machine: rays and errors."""
     full = {row.aa: row for row in rows if row.mode == "none"}
     off = [row.rays - _expected_rays(row) for row in rows if row.mode != "none"]
     study.at_most(
@@ -235,7 +235,7 @@ def _read(study: Study, number: int, rows: Sequence[Row]) -> bool:
 
 
 def _show_contours(study: Study, number: int, rows: Sequence[Row]) -> None:
-    """What each detector would refine, as the report shows it."""
+    """Show what each detector would refine, as the report does."""
     aa = min(row.aa for row in rows)
     masks = [_samples(row.warm.result) > 1 for row in rows if row.aa == aa and row.mode != "none"]
     found = [filters.EdgeMap(mask=mask, value=mask.astype(np.float32)) for mask in masks]

@@ -1,4 +1,4 @@
-"""From the report's picture of a scene to that of its stock flavour, one approximation at a time."""
+"""The way from the report's picture of a scene to its stock flavour, one approximation at a time."""
 
 from __future__ import annotations
 

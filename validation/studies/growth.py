@@ -40,7 +40,7 @@ class Extent:
 
 @dataclass(frozen=True)
 class Found:
-    """What one size cost."""
+    """The cost of one size."""
 
     warm: Warm
     kernels: int  # different ones

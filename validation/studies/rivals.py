@@ -32,7 +32,7 @@ TITLE = "Speed against Mitsuba's own plugins"
 DIRECT_GOAL = 0.9
 PATH_GOAL = 1.05
 
-# Of means of pictures: random lights and paths leave half a percent at the size of the quick study; with one
+# For means of pictures: random lights and paths leave half a percent at the size of the quick study; with one
 # light, or one light's shadow, too few or too many it would be tens of percent
 SAME_MEAN = 0.03
 
@@ -82,7 +82,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Finding:
-    """What comparing a pair gave."""
+    """The result of comparing a pair."""
 
     pair: Pair
     time: Ratio

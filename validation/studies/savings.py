@@ -1,4 +1,4 @@
-"""What the render plan saves: everything it leaves out, forced into scenes that do not need it."""
+"""Savings of the render plan: everything it leaves out, forced into scenes that do not need it."""
 
 from __future__ import annotations
 

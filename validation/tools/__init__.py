@@ -1,1 +1,1 @@
-"""What studies are made of: bounds, the report page, image tests, timing, probes."""
+"""Parts of studies: bounds, the report page, image tests, timing, probes."""

@@ -1,4 +1,4 @@
-"""What a render of one of the report's scenes costs: seconds, kernels, rays, and the floor under it.
+"""The cost of rendering one of the report's scenes: seconds, kernels, rays, and the floor under it.
 
 The floor is the time of its own rays, recorded, through Mitsuba's ray queries and nothing else. What a
 picture costs beyond it goes into shading, planes, the bounce loop, means over pixels and Python.
@@ -22,7 +22,7 @@ class Recorder:
     """Stands before a Mitsuba scene and keeps the rays that it is asked about."""
 
     scene: Any
-    # Of each wavefront: camera, mirror or shadow; whether it was said to be coherent; its rays
+    # For each wavefront: camera, mirror or shadow; whether it was said to be coherent; its rays
     waves: list[tuple[str, bool, Any]] = field(default_factory=list)
     single: list[tuple[int, Any, Any]] = field(default_factory=list)
 

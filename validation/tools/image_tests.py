@@ -20,7 +20,7 @@ from mrt_mitsuba.errors import UsageError
 # Relative size of differences that are float32's: sums in another order and fused operations
 ROUNDING = 1e-5
 
-# Of relRMSE: keeps black pixels, which no relative error describes, from ruling it
+# Keeps black pixels, which no relative error describes, from ruling relRMSE
 EPSILON = 1e-2
 
 
@@ -80,7 +80,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What ``compare`` found. ``z`` [H, W, C]: differences over their standard deviations."""
+    """The findings of ``compare``. ``z`` [H, W, C]: differences over their standard deviations."""
 
     pixel: Verdict
     tile: Verdict

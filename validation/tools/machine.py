@@ -1,4 +1,4 @@
-"""What figures were measured with: as much of the machine and the software as one needs to compare them."""
+"""The machine and the software that figures were measured with, as far as comparing them needs it."""
 
 from __future__ import annotations
 

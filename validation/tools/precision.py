@@ -1,4 +1,4 @@
-"""What measuring error against time found: the figures of each case, what they answer, and how sure it is.
+"""Findings about error against time: the figures of each case, what they answer, and how sure it is.
 
 The pictures x₁ … x_R of a case and two independent halves h₁, h₂ of the reference give the matrix G[r, s] =
 mean (x_r − h₁)(x_s − h₂), in which the reference's own noise cancels. The mean of its diagonal is the squared
@@ -124,7 +124,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Strip:
-    """What each curve reaches in about the same time."""
+    """The error that each curve reaches in about the same time."""
 
     seconds: float
     panels: Sequence[Panel]
@@ -132,7 +132,7 @@ class Strip:
 
 @dataclass(frozen=True)
 class Findings:
-    """What was found about several cases."""
+    """The findings about several cases."""
 
     scene: str
     points: Mapping[str, Point]

@@ -1,4 +1,4 @@
-"""What ``mrt-validate`` leaves: a table on the terminal, ``summary.json``, CSV files, pictures and a page."""
+"""Output of ``mrt-validate``: a table on the terminal, ``summary.json``, CSV files, pictures and a page."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from mrt_mitsuba.validation.oracles.reference import ReferenceResult, reference_
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What changes in a pixel when its ray is moved by a small part of a pixel; all [H, W].
+    """The changes in a pixel when its ray is moved by a small part of a pixel; all [H, W].
 
     Every pixel is of at most one kind: ``silhouette`` where the rays meet other objects, else ``shadow``
     where a light appears or vanishes (the edge of a shadow, or a terminator). ``spread`` is the largest

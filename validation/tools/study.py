@@ -1,4 +1,4 @@
-"""What a validation study produces: bounds, tables, plots and pictures, collected while it runs.
+"""The product of a validation study: bounds, tables, plots and pictures, collected while it runs.
 
 A study is a module with ``TITLE`` and ``run(study, *, quick)``. It states its findings through the ``Study``
 it is given; ``report`` turns the result into a table on the terminal, ``summary.json``, CSV files and a page.

@@ -15,7 +15,7 @@ Name = TypeVar("Name", bound=Hashable)  # by which a caller knows its runs
 
 @dataclass(frozen=True)
 class Warm:
-    """What a run returned, and its seconds after a first run that compiled its kernels."""
+    """The returned value of a run, and its seconds after a first run that compiled its kernels."""
 
     result: Any
     seconds: float  # the median

@@ -29,7 +29,7 @@ MOST_ERRORS = 4
 
 @dataclass(frozen=True)
 class WorkPrecision(Findings):
-    """What ``error_vs_time`` found."""
+    """The findings of ``error_vs_time``."""
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""

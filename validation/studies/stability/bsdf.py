@@ -183,7 +183,7 @@ def _decade(cosines: np.ndarray) -> np.ndarray:
 
 
 def _conditioning(cases: Cases, lobes: Lobes) -> None:
-    """What the directions' own rounding does to D: no formula can give it back."""
+    """Show what the rounding of the directions does to D: no formula can give it back."""
     nearby = np.nextafter(lobes.wo, np.float32(2))
     moved = lobes.wi[:, :2].astype(np.float64) + nearby[:, :2]
     tan2 = (moved**2).sum(axis=1) / (lobes.wi[:, 2].astype(np.float64) + lobes.wo[:, 2]) ** 2

@@ -1,4 +1,4 @@
-"""The same reflectance three times in float32: as the report writes it, as Mitsuba's, and this project's.
+"""One reflectance three times in float32: as in the report, as in Mitsuba, and as in this project.
 
 All take local directions, alpha and the index of refraction as float32 arrays; the Fresnel term is the exact
 dielectric one, outside index 1. Values are those of Mitsuba's convention, BSDF times cos θo; densities are of
@@ -69,7 +69,7 @@ class Report:
 
 
 class Mitsuba:
-    """What ``roughconductor`` computes for a material without absorption, by Mitsuba's own functions.
+    """The terms of ``roughconductor`` for a material without absorption, by Mitsuba's own functions.
 
     Mitsuba raises alpha to 1e-4.
     """

@@ -293,7 +293,7 @@ def stand_in_cases(cases: Cases) -> None:
 
 @dataclass(frozen=True)
 class _Cell:
-    """What rays from one distance found at one size of a solid."""
+    """The findings of rays from one distance at one size of a solid."""
 
     hits: int
     across: float  # worst error across the surface, in roundings of the largest coordinate
@@ -309,7 +309,7 @@ class _Cell:
 
 @dataclass(frozen=True)
 class _Traced:
-    """What the integrator found along N rays."""
+    """The findings of the integrator along N rays."""
 
     found: np.ndarray
     t: np.ndarray

@@ -25,7 +25,7 @@ WIDTH, HEIGHT = 64, 48
 # Differences count relative to the value plus a thousandth, and the worst of 95 % of the pixels is held to a
 # bound: the others may show outlines and the edges of shadows
 SMALL, SHARE = 1e-3, 0.95
-# Of plain cases: some float32 roundings, three times what was measured
+# For plain cases: some float32 roundings, three times what was measured
 PLAIN = 3e-6
 
 GREY = Material(1.3, 0.1, (0.5, 0.5, 0.5), (0.3, 0.2, 0.1))

@@ -1,0 +1,78 @@
+"""Launching kernels again that were recorded before, without running the Python code that describes them.
+
+Recording the code of a small picture takes ten times as long as running it. ``dr.freeze`` spares it where
+that is safe, which ``mrt_whitted`` decides: in vectorised variants, where no derivatives are wanted and all
+that a kernel reads is known. A recording is told apart by a key, which names everything in Python that shapes
+the code, and by Dr.Jit by number, types and sizes of the arrays. An array that the code reads and that is not
+among the inputs is an error while recording, so none can go out of date unseen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+# Recordings of one kind that are kept: of a picture with filters there are up to eight
+MOST = 32
+
+
+class Replay:
+    """Recordings of one kind; ``replay(key, inputs, run)`` returns what ``run()`` does: arrays."""
+
+    def __init__(self) -> None:
+        self._frozen = dr.freeze(_run, limit=MOST, warn_after=2**31 - 1)
+
+    def __call__(self, key: Hashable, inputs: Any, run: Callable[[], Any]) -> Any:
+        """Return what ``run()`` does, which reads no arrays but ``inputs`` and those that it makes."""
+        call = _Call(key, run)
+        try:
+            return self._frozen(call, inputs)
+        finally:
+            call.run = None  # a recording keeps the call, and must not keep the scene
+
+    @property
+    def recorded(self) -> int:
+        """Number of recordings made so far."""
+        return int(self._frozen.n_recordings)
+
+
+def held(things: list[Any]) -> list[Any]:
+    """Return the arrays, and the emitters, in objects of this package and in what they hold."""
+    found, waiting, seen = list[Any](), list(things), set[int]()
+    while waiting:
+        value = waiting.pop()
+        if id(value) in seen or isinstance(value, type):
+            continue
+        seen.add(id(value))
+        if dr.is_array_v(value):
+            found += [value] if dr.width(value) else []  # Dr.Jit aborts on an array of nothing
+        elif isinstance(value, mi.Emitter):
+            found.append(value)
+        elif isinstance(value, dict):
+            waiting += value.values()
+        elif isinstance(value, list | tuple):
+            waiting += value
+        elif type(value).__module__.startswith(f"{__package__}.") and hasattr(value, "__dict__"):
+            waiting.append(vars(value))
+    return found
+
+
+class _Call:
+    """A function of no arguments, which is the same as another one of its key."""
+
+    def __init__(self, key: Hashable, run: Callable[[], Any] | None) -> None:
+        self.key, self.run = key, run
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Call) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
+def _run(call: _Call, inputs: Any) -> Any:
+    assert call.run is not None
+    return call.run()
