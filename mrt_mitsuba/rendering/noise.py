@@ -43,7 +43,7 @@ class Halves(Stack):
     ) -> None:
         film = exposer.film
         super().__init__(film, HALVES, len(exposer.names))
-        self._exposer, self._seed, self._blurred = exposer, seed, blurred
+        self._exposer, self._seed, self._blurred, self._step = exposer, seed, blurred, STEP
         self._total, self._square = np.zeros((2, HALVES, film.pixels, 3))
 
     # ------------------------------------------- Rounds ---------------------------------------------
@@ -118,8 +118,8 @@ class Halves(Stack):
 
     # ------------------------------------------- Sharing --------------------------------------------
 
-    def next(self, most: float, target: float | None) -> np.ndarray:
-        """Return numbers of further groups, [2, pixels].
+    def next(self, most: float, target: float | None) -> np.ndarray | None:
+        """Return numbers of further groups, [2, pixels]; None where ``most`` leaves no room.
 
         Enough for an RMSE of ``target``, if that takes a mean of no more than ``most`` rays a pixel in all.
         """
@@ -128,44 +128,41 @@ class Halves(Stack):
         if target is not None:
             allowed = (variance / self.rays).sum() * (target / self.error().rmse) ** 2
             wanted = _water(self.rays, deviation, lambda due: (variance / due).sum() <= allowed)
-            least = STEP * self.rays.sum()
+            least = self._step * self.rays.sum()
             if least <= wanted.sum() <= most:
                 return self._groups(wanted)
             if wanted.sum() < least:
-                most = min(most, least)
+                most, self._step = min(most, least), 1.5 * self._step  # that it was short may be by chance
         return self._within(most, deviation)
 
-    def _within(self, most: float, deviation: np.ndarray) -> np.ndarray:
-        """Return numbers of groups that make no more than so many rays in all."""
-        budget = most
-
-        def spent(due: np.ndarray) -> bool:
-            return bool(due.sum() >= budget)
-
-        for _ in range(4):
-            groups = self._groups(_water(self.rays, deviation, spent))
-            excess = self.rays.sum() + self.cost(groups) - most  # by rounding, and by pixels under the filter
-            if excess <= 0:
+    def _within(self, most: float, deviation: np.ndarray) -> np.ndarray | None:
+        """Return numbers of groups that make no more than so many rays in all, and not many fewer."""
+        have, best = float(self.rays.sum()), None
+        low, budget, high = have, most, most
+        for _ in range(6):  # rounding, and pixels under the filter, make of a budget more or less than it is
+            groups = self._groups(_water(self.rays, deviation, lambda due: bool(due.sum() >= budget)))  # noqa: B023
+            if have + self.cost(groups) > most:
+                high = budget
+            else:
+                best, low = groups, budget
+            if low == most:
                 break
-            budget -= excess
-        return groups
+            budget = (low + high) / 2
+        return best
 
     def _groups(self, due: np.ndarray) -> np.ndarray:
         """Return whole numbers of groups for what is due; one at least."""
-        missing = (due - self.rays) / GROUP
-        groups = np.floor(missing + self._rounding())
+        missing, rounding = (due - self.rays) / GROUP, self._rounding()
+        groups = np.floor(missing + rounding)
         if not groups.any():
-            groups = (missing >= missing.max()) * 1.0
+            groups = (missing > 0) & (rounding >= rounding.max())
         return np.asarray(groups, np.int64)
 
-    def _rounding(self) -> float | np.ndarray:
-        """Return what to add before numbers are rounded down: alike in a tile, under a filter.
-
-        There, a lone pixel would have rays traced all around it.
-        """
-        if not self.film.reach:
-            return 0.5
-        rows, columns = (np.arange(n) // TILE for n in self.film.shape)
+    def _rounding(self) -> np.ndarray:
+        """Return random numbers to add before rounding down; alike in a tile, where a filter has rays traced
+        around all pixels that need some."""
+        tile = TILE if self.film.reach else 1
+        rows, columns = (np.arange(n) // tile for n in self.film.shape)
         random = np.random.default_rng((self._seed, int(self.rays.sum())))
         return random.random((rows[-1] + 1, columns[-1] + 1))[rows[:, None], columns].ravel()
 

@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 GROWTH = 4.25
 MARGIN = 0.97  # of the target to aim at: an estimate is as often too low as too high
 SURE = 2.0  # times the target, the upper end of the error's interval may be
-LEAST_GROWTH = 1.02  # fewer rays, and a round costs more than it brings
+LEAST_GROWTH = 1.05  # fewer rays, and a round costs more than it brings
 
 OnRound = Callable[[RoundPicture], object]
 Stage = Callable[[str, int, str], AbstractContextManager[Advance]]

@@ -34,7 +34,7 @@ class Extent:
     timed: tuple[int, int]  #: size of pictures that are timed
 
 
-FULL = Extent(tuple(SCENES), (64, 48), 2**13, 4, 7, 32, (192, 144))
+FULL = Extent(tuple(SCENES), (64, 48), 2**13, 4, 5, 32, (192, 144))
 QUICK = Extent(("gloss", "stratified", "texture_and_sky"), (32, 24), 2**12, 2, 3, 12, (48, 36))
 
 
