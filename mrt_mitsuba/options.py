@@ -243,10 +243,10 @@ def option(default: Any, kind: Kind, text: str = "", shown: str | None = None) -
 def checked(field: dataclasses.Field[Any], value: Any) -> Any:
     """Return a value from Python as the field holds it; raise ``UsageError`` if it is not allowed.
 
-    None passes where it is the default.
+    The default passes as it is.
     """
-    if value is None and field.default is None:
-        return None
+    if value is field.default:
+        return value
     return check(field.name, field.metadata["kind"], value)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, TypeVar
 
 import drjit as dr
@@ -44,7 +45,7 @@ class Watch:
 
     def __init__(self, thing: Any) -> None:
         self.thing = thing
-        collector = _Collector(thing, [])
+        collector = _collector(mi.variant())(thing, [])
         thing.traverse(collector)
         self._entries = collector.entries
         self._state, values = self._look()
@@ -68,15 +69,21 @@ class Watch:
         return True
 
 
-class _Collector(mi.TraversalCallback):
-    """Collects the parameters of an object, of its textures and of the BSDFs inside a BSDF."""
+@cache
+def _collector(variant: str) -> type:
+    """Return the class of what collects parameters, for a variant: there is none before one is chosen."""
 
-    def __init__(self, node: Any, entries: list[tuple[Any, Any, Any]]) -> None:
-        super().__init__()
-        self.node, self.entries = node, entries
+    class Collector(mi.TraversalCallback):
+        """Collects the parameters of an object, of its textures and of the BSDFs inside a BSDF."""
 
-    def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
-        if not isinstance(value, mi.Object):
-            self.entries.append((value, cpptype, self.node))
-        elif not isinstance(value, (mi.Shape, mi.Emitter, mi.Medium)):
-            value.traverse(_Collector(value, self.entries))
+        def __init__(self, node: Any, entries: list[tuple[Any, Any, Any]]) -> None:
+            super().__init__()
+            self.node, self.entries = node, entries
+
+        def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
+            if not isinstance(value, mi.Object):
+                self.entries.append((value, cpptype, self.node))
+            elif not isinstance(value, (mi.Shape, mi.Emitter, mi.Medium)):
+                value.traverse(Collector(value, self.entries))
+
+    return Collector

@@ -43,12 +43,12 @@ class Bundle:
 
     @property
     def form(self) -> tuple[Any, ...]:
-        """What shapes the code of ``placed``; all else is data."""
+        """Return what shapes the code of ``placed``; all else is data."""
         phase = None if self.shutter is None else self.shutter.phase is None
         return self.lattice, self.ray_count, self.rays_per_pixel, isinstance(self.pixels, range), phase
 
     def numbers(self, width: int, height: int) -> Numbers:
-        """Return the data of ``placed``: another picture size needs no other kernel."""
+        """Return the data of ``placed``: the size of the picture, and all that ``form`` leaves open."""
         import mitsuba as mi
 
         first = self.pixels.start if isinstance(self.pixels, range) else 0

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Hashable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -77,18 +78,30 @@ class Film:
         sampler.set_sample_count(count)
         return int(sampler.sample_count())
 
-    def rays(self, pixel: Any, sampler: Any) -> tuple[Any, Any, Any]:
+    @property
+    def form(self) -> Hashable | None:
+        """What shapes the code of ``rays``, all else being in its numbers and the sensor; None where that is
+        not known."""
+        if self.sensor.shutter_open_time() > 0 or self.bands:
+            return None
+        return self.sensor.shutter_open(), self.grey
+
+    def numbers(self) -> Numbers:
+        """Return the data of ``rays``."""
+        import mitsuba as mi
+
+        return _opaque_numbers(self.width, self.height, self.border, mi.variant())
+
+    def rays(self, pixel: Any, sampler: Any, numbers: Numbers) -> tuple[Any, Any, Any]:
         """Return places in the film's pixels, in pixels, and rays through them with their weights.
 
         Draws from the sampler what Mitsuba's integrators draw, in their order.
         """
-        import drjit as dr
         import mitsuba as mi
 
-        row, column = Divisor.opaque(self.width).divide(pixel)
+        row, column = numbers.width.divide(pixel)
         place = mi.Point2f(mi.Float(column), mi.Float(row)) + sampler.next_2d()
-        size = [float(n - 2 * self.border) for n in (self.width, self.height)]
-        inside = (place - dr.opaque(mi.Float, self.border)) / dr.opaque(mi.Vector2f, size)
+        inside = (place - numbers.border) / numbers.size
         sensor, time = self.sensor, mi.Float(self.sensor.shutter_open())
         aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         if sensor.shutter_open_time() > 0:
@@ -126,9 +139,7 @@ class Film:
 
     def spread_out(self, variance: np.ndarray) -> np.ndarray:
         """Return the variance [..., H, W] of pixels, up to a factor, given that of the rays in each."""
-        if not self.reach:
-            return variance
-        for axis in (-2, -1):
+        for axis in (-2, -1) if self.reach else ():
             padding = [(0, 0)] * variance.ndim
             padding[axis] = (self.reach, self.reach)
             windows = np.lib.stride_tricks.sliding_window_view(
@@ -136,6 +147,24 @@ class Film:
             )
             variance = windows @ self.spread
         return variance
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The size of a film as the kernel has it."""
+
+    width: Divisor
+    border: Any
+    size: Any  #: of the picture, in pixels
+
+
+@lru_cache(maxsize=16)
+def _opaque_numbers(width: int, height: int, border: int, variant: str) -> Numbers:
+    import drjit as dr
+    import mitsuba as mi
+
+    size = [float(n - 2 * border) for n in (width, height)]
+    return Numbers(Divisor.opaque(width), dr.opaque(mi.Float, border), dr.opaque(mi.Vector2f, size))
 
 
 class Canvas:

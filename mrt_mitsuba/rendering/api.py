@@ -33,7 +33,7 @@ from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, shader_for
 from mrt_mitsuba.rendering.trace import Tracer
 from mrt_mitsuba.rendering.view import View
-from mrt_mitsuba.scene.open import Source, open_scene, sized
+from mrt_mitsuba.scene.open import Source, reopen_scene, sized
 
 log = logging.getLogger(__name__)
 
@@ -164,9 +164,9 @@ def render(
 
 
 def render_with(
-    scene: Any, settings: RenderSettings, progress: Progress, *, opener: Callable[..., Source] = open_scene
+    scene: Any, settings: RenderSettings, progress: Progress, *, opener: Callable[..., Source] = reopen_scene
 ) -> Result:
-    """Render a scene as ``render`` does; ``opener`` takes the place of ``open_scene``."""
+    """Render a scene as ``render`` does; ``opener`` takes the place of ``reopen_scene``."""
     start = time.perf_counter()
     with counting_kernels(progress) as kernels:
         runtime.use(settings.variant)
@@ -217,6 +217,7 @@ def _render(
         focalrange=plan.focus.range,
         variant=plan.variant,
         integrator=plan.integrator,
+        layers=tuple(name for name in settings.layers if name in plan.layers),
     )
     image, layers = _mean(total, plan)
     return Result(

@@ -186,8 +186,11 @@ class Plan(RenderFacts):
 
 def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
     """Decide what to trace and what to leave out. Raises ``UsageError`` for layers that nothing provides."""
-    asked, lattice = frozenset(settings.layers), Lattice(str(settings.lattice), int(settings.aa or 1))
+    possible, asked = _possible(facts, settings), frozenset(settings.layers)
+    if asked == LAYERS.keys():
+        asked &= possible
     _check_layers(asked, facts, settings)
+    lattice = Lattice(str(settings.lattice), int(settings.aa or 1))
     aamode = str(settings.aamode)
     detector = aamode if aamode in DETECTORS and (lattice.aa > 1 or "edges" in asked) else None
     blur = settings.dof if facts.focus.distance else None
@@ -205,7 +208,7 @@ def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
         repeats=_repeats(settings, lattice),
         motion=(FILM if lattice.kind == FILM else settings.motionmode) if settings.motion else None,
         motion_samples=settings.motionsamples if settings.motion else 1,
-        layers=asked | {name for name, layer in LAYERS.items() if made & set(layer.free_with)},
+        layers=asked | {name for name in possible if made & set(TABLE[name].free_with)},
         passes=passes,
         left_out=tuple(_left_out(traced, facts, made, settings)),
     )
@@ -218,6 +221,14 @@ def _region(asked: Sequence[int] | None, facts: RenderFacts) -> Region:
     return region
 
 
+def _possible(facts: RenderFacts, settings: RenderSettings) -> frozenset[str]:
+    """Return the layers that can be made."""
+    made = facts.traceable | layers.named(DERIVED)
+    made -= {"error", "variance"} if settings.aamode != NOISE else set()
+    made -= {"variance"} if settings.lattice != FILM else set()
+    return made - ({"edges"} if settings.aamode not in DETECTORS else set())
+
+
 def _check_layers(asked: frozenset[str], facts: RenderFacts, settings: RenderSettings) -> None:
     if "edges" in asked and settings.aamode not in DETECTORS:
         raise UsageError(
@@ -225,6 +236,8 @@ def _check_layers(asked: frozenset[str], facts: RenderFacts, settings: RenderSet
         )
     if asked & {"error", "variance"} and settings.aamode != NOISE:
         raise UsageError("layers=error,variance: only rounds estimate them; give a target= or aamode=noise")
+    if "variance" in asked and settings.lattice != FILM:
+        raise UsageError("layers=variance: without random numbers there is none; choose lattice=film")
     missing = sorted(asked - facts.traceable - layers.named(DERIVED))
     if missing:
         raise UsageError(

@@ -10,6 +10,7 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.validation.studies.antialiasing import variance_error
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -134,25 +135,9 @@ def test_plan_says_that_one_random_ray_takes_noise_for_edges():
     assert "noise will" not in str(mrt.render(0, width=8, height=6, aa=2, aamode="sobel").plan)
 
 
-@pytest.mark.parametrize("aamode", ["luma", "sobel"])
-@pytest.mark.parametrize("spp", [2, 5])
-def test_variance_of_a_pixel_is_the_unbiased_one(aamode, spp):
-    """Behind a veil that stops half of the rays: of n zeros and ones with mean m, m (1 - m) / (n - 1)."""
-    black = {"type": "diffuse", "reflectance": 0.0}
-    scene = {
-        "type": "scene",
-        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 40, "height": 30}},
-        "integrator": {"type": "path", "rr_depth": 100},
-        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}},
-        "veil": {"type": "sphere", "radius": 2, "bsdf": {"type": "mask", "opacity": 0.5, "nested": black}},
-    }
-    scene["sensor"]["film"]["rfilter"] = {"type": "box"}
-    scene["sensor"]["to_world"] = mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, 1], [0, 1, 0])
-    result = mrt.render(mi.load_dict(scene), spp=spp, aa=1, aamode=aamode, layers=["edges"])
-    mean = result.image
-    assert set(np.unique(np.round(mean * spp))) <= set(range(spp + 1)) and 0.4 < mean.mean() < 0.6
-    expected = getattr(mrt.filters, f"{aamode}_edges")(mean, variance=mean * (1 - mean) / (spp - 1)).value
-    # whole numbers, or roundings of a mean of squares; a value next to none may be none
-    off = np.abs(result.layers["edges.Y"] - expected) > (1.0 if aamode == "sobel" else 1e-5)
-    assert off.mean() < 0.02
-    assert expected.max() > 0
+@pytest.mark.parametrize(
+    ("aamode", "spp", "lattice"),
+    [("luma", 2, "film"), ("sobel", 5, "film"), ("luma", 5, "report"), ("sobel", 2, "report")],
+)
+def test_variance_of_a_pixel_is_the_unbiased_one(aamode, spp, lattice):
+    assert variance_error(aamode, spp=spp, lattice=lattice) < 0.02

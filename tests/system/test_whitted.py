@@ -10,9 +10,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mrt_mitsuba.scene.model import Cone, Cylinder, Material
-from mrt_mitsuba.validation.oracles import reference
-
 pytestmark = pytest.mark.usefixtures("variant")
 
 WHITTED = {"type": "mrt_whitted", "clamp": False, "min_contribution": 0.0, "bounce_budget": "plain"}
@@ -44,9 +41,6 @@ def trace(nodes: dict[str, Any], o: Any, d: Any, **integrator: Any) -> Traced:
 
 def radiance(nodes: dict[str, Any], o: Any, d: Any, **integrator: Any) -> np.ndarray:
     return trace(nodes, o, d, **integrator).radiance
-
-
-NONE = Material(1, 1, (0, 0, 0), (0, 0, 0))
 
 
 @pytest.mark.parametrize("count", [1, 8, 9, 30])
@@ -130,52 +124,6 @@ def test_schlick_mirrors_at_grazing_angles_whatever_is_reflected_at_normal_incid
         {"floor": floor, "sky": sky}, np.tile([0.0, 0, 1], (3, 1)), d, min_contribution=1 / 16 / 255
     )
     np.testing.assert_allclose(found[:, 0], 0.5 * (f0 + (1 - f0) * (1 - cos) ** 5), rtol=1e-4)
-
-
-@pytest.mark.parametrize("kind", ["cone", "cylinder"])
-def test_grazing_rays_are_not_lost(kind: str) -> None:
-    """Rays along the sides of upright objects, a few roundings deep: each meets what float64 meets."""
-    rng = np.random.default_rng(3)
-    things = []
-    for x in range(20):
-        base, radius = np.float32([1.7 * x, 0.3 * x, 0]), float(np.float32(rng.uniform(0.2, 0.6)))
-        ends = tuple(map(float, base + np.float32([0, 0, 1]))), tuple(map(float, base))
-        things.append((Cone if kind == "cone" else Cylinder)(*ends, radius, NONE))
-    numbers = np.float32([[*a, *b, r] for a, b, r in (tuple(vars(t).values())[:3] for t in things)])
-    group = {"type": "mrt_group", "kind": kind, "numbers": mi.Bitmap(numbers)}
-    which, count = rng.integers(0, 20, 300_000), 300_000
-    # Tangents of the lowest part of the sides, along the axes, where the box and the surface touch
-    side = rng.choice([-1.0, 1.0], count) * (numbers[which, 6] * (1 - 10.0 ** rng.uniform(-6.3, -5, count)))
-    along_x = rng.random(count) < 0.5
-    height = rng.uniform(0, 2e-7 if kind == "cone" else 1, count)
-    away = np.full(count, -3.0)
-    o = numbers[which, 3:6] + np.where(along_x, [away, side, height], [side, away, height]).T
-    o = np.float32(o)
-    d = np.float32(np.where(along_x[:, None], [1.0, 0, 0], [0, 1.0, 0]))
-    with np.errstate(all="ignore"):
-        parts = np.array_split(np.arange(count), 30)
-        exact = np.concatenate([reference.Axial(things).distances(np.float64(o[k]), d[k]) for k in parts])
-    exact = exact[np.arange(count), which]
-    assert np.isfinite(exact).mean() > 0.3
-    assert np.count_nonzero(np.isfinite(exact) & ~trace({"group": group}, o, d).found) == 0
-
-
-def test_the_place_on_a_cone_is_known_to_roundings_of_the_way_to_it() -> None:
-    """Hits from 1e5 radii away, across the surface: seven roundings of the way at worst, of 200,000 rays."""
-    rng, count, away = np.random.default_rng(4), 200_000, 1e5
-    apex, base, radius = (0.3, 0.1, 1.0), (-0.2, 0.2, -1.0), 0.5
-    d = rng.normal(size=(count, 3))
-    d = np.float32(d / np.linalg.norm(d, axis=1, keepdims=True))
-    o = np.float32(rng.uniform(-0.6, 0.6, (count, 3)) - away * d)
-    cone, length = reference.Axial([Cone(apex, base, radius, NONE)]), np.linalg.norm(np.float64(d), axis=1)
-    with np.errstate(all="ignore"):
-        t = cone.distances(np.float64(o), d / length[:, None])[:, 0] / length
-        n = cone.normals(o + t[:, None] * np.float64(d), np.zeros(count, int))
-    traced = trace({"cone": {"type": "mrt_cone", "apex": apex, "base_center": base, "radius": radius}}, o, d)
-    both = traced.found & np.isfinite(t)
-    assert both.mean() > 0.3
-    across = np.abs((traced.t[both] - t[both]) * (n * d).sum(axis=1)[both])
-    assert across.max() < 12 * 2.0**-24 * away
 
 
 def test_lobes_are_chosen_by_their_mean_reflectance() -> None:

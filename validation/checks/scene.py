@@ -111,12 +111,17 @@ def check_scene(
     left_out = tuple(
         f"{count} more of {kind} are like those that were checked" for kind, count in left.items()
     )
+    instances = sum(shape.class_name() == "Instance" for shape in source.scene.shapes())
+    if instances:
+        left_out += (
+            f"{instances} instances cannot be checked by themselves: check a dict of one and its group",
+        )
     return SceneCheck(source.name, checks, _hunt(source, quick, seed), left_out)
 
 
 def _all(scene: Any) -> Iterator[tuple[str, Any]]:
     """Yield each BSDF, shape and emitter once, after its kind."""
-    shapes = list(scene.shapes())
+    shapes = [shape for shape in scene.shapes() if shape.class_name() != "Instance"]
     bsdfs = {str(id(b)): b for b in (shape.bsdf() for shape in shapes) if b is not None}
     for word, plugins in (("BSDF", bsdfs.values()), ("shape", shapes), ("emitter", scene.emitters())):
         yield from ((f"{word} {class_name(plugin)}", plugin) for plugin in plugins)

@@ -55,7 +55,7 @@ def bbox(law: Law, case: Case) -> None:
         except RuntimeError:
             law.notes.append("sample_position() is not there")
     p = np.concatenate(points)
-    out = np.maximum(case.low - p, p - case.high).max(axis=1) / case.size
+    out = np.maximum(case.box[0] - p, p - case.box[1]).max(axis=1) / case.size
     i = int(out.argmax())
     law.at_most(
         "points outside the bounding box, in sizes",
@@ -81,7 +81,7 @@ def variants(law: Law, case: Case) -> None:
     try:
         mi.set_variant(other)
         runtime.use(other)
-        there = trace(mi.load_dict({"type": "scene", "shape": case.recipe.load()}), o, d)
+        there = trace(case.recipe.scene(), o, d)
     except RuntimeError as problem:
         if "not found" not in str(problem):
             raise

@@ -30,7 +30,7 @@ class ReferenceEdges:
 
 
 def luma_edges(image: np.ndarray) -> ReferenceEdges:
-    """Contrast of ``√(0.299 R + 0.587 G + 0.114 B)`` in the 3×3 neighbourhood."""
+    """Return the contrast of ``√(0.299 R + 0.587 G + 0.114 B)`` in the 3×3 neighbourhood."""
     red, green, blue = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
     luma = np.sqrt(0.299 * red + 0.587 * green + 0.114 * blue)
     result = _empty(luma.shape)
@@ -44,7 +44,7 @@ def luma_edges(image: np.ndarray) -> ReferenceEdges:
 
 
 def sobel_edges(image: np.ndarray) -> ReferenceEdges:
-    """Sobel gradient of ``int(255 (0.07 R + 0.72 G + 0.21 B))``.
+    """Return the Sobel gradient of ``int(255 (0.07 R + 0.72 G + 0.21 B))``.
 
     Here ``margin`` is the distance of the nearest grey of the window, before truncation, from a whole number.
     Next to zero that is no matter, since truncation goes to zero from both sides, and it counts as far away.
@@ -64,7 +64,7 @@ def sobel_edges(image: np.ndarray) -> ReferenceEdges:
 
 
 def blur_amount(depth: np.ndarray, focal_distance: float, focal_range: float) -> np.ndarray:
-    """The height map: ``clamp(|focal_distance − depth| − focal_range, 0, 8)``, and 8 for a miss."""
+    """Return the height map: ``clamp(|focal_distance − depth| − focal_range, 0, 8)``, and 8 for a miss."""
     amount = np.zeros(depth.shape)
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
@@ -101,7 +101,7 @@ def gaussian_dof(image: np.ndarray, amount: np.ndarray) -> np.ndarray:
 
 
 def disc_radius(amount: np.ndarray) -> np.ndarray:
-    """Radii of the discs of the corrected blur."""
+    """Return the radii of the discs of the corrected blur."""
     small = amount**2 / (8 - 4 * np.minimum(amount, 1) ** 2)
     return np.where(amount < 1, small, np.sqrt(np.maximum(2 * amount - 23 / 16, 0)) - 0.5)
 
@@ -136,12 +136,12 @@ def corrected_dof(image: np.ndarray, radius: np.ndarray) -> np.ndarray:
 
 
 def _cover(radius: np.ndarray, dx: int, dy: int) -> np.ndarray:
-    """How much of a pixel so far away a disc covers."""
+    """Return how much of a pixel so far away a disc covers."""
     return np.clip(radius + 1 - math.hypot(dx, dy), 0, 1)
 
 
 def _light(radius: np.ndarray, steps: Sequence[tuple[int, int]]) -> np.ndarray:
-    """Pixels that a disc covers in all."""
+    """Return the pixels that a disc covers in all."""
     return np.asarray(sum(_cover(radius, dx, dy) for dx, dy in steps))
 
 

@@ -92,6 +92,10 @@ def run(study: Study, *, quick: bool) -> None:
     _compare_with_mitsuba(study, quick=quick)
     _compare_modes_over_path(study, extent)
     _chase_noise(study, extent)
+    for lattice in ("report", "film"):
+        error = variance_error("sobel", spp=2, lattice=lattice)
+        why = "of 2 rays: a variance by n in place of n - 1 is half as large, and changes nearly all"
+        study.at_most(f"noise: share of pixels of another variance, lattice={lattice}", error, 0.02, why)
 
 
 # ----------------------------------------- The report's scenes ------------------------------------------
@@ -248,7 +252,7 @@ def _show_contours(study: Study, number: int, rows: Sequence[Row]) -> None:
 
 
 def _compare_with_mitsuba(study: Study, *, quick: bool) -> None:
-    """Lattices against random samples that Mitsuba places and filters itself, on scene 3."""
+    """Compare lattices with random samples that Mitsuba places and filters itself, on scene 3."""
     import mitsuba as mi
 
     width, height, spp = (96, 72, 1024) if quick else (200, 150, 8192)
@@ -303,8 +307,40 @@ def _compare_modes_over_path(study: Study, extent: Extent) -> None:
     )
 
 
+def variance_error(detector: str, *, spp: int, lattice: str) -> float:
+    """Return the share of pixels whose edges are not those by the unbiased variance of their rays.
+
+    Behind a veil that stops half of the rays: of n zeros and ones with mean m, it is m (1 - m) / (n - 1).
+    """
+    import mitsuba as mi
+
+    black = {"type": "diffuse", "reflectance": 0.0}
+    film = {"type": "hdrfilm", "width": 40, "height": 30, "rfilter": {"type": "box"}}
+    look = mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, 1], [0, 1, 0])
+    scene = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "film": film, "to_world": look},
+        "integrator": {"type": "path", "rr_depth": 100},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}},
+        "veil": {"type": "sphere", "radius": 2, "bsdf": {"type": "mask", "opacity": 0.5, "nested": black}},
+    }
+    options: dict[str, Any] = {
+        "spp": spp,
+        "aa": 1,
+        "aamode": detector,
+        "layers": ["edges"],
+        "lattice": lattice,
+    }
+    found = mrt.render(mi.load_dict(scene), **options)
+    mean = found.image
+    expected = getattr(filters, f"{detector}_edges")(mean, variance=mean * (1 - mean) / (spp - 1)).value
+    # whole numbers, or roundings of a mean of squares; a value next to none may be none
+    off = np.abs(found.layers["edges.Y"] - expected) > (1.0 if detector == "sobel" else 1e-5)
+    return float(off.mean()) if np.max(expected) > 0 else 1.0
+
+
 def _chase_noise(study: Study, extent: Extent) -> None:
-    """Refined pixels where the converged picture is flat, and where it has an edge."""
+    """Count refined pixels where the converged picture is flat, and where it has an edge."""
     scene = _load(lit_by_a_sphere(*extent.light_size))
     centre: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}  # where the detectors look
     truth = mrt.render(scene, **centre, spp=16 * extent.light_spp, seed=78).image

@@ -136,7 +136,7 @@ def compare_rest(numbers: Sequence[int], *, width: int, height: int, spp: int) -
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Where the report's pictures and those of the stock flavour differ, and by what."""
+    """Show where the report's pictures and those of the stock flavour differ, and by what."""
     numbers = (0, 1, 3) if quick else (0, 1, 2, 3, 4)
     size: dict[str, Any] = {"width": 64, "height": 48} if quick else {"width": 160, "height": 120}
     spp = 64 if quick else 256

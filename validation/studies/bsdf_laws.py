@@ -60,7 +60,7 @@ G1_FIT = 3.5e-3
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Every law in turn, in ``llvm_ad_rgb``."""
+    """Hold every law in turn, in ``llvm_ad_rgb``."""
     runtime.use(runtime.FAST)
     study.text(
         "Each law is a property that the formula has and that no other renderer is needed to check: samples "
@@ -89,7 +89,7 @@ def load(**parameters: Any) -> Any:
 
 
 def general(study: Study, *, quick: bool) -> None:
-    """The laws of any BSDF, over forms and ways to sample; of each what is nearest its limit."""
+    """Check the laws of any BSDF, over forms and ways to sample; show for each what is nearest its limit."""
     for name, parameters in list(MATERIALS.items())[: 3 if quick else None]:
         found = check_bsdf({"type": "mrt_bsdf", **parameters}, quick=quick)
         for law in found.laws.values():
@@ -102,7 +102,7 @@ def general(study: Study, *, quick: bool) -> None:
 
 
 def furnace(study: Study, *, quick: bool) -> None:
-    """No more light out than in where Kd + Ks <= 1; what the report's own materials reflect is recorded."""
+    """Hold light out to light in where Kd + Ks <= 1; record what the report's own materials reflect."""
     from matplotlib.figure import Figure
 
     angles = np.array([0, 30, 60, 75, 85, 89] if quick else [*range(0, 90, 5), 87, 89])
@@ -155,7 +155,7 @@ def _report_albedo() -> float:
 
 
 def dielectric_terms(study: Study, *, quick: bool) -> None:
-    """``roughdielectric``'s reflection and its factors against ours; the diffuse term against ``diffuse``."""
+    """Compare ``roughdielectric``'s reflection and factors with ours, the diffuse term with ``diffuse``."""
     import mitsuba as mi
 
     errors: dict[str, float] = dict.fromkeys(("D", "G", "F", "reflection", "diffuse"), 0.0)
@@ -222,7 +222,7 @@ def _factors(alpha: float, ior: float, wi: Any, wo: Any) -> dict[str, float]:
 
 
 def published(study: Study, *, quick: bool) -> None:
-    """Five albedos published with another renderer."""
+    """Compare five albedos published with another renderer."""
     bsdf = load(**NORI_BSDF)
     rows = [[angle, float(albedo(bsdf, at_angle(angle)) @ LUMINANCE), known] for angle, known in NORI.items()]
     study.table(

@@ -99,7 +99,7 @@ class Found:
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """The table of errors, of some hundred million cosines each, or of some hundred thousand."""
+    """Show the table of errors, of some hundred million cosines each, or of some hundred thousand."""
     if runtime.obstacle(runtime.FAST):
         raise VariantError(f"every cosine needs llvm arrays: {runtime.obstacle(runtime.FAST)}")
     stride = QUICK if quick else 1

@@ -113,7 +113,7 @@ def exact_reflectance(cos_theta: Array, eta: Array, k: Array) -> Array:
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Every preset, with a table, a map over metal and angle, and a picture of the worst metal."""
+    """Check every preset, with a table, a map over metal and angle, and a picture of the worst metal."""
     names = preset_names()
     with study.stage("metals", len(names)) as advance:
         metals = []
@@ -200,7 +200,7 @@ def _curves(metal: Metal) -> Any:
 
 
 def _picture(study: Study, metal: Metal, quick: bool) -> None:
-    """A ball of the metal, both ways, and the difference."""
+    """Show a ball of the metal, both ways, and the difference."""
     import mitsuba as mi
 
     size, spp = QUICK_PICTURE if quick else PICTURE

@@ -45,7 +45,7 @@ MUTATIONS: Mapping[str, Mapping[str, Any]] = {
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """All parts; ``compare_roughconductor`` does the pictures of one roughness."""
+    """Run all parts; ``compare_roughconductor`` does the pictures of one roughness."""
     study.text(
         "With F = 1 and no diffuse part, mrt_bsdf and roughconductor are the same function: their values are "
         "compared point by point and in pictures, with equal random numbers and with independent ones. Real "
@@ -331,7 +331,7 @@ def same_numbers(alpha: float, *, size: int = 96, spp: int = 16) -> float:
 
 
 def rendered(study: Study, *, quick: bool) -> None:
-    """Pictures: equal with equal random numbers, indistinguishable with others, while small errors show."""
+    """Compare pictures: equal with equal random numbers, alike with others, while small errors show."""
     settings: dict[str, Any] = (
         {"size": 64, "spp": 8, "renders": 64} if quick else {"size": 128, "spp": 8, "renders": 96}
     )
@@ -411,7 +411,7 @@ def measure_efficiency(
 
 
 def efficiency(study: Study, *, quick: bool) -> None:
-    """Noise at equal sample counts, which is held; at equal time, which depends on the machine, recorded."""
+    """Compare noise at equal sample counts, which is held, and at equal time, which is recorded."""
     settings = {"size": 64, "spp": 16, "renders": 12} if quick else {"size": 96, "spp": 16, "renders": 32}
     alphas = (0.1, 0.5) if quick else (0.02, 0.1, 0.3, 0.6)
     rows: list[list[Any]] = []

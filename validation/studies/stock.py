@@ -12,6 +12,7 @@ import numpy as np
 import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.scene.shapes import torus
 from mrt_mitsuba.validation.oracles.reference import camera_directions, reference_render
 from mrt_mitsuba.validation.studies import approximations
 from mrt_mitsuba.validation.tools import mutations
@@ -34,9 +35,10 @@ WAVES = 3
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """All comparisons with what Mitsuba brings."""
+    """Make all comparisons with what Mitsuba brings."""
     _direct(study, quick)
     _gloss(study, quick)
+    _materials(study)
     study.text(
         "Lattices are compared with Mitsuba's box filter in antialiasing, the blur with its thinlens camera "
         "in depth-of-field."
@@ -205,9 +207,7 @@ def _shiny_spheres(alpha: float, width: int, height: int) -> dict[str, Any]:
     ]
     scene = dataclasses.replace(scene, spheres=tuple(spheres), planes=(), lights=())
     nodes = mrt.scene_dict(scene, width=width, height=height, fresnel="dielectric")
-    y, x = np.mgrid[:64, :128] / 64 * np.pi
-    waves = np.stack([1 + 0.8 * np.sin(WAVES * x + phase) * np.sin(y) for phase in (0, 2, 4)], axis=-1)
-    return {**nodes, "sky": {"type": "envmap", "bitmap": mi.Bitmap(waves.astype(np.float32))}}
+    return {**nodes, "sky": {"type": "envmap", "bitmap": mi.Bitmap(_waves())}}
 
 
 def _gloss(study: Study, quick: bool) -> None:
@@ -240,6 +240,80 @@ def _gloss(study: Study, quick: bool) -> None:
     names = ["mirror of mrt_whitted", *(f"path, alpha {alpha:g}" for alpha in alphas)]
     figure = gallery(dict(zip(names, found.pictures, strict=True)), columns=3)
     study.plot("gloss_pictures", "Gloss, and the mirror", figure)
+
+
+# ---------------------------------- Mitsuba's own materials and surfaces -----------------------------------
+
+
+def _materials(study: Study) -> None:
+    """What the report does not have: Mitsuba's integrators draw it alike, ray by ray."""
+    import mitsuba as mi
+
+    for name, (shapes, theirs, spp, limit) in _stock_scenes().items():
+        nodes = {**_view(), **shapes}
+        ours = {"type": "mrt_whitted", "clamp": False, "bounce_budget": "plain", "max_depth": 5}
+        images = [
+            mrt.render(mi.load_dict(nodes), integrator=i, spp=spp, seed=3, **approximations.AT_CENTRES).image
+            for i in (ours, theirs)
+        ]
+        off = np.abs(images[0] - images[1]).max(axis=-1) > limit * (1 + images[1].max(axis=-1))
+        why = f"by {limit:g} relative to 1 + value; measured 3 of 3072, at edges of what a mirror shows"
+        study.at_most(f"{name}: share of pixels off", off.mean(), 2e-3, why)
+        study.at_least(f"{name}: share of pixels to compare", (images[1] > 1e-3).any(axis=-1).mean(), 0.1)
+
+
+def _view() -> dict[str, Any]:
+    import mitsuba as mi
+
+    look = mi.ScalarTransform4f().look_at([0, -1, 5], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 64, "height": 48, "rfilter": {"type": "box"}}
+    return {"type": "scene", "sensor": {"type": "perspective", "fov": 40, "to_world": look, "film": film}}
+
+
+def _stock_scenes() -> dict[str, tuple[dict[str, Any], dict[str, Any], int, float]]:
+    """Return shapes, Mitsuba's integrator, rays a pixel, and the difference that counts, by name."""
+    import mitsuba as mi
+
+    turn = mi.ScalarTransform4f().translate([0, 1, 0]).rotate([1, 0, 0], -90).scale(3)  # seen from below
+    paper = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.6}}
+    lamp = {"type": "point", "position": [1, -2, 1], "intensity": 10.0}
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(_waves()), "scale": 1.0}
+    bulb = {"type": "sphere", "center": [0, -2, 2], "radius": 0.1}
+    bulb["emitter"] = {"type": "area", "radiance": 100.0}
+    direct: dict[str, Any] = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
+    bumps = {
+        "type": "bumpmap",
+        "texture": {"type": "bitmap", "bitmap": mi.Bitmap(0.5 * _waves())},
+        "scale": 0.4,
+    }
+    return {
+        "two-sided paper from behind": ({"paper": {"type": "rectangle", "to_world": turn, "bsdf": paper},
+                                         "lamp": lamp}, direct, 1, 1e-5),
+        "a smooth mirror": ({"mirror": {**_smooth_ball(), "bsdf": {"type": "conductor"}}, "sky": sky},
+                            {"type": "path", "max_depth": 6, "rr_depth": 100}, 1, 5e-3),
+        "a bumpy ball": ({"ball": {"type": "sphere", "bsdf": {**bumps, "bsdf": {"type": "diffuse"}}},
+                          "lamp": lamp}, direct, 1, 1e-4),
+        "an area light": ({"ball": {"type": "sphere", "bsdf": {"type": "diffuse"}}, "bulb": bulb},
+                          direct, 16, 1e-5),
+    }  # fmt: skip
+
+
+def _waves() -> np.ndarray:
+    y, x = np.mgrid[:64, :128] / 64 * np.pi
+    waves = [1 + 0.8 * np.sin(WAVES * x + phase) * np.sin(y) for phase in (0, 2, 4)]
+    return np.stack(waves, axis=-1).astype(np.float32)
+
+
+def _smooth_ball() -> dict[str, Any]:
+    """Return a coarse ball whose corners have the normals of a sphere."""
+    import mitsuba as mi
+
+    mesh = torus((0, 0, 0), 0.9, 0.5, report_scene(0).spheres[0].material, rings=16, sides=8)
+    around = mesh.vertices * [1, 1, 0]
+    middle = 0.9 * around / np.linalg.norm(around, axis=1, keepdims=True)
+    arrays = {"positions": mesh.vertices, "faces": mesh.faces, "normals": mesh.vertices - middle}
+    bitmaps = {name: mi.Bitmap(np.ascontiguousarray(a[np.newaxis])) for name, a in arrays.items()}
+    return {"type": "mrt_mesh", **bitmaps}
 
 
 def _curve(

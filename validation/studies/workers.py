@@ -157,7 +157,7 @@ def alphas(extent: Extent) -> list[float]:
 
 
 def same(a: Path, b: Path) -> bool:
-    """Whether two files hold the same picture and layers."""
+    """Return whether two files hold the same picture and layers."""
     one, other = read_exr(a), read_exr(b)
     pairs: list[tuple[Mapping[str, Any], Mapping[str, Any]]] = [
         ({"": one.image}, {"": other.image}),
@@ -170,7 +170,7 @@ def same(a: Path, b: Path) -> bool:
 
 
 def _overhead(folder: Path, count: int) -> float:
-    """Milliseconds of a job beyond what its render and its file take."""
+    """Return the milliseconds of a job beyond what its render and its file take."""
     few, spans = max(1, count // 10), []
     for number in (few, count):
         start = time.perf_counter()

@@ -111,7 +111,7 @@ def _without_clamp(spp: int, size: dict[str, Any]) -> Comparison:
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Every mistake must be found at the largest count, and none where there is none."""
+    """Check that every mistake is found at the largest count, and none where there is none."""
     counts = (4, 16) if quick else (4, 16, 64, 256)
     size: dict[str, Any] = {"width": 64, "height": 48} if quick else {"width": 120, "height": 90}
     with study.stage("Mutations", 1) as advance:

@@ -11,7 +11,7 @@ PARTS = (bsdf, geometry, transport, filters, finite)
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """All parts, each with its tables: reflectance, geometry, light transport, filters, finite results."""
+    """Run all parts, each with its tables: reflectance, geometry, light, filters, finite results."""
     with study.stage(TITLE, len(PARTS)) as advance:
         for part in PARTS:
             part.run(study, quick=quick)

@@ -40,6 +40,9 @@ BOUND = 5e-6
 # tan²/alpha², and those of the other factors
 BOUND_EVERYWHERE = 2e-5
 
+# G and F hold no exp: 16 and 24 roundings, three times what was measured
+BOUND_OF = {"g": (1e-6, 1.2e-6), "f": (1.5e-6, 2e-6)}
+
 FRESNEL_IORS = np.array(
     [
         *(1e-3, 1e-2, 0.1, 0.5, 0.9, 0.99, 1 - 1e-7, 1 + 1e-7, 1.0001),
@@ -60,7 +63,7 @@ class Errors:
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Errors of D, G, F, the whole, its density and gradient; heat maps; worst cases."""
+    """Measure errors of D, G, F, the whole, its density and gradient; heat maps; worst cases."""
     cases = Cases(study, "bsdf", "Reflectance")
     lobes, truth = lobes_with_truth(2 if quick else 12)
     angles = FresnelGrid.make(60 if quick else 600)
@@ -138,7 +141,7 @@ def _relative(found: Any, truth: np.ndarray) -> np.ndarray:
 
 
 def _wrong(lobes: Lobes, truth: Truth, angles: FresnelGrid) -> tuple[Lobes, Truth, FresnelGrid]:
-    """Alpha and index of refraction 1 in 30,000 too large."""
+    """Return alpha and index of refraction 1 in 30,000 too large."""
     factor = np.float32(1 + 1 / 30_000)
     lobes = replace(lobes, alpha=lobes.alpha * factor, ior=lobes.ior * factor)
     return lobes, truth, replace(angles, iors=angles.iors * factor)
@@ -149,6 +152,7 @@ def _hold(cases: Cases, lobes: Lobes, found: Sequence[Errors], wrong: Errors) ->
     for name, title in QUANTITIES.items():
         error, fault = (e.of[name] if name == "f" else e.of[name][lobes.in_bound] for e in (ours, wrong))
         least = "alpha and index 1 in 30,000 too large"
+        usual, everywhere = BOUND_OF.get(name, (BOUND, BOUND_EVERYWHERE))
         where = "cosines 1e-7 … 1, IOR 1e-3 … 1e6" if name == "f" else "alpha 1e-4 … 1, D ≥ 1e-7 of its peak"
         # the grid holds a thousand points and more, so that the 99.9th percentile is one of its last
         cases.at_most(
@@ -156,15 +160,15 @@ def _hold(cases: Cases, lobes: Lobes, found: Sequence[Errors], wrong: Errors) ->
             where,
             "a few roundings",
             np.quantile(error, 0.999),
-            BOUND,
+            usual,
             fault=(least, np.quantile(fault, 0.999)),
         )
         cases.at_most(
             f"{title}, largest",
             "the whole grid: alpha 1e-8 … 100, D ≥ 1e-20 of its peak",
-            "exp enlarges roundings by up to 46",
+            "a few roundings, which exp enlarges by up to 46",
             ours.of[name].max(),
-            BOUND_EVERYWHERE,
+            everywhere,
             fault=(least, wrong.of[name].max()),
         )
     for alpha in (1e-4, 1e-3):
@@ -200,7 +204,7 @@ def _conditioning(cases: Cases, lobes: Lobes) -> None:
 
 
 def _total_reflection(cases: Cases) -> None:
-    """Around the critical angle F ends in a square root: errors are those of g = 0, not of F."""
+    """Measure F around the critical angle, where it ends in a square root: errors are those of g = 0."""
     import mitsuba as mi
 
     iors = np.repeat(np.array([0.5, 0.9, 0.99, 0.9999], np.float32), 81)

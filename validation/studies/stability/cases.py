@@ -34,7 +34,7 @@ class Cases:
         *,
         fault: tuple[str, float] | None = None,
     ) -> None:
-        """A case whose figure must not exceed ``limit``."""
+        """Add a case whose figure must not exceed ``limit``."""
         least = fault[0] if fault else f"{limit:.3g}" if limit else "a single one"
         title = f"{self.title}: {name}"
         self._add(Bound(title, float(measured), float(limit), note=f"least fault: {least}"), what, expected)
@@ -42,11 +42,11 @@ class Cases:
             self.at_least(f"{name}, its fault", least, "seen", fault[1], 2 * limit or 1)
 
     def at_least(self, name: str, what: str, expected: str, measured: float, limit: float) -> None:
-        """A case whose figure must not be below ``limit``."""
+        """Add a case whose figure must not be below ``limit``."""
         self._add(Bound(f"{self.title}: {name}", float(measured), float(limit), False), what, expected)
 
     def beyond_float32(self, name: str, what: str, measured: float, why: str) -> None:
-        """A case that no float32 renderer can pass: its figure is shown, not held to anything."""
+        """Add a case that no float32 renderer can pass: its figure is shown, not held to anything."""
         self.rows.append((name, what, why, float(measured), "-", "cannot hold"))
 
     def close(self, note: str = "") -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from mrt_mitsuba import filters, runtime
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.validation.oracles import filters as loops
 from mrt_mitsuba.validation.studies.stability.cases import Cases
 from mrt_mitsuba.validation.tools.study import Study
 
@@ -29,7 +30,7 @@ EDGES: dict[str, Edges] = {
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """The table of cases, in both kinds of variants."""
+    """Make the table of cases, in both kinds of variants."""
     del quick  # all of it is quick
     cases = Cases(study, "filters", "Filters")
     import mitsuba as mi
@@ -180,6 +181,30 @@ def _no_focus() -> float:
     )
 
 
+def _loops(mode: str) -> float:
+    """Largest difference of a blur from float64 loops, with all amounts before and behind the focus."""
+    image, depth = _noise((30, 24)), _depths((30, 24))
+    amount = loops.blur_amount(depth, BLUR["focal_distance"], BLUR["focal_range"])
+    if mode == "report":
+        truth = loops.gaussian_dof(image, amount)
+    else:
+        near = (depth > 0) & (depth < BLUR["focal_distance"])
+        truth = loops.corrected_dof(image, np.where(near, -1, 1) * loops.disc_radius(amount))
+    return float(np.abs(_blurred(image, depth, mode) - truth).max())
+
+
+def _edge_loops() -> float:
+    """Pixels of luma and sobel that float64 loops decide otherwise, but for those on the threshold."""
+    image = np.repeat(np.repeat(_noise((10, 8)), 3, axis=0), 3, axis=1)
+    wrong = 0
+    for name in ("luma", "sobel"):
+        found, truth = (getattr(place, f"{name}_edges")(image) for place in (filters, loops))
+        wrong += int(((np.asarray(found.mask) != truth.mask) & (truth.margin > 1e-3)).sum())
+        off = np.abs(np.asarray(found.value) - truth.value) > 1e-5
+        wrong += int((off & (truth.margin > 1e-3)).sum())
+    return float(wrong)
+
+
 def _border() -> float:
     """Return the difference at the border, where nothing is blurred, between a picture and a part of it."""
     image, depth = _noise((40, 30)), np.full((40, 30), 2.0, np.float32)
@@ -245,6 +270,26 @@ def _raises_usage_error(call: Callable[[], Any]) -> bool:
 
 # One line for each case
 CASES = (
+    _Case(
+        "the report's blur",
+        "30×24, all amounts: largest difference from float64 loops",
+        "sums of 32 products",
+        lambda: _loops("report"),
+        1e-6,
+    ),
+    _Case(
+        "the corrected blur",
+        "the same",
+        "sums of 81 products, and quotients of them",
+        lambda: _loops("corrected"),
+        1e-6,
+    ),
+    _Case(
+        "edges",
+        "30×24 in patches: pixels that float64 loops decide otherwise, or see another value in",
+        "none",
+        _edge_loops,
+    ),
     _Case(
         "constant pictures, blur",
         "1×1 … 40×30, values 1e-25, 0.3, 1e30: relative change",

@@ -37,7 +37,7 @@ FRESNEL = ("schlick", "dielectric", "unity")
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Bulk evaluations with one in three numbers an extreme one; random scenes."""
+    """Check bulk evaluations with one in three numbers an extreme one; random scenes."""
     cases = Cases(study, "finite", "Finite and not negative")
     count = 10**6 if quick else 10**8
     for name, what, evaluate in BULK:
@@ -273,7 +273,7 @@ BULK: Sequence[tuple[str, str, Callable[[_Draw], Any]]] = (
 
 
 def _random_scenes(cases: Cases, count: int) -> None:
-    """Random scenes of extreme objects, materials and lights."""
+    """Check random scenes of extreme objects, materials and lights."""
     bad = 0
     for seed in range(count):
         described = _random_scene(np.random.default_rng(seed)).to_dict(

@@ -101,15 +101,16 @@ PATHS: Sequence[Path] = (
     Path("light on the ball", "its top", _lit((0, 1, 0)), _lit((0, 1.01, 0)), 5e-6),
     Path("light at 1e6", "parallel light", _lit((4e5, 6e5, 7e5)), _lit((4.001e5, 6e5, 7e5))),
     Path("light at the camera", "no shadow", _lit(CAMERA.position), _lit((0.2, 0.501, 3))),
-    Path("black", "Kd = Ks = 0", _ball(specular=(0,) * 3, diffuse=(0,) * 3), _ball(specular=(1e-3,) * 3)),
+    Path("black", "Kd = Ks = 0", _ball(specular=(0,) * 3, diffuse=(0,) * 3),
+         _ball(specular=(1e-3,) * 3), 3e-7),
     Path("over-bright", "Kd 5, Ks 3", _ball(specular=(3,) * 3, diffuse=(5,) * 3),
          _ball(specular=(3,) * 3, diffuse=(5.001,) * 3), PLAIN, OPEN),
     Path("diffuse", "Kd 0.3, 0.2, 0.1", BASE, _ball(diffuse=(0.3001, 0.2, 0.1))),
-    Path("roughness 0", "acts as 1e-8", _highlight(0.0), _highlight(1e-3), truth=_highlight(1e-8)),
+    Path("roughness 0", "acts as 1e-8", _highlight(0.0), _highlight(1e-3), 1e-9, truth=_highlight(1e-8)),
     Path("roughness 1e-3", "its highlight from near by", _highlight(1e-3), _highlight(1.001e-3), 3e-4, OPEN),
     Path("roughness 100", "a lobe of 1e-5", _flat(100.0), _flat(99.0), PLAIN, OPEN),
     Path("negative roughness", "alpha -0.4", _shiny(alpha=-0.4), _shiny(alpha=0.4), 5e-6, OPEN),
-    Path("index just above 1", "1 + 1e-7", _shiny(ior=1.0000001), _shiny(ior=1.005)),
+    Path("index just above 1", "1 + 1e-7", _shiny(ior=1.0000001), _shiny(ior=1.005), 3e-7),
     Path("index 1e6", "a metal", _shiny(ior=1e6), _shiny(ior=1e4), 1e-5),
     Path("index 0.95", "total reflection at grazing angles", _shiny(ior=0.95), _shiny(ior=0.9501), 5e-6),
     Path("no lights", "mirrors of the sky", replace(BASE, lights=()),
@@ -120,7 +121,7 @@ PATHS: Sequence[Path] = (
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Every case against the float64 tracer, sums over bounces in closed form, whole renders."""
+    """Check every case against the float64 tracer, sums over bounces in closed form, whole renders."""
     cases = Cases(study, "transport", "Light transport")
     rows = [_case(cases, path) for path in PATHS]
     _bounces(cases, (1, 3, 10) if quick else range(1, 11))
@@ -184,7 +185,7 @@ def _render(scene: Scene, *, fresnel: str, clamp: bool) -> np.ndarray:
 
 
 def _bounces(cases: Cases, depths: Sequence[int]) -> None:
-    """A ray to and fro between two mirrors: the geometric sum of what both send back."""
+    """Check a ray to and fro between two mirrors: the geometric sum of what both send back."""
     import mitsuba as mi
 
     before = mi.variant()
