@@ -148,7 +148,7 @@ def test_library_without_version_in_its_name_is_asked(
         source += f"void LLVMGetVersion(unsigned *a, unsigned *b, unsigned *c) {{ {assignments} }}\n"
     (tmp_path / "llvm.c").write_text(source)
     mine = tmp_path / "libLLVM.so"
-    subprocess.run(["cc", "-shared", "-fPIC", "-o", mine, tmp_path / "llvm.c"], check=True)
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", mine, tmp_path / "llvm.c"], check=True, timeout=60)
     choice = llvm.choose({llvm.VARIABLE: str(mine)}, [], [])
     assert (choice.path == str(mine)) is chosen
     if chosen:

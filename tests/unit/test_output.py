@@ -158,11 +158,7 @@ def make_bad_target(kind: str, folder: Path) -> Path:
 def test_target_that_cannot_be_written(tmp_path: Path, image: np.ndarray, kind: str, reason: str) -> None:
     path = make_bad_target(kind, tmp_path)
     before = sorted(tmp_path.rglob("*"))
-    for attempt in (
-        check_target,
-        lambda p: output.write_png(p, image),
-        lambda p: output.write_exr(p, image),
-    ):
+    for attempt in (check_target, lambda p: output.write_png(p, image), lambda p: output.write_exr(p, image)):
         with pytest.raises(OutputError, match=f"(?i)cannot write .*{reason}"):
             attempt(path)
     assert sorted(tmp_path.rglob("*")) == before
