@@ -32,7 +32,7 @@ _WHY = {
     "not-asked-for": "not asked for",
     "noise": "rounds go where the variance is",
     "linear-rgb": "pictures are linear sRGB, whose luminance or XYZ follow",
-    "spectrum": "the picture is the colour of the spectrum that the film sees",
+    "spectrum": "the picture is the colour of the spectrum that the film sees, and rounds go by it",
     "one-sequence": "rounds continue one sequence of numbers in each pixel",
     "lattice": "the lattice that was asked for places and averages samples",
     "arrays": "a scalar variant traces a lattice, ray by ray",
@@ -47,6 +47,7 @@ class FilmFacts:
     sampler: str  #: its class
     rfilter: str  #: class of the reconstruction filter
     pixel_format: str  #: "rgb", "rgba", "luminance", ...; "" for a film of another kind
+    bands: tuple[str, ...] = ()  #: of its spectrum
     aovs: tuple[str, ...] = ()  #: channels of the integrator's own
 
 
@@ -142,8 +143,8 @@ class Plan(RenderFacts):
         channels = layers.channels(self.traced | self.layers)
         if self.lattice.kind == FILM:
             # sums by pixel, in double precision, while a film is exposed
-            aovs = len(self.film.aovs) if self.film else 0
-            channels += (ROUND_CHANNELS if ROUNDS in self.steps else 16) + 5 * aovs
+            more = len(self.film.bands + self.film.aovs) if self.film else 0
+            channels += (ROUND_CHANNELS if ROUNDS in self.steps else 16) + 5 * more
         return channels
 
     @property
@@ -333,8 +334,8 @@ def _film_left_out(facts: RenderFacts, settings: RenderSettings) -> list[Omissio
     left_out = []
     if film.pixel_format.startswith("xyz"):
         left_out.append(Omission(f"pixel format {film.pixel_format}", "linear-rgb"))
-    if not film.pixel_format:
-        left_out.append(Omission("spectral bands of the film", "spectrum"))
+    if film.bands:
+        left_out.append(Omission(f"{', '.join(film.bands)} in the picture, only as layers", "spectrum"))
     if settings.aamode == NOISE:
         left_out.append(Omission(film.sampler, "one-sequence"))
     return left_out
