@@ -52,7 +52,7 @@ class Levels:
         change = _squares(self._image, self._coarser)
         near = box_mean(change, 1)  # a pixel may change little by chance, its neighbours less likely
         order = np.argsort(near, axis=None)
-        # of the sharp picture, whose changes a blur makes smaller
+        # changes of the sharp picture count, which a blur makes smaller
         allowed = change.sum() * ((target or 0.0) / max(self.error().rmse, 1e-30)) ** 2 / 2
         noisy = np.zeros(self._aa.size, bool)
         noisy[order[np.searchsorted(np.cumsum(near.flat[order]), allowed) :]] = True

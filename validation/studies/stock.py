@@ -251,7 +251,7 @@ def _gloss(study: Study, quick: bool) -> None:
 
 
 def _materials(study: Study) -> None:
-    """What the report does not have: Mitsuba's integrators draw it alike, ray by ray."""
+    """Check what the report does not have: Mitsuba's integrators draw it alike, ray by ray."""
     import mitsuba as mi
 
     for name, (shapes, theirs, spp, limit) in _stock_scenes().items():
