@@ -96,8 +96,8 @@ def check_scene(
 ) -> SceneCheck:
     """Check every BSDF, shape and emitter of a scene, and hunt for pixels that are not finite.
 
-    ``scene`` and ``options`` (such as ``integrator``) are those of ``render``. Of many plugins of one kind,
-    some are checked. Raises ``SceneError`` or ``UsageError`` for a scene that cannot be opened.
+    ``scene`` and ``options`` (such as ``integrator``) are those of ``render``. Only some
+    of many plugins of one kind are checked. Raises ``SceneError`` or ``UsageError`` for a scene that cannot be opened.
     """
     runtime.use()
     source = open_scene(scene, **options)
