@@ -97,7 +97,8 @@ def check_scene(
     """Check every BSDF, shape and emitter of a scene, and hunt for pixels that are not finite.
 
     ``scene`` and ``options`` (such as ``integrator``) are those of ``render``. Only some
-    of many plugins of one kind are checked. Raises ``SceneError`` or ``UsageError`` for a scene that cannot be opened.
+    of many plugins of one kind are checked. Raises ``SceneError`` or ``UsageError`` where the scene does not
+    open.
     """
     runtime.use()
     source = open_scene(scene, **options)
