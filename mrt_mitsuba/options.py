@@ -168,6 +168,17 @@ def anything() -> Kind:
     return Kind("", "anything", str, lambda value: value)
 
 
+def function() -> Kind:
+    """Return the kind of what can be called."""
+
+    def check(value: Any) -> Any:
+        if not callable(value):
+            raise ValueError
+        return value
+
+    return Kind("", "a function", str, check)
+
+
 def rectangle() -> Kind:
     """Return the kind of rectangles: column and row of the first pixel, width and height."""
 
@@ -232,10 +243,10 @@ def option(default: Any, kind: Kind, text: str = "", shown: str | None = None) -
 def checked(field: dataclasses.Field[Any], value: Any) -> Any:
     """Return a value from Python as the field holds it; raise ``UsageError`` if it is not allowed.
 
-    None passes where it is the default.
+    The default passes as it is.
     """
-    if value is None and field.default is None:
-        return None
+    if value is field.default:
+        return value
     return check(field.name, field.metadata["kind"], value)
 
 

@@ -61,6 +61,8 @@ class Hit:
 class SceneReading:
     """The objects of a scene, sorted by who traces them, and the facts about them."""
 
+    facts: SceneFacts
+
     def __init__(self, scene: mi.Scene, before: SceneReading | None = None) -> None:
         """Read a scene; what has not changed since ``before`` is taken from there."""
         # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed
@@ -85,7 +87,7 @@ class SceneReading:
         materials = uniform_materials(self.shapes, read)
         self.unmergeable = materials if isinstance(materials, Reason) else None
         self.materials = {} if isinstance(materials, Reason) else materials
-        self.facts = self._read_facts()
+        self.facts = self._read_facts(self._touching(before))
 
     def is_of(self, scene: mi.Scene) -> bool:
         """Return whether this scene was read.
@@ -109,6 +111,13 @@ class SceneReading:
     def _moving(self) -> list[bool]:
         return [s.moving_frame() is not None for s in self.quadrics]
 
+    def _touching(self, before: SceneReading | None) -> bool:
+        """Return whether a point light is on a surface."""
+        self.places = list(filter(None, map(partial(self.notes.read, place), self.lights[:MOST_EMITTERS])))
+        if before and self.same_shapes(before) and self.places == before.places:
+            return before.facts.touching
+        return any_touching(self.shapes, self.places)
+
     def _lights(self) -> list[Any]:
         pairs = zip(self.emitters, self.brightness, strict=True)
         return [e for e, value in pairs if not e.is_environment() and value != 0]
@@ -116,14 +125,13 @@ class SceneReading:
     def _read_of_bsdfs(self, function: Callable[[Any], Any]) -> list[Any]:
         return [self.notes.read(function, b) for b in self.bsdfs]
 
-    def _read_facts(self) -> SceneFacts:
+    def _read_facts(self, touching: bool) -> SceneFacts:
         quadrics: Counter[str] = Counter()
         for table in self._tables:
             quadrics[table.kind] += len(table.rows)
         delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
         read, largest = self.notes.read, dict(zip(map(id, self.emitters), self.brightness, strict=True))
         surfaces = [largest[id(e)] for e in self.lights if mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
-        of_lights = [read(place, e) for e in self.lights[:MOST_EMITTERS]]
         return SceneFacts(
             vectorised=is_jit(),
             native_shapes=len(self.native),
@@ -140,7 +148,7 @@ class SceneReading:
             arriving=sum(arriving(e, largest[id(e)]) for e in self.lights),
             emission=max(surfaces, default=0.0),
             alone=self._alone(),
-            touching=any_touching(self.shapes, [p for p in of_lights if p is not None]),
+            touching=touching,
             value=max(self._read_of_bsdfs(_value_bound), default=0.0),
             diffuse=self._has_lobe("diffuse"),
             specular=self._has_lobe("specular"),
@@ -175,6 +183,7 @@ class SceneData:
     quadrics: Any
     errors: HitErrors
     spheres: Spheres | None
+    lights: Lights
 
     def __init__(self, reading: SceneReading, plan: KernelPlan, before: SceneData | None = None) -> None:
         self.reading, self.facts = reading, reading.facts
@@ -184,7 +193,11 @@ class SceneData:
                 setattr(self, name, getattr(before, name))
         else:
             self._trace_shapes(plan)
-        self.lights = Lights(reading.lights, reading.numbers, plan.lights)
+        self.lights = (
+            before.lights
+            if before and self._same_lights(before)
+            else Lights(reading.lights, reading.numbers, plan.lights)
+        )
         self.environment = reading.environment
         self.merged = MergedBSDF(reading.shapes, reading.materials) if plan.merged else None
         parts = self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged
@@ -192,6 +205,11 @@ class SceneData:
         self.ray_flags = ray_flags(
             textures=plan.textures, shading_frames=plan.shading_frames, tangents=plan.tangents
         )
+
+    def _same_lights(self, before: SceneData) -> bool:
+        now, then = self.reading, before.reading
+        same = (now.lights, now.numbers, self.plan.lights) == (then.lights, then.numbers, before.plan.lights)
+        return same and now.numbers is not None
 
     def _trace_shapes(self, plan: KernelPlan) -> None:
         reading = self.reading
@@ -218,7 +236,7 @@ class SceneData:
 
     @property
     def form(self) -> Hashable:
-        """What shapes the code of the kernels, ``arrays`` being their data."""
+        """Return what shapes the code of the kernels, ``arrays`` being their data."""
         return replace(self.plan, cut_off=CutOff(0.0, self.plan.cut_off.lights))
 
     def arrays(self, scene: mi.Scene) -> list[Any] | None:

@@ -60,12 +60,7 @@ def blur_amount(depth: Any, *, focal_distance: float | None, focal_range: float 
 
 
 def gaussian_dof(
-    image: Any,
-    depth: Any,
-    *,
-    focal_distance: float | None,
-    focal_range: float = 2.0,
-    mode: str = "report",
+    image: Any, depth: Any, *, focal_distance: float | None, focal_range: float = 2.0, mode: str = "report"
 ) -> Any:
     """Return the picture as a lens focused at a distance would show it, [H, W, 3] float32.
 
@@ -209,9 +204,11 @@ class _Taps:
 
     def pixels(self, grid: Grid) -> Any:
         """Return the indices of all pixels in any of the lines, in ascending order."""
-        dr.eval(self._first, self._count)
         touched = dr.zeros(grid.Bool, grid.count)
-        for step in range(dr.width(self._weights)):
-            j = dr.opaque(grid.Int, step)  # every step is a launch of its own, of the same kernel
+
+        def mark(j: Any, none: Sequence[Any]) -> Sequence[Any]:
             dr.scatter(touched, grid.Bool(True), self._index(j), active=j < self._count)
+            return none
+
+        grid.accumulate(dr.width(self._weights), [], mark)
         return grid.Int(dr.compress(touched))

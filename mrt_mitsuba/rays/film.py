@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Hashable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba.rays.divisor import Divisor
 
-LUMINANCE = np.array([0.212671, 0.715160, 0.072169])  # of linear sRGB, as in Mitsuba
 STEPS = 32  # of a pixel, where integrals over a filter are summed
 
 
@@ -26,6 +26,7 @@ class Film:
     reach: int  #: pixels on either side to which a ray contributes
     alpha: bool  #: does it keep the coverage
     grey: bool  #: does it keep the luminance only
+    bands: tuple[str, ...]  #: names of its spectral bands, if it has such
 
     @classmethod
     def of(cls, sensor: Any) -> Film:
@@ -38,9 +39,8 @@ class Film:
         border = int(rfilter.border_size()) if film.sample_border() else 0
         width, height = (int(n) + 2 * border for n in film.crop_size())
         alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        return cls(
-            sensor, width, height, border, reach, alpha, pixel_format(film) in ("luminance", "y", "ya")
-        )
+        grey = pixel_format(film) in ("luminance", "y", "ya")
+        return cls(sensor, width, height, border, reach, alpha, grey, spectral_bands(film))
 
     @property
     def pixels(self) -> int:
@@ -61,9 +61,16 @@ class Film:
         """Return a picture [H, W] with the film's border around it, of one value."""
         return np.pad(picture, self.border, constant_values=value)
 
-    def toned(self, colors: np.ndarray) -> np.ndarray:
-        """Return colours [..., 3] as the film keeps them."""
-        return np.repeat(colors @ LUMINANCE[:, None], 3, axis=-1) if self.grey else colors
+    def toned(self, color: Any) -> Any:
+        """Return linear sRGB as the film keeps it."""
+        import mitsuba as mi
+
+        return mi.Color3f(mi.luminance(mi.Color3f(color))) if self.grey else color
+
+    def banded(self, spectrum: Any, wavelengths: Any) -> list[Any]:
+        """Return what each spectral band measures of a radiance."""
+        measured = self.sensor.film().prepare_sample(spectrum, wavelengths, len(self.bands) + 1)
+        return list(measured[: len(self.bands)])  # without the weight
 
     def rays_near(self, count: int) -> int:
         """Return the number of rays a pixel that the scene's sampler makes of a number."""
@@ -71,18 +78,29 @@ class Film:
         sampler.set_sample_count(count)
         return int(sampler.sample_count())
 
-    def rays(self, pixel: Any, sampler: Any) -> tuple[Any, Any, Any]:
+    @property
+    def form(self) -> Hashable | None:
+        """Return what shapes the code of ``rays``, all else being data; None where that is not known."""
+        if self.sensor.shutter_open_time() > 0 or self.bands:
+            return None
+        return self.sensor.shutter_open(), self.grey
+
+    def numbers(self) -> Numbers:
+        """Return the data of ``rays``."""
+        import mitsuba as mi
+
+        return _opaque_numbers(self.width, self.height, self.border, mi.variant())
+
+    def rays(self, pixel: Any, sampler: Any, numbers: Numbers) -> tuple[Any, Any, Any]:
         """Return places in the film's pixels, in pixels, and rays through them with their weights.
 
         Draws from the sampler what Mitsuba's integrators draw, in their order.
         """
-        import drjit as dr
         import mitsuba as mi
 
-        row, column = Divisor.opaque(self.width).divide(pixel)
+        row, column = numbers.width.divide(pixel)
         place = mi.Point2f(mi.Float(column), mi.Float(row)) + sampler.next_2d()
-        size = [float(n - 2 * self.border) for n in (self.width, self.height)]
-        inside = (place - dr.opaque(mi.Float, self.border)) / dr.opaque(mi.Vector2f, size)
+        inside = (place - numbers.border) / numbers.size
         sensor, time = self.sensor, mi.Float(self.sensor.shutter_open())
         aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         if sensor.shutter_open_time() > 0:
@@ -120,7 +138,7 @@ class Film:
 
     def spread_out(self, variance: np.ndarray) -> np.ndarray:
         """Return the variance [..., H, W] of pixels, up to a factor, given that of the rays in each."""
-        for axis in (-2, -1):
+        for axis in (-2, -1) if self.reach else ():
             padding = [(0, 0)] * variance.ndim
             padding[axis] = (self.reach, self.reach)
             windows = np.lib.stride_tricks.sliding_window_view(
@@ -128,6 +146,24 @@ class Film:
             )
             variance = windows @ self.spread
         return variance
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The size of a film as the kernel has it."""
+
+    width: Divisor
+    border: Any
+    size: Any  #: of the picture, in pixels
+
+
+@lru_cache(maxsize=16)
+def _opaque_numbers(width: int, height: int, border: int, variant: str) -> Numbers:
+    import drjit as dr
+    import mitsuba as mi
+
+    size = [float(n - 2 * border) for n in (width, height)]
+    return Numbers(Divisor.opaque(width), dr.opaque(mi.Float, border), dr.opaque(mi.Vector2f, size))
 
 
 class Canvas:
@@ -163,6 +199,16 @@ class Canvas:
         sums = np.asarray(self.block.tensor(), np.float64)
         sums = sums.reshape(self.pictures, self.rows, self.film.width, -1)
         return sums[:, self.film.reach : self.film.reach + self.film.height]
+
+
+def spectral_bands(film: Any) -> tuple[str, ...]:
+    """Return the names of a film's spectral bands, in its order; nothing for one that keeps colours."""
+    import mitsuba as mi
+
+    if not mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        return ()
+    film.prepare([])  # it knows its channels from then on
+    return tuple(field.name for field in film.bitmap().struct_())
 
 
 def pixel_format(film: Any) -> str:

@@ -36,14 +36,18 @@ def _sampler_class(variant: str) -> type:
             """Turn to the rays ``first`` to ``first + count - 1``."""
             self.start_at(seed, dr.arange(mi.UInt64, count) + dr.opaque(mi.UInt64, first))
 
-        def start_at(self, seed: int, number: Any) -> None:
-            """Turn to the rays of these numbers, or of this one in scalar variants."""
+        def start_at(self, seed: Any, number: Any) -> None:
+            """Turn to the rays of these numbers, or of this one in scalar variants.
+
+            ``seed``: a number, or an array of one.
+            """
             if mi.variant().startswith("scalar"):
                 seed = (seed + (number >> 32) * _STRIDE) % 2**32
                 state, sequence = mi.sample_tea_32(seed, number % 2**32)
             else:
-                mi.Sampler.seed(self, seed, dr.width(number))
-                start = dr.opaque(mi.UInt32, seed) + mi.UInt32(number >> 32) * _STRIDE
+                mi.Sampler.seed(self, 0, dr.width(number))  # which only notes how many there are
+                seed = seed if dr.is_array_v(seed) else dr.opaque(mi.UInt32, seed)
+                start = seed + mi.UInt32(number >> 32) * _STRIDE
                 state, sequence = mi.sample_tea_32(start, mi.UInt32(number))
             self.random = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from mrt_mitsuba.memory import Workspace
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.divisor import Divisor
-from mrt_mitsuba.rays.film import Canvas, Film
+from mrt_mitsuba.rays.film import Canvas, Film, Numbers
 from mrt_mitsuba.rays.sampler import ray_sampler
 from mrt_mitsuba.rays.sequence import pixel_sequence
 from mrt_mitsuba.rendering.shading import Shader, components
@@ -87,7 +88,9 @@ class Stack:
 
     def widened(self, groups: np.ndarray) -> np.ndarray:
         """Return numbers of groups [pictures, pixels], one at least wherever the filter reaches from."""
-        near = np.stack([box_mean(chosen > 0, self.film.reach) > 0 for chosen in self.rows(groups)])
+        if not self.film.reach:
+            return groups
+        near = box_mean(self.rows(groups) > 0, self.film.reach, (1, 2)) > 0
         return np.maximum(groups, near.reshape(groups.shape))
 
     def add(self, exposed: Exposed, chosen: np.ndarray) -> None:
@@ -120,16 +123,16 @@ def _divided(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.asarray(sums / np.where(weights == 0, 1, weights)[..., None])
 
 
-def box_mean(values: np.ndarray, reach: int) -> np.ndarray:
-    """Return the means [H, W, ...] over windows of 2 reach + 1 rows and columns, cut at the border."""
-    for axis in (0, 1):
-        values = np.moveaxis(values, axis, 0)
-        size = len(values)
-        sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, 0, dtype=np.float64)])
-        first = np.maximum(np.arange(size) - reach, 0)
-        last = np.minimum(np.arange(size) + reach + 1, size)
-        counts = (last - first).reshape(-1, *([1] * (values.ndim - 1)))
-        values = np.moveaxis((sums[last] - sums[first]) / counts, 0, axis)
+def box_mean(values: np.ndarray, reach: int, axes: tuple[int, ...] = (0, 1)) -> np.ndarray:
+    """Return the means over windows of 2 reach + 1 values along axes, cut at the border."""
+    for axis in axes:
+        sums = np.moveaxis(np.cumsum(values, axis, dtype=np.float64), axis, 0)
+        place = np.arange(len(sums))
+        last, before = np.minimum(place + reach, len(sums) - 1), np.maximum(place - reach - 1, -1)
+        means = sums[last]
+        means[reach + 1 :] -= sums[: max(len(sums) - reach - 1, 0)]
+        means /= (last - before).reshape(-1, *([1] * (sums.ndim - 1)))
+        values = np.moveaxis(means, 0, axis)
     return values
 
 
@@ -146,10 +149,10 @@ class Exposer:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Channels of the picture: R, G, B, A where the film has it, the integrator's own and the layers'."""
+        """Channels of the picture: R, G, B, those that the film and the integrator have, and the layers'."""
         alpha = ("A",) if self.film.alpha else ()
         layers = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
-        return ("R", "G", "B", *alpha, *self.shader.aovs, *layers)
+        return ("R", "G", "B", *alpha, *self.film.bands, *self.shader.aovs, *layers)
 
     def expose(
         self,
@@ -176,10 +179,11 @@ class Exposer:
         step = max(1, self.workspace.rays_at_once(2 * len(self.names)) // groups.size)
         for start in range(0, len(pixel), step):
             part, own = groups.part(start, start + step), pixel[start : start + step]
-            lanes = self._lanes(part, seed, start, progressive)
-            planes = self._trace(part, lanes, canvas, kept, moments)
+            planes = self._wavefront(part, _Start(seed, start, progressive), canvas, kept, moments)
+            starts = np.flatnonzero(np.diff(own, prepend=-1))  # of the groups of each pixel
             for row, plane in zip(total, planes, strict=False):
-                row[own[0] : own[-1] + 1] += np.bincount(own - own[0], np.broadcast_to(plane, own.shape))
+                plane = np.broadcast_to(plane, own.shape)
+                row[own[starts]] += np.add.reduceat(plane, starts, dtype=np.float64)
             self._count("primary", len(own) * groups.size)
             for kind, plane in zip(self._counted.values(), planes[len(total) :], strict=True):
                 self._count(kind, round(np.sum(np.asarray(plane), dtype=np.float64)))
@@ -202,48 +206,76 @@ class Exposer:
     def _count(self, kind: str, number: int) -> None:
         self.rays[kind] = self.rays.get(kind, 0) + number
 
-    def _lanes(self, groups: Groups, seed: int, before: int, progressive: bool) -> _Lanes:
-        """Return the rays of a wavefront, ``before`` groups having been traced."""
-        import drjit as dr
-        import mitsuba as mi
-
-        rays = len(groups) * groups.size
-        group, number = Divisor.opaque(groups.size).divide(dr.arange(mi.UInt32, rays))
-        pixel = dr.gather(mi.UInt32, mi.UInt32(groups.pixels), group)
-        picture = dr.gather(mi.UInt32, mi.UInt32(groups.pictures), group)
-        own = self.film.sensor.sampler()
-        if progressive:
-            sampler = pixel_sequence()
-            first = dr.gather(mi.UInt32, mi.UInt32(groups.first), group)
-            key = pixel + picture * dr.opaque(mi.UInt32, self.film.pixels)
-            sampler.start(first + number, mi.sample_tea_32(key, dr.opaque(mi.UInt32, seed))[0])
-        elif own.class_name() == "IndependentSampler":
-            sampler = ray_sampler()
-            # numbered as Mitsuba numbers the rays of a whole picture
-            number = mi.UInt64(pixel) * dr.opaque(mi.UInt64, groups.size) + mi.UInt64(number)
-            sampler.start_at(seed, number)
-        else:
-            sampler = own.clone()
-            sampler.set_sample_count(groups.size)
-            sampler.set_samples_per_wavefront(groups.size)
-            sampler.seed((seed + before) % 2**32, rays)
-        return _Lanes(group, pixel, picture, sampler)
-
-    def _trace(
-        self, groups: Groups, lanes: _Lanes, canvas: Canvas | None, kept: int, moments: bool
+    def _wavefront(
+        self, groups: Groups, start: _Start, canvas: Canvas | None, kept: int, moments: bool
     ) -> list[Any]:
         """Trace a wavefront onto the canvas; return sums over each group of the first ``kept`` channels, of
         squared colours, and of numbers of rays."""
         import drjit as dr
+
+        data = _Data.of(groups, start.seed, self.film)
+        form = groups.size, len(groups), kept, moments, self.film.form, *self.names
+
+        def trace() -> list[Any]:
+            return self._trace(groups, self._lanes(groups, data, start), data, canvas, kept, moments)
+
+        # numbered rays of a film without a canvas, which would be written to
+        known = canvas is None and not start.progressive and self._independent and self.film.form is not None
+        sums = self.shader.replayed(self.view, form, self.layers, data, trace) if known else trace()
+        dr.eval(sums)
+        return sums
+
+    @property
+    def _independent(self) -> bool:
+        return bool(self.film.sensor.sampler().class_name() == "IndependentSampler")
+
+    def _lanes(self, groups: Groups, data: _Data, start: _Start) -> _Lanes:
+        """Return the rays of a wavefront."""
+        import drjit as dr
         import mitsuba as mi
 
-        place, ray, weight = self.film.rays(lanes.pixel, lanes.sampler)
+        rays = len(groups) * groups.size
+        group, number = data.group.divide(dr.arange(mi.UInt32, rays))
+        pixel = dr.gather(mi.UInt32, data.pixels, group)
+        picture = dr.gather(mi.UInt32, data.pictures, group)
+        if start.progressive:
+            sampler = pixel_sequence()
+            first = dr.gather(mi.UInt32, mi.UInt32(groups.first), group)
+            key = pixel + picture * dr.opaque(mi.UInt32, self.film.pixels)
+            sampler.start(first + number, mi.sample_tea_32(key, data.seed)[0])
+        elif self._independent:
+            sampler = ray_sampler()
+            # numbered as Mitsuba numbers the rays of a whole picture
+            number = mi.UInt64(pixel) * data.size + mi.UInt64(number)
+            sampler.start_at(data.seed, number)
+        else:
+            sampler = self.film.sensor.sampler().clone()
+            sampler.set_sample_count(groups.size)
+            sampler.set_samples_per_wavefront(groups.size)
+            sampler.seed((start.seed + start.before) % 2**32, rays)
+        return _Lanes(group, pixel, picture, sampler)
+
+    def _trace(
+        self,
+        groups: Groups,
+        lanes: _Lanes,
+        data: _Data,
+        canvas: Canvas | None,
+        kept: int,
+        moments: bool,
+    ) -> list[Any]:
+        import drjit as dr
+        import mitsuba as mi
+
+        place, ray, weight = self.film.rays(lanes.pixel, lanes.sampler, data.film)
         if self.view.motion is not None:
             ray = self.view.moved(ray, lanes.sampler.next_1d())
         values = self.shader.values(self.view, ray, weight, lanes.sampler)
-        channels = [mi.Float(c) for c in values.image]
+        channels = [mi.Float(c) for c in self.film.toned(values.image)]
         if self.film.alpha:
             channels.append(dr.select(values.valid, mi.Float(1), 0))
+        if self.film.bands:
+            channels += self.film.banded(values.spectrum, ray.wavelengths)
         channels += values.aovs
         layers = {name: TABLE[name].value(values) for name in self.layers}
         channels += [mi.Float(c) for value in layers.values() for c in components(value)]
@@ -255,9 +287,44 @@ class Exposer:
             dr.eval(planes, canvas.block.tensor())
         else:
             dr.eval(planes)  # block_reduce would evaluate each plane by itself, in a kernel of its own
-        sums = [dr.block_reduce(dr.ReduceOp.Add, plane, groups.size) for plane in planes]
-        dr.eval(sums)
-        return sums
+        return [dr.block_reduce(dr.ReduceOp.Add, plane, groups.size) for plane in planes]
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Where the random numbers of a wavefront begin."""
+
+    seed: int
+    before: int  #: groups that were traced already
+    progressive: bool  #: continue the sequences of the pixels
+
+
+@dataclass(frozen=True)
+class _Data:
+    """The groups of a wavefront and the film as the kernel has them: a PyTree of its data."""
+
+    pixels: Any
+    pictures: Any
+    seed: Any
+    group: Divisor  #: size of a group, to divide by
+    size: Any  #: of a group
+    film: Numbers
+
+    @classmethod
+    def of(cls, groups: Groups, seed: int, film: Film) -> _Data:
+        """Return the data of some groups."""
+        import mitsuba as mi
+
+        pixels, pictures = mi.UInt32(groups.pixels), mi.UInt32(groups.pictures)
+        return cls(pixels, pictures, *_opaque(seed, groups.size, mi.variant()), film.numbers())
+
+
+@lru_cache(maxsize=64)
+def _opaque(seed: int, size: int, variant: str) -> tuple[Any, Divisor, Any]:
+    import drjit as dr
+    import mitsuba as mi
+
+    return dr.opaque(mi.UInt32, seed), Divisor.opaque(size), dr.opaque(mi.UInt64, size)
 
 
 @dataclass(frozen=True)

@@ -133,10 +133,7 @@ MISTAKES: dict[str, tuple[dict[str, Callable[..., Any]], set[str]]] = {
     "a fixed least distance": ({"hit": not_near}, {"surface", "watertight"}),
     "a box that is too small": ({"bbox": half}, {"bbox"}),
     "ray_test unlike ray_intersect": ({"test": lambda found, ray: found & (ray.d.x < 0.7)}, {"hits"}),
-    "maxt ignored": (
-        {"hit": deaf_to_its_limit, "test": lambda found, ray: found | (ray.maxt < 0)},
-        {"hits"},
-    ),
+    "maxt ignored": ({"hit": deaf_to_its_limit, "test": lambda found, ray: found | (ray.maxt < 0)}, {"hits"}),
     "hit point below the surface": ({"hit": changed(p=lambda si: si.p - 2e-3 * si.n)}, {"surface"}),
     "NaN along an axis": (
         {"hit": lambda si, ray: changed(uv=lambda si: dr.select(ray.d.x == 0, dr.nan, si.uv))(si, ray)},
@@ -191,5 +188,7 @@ def test_snippets_are_programs(capsys, tmp_path: Path) -> None:
 
 
 def test_wrong_usage() -> None:
+    with pytest.raises(mrt.SceneError, match=r'cannot load the mrt_cone: .*"apex" is missing'):
+        mrt.check_shape({"type": "mrt_cone"})
     with pytest.raises(mrt.UsageError, match="is not a shape"):
         mrt.check_shape(mi.load_dict({"type": "diffuse"}))

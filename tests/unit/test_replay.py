@@ -123,6 +123,9 @@ def test_sizes_options_scenes_and_variants_do_not_mix() -> None:
             {"integrator": {"type": "mrt_whitted", "max_depth": 2}},
             {"motion": [0.3, 0, 0], "motionsamples": 3},
             {"count_rays": True, "layers": ["bounces"]},
+            {"lattice": "film"},
+            {"lattice": "film", "aa": 2, "seed": 5},
+            {"lattice": "film", "aa": 2, "aamode": "sobel", "layers": ["direct", "depth"]},
         )
     ]
     truth = [anew(scenes[number], **options) for number, options in cases]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mrt_mitsuba.scene.loading import load_dict
 from mrt_mitsuba.validation.checks.law import Skip
 
 
@@ -41,6 +42,24 @@ class Recipe:
         if self.description is None:
             raise Skip("a loaded object was given: this needs the dict that it is made from")
         return mi.load_dict(_made(self.description))
+
+    def open(self) -> Any:
+        """Load it for the first time. Raises ``SceneError`` for a dict that is none of a plugin."""
+        return load_dict(_made(self.description), f"the {(self.description or {}).get('type', 'dict')}")
+
+    def scene(self) -> Any:
+        """Load a scene that holds the shape alone, or an instance with its group. Raises ``Skip`` as well."""
+        import mitsuba as mi
+
+        given = self.description or {}
+        groups = [
+            key for key, value in given.items() if isinstance(value, dict) and value["type"] == "shapegroup"
+        ]
+        if given.get("type") != "instance" or not groups:
+            return mi.load_dict({"type": "scene", "shape": self.load()})
+        reference = {"type": "ref", "id": "group"}
+        nodes = {"group": given[groups[0]], "shape": {**given, groups[0]: reference}}
+        return mi.load_dict({"type": "scene", **_made(nodes)})
 
     def with_(self, **changes: Any) -> Recipe:
         """Return a recipe with other values of some parameters."""

@@ -25,13 +25,14 @@ def check_shape(
     """Check the laws of a shape in the current variant: a dict for ``mi.load_dict``, or a loaded one.
 
     Any other object that has ``ray_intersect``, ``ray_test`` and ``bbox`` will do as well.
-    ``quick``: fewer rays. ``only``: names of ``LAWS``. Raises ``UsageError`` for anything else.
+    ``quick``: fewer rays. ``only``: names of ``LAWS``. Raises ``UsageError`` for anything else, and
+    ``SceneError`` for a dict that Mitsuba cannot load.
     """
     import mitsuba as mi
 
     runtime.use()
     recipe = Recipe.of(shape)
-    loaded = shape if recipe.description is None else recipe.load()
+    loaded = shape if recipe.description is None else recipe.open()
     if not all(hasattr(loaded, name) for name in ("ray_intersect", "ray_test", "bbox")):
         raise UsageError(
             f"{type(loaded).__name__} is not a shape of {mi.variant()}: give a dict or a loaded shape"
@@ -55,7 +56,7 @@ def bbox(law: Law, case: Case) -> None:
         except RuntimeError:
             law.notes.append("sample_position() is not there")
     p = np.concatenate(points)
-    out = np.maximum(case.low - p, p - case.high).max(axis=1) / case.size
+    out = np.maximum(case.box[0] - p, p - case.box[1]).max(axis=1) / case.size
     i = int(out.argmax())
     law.at_most(
         "points outside the bounding box, in sizes",
@@ -81,7 +82,7 @@ def variants(law: Law, case: Case) -> None:
     try:
         mi.set_variant(other)
         runtime.use(other)
-        there = trace(mi.load_dict({"type": "scene", "shape": case.recipe.load()}), o, d)
+        there = trace(case.recipe.scene(), o, d)
     except RuntimeError as problem:
         if "not found" not in str(problem):
             raise

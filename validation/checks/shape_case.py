@@ -78,12 +78,21 @@ class Case:
         self.target = self.shape
         if isinstance(self.shape, mi.Shape):
             name = self.shape.id()
-            self.target = mi.load_dict({"type": "scene", "shape": self.shape})
-            self.shape.set_id(name)  # which the scene has changed
+            if self.shape.class_name() == "Instance":
+                if self.recipe.description is None:
+                    raise UsageError("a loaded instance does not give its group away: give a dict of both")
+                self.target = self.recipe.scene()
+            else:
+                self.target = mi.load_dict({"type": "scene", "shape": self.shape})
+                self.shape.set_id(name)  # which the scene has changed
         box = self.shape.bbox()
         low, high = (np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max))
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (high >= low).all()):
             raise UsageError(f"the bounding box of the shape is {low} … {high}: it must be finite")
+        self.box = low, high  # as the shape has it, which may be wrong
+        ends = corners(self.shape)
+        if ends is not None:
+            low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
         self.low, self.high, self.middle = low, high, (low + high) / 2
         self.size = float(np.linalg.norm(high - low))
 

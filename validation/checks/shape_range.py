@@ -27,7 +27,8 @@ def scale(law: Law, case: Case) -> None:
     for power in (-20, -10, 10, 20):
         larger = np.diag([2.0**power] * 3 + [1]) @ matrix
         try:
-            shape = case.recipe.with_(to_world=mi.ScalarTransform4f(larger)).load()
+            recipe = case.recipe.with_(to_world=mi.ScalarTransform4f(larger))
+            shape = recipe.load()
         except RuntimeError as problem:
             raise Skip(
                 f"to_world is not accepted: {str(problem).strip().splitlines()[-1][:200]}"
@@ -36,8 +37,7 @@ def scale(law: Law, case: Case) -> None:
         grown = np.linalg.norm(np.ravel(np.array(box.max, np.float64) - np.array(box.min, np.float64)))
         if not np.isclose(grown, 2.0**power * case.size, rtol=1e-3):
             raise Skip("to_world does not scale all of it (of curves, the radius stays)")
-        target = mi.load_dict({"type": "scene", "shape": shape})
-        there = trace(target, (o * 2.0**power).astype(np.float32), d)
+        there = trace(recipe.scene(), (o * 2.0**power).astype(np.float32), d)
         bad = steep & (there.found != seen.found)
         law.none(
             f"rays answered otherwise at 2^{power} of the size",

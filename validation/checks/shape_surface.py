@@ -175,7 +175,7 @@ def _two_sides(law: Law, case: Case) -> None:
     """The normal is the surface's, not the ray's: the same for a ray that comes back from behind."""
     o, d, met = case.met
     back = case.behind
-    same = back.found & near(met.p, back.p)
+    same = back.found & near(met.p, back.p) & (back.part == met.part)
     if same.sum() > 20:
         law.share(
             "share of normals that turn where the same point is met from behind",
