@@ -7,6 +7,7 @@ meets both.
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -22,7 +23,6 @@ from mrt_mitsuba.validation.tools import small_renders
 
 # What any program on Mitsuba waits for: import, variant, one kernel
 BARE = """
-import os
 from mrt_mitsuba import llvm
 import mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
@@ -59,6 +59,8 @@ def waits(before: str | None, turns: int, cases: Sequence[str] | None = None) ->
         command = [sys.executable, "-m", "mrt_mitsuba.command.main", f"{folder}/out", "0", "quiet=1"]
         pair = lambda: _seconds(command), lambda: _seconds([sys.executable, "-c", BARE])
         found = [Waits.of(START, *_in_turns(pair, turns))]
+    if not names:
+        return found
     sides = [lambda: _small(sys.executable, names)]
     if before is not None:
         sides.append(lambda: _small(before, names))
@@ -82,8 +84,10 @@ def _in_turns(sides: Sequence[Callable[[], Any]], turns: int) -> list[list[Any]]
 
 
 def _seconds(command: Sequence[str]) -> float:
+    # as after installation: Python compiles a module once
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     start = time.perf_counter()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, timeout=600)
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, timeout=600, env=environment)
     return time.perf_counter() - start
 
 
