@@ -45,12 +45,23 @@ def generate(app: object) -> None:
     folder = HERE / "_generated"
     folder.mkdir(exist_ok=True)
     (folder / "options.inc.md").write_text(options_list())
+    (folder / "layers.inc.md").write_text(layers_table())
     gallery.build(folder)
     ledger.build(folder)
 
 
+def layers_table() -> str:
+    """Return the layers that can be asked for, as a table."""
+    from mrt_mitsuba.output import LAYERS
+
+    rows = [
+        f"| `{layer.name}` | {layer.letters} | {layer.doc} | {layer.source} |" for layer in LAYERS.values()
+    ]
+    return "\n".join(["| layer | channels | what it holds | how |", "|---|---|---|---|", *rows])
+
+
 def options_list() -> str:
-    """The options of the command as a list."""
+    """Return the options of the command as a list."""
     from mrt_mitsuba.command import options
 
     lines = []

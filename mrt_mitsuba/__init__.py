@@ -53,11 +53,7 @@ _HOME = {
 }
 _SUBMODULES = ("filters",)
 
-__all__ = [
-    "__version__",
-    *_HOME,
-    *_SUBMODULES,
-]
+__all__ = ["__version__", *_HOME, *_SUBMODULES]
 
 
 def __getattr__(name: str) -> object:

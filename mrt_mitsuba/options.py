@@ -168,6 +168,17 @@ def anything() -> Kind:
     return Kind("", "anything", str, lambda value: value)
 
 
+def function() -> Kind:
+    """Return the kind of what can be called."""
+
+    def check(value: Any) -> Any:
+        if not callable(value):
+            raise ValueError
+        return value
+
+    return Kind("", "a function", str, check)
+
+
 def rectangle() -> Kind:
     """Return the kind of rectangles: column and row of the first pixel, width and height."""
 

@@ -31,13 +31,7 @@ from .intersect import (
     sphere_frame,
     sphere_surface,
 )
-from .unit_meshes import (
-    UnitMesh,
-    unit_capsule_mesh,
-    unit_cone_mesh,
-    unit_cylinder_mesh,
-    unit_sphere_mesh,
-)
+from .unit_meshes import UnitMesh, unit_capsule_mesh, unit_cone_mesh, unit_cylinder_mesh, unit_sphere_mesh
 
 POINT, DISC, BALL = (0, 0, 0), (1, 1, 0), (1, 1, 1)
 """What the ends of a quadric are, by the squared semi-axes of their unit frame that span them."""
@@ -59,7 +53,7 @@ class QuadricKind:
 
     @property
     def width(self) -> int:
-        """How many numbers an object is made of."""
+        """Return how many numbers an object is made of."""
         return 3 * self.points + 1
 
 

@@ -25,27 +25,32 @@ settings.load_profile("short")
 
 
 @pytest.fixture
-def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Run Python code in a process and a folder of its own: ``run_python(code, *arguments, VARIABLE=value)``.
+def run_command(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run a command in a process and a folder of its own: ``run_command(*words, VARIABLE=value)``.
 
     A variable set to None is taken out of the environment. ``DRJIT_LIBLLVM_PATH`` is out unless given.
     """
 
-    def run(code: str, *arguments: str, **variables: str | None) -> subprocess.CompletedProcess[str]:
-        variables = {"DRJIT_LIBLLVM_PATH": None, **variables}
-        environ = {key: value for key, value in os.environ.items() if key not in variables}
-        environ |= {key: value for key, value in variables.items() if value is not None}
+    def run(*words: object, **variables: str | None) -> subprocess.CompletedProcess[str]:
+        given = os.environ | {"DRJIT_LIBLLVM_PATH": None} | variables
+        environ = {key: value for key, value in given.items() if value is not None}
         return subprocess.run(
-            [sys.executable, "-c", code, *arguments],
-            cwd=tmp_path,
-            env=environ,
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=False,
+            words, cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=120, check=False
         )
 
     return run
+
+
+@pytest.fixture
+def run_python(run_command: Callable[..., Any]) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run Python code in the same way: ``run_python(code, *arguments, VARIABLE=value)``."""
+    return functools.partial(run_command, sys.executable, "-c")
+
+
+@pytest.fixture
+def mrt_command(run_command: Callable[..., Any]) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run the installed ``mrt`` in the same way, as after installation: LLVM is found by the package."""
+    return functools.partial(run_command, Path(sys.executable).with_name("mrt"))
 
 
 @pytest.fixture

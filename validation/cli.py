@@ -38,7 +38,7 @@ STUDIES = {
     "stock": Entry("stock", "are light, gloss, mirrors, anti-aliasing what Mitsuba computes", 15, 60),
     "scenes": Entry("scenes", "are the report's scenes right, with a reason for each pixel off", 10, 60),
     "antialiasing": Entry("antialiasing", "does refining edges give the picture of refining all", 6, 60),
-    "adaptive": Entry("adaptive", "are own scenes Mitsuba's, and errors as stated and cheap", 20, 300),
+    "adaptive": Entry("adaptive", "are own scenes Mitsuba's, and errors as stated and cheap", 10, 180),
     "depth-of-field": Entry("depth_of_field", "what do the blur filters get wrong against a lens", 3, 60),
     "stability": Entry("stability", "where must float32 give out, and where does it not", 8, 60),
     "exhaustive": Entry("exhaustive", "how far off are formulas, over every float32 cosine", 2, 120),

@@ -12,7 +12,7 @@ from mrt_mitsuba.command.logs import LEVELS
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import checked, choice, either, from_text, option, path, plain, switch
 from mrt_mitsuba.rendering import settings
-from mrt_mitsuba.rendering.settings import NOISE, RenderSettings
+from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.model import is_obj
 from mrt_mitsuba.scene.report import NUMBERS
 
@@ -68,21 +68,11 @@ def parse(arguments: Sequence[str]) -> Options:
             params[name] = text
     _check_together(values)
     _check_declared(params, values.get("scene"))
-    if "layers=all" in rest:
-        values["layers"] = tuple(name for name in values["layers"] if name not in _not_made(values))
     options = Options(**values, params=params or None)
     of_models = [name for name in options.model() if name != "convention"]
     if of_models and not is_obj(options.scene):
         raise UsageError(f"{of_models[0]} is of use only with an OBJ file: scene=PATH.obj")
     return options
-
-
-def _not_made(values: dict[str, Any]) -> set[str]:
-    """Return the layers that no pass makes."""
-    aamode = values.get("aamode", NOISE if isinstance(values.get("target"), float) else None)
-    return (set() if aamode == NOISE else {"error", "variance"}) | (
-        {"edges"} if aamode in ("none", NOISE) else set()
-    )
 
 
 def _check_declared(params: dict[str, str], scene: str | None) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.command.options import Options
 from mrt_mitsuba.errors import MrtWarning, OutputError
+from mrt_mitsuba.rendering.settings import NOISE
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, is_obj
 
 if TYPE_CHECKING:
@@ -49,6 +50,8 @@ def run(options: Options) -> int:
     seconds = time.perf_counter() - start
     result.save(*options.outputs(), tonemap=options.tonemap)
     if not options.quiet:
+        if result.error is not None:
+            print(f"Error: {result.error}, {result.rounds[-1].spp:.1f} rays a pixel")
         print(f"Wrote {' and '.join(options.outputs())}")
         print(f"Render time: {seconds:.6f}s")
     return 0
@@ -72,12 +75,13 @@ def banner(options: Options) -> str:
         focus = options.focus(scene.focal_distance, scene.focal_range)
     own_film = options.scene is not None and not is_obj(options.scene)
     width, height = ("from the file", "from the file") if own_film else SIZE
+    aamode = options.aamode or (NOISE if options.rmse else None)
     lines = {
         "Scene": options.scene if options.scene is not None else options.scene_number,
         "Width": options.width or width,
         "Height": options.height or height,
-        "AA": options.aa or ("from the file" if own_film else 4),
-        "AA mode": options.aamode or ("noise" if options.rmse else "from the file" if own_film else "sobel"),
+        "AA": options.aa or ("as noise needs" if aamode == NOISE else "from the file" if own_film else 4),
+        "AA mode": aamode or ("from the file" if own_film else "sobel"),
         "F distance": focus.distance or "off",
         "F range": focus.range if focus.distance else "off",
     }

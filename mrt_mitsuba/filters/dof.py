@@ -60,12 +60,7 @@ def blur_amount(depth: Any, *, focal_distance: float | None, focal_range: float 
 
 
 def gaussian_dof(
-    image: Any,
-    depth: Any,
-    *,
-    focal_distance: float | None,
-    focal_range: float = 2.0,
-    mode: str = "report",
+    image: Any, depth: Any, *, focal_distance: float | None, focal_range: float = 2.0, mode: str = "report"
 ) -> Any:
     """Return the picture as a lens focused at a distance would show it, [H, W, 3] float32.
 

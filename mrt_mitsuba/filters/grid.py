@@ -95,9 +95,7 @@ class Grid:
             return totals
         end = dr.opaque(self.Int, count)
         return dr.while_loop(
-            (self.Int(0), *totals),
-            lambda j, *_: j < end,
-            lambda j, *totals: (j + 1, *add(j, totals)),
+            (self.Int(0), *totals), lambda j, *_: j < end, lambda j, *totals: (j + 1, *add(j, totals))
         )[1:]
 
     def output(self, planes: Sequence[Any], channels: Sequence[int] = ()) -> Any:

@@ -20,6 +20,9 @@ class ErrorEstimate:
     low: float
     high: float
 
+    def __str__(self) -> str:
+        return f"{self.rmse:.3g} (95 %: {self.low:.3g} to {self.high:.3g})"
+
 
 @dataclass(frozen=True)
 class Round:

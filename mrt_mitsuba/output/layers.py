@@ -25,7 +25,7 @@ class Layer:
     name: str
     letters: str  #: names of its EXR channels, in the order of the last axis
     source: str  #: ``FIRST_HIT``, ``AVERAGED`` or ``DERIVED``
-    doc: str
+    doc: str  #: for the page of the command
     value: Callable[[Any], Any] = _derived  #: along rays
     free_with: tuple[str, ...] = ()  #: the passes that make it in any case
     counts: str = ""  #: the kind of rays that it counts
@@ -40,26 +40,14 @@ class Layer:
 
 _ROWS = (
     Layer(
-        "depth",
-        "Z",
-        FIRST_HIT,
-        "distance of the first hit",
-        lambda r: r.distance,
-        free_with=("depth of field",),
+        "depth", "Z", FIRST_HIT, "distance of the hit", lambda r: r.distance, free_with=("depth of field",)
     ),
     Layer("normal", "XYZ", FIRST_HIT, "geometric normal", lambda r: r.normal),
     Layer("albedo", "RGB", FIRST_HIT, "diffuse reflectance", lambda r: r.albedo, calls=True),
-    Layer("position", "XYZ", FIRST_HIT, "place of the first hit", lambda r: r.position),
+    Layer("position", "XYZ", FIRST_HIT, "place of the hit", lambda r: r.position),
     Layer("uv", "UV", FIRST_HIT, "texture coordinates", lambda r: r.uv),
-    Layer("shape", "I", FIRST_HIT, "number of the shape, from 1; 0 for none", lambda r: r.shape, calls=True),
-    Layer(
-        "material",
-        "I",
-        FIRST_HIT,
-        "number of the material, from 1; 0 for none",
-        lambda r: r.material,
-        calls=True,
-    ),
+    Layer("shape", "I", FIRST_HIT, "shape, from 1; 0 for none", lambda r: r.shape, calls=True),
+    Layer("material", "I", FIRST_HIT, "material, from 1; 0 for none", lambda r: r.material, calls=True),
     Layer("edges", "Y", DERIVED, "what the edge detector measured", free_with=("edges",)),
     Layer("samples", "Y", DERIVED, "samples of the pixel", free_with=("edges", "rounds")),
     Layer("error", "Y", DERIVED, "standard error of the pixel", free_with=("rounds",)),
@@ -68,7 +56,7 @@ _ROWS = (
     Layer("image", "RGB", AVERAGED, "the picture", lambda r: r.image, internal=True),
     Layer("direct", "RGB", AVERAGED, "light without mirror rays", lambda r: r.direct),
     Layer("reflection", "RGB", AVERAGED, "light that mirror rays add", lambda r: r.reflection),
-    Layer("bounces", "Y", AVERAGED, "mirror rays", lambda r: r.bounces, counts="mirror"),
+    Layer("bounces", "Y", AVERAGED, "number of mirror rays", lambda r: r.bounces, counts="mirror"),
     Layer(
         "shadow_rays", "Y", AVERAGED, "shadow rays", lambda r: r.shadow_rays, counts="shadow", internal=True
     ),

@@ -12,7 +12,6 @@ import numpy as np
 
 from mrt_mitsuba.rays.divisor import Divisor
 
-LUMINANCE = np.array([0.212671, 0.715160, 0.072169])  # of linear sRGB, as in Mitsuba
 STEPS = 32  # of a pixel, where integrals over a filter are summed
 
 
@@ -27,6 +26,7 @@ class Film:
     reach: int  #: pixels on either side to which a ray contributes
     alpha: bool  #: does it keep the coverage
     grey: bool  #: does it keep the luminance only
+    bands: tuple[str, ...]  #: names of its spectral bands, if it has such
 
     @classmethod
     def of(cls, sensor: Any) -> Film:
@@ -39,9 +39,8 @@ class Film:
         border = int(rfilter.border_size()) if film.sample_border() else 0
         width, height = (int(n) + 2 * border for n in film.crop_size())
         alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        return cls(
-            sensor, width, height, border, reach, alpha, pixel_format(film) in ("luminance", "y", "ya")
-        )
+        grey = pixel_format(film) in ("luminance", "y", "ya")
+        return cls(sensor, width, height, border, reach, alpha, grey, spectral_bands(film))
 
     @property
     def pixels(self) -> int:
@@ -62,9 +61,16 @@ class Film:
         """Return a picture [H, W] with the film's border around it, of one value."""
         return np.pad(picture, self.border, constant_values=value)
 
-    def toned(self, colors: np.ndarray) -> np.ndarray:
-        """Return colours [..., 3] as the film keeps them."""
-        return np.repeat(colors @ LUMINANCE[:, None], 3, axis=-1) if self.grey else colors
+    def toned(self, color: Any) -> Any:
+        """Return linear sRGB as the film keeps it."""
+        import mitsuba as mi
+
+        return mi.Color3f(mi.luminance(mi.Color3f(color))) if self.grey else color
+
+    def banded(self, spectrum: Any, wavelengths: Any) -> list[Any]:
+        """Return what each spectral band measures of a radiance."""
+        measured = self.sensor.film().prepare_sample(spectrum, wavelengths, len(self.bands) + 1)
+        return list(measured[: len(self.bands)])  # without the weight
 
     def rays_near(self, count: int) -> int:
         """Return the number of rays a pixel that the scene's sampler makes of a number."""
@@ -74,9 +80,10 @@ class Film:
 
     @property
     def form(self) -> Hashable | None:
-        """What shapes the code of ``rays``, all else being in its numbers and the sensor; None where that is
-        not known."""
-        return None if self.sensor.shutter_open_time() > 0 else self.sensor.shutter_open()
+        """Return what shapes the code of ``rays``, all else being data; None where that is not known."""
+        if self.sensor.shutter_open_time() > 0 or self.bands:
+            return None
+        return self.sensor.shutter_open(), self.grey
 
     def numbers(self) -> Numbers:
         """Return the data of ``rays``."""
@@ -192,6 +199,16 @@ class Canvas:
         sums = np.asarray(self.block.tensor(), np.float64)
         sums = sums.reshape(self.pictures, self.rows, self.film.width, -1)
         return sums[:, self.film.reach : self.film.reach + self.film.height]
+
+
+def spectral_bands(film: Any) -> tuple[str, ...]:
+    """Return the names of a film's spectral bands, in its order; nothing for one that keeps colours."""
+    import mitsuba as mi
+
+    if not mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        return ()
+    film.prepare([])  # it knows its channels from then on
+    return tuple(field.name for field in film.bitmap().struct_())
 
 
 def pixel_format(film: Any) -> str:

@@ -37,7 +37,8 @@ def _sequence_class(variant: str) -> type:
             """Turn to the rays with these numbers in their pixels, the pixels having these keys."""
             count = dr.width(index)
             mi.Sampler.seed(self, 0, count)
-            self.index, self.key, self.dimension = index, key, dr.zeros(mi.UInt32, count)
+            # with its first bit lowest, as scrambling takes it
+            self.index, self.key, self.dimension = dr.brev(index), key, dr.zeros(mi.UInt32, count)
 
         def next_1d(self, active: Any = True) -> Any:
             index, a, b = self._shuffled(active)
@@ -52,12 +53,19 @@ def _sequence_class(variant: str) -> type:
 
         def _shuffled(self, active: Any) -> tuple[Any, Any, Any]:
             """Return the index, shuffled for this dimension and with its first bit lowest, and two hashes."""
-            a, b = mi.sample_tea_32(self.key, self.dimension, 3)
+            a = _mixed(self.key + self.dimension * 0x9E3779B9)
+            b = _mixed(a)
             self.dimension = dr.select(active, self.dimension + 1, self.dimension)
-            return dr.brev(_scrambled(dr.brev(self.index), a, b)), a, b
+            return dr.brev(_scrambled(self.index, a, b)), a, b
 
         def to_string(self) -> str:
             return "PixelSequence[]"
+
+    def _mixed(bits: Any) -> Any:
+        """Return a hash of 32 bits. Source: C. Wellons, "Prospecting for Hash Functions" (2018)."""
+        bits = (bits ^ (bits >> 16)) * 0x7FEB352D
+        bits = (bits ^ (bits >> 15)) * 0x846CA68B
+        return bits ^ (bits >> 16)
 
     def _scrambled(bits: Any, a: Any, b: Any) -> Any:
         """Flip every bit by a hash of the lower ones."""

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba import runtime
+from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.interrupts import surfacing
 from mrt_mitsuba.memory import Budget, Workspace
 from mrt_mitsuba.output.layers import AVERAGED, TABLE
 from mrt_mitsuba.rays.exposure import Exposure
-from mrt_mitsuba.rays.film import pixel_format
+from mrt_mitsuba.rays.film import pixel_format, spectral_bands
 from mrt_mitsuba.rays.lattice import FILM
 from mrt_mitsuba.rendering.defaults import decided
 from mrt_mitsuba.rendering.job import Job, Kernels, counting_kernels
@@ -44,7 +45,7 @@ def render(
     aa: int | None = None,
     aamode: str | None = None,
     target: float | Sequence[float] | None = None,
-    maxspp: int = 4096,
+    maxspp: int | None = None,
     maxseconds: float | None = None,
     on_round: OnRound | None = None,
     lattice: str | None = None,
@@ -84,7 +85,8 @@ def render(
             where noise is ("noise"). "sobel", or "none" in a scene of one's own with a random integrator.
         target: error to render to, the RMSE to the converged picture in linear values. Rays go in rounds to
             where they are needed. Three numbers: what the camera of an OBJ file looks at.
-        maxspp, maxseconds: where to stop short of the target: mean rays of a pixel, seconds.
+        maxspp, maxseconds: where to stop short of the target: mean rays of a pixel, 4096 if not given, and
+            seconds.
         on_round: called after each round with a ``RoundPicture``; stops the render by returning False.
         lattice: "report" or "centered", see ``rays.lattice.Lattice``, or "film": as Mitsuba places samples
             and filters them, which is the default for a scene of one's own.
@@ -154,6 +156,8 @@ def render(
         params=params,
         region=region,
     )
+    if progress is not None and not isinstance(progress, Progress):
+        raise UsageError(f"progress={progress!r}: must be a rendering.progress.Progress")
     with surfacing(), runtime.one_at_a_time:
         return render_with(scene, settings, default() if progress is None else progress)
 
@@ -212,6 +216,7 @@ def _render(
         focalrange=plan.focus.range,
         variant=plan.variant,
         integrator=plan.integrator,
+        layers=tuple(name for name in settings.layers if name in plan.layers),
     )
     image, layers = _mean(total, plan)
     return Result(
@@ -255,6 +260,7 @@ def _film_facts(source: Source, shader: Shader) -> FilmFacts:
         sampler.class_name(),
         film.rfilter().class_name(),
         pixel_format(film),
+        spectral_bands(film),
         shader.aovs,
     )
 
@@ -263,9 +269,9 @@ def _each_picture(
     job: Job, tracer: Tracer, plan: Plan, exposures: Sequence[Exposure], settings: RenderSettings
 ) -> Iterator[Passes]:
     kind = Passes
-    if plan.lattice.kind == FILM:
-        from mrt_mitsuba.rendering.film_passes import FilmPasses as kind  # a seventh of all that is imported
-    rays = settings.maxspp if settings.rmse else plan.repeats
+    if plan.lattice.kind == FILM:  # a seventh of all that is imported
+        from mrt_mitsuba.rendering.film_passes import FilmPasses as kind
+    rays = plan.repeats if settings.maxspp is None else settings.maxspp
     on_round: Any = settings.on_round
     goal = Goal(settings.rmse, rays, settings.maxseconds, on_round)
     for exposure in exposures:
@@ -302,15 +308,19 @@ def _add(total: dict[str, np.ndarray], picture: dict[str, np.ndarray]) -> None:
 
 
 def _mean(total: dict[str, np.ndarray], plan: Plan) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the mean picture [H, W, 3] and its layers by EXR channel, [H, W] each; all are views."""
-    shape, inside, layers = (plan.seen.height, plan.seen.width), plan.region.inside(plan.seen), {}
+    """Return the mean picture [H, W, 3] and its layers by EXR channel, [H, W] each; all are views.
+
+    First come the channels of the film and the integrator, in Mitsuba's order.
+    """
+    shape, inside = (plan.seen.height, plan.seen.width), plan.region.inside(plan.seen)
+    channels, layers = dict[str, np.ndarray](), dict[str, np.ndarray]()
     for name, values in total.items():
         own = name not in TABLE  # a channel of the film's or the integrator's
         if plan.frames > 1 and (own or TABLE[name].source == AVERAGED):
             values /= np.float32(plan.frames)
         if own:
-            layers[name] = values.reshape(shape)[inside]
+            channels[name] = values.reshape(shape)[inside]
         elif name in plan.layers:
             for index, letter in enumerate(TABLE[name].letters):
                 layers[f"{name}.{letter}"] = values[:, index].reshape(shape)[inside]
-    return total["image"].reshape(*shape, 3)[inside], dict(sorted(layers.items()))
+    return total["image"].reshape(*shape, 3)[inside], channels | dict(sorted(layers.items()))

@@ -7,7 +7,7 @@ from dataclasses import replace
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.rays.lattice import FILM
 from mrt_mitsuba.rendering.plan import RenderFacts
-from mrt_mitsuba.rendering.settings import MIN_SPP, NOISE, RenderSettings
+from mrt_mitsuba.rendering.settings import MAX_SPP, MIN_SPP, NOISE, RenderSettings
 
 
 def decided(settings: RenderSettings, facts: RenderFacts) -> RenderSettings:
@@ -17,6 +17,7 @@ def decided(settings: RenderSettings, facts: RenderFacts) -> RenderSettings:
     Raises ``UsageError`` for options that do not go together.
     """
     film, aamode = facts.film, settings.aamode
+    _check_rounds(settings)
     # Mitsuba's integrators draw random numbers for every ray, and their noise would pass for edges
     plain = film is not None and facts.random and settings.aa is None
     if aamode is None:
@@ -26,16 +27,34 @@ def decided(settings: RenderSettings, facts: RenderFacts) -> RenderSettings:
         lattice = "centered"
     aa = settings.aa or (1 if aamode == NOISE or (plain and aamode == "none") else 4)
     spp = settings.spp or (film.rays if film and plain and settings.aamode is None else 1)
-    settings = replace(settings, aa=aa, aamode=aamode, lattice=lattice, spp=spp)
+    most = settings.maxspp or (MAX_SPP if settings.rmse is not None else None)
+    settings = replace(settings, aa=aa, aamode=aamode, lattice=lattice, spp=spp, maxspp=most)
     _check(settings, facts)
     return settings
+
+
+def _check_rounds(settings: RenderSettings) -> None:
+    """Raise ``UsageError`` for options that rounds do not heed, and for those that nothing else heeds."""
+    if settings.rmse is None and settings.aamode != NOISE:
+        names = ("maxspp", "maxseconds", "on_round")
+        given = next((name for name in names if getattr(settings, name) is not None), None)
+        if given is not None:
+            raise UsageError(f"{given} is of use only where rays go in rounds: with target or aamode=noise")
+        return
+    rounds = "aamode=noise" if settings.rmse is None else f"target={settings.rmse:g}"
+    if settings.rmse is not None and settings.aamode not in (None, NOISE):
+        raise UsageError(f"{rounds} with aamode={settings.aamode}: leave one of them out")
+    if settings.rmse is not None and settings.spp is not None:
+        raise UsageError(f"{rounds} with spp={settings.spp}: leave one of them out, or bound it by maxspp")
+    if settings.aa is not None:
+        raise UsageError(f"{rounds} with aa={settings.aa}: rounds decide it; leave one of them out")
+    if settings.region is not None:
+        raise UsageError(f"{rounds} with region: rounds share the rays out over the whole picture")
 
 
 def _check(settings: RenderSettings, facts: RenderFacts) -> None:
     if settings.lattice == FILM and facts.variant.startswith("scalar"):
         raise UsageError("lattice=film needs arrays of rays: choose variant=llvm_ad_rgb")
-    if settings.rmse is not None and settings.aamode != NOISE:
-        raise UsageError(f"target={settings.rmse:g} with aamode={settings.aamode}: leave one of them out")
     if settings.aamode != NOISE:
         return
     if settings.lattice != FILM and facts.random:

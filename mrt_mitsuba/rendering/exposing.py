@@ -88,7 +88,9 @@ class Stack:
 
     def widened(self, groups: np.ndarray) -> np.ndarray:
         """Return numbers of groups [pictures, pixels], one at least wherever the filter reaches from."""
-        near = np.stack([box_mean(chosen > 0, self.film.reach) > 0 for chosen in self.rows(groups)])
+        if not self.film.reach:
+            return groups
+        near = box_mean(self.rows(groups) > 0, self.film.reach, (1, 2)) > 0
         return np.maximum(groups, near.reshape(groups.shape))
 
     def add(self, exposed: Exposed, chosen: np.ndarray) -> None:
@@ -121,16 +123,16 @@ def _divided(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.asarray(sums / np.where(weights == 0, 1, weights)[..., None])
 
 
-def box_mean(values: np.ndarray, reach: int) -> np.ndarray:
-    """Return the means [H, W, ...] over windows of 2 reach + 1 rows and columns, cut at the border."""
-    for axis in (0, 1):
-        values = np.moveaxis(values, axis, 0)
-        size = len(values)
-        sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, 0, dtype=np.float64)])
-        first = np.maximum(np.arange(size) - reach, 0)
-        last = np.minimum(np.arange(size) + reach + 1, size)
-        counts = (last - first).reshape(-1, *([1] * (values.ndim - 1)))
-        values = np.moveaxis((sums[last] - sums[first]) / counts, 0, axis)
+def box_mean(values: np.ndarray, reach: int, axes: tuple[int, ...] = (0, 1)) -> np.ndarray:
+    """Return the means over windows of 2 reach + 1 values along axes, cut at the border."""
+    for axis in axes:
+        sums = np.moveaxis(np.cumsum(values, axis, dtype=np.float64), axis, 0)
+        place = np.arange(len(sums))
+        last, before = np.minimum(place + reach, len(sums) - 1), np.maximum(place - reach - 1, -1)
+        means = sums[last]
+        means[reach + 1 :] -= sums[: max(len(sums) - reach - 1, 0)]
+        means /= (last - before).reshape(-1, *([1] * (sums.ndim - 1)))
+        values = np.moveaxis(means, 0, axis)
     return values
 
 
@@ -147,10 +149,10 @@ class Exposer:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Channels of the picture: R, G, B, A where the film has it, the integrator's own and the layers'."""
+        """Channels of the picture: R, G, B, those that the film and the integrator have, and the layers'."""
         alpha = ("A",) if self.film.alpha else ()
         layers = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
-        return ("R", "G", "B", *alpha, *self.shader.aovs, *layers)
+        return ("R", "G", "B", *alpha, *self.film.bands, *self.shader.aovs, *layers)
 
     def expose(
         self,
@@ -178,8 +180,10 @@ class Exposer:
         for start in range(0, len(pixel), step):
             part, own = groups.part(start, start + step), pixel[start : start + step]
             planes = self._wavefront(part, _Start(seed, start, progressive), canvas, kept, moments)
+            starts = np.flatnonzero(np.diff(own, prepend=-1))  # of the groups of each pixel
             for row, plane in zip(total, planes, strict=False):
-                row[own[0] : own[-1] + 1] += np.bincount(own - own[0], np.broadcast_to(plane, own.shape))
+                plane = np.broadcast_to(plane, own.shape)
+                row[own[starts]] += np.add.reduceat(plane, starts, dtype=np.float64)
             self._count("primary", len(own) * groups.size)
             for kind, plane in zip(self._counted.values(), planes[len(total) :], strict=True):
                 self._count(kind, round(np.sum(np.asarray(plane), dtype=np.float64)))
@@ -267,9 +271,11 @@ class Exposer:
         if self.view.motion is not None:
             ray = self.view.moved(ray, lanes.sampler.next_1d())
         values = self.shader.values(self.view, ray, weight, lanes.sampler)
-        channels = [mi.Float(c) for c in values.image]
+        channels = [mi.Float(c) for c in self.film.toned(values.image)]
         if self.film.alpha:
             channels.append(dr.select(values.valid, mi.Float(1), 0))
+        if self.film.bands:
+            channels += self.film.banded(values.spectrum, ray.wavelengths)
         channels += values.aovs
         layers = {name: TABLE[name].value(values) for name in self.layers}
         channels += [mi.Float(c) for value in layers.values() for c in components(value)]

@@ -60,7 +60,7 @@ class FilmPasses(Passes):
     def _rounds(self, step: Pass) -> None:
         """Expose pixels until the noise is as low as was asked for."""
         exposer = self._exposer(step)
-        halves = Halves(exposer, self._exposure.seed)
+        halves = Halves(exposer, self._exposure.seed, self._finished if self._plan.blur else None)
         self.rounds = run_rounds(halves, self._film.pixels, self._goal, self._job.stage)
         self.error = halves.error()
         self._develop(exposer, halves)
@@ -80,7 +80,7 @@ class FilmPasses(Passes):
     def _develop(self, exposer: Exposer, stack: Stack) -> None:
         """Turn what is exposed into layers."""
         picture = stack.mean()
-        self._set("image", self._film.toned(picture[..., :3]))
+        self._set("image", picture[..., :3])
         picture = picture[self._seen].reshape(len(self._pixels), -1)
         for name, channel in zip(exposer.names[3:], picture[:, 3:].T, strict=True):
             own, _, letter = name.partition(".")

@@ -22,18 +22,22 @@ FACTOR = 2.0  # by which it may be more or less
 
 
 class Levels:
-    """The aa of each pixel, and the squared change that doubling it brought last, [H, W].
+    """The aa of each pixel, its colour, and that before the aa was doubled last.
 
-    ``trace`` traces pixels, numbered row by row, with an aa, and returns their colours, [pixels, 3].
+    ``trace`` traces pixels, numbered row by row, with an aa, and returns their colours, [pixels, 3];
+    ``finished`` returns a picture [H, W, 3] as it is shown.
     """
 
     def __init__(
-        self, shape: tuple[int, int], lattice: str, trace: Callable[[int, np.ndarray], np.ndarray]
+        self,
+        shape: tuple[int, int],
+        lattice: str,
+        trace: Callable[[int, np.ndarray], np.ndarray],
+        finished: Callable[[np.ndarray], np.ndarray],
     ) -> None:
-        self._trace, self._left = trace, LEFT[lattice]
-        self._aa, self._change = np.zeros(shape, np.int64), np.full(shape, np.inf)
-        self._image = np.zeros((*shape, 3), np.float32)
-        self._rays = np.zeros(shape)
+        self._trace, self._finished, self._left = trace, finished, LEFT[lattice]
+        self._aa, self._rays = np.zeros(shape, np.int64), np.zeros(shape)
+        self._image, self._coarser = np.zeros((2, *shape, 3), np.float32)
 
     def first(self) -> dict[int, np.ndarray]:
         """Return two levels of all pixels, by their aa."""
@@ -43,11 +47,13 @@ class Levels:
     def next(self, most: float, target: float | None) -> dict[int, np.ndarray] | None:
         """Return the pixels to double, by their new aa; None where ``most`` rays a pixel do not suffice.
 
-        As many as leave half of the squared error of ``target`` in the others, and those around them.
+        They leave half of the squared error of ``target`` in the others; those around them are doubled, too.
         """
-        near = box_mean(self._change, 1)  # a pixel may change little by chance, its neighbours less likely
+        change = _squares(self._image, self._coarser)
+        near = box_mean(change, 1)  # a pixel may change little by chance, its neighbours less likely
         order = np.argsort(near, axis=None)
-        allowed = ((target or 0.0) / self._left) ** 2 * self._aa.size / 2
+        # changes of the sharp picture count, which a blur makes smaller
+        allowed = change.sum() * ((target or 0.0) / max(self.error().rmse, 1e-30)) ** 2 / 2
         noisy = np.zeros(self._aa.size, bool)
         noisy[order[np.searchsorted(np.cumsum(near.flat[order]), allowed) :]] = True
         doubled = (box_mean(noisy.reshape(self._aa.shape), 1) > 0) & (self._aa < LARGEST_AA)
@@ -65,18 +71,24 @@ class Levels:
     def trace(self, chosen: dict[int, np.ndarray], advance: Callable[[int], object]) -> None:
         """Trace pixels, and note what changes in them."""
         for aa, pixels in chosen.items():
-            before, now = self._image.reshape(-1, 3)[pixels], self._trace(aa, pixels)
-            self._image.reshape(-1, 3)[pixels] = now
-            self._change.flat[pixels] = np.square(now - before, dtype=np.float64).mean(axis=-1)
+            image, coarser = self._image.reshape(-1, 3), self._coarser.reshape(-1, 3)
+            coarser[pixels], image[pixels] = image[pixels], self._trace(aa, pixels)
             self._aa.flat[pixels] = aa
             self._rays.flat[pixels] += aa**2
             advance(aa**2 * len(pixels))
 
     def error(self) -> ErrorEstimate:
         """Return the estimated error of the picture."""
-        rmse = float(self._left * np.sqrt(self._change.mean()))
+        change = _squares(self._finished(self._image), self._finished(self._coarser))
+        rmse = float(self._left * np.sqrt(change.mean()))
         return ErrorEstimate(rmse, rmse / FACTOR, rmse * FACTOR)
 
     def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the picture [H, W, 3], the error of each pixel and the samples in its mean, [H, W]."""
-        return self._image, self._left * np.sqrt(self._change), self._aa**2
+        change = _squares(self._image, self._coarser)
+        return self._finished(self._image), self._left * np.sqrt(change), self._aa**2
+
+
+def _squares(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the squared differences of pictures, means of their colours, [H, W]."""
+    return np.asarray(np.square(a - b, dtype=np.float64).mean(axis=-1))

@@ -17,28 +17,33 @@ from collections.abc import Callable
 
 import numpy as np
 
+from mrt_mitsuba.filters.dof import REACH
 from mrt_mitsuba.output.error import ErrorEstimate
 from mrt_mitsuba.rendering.exposing import Exposed, Exposer, Groups, Stack, box_mean
 
 HALVES = 2
+TILE = 16  # pixels, under a filter
 GROUP = 8  # rays that are traced together; two groups to a pixel begin
 STEP = (
     1.25  # times the rays there are must be there after another round: a short one costs more than it brings
 )
 
 # Candidates for the smoothing of variances: half the width of a window, and how many rays its mean is worth
-_WINDOWS = ((1, 8), (1, 32), (2, 32), (2, math.inf), (4, math.inf), (8, math.inf))
+_WINDOWS = {1: (8, 32), 2: (32, math.inf), 4: (math.inf,), 8: (math.inf,)}
 _FLOORS = (0.003, 0.03, 0.2, 1.0)  # share of the picture's mean in the variance of every pixel
+_JUDGES = 2**13  # pixels, about, that choose among the candidates
 _REGION = 8  # half the width of the windows in which rays are compared with independent ones
 
 
 class Halves(Stack):
     """Two half pictures, and the moments of the rays in each pixel, as they grow round by round."""
 
-    def __init__(self, exposer: Exposer, seed: int) -> None:
+    def __init__(
+        self, exposer: Exposer, seed: int, blurred: Callable[[np.ndarray], np.ndarray] | None = None
+    ) -> None:
         film = exposer.film
         super().__init__(film, HALVES, len(exposer.names))
-        self._exposer, self._seed = exposer, seed
+        self._exposer, self._seed, self._blurred, self._step = exposer, seed, blurred, STEP
         self._total, self._square = np.zeros((2, HALVES, film.pixels, 3))
 
     # ------------------------------------------- Rounds ---------------------------------------------
@@ -61,7 +66,9 @@ class Halves(Stack):
 
     def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the picture [H, W, 3], and the standard error and the rays of each pixel, [H, W]."""
-        return self.mean()[..., :3], np.sqrt(self.variance().mean(-1)), self.samples()
+        image = self.mean()[..., :3]
+        shown = image if self._blurred is None else self._blurred(image)
+        return shown, np.sqrt(self.variance().mean(-1)), self.samples()
 
     def add(self, exposed: Exposed, chosen: np.ndarray) -> None:
         super().add(exposed, chosen)
@@ -75,28 +82,33 @@ class Halves(Stack):
 
         The mean of two independent values has a variance of a quarter of their expected squared difference.
         """
-        first, second = self.pictures()[..., :3]
-        return np.asarray(np.square(first - second, dtype=np.float64).mean(-1) / 4)
+        return _quarter_squares(*self.pictures()[..., :3])
 
     def error(self) -> ErrorEstimate:
         """Return the estimated RMSE of the picture, without the border.
 
         The mean of squares of which each is as uncertain as it is large, correlated as the filter has it; the
-        true error is a mean of as many squares, and as uncertain. The interval is that of a log-normal law.
+        true error is a mean of as many squares, and as uncertain. The interval is that of a log-normal law,
+        wider upwards the fewer squares make up the mean: there may be others that no ray has met yet.
         """
-        squares = self._inside(self._squared_error())
+        halves, correlation = self.film.picture(self.pictures()[..., :3]), self.film.correlation
+        if self._blurred is not None:
+            halves = np.stack([self._blurred(half) for half in halves])
+        squares = _quarter_squares(*halves)
         mean = float(squares.mean())
         if mean == 0:
             return ErrorEstimate(0.0, 0.0, 0.0)
-        spread = math.sqrt(2 * self.film.correlation * float(np.square(squares).sum())) / float(squares.sum())
-        rmse, factor = math.sqrt(mean), math.exp(1.96 * spread / 2)
-        return ErrorEstimate(rmse, rmse / factor, rmse * factor)
+        if self._blurred is not None:  # pixels are as good as one in a window of the blur's reach
+            squares, correlation = _blocks(squares, 2 * REACH), 1.0
+        spread = math.sqrt(2 * correlation * float(np.square(squares).sum())) / float(squares.sum())
+        rmse, width = math.sqrt(mean), 1.96 * spread / 2
+        return ErrorEstimate(rmse, rmse * math.exp(-width), rmse * math.exp(width * (1 + spread)))
 
     def variance(self) -> np.ndarray:
         """Return the estimated variance of each channel in the picture, [H, W, 3], without the border."""
         moments = self._moments()
         rays = self.rows(self.rays)[..., None]
-        each = (_smoothed(moments, rays, 1, 8) / rays).sum(0)
+        each = (_smoothed(moments, box_mean(moments, 1, (1, 2)), rays, 8) / rays).sum(0)
         spread = np.moveaxis(self.film.spread_out(np.moveaxis(each, -1, 0)), 0, -1)
         return self.film.picture(spread / 4 * self._better(moments.mean(-1))[..., None])
 
@@ -106,8 +118,8 @@ class Halves(Stack):
 
     # ------------------------------------------- Sharing --------------------------------------------
 
-    def next(self, most: float, target: float | None) -> np.ndarray:
-        """Return numbers of further groups, [2, pixels].
+    def next(self, most: float, target: float | None) -> np.ndarray | None:
+        """Return numbers of further groups, [2, pixels]; None where ``most`` leaves no room.
 
         Enough for an RMSE of ``target``, if that takes a mean of no more than ``most`` rays a pixel in all.
         """
@@ -116,51 +128,64 @@ class Halves(Stack):
         if target is not None:
             allowed = (variance / self.rays).sum() * (target / self.error().rmse) ** 2
             wanted = _water(self.rays, deviation, lambda due: (variance / due).sum() <= allowed)
-            least = STEP * self.rays.sum()
+            least = self._step * self.rays.sum()
             if least <= wanted.sum() <= most:
                 return self._groups(wanted)
             if wanted.sum() < least:
-                most = min(most, least)
+                most, self._step = min(most, least), 1.5 * self._step  # that it was short may be by chance
         return self._within(most, deviation)
 
-    def _within(self, most: float, deviation: np.ndarray) -> np.ndarray:
-        """Return numbers of groups that make no more than so many rays in all."""
-        budget = most
-
-        def spent(due: np.ndarray) -> bool:
-            return bool(due.sum() >= budget)
-
-        for _ in range(4):
-            groups = self._groups(_water(self.rays, deviation, spent))
-            excess = self.rays.sum() + self.cost(groups) - most  # by rounding, and by pixels under the filter
-            if excess <= 0:
+    def _within(self, most: float, deviation: np.ndarray) -> np.ndarray | None:
+        """Return numbers of groups that make no more than so many rays in all, and not many fewer."""
+        have, best = float(self.rays.sum()), None
+        low, budget, high = have, most, most
+        for _ in range(6):  # rounding, and pixels under the filter, make of a budget more or less than it is
+            groups = self._groups(_water(self.rays, deviation, lambda due: bool(due.sum() >= budget)))  # noqa: B023
+            if have + self.cost(groups) > most:
+                high = budget
+            else:
+                best, low = groups, budget
+            if low == most:
                 break
-            budget -= excess
-        return groups
+            budget = (low + high) / 2
+        return best
 
     def _groups(self, due: np.ndarray) -> np.ndarray:
         """Return whole numbers of groups for what is due; one at least."""
-        missing = (due - self.rays) / GROUP
-        groups = np.floor(missing + 0.5)
+        missing, rounding = (due - self.rays) / GROUP, self._rounding()
+        groups = np.floor(missing + rounding)
         if not groups.any():
-            groups = (missing >= missing.max()) * 1.0
+            groups = (missing > 0) & (rounding >= rounding.max())
         return np.asarray(groups, np.int64)
+
+    def _rounding(self) -> np.ndarray:
+        """Return random numbers to add before rounding down; alike in a tile, where a filter has rays traced
+        around all pixels that need some."""
+        tile = TILE if self.film.reach else 1
+        rows, columns = (np.arange(n) // tile for n in self.film.shape)
+        random = np.random.default_rng((self._seed, int(self.rays.sum())))
+        return random.random((rows[-1] + 1, columns[-1] + 1))[rows[:, None], columns].ravel()
 
     def _decisive(self) -> np.ndarray:
         """Return the variance of a ray's value that decides in each half, [2, pixels]: the other half's."""
         moments, rays = self._moments().mean(-1), self.rows(self.rays)
         measured = moments * self._better(moments)
         mean = measured.mean((1, 2))[:, None, None]
-        best, least = measured, math.inf
-        for width, worth in _WINDOWS:
-            smooth = _smoothed(measured, rays, width, worth)
-            for floor in _FLOORS:
-                candidate = (1 - floor) * smooth + floor * mean + 1e-30
-                deviation = np.sqrt(candidate)
-                cost = ((measured[::-1] / deviation).mean((1, 2)) * deviation.mean((1, 2))).sum()
-                if cost < least:
-                    best, least = candidate, cost
-        return best[::-1].reshape(HALVES, -1)
+        step = max(1, math.isqrt(measured[0].size // _JUDGES))
+        judges, other = (slice(None), *[slice(None, None, step)] * 2), measured[::-1, ::step, ::step]
+        best, least, lowest = measured, math.inf, 0.0
+        for width, worths in _WINDOWS.items():
+            if width < self.film.reach:
+                continue
+            around = box_mean(measured, width, (1, 2))
+            for worth in worths:
+                smooth = _smoothed(measured, around, rays, worth)
+                for floor in _FLOORS:
+                    deviation = np.sqrt((1 - floor) * smooth[judges] + floor * mean + 1e-30)
+                    cost = ((other / deviation).mean((1, 2)) * deviation.mean((1, 2))).sum()
+                    if cost < least:
+                        best, least, lowest = smooth, cost, floor
+        return ((1 - lowest) * best + lowest * mean + 1e-30)[::-1].reshape(HALVES, -1)
 
     def _moments(self) -> np.ndarray:
         """Return the variance of a ray's value in each half and channel, [2, H, W, 3]."""
@@ -183,9 +208,20 @@ class Halves(Stack):
         return self.film.picture(values[..., None])[..., 0]
 
 
-def _smoothed(variance: np.ndarray, rays: np.ndarray, width: int, worth: float) -> np.ndarray:
-    """Return variances [2, H, W, ...] drawn towards their mean in a window, the less the more rays."""
-    around = np.stack([box_mean(half, width) for half in variance])
+def _quarter_squares(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return a quarter of the squared difference of pictures, mean of colours, [H, W]."""
+    return np.asarray(np.square(first - second, dtype=np.float64).mean(-1) / 4)
+
+
+def _blocks(values: np.ndarray, side: int) -> np.ndarray:
+    """Return the sums of values [H, W] over blocks."""
+    for axis, size in enumerate(values.shape):
+        values = np.add.reduceat(values, np.arange(0, size, side), axis)
+    return values
+
+
+def _smoothed(variance: np.ndarray, around: np.ndarray, rays: np.ndarray, worth: float) -> np.ndarray:
+    """Return variances [2, H, W, ...] drawn towards their means in windows, the less the more rays."""
     share = 1.0 if math.isinf(worth) else worth / (rays + worth)
     return np.asarray(variance + share * (around - variance))
 

@@ -100,7 +100,7 @@ class Passes:
                     self.layers[name][pixels[part], channel] = plane
             return self.layers["image"][pixels]
 
-        levels = Levels(self._shape, self._plan.lattice.kind, trace)
+        levels = Levels(self._shape, self._plan.lattice.kind, trace, self._finished)
         self.rounds = run_rounds(levels, len(self._pixels), self._goal, self._job.stage)
         self.error = levels.error()
         _, errors, samples = levels.maps()
@@ -150,28 +150,45 @@ class Passes:
         return np.asarray(np.maximum(square, 0) / (rays - 1))
 
     def _blur(self, step: Pass) -> None:
-        """Blur the picture in place; what the next band sees of this one is kept as it was."""
+        """Blur the picture, and note by how much."""
+        from mrt_mitsuba import filters
+
+        amount = self._add("blur").reshape(self._shape) if "blur" in self._plan.layers else None
+        with self._job.stage(step.name, len(self._pixels), "Computing depth of field..") as advance:
+            for band in self._blurring(self._picture("image")):
+                if amount is not None:
+                    depth = self._picture("depth")[band.rows]
+                    amount[band.rows] = filters.blur_amount(depth, **self._focus)
+                advance((band.stop - band.start) * self._shape[1])
+
+    def _blurring(self, image: np.ndarray) -> Iterator[Any]:
+        """Blur a picture in place, band by band; what the next band sees of this one is kept as it was."""
         from mrt_mitsuba import filters
         from mrt_mitsuba.filters.dof import REACH
 
-        focus: dict[str, Any] = {
-            "focal_distance": self._plan.focus.distance,
-            "focal_range": self._plan.focus.range,
-        }
-        image, depth = self._picture("image"), self._picture("depth")
-        amount = self._add("blur").reshape(self._shape) if "blur" in self._plan.layers else None
-        above = image[:0]
-        with self._job.stage(step.name, len(self._pixels), "Computing depth of field..") as advance:
-            for band in self._bands(REACH):
-                sharp = image[band.start : band.bottom]
-                if len(above):
-                    sharp = np.concatenate([above, sharp])
-                blurred = filters.gaussian_dof(sharp, depth[band.seen], **focus, mode=step.mode)
-                above = sharp[: band.stop - band.top][-REACH:].copy()
-                image[band.rows] = blurred[band.inner]
-                if amount is not None:
-                    amount[band.rows] = filters.blur_amount(depth[band.rows], **focus)
-                advance((band.stop - band.start) * self._shape[1])
+        depth, above = self._picture("depth"), image[:0]
+        for band in self._bands(REACH):
+            sharp = image[band.start : band.bottom]
+            if len(above):
+                sharp = np.concatenate([above, sharp])
+            blurred = filters.gaussian_dof(sharp, depth[band.seen], **self._focus, mode=str(self._plan.blur))
+            above = sharp[: band.stop - band.top][-REACH:].copy()
+            image[band.rows] = blurred[band.inner]
+            yield band
+
+    def _finished(self, picture: np.ndarray) -> np.ndarray:
+        """Return a picture [H, W, 3] as the passes after the rounds show it."""
+        if self._plan.blur is None:
+            return picture
+        picture = picture.astype(np.float32)
+        for _ in self._blurring(picture):
+            pass
+        return picture
+
+    @property
+    def _focus(self) -> dict[str, Any]:
+        focus = self._plan.focus
+        return {"focal_distance": focus.distance, "focal_range": focus.range}
 
     def _bands(self, halo: int) -> Iterator[Any]:
         from mrt_mitsuba.filters.bands import bands

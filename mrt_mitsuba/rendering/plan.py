@@ -32,7 +32,7 @@ _WHY = {
     "not-asked-for": "not asked for",
     "noise": "rounds go where the variance is",
     "linear-rgb": "pictures are linear sRGB, whose luminance or XYZ follow",
-    "spectrum": "the picture is the colour of the spectrum that the film sees",
+    "spectrum": "the picture is the colour of the spectrum that the film sees, and rounds go by it",
     "one-sequence": "rounds continue one sequence of numbers in each pixel",
     "lattice": "the lattice that was asked for places and averages samples",
     "arrays": "a scalar variant traces a lattice, ray by ray",
@@ -47,6 +47,7 @@ class FilmFacts:
     sampler: str  #: its class
     rfilter: str  #: class of the reconstruction filter
     pixel_format: str  #: "rgb", "rgba", "luminance", ...; "" for a film of another kind
+    bands: tuple[str, ...] = ()  #: of its spectrum
     aovs: tuple[str, ...] = ()  #: channels of the integrator's own
 
 
@@ -142,8 +143,8 @@ class Plan(RenderFacts):
         channels = layers.channels(self.traced | self.layers)
         if self.lattice.kind == FILM:
             # sums by pixel, in double precision, while a film is exposed
-            aovs = len(self.film.aovs) if self.film else 0
-            channels += (ROUND_CHANNELS if ROUNDS in self.steps else 16) + 5 * aovs
+            more = len(self.film.bands + self.film.aovs) if self.film else 0
+            channels += (ROUND_CHANNELS if ROUNDS in self.steps else 16) + 5 * more
         return channels
 
     @property
@@ -185,8 +186,11 @@ class Plan(RenderFacts):
 
 def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
     """Decide what to trace and what to leave out. Raises ``UsageError`` for layers that nothing provides."""
-    asked, lattice = frozenset(settings.layers), Lattice(str(settings.lattice), int(settings.aa or 1))
+    possible, asked = _possible(facts, settings), frozenset(settings.layers)
+    if asked == LAYERS.keys():
+        asked &= possible
     _check_layers(asked, facts, settings)
+    lattice = Lattice(str(settings.lattice), int(settings.aa or 1))
     aamode = str(settings.aamode)
     detector = aamode if aamode in DETECTORS and (lattice.aa > 1 or "edges" in asked) else None
     blur = settings.dof if facts.focus.distance else None
@@ -204,7 +208,7 @@ def make_plan(facts: RenderFacts, settings: RenderSettings) -> Plan:
         repeats=_repeats(settings, lattice),
         motion=(FILM if lattice.kind == FILM else settings.motionmode) if settings.motion else None,
         motion_samples=settings.motionsamples if settings.motion else 1,
-        layers=asked | {name for name, layer in LAYERS.items() if made & set(layer.free_with)},
+        layers=asked | {name for name in possible if made & set(TABLE[name].free_with)},
         passes=passes,
         left_out=tuple(_left_out(traced, facts, made, settings)),
     )
@@ -217,6 +221,14 @@ def _region(asked: Sequence[int] | None, facts: RenderFacts) -> Region:
     return region
 
 
+def _possible(facts: RenderFacts, settings: RenderSettings) -> frozenset[str]:
+    """Return the layers that can be made."""
+    made = facts.traceable | layers.named(DERIVED)
+    made -= {"error", "variance"} if settings.aamode != NOISE else set()
+    made -= {"variance"} if settings.lattice != FILM else set()
+    return made - ({"edges"} if settings.aamode not in DETECTORS else set())
+
+
 def _check_layers(asked: frozenset[str], facts: RenderFacts, settings: RenderSettings) -> None:
     if "edges" in asked and settings.aamode not in DETECTORS:
         raise UsageError(
@@ -224,6 +236,8 @@ def _check_layers(asked: frozenset[str], facts: RenderFacts, settings: RenderSet
         )
     if asked & {"error", "variance"} and settings.aamode != NOISE:
         raise UsageError("layers=error,variance: only rounds estimate them; give a target= or aamode=noise")
+    if "variance" in asked and settings.lattice != FILM:
+        raise UsageError("layers=variance: without random numbers there is none; choose lattice=film")
     missing = sorted(asked - facts.traceable - layers.named(DERIVED))
     if missing:
         raise UsageError(
@@ -320,8 +334,8 @@ def _film_left_out(facts: RenderFacts, settings: RenderSettings) -> list[Omissio
     left_out = []
     if film.pixel_format.startswith("xyz"):
         left_out.append(Omission(f"pixel format {film.pixel_format}", "linear-rgb"))
-    if not film.pixel_format:
-        left_out.append(Omission("spectral bands of the film", "spectrum"))
+    if film.bands:
+        left_out.append(Omission(f"{', '.join(film.bands)} in the picture, only as layers", "spectrum"))
     if settings.aamode == NOISE:
         left_out.append(Omission(film.sampler, "one-sequence"))
     return left_out

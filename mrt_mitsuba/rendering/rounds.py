@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -11,14 +12,18 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from mrt_mitsuba.errors import MrtWarning
 from mrt_mitsuba.output.error import ErrorEstimate, Round, RoundPicture
 from mrt_mitsuba.rendering.progress import Advance
 
 log = logging.getLogger(__name__)
 
-GROWTH = 4  # times the rays there are may be there after another round: the error is known better then
+# Times the rays there are may be there after another round: the error is known better then. The first
+# doubling of a lattice takes up to 4.2
+GROWTH = 4.25
 MARGIN = 0.97  # of the target to aim at: an estimate is as often too low as too high
-LEAST_GROWTH = 1.02  # fewer rays, and a round costs more than it brings
+SURE = 2.0  # times the target, the upper end of the error's interval may be
+LEAST_GROWTH = 1.05  # fewer rays, and a round costs more than it brings
 
 OnRound = Callable[[RoundPicture], object]
 Stage = Callable[[str, int, str], AbstractContextManager[Advance]]
@@ -58,7 +63,10 @@ class Refinable(Protocol[Chosen]):
 
 
 def run_rounds(picture: Refinable[Chosen], pixels: int, goal: Goal, stage: Stage) -> list[Round]:
-    """Trace rounds until the goal is reached or ``on_round`` returns False; return what each has found."""
+    """Trace rounds until the goal is reached or ``on_round`` returns False; return what each has found.
+
+    Warns of a target that is not reached.
+    """
     start, done, rays = time.perf_counter(), list[Round](), 0
     chosen: Chosen | None = picture.first()
     while chosen is not None:
@@ -66,30 +74,54 @@ def run_rounds(picture: Refinable[Chosen], pixels: int, goal: Goal, stage: Stage
         rays += cost
         with stage("rounds", cost, _message(done, goal, cost / pixels)) as advance:
             picture.trace(chosen, advance)
-        done.append(Round(time.perf_counter() - start, rays / pixels, picture.error().rmse))
+        error = picture.error()
+        done.append(Round(time.perf_counter() - start, rays / pixels, error.rmse))
         log.info("round %d: %.1f rays a pixel, error %.3g", len(done), done[-1].spp, done[-1].rmse)
         if goal.on_round is not None:
             now, maps = done[-1], (np.asarray(values, np.float32) for values in picture.maps())
             if goal.on_round(RoundPicture(now.seconds, now.spp, now.rmse, *maps)) is False:
-                break
-        chosen = _next(picture, goal, done[-1])
+                return done
+        chosen = _next(picture, goal, done[-1], error)
+    _warn_unless_reached(goal, done[-1])
     return done
 
 
-def _next(picture: Refinable[Chosen], goal: Goal, now: Round) -> Chosen | None:
-    if now.rmse <= (goal.target or 0):
+def _next(picture: Refinable[Chosen], goal: Goal, now: Round, error: ErrorEstimate) -> Chosen | None:
+    target = goal.target or 0.0
+    if error.rmse <= target and error.high <= SURE * target:
         return None
     most = min(goal.rays, GROWTH * now.spp)
     if goal.seconds is not None:
         most = min(most, now.spp * goal.seconds / now.seconds)
     if most < LEAST_GROWTH * now.spp:
         return None
-    return picture.next(most, None if goal.target is None else MARGIN * goal.target)
+    if error.rmse <= target:  # by chance, perhaps
+        return picture.next(min(most, 2 * now.spp), None)
+    return picture.next(most, None if goal.target is None else MARGIN * target)
+
+
+def _warn_unless_reached(goal: Goal, now: Round) -> None:
+    if goal.target is None or now.rmse <= goal.target:
+        return
+    late = goal.seconds is not None and now.spp * goal.seconds < LEAST_GROWTH * now.spp * now.seconds
+    limit = f"maxseconds={goal.seconds:g}" if late else f"maxspp={goal.rays}"
+    warnings.warn(
+        f"target={goal.target:g} is not reached: {limit} ends the render at an error of {now.rmse:.3g}, "
+        f"after {now.spp:.1f} rays a pixel and {now.seconds:.1f} s",
+        MrtWarning,
+        stacklevel=8,  # the caller of render
+    )
 
 
 def _message(done: list[Round], goal: Goal, more: float) -> str:
     """Return where a render stands before a round of so many rays a pixel."""
     if not done:
         return ""
-    aim = "" if goal.target is None else f" → {goal.target:.3g}"
-    return f"error {done[-1].rmse:.3g}{aim}, {done[-1].seconds:.0f} s, {more:.1f} rays a pixel more"
+    aim = "" if goal.target is None else f" → {_two_digits(goal.target)}"
+    now = done[-1]
+    return f"error {_two_digits(now.rmse)}{aim}, {now.seconds:.0f} s, {more:.1f} rays a pixel more"
+
+
+def _two_digits(error: float) -> str:
+    """Return an error with as many digits as are known of it, such as 0.010."""
+    return f"{error:#.2g}" if error < 10 else f"{error:.0f}"

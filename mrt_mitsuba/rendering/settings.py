@@ -14,6 +14,7 @@ from mrt_mitsuba.options import (
     checked,
     choice,
     error_or_place,
+    function,
     integer,
     number,
     option,
@@ -32,6 +33,7 @@ from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE
 
 NOISE = "noise"  # the aamode that puts rays where the variance is
 MIN_SPP = 16  # rays of a pixel from which its variance is known
+MAX_SPP = 4096  # of a pixel on average, where a target alone would ask for more
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
 
 
@@ -67,7 +69,9 @@ class RenderSettings:
         "error to render to (RMSE, linear); OBJ file: what the camera looks at",
         "none",
     )
-    maxspp: int = option(4096, integer(MIN_SPP, 2**24), "rays of a pixel at most, with a target, on average")
+    maxspp: int | None = option(
+        None, integer(MIN_SPP, 2**24), "rays of a pixel at most, with a target, on average", str(MAX_SPP)
+    )
     maxseconds: float | None = option(None, number(0), "seconds to spend at most, with a target", "none")
     lattice: str | None = option(
         None,
@@ -119,7 +123,7 @@ class RenderSettings:
     seed: int = option(0, integer(0, 2**32 - 1), "seed where anything is random")
     integrator: object = option(None, anything())
     sensor: int = option(0, integer(0, 65535), "number of the sensor, in a scene that has several")
-    on_round: object = option(None, anything())
+    on_round: object = option(None, function())  # a function
     spp: int | None = option(
         None,
         integer(1, 65536),

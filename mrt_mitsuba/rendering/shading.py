@@ -22,7 +22,8 @@ from mrt_mitsuba.rendering.view import View
 class RayValues:
     """Values along camera rays, for the rows of the table of layers; what no row reads costs nothing."""
 
-    image: Any
+    spectrum: Any  # radiance with the sensor's weight
+    image: Any  # its colour
     si: Any  # interaction at the first hit
     found: Any  # is there one
     valid: Any  # did the integrator find anything; Mitsuba's alpha
@@ -118,7 +119,8 @@ class SampledValues(RayValues):
 
         super().__init__(scene, view, ray, weight)
         spectrum, self.valid, self.aovs = sample
-        self.image = self.rgb(mi.unpolarized_spectrum(spectrum))
+        self.spectrum = mi.unpolarized_spectrum(spectrum) * self.weight
+        self.image = to_rgb(self.spectrum, ray)
 
     @cached_property
     def si(self) -> Any:
@@ -136,7 +138,8 @@ class LayeredValues(RayValues):
 
     def __init__(self, scene: Any, view: View, ray: Any, weight: Any, trace: Any) -> None:
         super().__init__(scene, view, ray, weight)
-        self.trace, self.image = trace, self.rgb(trace.radiance)
+        self.trace, self.spectrum = trace, trace.radiance * self.weight
+        self.image = to_rgb(self.spectrum, ray)
         self.si, self.found = trace.hit.si, trace.hit.found
         self.valid = self.found
 
@@ -209,7 +212,8 @@ class Shader:
         """Return what is known along rays with these weights."""
         import mitsuba as mi
 
-        sample = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(ray))
+        medium = view.sensor.get_medium()  # that the camera is in
+        sample = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(ray), medium)
         return SampledValues(self.scene, view, ray, weight, sample)
 
 

@@ -19,12 +19,7 @@ STOCK_EXTENT = 100.0
 
 
 def scene_dict(
-    scene: int | Scene,
-    *,
-    width: int = 800,
-    height: int = 600,
-    fresnel: str = "schlick",
-    flavor: str = "mrt",
+    scene: int | Scene, *, width: int = 800, height: int = 600, fresnel: str = "schlick", flavor: str = "mrt"
 ) -> dict[str, Any]:
     """Return a scene as a plain Mitsuba dict; ``mi.load_dict`` takes it (after ``mrt.register()``).
 

@@ -94,11 +94,8 @@ def reopen_scene(
     model: Mapping[str, Any],
     budget: Budget,
 ) -> Source:
-    """Open a scene as ``open_scene`` does; of the same number, it may be the one that was opened before.
-
-    For those who leave it as it is.
-    """
-    numbered = hasattr(scene, "__index__") and not params and not model.keys() - {"convention"}
+    """Open a scene as ``open_scene`` does, for callers who leave it as it is; numbered ones may be kept."""
+    numbered = isinstance(scene, SupportsIndex) and not params and not model.keys() - {"convention"}
     if not numbered or report_scene(operator.index(scene)).pictures:
         how: dict[str, Any] = {"size": size, "fresnel": fresnel, "integrator": integrator, "sensor": sensor}
         return open_scene(scene, **how, params=params, model=model, budget=budget)

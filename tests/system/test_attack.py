@@ -64,7 +64,9 @@ except mrt.SceneError as error:
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
-def test_no_native_code_from_the_folders_of_process_and_scene(run_python, tmp_path: Path) -> None:
+def test_no_native_code_from_the_folders_of_process_and_scene(
+    run_python, mrt_command, tmp_path: Path
+) -> None:
     trap, sign = tmp_path / "trap.so", tmp_path / "it ran"
     (tmp_path / "trap.c").write_text(TRAP)
     subprocess.run(["cc", "-shared", "-fPIC", "-o", trap, tmp_path / "trap.c"], check=True, timeout=60)
@@ -88,13 +90,11 @@ def test_no_native_code_from_the_folders_of_process_and_scene(run_python, tmp_pa
     assert lines["scene/known.xml"] == lines["scene/by_path.xml"] == "rendered"
     for name in ("scene/unknown.xml", "scene/by_parameter.xml", "dict"):
         assert "native code that is not Mitsuba's" in lines[name]
-    command = [MRT, "out", "3", "width=8", "height=6", "quiet=1"]
-    environ = os.environ | {"MRT_TRAP": str(sign)}
-    subprocess.run(command, cwd=tmp_path, env=environ, check=True, timeout=120)
-    (tmp_path / "plugins" / "wicked.so").rename(
-        tmp_path / "plugins" / "mrt_bsdf.so"
-    )  # looked for there first
-    done = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=120)
+    words = ("out", "3", "width=8", "height=6", "quiet=1")
+    assert mrt_command(*words, MRT_TRAP=str(sign)).returncode == 0
+    plugins = tmp_path / "plugins"
+    (plugins / "wicked.so").rename(plugins / "mrt_bsdf.so")  # looked for there first
+    done = mrt_command(*words, MRT_TRAP=str(sign))
     assert done.returncode == 1 and "native code that is not Mitsuba's" in done.stderr
     assert not sign.exists()
 
@@ -174,12 +174,9 @@ def test_textures_count(variant: str, tmp_path: Path, inside: str, kind: str) ->
 
 
 @pytest.mark.parametrize("megabytes", [200, 400, 600, 900])
-def test_limited_addresses_end_in_a_message(tmp_path: Path, megabytes: int) -> None:
+def test_limited_addresses_end_in_a_message(run_command, megabytes: int) -> None:
     command = f"{MRT} out 3 width=1500 height=1500 aa=1 quiet=1"
-    limit = f"ulimit -v {megabytes * 1000} && exec {command}"
-    done = subprocess.run(
-        ["sh", "-c", limit], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
-    )
+    done = run_command("sh", "-c", f"ulimit -v {megabytes * 1000} && exec {command}")
     if done.returncode != 0:
         assert done.returncode == 2 and "memory=" in done.stderr and done.stderr.count("\n") == 1, done.stderr
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import importlib
-import os
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -55,12 +53,9 @@ def test_the_scene_of_the_tutorial_is_written_and_is_that_of_the_file(run_python
     assert abs(written - same).mean() < 1e-6  # the same scene, but for the rounding of its camera's matrix
 
 
-def test_the_worked_example_passes_its_tests(examples: Path) -> None:
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_matte.py"]
-    variables = {key: value for key, value in os.environ.items() if key != "PYTEST_ADDOPTS"}
-    done = subprocess.run(
-        command, cwd=examples, env=variables, capture_output=True, text=True, timeout=120, check=False
-    )
+def test_the_worked_example_passes_its_tests(run_command, examples: Path) -> None:
+    words = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", examples)
+    done = run_command(sys.executable, *words, examples / "test_matte.py", PYTEST_ADDOPTS=None)
     assert done.returncode == 0, done.stdout
     assert " passed" in done.stdout and "skipped" not in done.stdout
 

@@ -122,7 +122,10 @@ def test_references_of_other_kinds(variant, tmp_path):
 
 def test_renders_to_an_error_are_cases_too(scene):
     """They come to it, and their own estimate is not what they are judged by."""
-    cases = {"target 0.01": path(1, target=0.01, maxspp=256), "noise": path(64, aamode="noise")}
+    cases = {
+        "target 0.01": {"integrator": "path", "target": 0.01, "maxspp": 256},
+        "noise": path(64, aamode="noise"),
+    }
     found = mrt.error_vs_time(scene, cases, reference=path(2048, **ONE_RAY), repeats=3)
     assert not found.failed
     assert found.points["target 0.01"].rmse == pytest.approx(0.01, rel=0.3)

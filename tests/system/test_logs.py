@@ -2,34 +2,17 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
 from mrt_mitsuba.command.logs import LEVELS
 from mrt_mitsuba.command.options import Options, parse
 
 
-def logged(folder: Path, *options: str) -> list[str]:
-    command = [
-        sys.executable,
-        "-m",
-        "mrt_mitsuba.command.main",
-        "a",
-        "0",
-        "width=16",
-        "height=12",
-        "quiet=1",
-        *options,
-    ]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
-    return done.stderr.splitlines()
-
-
-def test_levels_log_more_and_more(tmp_path: Path) -> None:
-    silent, info, debug = (logged(tmp_path, f"log={level}") for level in ("warn", "info", "debug"))
+def test_levels_log_more_and_more(mrt_command) -> None:
+    silent, info, debug = (
+        mrt_command("a", "0", "width=16", "height=12", "quiet=1", f"log={level}").stderr.splitlines()
+        for level in ("warn", "info", "debug")
+    )
     assert not silent
     for what in ("scene 0 loaded in", "rendering: 192 pixels in", "kernels: compiled in", "wrote"):
         assert sum(what in line for line in info) >= 1

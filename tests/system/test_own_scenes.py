@@ -22,6 +22,11 @@ def _load(name: str, **more: Any) -> Any:
     return load(name, **{"width": WIDTH, "height": HEIGHT} | more)
 
 
+def _sensor_of(name: str) -> dict[str, Any]:
+    found = SCENES[name](mi.ScalarTransform4f())["sensor"]
+    return found | {"film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT} | found["film"]}
+
+
 def _rmse(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(a - b, dtype=np.float64))))
 
@@ -39,6 +44,20 @@ def test_uniform_samples_are_mitsubas(name):
     assert ours.rays["primary"] >= SPP * WIDTH * HEIGHT
     off = np.abs(ours.image - theirs).max(axis=-1)
     assert np.quantile(off, 0.98) < 2e-4 * (1 + np.abs(theirs).max()) and _rmse(ours.image, theirs) < 0.01
+
+
+def test_a_camera_in_fog():
+    fog = {"type": "homogeneous", "id": "fog", "sigma_t": 0.2, "albedo": 0.8}
+    around = {"type": "sphere", "radius": 20, "bsdf": {"type": "null"}}
+    scene = _load(
+        "spot",
+        integrator={"type": "volpath", "max_depth": 4},
+        fog=fog,
+        around=around | {"interior": {"type": "ref", "id": "fog"}},
+        sensor=_sensor_of("spot") | {"medium": {"type": "ref", "id": "fog"}},
+    )
+    theirs = np.array(mi.render(scene, spp=16, seed=7))
+    assert _rmse(mrt.render(scene, spp=16, seed=7).image, theirs) < 0.01 < theirs.std()
 
 
 def test_a_scene_renders_by_itself_as_mitsuba_renders_it():
@@ -94,6 +113,7 @@ def test_filters_alpha_and_channels_are_kept(tmp_path):
     names = [field.name for field in bitmap.struct_()]
     values = np.array(bitmap, np.float32)
     assert {"A", "far.T", "facing.X", "picture.G"} <= result.layers.keys() and theirs.shape[:2] == (16, 24)
+    assert ["R", "G", "B", *result.layers] == names
     for name in result.layers:
         np.testing.assert_allclose(result.layers[name], values[..., names.index(name)], atol=2e-3)
     from mrt_mitsuba.output import read_exr
@@ -111,6 +131,20 @@ def test_luminance_and_what_is_not_kept_are_said():
     noise = str(mrt.render(_load("stratified"), aamode="noise", spp=16).plan)
     assert "without StratifiedSampler: rounds continue one sequence" in noise
     assert "the lattice that was asked for" in str(mrt.render(scene, lattice="centered", spp=1).plan)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_bands_of_a_spectral_film(variant):
+    def band(low: int, high: int) -> dict[str, Any]:
+        return {"type": "regular", "wavelength_min": low, "wavelength_max": high, "values": "0.2,0.6"}
+
+    film = {"type": "specfilm", "width": 16, "height": 12, "warm": band(550, 700), "cold": band(400, 550)}
+    scene = _load("spot", sensor=_sensor_of("spot") | {"film": film})
+    result = mrt.render(scene, spp=16, seed=2, variant=variant)
+    theirs = np.array(mi.render(scene, spp=16, seed=2))
+    assert sorted(result.layers) == ["cold", "warm"] and result.image.mean() > 0
+    np.testing.assert_allclose(np.stack([*result.layers.values()], -1), theirs, atol=1e-4)
+    assert "in the picture, only as layers" in str(result.plan)
 
 
 def test_size_sensor_and_parameters(tmp_path):
@@ -210,6 +244,15 @@ def test_kernels_are_compiled_once(tmp_path):
     assert len(result.rounds) > 2 and len(set(tracing)) == 1
 
 
+@pytest.mark.parametrize("name", ["area_light", "spot"])
+def test_few_rounds_are_enough(name):
+    """Under a wide filter, a lone pixel that needs rays takes many around it; so they must go by regions."""
+    scene = _load(name, width=64, height=48, film={"rfilter": {"type": "mitchell"}})
+    error = mrt.render(scene, aamode="noise", spp=16).error.rmse
+    for share in (0.95, 0.86):
+        assert len(mrt.render(scene, target=share * error).rounds) <= 3
+
+
 def test_rounds_report_and_stop():
     seen: list[Any] = []
 
@@ -229,8 +272,10 @@ def test_rounds_report_and_stop():
 
 def test_limits_of_rays_and_seconds():
     scene = _load("rough_glass")
-    assert mrt.render(scene, target=1e-6, maxspp=40).rounds[-1].spp <= 41
-    assert len(mrt.render(scene, target=1e-6, maxseconds=0).rounds) == 1
+    with pytest.warns(mrt.MrtWarning, match=r"target=1e-06 is not reached: maxspp=40 ends the render"):
+        assert mrt.render(scene, target=1e-6, maxspp=40).rounds[-1].spp <= 41
+    with pytest.warns(mrt.MrtWarning, match=r"maxseconds=0 ends the render at an error of 0\.0"):
+        assert len(mrt.render(scene, target=1e-6, maxseconds=0).rounds) == 1
     assert mrt.render(scene, spp=4).error is None
 
 
@@ -245,9 +290,34 @@ def test_no_random_numbers_no_variance_but_a_finer_lattice():
     }
 
 
+def test_errors_are_those_of_the_finished_picture():
+    """After a depth of field, which makes them smaller, and in grey where the film is."""
+    size = {"width": 64, "height": 48}
+    truth = mrt.render(3, aa=32, aamode="none", **size).image
+    for target in (0.02, 0.005):
+        result = mrt.render(3, target=target, **size)
+        assert result.error.low <= _rmse(result.image, truth) <= result.error.high
+    scene = _load("gloss", film={"pixel_format": "luminance"})
+    seen: list[Any] = []
+    for options in ({}, {"focaldist": 4, "focalrange": 0.5}):
+        truth = mrt.render(scene, spp=2**12, **options).image
+        result = mrt.render(scene, target=0.03, seed=1, on_round=seen.append, **options)
+        assert result.error.low <= _rmse(result.image, truth) <= result.error.high
+        np.testing.assert_array_equal(seen[-1].image, result.image)
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [
+        ({"target": 0.1, "aa": 2}, "target=0.1 with aa=2: rounds decide it"),
+        ({"target": 0.1, "spp": 9}, "target=0.1 with spp=9: leave one of them out, or bound it by maxspp"),
+        ({"target": 0.1, "region": (0, 0, 4, 4)}, "with region: rounds share the rays out"),
+        ({"aamode": "noise", "spp": 64, "aa": 2}, "aamode=noise with aa=2"),
+        ({"maxspp": 100}, "maxspp is of use only where rays go in rounds"),
+        ({"maxseconds": 1}, "maxseconds is of use only"),
+        ({"on_round": print}, "on_round is of use only"),
+        ({"target": 0.1, "on_round": 3}, "on_round=3: must be a function"),
+        ({"progress": 3}, "progress=3: must be a"),
         ({"aamode": "noise"}, "give the mean of a pixel"),
         ({"aamode": "noise", "spp": 8}, "16 or more"),
         ({"target": 0.1, "aamode": "sobel"}, "target=0.1 with aamode=sobel: leave one of them out"),

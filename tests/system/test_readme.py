@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -33,17 +31,10 @@ def test_python_examples_run(code, run_python):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_commands_run(command, tmp_path):
+def test_commands_run(command, run_python, tmp_path):
     _, *arguments = shlex.split(command)
     code = "import sys; from mrt_mitsuba.command.main import main; sys.exit(main(sys.argv[1:]))"
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = run_python(code, *arguments)
     assert done.returncode == 0, done.stderr
     written = {path.name for path in tmp_path.iterdir()}
     if arguments[0] == "picture":

@@ -13,6 +13,7 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.memory import BYTES_PER_CHANNEL_OF_RAY, Workspace
+from mrt_mitsuba.output import LAYERS
 from mrt_mitsuba.rays.bundle import Bundle
 from mrt_mitsuba.rays.lattice import Lattice
 from mrt_mitsuba.rendering.shading import shader_for
@@ -264,6 +265,28 @@ def test_other_variants_show_the_same_scene(variant):
 
 
 # ------------------------------------------------ Layers ------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "missing"),
+    [
+        ({}, {"error", "variance"}),
+        ({"aamode": "none"}, {"error", "variance", "edges"}),
+        ({"target": 0.1}, {"edges", "variance"}),
+        ({"aamode": "noise", "lattice": "film", "spp": 16}, {"edges"}),
+        ({"integrator": "direct"}, {"error", "variance", "direct", "reflection", "bounces"}),
+    ],
+    ids=str,
+)
+def test_all_layers_are_those_that_can_be_made(options, missing):
+    result = mrt.render(3, width=16, height=12, layers="all", **options)
+    assert {channel.split(".")[0] for channel in result.layers} == LAYERS.keys() - missing
+    assert LAYERS.keys() - set(result.options["layers"]) == missing
+
+
+def test_a_lattice_has_no_variance():
+    with pytest.raises(mrt.UsageError, match="without random numbers there is none"):
+        mrt.render(3, width=16, height=12, layers=["variance"], target=0.1)
 
 
 def test_layers_belong_together():

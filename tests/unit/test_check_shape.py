@@ -133,10 +133,7 @@ MISTAKES: dict[str, tuple[dict[str, Callable[..., Any]], set[str]]] = {
     "a fixed least distance": ({"hit": not_near}, {"surface", "watertight"}),
     "a box that is too small": ({"bbox": half}, {"bbox"}),
     "ray_test unlike ray_intersect": ({"test": lambda found, ray: found & (ray.d.x < 0.7)}, {"hits"}),
-    "maxt ignored": (
-        {"hit": deaf_to_its_limit, "test": lambda found, ray: found | (ray.maxt < 0)},
-        {"hits"},
-    ),
+    "maxt ignored": ({"hit": deaf_to_its_limit, "test": lambda found, ray: found | (ray.maxt < 0)}, {"hits"}),
     "hit point below the surface": ({"hit": changed(p=lambda si: si.p - 2e-3 * si.n)}, {"surface"}),
     "NaN along an axis": (
         {"hit": lambda si, ray: changed(uv=lambda si: dr.select(ray.d.x == 0, dr.nan, si.uv))(si, ray)},

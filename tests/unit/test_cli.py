@@ -6,7 +6,6 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
 import time
 import types
@@ -258,14 +257,11 @@ def test_signal_leaves_the_old_file_and_does_not_wait_for_the_kernel(
     assert (tmp_path / "out.png").read_bytes() == b"old"
 
 
-def test_reader_that_goes_away(tmp_path: Path) -> None:
+def test_reader_that_goes_away(run_command) -> None:
     """``mrt help | head -1`` ends without complaint."""
     code = "import sys; from mrt_mitsuba.command.main import main; sys.exit(main())"
-    command = f"{sys.executable} -c '{code}' help | head -1"
-    done = subprocess.run(
-        command, shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True
-    )
-    assert done.stdout.startswith("usage: mrt") and done.stderr == ""
+    done = run_command("sh", "-c", f"{sys.executable} -c '{code}' help | head -1")
+    assert done.returncode == 0 and done.stdout.startswith("usage: mrt") and done.stderr == ""
 
 
 def test_wrong_usage_starts_nothing_heavy(run_python) -> None:

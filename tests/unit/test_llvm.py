@@ -148,7 +148,7 @@ def test_library_without_version_in_its_name_is_asked(
         source += f"void LLVMGetVersion(unsigned *a, unsigned *b, unsigned *c) {{ {assignments} }}\n"
     (tmp_path / "llvm.c").write_text(source)
     mine = tmp_path / "libLLVM.so"
-    subprocess.run(["cc", "-shared", "-fPIC", "-o", mine, tmp_path / "llvm.c"], check=True)
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", mine, tmp_path / "llvm.c"], check=True, timeout=60)
     choice = llvm.choose({llvm.VARIABLE: str(mine)}, [], [])
     assert (choice.path == str(mine)) is chosen
     if chosen:
@@ -199,7 +199,7 @@ def test_old_library_named_by_the_user_is_refused_with_a_warning(run_python, tmp
     assert f"{llvm.VARIABLE}={old} is LLVM 15" in done.stderr
 
 
-def test_importing_drjit_too_early_is_told(run_python) -> None:
+def test_importing_drjit_too_early_warns(run_python) -> None:
     code = """
 import drjit, mrt_mitsuba
 from mrt_mitsuba import runtime

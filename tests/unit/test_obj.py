@@ -180,10 +180,7 @@ def test_texture_names(model, tmp_path: Path, name: str) -> None:
 
 def test_missing_texture_is_named_and_replaced_by_kd(model, tmp_path: Path) -> None:
     text = "mtllib model.mtl\n" + SQUARE + UVS + "usemtl painted\nf 1/1 2/2 3/3\n"
-    with pytest.warns(
-        MrtWarning,
-        match=r"model\.mtl:10: the texture picture\.png is missing .*Kd is used",
-    ):
+    with pytest.warns(MrtWarning, match=r"model\.mtl:10: the texture picture\.png is missing .*Kd is used"):
         (mesh,) = model(text, PAINTED)
     assert mesh.material.texture is None and mesh.material.diffuse == (0.5, 0.5, 0.5)
 

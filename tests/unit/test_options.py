@@ -15,8 +15,6 @@ from mrt_mitsuba.command.options import Options, parse
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.output import LAYERS
 
-WITHOUT_NOISE = tuple(name for name in LAYERS if name not in ("error", "variance"))
-
 
 def test_defaults_of_the_report() -> None:
     parsed = parse(["out"])
@@ -36,11 +34,7 @@ def test_defaults_of_the_report() -> None:
         ("o focaldist=0", {"focaldist": 0.0}),
         ("o fresnel=dielectric variant=scalar_rgb", {"fresnel": "dielectric", "variant": "scalar_rgb"}),
         ("o layers=depth,normal", {"layers": ("depth", "normal")}),
-        ("o layers=all", {"layers": WITHOUT_NOISE}),
-        (
-            "o layers=all aamode=none",
-            {"layers": tuple(name for name in WITHOUT_NOISE if name != "edges"), "aamode": "none"},
-        ),
+        ("o layers=all aamode=none", {"layers": tuple(LAYERS), "aamode": "none"}),
         ("o motion=0.1,-2,3e-1 motionsamples=4", {"motion": (0.1, -2.0, 0.3), "motionsamples": 4}),
         ("o memory=4G", {"memory": 4 * 2**30}),
         ("o memory=1.5gib", {"memory": 3 * 2**29}),

@@ -53,7 +53,7 @@ def test_srgb_inverts_the_decoding_of_every_level(level: int) -> None:
     assert levels(grey(linear), "srgb") == [level]
 
 
-def test_nan_is_black_and_told() -> None:
+def test_nan_is_black_with_a_warning() -> None:
     with pytest.warns(MrtWarning, match="1 pixels are NaN"):
         assert levels(grey(0.5, np.nan), "report") == [127, 0]
 
@@ -158,11 +158,7 @@ def make_bad_target(kind: str, folder: Path) -> Path:
 def test_target_that_cannot_be_written(tmp_path: Path, image: np.ndarray, kind: str, reason: str) -> None:
     path = make_bad_target(kind, tmp_path)
     before = sorted(tmp_path.rglob("*"))
-    for attempt in (
-        check_target,
-        lambda p: output.write_png(p, image),
-        lambda p: output.write_exr(p, image),
-    ):
+    for attempt in (check_target, lambda p: output.write_png(p, image), lambda p: output.write_exr(p, image)):
         with pytest.raises(OutputError, match=f"(?i)cannot write .*{reason}"):
             attempt(path)
     assert sorted(tmp_path.rglob("*")) == before

@@ -186,11 +186,7 @@ def test_what_turns_the_plan_turns_kernels(
 
 @pytest.mark.parametrize(
     ("common", "change"),
-    [
-        ({}, {"region": (2, 2, 8, 6)}),
-        ({"motion": [0.1, 0, 0]}, {"motionsamples": 5}),
-        ({}, {"spp": 2}),
-    ],
+    [({}, {"region": (2, 2, 8, 6)}), ({"motion": [0.1, 0, 0]}, {"motionsamples": 5}), ({}, {"spp": 2})],
 )
 def test_numbers_of_the_plan_are_data(common: dict[str, Any], change: dict[str, Any]) -> None:
     before, after = planned(scene(), **common), planned(scene(), **common | change)
@@ -223,17 +219,10 @@ def test_what_the_integrator_does_not_say_is_not_made_up() -> None:
             ],
         ),
         ({"aamode": "none"}, ["16 samples a pixel, with depth", "depth of field: report"]),
-        (
-            {"focaldist": 0, "aa": 2},
-            ["1 sample a pixel", "edges: sobel", "3 further samples in edge pixels"],
-        ),
+        ({"focaldist": 0, "aa": 2}, ["1 sample a pixel", "edges: sobel", "3 further samples in edge pixels"]),
         (
             {"focaldist": 0, "aa": 2, "lattice": "centered", "aamode": "geometry"},
-            [
-                "1 sample a pixel, with depth, normal",
-                "edges: geometry",
-                "4 further samples in edge pixels",
-            ],
+            ["1 sample a pixel, with depth, normal", "edges: geometry", "4 further samples in edge pixels"],
         ),
         ({"focaldist": 0, "aa": 1}, ["1 sample a pixel"]),
         ({"focaldist": 0, "aa": 1, "layers": ["edges"]}, ["1 sample a pixel", "edges: sobel"]),

@@ -167,11 +167,7 @@ def test_meshes_are_drawn_at_every_size_that_is_taken(variant: str, size: float)
             "embree_use_robust_intersections": True,
             "sensor": {**sensor, "to_world": look, "film": film},
             "light": {"type": "mrt_light", "position": [2 * s, 3 * s, 5 * s]},
-            "mesh": {
-                **mesh,
-                "faces": mi.Bitmap(np.ascontiguousarray(faces)),
-                "bsdf": {"type": "mrt_bsdf"},
-            },
+            "mesh": {**mesh, "faces": mi.Bitmap(np.ascontiguousarray(faces)), "bsdf": {"type": "mrt_bsdf"}},
         }
         return render(scene, aa=1).image
 

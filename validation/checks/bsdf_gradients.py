@@ -28,37 +28,32 @@ def gradients(law: Law, case: Case) -> None:
     keys = [k for k, _ in parameters(case) if not params.flags(k) & int(mi.ParamFlags.NonDifferentiable)]
     if not keys:
         raise Skip("traverse() marks no parameter as differentiable")
-    detached = []
-    for key in keys:
-        with changed(case, key, _inside):
-            found, attached, broken = _derivatives(case, key)
-            slope, error = _differences(case, key)
-        off = np.abs(found - slope)
-        usual = off <= np.quantile(
-            off, 0.98
-        )  # where a value has a kink, such as total reflection, no slope is
-        beyond = np.maximum(off - error, 0)[usual].sum()
-        measured = beyond / max(np.abs(slope)[usual].sum(), np.abs(found)[usual].sum(), 1e-30)
-        if measured > GRADIENT and not attached:
-            detached.append(key)
-        i = int(np.where(usual, off, 0).argmax())
-        few = _lit(case)
-        law.at_most(
-            f"derivative of values by {key}{'' if attached else ' (detached)'}, relative, beyond the error "
-            "of differences",
-            measured,
-            GRADIENT,
-            "differences of two widths agree better than that, or the difference is allowed for",
-            case.snippet(snippets.GRADIENT, key=key, wi=few.wi[i], uv=few.uv[i], wo=few.wo[i]),
-        )
-        law.none(
-            f"derivatives by {key} that are not finite, of finite values",
-            broken,
-            "one of them spoils a whole gradient",
-            case.at(snippets.GRADIENT, few, key=key),
-        )
+    detached = [key for key in keys if not _holds(law, case, key)]
     if detached:
         law.notes.append(f"detached: {', '.join(detached)}")
+
+
+def _holds(law: Law, case: Case, key: str) -> bool:
+    """Hold the derivative by one parameter to differences; return False where it is detached, and wrong."""
+    with changed(case, key, _inside):
+        found, attached, broken = _derivatives(case, key)
+        slope, error = _differences(case, key)
+    off, few = np.abs(found - slope), _lit(case)
+    usual = off <= np.quantile(off, 0.98)  # where values have a kink, no slope is
+    beyond = np.maximum(off - error, 0)[usual].sum()
+    measured = beyond / max(np.abs(slope)[usual].sum(), np.abs(found)[usual].sum(), 1e-30)
+    show = case.at(snippets.GRADIENT, few, key=key)
+    law.at_most(
+        f"derivative of values by {key}{'' if attached else ' (detached)'}, relative, beyond the error of "
+        "differences",
+        measured,
+        GRADIENT,
+        "differences of two widths agree better than that, or the difference is allowed for",
+        show(int(np.where(usual, off, 0).argmax())),
+    )
+    why = "one of them spoils a whole gradient"
+    law.none(f"derivatives by {key} that are not finite, of finite values", broken, why, show)
+    return attached or measured <= GRADIENT
 
 
 def _inside(value: Any) -> Any:
