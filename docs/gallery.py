@@ -37,7 +37,7 @@ class Section:
 
 
 def sections() -> list[Section]:
-    """All that the gallery shows."""
+    """Return all that the gallery shows."""
     return [
         Section(
             "The report's scenes",

@@ -136,7 +136,7 @@ def roughness_sign() -> str:
 
 
 def cone() -> str:
-    """How much of scene 9 shows what the original's cone lacks: its shadow, and its shading."""
+    """Return how much of scene 9 shows what the original's cone lacks: its shadow, and its shading."""
     scene = report_scene(9)
     whole, empty = (mrt.render(s, **PLAIN, aa=1, layers=["depth"]) for s in (scene, replace(scene, cones=())))
     on_plane = whole.layers["depth.Z"] == empty.layers["depth.Z"]

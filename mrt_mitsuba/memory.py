@@ -56,7 +56,7 @@ class Budget:
     def of(cls, memory: int | None) -> Budget:
         """Return what was asked for, by default half of what is free; never more than the machine has.
 
-        Of renders in quick succession, only one in a tenth of a second looks at the machine.
+        The machine is looked at ten times a second at most.
         """
         moment = int(10 * time.monotonic())
         wanted = _look(free_memory, moment) // 2 if memory is None else memory

@@ -173,8 +173,8 @@ def _arriving(facts: SceneFacts, settings: Settings) -> float:
 def _hits(mirrors: Sequence[Mirror], settings: Settings) -> float:
     """Return the number of hits of a path, weighted by its throughput at normal incidence.
 
-    Of materials that reflect less than a half there, it is one: what is left out at further hits adds less
-    than as much again. Where mirrors face each other, it adds up.
+    It is one where materials reflect less than a half there: what is left out at further hits adds less than
+    as much again. Where mirrors face each other, it adds up.
     """
     reflectance = max((m.at_normal for m in mirrors if m.at_normal < math.inf), default=0.0)
     bounces = (settings.max_depth - 2) // min((settings.cost(m.int_ior) for m in mirrors), default=1) + 1

@@ -53,7 +53,7 @@ class QuadricKind:
 
     @property
     def width(self) -> int:
-        """How many numbers an object is made of."""
+        """Return how many numbers an object is made of."""
         return 3 * self.points + 1
 
 

@@ -236,7 +236,7 @@ class SceneData:
 
     @property
     def form(self) -> Hashable:
-        """What shapes the code of the kernels, ``arrays`` being their data."""
+        """Return what shapes the code of the kernels, ``arrays`` being their data."""
         return replace(self.plan, cut_off=CutOff(0.0, self.plan.cut_off.lights))
 
     def arrays(self, scene: mi.Scene) -> list[Any] | None:

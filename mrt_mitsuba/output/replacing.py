@@ -1,8 +1,8 @@
 """Putting files in the place of others: all of one result, or none.
 
 New files are written next to the old ones under temporary names. Once all are complete and on the disk, they
-take the places of the old; if anything goes wrong before, they disappear. Those of a process that was killed
-are removed by the next one that writes to the folder: a lock says whether their writer still lives.
+take the places of the old; if anything goes wrong before, they disappear. What a killed process left
+is removed by the next one that writes to the folder: a lock says whether its writer still lives.
 """
 
 from __future__ import annotations

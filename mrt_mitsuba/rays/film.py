@@ -83,8 +83,7 @@ class Film:
 
     @property
     def form(self) -> Hashable | None:
-        """What shapes the code of ``rays``, all else being in its numbers and the sensor; None where that is
-        not known."""
+        """Return what shapes the code of ``rays``, all else being data; None where that is not known."""
         if self.sensor.shutter_open_time() > 0 or self.bands:
             return None
         return self.sensor.shutter_open(), self.grey

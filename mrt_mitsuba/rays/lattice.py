@@ -31,7 +31,7 @@ class Lattice:
 
     @property
     def holds_centre(self) -> bool:
-        """Whether the pixel's centre is one of the samples; it then comes first."""
+        """Return whether the pixel's centre is one of the samples; it then comes first."""
         return self.kind == "report" or (self.kind == "centered" and self.aa % 2 == 1)
 
     def offset(self, sample: Any, aa: Divisor) -> tuple[Any, Any]:

@@ -47,12 +47,12 @@ class Levels:
     def next(self, most: float, target: float | None) -> dict[int, np.ndarray] | None:
         """Return the pixels to double, by their new aa; None where ``most`` rays a pixel do not suffice.
 
-        As many as leave half of the squared error of ``target`` in the others, and those around them.
+        They leave half of the squared error of ``target`` in the others; those around them are doubled, too.
         """
         change = _squares(self._image, self._coarser)
         near = box_mean(change, 1)  # a pixel may change little by chance, its neighbours less likely
         order = np.argsort(near, axis=None)
-        # of the sharp picture, whose changes a blur makes smaller
+        # changes of the sharp picture count, which a blur makes smaller
         allowed = change.sum() * ((target or 0.0) / max(self.error().rmse, 1e-30)) ** 2 / 2
         noisy = np.zeros(self._aa.size, bool)
         noisy[order[np.searchsorted(np.cumsum(near.flat[order]), allowed) :]] = True

@@ -23,7 +23,7 @@ class View:
 
     @property
     def form(self) -> Hashable | None:
-        """What shapes the code of its rays, all else being in ``arrays``; None where that is not known."""
+        """Return what shapes the code of its rays, all but ``arrays``; None where that is not known."""
         if self.sensor.class_name() != "PerspectiveCamera" or self.motion is not None:
             return None
         return self.sensor.near_clip(), self.sensor.far_clip()

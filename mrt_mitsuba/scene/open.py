@@ -15,7 +15,6 @@ from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, is_obj
 from mrt_mitsuba.scene.parameters import set_parameters
-from mrt_mitsuba.scene.placement import model_scene
 from mrt_mitsuba.scene.report import report_scene
 
 
@@ -95,11 +94,8 @@ def reopen_scene(
     model: Mapping[str, Any],
     budget: Budget,
 ) -> Source:
-    """Open a scene as ``open_scene`` does; of the same number, it may be the one that was opened before.
-
-    For those who leave it as it is.
-    """
-    numbered = hasattr(scene, "__index__") and not params and not model.keys() - {"convention"}
+    """Open a scene as ``open_scene`` does, for callers who leave it as it is; numbered ones may be kept."""
+    numbered = isinstance(scene, SupportsIndex) and not params and not model.keys() - {"convention"}
     if not numbered or report_scene(operator.index(scene)).pictures:
         how: dict[str, Any] = {"size": size, "fresnel": fresnel, "integrator": integrator, "sensor": sensor}
         return open_scene(scene, **how, params=params, model=model, budget=budget)
@@ -152,6 +148,8 @@ def _model(scene: Any, options: Mapping[str, Any]) -> tuple[str, Scene | None]:
         number = operator.index(scene)
         return str(number), report_scene(number)
     if is_obj(scene):
+        from mrt_mitsuba.scene.placement import model_scene
+
         model = model_scene(scene, **options)
         return model.title, model
     return "", None

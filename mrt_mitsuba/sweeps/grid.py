@@ -9,7 +9,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,7 +66,7 @@ def _job(name: str, scene: Any, point: dict[str, Any], shared: Mapping[str, Any]
 def _axes(grid: Mapping[str, Any], fixed: Mapping[str, Any]) -> dict[str, list[Any]]:
     axes = {}
     for key, values in grid.items():
-        if isinstance(values, str | bytes | Mapping) or not hasattr(values, "__iter__"):
+        if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
             raise UsageError(f"grid: {key} is {values!r}; give a list of values, such as [{values!r}]")
         axes[key] = [_check(key, plain(value)) for value in values]
         if not axes[key]:

@@ -105,7 +105,7 @@ def assemble_task(mosaic: Mosaic, found: Sequence[Mapping[str, Any] | None], hou
     except (OSError, RuntimeError, OutputError) as error:
         return facts | {"error": f"cannot put {task.name} together: {error}"}
     for name in ("seconds", "rays"):
-        # those of tiles that an earlier sweep made are not known
+        # tiles that an earlier sweep made have none
         facts[name] = sum(tile[name] for tile in found if tile) if all(found) else None
     return facts | {"file": task.files[-1]}
 

@@ -106,5 +106,5 @@ def _explained() -> Iterator[None]:
         yield
     except (CancelledError, OSError) as error:
         raise ClusterError(
-            "the scheduler is gone: start it and its workers, and then the same sweep again, which goes on"
+            "the scheduler is gone: start it and its workers, then run the same sweep again; it continues"
         ) from error

@@ -54,17 +54,8 @@ def test_the_scene_of_the_tutorial_is_written_and_is_that_of_the_file(run_python
 
 
 def test_the_worked_example_passes_its_tests(run_command, examples: Path) -> None:
-    words = (
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "--rootdir",
-        examples,
-        examples / "test_matte.py",
-    )
-    done = run_command(sys.executable, *words, PYTEST_ADDOPTS=None)
+    words = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", examples)
+    done = run_command(sys.executable, *words, examples / "test_matte.py", PYTEST_ADDOPTS=None)
     assert done.returncode == 0, done.stdout
     assert " passed" in done.stdout and "skipped" not in done.stdout
 

@@ -30,7 +30,7 @@ def _missed(study: Study) -> set[str]:
     return {bound.name for bound in study.bounds if not bound.holds}
 
 
-def test_bounds_hold_and_everything_is_told():
+def test_bounds_hold_and_everything_is_shown():
     study = _run()
     assert not _missed(study)
     tables = {part.name: part for part in study.parts if isinstance(part, Table)}

@@ -213,7 +213,7 @@ def test_undefined_reflectance_is_that_of_the_limit() -> None:
 def test_wrong_fresnel_of_metals_is_seen(monkeypatch) -> None:
     monkeypatch.setattr(metals, "f0_of_conductor", lambda eta, k: ((eta - 1) / (eta + 1)) ** 2)
     monkeypatch.setattr(metals, "preset_names", lambda: ["Au"])
-    monkeypatch.setattr(metals, "_picture", lambda *arguments: None)
+    monkeypatch.setattr(metals, "show_ball", lambda *arguments: None)
     assert missed(findings(metals.run)) == {
         "F₀ of 1 metals against the exact value, relative",
         "Schlick against exact under even light, worst metal",

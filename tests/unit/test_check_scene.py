@@ -93,6 +93,29 @@ def test_the_pixel_and_its_object_are_found(scene, capsys) -> None:
     assert "Made by the BSDF" in found._repr_html_()
 
 
+def test_a_light_that_is_no_number_and_instances() -> None:
+    group, place = (
+        {"type": "shapegroup", "a": {"type": "sphere"}},
+        mi.ScalarTransform4f().translate([0, 0, -3]),
+    )
+    nodes = {
+        "type": "scene",
+        "integrator": {"type": "direct"},
+        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+        "group": group,
+        "one": {"type": "instance", "to_world": place, "g": {"type": "ref", "id": "group"}},
+        "ball": {"type": "sphere", "center": [0, 0, 4]},
+        "lamp": {"type": "point", "intensity": {"type": "rgb", "value": float("nan")}},
+    }
+    found = mrt.check_scene(mi.load_dict(nodes), quick=True)
+    assert found.failed == ["emitter PointLight lamp: finite", "pixels"], str(found)
+    assert found.fault.culprit == "the emitter PointLight 'lamp'"
+    assert found.left_out == ("1 instances are not checked: give a dict of one with its group",)
+    assert mrt.check_shape({"type": "instance", "to_world": place, "g": group}, quick=True).failed == [
+        "scale"
+    ]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -101,6 +124,7 @@ def test_the_pixel_and_its_object_are_found(scene, capsys) -> None:
         (["3", "quick=yes"], "must be 0 or 1"),
         (["3", "fast=1"], "unknown option 'fast'"),
         (["99"], "99"),
+        (["scene=none.xml"], "no such file"),
     ],
 )
 def test_wrong_usage(arguments: list[str], message: str, capsys) -> None:

@@ -118,7 +118,9 @@ def noisy(mean: np.ndarray, samples: int, rng: np.random.Generator) -> tuple[np.
 def test_noise_is_no_edge(detector: Any, level: float, samples: int) -> None:
     image, variance = noisy(np.full((150, 200), level), samples, np.random.default_rng(samples))
     inner = (slice(1, -1), slice(1, -1))
-    assert detector(image).mask[inner].mean() > 0.95  # what the detector makes of it untold
+    assert (
+        detector(image).mask[inner].mean() > 0.95
+    )  # which it takes for edges as long as it does not know the noise
     # three deviations leave 0.5 % for normal noise (|Gx| + |Gy|: 4 × 0.135 %); 4 skewed samples reach 1.3 %
     assert detector(image, variance=variance).mask[inner].mean() < (0.02 if samples == 4 else 0.008)
     # the limit is not that far because the detector is blind: at one deviation it still fires

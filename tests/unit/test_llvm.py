@@ -199,7 +199,7 @@ def test_old_library_named_by_the_user_is_refused_with_a_warning(run_python, tmp
     assert f"{llvm.VARIABLE}={old} is LLVM 15" in done.stderr
 
 
-def test_importing_drjit_too_early_is_told(run_python) -> None:
+def test_importing_drjit_too_early_warns(run_python) -> None:
     code = """
 import drjit, mrt_mitsuba
 from mrt_mitsuba import runtime

@@ -53,7 +53,7 @@ def test_srgb_inverts_the_decoding_of_every_level(level: int) -> None:
     assert levels(grey(linear), "srgb") == [level]
 
 
-def test_nan_is_black_and_told() -> None:
+def test_nan_is_black_with_a_warning() -> None:
     with pytest.warns(MrtWarning, match="1 pixels are NaN"):
         assert levels(grey(0.5, np.nan), "report") == [127, 0]
 

@@ -168,7 +168,7 @@ def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:
 def excess(one: Array, other: Array, allowed: Array) -> Array:
     """Return [N]: how far two arrays [N, …] differ beyond ``8 * allowed``, relative to the larger one.
 
-    Of several channels, the brightest counts as the size. What is not finite is left to the law ``finite``.
+    The brightest channel counts as the size. What is not finite is left to the law ``finite``.
     """
     one, other, allowed = (np.reshape(x, (len(one), -1)).astype(np.float64) for x in (one, other, allowed))
     size = np.maximum(np.abs(one), np.abs(other)).max(axis=1, keepdims=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.command.words import words
-from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.validation.checks import emitter
@@ -96,8 +96,9 @@ def check_scene(
 ) -> SceneCheck:
     """Check every BSDF, shape and emitter of a scene, and hunt for pixels that are not finite.
 
-    ``scene`` and ``options`` (such as ``integrator``) are those of ``render``. Of many plugins of one kind,
-    some are checked. Raises ``SceneError`` or ``UsageError`` for a scene that cannot be opened.
+    ``scene`` and ``options`` (such as ``integrator``) are those of ``render``. Only some
+    of many plugins of one kind are checked. Raises ``SceneError`` or ``UsageError`` where the scene does not
+    open.
     """
     runtime.use()
     source = open_scene(scene, **options)
@@ -113,9 +114,7 @@ def check_scene(
     )
     instances = sum(shape.class_name() == "Instance" for shape in source.scene.shapes())
     if instances:
-        left_out += (
-            f"{instances} instances cannot be checked by themselves: check a dict of one and its group",
-        )
+        left_out += (f"{instances} instances are not checked: give a dict of one with its group",)
     return SceneCheck(source.name, checks, _hunt(source, quick, seed), left_out)
 
 
@@ -260,35 +259,44 @@ def _follow(source: Any, count: int, seed: int) -> Counter[str]:
     ray, active, draw = _camera_rays(source, rng), mi.Bool(True), rng.next_float32
     counts: Counter[str] = Counter()
 
-    def note(bad: Any, name: Callable[[Any], str], shapes: Any = None) -> Any:
+    def note(bad: Any, name: Callable[[Any], str], pointers: Any, plugins: Iterable[Any]) -> Any:
         bad &= active
         if dr.any(bad):
-            for shape in [None] if shapes is None else scene.shapes():
-                here = bad if shape is None else bad & (shapes == mi.ShapePtr(shape))
-                counts[name(shape)] += int(dr.count(here)[0])
+            for plugin in plugins:
+                counts[name(plugin)] += int(dr.count(bad & (pointers == type(pointers)(plugin)))[0])
         return ~bad
+
+    shapes, emitters = scene.shapes(), scene.emitters()
 
     for _ in range(DEPTH):
         si = scene.ray_intersect(ray, active)
-        active &= note(_not_finite(si.emitter(scene, active).eval(si, active)), lambda _: "an emitter")
+        met = si.emitter(scene, active)
+        active &= note(_not_finite(met.eval(si, active)), _emitter, met, emitters)
         active &= si.is_valid()
-        active &= note(
-            _not_finite(si.p, si.n, si.sh_frame.n, si.uv), lambda s: f"the shape {_name(s)}", si.shape
-        )
+        bad = _not_finite(si.p, si.n, si.sh_frame.n, si.uv)
+        active &= note(bad, lambda shape: f"the shape {_name(shape)}", si.shape, shapes)
         ds, light = scene.sample_emitter_direction(si, mi.Point2f(draw(), draw()), True, active)
-        active &= note(_not_finite(light), lambda _: "an emitter")
+        active &= note(_not_finite(light), _emitter, ds.emitter, emitters)
         bsdf = si.bsdf(ray)
         value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active & (ds.pdf > 0))
         bs, weight = bsdf.sample(ctx, si, draw(), mi.Point2f(draw(), draw()), active)
         lit = dr.any(mi.unpolarized_spectrum(weight) != 0)
         bad = _not_finite(mi.unpolarized_spectrum(value), pdf, mi.unpolarized_spectrum(weight))
         bad |= lit & _not_finite(bs.wo, bs.pdf)
-        active &= lit & note(bad, lambda s: f"the BSDF {_name(s.bsdf())}, on {_name(s)}", si.shape)
+        active &= lit & note(bad, _bsdf_on, si.shape, shapes)
         ray = si.spawn_ray(si.to_world(bs.wo))
         dr.eval(ray, active, rng)
         if not dr.any(active):
             break
     return +counts
+
+
+def _emitter(emitter: Any) -> str:
+    return f"the emitter {_name(emitter)}"
+
+
+def _bsdf_on(shape: Any) -> str:
+    return f"the BSDF {_name(shape.bsdf())}, on {_name(shape)}"
 
 
 def _name(plugin: Any) -> str:
@@ -322,7 +330,10 @@ def command(arguments: list[str]) -> int:
     scene: Any = int(scenes[0]) if scenes[0].isdigit() else scenes[0]
     if "out" in given:
         report.prepare(Path(given["out"]), "summary.json", "index.html")
-    found = check_scene(scene, quick=given.get("quick") == "1", progress=TerminalProgress(unit="plugin"))
+    try:
+        found = check_scene(scene, quick=given.get("quick") == "1", progress=TerminalProgress(unit="plugin"))
+    except SceneError as error:  # nothing was checked
+        raise UsageError(str(error)) from error
     print(found)
     if "out" in given:
         found.save(given["out"])

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba import runtime
+from mrt_mitsuba.validation.tools.gallery import curves
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.warm import measure
 
@@ -62,9 +63,9 @@ def run(study: Study, *, quick: bool) -> None:
         )
     for name in () if quick else ("tree", "bvh"):
         study.record(f"{name}_pays_from_objects", crossing(rates["loop"], rates[name]))
-    study.plot(
-        "rays", "Rays a second over objects", _figure(rates), "Both axes logarithmic; a loop falls as 1/n."
-    )
+    lines = {title: (list(rates[name]), list(rates[name].values())) for name, title in METHODS.items()}
+    figure = curves(lines, "objects", "rays per second")
+    study.plot("rays", "Rays a second over objects", figure, "Both axes logarithmic; a loop falls as 1/n.")
 
 
 def methods(count: int) -> tuple[dict[str, Callable[[], np.ndarray]], dict[str, int]]:
@@ -151,15 +152,3 @@ def crossing(loop: Mapping[int, float], other: Mapping[int, float]) -> float:
         if lead[i - 1] < 0 <= lead[i]:
             return float(np.exp(np.interp(0, lead[i - 1 : i + 1], np.log(counts[i - 1 : i + 1]))))
     return float(counts[0]) if lead[0] >= 0 else float("inf")
-
-
-def _figure(rates: Rates) -> Any:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-    axes = figure.subplots()
-    for name, title in METHODS.items():
-        axes.loglog(list(rates[name]), list(rates[name].values()), "o-", label=title)
-    axes.set(xlabel="objects", ylabel="rays per second")
-    axes.legend()
-    return figure

@@ -19,6 +19,7 @@ from mrt_mitsuba.validation.tools.bsdf_probe import (
     relative_error,
     rgb,
 )
+from mrt_mitsuba.validation.tools.gallery import curves
 from mrt_mitsuba.validation.tools.study import Bound, Study
 
 TITLE = "Laws of the BSDF: sampling, energy, reciprocity, gradients, known numbers"
@@ -103,24 +104,16 @@ def general(study: Study, *, quick: bool) -> None:
 
 def furnace(study: Study, *, quick: bool) -> None:
     """Hold light out to light in where Kd + Ks <= 1; record what the report's own materials reflect."""
-    from matplotlib.figure import Figure
-
     angles = np.array([0, 30, 60, 75, 85, 89] if quick else [*range(0, 90, 5), 87, 89])
-    figure = Figure(figsize=(6, 4))
-    axes = figure.subplots()
-    albedos_found = []
+    lines = {}
     for alpha in (0.1, 0.3, 0.7, 1.0):
         bsdf = load(alpha=alpha, fresnel="unity", diffuse_reflectance=0.0)
-        found = np.array([albedo(bsdf, at_angle(a)).max() for a in angles])
-        albedos_found.append(found)
-        axes.plot(angles, found, marker=".", label=f"α = {alpha}")
-    axes.axhline(1, color="black", linewidth=0.8)
-    axes.set(xlabel="angle of incidence [°]", ylabel="albedo", ylim=(0, 1.05))
-    axes.legend()
+        lines[f"α = {alpha}"] = angles, np.array([albedo(bsdf, at_angle(a)).max() for a in angles])
+    albedos_found = [found for _, found in lines.values()]
     study.plot(
         "furnace",
         "White furnace: albedo of the lobe with F = 1, Ks = 1, Kd = 0",
-        figure,
+        curves(lines, "angle of incidence [°]", "albedo", log=False, level=1),
         "Light that a second bounce between facets would bring back is missing, the more the rougher.",
     )
     study.at_most(

@@ -135,7 +135,7 @@ def run(study: Study, *, quick: bool) -> None:
         _curves(metals[0]),
         "Solid: exact. Dashed: Schlick. The dip towards grazing angles is what Schlick lacks.",
     )
-    _picture(study, metals[0], quick)
+    show_ball(study, metals[0], quick)
 
 
 def _hold(study: Study, metals: Sequence[Metal]) -> None:
@@ -199,7 +199,7 @@ def _curves(metal: Metal) -> Any:
     return figure
 
 
-def _picture(study: Study, metal: Metal, quick: bool) -> None:
+def show_ball(study: Study, metal: Metal, quick: bool) -> None:
     """Show a ball of the metal, both ways, and the difference."""
     import mitsuba as mi
 

@@ -17,6 +17,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
 from mrt_mitsuba.scene.model import Cone, Scene
 from mrt_mitsuba.scene.report import scene_of_spheres
+from mrt_mitsuba.validation.tools.gallery import curves
 from mrt_mitsuba.validation.tools.knobs import load
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.warm import measure, ratio
@@ -112,7 +113,10 @@ def _mesh_errors(study: Study, count: int) -> None:
         "a share: silhouette, rim and apex within a chord's height, a few times 7.5e-5; a leak adds to it",
     )
     caption = "Both axes logarithmic; the dashed line has slope 2."
-    study.plot("mesh_cones", "Error of a mesh cone over its sides", _figure(errors), caption)
+    sides, means = np.array(list(errors), float), list(errors.values())
+    lines = {"mean error": (sides, means), "slope 2": (sides, means[0] * (sides / sides[0]) ** -2)}
+    figure = curves(lines, "sides", "relative error of distance", dashed=["slope 2"])
+    study.plot("mesh_cones", "Error of a mesh cone over its sides", figure, caption)
 
 
 def mesh_error(found: np.ndarray, exact: np.ndarray) -> float:
@@ -162,16 +166,3 @@ def _exact(ray: Any, frame: Any) -> np.ndarray:
 
     wide = Frame(Array3f64(frame.origin), *(Array3f64(row) for row in (frame.x, frame.y, frame.z)))
     return np.array(intersect_cone(Array3f64(ray.o), Array3f64(ray.d), wide).t)
-
-
-def _figure(errors: dict[int, float]) -> Any:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-    axes = figure.subplots()
-    sides, values = np.array(list(errors), float), list(errors.values())
-    axes.loglog(sides, values, "o-", label="mean error")
-    axes.loglog(sides, values[0] * (sides / sides[0]) ** -2, "--", color="grey", label="slope 2")
-    axes.set(xlabel="sides", ylabel="relative error of distance")
-    axes.legend()
-    return figure

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ from mrt_mitsuba.scene.shapes import torus
 from mrt_mitsuba.validation.oracles.reference import camera_directions, reference_render
 from mrt_mitsuba.validation.studies import approximations
 from mrt_mitsuba.validation.tools import mutations
-from mrt_mitsuba.validation.tools.gallery import gallery
+from mrt_mitsuba.validation.tools.gallery import curves, gallery
 from mrt_mitsuba.validation.tools.sensitivity import sensitivity
 from mrt_mitsuba.validation.tools.study import Study
 
@@ -234,7 +234,12 @@ def _gloss(study: Study, quick: bool) -> None:
     study.plot(
         "gloss",
         "Gloss becomes a mirror",
-        _curve(found.alphas, {f"slope {found.slope:.2f}": found.errors}, "alpha", "mean relative difference"),
+        curves(
+            {f"slope {found.slope:.2f}": (found.alphas, found.errors)},
+            "alpha",
+            "mean relative difference",
+            ticks=alphas,
+        ),
         "Difference between path with mrt_bsdf and the mirror rays of mrt_whitted.",
     )
     names = ["mirror of mrt_whitted", *(f"path, alpha {alpha:g}" for alpha in alphas)]
@@ -246,7 +251,7 @@ def _gloss(study: Study, quick: bool) -> None:
 
 
 def _materials(study: Study) -> None:
-    """What the report does not have: Mitsuba's integrators draw it alike, ray by ray."""
+    """Check what the report does not have: Mitsuba's integrators draw it alike, ray by ray."""
     import mitsuba as mi
 
     for name, (shapes, theirs, spp, limit) in _stock_scenes().items():
@@ -314,23 +319,3 @@ def _smooth_ball() -> dict[str, Any]:
     arrays = {"positions": mesh.vertices, "faces": mesh.faces, "normals": mesh.vertices - middle}
     bitmaps = {name: mi.Bitmap(np.ascontiguousarray(a[np.newaxis])) for name, a in arrays.items()}
     return {"type": "mrt_mesh", **bitmaps}
-
-
-def _curve(
-    x: Sequence[float],
-    series: Mapping[str, Sequence[float]],
-    xlabel: str,
-    ylabel: str,
-) -> Any:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axis = figure.subplots()
-    for label, y in series.items():
-        axis.loglog(x, y, marker="o", label=label)
-    axis.set_xticks(x, [f"{value:g}" for value in x])
-    axis.minorticks_off()
-    axis.set_xlabel(xlabel)
-    axis.set_ylabel(ylabel)
-    axis.legend()
-    return figure

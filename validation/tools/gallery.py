@@ -1,8 +1,8 @@
-"""Pictures side by side, each under its name, in a figure that a phone can show."""
+"""Figures that studies share: pictures side by side, each under its name, and curves."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,4 +24,31 @@ def gallery(pictures: Mapping[str, np.ndarray], *, columns: int = 2) -> Any:
     for axis, (name, image) in zip(axes, pictures.items(), strict=False):
         axis.imshow(to_8bit(image, "srgb"))
         axis.set_title(name, fontsize="small")
+    return figure
+
+
+def curves(
+    series: Mapping[str, tuple[Any, Any]],
+    xlabel: str,
+    ylabel: str,
+    *,
+    log: bool = True,
+    dashed: Collection[str] = (),
+    level: float | None = None,
+    ticks: Sequence[float] = (),
+) -> Any:
+    """Return a matplotlib figure of curves (x, y) by name; ``level``: a horizontal line to compare with."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for name, (x, y) in series.items():
+        (axes.loglog if log else axes.plot)(x, y, "--" if name in dashed else "o-", markersize=4, label=name)
+    if ticks:
+        axes.set_xticks(ticks, [f"{value:g}" for value in ticks])
+        axes.minorticks_off()
+    if level is not None:
+        axes.axhline(level, color="grey", linestyle=":")
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.legend(fontsize="small")
     return figure

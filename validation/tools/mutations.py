@@ -12,6 +12,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.studies.approximations import LEVEL, RENDERS, finite, path_estimate, physical
+from mrt_mitsuba.validation.tools.gallery import curves
 from mrt_mitsuba.validation.tools.image_tests import Comparison, Estimate, compare, estimate
 from mrt_mitsuba.validation.tools.study import Study
 
@@ -126,7 +127,13 @@ def run(study: Study, *, quick: bool) -> None:
     caption = (
         "Probability of such a difference between equal pictures; below the dashed line they are rejected."
     )
-    study.plot("mutations", "How soon a mistake is found", _plot(by_mistake), caption)
+    lines = {  # a smaller p is as certain
+        name: ([t.samples for t in series], [max(t.found.p, 1e-40) for t in series])
+        for name, series in by_mistake.items()
+    }
+    samples = [trial.samples for trial in by_mistake[NONE]]
+    figure = curves(lines, "samples a pixel", "p of equality", level=LEVEL, ticks=samples)
+    study.plot("mutations", "How soon a mistake is found", figure, caption)
     study.table(
         "mutations",
         "Which test finds which mistake, at how many samples",
@@ -142,21 +149,3 @@ def _row(trial: Trial) -> list[Any]:
     questions = ", ".join(found.detected_by) or "-"
     values = (found.pixel.p, found.tile.p, found.image.p, found.rel_rmse)
     return [trial.mistake, trial.samples, questions, *values]
-
-
-def _plot(by_mistake: dict[str, list[Trial]]) -> Any:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axis = figure.subplots()
-    for name, series in by_mistake.items():
-        p = [max(trial.found.p, 1e-40) for trial in series]  # what is less is as certain
-        axis.loglog([trial.samples for trial in series], p, marker="o", label=name)
-    samples = [trial.samples for trial in by_mistake[NONE]]
-    axis.set_xticks(samples, [str(count) for count in samples])
-    axis.minorticks_off()
-    axis.axhline(LEVEL, color="gray", linestyle="--")
-    axis.set_xlabel("samples a pixel")
-    axis.set_ylabel("p of equality")
-    axis.legend(fontsize="small")
-    return figure
