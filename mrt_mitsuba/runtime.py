@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import threading
 import warnings
 
@@ -104,17 +103,18 @@ def usable_variants() -> list[str]:
 
 def versions() -> dict[str, str]:
     """Return the versions of what decides about pixels."""
+    import drjit as dr
+    import mitsuba as mi
+
     from mrt_mitsuba import __version__
 
-    packages = {name: _version(name) for name in ("mitsuba", "drjit")}
-    return {"mrt-mitsuba": __version__, **packages, "llvm": llvm.version_text(llvm.prepare().version)}
-
-
-@functools.cache  # it takes a millisecond
-def _version(package: str) -> str:
-    from importlib import metadata
-
-    return metadata.version(package)
+    llvm_version = llvm.version_text(llvm.prepare().version)
+    return {
+        "mrt-mitsuba": __version__,
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "llvm": llvm_version,
+    }
 
 
 def _llvm_obstacle() -> str | None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NoReturn
+
 import drjit as dr
 import mitsuba as mi
 
@@ -39,7 +42,7 @@ class MrtLight(mi.Emitter):
     refused: a light without falloff emits no finite power.
     """
 
-    def __init__(self, props: mi.Properties):
+    def __init__(self, props: mi.Properties) -> None:
         mi.Emitter.__init__(self, props)
         self.position = mi.Point3f(vector(props, "position", (0, 0, 0)))
         self.intensity = spectrum(props, "intensity", 1.0, emissive=True)
@@ -49,19 +52,21 @@ class MrtLight(mi.Emitter):
     def _update(self) -> None:
         dr.make_opaque(self.position)
 
-    def traverse(self, callback) -> None:
+    def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("position", self.position, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
         callback.put("intensity", self.intensity, mi.ParamFlags.Differentiable)
 
-    def parameters_changed(self, keys=()) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         self._update()
 
-    def sample_direction(self, it, sample, active=True):
+    def sample_direction(
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         ds = direction_to(self.position, it)
         ds.emitter = pointer("Emitter", self)
         return ds, mi.depolarizer(self.irradiance(it, active))
 
-    def irradiance(self, it, active=True):
+    def irradiance(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
         """Return the light's colour at the wavelengths of ``it``, as an unpolarised spectrum."""
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wavelengths = it.wavelengths
@@ -76,21 +81,32 @@ class MrtLight(mi.Emitter):
             return None
         return list(map(first, self.position)), list(map(first, intensity))
 
-    def pdf_direction(self, it, ds, active=True):
+    def pdf_direction(
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
+    ) -> mi.Float:
         return mi.Float(0)
 
-    def eval_direction(self, it, ds, active=True):
+    def eval_direction(
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
+    ) -> mi.Spectrum:
         return mi.depolarizer(dr.select(active, self.irradiance(it, active), 0))
 
-    def eval(self, si, active=True):
+    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
         return mi.Spectrum(0)
 
-    def sample_ray(self, time, sample1, sample2, sample3, active=True):
+    def sample_ray(
+        self,
+        time: mi.Float,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> NoReturn:
         raise NotImplementedError(
             "mrt_light: light tracing needs a finite emitted power; use a stock 'point' light"
         )
 
-    def bbox(self):
+    def bbox(self) -> mi.ScalarBoundingBox3f:
         p = mi.ScalarPoint3f(list(map(first, self.position)))
         # Scalar variants have no second name for it
         return mi.ScalarBoundingBox3f(p, p) if is_jit() else mi.BoundingBox3f(p, p)

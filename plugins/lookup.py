@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -9,7 +12,7 @@ import numpy as np
 from .variants import is_jit, pointer
 
 
-def aligned(values: np.ndarray):
+def aligned(values: np.ndarray) -> mi.Float:
     """Return numbers as a flat float32 array at a multiple of 64 bytes.
 
     Dr.Jit uses arrays of numpy where they lie, and most lie elsewhere. Only from aligned ones does a kernel
@@ -26,7 +29,7 @@ def aligned(values: np.ndarray):
 class Table:
     """Rows of numbers, or pointers to objects of Mitsuba (``kind`` "Shape", ...), looked up by index."""
 
-    def __init__(self, kind, rows):
+    def __init__(self, kind: Any, rows: Sequence[Any]) -> None:
         self.kind, self.rows = kind, rows
         if not is_jit():
             self.rows = rows if isinstance(kind, str) else [kind([float(x) for x in row]) for row in rows]
@@ -36,7 +39,7 @@ class Table:
             self.rows = aligned(np.array(rows))
         dr.eval(self.rows)
 
-    def __call__(self, index, active):
+    def __call__(self, index: mi.UInt32, active: mi.Bool) -> Any:
         if is_jit():
             return dr.gather(self.kind, self.rows, index, active)
         return self.rows[index if active else 0]
@@ -45,7 +48,7 @@ class Table:
 class ByShape:
     """Numbers for each of some shapes, looked up for the one that was hit; ``fallback`` for others."""
 
-    def __init__(self, kind, shapes, rows, fallback):
+    def __init__(self, kind: Any, shapes: Sequence[mi.Shape], rows: Sequence[Any], fallback: Any) -> None:
         self.kind = kind
         self.fallback = kind(fallback)
         if not is_jit():
@@ -61,7 +64,7 @@ class ByShape:
         self.size = dr.opaque(mi.UInt32, size)
         dr.make_opaque(self.fallback)
 
-    def __call__(self, si, found):
+    def __call__(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> Any:
         if not is_jit():
             return self.rows.get(id(si.shape), self.fallback) if found else self.fallback
         ids = dr.reinterpret_array(mi.UInt32, si.shape)

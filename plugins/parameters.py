@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import drjit as dr
 
@@ -16,7 +16,7 @@ class ParameterError(ValueError):
     """A plugin parameter has a wrong value. The text names plugin, key, value and what is allowed."""
 
 
-def _fail(props, name: str, value, allowed: str) -> NoReturn:
+def _fail(props: Any, name: str, value: Any, allowed: str) -> NoReturn:
     raise ParameterError(f'{props.plugin_name()}: "{name}" is {value!r}, but must be {allowed}')
 
 
@@ -24,7 +24,9 @@ def _without_tiny(value: float) -> float:
     return 0.0 if abs(value) < SMALLEST else float(value)
 
 
-def number(props, name: str, default: float, *, above: float = -math.inf, least: float = -math.inf) -> float:
+def number(
+    props: Any, name: str, default: float, *, above: float = -math.inf, least: float = -math.inf
+) -> float:
     """Return a finite float parameter, > ``above`` and >= ``least``."""
     value = props.get(name, default)
     bounds = ((">", above), (">=", least))
@@ -37,7 +39,7 @@ def number(props, name: str, default: float, *, above: float = -math.inf, least:
     return rounded
 
 
-def integer(props, name: str, default: int, *, least: int, most: int | None = None) -> int:
+def integer(props: Any, name: str, default: int, *, least: int, most: int | None = None) -> int:
     """Return an integer parameter >= ``least`` and, if given, <= ``most``."""
     value = props.get(name, default)
     limits = f">= {least}" if most is None else f"from {least} to {most}"
@@ -47,7 +49,7 @@ def integer(props, name: str, default: int, *, least: int, most: int | None = No
     return value
 
 
-def flag(props, name: str, default: bool) -> bool:
+def flag(props: Any, name: str, default: bool) -> bool:
     """Return a boolean parameter."""
     value = props.get(name, default)
     if not isinstance(value, bool):
@@ -55,7 +57,7 @@ def flag(props, name: str, default: bool) -> bool:
     return value
 
 
-def choice(props, name: str, allowed: Sequence[str]) -> str:
+def choice(props: Any, name: str, allowed: Sequence[str]) -> str:
     """Return one of a few strings; the first is the default."""
     value = props.get(name, allowed[0])
     if not isinstance(value, str) or value not in allowed:
@@ -63,7 +65,9 @@ def choice(props, name: str, allowed: Sequence[str]) -> str:
     return value
 
 
-def vector(props, name: str, default: Sequence[float] | None = None, *, nonzero: bool = False) -> list[float]:
+def vector(
+    props: Any, name: str, default: Sequence[float] | None = None, *, nonzero: bool = False
+) -> list[float]:
     """Return three finite numbers, not all 0 if ``nonzero``. Without a default the key is required."""
     if name not in props and default is None:
         raise ParameterError(f'{props.plugin_name()}: "{name}" is missing; give three numbers')
@@ -79,7 +83,7 @@ def vector(props, name: str, default: Sequence[float] | None = None, *, nonzero:
     return numbers
 
 
-def spectrum(props, name: str, default: float | None = None, *, emissive: bool = False):
+def spectrum(props: Any, name: str, default: float | None = None, *, emissive: bool = False) -> Any:
     """Return a spectrum or texture as a texture; numbers and colours must be finite and not negative.
 
     ``emissive``: one for lights, with the spectrum of daylight where a variant renders spectra.
@@ -96,7 +100,7 @@ def spectrum(props, name: str, default: float | None = None, *, emissive: bool =
         _fail(props, name, value, "a number, a colour, a spectrum or a texture")
 
 
-def text(props, name: str) -> str:
+def text(props: Any, name: str) -> str:
     """Return a string parameter."""
     value = props[name]
     if not isinstance(value, str) or not value:

@@ -43,7 +43,7 @@ class MrtPlane(mi.Mesh):
     ``to_world`` is refused.
     """
 
-    def __init__(self, props: mi.Properties):
+    def __init__(self, props: mi.Properties) -> None:
         if "to_world" in props:
             raise ParameterError(
                 'mrt_plane: "to_world" is not accepted; give "normal" and "distance" in world space'

@@ -23,20 +23,27 @@ class Replay:
     """Recordings of one kind; ``replay(key, inputs, run)`` returns what ``run()`` does: arrays."""
 
     def __init__(self) -> None:
-        self._frozen = dr.freeze(_run, limit=MOST, warn_after=2**31 - 1)
+        self._asked: dict[Hashable, None] = {}  # keys, the last to be asked for at the end
+        self._frozen: Any = None
 
     def __call__(self, key: Hashable, inputs: Any, run: Callable[[], Any]) -> Any:
-        """Return what ``run()`` does, which reads no arrays but ``inputs`` and those that it makes."""
+        """Return what ``run()`` does, which reads no arrays but ``inputs`` and those that it makes.
+
+        It is recorded when it is asked for again: many a picture is rendered once.
+        """
+        again = key in self._asked
+        self._asked[key] = self._asked.pop(key, None)
+        if not again:
+            for old in list(self._asked)[:-MOST]:
+                del self._asked[old]
+            return run()
+        if self._frozen is None:
+            self._frozen = dr.freeze(_run, limit=MOST, warn_after=2**31 - 1)
         call = _Call(key, run)
         try:
             return self._frozen(call, inputs)
         finally:
             call.run = None  # a recording keeps the call, and must not keep the scene
-
-    @property
-    def recorded(self) -> int:
-        """Number of recordings made so far."""
-        return int(self._frozen.n_recordings)
 
 
 def held(things: list[Any]) -> list[Any]:

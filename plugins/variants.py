@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit.scalar
 import mitsuba as mi
 
@@ -11,26 +13,26 @@ def is_jit() -> bool:
     return not mi.variant().startswith("scalar")
 
 
-def pointer(kind: str, objects):
+def pointer(kind: str, objects: Any) -> Any:
     """Return an array of pointers to objects (``kind`` "Shape", ...); in scalar variants, the objects."""
     return getattr(mi, kind + "Ptr")(objects) if is_jit() else objects
 
 
-def first(value) -> float:
+def first(value: Any) -> float:
     """Return the first entry of a Dr.Jit array, or the number itself, as a Python float."""
     return float(value) if isinstance(value, float) else float(value[0])
 
 
-def updatable(number: float):
+def updatable(number: float) -> mi.Float:
     """Return a parameter in a form that ``mi.traverse`` can update, which Python floats are not."""
     return mi.Float(number) if is_jit() else drjit.scalar.Array1f64(number)
 
 
-def but_not(mask, excluded):
+def but_not(mask: mi.Bool, excluded: mi.Bool) -> mi.Bool:
     """Return ``mask & ~excluded``; on a Python bool, ~ gives a number."""
     return mask & ~excluded if is_jit() else mask and not excluded
 
 
-def varies(texture) -> bool:
+def varies(texture: mi.Texture) -> bool:
     """Return whether a texture varies over a surface; Mitsuba's ``mesh_attribute`` denies that it does."""
     return texture.is_spatially_varying() or texture.class_name() == "MeshAttribute"

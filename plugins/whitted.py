@@ -101,10 +101,10 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     plugin_name = "mrt_whitted"
 
-    def __init__(self, props: mi.Properties):
+    def __init__(self, props: mi.Properties) -> None:
         _construct(self, props)
         self.max_depth = integer(props, "max_depth", 10, least=1, most=2**32 - 1)
-        self.sky = spectrum(props, "sky", emissive=True) if "sky" in props else None
+        self.sky: Any = spectrum(props, "sky", emissive=True) if "sky" in props else None
         self.clamp = flag(props, "clamp", True)
         self.min_contribution = number(props, "min_contribution", MIN_CONTRIBUTION, least=0)
         self.bounce_budget = choice(props, "bounce_budget", BUDGETS)
@@ -263,16 +263,25 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     # ------------------------------------------- Shading -----------------------------------------------
 
-    def _shade(self, data, scene, sampler, ray, hit, throughput, active) -> Shading:
+    def _shade(
+        self,
+        data: SceneData,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        hit: Hit,
+        throughput: mi.UnpolarizedSpectrum,
+        active: mi.Bool,
+    ) -> Shading:
         """Return the light that leaves ``hit`` back along ``ray``, and its mirror reflection; or the sky.
 
         ``throughput`` is that of the path up to ``hit``.
         """
 
-        def at_surface(hit, throughput, sampler):
+        def at_surface(hit: Hit, throughput: mi.UnpolarizedSpectrum, sampler: mi.Sampler) -> tuple:
             return self._shade_surface(data, scene, sampler, hit, throughput), sampler
 
-        def nowhere(hit, throughput, sampler):
+        def nowhere(hit: Hit, throughput: mi.UnpolarizedSpectrum, sampler: mi.Sampler) -> tuple:
             black = mi.UnpolarizedSpectrum(0)
             return Shading(black, mi.UInt32(0), black, mi.UInt32(0)), sampler
 
@@ -282,7 +291,14 @@ class MrtWhitted(mi.SamplingIntegrator):
         shading.radiance += self._sky(data, ray, but_not(active, hit.found))
         return shading
 
-    def _shade_surface(self, data, scene, sampler, hit, throughput) -> Shading:
+    def _shade_surface(
+        self,
+        data: SceneData,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        hit: Hit,
+        throughput: mi.UnpolarizedSpectrum,
+    ) -> Shading:
         si, radiance = hit.si, mi.UnpolarizedSpectrum(0)
         if data.plan.emission:
             radiance += mi.unpolarized_spectrum(si.emitter(scene, hit.found).eval(si, hit.found))
@@ -299,14 +315,24 @@ class MrtWhitted(mi.SamplingIntegrator):
             radiance, shadow_rays = self._loop_over_lights(data, scene, sampler, hit, throughput, radiance)
         return Shading(radiance, shadow_rays, reflectance, self._cost(int_ior))
 
-    def _cost(self, int_ior):
+    def _cost(self, int_ior: mi.Float) -> mi.UInt32:
         """Return what a bounce off a material of this index takes from the bounce budget."""
         if self.bounce_budget == "plain":
             return mi.UInt32(1)
         return mi.UInt32(dr.maximum(10 - mi.Int32(dr.minimum(10 * int_ior, 10)), 1))
 
-    def _loop_over_lights(self, data, scene, sampler, hit, throughput, radiance):
-        def step(i, radiance, shadow_rays, sampler):
+    def _loop_over_lights(
+        self,
+        data: SceneData,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        hit: Hit,
+        throughput: mi.UnpolarizedSpectrum,
+        radiance: mi.UnpolarizedSpectrum,
+    ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32]:
+        def step(
+            i: mi.UInt32, radiance: mi.UnpolarizedSpectrum, shadow_rays: mi.UInt32, sampler: mi.Sampler
+        ) -> tuple:
             sample = self._light_sample(data, data.lights.at(i, hit.found), sampler, hit)
             (value,), _, _ = data.eval_bsdf(hit, [sample.wo], [sample.facing], mirror=False)
             lit, traced = self._visible_part(data, scene, hit, throughput, sample, value)
@@ -316,7 +342,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         state = dr.while_loop(state, lambda i, *_: hit.found & (i < data.lights.count), step, label="lights")
         return state[1], state[2]
 
-    def _light_sample(self, data, light, sampler, hit) -> LightSample:
+    def _light_sample(self, data: SceneData, light: mi.Emitter, sampler: mi.Sampler, hit: Hit) -> LightSample:
         """Return the direction to a light and what arrives from it, if nothing is in between."""
         u = sampler.next_2d(hit.found) if data.plan.random else mi.Point2f(0.5)
         ds, weight = light.sample_direction(hit.si, u, hit.found)
@@ -326,7 +352,15 @@ class MrtWhitted(mi.SamplingIntegrator):
             facing &= mi.Frame3f.cos_theta(wo) > 0
         return LightSample(ds, wo, mi.unpolarized_spectrum(weight), facing)
 
-    def _visible_part(self, data, scene, hit, throughput, sample, bsdf_value):
+    def _visible_part(
+        self,
+        data: SceneData,
+        scene: mi.Scene,
+        hit: Hit,
+        throughput: mi.UnpolarizedSpectrum,
+        sample: LightSample,
+        bsdf_value: mi.UnpolarizedSpectrum,
+    ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32]:
         """Return a light's contribution where nothing blocks it, and the shadow rays traced for it."""
         value = sample.weight * bsdf_value
         if self.clamp:
@@ -337,7 +371,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         visible = but_not(sample.facing, data.occluded(scene, hit, sample.ds, traced))
         return dr.select(visible, value, 0), dr.select(traced, mi.UInt32(1), mi.UInt32(0))
 
-    def _sky(self, data, ray, active):
+    def _sky(self, data: SceneData, ray: mi.Ray3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi = -ray.d
         si.wavelengths = ray.wavelengths
@@ -348,7 +382,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         return dr.select(active, mi.unpolarized_spectrum(data.environment.eval(si, active)), 0)
 
 
-def _construct(integrator, props) -> None:
+def _construct(integrator: mi.SamplingIntegrator, props: mi.Properties) -> None:
     """Construct the base class without Mitsuba's warning about scalar variants; ``mrt.render`` gives one."""
     level = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)

@@ -25,7 +25,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.validation.studies import rivals
-from mrt_mitsuba.validation.tools import kernels, machine
+from mrt_mitsuba.validation.tools import kernels, machine, turns
 from mrt_mitsuba.validation.tools.costs import scene_cost
 from mrt_mitsuba.validation.tools.report import prepare
 from mrt_mitsuba.validation.tools.study import Goal
@@ -198,6 +198,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--out", type=Path, default=Path("bench.json"), help="file to write (default: bench.json)")
     add("--compare", type=Path, help="an earlier file; ratios above 1 are slower")
     add("--quick", action="store_true", help="small pictures: a trial of the benchmark, not a measurement")
+    add("--small", action="store_true", help="the start of the command and small renders alone, in turns")
+    add("--before", metavar="PYTHON", help="with --small: a Python that has an earlier version")
+    add("--turns", type=int, default=7, help="with --small: processes of each side (default: 7)")
     add("--schema", action="store_true", help="print the JSON schema of the file and stop")
     given = parser.parse_args(arguments)
     if given.schema:
@@ -211,6 +214,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MrtError as error:
         print(f"make bench: {error}", file=sys.stderr)
         return error.exit_code
+    if given.small:
+        found = turns.waits(given.before, given.turns)
+        with replacing(given.out) as file:
+            file.write(json.dumps(turns.as_dicts(found), indent=2).encode() + b"\n")
+        print(turns.table(found))
+        return 0
     with kernels.own_cache():  # seconds of compilation are then the compiler's
         now = bench(QUICK if given.quick else FULL)
     with replacing(given.out) as file:

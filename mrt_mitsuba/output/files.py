@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 Path = str | os.PathLike[str]
 
+# Of zlib: from 1 to 9 a picture of 800x600 takes 9, 9, 10, ... 16 at Pillow's 6, ... 88 ms, and 69 to 44 kB
+PNG_LEVEL = 2
+
 _PIXELS = 2**18  # converted to 8 bit at a time, to bound the memory of intermediate arrays
 
 
@@ -89,7 +92,7 @@ def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
     picture = PilImage.new("RGB", (width, height))
     for row, block in _blocks(image, tonemap):
         picture.paste(PilImage.fromarray(block), (0, row))
-    picture.save(file, format="PNG")
+    picture.save(file, format="PNG", compress_level=PNG_LEVEL)
 
 
 def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Mapping[str, Any]) -> None:

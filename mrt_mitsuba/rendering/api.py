@@ -22,7 +22,6 @@ from mrt_mitsuba.rays.exposure import Exposure
 from mrt_mitsuba.rays.film import pixel_format, spectral_bands
 from mrt_mitsuba.rays.lattice import FILM
 from mrt_mitsuba.rendering.defaults import decided
-from mrt_mitsuba.rendering.film_passes import FilmPasses
 from mrt_mitsuba.rendering.job import Job, Kernels, counting_kernels
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import FilmFacts, Plan, RenderFacts, make_plan
@@ -269,7 +268,9 @@ def _film_facts(source: Source, shader: Shader) -> FilmFacts:
 def _each_picture(
     job: Job, tracer: Tracer, plan: Plan, exposures: Sequence[Exposure], settings: RenderSettings
 ) -> Iterator[Passes]:
-    kind = FilmPasses if plan.lattice.kind == FILM else Passes
+    kind = Passes
+    if plan.lattice.kind == FILM:  # a seventh of all that is imported
+        from mrt_mitsuba.rendering.film_passes import FilmPasses as kind
     rays = plan.repeats if settings.maxspp is None else settings.maxspp
     on_round: Any = settings.on_round
     goal = Goal(settings.rmse, rays, settings.maxseconds, on_round)

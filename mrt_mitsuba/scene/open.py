@@ -15,7 +15,6 @@ from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, is_obj
 from mrt_mitsuba.scene.parameters import set_parameters
-from mrt_mitsuba.scene.placement import model_scene
 from mrt_mitsuba.scene.report import report_scene
 
 
@@ -149,6 +148,8 @@ def _model(scene: Any, options: Mapping[str, Any]) -> tuple[str, Scene | None]:
         number = operator.index(scene)
         return str(number), report_scene(number)
     if is_obj(scene):
+        from mrt_mitsuba.scene.placement import model_scene
+
         model = model_scene(scene, **options)
         return model.title, model
     return "", None

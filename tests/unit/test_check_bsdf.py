@@ -169,6 +169,8 @@ def test_wrong_usage() -> None:
         mrt.check_bsdf(mi.load_dict({"type": "sphere"}))
     with pytest.raises(mrt.UsageError, match="unknown law 'colour'"):
         mrt.check_bsdf({"type": "diffuse"}, only=["colour"])
+    with pytest.raises(mrt.SceneError, match=r'cannot load the nonsense: .* "nonsense" not found'):
+        mrt.check_bsdf({"type": "nonsense"})
 
 
 def test_what_a_check_leaves(tmp_path: Path) -> None:

@@ -188,5 +188,7 @@ def test_snippets_are_programs(capsys, tmp_path: Path) -> None:
 
 
 def test_wrong_usage() -> None:
+    with pytest.raises(mrt.SceneError, match=r'cannot load the mrt_cone: .*"apex" is missing'):
+        mrt.check_shape({"type": "mrt_cone"})
     with pytest.raises(mrt.UsageError, match="is not a shape"):
         mrt.check_shape(mi.load_dict({"type": "diffuse"}))

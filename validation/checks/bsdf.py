@@ -24,13 +24,13 @@ def check_bsdf(bsdf: Any, *, quick: bool = False, seed: int = 0, only: Iterable[
     """Check the laws of a BSDF in the current variant: a dict for ``mi.load_dict``, or a loaded one.
 
     ``quick``: fewer angles and samples. ``only``: names of ``LAWS``. A loaded BSDF skips what has to load it
-    again. Raises ``UsageError`` for anything else, and what Mitsuba raises for a dict it cannot load.
+    again. Raises ``UsageError`` for anything else, and ``SceneError`` for a dict that Mitsuba cannot load.
     """
     import mitsuba as mi
 
     runtime.use()
     recipe = Recipe.of(bsdf)
-    loaded = bsdf if recipe.description is None else recipe.load()
+    loaded = bsdf if recipe.description is None else recipe.open()
     if not isinstance(loaded, mi.BSDF):
         raise UsageError(
             f"{type(loaded).__name__} is not a BSDF of {mi.variant()}: give a dict or a loaded BSDF"

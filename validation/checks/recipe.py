@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mrt_mitsuba.scene.loading import load_dict
 from mrt_mitsuba.validation.checks.law import Skip
 
 
@@ -41,6 +42,10 @@ class Recipe:
         if self.description is None:
             raise Skip("a loaded object was given: this needs the dict that it is made from")
         return mi.load_dict(_made(self.description))
+
+    def open(self) -> Any:
+        """Load it for the first time. Raises ``SceneError`` for a dict that is none of a plugin."""
+        return load_dict(_made(self.description), f"the {(self.description or {}).get('type', 'dict')}")
 
     def scene(self) -> Any:
         """Load a scene that holds the shape alone, or an instance with its group. Raises ``Skip`` as well."""

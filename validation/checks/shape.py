@@ -25,13 +25,14 @@ def check_shape(
     """Check the laws of a shape in the current variant: a dict for ``mi.load_dict``, or a loaded one.
 
     Any other object that has ``ray_intersect``, ``ray_test`` and ``bbox`` will do as well.
-    ``quick``: fewer rays. ``only``: names of ``LAWS``. Raises ``UsageError`` for anything else.
+    ``quick``: fewer rays. ``only``: names of ``LAWS``. Raises ``UsageError`` for anything else, and
+    ``SceneError`` for a dict that Mitsuba cannot load.
     """
     import mitsuba as mi
 
     runtime.use()
     recipe = Recipe.of(shape)
-    loaded = shape if recipe.description is None else recipe.load()
+    loaded = shape if recipe.description is None else recipe.open()
     if not all(hasattr(loaded, name) for name in ("ray_intersect", "ray_test", "bbox")):
         raise UsageError(
             f"{type(loaded).__name__} is not a shape of {mi.variant()}: give a dict or a loaded shape"
