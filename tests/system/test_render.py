@@ -94,6 +94,20 @@ def test_no_focal_distance_means_no_depth_kept():
     assert blurred.kernel_launches > result.kernel_launches
 
 
+def test_all_in_focus_is_not_blurred():
+    """Inside a room, with a range as wide as that: kernels and picture are those without a focal distance."""
+    (floor,) = report_scene(0).planes
+    wall = dataclasses.replace(floor, normal=(1, 0, 0), distance=20)
+    room = dataclasses.replace(report_scene(0), planes=(floor, wall))
+    options = {**SMALL, "aa": 1, "aamode": "none"}
+    sharp = mrt.render(room, **options, focaldist=0, layers=["depth"])
+    for dof in ("report", "corrected"):
+        focused = mrt.render(room, **options, focaldist=1.0, focalrange=1e6, dof=dof)
+        assert "depth of field" not in _omitted(focused)
+        assert focused.kernel_launches == sharp.kernel_launches
+        assert np.array_equal(focused.image, sharp.image)
+
+
 def test_aa_1_has_no_edge_pass_unless_edges_are_asked_for():
     assert "edge pass" in _omitted(mrt.render(0, **SMALL, aa=1, aamode="sobel"))
     asked = mrt.render(0, **SMALL, aa=1, aamode="sobel", layers=["edges"])

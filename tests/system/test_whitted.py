@@ -26,6 +26,7 @@ class Traced:
     found: np.ndarray  # [N]
     t: np.ndarray  # [N]
     p: np.ndarray  # [N, 3]
+    n: np.ndarray  # [N, 3]
 
 
 def trace(nodes: dict[str, Any], o: Any, d: Any, **integrator: Any) -> Traced:
@@ -36,7 +37,8 @@ def trace(nodes: dict[str, Any], o: Any, d: Any, **integrator: Any) -> Traced:
     rays = mi.Ray3f(mi.Point3f(np.atleast_2d(o).T), mi.Vector3f(np.atleast_2d(d).T))
     found = tracer.trace(scene, None, rays)
     si = found.hit.si
-    return Traced(np.array(found.radiance).T, np.array(found.hit.found), np.array(si.t), np.array(si.p).T)
+    points = (np.array(v).T for v in (si.p, si.n))
+    return Traced(np.array(found.radiance).T, np.array(found.hit.found), np.array(si.t), *points)
 
 
 def radiance(nodes: dict[str, Any], o: Any, d: Any, **integrator: Any) -> np.ndarray:
@@ -75,9 +77,11 @@ def test_hits_lie_on_their_sphere(others: dict[str, Any]) -> None:
     distance = np.linalg.norm(found.p - center, axis=1)
     met = found.found & (distance < 1)
     assert met.mean() > 0.5
-    assert (
-        np.abs(distance - radius)[met].max() < 8 * 2.0**-24 * 3.5
-    )  # some roundings of coordinates below 3.5
+    few = 8 * 2.0**-24 * 3.5  # some roundings of coordinates below 3.5
+    assert np.abs(distance - radius)[met].max() < few
+    # The normal is the direction from the centre; that of a hit 5000 away is known to 5000 roundings of it
+    outwards = (found.p - center)[met] / distance[met, None]
+    assert np.abs(found.n[met] - outwards).max() < (few / radius if not others else 1e-3)
 
 
 @pytest.mark.parametrize("above", [True, False])

@@ -17,6 +17,7 @@ MISTAKES = {
     "not reciprocal": {"reciprocity"},
     "albedo 1.05": {"energy"},
     "NaN at grazing": {"finite"},
+    "NaN at roughness 0": {"finite"},
     "eval_pdf unlike eval": {"eval_pdf"},
     "detached gradient": {"gradients"},
     "wrong hemisphere flag": {"components"},
@@ -149,9 +150,13 @@ def register() -> None:
         def parameters_changed(self, keys=()):
             pass
 
+        def roughness(self):
+            alpha = self.alpha if is_jit() else first(self.alpha)
+            return alpha if self.mistake == "NaN at roughness 0" else dr.maximum(alpha, 1e-4)
+
         def lobes(self, ctx, wi, wo, active):
             """f cos θo, and the density of plain sampling of D, for both directions above."""
-            alpha = self.alpha if is_jit() else first(self.alpha)
+            alpha = self.roughness()
             if self.mistake == "detached gradient":
                 alpha = dr.detach(alpha)
             active = active & (wi.z > 1e-7) & (wo.z > 1e-7)
@@ -188,7 +193,7 @@ def register() -> None:
         def sample(self, ctx, si, sample1, sample2, active=True):
             diffuse, glossy = (ctx.component in (0xFFFFFFFF, i) for i in range(2))
             second = sample1 < (0.5 if diffuse and glossy else float(glossy))
-            tan = (self.alpha if is_jit() else first(self.alpha)) * dr.sqrt(-dr.log(1 - sample2.x))
+            tan = self.roughness() * dr.sqrt(-dr.log(1 - sample2.x))
             sin, cos = dr.sincos(2 * dr.pi * sample2.y)
             m = dr.normalize(mi.Vector3f(tan * cos, tan * sin, 1))
             bs = mi.BSDFSample3f()

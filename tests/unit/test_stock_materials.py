@@ -130,6 +130,20 @@ def test_to_world(name: str, scale: list[float]) -> None:
     assert ours.max() > 0.02
 
 
+def test_normals_of_corners_stay_across_the_surface() -> None:
+    """A stretched ball has the normals of an ellipsoid, as Mitsuba turns normals into world space."""
+    points = np.random.default_rng(2).normal(size=(3, 3))
+    points = np.float32(points / np.linalg.norm(points, axis=1, keepdims=True))
+    to_world = mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 40).scale([1, 2, -0.5])
+    arrays = {"positions": points, "normals": points, "faces": np.array([[0, 1, 2]], np.uint32)}
+    bitmaps = {name: mi.Bitmap(a[np.newaxis]) for name, a in arrays.items()}
+    mesh = mi.load_dict({"type": "mrt_mesh", **bitmaps, "to_world": to_world})
+    normals = np.array(mi.traverse(mesh)["vertex_normals"]).reshape(3, 3)
+    expected = np.array([list(to_world @ mi.ScalarNormal3f(n.tolist())) for n in points])
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(normals, expected, atol=1e-6)
+
+
 @pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder", "capsule"])
 def test_derivatives_by_uv_are_those_of_the_surface(kind: str) -> None:
     """dp/du and dp/dv of a hit by finite differences of the hits around it."""

@@ -166,11 +166,10 @@ def _ends(case: Case) -> Iterator[tuple[str, float]]:
     """Yield every number, colour or bitmap of the BSDF at the ends of its likely range, one at a time."""
     for key, value in parameters(case):
         number = float(np.mean(np.array(value)))
-        least = 1e-3 if "alpha" in key or "rough" in key else 0.0  # 0: another kind of surface
         if key.split(".")[-2 if key.endswith(".value") else -1] in INDICES and number <= 1:
             ends = 0.5 * number, 2.0 * number  # of metals: 0 makes no sense there
         else:
-            ends = (least, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)
+            ends = (0.0, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)
         for end in ends:
             yield key, end
 

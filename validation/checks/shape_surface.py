@@ -54,11 +54,11 @@ def hits(law: Law, case: Case) -> None:
             return case.snippet(o[i], d[i], snippets.MAXT, maxt=limit[i])
 
         for name, found in zip(("ray_test()", "ray_intersect()"), tested(maxt), strict=True):
-            bad = counts & (found != expected)
-            law.none(
-                f"rays on which {name} is wrong {what}",
-                bad,
-                "one question, one answer; grazing rays are left out",
+            law.share(
+                f"share of rays on which {name} is wrong {what}",
+                counts & (found != expected),
+                5e-4 if maxt is None else 0,
+                "one question, one answer; rays that graze are left out, but for those that just miss",
                 show,
             )
 

@@ -286,6 +286,13 @@ def _stock_scenes() -> dict[str, tuple[dict[str, Any], dict[str, Any], int, floa
     bulb = {"type": "sphere", "center": [0, -2, 2], "radius": 0.1}
     bulb["emitter"] = {"type": "area", "radiance": 100.0}
     direct: dict[str, Any] = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
+    kinds: dict[str, dict[str, Any]] = {
+        "mrt_cone": {"apex": [-1.2, 1, 0], "base_center": [-1.2, 0, 0], "radius": 0.7},
+        "mrt_plane": {"normal": [0, 0, 1], "distance": 2.0},
+        "mrt_group": {"numbers": mi.Bitmap(np.array([[-1, -1, 0, 0.5]], np.float32))},
+    }
+    turned = {name: {"type": name, **numbers, "flip_normals": True} for name, numbers in kinds.items()}
+    lit = {"ball": {"type": "sphere", "center": [1, 0, 0]}, "lamp": lamp}
     bumps = {
         "type": "bumpmap",
         "texture": {"type": "bitmap", "bitmap": mi.Bitmap(0.5 * _waves())},
@@ -298,6 +305,7 @@ def _stock_scenes() -> dict[str, tuple[dict[str, Any], dict[str, Any], int, floa
                             {"type": "path", "max_depth": 6, "rr_depth": 100}, 1, 5e-3),
         "a bumpy ball": ({"ball": {"type": "sphere", "bsdf": {**bumps, "bsdf": {"type": "diffuse"}}},
                           "lamp": lamp}, direct, 1, 1e-4),
+        "shapes turned inside out": ({**lit, **turned}, direct, 1, 1e-4),
         "an area light": ({"ball": {"type": "sphere", "bsdf": {"type": "diffuse"}}, "bulb": bulb},
                           direct, 16, 1e-5),
     }  # fmt: skip

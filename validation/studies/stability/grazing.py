@@ -42,13 +42,14 @@ def grazing_cases(cases: Cases, *, quick: bool) -> None:
             0,
             fault=("one in a thousand", (~wrong[::1000]).sum()),
         )
-    across, fault = _from_afar(count)
+    across, fault = _from_afar(200_000)
     cases.at_most(
         "cone, from 1e5 radii away",
-        f"worst distance error across the surface of {count} rays, in roundings of the way",
-        "seven",
+        "distance error across the surface of 99.9 % of 200000 rays, in roundings of the way; "
+        "points of lines that are made orthogonal to them once, not twice, leave 4.0",
+        "3.4 to 3.5",
         across,
-        12,
+        3.75,
         fault=("hits 2 in a million further away", fault),
     )
 
@@ -97,7 +98,7 @@ def _level(kind: str, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _from_afar(count: int) -> tuple[float, float]:
-    """Return the worst error of a cone's place, and what it would be with hits too far away."""
+    """Return the error of a cone's place, and what it would be with hits too far away."""
     rng, away = np.random.default_rng(4), 1e5
     apex, base, radius = (0.3, 0.1, 1.0), (-0.2, 0.2, -1.0), 0.5
     d = rng.normal(size=(count, 3))
@@ -111,7 +112,7 @@ def _from_afar(count: int) -> tuple[float, float]:
     with np.errstate(invalid="ignore"):
         n = reference.Axial([cone]).normals(o + exact[:, None] * np.float64(d), np.zeros(count, int))
     cosine = np.abs((n * d).sum(axis=1))[both] / (ROUNDING * away)
-    return tuple((np.abs(far * t[both] - exact[both]) * cosine).max() for far in (1, 1 + 2e-6))
+    return tuple(np.quantile(np.abs(far * t[both] - exact[both]) * cosine, 0.999) for far in (1, 1 + 2e-6))
 
 
 def _exact(things: list[Any], which: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:

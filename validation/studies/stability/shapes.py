@@ -78,11 +78,13 @@ MATTE = Material(0.0, 1.0, (0, 0, 0), (1, 1, 1))
 
 
 def _triangle_dict(size: float) -> dict[str, Any]:
+    """Return the triangle, mirrored and of size 1, with what puts it right."""
     import mitsuba as mi
 
-    positions = mi.Bitmap((CORNERS * size).astype(np.float32)[np.newaxis])
-    faces = mi.Bitmap(np.array([[[0, 1, 2]]], np.uint32))
-    return {"type": "mrt_mesh", "positions": positions, "faces": faces}
+    positions = mi.Bitmap((CORNERS * [1, 1, -1]).astype(np.float32)[np.newaxis])
+    faces = mi.Bitmap(np.array([[[0, 2, 1]]], np.uint32))
+    right = mi.ScalarTransform4f().scale([size, size, -size])
+    return {"type": "mrt_mesh", "positions": positions, "faces": faces, "to_world": right}
 
 
 def _axis_dict(kind: str, first: str, second: str) -> Callable[[float], dict[str, Any]]:
@@ -275,8 +277,9 @@ def stand_in_cases(cases: Cases) -> None:
     o, d = _rays(1.0, 4.0, 20_000)
     for solid in (s for s in SOLIDS if s.name in ("cone", "cylinder")):
         single = {**solid.to_dict(1.0), "segments": SIDES}
-        numbers = mi.Bitmap(np.array([[*APEX, *BASE, CONE_RADIUS]], np.float32))
+        numbers = mi.Bitmap(np.array([[*np.add(APEX, 1), *np.add(BASE, 1), CONE_RADIUS]], np.float32))
         group = {"type": "mrt_group", "kind": solid.name, "numbers": numbers, "segments": SIDES}
+        group["to_world"] = mi.ScalarTransform4f().translate([-1, -1, -1])
         _stand_in(cases, solid, f"{solid.name}, stand-in", single, o, d)
         _stand_in(cases, solid, f"{solid.name}, stand-in in a group", group, o, d)
         _around(cases, solid, single, o, d)

@@ -27,6 +27,7 @@ WIDTH, HEIGHT = 64, 48
 SMALL, SHARE = 1e-3, 0.95
 # For plain cases: some float32 roundings, three times what was measured
 PLAIN = 3e-6
+CUT_OFF = 1 / 16 / 255  # the default of ``min_contribution``
 
 GREY = Material(1.3, 0.1, (0.5, 0.5, 0.5), (0.3, 0.2, 0.1))
 MIRROR = Material(1.5, 0.3, (0.95, 0.9, 0.85), (0.2, 0.2, 0.2))
@@ -124,6 +125,7 @@ def run(study: Study, *, quick: bool) -> None:
     """Check every case against the float64 tracer, sums over bounces in closed form, whole renders."""
     cases = Cases(study, "transport", "Light transport")
     rows = [_case(cases, path) for path in PATHS]
+    _cut_offs(cases)
     _bounces(cases, (1, 3, 10) if quick else range(1, 11))
     _whole_renders(cases, quick=quick)
     cases.close(
@@ -175,10 +177,34 @@ def difference(image: np.ndarray, truth: np.ndarray) -> float:
     return float(np.quantile(np.nan_to_num(relative, nan=np.inf), SHARE))
 
 
-def _render(scene: Scene, *, fresnel: str, clamp: bool) -> np.ndarray:
+def _render(scene: Scene, *, fresnel: str, clamp: bool, least: float = 0.0) -> np.ndarray:
     described = scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=fresnel)
-    described["integrator"] = {"type": "mrt_whitted", "clamp": clamp, "min_contribution": 0.0}
+    described["integrator"] = {"type": "mrt_whitted", "clamp": clamp, "min_contribution": least}
     return render(described, aa=1, lattice="report").image
+
+
+def _cut_offs(cases: Cases) -> None:
+    """What cutting dim paths changes where something very bright may end them."""
+    glass = Material(1.5, 0.1, (0.2, 0.2, 0.2), (0.1, 0.1, 0.1))
+    pair = Sphere((-0.51, 0.5, 0), 0.5, glass), Sphere((0.51, 0.5, 0), 0.5, glass)
+    balls = replace(BASE, camera=Camera((0.2, 1.0, 4.0), (0.0, 0.5, 0.0)), spheres=pair, planes=())
+    bright = (
+        ("a sky of 1000", replace(balls, sky=(1000, 1000, 1000)), True),
+        ("a light of 1e4", replace(balls, lights=(Light((2, 3, 4), (1e4, 1e4, 1e4)),)), False),
+    )
+    for name, scene, clamp in bright:
+        whole, cut, more = (
+            _render(scene, fresnel="dielectric", clamp=clamp, least=least)
+            for least in (0.0, CUT_OFF, 1e3 * CUT_OFF)
+        )
+        cases.at_most(
+            f"cut-off under {name}",
+            f"largest change by it{'' if clamp else ', without clamp'}",
+            "a sixteenth of an 8-bit step, as promised",
+            np.abs(cut - whole).max(),
+            CUT_OFF,
+            fault=("paths cut at 1000 times as much", np.abs(more - whole).max()),
+        )
 
 
 # -------------------------------------------- Bounces in closed form ---------------------------------------
