@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Hashable
 from dataclasses import dataclass
@@ -12,6 +13,8 @@ import numpy as np
 
 from mrt_mitsuba.rays.divisor import Divisor
 
+# Whole numbers stand for floats where all but a few have so many binary digits, of which a pixel adds many up
+DIGITS, COARSE = 12, 1e-3
 STEPS = 32  # of a pixel, where integrals over a filter are summed
 
 
@@ -167,38 +170,79 @@ def _opaque_numbers(width: int, height: int, border: int, variant: str) -> Numbe
 
 
 class Canvas:
-    """Sums of filtered values over the pixels of a film, in some pictures at once.
+    """Sums of filtered values over the pixels of a film whose filter reaches into others, in some pictures.
 
-    A film whose filter reaches into other pixels is exposed by Mitsuba's ``ImageBlock``, pictures one below
-    the other. A box needs none: there, the sums over the rays of each pixel are the picture.
+    They are added up in whole numbers, whose sums do not depend on their order as those of floats do, with
+    which the same render would not give the same bits.
     """
 
-    def __init__(self, film: Film, pictures: int, channels: int, coalesce: bool) -> None:
-        import mitsuba as mi
+    def __init__(self, film: Film, pictures: int, channels: int) -> None:
+        self.film, self.rows = film, film.height + 2 * film.reach
+        self._sums = np.zeros((pictures, self.rows, film.width, channels))
 
-        self.film, self.pictures, self.rows = film, pictures, film.height + 2 * film.reach
-        self.block = mi.ImageBlock(
-            (film.width, self.rows * pictures),
-            (0, -film.reach),
-            channels,
-            rfilter=film.sensor.film().rfilter(),
-            coalesce=coalesce,
-        )
+    def put(self, place: Any, picture: Any, values: list[Any], rays: int) -> None:
+        """Add values at places on the film, [channels] each, to pictures of these numbers.
 
-    def put(self, place: Any, picture: Any, values: list[Any]) -> None:
-        """Add values at places on the film, [channels] each, to pictures of these numbers."""
+        No more than so many ``rays`` start in a pixel.
+        """
         import drjit as dr
         import mitsuba as mi
 
-        below = mi.Float(picture) * dr.opaque(mi.Float, self.rows)
-        self.block.put(place + mi.Vector2f(0, below), values)
+        dr.eval(place, picture, values)
+        sizes = [dr.abs(value) for value in values]
+        largest = np.array([float(dr.max(size)[0]) for size in sizes])
+        # Sums must not exceed 63 bits; a filter's values are below 2
+        bits = 61 - math.ceil(math.log2(rays * (2 * self.film.reach + 1) ** 2))
+        least = [dr.opaque(mi.Float, float(most) * 2.0 ** (DIGITS - bits)) for most in largest]
+        coarse = [_coarse(size, low) for size, low in zip(sizes, least, strict=True)]
+        exact = max(coarse) <= COARSE * dr.width(place)
+        exponents = np.minimum(bits - np.frexp(largest)[1], 126) if exact else np.zeros(len(values), int)
+        sums = [dr.zeros(mi.Int64 if exact else mi.Float, self._sums[..., 0].size) for _ in values]
+        scaled = [
+            value * dr.opaque(mi.Float, 2.0 ** int(e)) for value, e in zip(values, exponents, strict=True)
+        ]
+        self._add(place, picture, scaled, sums)
+        dr.eval(sums)
+        for channel, (total, exponent) in enumerate(zip(sums, exponents, strict=True)):
+            found = np.asarray(total).reshape(self._sums.shape[:-1])
+            self._sums[..., channel] += np.ldexp(found.astype(np.float64), -exponent)
+
+    def _add(self, place: Any, picture: Any, values: list[Any], sums: list[Any]) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        reach, rfilter = self.film.reach, self.film.sensor.film().rfilter()
+        width, rows = dr.opaque(mi.Int32, self.film.width), dr.opaque(mi.Int32, self.rows)
+        column, row = mi.Int32(dr.floor(place.x)), mi.Int32(dr.floor(place.y))
+        top = mi.Int32(picture) * rows + row + reach
+        near = [column + step for step in range(-reach, reach + 1)]
+        along = [rfilter.eval(mi.Float(x) + 0.5 - place.x) for x in near]
+
+        def add_row(step: Any) -> tuple[Any]:
+            down = rfilter.eval(mi.Float(row + step) + 0.5 - place.y)
+            for x, weight in zip(near, along, strict=True):
+                index, inside = mi.UInt32((top + step) * width + x), (x >= 0) & (x < width)
+                for value, total in zip(values, sums, strict=True):
+                    number = value * (weight * down)
+                    number = number if dr.is_float_v(total) else mi.Int64(dr.round(number))
+                    dr.scatter_reduce(dr.ReduceOp.Add, total, number, index, inside)
+            return (step + 1,)
+
+        dr.while_loop((mi.Int32(-reach),), lambda step: step <= reach, add_row)
 
     @property
     def sums(self) -> np.ndarray:
         """The sums, [pictures, H, W, channels]."""
-        sums = np.asarray(self.block.tensor(), np.float64)
-        sums = sums.reshape(self.pictures, self.rows, self.film.width, -1)
-        return sums[:, self.film.reach : self.film.reach + self.film.height]
+        return self._sums[:, self.film.reach : self.film.reach + self.film.height]
+
+
+def _coarse(size: Any, least: Any) -> float:
+    """Return how many numbers are less than ``least``, without zeros; ``inf`` if one is not finite."""
+    import drjit as dr
+    import mitsuba as mi
+
+    one = dr.select((size > 0) & (size < least), mi.Float(1), 0)
+    return float(dr.sum(dr.select(dr.isfinite(size), one, dr.inf))[0])
 
 
 def spectral_bands(film: Any) -> tuple[str, ...]:

@@ -55,6 +55,12 @@ class Groups:
     def __len__(self) -> int:
         return len(self.pixels)
 
+    @property
+    def most(self) -> int:
+        """The most rays that start in a pixel of a picture."""
+        place = np.flatnonzero(np.diff(self.pixels, prepend=-1) | np.diff(self.pictures, prepend=-1))
+        return self.size * int(np.diff(place, append=len(self)).max())
+
     def part(self, start: int, stop: int) -> Groups:
         """Return the groups ``start`` to ``stop − 1``."""
         return Groups(
@@ -172,7 +178,7 @@ class Exposer:
             moments: add up colours and their squares by pixel as well.
         """
         film = self.film
-        canvas = Canvas(film, pictures, len(self.names) + 1, groups.size >= 4) if film.reach else None
+        canvas = Canvas(film, pictures, len(self.names) + 1) if film.reach else None
         kept = len(self.names) if canvas is None else 3 * moments
         total = np.zeros((kept + 3 * moments, pictures * film.pixels))
         pixel = groups.pictures.astype(np.int64) * film.pixels + groups.pixels  # ascending
@@ -283,8 +289,9 @@ class Exposer:
         planes += [mi.Float(layers[name]) for name in self._counted]
         if canvas is not None:
             share = dr.gather(mi.Float, mi.Float(groups.weights), lanes.group)
-            canvas.put(place, lanes.picture, [*(c * share for c in channels), share])
-            dr.eval(planes, canvas.block.tensor())
+            weighted = [*(c * share for c in channels), share]
+            dr.eval(planes, place, lanes.picture, weighted)
+            canvas.put(place, lanes.picture, weighted, groups.most)
         else:
             dr.eval(planes)  # block_reduce would evaluate each plane by itself, in a kernel of its own
         return [dr.block_reduce(dr.ReduceOp.Add, plane, groups.size) for plane in planes]

@@ -18,7 +18,7 @@ from mrt_mitsuba.rendering.detectors import DETECTORS
 from mrt_mitsuba.rendering.settings import NOISE, Focus, RenderSettings
 
 # Float32 channels of a pixel that its statistics take while rounds are shared out
-ROUND_CHANNELS = 110
+ROUND_CHANNELS = 122
 
 # Passes over the picture, in the order in which they may occur
 FIRST_HITS, RENDERING, EDGES = "first hits", "rendering", "edges"
@@ -144,7 +144,7 @@ class Plan(RenderFacts):
         if self.lattice.kind == FILM:
             # sums by pixel, in double precision, while a film is exposed
             more = len(self.film.bands + self.film.aovs) if self.film else 0
-            channels += (ROUND_CHANNELS if ROUNDS in self.steps else 16) + 5 * more
+            channels += (ROUND_CHANNELS if ROUNDS in self.steps else 28) + 5 * more
         return channels
 
     @property

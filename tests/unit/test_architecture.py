@@ -37,7 +37,7 @@ class WithoutTypes(ast.NodeTransformer):
 
 
 def sources() -> dict[str, str]:
-    """The text of all modules, by name."""
+    """Return the text of all modules, by name."""
     found = {}
     for folder, package in FOLDERS.items():
         for file in sorted((ROOT / folder).rglob("*.py")):
@@ -54,7 +54,7 @@ PACKAGES = {name for name in MODULES if any(other.startswith(f"{name}.") for oth
 
 
 def imported(name: str) -> Iterator[tuple[str, str]]:
-    """Pairs (module of the project, name taken from it, or none) that a module imports anywhere."""
+    """Yield pairs (module of the project, name taken from it, or none) that a module imports anywhere."""
     package = name if name in PACKAGES else name.rpartition(".")[0]
     for node in ast.walk(MODULES[name]):
         if isinstance(node, ast.Import):

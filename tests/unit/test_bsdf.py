@@ -63,7 +63,7 @@ def count_for(variant: str, vectorised: int) -> int:
 
 
 LAWFUL = {
-    "schlick": {},
+    "schlick": {"diffuse_reflectance": 0.4, "specular_reflectance": 0.5},  # defaults: > 1 at 85°
     "dielectric": {"alpha": 0.4, "fresnel": "dielectric"},
     "plain sampling": {"alpha": 0.05, "diffuse_reflectance": 0.0, "sample_visible": False},
     "narrow": {"alpha": 0.01, "fresnel": "dielectric", "diffuse_reflectance": 0.0},

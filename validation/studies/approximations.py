@@ -30,6 +30,9 @@ LEVEL = (
 )
 
 
+# Seeds are fixed, so what such a bound can fail for is a change; by as much as this, it does
+POWER = "least fault: the mistakes of the table of mutations, 2 % of the light and 5 % of alpha among them"
+
 # One ray at a time through the pixel's centre, as the report's lattice has it
 AT_CENTRES: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}
 
@@ -146,7 +149,7 @@ def run(study: Study, *, quick: bool) -> None:
         for number, found in zip(numbers, comparisons, strict=True):
             rows += _chain(study, number, without_approximations(number, spp=spp, **size))
             name = f"scene {number}: p that black mrt_bsdf and roughplastic make the same picture"
-            study.at_least(name, found.p, LEVEL)
+            study.at_least(name, found.p, LEVEL, POWER)
             rest.append([number, *(v.p for v in (found.pixel, found.tile, found.image)), found.rel_rmse])
             advance(1)
     figures = ["mean difference", "% of pixels > 1/255", "mean left to the stock flavour", "FLIP left"]

@@ -44,6 +44,18 @@ MATERIALS: dict[str, dict[str, Any]] = {
     "with f0": {"f0": rgb((0.9, 0.5, 0.1)), "diffuse_reflectance": 0.0, "alpha": 0.2},
 }
 
+# The limits of these laws leave room for anybody's BSDF; ours is held to some roundings, eight times what was
+# measured
+OWN = {
+    "gradients": 1e-5,
+    "reciprocity": 1e-6,
+    "weights": 2e-6,
+    "eval_pdf": 1e-6,
+    "components": 1e-6,
+    "variants": 2e-6,
+    "switch": 1e-6,
+}
+
 # Albedos by angle that the tests of Nori give for a BSDF of this family, and its parameters
 NORI = {0: 0.207067, 45: 0.215733, 60: 0.247884, 80: 0.430936, 85: 0.519016}
 NORI_BSDF = {
@@ -96,10 +108,10 @@ def general(study: Study, *, quick: bool) -> None:
         for law in found.laws.values():
             if not law.skipped:
                 worst = law.worst
-                why = f"{worst.name}: {worst.note}"
-                study.bounds.append(
-                    Bound(f"{name}: {law.name}", worst.measured, worst.limit, worst.at_most, why)
-                )
+                limit = min(worst.limit, OWN.get(law.name, worst.limit))
+                least = f"{limit:.3g}" if worst.at_most else "a density 10 % too large, as the tests show"
+                why = f"{worst.name}: {worst.note}; least fault: {least}"
+                study.bounds.append(Bound(f"{name}: {law.name}", worst.measured, limit, worst.at_most, why))
 
 
 def furnace(study: Study, *, quick: bool) -> None:
@@ -178,12 +190,9 @@ def dielectric_terms(study: Study, *, quick: bool) -> None:
     one, other = (evaluate(mi.load_dict(d), wi, wo)[0] for d in diffuse)
     errors["diffuse"] = relative_error(one, other).max()
     for name, error in errors.items():
-        study.at_most(
-            f"{name} against Mitsuba's, relative",
-            error,
-            2.4e-5,
-            "exp of up to 16 and a few roundings" if name in ("D", "reflection") else "a few roundings",
-        )
+        limit, why = {"G": 2e-6, "F": 4e-6, "diffuse": 5e-7}.get(name, 2.4e-5), "a few roundings"
+        why = f"exp of up to 16 and {why}" if name in ("D", "reflection") else why
+        study.at_most(f"{name} against Mitsuba's, relative", error, limit, why)
 
 
 def _factors(alpha: float, ior: float, wi: Any, wo: Any) -> dict[str, float]:

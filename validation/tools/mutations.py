@@ -11,7 +11,14 @@ import numpy as np
 import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.studies.approximations import LEVEL, RENDERS, finite, path_estimate, physical
+from mrt_mitsuba.validation.studies.approximations import (
+    LEVEL,
+    POWER,
+    RENDERS,
+    finite,
+    path_estimate,
+    physical,
+)
 from mrt_mitsuba.validation.tools.gallery import curves
 from mrt_mitsuba.validation.tools.image_tests import Comparison, Estimate, compare, estimate
 from mrt_mitsuba.validation.tools.study import Study
@@ -121,7 +128,7 @@ def run(study: Study, *, quick: bool) -> None:
     by_mistake = {trial.mistake: [t for t in found if t.mistake == trial.mistake] for trial in found}
     for name, series in by_mistake.items():
         if name == NONE:
-            study.at_least("p of equality without a mistake", series[-1].found.p, LEVEL)
+            study.at_least("p of equality without a mistake", series[-1].found.p, LEVEL, POWER)
         else:
             study.at_most(f"p of equality with {name}", series[-1].found.p, LEVEL)
     caption = (

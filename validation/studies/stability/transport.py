@@ -79,6 +79,12 @@ def _lit(position: tuple[float, float, float], color: float = 1.0) -> Scene:
     return replace(BASE, lights=(Light(position, (color,) * 3),))
 
 
+def _under(outwards: float) -> Scene:
+    """A light on the lower side of the ball, or so many radii outside, and the floor that it lights."""
+    x, y, z = ((1 + outwards) * 0.5 * c for c in (0.26726124, -0.53452248, 0.80178373))
+    return replace(_lit((x, 0.5 + y, z)), camera=Camera((1.5, 1.5, 3.0), (0.3, 0.0, 0.6)))
+
+
 def _hall(specular: float, light: float = 1.0) -> Scene:
     """Return two mirrors that face each other, with a ball and the camera between them."""
     material = replace(MIRROR, specular=(specular, 0.95 * specular, 0.9 * specular))
@@ -100,6 +106,7 @@ PATHS: Sequence[Path] = (
     Path("light inside a ball", "not lit from outside", _lit((0, 0.5, 0)), _lit((0, 0.8, 0.6))),
     Path("light on the floor", "at height 0", _lit((1.5, 0, 0.5)), _lit((1.5, 0.001, 0.5)), 5e-6),
     Path("light on the ball", "its top", _lit((0, 1, 0)), _lit((0, 1.01, 0)), 5e-6),
+    Path("light under the ball", "on its lower side", _under(0), _under(1e-3), 5e-6, truth=_under(1e-6)),
     Path("light at 1e6", "parallel light", _lit((4e5, 6e5, 7e5)), _lit((4.001e5, 6e5, 7e5))),
     Path("light at the camera", "no shadow", _lit(CAMERA.position), _lit((0.2, 0.501, 3))),
     Path("black", "Kd = Ks = 0", _ball(specular=(0,) * 3, diffuse=(0,) * 3),
