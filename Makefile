@@ -4,6 +4,7 @@
 # make attack [ROUNDS=10]               hostile files, signals, threads, limits: some minutes; 100 rounds: an hour
 # make docs                            the documentation as a site: docs/_build/index.html
 # make bench  [ARGS="--compare F"]      time scenes 0-4 into out/bench.json
+# make test-gpu, make bench-gpu        the tests of what runs on a device, and its times, on an NVIDIA GPU
 # make setup                            the environment alone: .venv with the commands mrt and mrt-validate
 # make lint, make types, make package   style, types, wheel and sdist
 PYTHON ?= python3
@@ -17,7 +18,7 @@ BIN  := $(VENV)/bin
 # One stamp per set of extras: installing one leaves the others as they are.
 STAMP := $(VENV)/.mrt
 
-.PHONY: setup render test fuzz attack bench docs lint types package clean
+.PHONY: setup render test test-gpu fuzz attack bench bench-gpu docs lint types package clean
 setup: $(STAMP)-base
 
 render: $(STAMP)-base
@@ -36,6 +37,14 @@ attack: $(STAMP)-test
 
 bench: $(STAMP)-test
 	$(BIN)/python -m mrt_mitsuba.validation.bench --out $(OUT)/bench.json $(ARGS)
+
+DEVICE ?= cuda
+test-gpu: $(STAMP)-test
+	MRT_DEVICE=$(DEVICE) $(BIN)/python -m pytest -m "device and not package" $(ARGS)
+
+bench-gpu: $(STAMP)-test
+	@mkdir -p $(OUT)
+	$(BIN)/python -m mrt_mitsuba.validation.bench --device $(DEVICE)_ad_rgb --out $(OUT)/bench-gpu.json $(ARGS)
 
 lint: $(STAMP)-dev
 	$(BIN)/ruff check .

@@ -41,6 +41,23 @@ def run_command(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str
     return run
 
 
+# Where tests in a vectorised variant run: "llvm", or "cuda" with make test-gpu
+DEVICE = os.environ.get("MRT_DEVICE", "llvm")
+
+
+def pytest_sessionstart() -> None:
+    """End at once where the device that was asked for is not there: skipped tests would look like success."""
+    problem = runtime.obstacle(f"{DEVICE}_ad_rgb")
+    if problem and "MRT_DEVICE" in os.environ:
+        pytest.exit(f"MRT_DEVICE={DEVICE}: {problem}", returncode=1)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if "variant" in getattr(item, "fixturenames", ()):
+            item.add_marker("device")
+
+
 @pytest.fixture
 def run_python(run_command: Callable[..., Any]) -> Callable[..., subprocess.CompletedProcess[str]]:
     """Run Python code in the same way: ``run_python(code, *arguments, VARIABLE=value)``."""
@@ -85,13 +102,14 @@ def original_data() -> Path:
 
 @pytest.fixture
 def variant(request: pytest.FixtureRequest) -> Iterator[str]:
-    """A Mitsuba variant with the plugins: ``llvm_ad_rgb``, or what a test asks for by an indirect parameter.
+    """A Mitsuba variant with the plugins: ``llvm_ad_rgb``, or what a test asks for by an indirect parameter;
+    of ``MRT_DEVICE`` in place of LLVM.
 
     Skips where it cannot run here. Afterwards the variant before is back.
     """
     import mitsuba as mi
 
-    name = getattr(request, "param", runtime.FAST)
+    name = getattr(request, "param", runtime.FAST).replace("llvm", DEVICE)
     problem = runtime.obstacle(name)
     if problem:
         pytest.skip(problem)

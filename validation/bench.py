@@ -25,7 +25,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.validation.studies import rivals
-from mrt_mitsuba.validation.tools import kernels, machine, turns
+from mrt_mitsuba.validation.tools import device_bench, kernels, machine, turns
 from mrt_mitsuba.validation.tools.costs import scene_cost
 from mrt_mitsuba.validation.tools.report import prepare
 from mrt_mitsuba.validation.tools.study import Goal
@@ -191,6 +191,29 @@ def read(path: Path) -> dict[str, Any]:
     return found
 
 
+def _special(given: argparse.Namespace) -> int:
+    """Measure small renders, or a device; write JSON."""
+    if given.small:
+        waits = turns.waits(given.before, given.turns)
+        print(turns.table(waits))
+        found = turns.as_dicts(waits)
+    else:
+        print(device_bench.HEADER)
+        rows = []
+        extent = device_bench.QUICK if given.quick else device_bench.FULL
+        try:
+            for row in device_bench.measure(given.device, extent):
+                print(row, flush=True)
+                rows.append(row)
+        except MrtError as error:
+            print(f"make bench-gpu: {error}", file=sys.stderr)
+            return error.exit_code
+        found = device_bench.as_dicts(rows)
+    with replacing(given.out) as file:
+        file.write(json.dumps(found, indent=2).encode() + b"\n")
+    return 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, write JSON, and compare."""
     parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
@@ -201,6 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--small", action="store_true", help="the start of the command and small renders alone, in turns")
     add("--before", metavar="PYTHON", help="with --small: a Python that has an earlier version")
     add("--turns", type=int, default=7, help="with --small: processes of each side (default: 7)")
+    add("--device", metavar="VARIANT", help="against Mitsuba's integrators in a variant, such as cuda_ad_rgb")
     add("--schema", action="store_true", help="print the JSON schema of the file and stop")
     given = parser.parse_args(arguments)
     if given.schema:
@@ -214,12 +238,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MrtError as error:
         print(f"make bench: {error}", file=sys.stderr)
         return error.exit_code
-    if given.small:
-        found = turns.waits(given.before, given.turns)
-        with replacing(given.out) as file:
-            file.write(json.dumps(turns.as_dicts(found), indent=2).encode() + b"\n")
-        print(turns.table(found))
-        return 0
+    if given.small or given.device:
+        return _special(given)
     with kernels.own_cache():  # seconds of compilation are then the compiler's
         now = bench(QUICK if given.quick else FULL)
     with replacing(given.out) as file:

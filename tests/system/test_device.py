@@ -1,0 +1,90 @@
+"""Pictures on a device, against the scalar variants: of make test-gpu on a GPU, else in LLVM."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba import runtime
+from mrt_mitsuba.validation.tools import device_bench
+
+SIZE = {"width": 16, "height": 12}
+# Float32 in another order of operations; at edges and in narrow highlights a rounding can turn a pixel
+NOISE, TURNED = 2e-4, 0.02
+
+
+def different(a: np.ndarray, b: np.ndarray) -> float:
+    """The share of the pixels that are not the same."""
+    a, b = (np.nan_to_num(x, posinf=1e6) for x in (a, b))
+    return float((np.abs(a - b).max(axis=-1) > NOISE * (1 + np.abs(b).max(axis=-1))).mean())
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb"], indirect=True)
+@pytest.mark.parametrize("number", [0, 3, 9])
+@pytest.mark.filterwarnings("ignore:scalar_:mrt_mitsuba.MrtWarning")
+def test_pictures_are_those_of_the_scalar_variant(number: int, variant: str) -> None:
+    options = {"aa": 1, "aamode": "none", "focaldist": 0, "layers": ["depth", "bounces"]}
+    found = [mrt.render(number, variant=variant, **SIZE, **options) for _ in range(3)]
+    truth = mrt.render(number, variant="scalar_rgb", **SIZE, **options)
+    for result in found:  # as it is, recorded, replayed
+        assert different(result.image, truth.image) <= TURNED
+        for name, layer in truth.layers.items():
+            assert different(result.layers[name][..., None], layer[..., None]) <= TURNED
+    assert different(found[0].image[::-1], truth.image) > TURNED  # the measure can tell
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+@pytest.mark.filterwarnings("ignore:scalar_:mrt_mitsuba.MrtWarning")
+def test_spectral_pictures_are_those_of_the_scalar_variant(variant: str) -> None:
+    options = {"aa": 1, "aamode": "none", "focaldist": 0}
+    found = mrt.render(3, variant=variant, **SIZE, **options).image
+    truth = mrt.render(3, variant="scalar_spectral", **SIZE, **options).image
+    assert different(found, truth) <= TURNED
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb"], indirect=True)
+def test_filters_and_updates_on_a_device(variant: str) -> None:
+    """Tables made of NumPy's arrays, ids of shapes and sizes that the host reads are what could go wrong."""
+    scene = mi.load_dict(mrt.scene_dict(3, **SIZE))
+    before = [mrt.render(scene, aa=2, lattice="report", focaldist=2.0).image for _ in range(3)]
+    assert np.array_equal(before[0], before[1]) and np.array_equal(before[1], before[2])
+    parameters = mi.traverse(scene)
+    key = next(k for k in list(parameters.keys()) if k.endswith("alpha"))
+    parameters[key] = mi.Float(0.4)
+    parameters.update()
+    after = mrt.render(scene, aa=2, lattice="report", focaldist=2.0).image
+    assert np.isfinite(after).all() and not np.array_equal(after, before[0])
+
+
+def test_make_test_gpu_runs_its_selection_where_it_is_told_to(tmp_path: Path) -> None:
+    """And ends with an error where the device is not there."""
+
+    def run(device: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "device", "--co"]
+        tests = [str(Path(__file__)), str(Path(__file__).parents[1] / "unit" / "test_updates.py")]
+        environment = os.environ | {"MRT_DEVICE": device}
+        return subprocess.run(
+            [*command, *tests], env=environment, capture_output=True, text=True, timeout=120, check=False
+        )
+
+    found = run("llvm")
+    assert found.returncode == 0 and "test_light_follows_its_parameters" in found.stdout
+    assert "test_make_test_gpu" not in found.stdout  # no picture, no device
+    if "cuda_ad_rgb" not in mi.variants() or runtime.obstacle("cuda_ad_rgb"):
+        missing = run("cuda")
+        assert missing.returncode == 1 and "needs an NVIDIA GPU" in missing.stdout + missing.stderr
+
+
+def test_bench_of_a_device_measures_all_pairs() -> None:
+    rows = list(device_bench.measure("llvm_ad_rgb", device_bench.QUICK))
+    assert {(row.scene, row.other) for row in rows} == {
+        (scene, other) for scene in ("0", "1000 triangles") for other in ("direct", "path")
+    }
+    assert all(row.time.seconds > 0 and row.time.other_seconds > 0 for row in rows)
