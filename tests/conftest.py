@@ -105,7 +105,7 @@ def variant(request: pytest.FixtureRequest) -> Iterator[str]:
     """A Mitsuba variant with the plugins: ``llvm_ad_rgb``, or what a test asks for by an indirect parameter;
     of ``MRT_DEVICE`` in place of LLVM.
 
-    Skips where it cannot run here. Afterwards the variant before is back.
+    Skips where it cannot run here. Afterwards the variant before is back, or this one if there was none.
     """
     import mitsuba as mi
 
@@ -115,5 +115,4 @@ def variant(request: pytest.FixtureRequest) -> Iterator[str]:
         pytest.skip(problem)
     before = mi.variant()
     yield runtime.use(name)
-    if before is not None:
-        runtime.use(before)
+    runtime.use(before or name)
