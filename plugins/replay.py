@@ -9,6 +9,7 @@ among the inputs is an error while recording, so none can go out of date unseen.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Hashable
 from typing import Any
 
@@ -19,12 +20,26 @@ import mitsuba as mi
 MOST = 32
 
 
+_all: weakref.WeakSet[Replay] = weakref.WeakSet()
+
+
+def forget_recordings() -> None:
+    """Drop all recordings; to be called before Dr.Jit drops its kernels, which they would still launch."""
+    for replay in _all:
+        replay.forget()
+
+
 class Replay:
     """Recordings of one kind; ``replay(key, inputs, run)`` returns what ``run()`` does: arrays."""
 
     def __init__(self) -> None:
         self._asked: dict[Hashable, None] = {}  # keys, the last to be asked for at the end
         self._frozen: Any = None
+        _all.add(self)
+
+    def forget(self) -> None:
+        """Drop the recordings."""
+        self._asked, self._frozen = {}, None
 
     def __call__(self, key: Hashable, inputs: Any, run: Callable[[], Any]) -> Any:
         """Return what ``run()`` does, which reads no arrays but ``inputs`` and those that it makes.

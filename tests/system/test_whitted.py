@@ -130,6 +130,18 @@ def test_schlick_mirrors_at_grazing_angles_whatever_is_reflected_at_normal_incid
     np.testing.assert_allclose(found[:, 0], 0.5 * (f0 + (1 - f0) * (1 - cos) ** 5), rtol=1e-4)
 
 
+@pytest.mark.parametrize(("ior", "bounces"), [(1.5, 9), (0.9, 9), (0.89, 4), (0.57, 1), (0.5, 1), (1e-6, 0)])
+def test_a_bounce_costs_what_the_index_leaves_of_ten(ior: float, bounces: int) -> None:
+    """Straight between two mirrors: max(1, 10 - int(10 ior)) of a budget of ten for each."""
+    mirror = {**MIRROR, "int_ior": ior}
+    walls = {f"wall{k}": {**FLOOR, "normal": [0, 0, k], "distance": 1.0, "bsdf": mirror} for k in (1, -1)}
+    scene = mi.load_dict({"type": "scene", **walls})
+    tracer = mi.load_dict({**WHITTED, "bounce_budget": "report", "sky": 1.0})
+    ray = mi.Ray3f(mi.Point3f(0, 0, 0.5), mi.Vector3f(0, 0, -1))
+    tracer.prepare(scene)
+    assert np.array(tracer.trace(scene, None, ray).bounces).item() == bounces
+
+
 def test_lobes_are_chosen_by_their_mean_reflectance() -> None:
     """Whatever their colours: 2/3 of cyan gloss against 1/6 of red paint is four in five."""
     colors = {"specular_reflectance": [0, 1, 1], "diffuse_reflectance": [0.5, 0, 0]}

@@ -120,6 +120,19 @@ def test_stand_in_encloses_the_right_volume() -> None:
     assert volume == pytest.approx(np.pi / 3 * (0.25 + 0.04), rel=2e-3)  # 64 sides for a circle: 1.6e-3
 
 
+def test_texture_coordinates_of_a_sphere_are_mitsubas() -> None:
+    rng = np.random.default_rng(3)
+    d = rng.normal(size=(3, 500))
+    ray = mi.Ray3f(mi.Point3f(-5 * d), mi.Vector3f(d))
+    group = {"type": "mrt_group", "numbers": mi.Bitmap(np.array([[0.1, 0.2, 0.3, 1]], np.float32))}
+    scene = mi.load_dict({"type": "scene", "group": group})
+    hit = mi.load_dict({"type": "mrt_whitted"}).trace(scene, None, ray).hit
+    sphere = mi.load_dict({"type": "scene", "sphere": {"type": "sphere", "center": [0.1, 0.2, 0.3]}})
+    found, expected = np.array(hit.si.uv), np.array(sphere.ray_intersect(ray).uv)
+    assert np.array(hit.found).mean() > 0.9
+    np.testing.assert_allclose(found[:, np.array(hit.found)], expected[:, np.array(hit.found)], atol=1e-3)
+
+
 ONE = np.array([[0, 0, 0, 1]], np.float32)
 
 

@@ -41,6 +41,24 @@ def test_a_lit_sphere_has_no_dark_spots(variant: str, distance: float) -> None:
     assert (image[~on_sphere] == 0).any()
 
 
+@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
+def test_large_surfaces_near_the_origin_have_no_dark_spots(variant: str, kind: str) -> None:
+    """What a hit is off by goes with the coordinates of the shape, not with its own, which are near zero."""
+    numbers = {
+        "sphere": [[0, -1000, 0, 1000]],
+        "cylinder": [[-900, -1000, 0, 900, -1000, 0, 1000]],
+    }[kind]
+    look = mi.ScalarTransform4f().look_at([0.3, 2, 3], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 160, "height": 120, "rfilter": {"type": "box"}}
+    scene = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "fov": 20, "to_world": look, "film": film},
+        "light": {"type": "mrt_light", "position": [0.3, 2, 3]},
+        "large": {"type": "mrt_group", "kind": kind, "numbers": mi.Bitmap(np.array(numbers, np.float32))},
+    }
+    assert (render(scene, aa=1, lattice="report").image > 0.02).all()
+
+
 def test_moving_a_sphere_has_the_right_derivative(variant: str) -> None:
     """The derivative of the light along fixed rays is that of central differences."""
     integrator = mi.load_dict(

@@ -85,9 +85,9 @@ def _under(outwards: float) -> Scene:
     return replace(_lit((x, 0.5 + y, z)), camera=Camera((1.5, 1.5, 3.0), (0.3, 0.0, 0.6)))
 
 
-def _hall(specular: float, light: float = 1.0) -> Scene:
+def _hall(specular: float, light: float = 1.0, ior: float = 1.5) -> Scene:
     """Return two mirrors that face each other, with a ball and the camera between them."""
-    material = replace(MIRROR, specular=(specular, 0.95 * specular, 0.9 * specular))
+    material = replace(MIRROR, ior=ior, specular=(specular, 0.95 * specular, 0.9 * specular))
     walls = (Plane((0, 0, 1), 2.0, material), Plane((0, 0, -1), 2.0, material), Plane((0, 1, 0), 1.0, GREY))
     ball, lamp = Sphere((0.3, -0.2, -0.5), 0.4, GREY), Light((0.5, 1.5, 0.3), (light,) * 3)
     return Scene(Camera((0.0, 0.1, 1.0), (0.05, 0.0, -2.0)), (0.2, 0.3, 0.4), (lamp,), (ball,), walls)
@@ -101,6 +101,8 @@ PATHS: Sequence[Path] = (
     Path("perfect facing mirrors", "Ks 1, ten bounces", _hall(1), {"max_depth": 9}, 2e-5, FULL),
     Path("facing mirrors, no clamp", "Ks 0.95", _hall(0.95), _hall(0.95, 1.001), 2e-5, {**FULL, **OPEN}),
     Path("mirrors that add light", "Ks 1.5: 58 times", _hall(1.5), _hall(1.501), 2e-5, FULL),
+    Path("bounce budget", "index 0.57: a bounce costs five of ten", _hall(0.95, ior=0.57),
+         {"max_depth": 11}, 2e-5, FULL),
     Path("clamp on", "a light of 1e4", _lit((2, 3, 4), 1e4), OPEN),
     Path("clamp off", "a light of 1e4", _lit((2, 3, 4), 1e4), _lit((2, 3, 4), 10001), PLAIN, OPEN),
     Path("light inside a ball", "not lit from outside", _lit((0, 0.5, 0)), _lit((0, 0.8, 0.6))),
