@@ -20,7 +20,7 @@ from mrt_mitsuba.validation.studies import growth
 from mrt_mitsuba.validation.tools.knobs import load
 from mrt_mitsuba.validation.tools.warm import Ratio, ratio
 
-THEIRS = {"direct": {"type": "direct"}, "path": {"type": "path", "max_depth": 6}}
+THEIRS: dict[str, dict[str, Any]] = {"direct": {"type": "direct"}, "path": {"type": "path", "max_depth": 6}}
 
 
 @dataclass(frozen=True)
