@@ -37,6 +37,10 @@ SMALLEST_MESH, LARGEST_MESH = 1e-8, 1e10
 # sides
 TOUCHING = 2.0**-10
 
+# To launch recorded kernels, Dr.Jit looks at every shape that Mitsuba traces, and at its material: 600 take
+# 20 ms, recording anew takes 3
+MOST_SHAPES = 200
+
 # What ``SceneData`` makes of the shapes, and the decisions that shape it
 OF_SHAPES = ("bvh", "planes", "quadrics", "errors", "spheres")
 
@@ -244,7 +248,8 @@ class SceneData:
         plan, bvh = self.plan, self.bvh or scene
         tabled = plan.merged and self.lights.known and (plan.spheres == "table" or not plan.bvh)
         plain = self.environment is None or self.environment.class_name() == "ConstantBackgroundEmitter"
-        if not (tabled and plain and isinstance(bvh, mi.Scene)):
+        few = len(self.reading.shapes) <= MOST_SHAPES or not plan.bvh
+        if not (tabled and plain and few and isinstance(bvh, mi.Scene)):
             return None
         return [*self._arrays, self.path_limit, *([bvh] if plan.bvh else [])]
 
