@@ -268,13 +268,13 @@ def test_whitted_works_in_mi_render():
     assert np.abs(mitsubas - ours).mean() < 5e-3
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
-def test_other_variants_show_the_same_scene(variant):
+@pytest.mark.parametrize("other_variant", ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
+def test_other_variants_show_the_same_scene(other_variant):
     """Spectral rendering upsamples colours and draws wavelengths; its luminance must agree to a few
     percent."""
     options = {"width": 32, "height": 24, "aa": 4, "aamode": "none", "focaldist": 0}
     rgb = mrt.render(0, **options, variant="llvm_ad_rgb").image @ [0.2126, 0.7152, 0.0722]
-    other = mrt.render(0, **options, variant=variant).image @ [0.2126, 0.7152, 0.0722]
+    other = mrt.render(0, **options, variant=other_variant).image @ [0.2126, 0.7152, 0.0722]
     assert other.mean() == pytest.approx(rgb.mean(), rel=0.05)
 
 
