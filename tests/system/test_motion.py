@@ -103,8 +103,8 @@ def test_frames_are_the_mean_of_renders_from_shifted_cameras(options):
     blurred = mrt.render(0, **{**SMALL, **options}, motion=WAY, motionsamples=3)
     frames = [mrt.render(_shifted(0, np.multiply(WAY, k / 3)), **{**SMALL, **options}) for k in range(3)]
     difference = np.abs(blurred.image - np.mean([frame.image for frame in frames], axis=0))
-    # the same rays up to float32 rounding of their origins; edges may flip in single pixels
-    assert np.median(difference) < 1e-6 and difference.mean() < 1e-3
+    # the same rays up to float32 rounding of their origins; an edge that flips in a pixel would be 5e-5
+    assert np.median(difference) < 1e-6 and difference.mean() < 2e-5
     assert blurred.rays["primary"] == pytest.approx(sum(frame.rays["primary"] for frame in frames), rel=1e-3)
 
 
