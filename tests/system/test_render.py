@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-from contextlib import nullcontext
+import warnings
 
 import mitsuba as mi
 import numpy as np
@@ -146,9 +146,16 @@ def test_scalar_variant_draws_the_same_picture(number):
     whole light."""
     size = {"width": 32, "height": 24, "aa": 1, "aamode": "none", "focaldist": 0}
     fast = mrt.render(number, **size, variant="llvm_ad_rgb")
-    with pytest.warns(mrt.MrtWarning, match="one ray at a time") if number == 0 else nullcontext():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", mrt.MrtWarning)  # that it is slow, once in a process
         slow = mrt.render(number, **size, variant="scalar_rgb")
     assert np.abs(fast.image - slow.image).mean() < 1e-5
+
+
+def test_slow_variants_are_warned_of_once_in_a_process(run_python):
+    render = 'mrt.render(0, width=2, height=1, aa=1, variant="scalar_rgb")'
+    done = run_python(f"import mrt_mitsuba as mrt\n{render}\n{render}")
+    assert done.stderr.count("one ray at a time") == 1
 
 
 def test_a_region_in_a_scalar_variant():
