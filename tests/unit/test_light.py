@@ -284,7 +284,6 @@ def test_a_light_on_a_surface_shines_at_every_scale(name: str) -> None:
     assert (picture(1.0, lift=1e-3) | picture(1.0, lift=-1e-3) != image).any(axis=-1).mean() < 0.03
 
 
-@pytest.mark.filterwarnings("ignore:.*one ray at a time")
 @pytest.mark.parametrize("name", SURFACES)
 def test_a_light_on_a_surface_shines_in_both_kinds_of_variants(name: str) -> None:
     found = []

@@ -295,7 +295,6 @@ def everything(material: Material = GLOSSY) -> Scene:
     )
 
 
-@pytest.mark.filterwarnings("ignore:.*one ray at a time")
 def test_variants_agree() -> None:
     scalar, vector = (
         mrt.render(everything(), width=60, height=40, aa=1, variant=name).image
