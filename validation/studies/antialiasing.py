@@ -122,7 +122,7 @@ def _compare_modes(study: Study, extent: Extent) -> None:
         f"Error to aa={extent.reference_aa} of the same lattice, {width}x{height}",
         COLUMNS,
         table,
-        "Seconds are medians of warm runs of this session, each setting in turn.",
+        "Seconds are medians of warm runs, each setting in turn.",
     )
     study.record("scenes where sobel or geometry reach the error of full in a third of its time", reached)
 
