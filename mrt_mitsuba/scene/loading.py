@@ -8,7 +8,7 @@ parser would end the process are refused as well.
 
 Objects are made one after the other. In parallel, Mitsuba makes Python objects inside each other, to the
 limit of the stack, and Dr.Jit's messages may wait for each other for ever; one by one takes no longer.
-``loaders.one_by_one`` makes that the default of Mitsuba's own loaders for scenes with our plugins.
+``mrt_mitsuba.loaders.one_by_one`` makes that the default of Mitsuba's own loaders for our plugins.
 """
 
 from __future__ import annotations

@@ -188,7 +188,7 @@ class Result:
 sys.modules["mrt_mitsuba.rendering.api"] = types.SimpleNamespace(render=lambda *scene, **options: Result())
 """
 BLURRING = """
-import sys
+import sys, time
 from mrt_mitsuba import memory
 from mrt_mitsuba.rendering.progress import TerminalProgress
 from contextlib import contextmanager
@@ -197,7 +197,7 @@ memory.MOST_PIXELS = 1
 def stage(self, title, total, message=""):
     if title == "Depth of field":
         print("working", flush=True)
-    yield lambda steps: None
+    yield lambda steps: time.sleep(0.02)  # for each of 125 bands: the signal must come before the last
 TerminalProgress.stage = stage
 """
 
@@ -217,7 +217,7 @@ def test_a_signal_in_the_middle_ends_it_in_order(start, tmp_path, code: str, wor
     with start(sys.executable, "-c", patient + code + COMMAND, "out", *words) as process:
         while "working" not in (line := process.stdout.readline()):
             assert line, process.stderr.read()
-        time.sleep(0.3)
+        time.sleep(0.1)
         process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=30) == 143, process.stderr.read()
         assert process.stderr.read() == "mrt: terminated\n"  # by force, it would be "interrupted"
