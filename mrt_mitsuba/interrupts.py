@@ -44,3 +44,27 @@ def surfacing(kinds: Mapping[int, type[KeyboardInterrupt]] | None = None) -> Ite
             signal.signal(number, handler)
     if raised:
         raise raised[0]
+
+
+@contextlib.contextmanager
+def held() -> Iterator[None]:
+    """Let signals that Python handles wait for the end of the block.
+
+    An interrupt that is raised while Mitsuba and Dr.Jit are being imported ends the process in their code.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in numbers}
+    before = {number: handler for number, handler in before.items() if callable(handler)}
+    waiting: list[int] = []
+    for number in before:
+        signal.signal(number, lambda number, frame: waiting.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if waiting:
+            signal.raise_signal(waiting[0])

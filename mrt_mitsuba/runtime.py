@@ -8,6 +8,7 @@ import warnings
 from mrt_mitsuba import llvm
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, UnknownVariantError, VariantError
+from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.memory import check_addresses
 
 FAST = "llvm_ad_rgb"
@@ -28,7 +29,7 @@ def use(variant: str | None = None) -> str:
     Raises ``UnknownVariantError`` for a name that this Mitsuba does not know, and ``VariantError`` for one
     that cannot run here.
     """
-    with one_at_a_time:
+    with one_at_a_time, held():
         return _use(variant)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.command.options import Options
 from mrt_mitsuba.errors import MrtWarning, OutputError
+from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.rendering.settings import NOISE
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, is_obj
 
@@ -25,7 +26,8 @@ def run(options: Options) -> int:
     check_addresses()
     for path in options.outputs():
         check_target(path)
-    from mrt_mitsuba.rendering.api import render
+    with held():  # it imports Dr.Jit
+        from mrt_mitsuba.rendering.api import render
     from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
 
     if options.quiet:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from mrt_mitsuba import interrupts
 from mrt_mitsuba.command.interrupt import Terminated, ending_soon
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
@@ -74,3 +75,19 @@ def test_other_threads_may_use_it() -> None:
     thread.start()
     thread.join()
     assert ran == [True]
+
+
+def test_a_held_interrupt_comes_at_the_end_of_the_block() -> None:
+    """Raised while Mitsuba is imported, it ended the process in nanobind's code."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    done = []
+    try:
+        with pytest.raises(KeyboardInterrupt), interrupts.held():
+            signal.raise_signal(signal.SIGINT)
+            done.append("all of the block")
+        assert done and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        with interrupts.held():
+            signal.raise_signal(signal.SIGINT)  # ignored before, and still
+    finally:
+        signal.signal(signal.SIGINT, before)
