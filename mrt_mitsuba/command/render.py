@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import os
 import time
 import warnings
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mrt_mitsuba.command.options import Options
-from mrt_mitsuba.errors import MrtWarning, OutputError
+from mrt_mitsuba.errors import MrtWarning
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.rendering.settings import NOISE
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, is_obj
-
-if TYPE_CHECKING:
-    from mrt_mitsuba.scene.model import Scene
 
 
 def run(options: Options) -> int:
     """Render and write what the options say; return the exit code."""
     from mrt_mitsuba.memory import check_addresses
-    from mrt_mitsuba.output.replacing import check_target
+    from mrt_mitsuba.output.replacing import check_not_read, check_target
 
     check_addresses()
     for path in options.outputs():
@@ -47,7 +42,7 @@ def run(options: Options) -> int:
         from mrt_mitsuba.scene.placement import model_scene
 
         scene = model_scene(scene, **options.model())
-        _spare_textures(scene, options.outputs())
+        check_not_read(options.outputs(), scene.pictures)  # at once, not after the render
     result = render(scene, progress=progress, **options.render_arguments())
     seconds = time.perf_counter() - start
     result.save(*options.outputs(), tonemap=options.tonemap)
@@ -57,14 +52,6 @@ def run(options: Options) -> int:
         print(f"Wrote {' and '.join(options.outputs())}")
         print(f"Render time: {seconds:.6f}s")
     return 0
-
-
-def _spare_textures(scene: Scene, outputs: Sequence[str]) -> None:
-    """Refuse at once what ``Result.save`` would refuse after the render."""
-    textures = {mesh.material.texture for mesh in scene.meshes if mesh.material.texture}
-    for path in outputs:
-        if os.path.realpath(path) in map(os.path.realpath, textures):
-            raise OutputError(f"cannot write {path}: the scene uses this picture; choose another name")
 
 
 def banner(options: Options) -> str:

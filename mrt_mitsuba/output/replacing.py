@@ -13,7 +13,7 @@ import logging
 import os
 import stat
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import IO
 
 from mrt_mitsuba.errors import OutputError
@@ -34,6 +34,16 @@ def check_target(path: Path) -> None:
         temporary, file = _open_next_to(_target(path))
         file.close()
         _discard(temporary)
+
+
+def check_not_read(paths: Sequence[Path], pictures: Iterable[Path]) -> None:
+    """Raise ``OutputError`` if one of the paths is one of the pictures that a scene is read from."""
+    read = set(map(os.path.realpath, pictures))
+    for path in paths:
+        if os.path.realpath(path) in read:
+            raise OutputError(
+                f"cannot write {os.fspath(path)}: the scene uses this picture; choose another name"
+            )
 
 
 @contextlib.contextmanager

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.output import files
 from mrt_mitsuba.output.error import ErrorEstimate, Round
+from mrt_mitsuba.output.replacing import check_not_read
 from mrt_mitsuba.rendering.plan import Plan
 
 Image = NDArray[np.float32]
@@ -52,11 +52,7 @@ class Result:
 
         ``tonemap`` ("report" or "srgb") concerns a PNG only.
         """
-        for path in paths:
-            if os.path.realpath(path) in self.inputs:
-                raise OutputError(
-                    f"cannot write {os.fspath(path)}: the scene uses this picture; choose another name"
-                )
+        check_not_read(paths, self.inputs)
         files.save(paths, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
 
     def header(self) -> dict[str, Any]:

@@ -142,7 +142,14 @@ class Scene:
     focal_distance: float | None = None
     focal_range: float = FOCAL_RANGE
     title: str = field(default="", compare=False)
-    pictures: frozenset[str] = field(default=frozenset(), compare=False)  #: paths that its files name
+    named: frozenset[str] = field(default=frozenset(), compare=False)  #: pictures that its files name
+
+    @property
+    def pictures(self) -> frozenset[str]:
+        """Return the paths of the pictures that it shows, and of those that its files name, used or not."""
+        kinds = (*(f"{kind}s" for kind in OBJECTS), "planes", "meshes")
+        textures = {thing.material.texture for kind in kinds for thing in getattr(self, kind)}
+        return self.named | {texture for texture in textures if texture is not None}
 
     def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> dict[str, Any]:
         """Return the scene as a Mitsuba dict of this project's plugins, materials shared by reference.

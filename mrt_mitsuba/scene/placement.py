@@ -50,7 +50,7 @@ def obj_scene(
         else (Light(place(4, 5, 4), (2.5, 2.5, 2.5)), Light(place(-4, 3, 5), (1.0, 1.0, 1.2))),
         meshes=meshes,
         texturing=texturing or convention,
-        pictures=pictures,
+        named=pictures,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import gc
+import os
 
 import mitsuba as mi
 import numpy as np
@@ -305,6 +306,13 @@ def test_all_layers_are_those_that_can_be_made(options, missing):
 def test_a_lattice_has_no_variance():
     with pytest.raises(mrt.UsageError, match="without random numbers there is none"):
         mrt.render(3, width=16, height=12, layers=["variance"], target=0.1)
+
+
+def test_pictures_that_a_numbered_scene_shows_are_inputs_each_time():
+    """Also of a scene that could be kept from render to render: none may be overwritten."""
+    for _ in range(2):
+        inputs = mrt.render(8, width=16, height=12, aa=1).inputs
+        assert [os.path.basename(path) for path in inputs] == ["block.png"]
 
 
 def test_layers_belong_together():
