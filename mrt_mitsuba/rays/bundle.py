@@ -55,12 +55,8 @@ class Bundle:
         numbers = _opaque_numbers(replace(self, pixels=first), width, height, mi.variant())
         return numbers if isinstance(self.pixels, range) else replace(numbers, pixels=mi.UInt32(self.pixels))
 
-    def samples(self, width: int, height: int) -> Samples:
-        """Return where every ray of the bundle starts. Vectorised variants only."""
-        return self.placed(self.numbers(width, height))
-
     def placed(self, numbers: Numbers) -> Samples:
-        """Return where every ray of the bundle starts, from the bundle's ``numbers``."""
+        """Return where every ray of the bundle starts, from its ``numbers``. Vectorised variants only."""
         import drjit as dr
         import mitsuba as mi
 

@@ -35,7 +35,7 @@ def _times(shutter: Shutter, pixels: int = 64, lattice: int = 4, repeats: int = 
     bundle = Bundle(
         range(pixels), Lattice("report", lattice), count=lattice**2, repeats=repeats, shutter=shutter
     )
-    return np.array(bundle.samples(8, pixels // 8).time).reshape(pixels, -1)
+    return np.array(bundle.placed(bundle.numbers(8, pixels // 8)).time).reshape(pixels, -1)
 
 
 # ------------------------------------------------- Times -------------------------------------------------

@@ -28,6 +28,12 @@ REPORT_TOLERANCE = 2e-6
 SIXTEENTH = st.integers(0, 16 * 14).map(
     lambda n: n / 16
 )  # exact in float32, and so is every amount made of them
+ANY_PICTURE = given(
+    size=st.one_of(st.just((37, 41)), st.tuples(st.integers(1, 30), st.integers(1, 20))),
+    seed=st.integers(0, 2**32 - 1),
+    focal_distance=SIXTEENTH.filter(bool),
+    focal_range=SIXTEENTH,
+)
 
 
 def tensor(backend: str, array: np.ndarray) -> Any:
@@ -95,12 +101,7 @@ def test_amount_of_bad_depths_and_misses(reach: dict[str, float], expected: list
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@given(
-    size=st.one_of(st.just((37, 41)), st.tuples(st.integers(1, 30), st.integers(1, 20))),
-    seed=st.integers(0, 2**32 - 1),
-    focal_distance=SIXTEENTH.filter(bool),
-    focal_range=SIXTEENTH,
-)
+@ANY_PICTURE
 @settings(max_examples=25)
 def test_report_equals_the_loops(
     backend: str, size: tuple[int, int], seed: int, focal_distance: float, focal_range: float
@@ -252,12 +253,7 @@ def test_wrong_arguments_are_named(change: dict[str, Any], message: str) -> None
 # ---- the corrected filter ----
 
 
-@given(
-    size=st.one_of(st.just((37, 41)), st.tuples(st.integers(1, 30), st.integers(1, 20))),
-    seed=st.integers(0, 2**32 - 1),
-    focal_distance=SIXTEENTH.filter(bool),
-    focal_range=SIXTEENTH,
-)
+@ANY_PICTURE
 @settings(max_examples=25)
 def test_corrected_equals_the_loops(
     size: tuple[int, int], seed: int, focal_distance: float, focal_range: float
