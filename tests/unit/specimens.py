@@ -91,6 +91,7 @@ CHANGES = {
     "stairs": ({"type": "roughconductor"}, "value", _stairs, {"roundoff"}),
     "derivatives that are NaN": ({"type": "specimen"}, "value", _steep, {"gradients"}),
     "other values in scalar variants": (DIFFUSE, "value", _other_in_scalar, {"variants"}),
+    "active ignored": (DIFFUSE, "active", None, {"eval_pdf"}),
     "density below the horizon": (DIFFUSE, "pdf", _below, {"sampling"}),
 }
 
@@ -110,7 +111,7 @@ def register() -> None:
             callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
 
         def eval(self, ctx, si, wo, active=True):
-            value = self.nested.eval(ctx, si, wo, active)
+            value = self.nested.eval(ctx, si, wo, True if self.kind == "active" else active)
             return self.change(value, si.wi, wo) if self.kind == "value" else value
 
         def pdf(self, ctx, si, wo, active=True):

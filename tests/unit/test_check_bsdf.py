@@ -118,6 +118,12 @@ def test_stock_bsdfs_fail_what_is_known(name: str, capsys) -> None:
                 run(part.snippet)
 
 
+@pytest.mark.parametrize("name", ["roughdielectric", "roughconductor"])
+def test_a_lobe_at_the_least_roughness(name: str) -> None:
+    """Mitsuba raises alpha to 1e-4: a kink. Lobes are 2e-4 wide, and along the normal cut by all azimuths."""
+    holds(mrt.check_bsdf({"type": name, "alpha": 1e-4}, quick=True))
+
+
 def test_a_texture_that_loading_uses_up(registered) -> None:
     bumps = mi.TensorXf(np.random.default_rng(0).random((8, 8, 1)).astype(np.float32))
     bumpy = {"type": "bumpmap", "texture": {"type": "bitmap", "raw": True, "data": bumps}, "scale": 0.02}

@@ -42,7 +42,8 @@ def poisoned() -> None:
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
             poison = dr.select(si.wi.z > 0.995, dr.nan, 0.5)
-            return mi.Spectrum(dr.select((si.wi.z > 0) & (wo.z > 0), poison * dr.inv_pi * wo.z, 0))
+            lit = active & (si.wi.z > 0) & (wo.z > 0)
+            return mi.Spectrum(dr.select(lit, poison * dr.inv_pi * wo.z, 0))
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
             return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)

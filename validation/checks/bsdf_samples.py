@@ -227,8 +227,9 @@ def _albedo(case: Case, view: View, cells: Cells | None) -> tuple[float, float |
         holes.append(float(np.mean(~np.isfinite(values))))
         return values
 
-    found = integrate(value, cells, case.rng, counts=np.zeros(len(cells.start)), samples=count)
     smooth = np.where(drawn.delta[:, None], 0, weight)
+    hint = np.bincount(cells.find(encode(drawn.wo)), smooth[:, 0], len(cells.start))
+    found = integrate(value, cells, case.rng, counts=hint, samples=count)
     by_samples, error = smooth.mean(axis=0), smooth.std(axis=0) / np.sqrt(count)
     by_cells, other = found.mean.sum(axis=0), np.sqrt(found.variance.sum(axis=0))
     least = max(least, float((by_cells + mean - by_samples - SIGMAS * (error + other)).max()))

@@ -17,7 +17,10 @@ BEYOND = "relative, beyond 8 times what the rounding of directions explains"
 
 
 def eval_pdf(law: Law, case: Case) -> None:
-    """``eval_pdf`` against ``eval`` and ``pdf``."""
+    """``eval_pdf`` against ``eval`` and ``pdf``; both ways to a value heed ``active``.
+
+    Densities need not: half of Mitsuba's plugins state one in any lane.
+    """
     case.need_smooth()
     p = case.pairs
     value, pdf = case.probe.pair(p.wi, p.wo, p.uv)
@@ -28,6 +31,9 @@ def eval_pdf(law: Law, case: Case) -> None:
         error = excess(one, other, case.spread(single, p.wi, p.wo, p.uv))
         name = f"{what} of eval_pdf() against that of the single function, {BEYOND}"
         law.most(name, error, 1e-4, "two ways to the same number", case.at(snippets.PAIR, p))
+    lit = np.any([(v != 0).any(axis=1) for v in case.probe.inactive(p.wi, p.wo, p.uv)], axis=0)
+    why = "a sum over lanes must not hold those that are switched off"
+    law.none("values that are not 0 where active is False", lit, why, case.at(snippets.INACTIVE, p))
 
 
 def reciprocity(law: Law, case: Case) -> None:

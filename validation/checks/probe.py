@@ -92,6 +92,15 @@ class Probe:
         pair = self._directions(lambda c, si, o: self.bsdf.eval_pdf(c, si, o), wi, wo, uv, ctx)
         return pair[0], pair[1][:, 0]
 
+    def inactive(self, wi: Array, wo: Array, uv: Array) -> list[Array]:
+        """Return the values of ``eval`` and ``eval_pdf`` in lanes that ``active`` switches off."""
+
+        def call(c: Any, si: Any, o: Any) -> list[Any]:
+            off = o.z > 2  # no lane
+            return [self.bsdf.eval(c, si, o, off), self.bsdf.eval_pdf(c, si, o, off)[0]]
+
+        return self._directions(call, wi, wo, uv, None)
+
     def sample(self, wi: Array, u: Array, uv: Array, ctx: Any = None) -> Samples:
         """Return what ``sample`` gives."""
         ctx = ctx or context()

@@ -82,6 +82,7 @@ print("eval_pdf():", bsdf.eval_pdf(ctx, si, wo))
 print("eval():", bsdf.eval(ctx, si, wo), "pdf():", bsdf.pdf(ctx, si, wo))
 """
 )
+INACTIVE = _POINT + _WO + 'print("a lane switched off:", bsdf.eval(ctx, si, wo, False), "should be 0")\n'
 ALBEDO = (
     _POINT
     + "ctx = mi.BSDFContext(mi.TransportMode.Importance)\n"
