@@ -72,7 +72,7 @@ def good(study: Study, *, quick: bool) -> None:
     figure.subplots().plot([1, 2])
     study.text("What it does, in a <b>sentence</b>.")
     study.at_most("largest error", 1e-6, 1e-5, "a reason")
-    study.at_least("power", 0.9, 0.5)
+    study.at_least("power", 0.9, 0.5, "a reason")
     study.goal("ratio of seconds", 1.4, 1.3, "taken in turn", interval=(1.35, 1.5))
     study.goal("another ratio", 1.2, 1.3, "taken in turn", interval=(1.1, 1.5))
     study.record("quick", quick)
@@ -85,11 +85,11 @@ def good(study: Study, *, quick: bool) -> None:
 
 
 def missed(study: Study, *, quick: bool) -> None:
-    study.at_most("largest error", 2e-5, 1e-5)
+    study.at_most("largest error", 2e-5, 1e-5, "a reason")
 
 
 def broken(study: Study, *, quick: bool) -> None:
-    study.at_most("found before", 0, 1)
+    study.at_most("found before", 0, 1, "a reason")
     raise ZeroDivisionError("a light without <area>")
 
 
@@ -170,7 +170,7 @@ def test_a_study_that_cannot_be_imported_is_a_failure(monkeypatch, tmp_path: Pat
 
 def test_infinite_and_undefined_figures_stay_readable(validate) -> None:
     def odd(study: Study, *, quick: bool) -> None:
-        study.at_most("undefined", float("nan"), 1)
+        study.at_most("undefined", float("nan"), 1, "a reason")
         study.record("infinite", float("inf"))
 
     code, summary, _ = validate(odd=odd)
@@ -216,7 +216,7 @@ def test_interrupt_leaves_the_report_as_it_was(validate, tmp_path: Path) -> None
 def test_many_bounds_are_folded_unless_one_is_missed(validate, wrong: bool) -> None:
     def many(study: Study, *, quick: bool) -> None:
         for i in range(LONG_LIST):
-            study.at_most(f"bound {i}", float(wrong and i == 3), 0)
+            study.at_most(f"bound {i}", float(wrong and i == 3), 0, "a reason")
 
     page = validate(many=many)[2]
     assert page.tags.count("details") == (0 if wrong else 1)

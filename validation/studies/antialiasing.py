@@ -189,14 +189,15 @@ def _hold(study: Study, name: str, rows: Sequence[Row]) -> None:
     """Bound what holds on any machine: rays and errors."""
     full = {row.aa: row for row in rows if row.mode == "none"}
     off = [row.rays - _expected_rays(row) for row in rows if row.mode != "none"]
-    study.at_most(
-        f"{name}: camera rays other than one a pixel and aa² - 1 in refined ones", max(map(abs, off)), 0
-    )
+    title = f"{name}: camera rays other than one a pixel and aa² - 1 in refined ones"
+    study.at_most(title, max(map(abs, off)), 0, "a count")
     least = max(full)
     sobel = next(row for row in rows if (row.mode, row.aa) == ("sobel", least))
-    # scene 4 leaves a fifth of its pixels alone and twice the error, scene 2 the outlines of its dark
-    # spheres; a detector that finds nothing has four times the error or more
-    study.at_most(f"{name}: error of sobel / full at aa={least}", sobel.error / full[least].error, 2.2)
+    why = (
+        "scene 4 leaves a fifth of its pixels alone and twice the error, scene 2 the outlines of its dark "
+        "spheres; a detector that finds nothing has four times the error or more"
+    )
+    study.at_most(f"{name}: error of sobel / full at aa={least}", sobel.error / full[least].error, 2.2, why)
 
 
 def _expected_rays(row: Row) -> int:
@@ -360,16 +361,17 @@ def _chase_noise(study: Study, extent: Extent) -> None:
         rows,
         f"Flat: luma contrast below {FLAT} in the converged picture; edges: above {EDGE}.",
     )
-    # three standard deviations: 0.3 % for one normal value; estimated from 4 samples, tails are longer
     study.at_most(
         "noise: share of flat pixels refined, 4 rays a pixel or more",
         max(r[2] for r in rows if r[1] >= 4),
         0.03,
+        "three deviations: 0.3 % for one normal value; estimated from 4 samples, tails are longer",
     )
-    # noise of 0.03 in a picture whose edges begin at a contrast of 0.2: at three deviations either way, most
-    # of them
     study.at_least(
-        "noise: share of edges found with 16 rays a pixel", min(r[3] for r in rows if r[1] == 16), 0.55
+        "noise: share of edges found with 16 rays a pixel",
+        min(r[3] for r in rows if r[1] == 16),
+        0.55,
+        "noise of 0.03, edges from a contrast of 0.2: at three deviations either way, most of them",
     )
     study.at_least(
         "noise: the same flat pixels without the variance",

@@ -184,14 +184,11 @@ def _rows(number: int, found: Comparison) -> list[tuple[Any, ...]]:
 
 def _hold(study: Study, number: int, found: Comparison) -> None:
     name = f"scene {number}"
-    study.at_most(f"{name}: RMSE of corrected / report", found.error("corrected") / found.error("report"), 1)
-    study.at_most(
-        f"{name}: RMSE of corrected / no blur at all", found.error("corrected") / found.error("sharp"), 1
-    )
-    # else the comparison would be one of noise
-    study.at_most(
-        f"{name}: noise of the lens / RMSE of corrected", found.noise / found.error("corrected"), 0.5
-    )
+    corrected, why = found.error("corrected"), "a correction that is worse is none"
+    study.at_most(f"{name}: RMSE of corrected / report", corrected / found.error("report"), 1, why)
+    study.at_most(f"{name}: RMSE of corrected / no blur at all", corrected / found.error("sharp"), 1, why)
+    why = "else the comparison would be one of noise"
+    study.at_most(f"{name}: noise of the lens / RMSE of corrected", found.noise / corrected, 0.5, why)
     study.record(f"{name}: aperture radius", found.lens.radius)
     study.record(f"{name}: focus distance", found.lens.focus)
     by_region = {

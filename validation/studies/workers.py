@@ -88,10 +88,14 @@ def run(study: Study, *, quick: bool) -> None:
         names = sorted(path.name for path in swept.glob("*.exr"))
         differ = sum(not same(alone / name, swept / name) for name in names)
         study.at_most("pictures that differ from those of a loop", differ, 0, "to the bit")
-        study.at_least("pictures", len(names), extent.alphas * len(AA))
+        study.at_least("pictures", len(names), extent.alphas * len(AA), "one of each combination")
         if extent.turns:
             warm = 2 * FIRST_JOBS
-            study.at_most("memory of a worker over that after its first jobs", watch.growth(warm), GROWTH)
+            title, why = (
+                "memory of a worker over that after its first jobs",
+                "a leak would grow with each of 400 renders",
+            )
+            study.at_most(title, watch.growth(warm), GROWTH, why)
             _times(study, Path(folder), extent, counts)
 
 
@@ -122,9 +126,8 @@ def _times(study: Study, folder: Path, extent: Extent, counts: Sequence[int]) ->
     )
     if usable_cores() > 1:
         best = ratios[usable_cores()]
-        study.goal(
-            "time of a sweep / a loop", statistics.median(best), FASTER, interval=(min(best), max(best))
-        )
+        span, why = (min(best), max(best)), "two workers halve it but for their start"
+        study.goal("time of a sweep / a loop", statistics.median(best), FASTER, why, interval=span)
     costs = [_overhead(folder / f"small-{turn}", extent.small) for turn in range(extent.turns)]
     study.goal(
         "milliseconds of a job outside its render",

@@ -130,7 +130,7 @@ def run(study: Study, *, quick: bool) -> None:
         if name == NONE:
             study.at_least("p of equality without a mistake", series[-1].found.p, LEVEL, POWER)
         else:
-            study.at_most(f"p of equality with {name}", series[-1].found.p, LEVEL)
+            study.at_most(f"p of equality with {name}", series[-1].found.p, LEVEL, "it must be seen")
     caption = (
         "Probability of such a difference between equal pictures; below the dashed line they are rejected."
     )

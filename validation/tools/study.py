@@ -118,18 +118,18 @@ class Study:
     def passed(self) -> bool:
         return bool(self.bounds) and all(bound.holds for bound in self.bounds)
 
-    def at_most(self, name: str, measured: float, limit: float, note: str = "") -> Bound:
-        """Hold a figure to an upper bound."""
+    def at_most(self, name: str, measured: float, limit: float, note: str) -> Bound:
+        """Hold a figure to an upper bound; ``note``: why it is this one."""
         self.bounds.append(Bound(name, float(measured), float(limit), True, note))
         return self.bounds[-1]
 
-    def at_least(self, name: str, measured: float, limit: float, note: str = "") -> Bound:
-        """Hold a figure to a lower bound."""
+    def at_least(self, name: str, measured: float, limit: float, note: str) -> Bound:
+        """Hold a figure to a lower bound; ``note``: why it is this one."""
         self.bounds.append(Bound(name, float(measured), float(limit), False, note))
         return self.bounds[-1]
 
     def goal(
-        self, name: str, measured: float, limit: float, note: str = "", *, interval: tuple[float, float]
+        self, name: str, measured: float, limit: float, note: str, *, interval: tuple[float, float]
     ) -> None:
         """Show whether a time or a ratio of times is at most so much; a busy machine must fail no study."""
         self.goals.append(Goal(name, float(measured), float(limit), True, note, *map(float, interval)))

@@ -42,8 +42,9 @@ class Cases:
             self.at_least(f"{name}, its fault", least, "seen", fault[1], 2 * limit or 1)
 
     def at_least(self, name: str, what: str, expected: str, measured: float, limit: float) -> None:
-        """Add a case whose figure must not be below ``limit``."""
-        self._add(Bound(f"{self.title}: {name}", float(measured), float(limit), False), what, expected)
+        """Add a case whose figure must not be below ``limit``; ``expected`` is the reason, too."""
+        bound = Bound(f"{self.title}: {name}", float(measured), float(limit), False, expected)
+        self._add(bound, what, expected)
 
     def beyond_float32(self, name: str, what: str, measured: float, why: str) -> None:
         """Add a case that no float32 renderer can pass: its figure is shown, not held to anything."""
