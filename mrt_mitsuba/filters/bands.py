@@ -7,7 +7,8 @@ halo as for the whole picture.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+
+from mrt_mitsuba.records import dataclass
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,9 @@ A new layer takes one row. What its ``value`` is computed from along camera rays
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any
+
+from mrt_mitsuba.records import dataclass
 
 FIRST_HIT = "first hit"  # of the first ray of a pixel; a mean would name no point
 AVERAGED = "averaged"  # over the rays of a pixel, as the picture is

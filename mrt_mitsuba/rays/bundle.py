@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 from mrt_mitsuba.rays.divisor import Divisor
 from mrt_mitsuba.rays.lattice import Lattice
 from mrt_mitsuba.rays.shutter import Number, Shutter
+from mrt_mitsuba.records import dataclass
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Hashable
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba.rays.divisor import Divisor
+from mrt_mitsuba.records import dataclass
 
 # Whole numbers stand for floats where all but a few have so many binary digits, of which a pixel adds many up
 DIGITS, COARSE = 12, 1e-3

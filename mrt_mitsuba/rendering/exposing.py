@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -15,6 +14,7 @@ from mrt_mitsuba.rays.divisor import Divisor
 from mrt_mitsuba.rays.film import Canvas, Film, Numbers
 from mrt_mitsuba.rays.sampler import ray_sampler
 from mrt_mitsuba.rays.sequence import pixel_sequence
+from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.rendering.shading import Shader, components
 from mrt_mitsuba.rendering.view import View
 

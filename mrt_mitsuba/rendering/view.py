@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba.rays.bundle import Samples
+from mrt_mitsuba.records import dataclass
 
 
 @dataclass(frozen=True)

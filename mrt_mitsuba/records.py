@@ -1,0 +1,74 @@
+"""Frozen dataclasses that take a tenth of the time to define.
+
+``dataclasses`` writes Python code for each method of each class and compiles it: half a millisecond a class
+at every import, in all a tenth of the time of ``mrt out 0``. Here all classes share their methods.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dataclasses import dataclass as dataclass
+else:
+
+    def dataclass(kind=None, /, *, frozen=False, eq=True, kw_only=False):
+        """Make a class a dataclass, as ``dataclasses.dataclass`` does."""
+        if kind is None:
+            return lambda kind: dataclass(kind, frozen=frozen, eq=eq, kw_only=kw_only)
+        if not frozen:
+            return dataclasses.dataclass(eq=eq, kw_only=kw_only)(kind)
+        kind = dataclasses.dataclass(init=False, repr=False, eq=False, kw_only=kw_only)(kind)
+        kind.__init__ = _init(kind)
+        kind.__setattr__ = kind.__delattr__ = _refuse
+        methods = {"__repr__": _repr, **({"__eq__": _eq, "__hash__": _hash} if eq else {})}
+        for name, method in methods.items():
+            if name not in vars(kind):
+                setattr(kind, name, method)
+        return kind
+
+
+def _init(kind: Any) -> Any:
+    fields, missing = dataclasses.fields(kind), dataclasses.MISSING
+    names, places = {field.name for field in fields}, kind.__match_args__
+    defaults = {field.name: field.default for field in fields if field.default is not missing}
+    made = {field.name: field.default_factory for field in fields if field.default_factory is not missing}
+    after = getattr(kind, "__post_init__", None)
+
+    def __init__(self: Any, *args: Any, **given: Any) -> None:
+        values = vars(self)
+        values.update(defaults)
+        for name, make in made.items():
+            values[name] = make()
+        values.update(zip(places, args, strict=False))
+        values.update(given)
+        if values.keys() != names or len(args) > len(places) or given.keys() & set(places[: len(args)]):
+            raise TypeError(f"{kind.__name__}({', '.join(places)}) does not take {args}, {given}")
+        if after is not None:
+            after(self)
+
+    return __init__
+
+
+def _values(self: Any) -> tuple[Any, ...]:
+    return tuple(getattr(self, field.name) for field in dataclasses.fields(self) if field.compare)
+
+
+def _eq(self: Any, other: Any) -> Any:
+    return _values(self) == _values(other) if type(other) is type(self) else NotImplemented
+
+
+def _hash(self: Any) -> int:
+    return hash(_values(self))
+
+
+def _repr(self: Any) -> str:
+    shown = (
+        f"{field.name}={getattr(self, field.name)!r}" for field in dataclasses.fields(self) if field.repr
+    )
+    return f"{type(self).__qualname__}({', '.join(shown)})"
+
+
+def _refuse(self: Any, name: str, *value: Any) -> None:
+    raise dataclasses.FrozenInstanceError(f"cannot change {name!r} of {type(self).__name__}")
