@@ -5,8 +5,31 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
+
+
+@contextlib.contextmanager
+def rewriting_later() -> Iterator[None]:
+    """Let functions under ``@dr.syntax`` be rewritten when they are first called.
+
+    Mitsuba has ten of them, in integrators for derivatives; to rewrite them takes 60 ms of each start.
+    """
+    import drjit as dr
+
+    rewrite = dr.syntax
+
+    def later(function: Any = None, **options: Any) -> Any:
+        if function is None or options:
+            return rewrite(function, **options)
+        rewritten = functools.cache(lambda: rewrite(function))
+        return functools.wraps(function)(lambda *args, **given: rewritten()(*args, **given))
+
+    dr.syntax = later
+    try:
+        yield
+    finally:
+        dr.syntax = rewrite
 
 
 def mitsuba_first(folder: str | None = None) -> None:

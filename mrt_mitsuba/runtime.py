@@ -9,6 +9,7 @@ from mrt_mitsuba import llvm
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, UnknownVariantError, VariantError
 from mrt_mitsuba.interrupts import held
+from mrt_mitsuba.loaders import mitsuba_first, one_by_one, rewriting_later
 from mrt_mitsuba.memory import check_addresses
 
 FAST = "llvm_ad_rgb"
@@ -29,13 +30,13 @@ def use(variant: str | None = None) -> str:
     Raises ``UnknownVariantError`` for a name that this Mitsuba does not know, and ``VariantError`` for one
     that cannot run here.
     """
-    with one_at_a_time, held():
+    llvm.prepare()
+    check_addresses()
+    with one_at_a_time, held(), rewriting_later():
         return _use(variant)
 
 
 def _use(variant: str | None) -> str:
-    llvm.prepare()
-    check_addresses()
     import mitsuba as mi
 
     if variant is None:
@@ -161,7 +162,6 @@ def _unknown(variant: str, known: list[str]) -> str:
 
 def _register_plugins() -> None:
     from mrt_mitsuba import plugins
-    from mrt_mitsuba.loaders import mitsuba_first, one_by_one
 
     mitsuba_first()
     one_by_one()

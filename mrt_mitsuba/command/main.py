@@ -25,15 +25,17 @@ TRACEBACK = "MRT_TRACEBACK"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code: 0, 1 for a failure, 2 for wrong usage, 130 when interrupted.
 
-    Without arguments, those of the process are taken, and an interrupt ends the process at once.
+    Without arguments, those of the process are taken, and a picture or an interrupt ends it at once.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     _open_closed_streams()
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         code = _guarded(words)
-    if code in (INTERRUPTED, TERMINATED) and arguments is None:
-        leave_now(code)  # the interpreter would wait for the kernels that run
+    picture = bool(words) and registry.find(words[0]) is None
+    if arguments is None and (picture or code in (INTERRUPTED, TERMINATED)):
+        # the interpreter would wait for kernels that run, and take apart all that it has loaded
+        leave_now(code)
     return code
 
 

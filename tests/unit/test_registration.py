@@ -96,6 +96,22 @@ print("done")
     assert lines(run_python, code, *order) == ["done"]
 
 
+def test_functions_under_syntax_are_rewritten_when_they_are_called(run_python) -> None:
+    """Mitsuba's integrators with a loop over lanes work, and Dr.Jit's decorator is again its own."""
+    code = """
+import drjit as dr
+before = dr.syntax
+mrt_mitsuba.register()
+assert dr.syntax is before
+counted = dr.ast._syntax_counter
+draws("prb")
+print(dr.ast._syntax_counter - counted)  # of those that are called, and once
+draws("prb")
+print(dr.ast._syntax_counter - counted)
+"""
+    assert lines(run_python, code) == ["1", "1"]
+
+
 def test_classes_of_several_variants_live_side_by_side(run_python) -> None:
     """A scene of one variant renders while others have been loaded since, with the plugins of its own."""
     code = """
