@@ -127,48 +127,45 @@ def _radius(amount: Any) -> Any:
 
 
 def _report(grid: Grid, planes: Sequence[Any], amount: Any) -> list[Any]:
-    """Blur with Pascal windows: for each k that occurs one pass along rows and one along columns.
+    """Blur with Pascal windows, in one pass along rows and one along columns.
 
     The weights of a window are the product of a row's and a column's, at the borders too, so two passes of 2k
-    values replace one of 4k². The first pass runs only over the pixels that the second one reads.
+    values replace one of 4k². The first pass runs only over what the second one reads: pixels on levels, one
+    for each k.
     """
     good = finite(planes)
     gives = good & (amount > 0)
     sources = [dr.select(gives, plane, 0) for plane in planes]
     sources.append(dr.select(gives, grid.Float(1), 0))  # the sum of weights is blurred along
-    steps = dr.select(good, grid.Int(amount), 0)
-    blurred = [grid.Float(plane) for plane in planes]
-    dr.eval(sources, steps, blurred)
-    for k in range(1, MAX_AMOUNT + 1):
-        pixels = dr.compress(steps == k)
-        if dr.width(pixels) == 0:
-            continue
-        sums = _pascal_passes(grid, sources, grid.Int(pixels), k)
+    k = dr.select(good, grid.Int(amount), 0)
+    blurred, wide = [grid.Float(plane) for plane in planes], k > 0
+    dr.eval(sources, k, blurred, wide)
+    pixels = grid.Int(dr.compress(wide))
+    if dr.width(pixels) > 0:
+        sums = _pascal_passes(grid, sources, pixels, dr.gather(grid.Int, k, pixels))
         for target, total in zip(blurred, sums[:3], strict=True):
             dr.scatter(target, total / sums[3], pixels)  # not zero: the pixel itself gives
         dr.eval(blurred)
     return blurred
 
 
-def _pascal_passes(grid: Grid, sources: Sequence[Any], pixels: Any, k: int) -> list[Any]:
+def _pascal_passes(grid: Grid, sources: Sequence[Any], pixels: Any, k: Any) -> list[Any]:
     """Return the weighted sums over the windows of ``pixels``, one per source plane."""
-    weights = grid.table(math.comb(2 * k - 1, j) / 2 ** (2 * k - 1) for j in range(2 * k))
-    reach = dr.opaque(grid.Int, k)  # no literal, so that all window sizes share their kernels
     column, row = grid.coordinates(pixels)
-    start, count = _cut(grid.height - 1 - row, reach, grid.height)
-    vertical = _Taps((grid.height - 1 - start) * grid.width + column, -grid.width, count, weights)
+    start, count = _cut(grid.height - 1 - row, k, grid.height)
+    bottom = (grid.height - 1 - start) * grid.width + column
+    vertical = _Taps(grid, (k - 1) * grid.size + bottom, -grid.width, count, k)
+    needed = vertical.touched(MAX_AMOUNT * grid.count)
 
-    needed = vertical.pixels(grid)
-    column, row = grid.coordinates(needed)
-    start, count = _cut(column, reach, grid.width)
-    horizontal = _Taps(row * grid.width + start, dr.opaque(grid.Int, 1), count, weights)
-
-    along_rows = []
-    for total in horizontal.sums(grid, sources):
-        along_rows.append(dr.empty(grid.Float, grid.count))  # read below only where written here
-        dr.scatter(along_rows[-1], total, needed)
-    dr.eval(along_rows)
-    return vertical.sums(grid, along_rows)
+    level = needed // grid.size
+    pixel, k = needed - level * grid.size, level + 1
+    column, row = grid.coordinates(pixel)
+    start, count = _cut(column, k, grid.width)
+    along_rows = _Taps(grid, row * grid.width + start, 1, count, k).sums(sources)
+    place = dr.empty(grid.Int, MAX_AMOUNT * grid.count)  # read below only where written here
+    dr.scatter(place, dr.arange(grid.Int, dr.width(needed)), needed)
+    dr.eval(along_rows, place)
+    return vertical.sums(along_rows, place)
 
 
 def _cut(centre: Any, k: Any, size: Any) -> tuple[Any, Any]:
@@ -178,37 +175,47 @@ def _cut(centre: Any, k: Any, size: Any) -> tuple[Any, Any]:
 
 
 class _Taps:
-    """Weighted pixels in a line: ``count`` of them from ``first`` on, ``stride`` apart."""
+    """Weighted values in lines: ``count`` from ``first`` on, ``stride`` apart, with the weights of ``k``."""
 
-    def __init__(self, first: Any, stride: Any, count: Any, weights: Any) -> None:
-        self._first = first
-        self._stride = stride
-        self._count = count
-        self._weights = weights
+    def __init__(self, grid: Grid, first: Any, stride: Any, count: Any, k: Any) -> None:
+        self._grid, self._first, self._stride, self._count = grid, first, stride, count
+        self._weights, self._line = grid.table(_PASCAL), (k - 1) * _MOST
 
-    def sums(self, grid: Grid, planes: Sequence[Any]) -> list[Any]:
-        """Return the weighted sum of each plane's values."""
+    def sums(self, planes: Sequence[Any], place: Any = None) -> list[Any]:
+        """Return the weighted sum of each plane's values; ``place``: where in the planes they are."""
+        grid = self._grid
 
         def add(j: Any, totals: Sequence[Any]) -> list[Any]:
-            weight, index, active = dr.gather(grid.Float, self._weights, j), self._index(j), j < self._count
+            weight, index, active = (
+                dr.gather(grid.Float, self._weights, self._line + j),
+                self._index(j),
+                j < self._count,
+            )
+            if place is not None:
+                index = dr.gather(grid.Int, place, index, active=active)
             return [
                 total + weight * dr.gather(grid.Float, plane, index, active=active)
                 for total, plane in zip(totals, planes, strict=True)
             ]
 
         zero = dr.zeros(grid.Float, dr.width(self._first))
-        return list(grid.accumulate(dr.width(self._weights), [zero] * len(planes), add))
+        return list(grid.accumulate(self._count, [zero] * len(planes), add))
 
     def _index(self, j: Any) -> Any:
         return self._first + j * self._stride
 
-    def pixels(self, grid: Grid) -> Any:
-        """Return the indices of all pixels in any of the lines, in ascending order."""
-        touched = dr.zeros(grid.Bool, grid.count)
+    def touched(self, size: int) -> Any:
+        """Return the indices of all values in any of the lines, of ``size``, in ascending order."""
+        grid, touched = self._grid, dr.zeros(self._grid.Bool, size)
 
         def mark(j: Any, none: Sequence[Any]) -> Sequence[Any]:
             dr.scatter(touched, grid.Bool(True), self._index(j), active=j < self._count)
             return none
 
-        grid.accumulate(dr.width(self._weights), [], mark)
+        grid.accumulate(self._count, [], mark)
         return grid.Int(dr.compress(touched))
+
+
+_MOST = 2 * MAX_AMOUNT
+# The line of Pascal's triangle with 2k entries for each k, filled up
+_PASCAL = [math.comb(2 * k - 1, j) / 2 ** (2 * k - 1) for k in range(1, MAX_AMOUNT + 1) for j in range(_MOST)]

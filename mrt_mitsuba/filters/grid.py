@@ -43,6 +43,7 @@ class Grid:
         self.Bool: Any = dr.mask_t(self.Float)
         self.rows, self.columns = shape[:2]
         self.count = self.rows * self.columns
+        self.size = dr.opaque(self.Int, self.count)
         self.height = dr.opaque(self.Int, self.rows)
         self.width = dr.opaque(self.Int, self.columns)
         self.index = dr.arange(self.Int, self.count)
@@ -82,18 +83,19 @@ class Grid:
         return self.Float(list(values))
 
     def accumulate(
-        self, count: int, totals: Sequence[Any], add: Callable[[Any, Sequence[Any]], Sequence[Any]]
+        self, count: Any, totals: Sequence[Any], add: Callable[[Any, Sequence[Any]], Sequence[Any]]
     ) -> Sequence[Any]:
         """Return ``totals`` after ``totals = add(j, totals)`` for j from 0 to ``count − 1``.
 
         One loop inside the kernel, so that its length makes no new kernel and its text stays short;
-        ``drjit.scalar`` has no kernels and loops here.
+        ``drjit.scalar`` has no kernels and loops here. Where ``count`` is an array, ``add`` leaves out what
+        is beyond it.
         """
         if not dr.is_jit_v(self.Float):
-            for j in range(count):
+            for j in range(count if isinstance(count, int) else int(dr.max(count))):
                 totals = add(j, totals)
             return totals
-        end = dr.opaque(self.Int, count)
+        end = dr.opaque(self.Int, count) if isinstance(count, int) else count
         return dr.while_loop(
             (self.Int(0), *totals), lambda j, *_: j < end, lambda j, *totals: (j + 1, *add(j, totals))
         )[1:]

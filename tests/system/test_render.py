@@ -91,7 +91,8 @@ def test_no_focal_distance_means_no_depth_kept():
     assert not any(name.startswith("depth") for name in result.layers)
     blurred = mrt.render(0, **SMALL, aamode="sobel", focaldist=3.0, focalrange=0.5)
     assert "depth.Z" in blurred.layers and "depth of field" not in _omitted(blurred)
-    assert blurred.kernel_launches > result.kernel_launches
+    # two passes, and what they read; however many amounts there are
+    assert result.kernel_launches < blurred.kernel_launches <= result.kernel_launches + 10
 
 
 def test_all_in_focus_is_not_blurred():
