@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Hashable
 from functools import cached_property, lru_cache
@@ -13,8 +12,6 @@ import numpy as np
 from mrt_mitsuba.rays.divisor import Divisor
 from mrt_mitsuba.records import dataclass
 
-# Whole numbers stand for floats where all but a few have so many binary digits, of which a pixel adds many up
-DIGITS, COARSE = 12, 1e-3
 STEPS = 32  # of a pixel, where integrals over a filter are summed
 
 
@@ -144,10 +141,10 @@ class Film:
         for axis in (-2, -1) if self.reach else ():
             padding = [(0, 0)] * variance.ndim
             padding[axis] = (self.reach, self.reach)
-            windows = np.lib.stride_tricks.sliding_window_view(
-                np.pad(variance, padding, mode="edge"), len(self.spread), axis
-            )
-            variance = windows @ self.spread
+            wide = np.moveaxis(np.pad(variance, padding, mode="edge"), axis, 0)
+            count = variance.shape[axis]
+            windows = (share * wide[step : step + count] for step, share in enumerate(self.spread))
+            variance = np.moveaxis(sum(windows, start=np.zeros(())), 0, axis)
         return variance
 
 
@@ -167,82 +164,6 @@ def _opaque_numbers(width: int, height: int, border: int, variant: str) -> Numbe
 
     size = [float(n - 2 * border) for n in (width, height)]
     return Numbers(Divisor.opaque(width), dr.opaque(mi.Float, border), dr.opaque(mi.Vector2f, size))
-
-
-class Canvas:
-    """Sums of filtered values over the pixels of a film whose filter reaches into others, in some pictures.
-
-    They are added up in whole numbers, whose sums do not depend on their order as those of floats do, with
-    which the same render would not give the same bits.
-    """
-
-    def __init__(self, film: Film, pictures: int, channels: int) -> None:
-        self.film, self.rows = film, film.height + 2 * film.reach
-        self._sums = np.zeros((pictures, self.rows, film.width, channels))
-
-    def put(self, place: Any, picture: Any, values: list[Any], rays: int) -> None:
-        """Add values at places on the film, [channels] each, to pictures of these numbers.
-
-        No more than so many ``rays`` start in a pixel.
-        """
-        import drjit as dr
-        import mitsuba as mi
-
-        dr.eval(place, picture, values)
-        sizes = [dr.abs(value) for value in values]
-        largest = np.array([float(dr.max(size)[0]) for size in sizes])
-        # Sums must not exceed 63 bits; a filter's values are below 2
-        bits = 61 - math.ceil(math.log2(rays * (2 * self.film.reach + 1) ** 2))
-        least = [dr.opaque(mi.Float, float(most) * 2.0 ** (DIGITS - bits)) for most in largest]
-        coarse = [_coarse(size, low) for size, low in zip(sizes, least, strict=True)]
-        exact = max(coarse) <= COARSE * dr.width(place)
-        exponents = np.minimum(bits - np.frexp(largest)[1], 126) if exact else np.zeros(len(values), int)
-        sums = [dr.zeros(mi.Int64 if exact else mi.Float, self._sums[..., 0].size) for _ in values]
-        scaled = [
-            value * dr.opaque(mi.Float, 2.0 ** int(e)) for value, e in zip(values, exponents, strict=True)
-        ]
-        self._add(place, picture, scaled, sums)
-        dr.eval(sums)
-        for channel, (total, exponent) in enumerate(zip(sums, exponents, strict=True)):
-            found = np.asarray(total).reshape(self._sums.shape[:-1])
-            self._sums[..., channel] += np.ldexp(found.astype(np.float64), -exponent)
-
-    def _add(self, place: Any, picture: Any, values: list[Any], sums: list[Any]) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
-        reach, rfilter = self.film.reach, self.film.sensor.film().rfilter()
-        width, rows = dr.opaque(mi.Int32, self.film.width), dr.opaque(mi.Int32, self.rows)
-        column, row = mi.Int32(dr.floor(place.x)), mi.Int32(dr.floor(place.y))
-        top = mi.Int32(picture) * rows + row + reach
-        near = [column + step for step in range(-reach, reach + 1)]
-        along = [rfilter.eval(mi.Float(x) + 0.5 - place.x) for x in near]
-
-        def add_row(step: Any) -> tuple[Any]:
-            down = rfilter.eval(mi.Float(row + step) + 0.5 - place.y)
-            for x, weight in zip(near, along, strict=True):
-                index, inside = mi.UInt32((top + step) * width + x), (x >= 0) & (x < width)
-                for value, total in zip(values, sums, strict=True):
-                    number = value * (weight * down)
-                    number = number if dr.is_float_v(total) else mi.Int64(dr.round(number))
-                    dr.scatter_reduce(dr.ReduceOp.Add, total, number, index, inside)
-            return (step + 1,)
-
-        dr.while_loop((mi.Int32(-reach),), lambda step: step <= reach, add_row)
-
-    @property
-    def sums(self) -> np.ndarray:
-        """The sums, [pictures, H, W, channels]."""
-        return self._sums[:, self.film.reach : self.film.reach + self.film.height]
-
-
-def _coarse(size: Any, least: Any) -> float:
-    """Return how many numbers are less than ``least``, without zeros; ``inf`` if one is not finite."""
-    import drjit as dr
-    import mitsuba as mi
-
-    one = dr.select((size > 0) & (size < least), mi.Float(1), 0)
-    return float(dr.sum(dr.select(dr.isfinite(size), one, dr.inf))[0])
 
 
 def spectral_bands(film: Any) -> tuple[str, ...]:

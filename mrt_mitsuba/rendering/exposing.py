@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba.memory import Workspace
 from mrt_mitsuba.output.layers import TABLE
+from mrt_mitsuba.rays.canvas import Canvas
 from mrt_mitsuba.rays.divisor import Divisor
-from mrt_mitsuba.rays.film import Canvas, Film, Numbers
+from mrt_mitsuba.rays.film import Film, Numbers
 from mrt_mitsuba.rays.sampler import ray_sampler
 from mrt_mitsuba.rays.sequence import pixel_sequence
 from mrt_mitsuba.records import dataclass
@@ -21,62 +22,66 @@ from mrt_mitsuba.rendering.view import View
 
 @dataclass(frozen=True)
 class Groups:
-    """Groups of ``size`` rays, each in one pixel of one of the pictures that are exposed at once."""
+    """Groups of ``size`` rays, some in each of some pixels.
+
+    Pixels of a second picture are numbered after those of the first.
+    """
 
     size: int
-    pixels: np.ndarray  #: [groups] uint32, as the film numbers them
-    pictures: np.ndarray  #: [groups] uint32
-    weights: np.ndarray  #: [groups] float32, of each ray
-    first: np.ndarray  #: [groups] uint32, number of the first ray in its pixel of its picture
+    pixels: np.ndarray  #: numbers of pixels, ascending
+    counts: np.ndarray  #: groups in each
+    first: np.ndarray  #: number of the first ray of each among all that the pixel gets in time
 
     @classmethod
-    def uniform(cls, pixels: np.ndarray, size: int) -> Groups:
+    def uniform(cls, size: int, pixels: np.ndarray) -> Groups:
         """Return one group in each pixel, of a single picture."""
-        zeros = np.zeros(len(pixels), np.uint32)
-        return cls(size, pixels.astype(np.uint32), zeros, np.ones(len(pixels), np.float32), zeros)
+        return cls(size, pixels, np.ones_like(pixels), np.zeros_like(pixels))
 
     @classmethod
     def spread(cls, size: int, counts: np.ndarray, before: np.ndarray) -> Groups:
-        """Return ``counts`` groups in each picture and pixel, [pictures, pixels], after ``before`` rays.
-
-        The rays of a pixel have a weight of 1 in all, so that pixels count alike whatever they are given.
-        """
-        pictures, pixels = np.nonzero(counts)
-        repeats = counts[pictures, pixels]
-        number = np.arange(repeats.sum()) - np.repeat(np.cumsum(repeats) - repeats, repeats)
-        return cls(
-            size,
-            np.repeat(pixels, repeats).astype(np.uint32),
-            np.repeat(pictures, repeats).astype(np.uint32),
-            np.repeat(1 / (repeats * size), repeats).astype(np.float32),
-            (np.repeat(before[pictures, pixels], repeats) + number * size).astype(np.uint32),
-        )
+        """Return ``counts`` groups in each picture and pixel, [pictures, pixels], after ``before`` rays."""
+        pixels = np.flatnonzero(counts)
+        return cls(size, pixels, counts.ravel()[pixels], before.ravel()[pixels].astype(np.int64))
 
     def __len__(self) -> int:
-        return len(self.pixels)
+        return int(self.counts.sum())
+
+    @cached_property
+    def _ends(self) -> np.ndarray:
+        return np.cumsum(self.counts)
 
     @property
-    def most(self) -> int:
-        """The most rays that start in a pixel of a picture."""
-        place = np.flatnonzero(np.diff(self.pixels, prepend=-1) | np.diff(self.pictures, prepend=-1))
-        return self.size * int(np.diff(place, append=len(self)).max())
+    def rays(self) -> np.ndarray:
+        """Number of rays of each pixel."""
+        return self.size * self.counts
 
     def part(self, start: int, stop: int) -> Groups:
         """Return the groups ``start`` to ``stop − 1``."""
-        return Groups(
-            self.size, *(a[start:stop] for a in (self.pixels, self.pictures, self.weights, self.first))
-        )
+        if start == 0 and stop >= len(self):
+            return self
+        stop = min(stop, len(self))
+        run = slice(np.searchsorted(self._ends, start, "right"), np.searchsorted(self._ends, stop) + 1)
+        begin = self._ends[run] - self.counts[run]
+        low, high = np.maximum(begin, start), np.minimum(self._ends[run], stop)
+        return Groups(self.size, self.pixels[run], high - low, self.first[run] + self.size * (low - begin))
+
+    def one_by_one(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pixel of each group, and the number of its first ray."""
+        if len(self) == len(self.pixels):
+            return self.pixels, self.first
+        number = np.arange(len(self)) - np.repeat(self._ends - self.counts, self.counts)
+        return np.repeat(self.pixels, self.counts), np.repeat(self.first, self.counts) + number * self.size
 
 
 @dataclass(frozen=True)
 class Exposed:
-    """The sums over the rays of one exposure."""
+    """The sums over the rays of one exposure; the rays of a pixel weigh 1 in all."""
 
     sums: np.ndarray  #: [pictures, H, W, channels]: filtered values times their weights
     weights: np.ndarray  #: [pictures, H, W]: filtered weights
     rays: np.ndarray  #: [pictures, pixels]: how many started there
-    total: np.ndarray  #: [pictures, pixels, 3]: of the colours of those; empty where not asked for
-    square: np.ndarray  #: [pictures, pixels, 3]: of their squares
+    total: np.ndarray  #: [pictures, H, W, 3]: of the colours of those; empty where not asked for
+    square: np.ndarray  #: [pictures, H, W, 3]: of their squares
 
 
 class Stack:
@@ -89,14 +94,14 @@ class Stack:
     def __init__(self, film: Film, pictures: int, channels: int) -> None:
         self.film = film
         self.rays = np.zeros((pictures, film.pixels))
-        self._sums = np.zeros((pictures, *film.shape, channels), np.float32)
+        self._sums = channels_last(np.zeros((channels, pictures, *film.shape), np.float32))
         self._weights, self._amount = np.zeros((2, pictures, *film.shape), np.float32)
 
     def widened(self, groups: np.ndarray) -> np.ndarray:
         """Return numbers of groups [pictures, pixels], one at least wherever the filter reaches from."""
         if not self.film.reach:
             return groups
-        near = box_mean(self.rows(groups) > 0, self.film.reach, (1, 2)) > 0
+        near = dilated(self.rows(groups) > 0, self.film.reach, (1, 2))
         return np.maximum(groups, near.reshape(groups.shape))
 
     def add(self, exposed: Exposed, chosen: np.ndarray) -> None:
@@ -124,6 +129,11 @@ class Stack:
         return values.reshape(-1, *self.film.shape, *values.shape[2:])
 
 
+def channels_last(values: np.ndarray) -> np.ndarray:
+    """Return a view [..., channels] of channels [channels, ...], whose rows NumPy adds up much faster."""
+    return np.moveaxis(values, 0, -1)
+
+
 def _divided(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return sums [..., channels] over weights [...], as Mitsuba's films divide them."""
     return np.asarray(sums / np.where(weights == 0, 1, weights)[..., None])
@@ -132,14 +142,26 @@ def _divided(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def box_mean(values: np.ndarray, reach: int, axes: tuple[int, ...] = (0, 1)) -> np.ndarray:
     """Return the means over windows of 2 reach + 1 values along axes, cut at the border."""
     for axis in axes:
-        sums = np.moveaxis(np.cumsum(values, axis, dtype=np.float64), axis, 0)
-        place = np.arange(len(sums))
-        last, before = np.minimum(place + reach, len(sums) - 1), np.maximum(place - reach - 1, -1)
-        means = sums[last]
-        means[reach + 1 :] -= sums[: max(len(sums) - reach - 1, 0)]
-        means /= (last - before).reshape(-1, *([1] * (sums.ndim - 1)))
-        values = np.moveaxis(means, 0, axis)
+        place = np.arange(values.shape[axis])
+        last, before = np.minimum(place + reach, len(place) - 1), np.maximum(place - reach - 1, -1)
+        sums = np.cumsum(values, axis, dtype=np.float64)
+        means = np.take(sums, last, axis)
+        ahead, behind = np.moveaxis(means, axis, 0), np.moveaxis(sums, axis, 0)  # views
+        ahead[reach + 1 :] -= behind[: max(len(place) - reach - 1, 0)]
+        ahead /= (last - before).reshape(-1, *([1] * (values.ndim - 1)))
+        values = means
     return values
+
+
+def dilated(mask: np.ndarray, reach: int, axes: tuple[int, ...] = (0, 1)) -> np.ndarray:
+    """Return where a mask is true within so many places along axes."""
+    for axis in axes:
+        mask, near = mask.copy(), np.moveaxis(mask, axis, 0)
+        wide = np.moveaxis(mask, axis, 0)  # a view
+        for step in range(1, reach + 1):
+            wide[step:] |= near[:-step]
+            wide[:-step] |= near[step:]
+    return mask
 
 
 @dataclass
@@ -177,32 +199,29 @@ class Exposer:
                 the scene's sampler does.
             moments: add up colours and their squares by pixel as well.
         """
-        film = self.film
-        canvas = Canvas(film, pictures, len(self.names) + 1) if film.reach else None
-        kept = len(self.names) if canvas is None else 3 * moments
-        total = np.zeros((kept + 3 * moments, pictures * film.pixels))
-        pixel = groups.pictures.astype(np.int64) * film.pixels + groups.pixels  # ascending
-        step = max(1, self.workspace.rays_at_once(2 * len(self.names)) // groups.size)
-        for start in range(0, len(pixel), step):
-            part, own = groups.part(start, start + step), pixel[start : start + step]
-            planes = self._wavefront(part, _Start(seed, start, progressive), canvas, kept, moments)
-            starts = np.flatnonzero(np.diff(own, prepend=-1))  # of the groups of each pixel
+        film, kept = self.film, len(self.names)
+        rays = np.zeros((pictures, film.pixels), np.int64)
+        rays.ravel()[groups.pixels] = groups.rays
+        # where pixels have one group each, and its rays reach no other, sums of groups are what is wanted
+        canvas = Canvas(film, rays, kept, moments=moments) if film.reach or progressive else None
+        total = np.zeros((0 if canvas else kept + 3 * moments, rays.size))
+        step = max(1, self.workspace.rays_at_once(2 * kept) // groups.size)
+        for start in range(0, len(groups), step):
+            part = groups.part(start, start + step)
+            planes = self._wavefront(part, _Start(seed, start, progressive), canvas, moments)
             for row, plane in zip(total, planes, strict=False):
-                plane = np.broadcast_to(plane, own.shape)
-                row[own[starts]] += np.add.reduceat(plane, starts, dtype=np.float64)
-            self._count("primary", len(own) * groups.size)
+                row[part.pixels] = np.broadcast_to(plane, len(part))
+            self._count("primary", len(part) * groups.size)
             for kind, plane in zip(self._counted.values(), planes[len(total) :], strict=True):
                 self._count(kind, round(np.sum(np.asarray(plane), dtype=np.float64)))
-            advance(len(own) * groups.size)
-        rays = groups.size * np.bincount(pixel, minlength=pictures * film.pixels)
-        rays = rays.reshape(pictures, film.pixels)
-        totals = np.moveaxis(total.reshape(-1, pictures, film.pixels), 0, -1)
-        if canvas is None:
-            means = totals[..., :kept] / np.maximum(rays, 1)[..., None]
-            sums = np.concatenate([means, rays[..., None] > 0], axis=-1).reshape(pictures, *film.shape, -1)
+            advance(len(part) * groups.size)
+        if canvas is not None:
+            sums, colors = canvas.sums, canvas.moments
         else:
-            sums = canvas.sums
-        return Exposed(sums[..., :-1], sums[..., -1], rays, totals[..., :3], totals[..., kept:])
+            means = np.concatenate([total[:kept] / np.maximum(rays.ravel(), 1), rays.reshape(1, -1) > 0])
+            found = np.concatenate([means, total[: 3 * moments], total[kept:]])
+            sums, colors = np.split(channels_last(found.reshape(-1, pictures, *film.shape)), [kept + 1], -1)
+        return Exposed(sums[..., :-1], sums[..., -1], rays, colors[..., :3], colors[..., 3:])
 
     @property
     def _counted(self) -> dict[str, str]:
@@ -212,21 +231,27 @@ class Exposer:
     def _count(self, kind: str, number: int) -> None:
         self.rays[kind] = self.rays.get(kind, 0) + number
 
-    def _wavefront(
-        self, groups: Groups, start: _Start, canvas: Canvas | None, kept: int, moments: bool
-    ) -> list[Any]:
-        """Trace a wavefront onto the canvas; return sums over each group of the first ``kept`` channels, of
-        squared colours, and of numbers of rays."""
+    def _wavefront(self, groups: Groups, start: _Start, canvas: Canvas | None, moments: bool) -> list[Any]:
+        """Trace a wavefront onto a canvas; without one, return sums over each group of the channels and of
+        squared colours. Return sums of numbers of rays after them."""
         import drjit as dr
 
-        data = _Data.of(groups, start.seed, self.film)
-        form = groups.size, len(groups), kept, moments, self.film.form, *self.names
+        pixels, first = groups.one_by_one()
+        data = _Data.of(pixels, groups.size, start.seed, self.film)
+        form = groups.size, len(groups), moments, self.film.form, *self.names
 
         def trace() -> list[Any]:
-            return self._trace(groups, self._lanes(groups, data, start), data, canvas, kept, moments)
+            place, channels, planes = self._trace(*self._lanes(first, data, start), data)
+            if canvas is None:
+                planes = [*channels, *(c * c for c in channels[: 3 * moments]), *planes]
+                dr.eval(planes)  # block_reduce would evaluate each plane by itself, in a kernel of its own
+            else:
+                dr.eval(place, channels, planes)
+                canvas.put(place, channels, groups.pixels, groups.rays)
+            return [dr.block_reduce(dr.ReduceOp.Add, plane, groups.size) for plane in planes]
 
         # numbered rays of a film without a canvas, which would be written to
-        known = canvas is None and not start.progressive and self._independent and self.film.form is not None
+        known = canvas is None and self._independent and self.film.form is not None
         sums = self.shader.replayed(self.view, form, self.layers, data, trace) if known else trace()
         dr.eval(sums)
         return sums
@@ -235,48 +260,39 @@ class Exposer:
     def _independent(self) -> bool:
         return bool(self.film.sensor.sampler().class_name() == "IndependentSampler")
 
-    def _lanes(self, groups: Groups, data: _Data, start: _Start) -> _Lanes:
-        """Return the rays of a wavefront."""
+    def _lanes(self, first: np.ndarray, data: _Data, start: _Start) -> tuple[Any, Any]:
+        """Return the pixels of the rays of groups that begin with the ``first``, and their sampler."""
         import drjit as dr
         import mitsuba as mi
 
-        rays = len(groups) * groups.size
+        rays = len(first) * data.each
         group, number = data.group.divide(dr.arange(mi.UInt32, rays))
         pixel = dr.gather(mi.UInt32, data.pixels, group)
-        picture = dr.gather(mi.UInt32, data.pictures, group)
         if start.progressive:
             sampler = pixel_sequence()
-            first = dr.gather(mi.UInt32, mi.UInt32(groups.first), group)
-            key = pixel + picture * dr.opaque(mi.UInt32, self.film.pixels)
-            sampler.start(first + number, mi.sample_tea_32(key, data.seed)[0])
+            number += dr.gather(mi.UInt32, mi.UInt32(first), group)
+            sampler.start(number, mi.sample_tea_32(pixel, data.seed)[0])
+            _, pixel = data.area.divide(pixel)
         elif self._independent:
             sampler = ray_sampler()
             # numbered as Mitsuba numbers the rays of a whole picture
-            number = mi.UInt64(pixel) * data.size + mi.UInt64(number)
-            sampler.start_at(data.seed, number)
+            sampler.start_at(data.seed, mi.UInt64(pixel) * data.size + mi.UInt64(number))
         else:
             sampler = self.film.sensor.sampler().clone()
-            sampler.set_sample_count(groups.size)
-            sampler.set_samples_per_wavefront(groups.size)
+            sampler.set_sample_count(data.each)
+            sampler.set_samples_per_wavefront(data.each)
             sampler.seed((start.seed + start.before) % 2**32, rays)
-        return _Lanes(group, pixel, picture, sampler)
+        return pixel, sampler
 
-    def _trace(
-        self,
-        groups: Groups,
-        lanes: _Lanes,
-        data: _Data,
-        canvas: Canvas | None,
-        kept: int,
-        moments: bool,
-    ) -> list[Any]:
+    def _trace(self, pixel: Any, sampler: Any, data: _Data) -> tuple[Any, list[Any], list[Any]]:
+        """Return the places of rays on the film, the channels of their values, and numbers of rays."""
         import drjit as dr
         import mitsuba as mi
 
-        place, ray, weight = self.film.rays(lanes.pixel, lanes.sampler, data.film)
+        place, ray, weight = self.film.rays(pixel, sampler, data.film)
         if self.view.motion is not None:
-            ray = self.view.moved(ray, lanes.sampler.next_1d())
-        values = self.shader.values(self.view, ray, weight, lanes.sampler)
+            ray = self.view.moved(ray, sampler.next_1d())
+        values = self.shader.values(self.view, ray, weight, sampler)
         channels = [mi.Float(c) for c in self.film.toned(values.image)]
         if self.film.alpha:
             channels.append(dr.select(values.valid, mi.Float(1), 0))
@@ -285,16 +301,7 @@ class Exposer:
         channels += values.aovs
         layers = {name: TABLE[name].value(values) for name in self.layers}
         channels += [mi.Float(c) for value in layers.values() for c in components(value)]
-        planes = channels[:kept] + [c * c for c in channels[: 3 * moments]]
-        planes += [mi.Float(layers[name]) for name in self._counted]
-        if canvas is not None:
-            share = dr.gather(mi.Float, mi.Float(groups.weights), lanes.group)
-            weighted = [*(c * share for c in channels), share]
-            dr.eval(planes, place, lanes.picture, weighted)
-            canvas.put(place, lanes.picture, weighted, groups.most)
-        else:
-            dr.eval(planes)  # block_reduce would evaluate each plane by itself, in a kernel of its own
-        return [dr.block_reduce(dr.ReduceOp.Add, plane, groups.size) for plane in planes]
+        return place, channels, [mi.Float(layers[name]) for name in self._counted]
 
 
 @dataclass(frozen=True)
@@ -310,35 +317,36 @@ class _Start:
 class _Data:
     """The groups of a wavefront and the film as the kernel has them: a PyTree of its data."""
 
-    pixels: Any
-    pictures: Any
+    each: int  #: rays of a group
+    pixels: Any  #: of each group
     seed: Any
-    group: Divisor  #: size of a group, to divide by
-    size: Any  #: of a group
+    group: Divisor  #: rays of a group, to divide by
+    size: Any  #: rays of a group
+    area: Divisor  #: pixels of a picture
     film: Numbers
 
     @classmethod
-    def of(cls, groups: Groups, seed: int, film: Film) -> _Data:
-        """Return the data of some groups."""
+    def of(cls, pixels: np.ndarray, size: int, seed: int, film: Film) -> _Data:
+        """Return the data of groups of a size in some pixels."""
         import mitsuba as mi
 
-        pixels, pictures = mi.UInt32(groups.pixels), mi.UInt32(groups.pictures)
-        return cls(pixels, pictures, *_opaque(seed, groups.size, mi.variant()), film.numbers())
+        variant = mi.variant()
+        group, wide = _size(size, variant)
+        area, _ = _size(film.pixels, variant)
+        return cls(size, mi.UInt32(pixels), _seed(seed, variant), group, wide, area, film.numbers())
 
 
 @lru_cache(maxsize=64)
-def _opaque(seed: int, size: int, variant: str) -> tuple[Any, Divisor, Any]:
+def _seed(seed: int, variant: str) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    return dr.opaque(mi.UInt32, seed), Divisor.opaque(size), dr.opaque(mi.UInt64, size)
+    return dr.opaque(mi.UInt32, seed)
 
 
-@dataclass(frozen=True)
-class _Lanes:
-    """The rays of a wavefront before they are rays."""
+@lru_cache(maxsize=64)
+def _size(size: int, variant: str) -> tuple[Divisor, Any]:
+    import drjit as dr
+    import mitsuba as mi
 
-    group: Any  #: number of their group
-    pixel: Any  #: where they start
-    picture: Any  #: to which they belong
-    sampler: Any  #: that serves them
+    return Divisor.opaque(size), dr.opaque(mi.UInt64, size)

@@ -33,14 +33,14 @@ class FilmPasses(Passes):
     def _render(self, step: Pass) -> None:
         """Expose every pixel alike."""
         exposer, rays = self._exposer(step), self._film.rays_near(step.samples * step.repeats)
-        groups = Groups.uniform(np.flatnonzero(self._near), rays)
+        groups = Groups.uniform(rays, np.flatnonzero(self._near))
         moments = "square" in step.layers
         self._stack = Stack(self._film, 1, len(exposer.names))
         with self._job.stage(step.name, len(groups) * rays) as advance:
             exposed = exposer.expose(groups, self._exposure.seed, moments=moments, advance=advance)
             self._stack.add(exposed, np.ones_like(exposed.rays))
         if moments:
-            mean, square = (self._stack.rows(v)[0] / rays for v in (exposed.total, exposed.square))
+            mean, square = (v[0] / rays for v in (exposed.total, exposed.square))
             variance = np.maximum(square - mean**2, 0) / (rays - 1) * self._film.averaging
             self._set("square", self._film.picture(variance))
         self._develop(exposer, self._stack)
@@ -52,7 +52,7 @@ class FilmPasses(Passes):
         edges[self._seen] = self._picture("samples") > 1
         edges = film.framed(edges, False).reshape(1, -1)
         exposer = self._exposer(step)
-        groups = Groups.uniform(np.flatnonzero(self._stack.widened(edges)[0]), rays)
+        groups = Groups.uniform(rays, np.flatnonzero(self._stack.widened(edges)[0]))
         with self._job.stage(step.name, len(groups) * rays, "Computing Anti aliasing..") as advance:
             self._stack.add(exposer.expose(groups, self._exposure.seed + 1, advance=advance), edges)
         self._develop(exposer, self._stack)

@@ -19,7 +19,7 @@ import numpy as np
 
 from mrt_mitsuba.filters.dof import REACH
 from mrt_mitsuba.output.error import ErrorEstimate
-from mrt_mitsuba.rendering.exposing import Exposed, Exposer, Groups, Stack, box_mean
+from mrt_mitsuba.rendering.exposing import Exposed, Exposer, Groups, Stack, box_mean, channels_last
 
 HALVES = 2
 TILE = 16  # pixels, under a filter
@@ -44,7 +44,7 @@ class Halves(Stack):
         film = exposer.film
         super().__init__(film, HALVES, len(exposer.names))
         self._exposer, self._seed, self._blurred, self._step = exposer, seed, blurred, STEP
-        self._total, self._square = np.zeros((2, HALVES, film.pixels, 3))
+        self._total, self._square = (channels_last(np.zeros((3, HALVES, *film.shape))) for _ in range(2))
 
     # ------------------------------------------- Rounds ---------------------------------------------
 
@@ -189,9 +189,9 @@ class Halves(Stack):
 
     def _moments(self) -> np.ndarray:
         """Return the variance of a ray's value in each half and channel, [2, H, W, 3]."""
-        rays = self.rays[..., None]
+        rays = self.rows(self.rays)[..., None]
         variance = (self._square - self._total**2 / rays) / np.maximum(rays - 1, 1)
-        return self.rows(np.maximum(variance, 0))
+        return np.maximum(variance, 0)
 
     def _better(self, moments: np.ndarray) -> np.ndarray:
         """Return the squared error over that of independent rays whose value has this variance, [H, W].

@@ -37,16 +37,19 @@ _TRACEBACK = re.compile(
 _CODE_PLACE = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
 
 
-def load_dict(scene: Mapping[str, Any], name: str = "the dict", budget: Budget | None = None) -> Any:
+def load_dict(
+    scene: Mapping[str, Any], name: str = "the dict", budget: Budget | None = None, *, merge: bool = True
+) -> Any:
     """Return what a Mitsuba dict describes.
 
+    ``merge``: make one of meshes of the same material, as Mitsuba does, which leaves them in any order.
     Raises ``SceneError`` that calls it ``name``, and ``UsageError`` for a texture too large for the budget.
     """
     import mitsuba as mi
 
     with _resolving(None):
         _check_dict(scene, name)
-        return _make(lambda config: mi.parser.parse_dict(config, scene), name, budget)
+        return _make(lambda config: mi.parser.parse_dict(config, scene), name, budget, merge)
 
 
 def load_file(path: str, budget: Budget | None = None, **parameters: Any) -> tuple[Any, Mapping[str, str]]:
@@ -74,12 +77,12 @@ def declared(path: str) -> dict[str, str]:
     return {each.get(b"name", ""): each.get(b"value", "") for each in found}
 
 
-def _make(parse: Callable[[Any], Any], name: str, budget: Budget | None) -> Any:
+def _make(parse: Callable[[Any], Any], name: str, budget: Budget | None, merge: bool = True) -> Any:
     """Parse, check and instantiate."""
     import mitsuba as mi
 
     config = mi.parser.ParserConfig(mi.variant())
-    config.parallel = False
+    config.parallel, config.merge_meshes = False, merge
     try:
         state = parse(config)
         mitsuba_first()  # a <path> of the file puts its folder before

@@ -78,7 +78,9 @@ def open_scene(
     if budget is not None:  # those that no face uses, too: a render must not overwrite them
         budget.pictures.update(map(os.path.realpath, own.pictures))
     width, height, fresnel = size[0] or SIZE[0], size[1] or SIZE[1], fresnel or "schlick"
-    loaded = load_dict(own.to_dict(width=width, height=height, fresnel=fresnel), name, budget)
+    # its meshes have a material each: kept apart, they stay in order, and the same file has the same layers
+    nodes = own.to_dict(width=width, height=height, fresnel=fresnel)
+    loaded = load_dict(nodes, name, budget, merge=False)
     set_parameters(loaded, keys)
     view, integrator = _sensor(name, loaded, sensor), _integrator(integrator, loaded)
     return Source(name, loaded, view, integrator, width, height, own.focal_distance, own.focal_range, fresnel)

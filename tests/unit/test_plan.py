@@ -40,7 +40,10 @@ def scene(**nodes: Any) -> dict[str, Any]:
     base = {
         "type": "scene",
         "integrator": {"type": "mrt_whitted"},
-        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 16, "height": 12}},
+        "sensor": {
+            "type": "perspective",
+            "film": {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}},
+        },
         "sky": {"type": "constant", "radiance": 0.3},
         "light": LIGHT,
         "ball": BALL,
@@ -154,7 +157,7 @@ def test_what_no_decision_depends_on_leaves_the_kernel(
     assert kernel == base[1]
 
 
-BOX = {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}}
+TENT = {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "tent"}}
 
 # What turns fields of the plan and, with them, kernels: nodes, options, and the fields
 TURNS: list[tuple[dict[str, Any], dict[str, Any], set[str]]] = [
@@ -167,7 +170,7 @@ TURNS: list[tuple[dict[str, Any], dict[str, Any], set[str]]] = [
     ({}, {"lattice": "report"}, {"lattice"}),
     ({}, {"integrator": "direct"}, {"integrator", "traceable", "random", "kernel"}),
     ({}, {"variant": "llvm_ad_mono"}, {"variant"}),
-    ({"sensor": {"type": "perspective", "film": BOX}}, {}, {"film"}),
+    ({"sensor": {"type": "perspective", "film": TENT}}, {}, {"film"}),
     ({}, {"width": 20, "height": 14}, {"width", "height"}),  # constants to Mitsuba's ``ImageBlock``
 ]
 # Numbers that kernels take as data, and what follows from other fields

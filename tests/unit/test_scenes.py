@@ -187,6 +187,16 @@ def test_scenes_render_and_repeat(number: int) -> None:
     assert np.array_equal(image, mrt.render(number, **SIZE).image)
 
 
+@pytest.mark.parametrize("number", [5, 7])
+def test_shapes_are_in_the_order_of_the_scene(number: int) -> None:
+    """Mitsuba leaves merged meshes in another order every time, and with it their numbers in layers."""
+    from mrt_mitsuba.scene.open import open_scene
+
+    names = [shape.id() for shape in open_scene(number).scene.shapes()]
+    assert names == [name for name in mrt.scene_dict(number) if name in names]
+    assert sum(name.startswith("mesh") for name in names) > 3
+
+
 def test_arrow_on_the_block_points_up() -> None:
     """Above the middle of the block's front the picture is blue, below it is wood: v = 0 is the first row."""
     image = mrt.render(8, width=240, height=180, aa=1).image

@@ -1,0 +1,155 @@
+"""What rays add up to on a film whose filter reaches beyond the pixel in which a ray starts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.rays.divisor import Divisor
+from mrt_mitsuba.rays.film import Film
+from mrt_mitsuba.records import dataclass
+
+MOST_SUMS = 128  # in a kernel: more take longer to compile, with fewer each ray is read more often
+
+
+class Canvas:
+    """Sums of filtered values over the pixels of some pictures; the rays of a pixel weigh 1 in all.
+
+    A lane adds up what the rays of one pixel give to one of its neighbours, for all neighbours in reach. What
+    it gives to the same neighbour lies at the same distance from it, along rows that are padded by the reach.
+    All sums are formed in the same order every time, and no two lanes write to one place.
+    """
+
+    def __init__(self, film: Film, rays: np.ndarray, channels: int, *, moments: bool) -> None:
+        """Take up values of so many channels of so many rays in each pixel, [pictures, pixels].
+
+        Args:
+            moments: add up the colours of the rays of each pixel and their squares as well, unfiltered.
+        """
+        self._film, self._rays = film, rays
+        self._width, self._height = (n + 2 * film.reach for n in (film.width, film.height))
+        size = len(rays) * self._height * self._width
+        self._sums, self._moments = np.zeros((channels + 1, size)), np.zeros((6 * moments, size))
+
+    @property
+    def sums(self) -> np.ndarray:
+        """The sums of values and, last, of weights, [pictures, H, W, channels + 1]."""
+        return self._inside(self._sums)
+
+    @property
+    def moments(self) -> np.ndarray:
+        """The sums of colours and of squared colours, [pictures, H, W, 6]; empty where not asked for."""
+        return self._inside(self._moments)
+
+    def _inside(self, planes: np.ndarray) -> np.ndarray:
+        padded = planes.reshape(len(planes), len(self._rays), self._height, self._width)
+        rows, columns = (slice(self._film.reach, n - self._film.reach) for n in padded.shape[2:])
+        return np.moveaxis(padded[..., rows, columns], 0, -1)
+
+    def put(self, place: Any, values: Sequence[Any], pixels: np.ndarray, rays: np.ndarray) -> None:
+        """Add the values of rays, [channels] each, colours first, at their places on the film.
+
+        Args:
+            pixels: where they start, ascending; those of the second picture follow on those of the first.
+            rays: how many start there, one after the other.
+        """
+        import drjit as dr
+
+        reach, film = self._film.reach, self._film
+        row, column = np.divmod(pixels, film.width)
+        padded = (row + (2 * (row // film.height) + 1) * reach) * self._width + column + reach
+        start, stop = int(padded[0]), int(padded[-1]) + 1
+        # one more than there are lanes, so that Dr.Jit gathers them: to load them, it would compile another
+        # kernel for every alignment of NumPy's memory
+        counts, shares = np.zeros(stop - start + 1, np.uint32), np.zeros(stop - start + 1, np.float32)
+        counts[padded - start + 1], shares[padded - start] = rays, 1 / self._rays.ravel()[pixels]
+        runs = self._runs(start, np.cumsum(counts, dtype=np.uint32), shares)
+        more = runs.moments(values[:3]) if len(self._moments) else []
+        dr.eval(more)
+        for total, found in zip(self._moments, more, strict=True):
+            total[start:stop] += np.asarray(found)
+        count, step = len(self._sums), max(1, MOST_SUMS // ((2 * reach + 1) * len(self._sums)))
+        for first in range(-reach, reach + 1, step):
+            down = range(first, min(first + step, reach + 1))
+            given = runs.given(film, place, values, down)
+            dr.eval(given)
+            steps = (y * self._width + x for y in down for x in range(-reach, reach + 1))
+            for index, along in enumerate(steps):
+                for total, found in zip(self._sums, given[index * count :], strict=False):
+                    total[start + along : stop + along] += np.asarray(found)
+
+    def _runs(self, start: int, ends: np.ndarray, shares: np.ndarray) -> _Runs:
+        """Return the rays of places in padded pictures from ``start`` on, given where they end."""
+        import drjit as dr
+        import mitsuba as mi
+
+        lane, ends = dr.arange(mi.UInt32, len(ends) - 1), mi.UInt32(ends)
+        first, last = dr.gather(mi.UInt32, ends, lane), dr.gather(mi.UInt32, ends, lane + 1)
+        share = dr.gather(mi.Float, mi.Float(shares), lane)
+        width, height = _divisors(self._width, self._height, mi.variant())
+        row, column = width.divide(lane + dr.opaque(mi.UInt32, start))
+        _, row = height.divide(row)
+        reach = self._film.reach
+        return _Runs(first, last, share, mi.Float(column) - reach, mi.Float(row) - reach)
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """The rays of each of some pixels, which follow on each other."""
+
+    first: Any  #: number of the first
+    last: Any  #: and of the one after the last
+    share: Any  #: weight of each ray
+    column: Any  #: of the pixel
+    row: Any
+
+    def given(self, film: Film, place: Any, values: Sequence[Any], down: range) -> list[Any]:
+        """Return what rays at places on a film give to pixels in reach so many rows further down."""
+        import drjit as dr
+        import mitsuba as mi
+
+        rfilter, across = film.sensor.film().rfilter(), range(-film.reach, film.reach + 1)
+        rows = [dr.opaque(mi.Float, step) for step in down]
+
+        def one(ray: Any) -> list[Any]:
+            if not film.reach:
+                return [*(dr.gather(mi.Float, value, ray) for value in values), mi.Float(1)]
+            x = dr.gather(mi.Float, place.x, ray) - (self.column + 0.5)
+            y = dr.gather(mi.Float, place.y, ray) - (self.row + 0.5)
+            along = [rfilter.eval(step - x) for step in across]
+            channels = [*(dr.gather(mi.Float, value, ray) for value in values), mi.Float(1)]
+            shown = ([value * rfilter.eval(step - y) for value in channels] for step in rows)
+            return [value * weight for values in shown for weight in along for value in values]
+
+        count = len(rows) * len(across) * (len(values) + 1)
+        return [total * self.share for total in self._summed(one, count)]
+
+    def moments(self, values: Sequence[Any]) -> list[Any]:
+        """Return the sums of values, and those of their squares."""
+        import drjit as dr
+        import mitsuba as mi
+
+        def one(ray: Any) -> list[Any]:
+            found = [dr.gather(mi.Float, value, ray) for value in values]
+            return [*found, *(value * value for value in found)]
+
+        return self._summed(one, 2 * len(values))
+
+    def _summed(self, one: Callable[[Any], list[Any]], count: int) -> list[Any]:
+        """Return sums over each run of what ``one`` returns of a ray."""
+        import drjit as dr
+        import mitsuba as mi
+
+        def add(ray: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            return ray + 1, [total + value for total, value in zip(sums, one(ray), strict=True)]
+
+        state = self.first, [mi.Float(0)] * count
+        return list(dr.while_loop(state, lambda ray, _: ray < self.last, add)[1])
+
+
+@lru_cache(maxsize=16)
+def _divisors(width: int, height: int, variant: str) -> tuple[Divisor, Divisor]:
+    return Divisor.opaque(width), Divisor.opaque(height)
