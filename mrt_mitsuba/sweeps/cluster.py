@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 CONNECTING = 10  # seconds to reach a scheduler, and for its first worker to be there
 STARTING = 120  # seconds for worker processes of this machine; a busy one takes its time
 # For workers of this machine: the engine's profiler stops a job a hundred times a second
-LOCAL = {"distributed.worker.profile.enabled": False}
+LOCAL = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False", "OMP_NUM_THREADS": "1"}
 
 
 class ClusterError(MrtError):
@@ -88,21 +88,22 @@ class Engine:
         ``if __name__ == "__main__"``.
         """
         from distributed import Scheduler, SpecCluster
-        from distributed.deploy.subprocess import SubprocessWorker
         from distributed.system import MEMORY_LIMIT
 
+        from mrt_mitsuba.sweeps.process import WorkerProcess
+
         devices = gpus() if self.variant.startswith("cuda") else []
+        options = {
+            "nthreads": 1,
+            "memory_limit": MEMORY_LIMIT // count,
+            "dashboard": False,
+            "silence_logs": logging.CRITICAL,
+        }
         workers = {}
         for number in range(count):
-            pinned = {"env": {"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]}} if devices else {}
-            options = {
-                "nthreads": 1,
-                "memory_limit": MEMORY_LIMIT // count,
-                "dashboard": False,
-                "config": LOCAL,
-                "silence_logs": logging.CRITICAL,
-            }
-            workers[number] = {"cls": SubprocessWorker, "options": {"worker_kwargs": options | pinned}}
+            pinned = {"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]} if devices else {}
+            settings = {"options": options, "environment": LOCAL | pinned}
+            workers[number] = {"cls": WorkerProcess, "options": settings}
         scheduler = {
             "allowed_failures": self.retries,
             "host": "127.0.0.1",

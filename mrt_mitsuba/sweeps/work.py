@@ -13,7 +13,7 @@ from mrt_mitsuba.sweeps.cluster import ClusterError
 from mrt_mitsuba.sweeps.sheet import MOST, write_sheet
 from mrt_mitsuba.sweeps.table import Table
 from mrt_mitsuba.sweeps.tiles import Mosaic, assemble_task
-from mrt_mitsuba.sweeps.worker import TOPIC, House, Task, is_fresh, named, render_task, thumbnail
+from mrt_mitsuba.sweeps.worker import ENDED, TOPIC, House, Task, is_fresh, named, render_task, thumbnail
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -29,7 +29,9 @@ class Work:
         self._client, self._house = client, house
         self._options: dict[str, Any] = {"house": house, "retries": retries, "pure": False}
         self._attempts: Counter[str] = Counter()
+        self._ended: dict[str, dict[str, Any]] = {}
         client.subscribe_topic(TOPIC, lambda event: self._attempts.update([event[1]]))
+        client.subscribe_topic(ENDED, lambda event: self._ended.update([event[1]]))
 
     def submit(self, tasks: Sequence[Task]) -> Pending:
         """Let the workers render pictures."""
@@ -59,7 +61,9 @@ class Work:
 
         try:
             for future in as_completed(list(pending), self._client.loop):
-                tasks, facts = pending.pop(future), _facts(future)
+                tasks, facts = pending.pop(future), self._ended.pop(future.key, None)
+                if facts is None or future.status != "finished":
+                    facts = _facts(future)
                 if tasks:
                     attempts = max(1, *(self._attempts[task.key] for task in tasks))
                     facts |= {"versions": named(self._house.versions), "attempts": attempts}
@@ -70,6 +74,7 @@ class Work:
             if self._client.status == "running":
                 self._client.cancel(list(pending))
                 self._client.unsubscribe_topic(TOPIC)
+                self._client.unsubscribe_topic(ENDED)
 
     def write_sheet(self, path: str, tasks: Sequence[Task]) -> None:
         """Write the pictures of some tasks, small, as one."""

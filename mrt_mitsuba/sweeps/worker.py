@@ -18,7 +18,10 @@ from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps.scenes import Opener, SceneFile
 
-TOPIC = "mrt-sweep"  # of the scheduler's events, by which a client learns what has begun
+# Of the scheduler's events, by which a client learns what has begun, and the facts about what has ended: to
+# fetch a result takes it and the worker much longer
+TOPIC = "mrt-sweep"
+ENDED = "mrt-sweep-ended"
 MADE_WITH = "mrt:sweep"  # header attribute: fingerprint of scene, settings and versions
 THUMBNAIL = 160  # pixels, the longer side
 PAUSE = 0.5  # seconds before a worker ends, in which the client fetches the facts about its last job
@@ -117,7 +120,7 @@ def render_task(task: Task, house: House) -> dict[str, Any]:
     with _one_at_a_time:
         if found := _read_note(note):  # done, but the worker was gone before it could report
             return found
-        if _done >= house.renew and worker.nanny:
+        if _done >= house.renew and (worker.nanny or house.local):
             _renew(worker)
             raise Reschedule  # to another worker, or to this one's next process
         worker.log_event(TOPIC, task.key)
@@ -129,6 +132,7 @@ def render_task(task: Task, house: House) -> dict[str, Any]:
         except MrtError as error:
             found = {"error": " ".join(str(error).split()), "worker": worker.address}
         _done += 1
+        worker.log_event(ENDED, (task.key, found))
     return found
 
 
@@ -199,11 +203,11 @@ def _render(task: Task, worker: Any) -> dict[str, Any]:
 
 def _memory(worker: Any) -> int | None:
     """Return half of what is free or, if that is less, of what the worker may take; others need theirs."""
-    from mrt_mitsuba.memory import free_memory
+    from mrt_mitsuba.memory import Budget
     from mrt_mitsuba.options import SMALLEST_MEMORY
 
     limit = worker.memory_manager.memory_limit
-    return max(min(free_memory(), limit) // 2, SMALLEST_MEMORY) if limit else None
+    return max(min(Budget.of(None).size, limit // 2), SMALLEST_MEMORY) if limit else None
 
 
 def thumbnail(path: str) -> Any:

@@ -307,6 +307,23 @@ def test_a_worker_killed_in_mid_job_costs_one_retry(mortal, tmp_path: Path) -> N
     assert pictures(out) == [f"seed={n}.exr" for n in range(6)] and not left_over(out)
 
 
+def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(tmp_path: Path) -> None:
+    import psutil
+
+    def workers() -> list[psutil.Process]:
+        return [p for p in psutil.Process().children() if "dask_spec" in " ".join(p.cmdline())]
+
+    others = workers()
+    sweep = Background(3, tmp_path, workers=1, **slow(3))
+    wait_for(lambda: pictures(tmp_path), "a picture")
+    (worker,) = set(workers()) - set(others)
+    worker.kill()
+    table = sweep.end()
+    assert [row["error"] for row in table.rows] == [""] * 3
+    assert sorted(row["attempts"] for row in table.rows) == [1, 1, 2]
+    assert workers() == others
+
+
 def test_a_scheduler_killed_ends_the_sweep_and_a_second_run_finishes_it(mortal, tmp_path: Path) -> None:
     cluster, out = mortal(), tmp_path / "out"
     sweep = Background(3, out, cluster=cluster.address, **slow(6))
