@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mpmath import mp, mpf
+from mpmath import mp
 from scipy.integrate import quad
 
 from mrt_mitsuba.plugins.columns import Vector3
@@ -80,48 +80,6 @@ def test_course_file_where_at_hand(original_data: Path) -> None:
         rows = [[*map(float, row.values())] for row in csv.DictReader(lines)]
     assert len(rows) == len(TABLE)
     assert max(abs(beckmann_d(1 / c**2 - 1, alpha) - d) for c, alpha, d in rows) < 7e-7
-
-
-def random_lobes(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """float32 (wi [N, 3], wo [N, 3], alpha [N]): alpha 1e-4 … 3, mirrored in normals from within the lobe."""
-    rng = np.random.default_rng(2)
-    alpha = 10 ** rng.uniform(-4, 0.5, count)
-    c = np.where(rng.random(count) < 0.3, 10 ** rng.uniform(-6, 0, count), rng.random(count))
-    phi, psi = rng.uniform(0, 2 * np.pi, (2, count))
-    s = np.sqrt(1 - c**2)
-    wi = np.stack([s * np.cos(phi), s * np.sin(phi), c], axis=-1)
-    slope = alpha * np.sqrt(3 * rng.exponential(size=count))
-    m = np.stack([slope * np.cos(psi), slope * np.sin(psi), np.ones(count)], axis=-1)
-    m /= np.linalg.norm(m, axis=-1, keepdims=True)
-    wo = 2 * (wi * m).sum(axis=-1, keepdims=True) * m - wi
-    up = wo[:, 2] > 1e-6
-    return tuple(x[up].astype(np.float32) for x in (wi, wo, alpha))
-
-
-def half_tan2(wi: np.ndarray, wo: np.ndarray) -> mpf:
-    x, y, z = (exact.number(a) + exact.number(b) for a, b in zip(wi, wo, strict=True))
-    return (x * x + y * y) / (z * z)
-
-
-def test_float32_is_exact_to_a_few_roundings() -> None:
-    """Errors at the same float32 directions and roughness, wherever D is above 1e-7 of its peak."""
-    wi, wo, alpha = random_lobes(800)
-    half = vectors32(wi) + vectors32(wo)
-    tan2 = [half_tan2(i, o) for i, o in zip(wi, wo, strict=True)]
-    assert relative_errors(tan2_theta(half), tan2).max() < 4e-7  # six roundings
-    counts = np.array([float(t / exact.number(a) ** 2) < 16 for t, a in zip(tan2, alpha, strict=True)])
-    assert counts.sum() > 500
-    d = [exact.beckmann_d(1 / mp.sqrt(1 + t), a) for t, a in zip(tan2, alpha, strict=True)]
-    g = [exact.smith_g1(i, a) for i, a in zip(wi, alpha, strict=True)]
-    # exp of up to 16 enlarges the error of tan² / alpha² as much
-    assert relative_errors(beckmann_d(tan2_theta(half), float32(alpha)), d)[counts].max() < 5e-6
-    assert relative_errors(smith_g1(vectors32(wi), float32(alpha)), g).max() < 5e-7
-    lobe = [
-        dd * gi * exact.smith_g1(o, a) / (4 * exact.number(i[2]))
-        for dd, gi, i, o, a in zip(d, g, wi, wo, alpha, strict=True)
-    ]
-    found = microfacet_specular(vectors32(wi), vectors32(wo), tan2_theta(half), float32(alpha))
-    assert relative_errors(found, lobe)[counts].max() < 5e-6
 
 
 @pytest.mark.parametrize("alpha", [0.02, 0.3, 1.5, *NEGATIVE_ALPHAS])

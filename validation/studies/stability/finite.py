@@ -148,7 +148,10 @@ def _bsdf(form: str, visible: bool) -> Callable[[_Draw], Any]:
         si = dr.zeros(mi.SurfaceInteraction3f, draw.count)
         si.wi = draw.local()
         context = mi.BSDFContext()
-        value, pdf = bsdf.eval_pdf(context, si, draw.local())
+        away = 10.0 ** (-9 * draw.uniform()) * draw.vector(mi.Vector3f)
+        near = dr.normalize(mi.Vector3f(-si.wi.x, -si.wi.y, si.wi.z) + away)  # where narrow lobes are
+        wo = dr.select((draw.uniform() < 0.5) & dr.all(dr.isfinite(near)), near, draw.local())
+        value, pdf = bsdf.eval_pdf(context, si, wo)
         drawn, weight = bsdf.sample(context, si, draw.uniform(), mi.Point2f(draw.uniform(), draw.uniform()))
         mirror = bsdf.eval_attribute("mirror_reflectance", si)
         return _bad(value, pdf, weight, drawn.pdf, mirror) | _not_unit(drawn.wo)
