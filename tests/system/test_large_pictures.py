@@ -9,7 +9,6 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import drjit as dr
 import numpy as np
@@ -17,9 +16,7 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import memory
-from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.filters.bands import bands
-from mrt_mitsuba.output.files import read_exr
 
 # ---------------------------------------------- Bands ----------------------------------------------
 
@@ -97,18 +94,6 @@ def test_random_numbers_do_not_depend_on_the_parts(monkeypatch: pytest.MonkeyPat
     assert_same(mrt.render(scene, **options), whole)
 
 
-def test_the_same_command_twice_gives_the_same_pixels(tmp_path: Path, capsys) -> None:
-    words = ["3", "width=200", "height=150", "aa=2", "format=exr", "layers=depth,normal,edges"]
-    pictures = []
-    for name, room in (("a", "memory=64M"), ("b", "memory=1G")):
-        assert cli.main([str(tmp_path / name), *words, room]) == 0, capsys.readouterr().err
-        pictures.append(read_exr(tmp_path / f"{name}.exr"))
-    assert pictures[0].image.tobytes() == pictures[1].image.tobytes()
-    assert pictures[0].layers.keys() == pictures[1].layers.keys()
-    for name, values in pictures[0].layers.items():
-        assert values.tobytes() == pictures[1].layers[name].tobytes(), name
-
-
 # ------------------------------------------------ Memory ------------------------------------------------
 
 PEAK = """
@@ -147,32 +132,10 @@ def test_peak_memory_stays_within_the_budget(run_python) -> None:
     assert tiled == whole
 
 
-# ---------------------------------------- Full disks and signals ----------------------------------------
+# ------------------------------------------------ Signals -----------------------------------------------
 
 
-# Only the picture's file may not grow: Dr.Jit keeps kernels in files, too
-LIMITED = """
-import resource, sys
-from mrt_mitsuba.rendering.result import Result
-save = Result.save
-def limited(self, *path, **options):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-    save(self, *path, **options)
-Result.save = limited
-"""
 COMMAND = "from mrt_mitsuba.command import main as cli\nsys.exit(cli.main())\n"
-
-
-@pytest.mark.parametrize("ending", ["png", "exr"])
-def test_a_file_that_may_not_grow_leaves_the_old_one(run_python, tmp_path: Path, ending: str) -> None:
-    """The system refuses to write on half way, as on a full disk."""
-    target = tmp_path / f"out.{ending}"
-    target.write_bytes(b"old")
-    words = ("out", "3", "width=160", "height=120", "aa=1", f"format={ending}", "quiet=1")
-    done = run_python(LIMITED + COMMAND, *words)
-    assert done.returncode == 1 and done.stderr.count("\n") == 1
-    assert done.stderr.startswith(f"mrt: cannot write out.{ending}: File too large")
-    assert target.read_bytes() == b"old" and list(tmp_path.iterdir()) == [target]
 
 
 # A picture that does not compress takes seconds to write, and one in narrow bands as long to blur

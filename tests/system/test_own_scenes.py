@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.validation.studies import adaptive
 from mrt_mitsuba.validation.tools.own_scenes import SCENES, SPP, load, sensor
+from mrt_mitsuba.validation.tools.study import findings
 
 WIDTH, HEIGHT = 32, 24
 
@@ -179,21 +181,9 @@ def test_size_sensor_and_parameters(tmp_path):
 # ---------------------------------------------- To an error ---------------------------------------------
 
 
-def test_stated_errors_hold():
-    """Of 30 renders over ten scenes, the interval of 95 % must hold the true error in 26, which it misses by
-    chance once in sixty times if it holds in 95 % of cases; and the error asked for is about reached."""
-    held, ratios = 0, []
-    for name in SCENES:
-        scene = _load(name)
-        truth = np.array(mi.render(scene, spp=2**11, seed=5))
-        for seed in range(3):
-            target = _rmse(np.array(mi.render(scene, spp=32, seed=50)), truth) * (0.6 + 0.2 * (seed % 2))
-            result = mrt.render(scene, target=target, seed=seed)
-            true = _rmse(result.image, truth)
-            held += result.error.low <= true <= result.error.high
-            ratios.append(true / target)
-    assert held >= 26
-    assert 0.7 < math.exp(np.mean(np.log(ratios))) < 1.1  # a first round may already be better than asked for
+def test_stated_errors_hold_and_means_are_unbiased():
+    found = findings(adaptive.run, quick=True)
+    assert found.passed, found.missed
 
 
 def test_rays_go_where_the_noise_is():
@@ -210,18 +200,6 @@ def test_rays_go_where_the_noise_is():
     assert np.sqrt(np.mean(error**2)) == pytest.approx(result.error.rmse, rel=0.2)
     variance = [result.layers[f"variance.{c}"] for c in "RGB"]
     np.testing.assert_allclose(np.mean(variance, axis=0), error**2, rtol=1e-3, atol=1e-12)
-
-
-def test_adaptive_means_are_unbiased():
-    """The mean of many pictures over that of the truth, and pixel by pixel, by their own spread."""
-    scene, runs = _load("gloss"), 24
-    truth = np.array(mi.render(scene, spp=2**14, seed=5), np.float64)
-    pictures = np.array([mrt.render(scene, aamode="noise", spp=32, seed=k).image for k in range(runs)])
-    whole = pictures.mean(axis=(1, 2, 3), dtype=np.float64)
-    # a quarter of the standard error of a picture's mean, plus three of what the renders leave
-    assert abs(whole.mean() - truth.mean()) < (0.25 + 3 / math.sqrt(runs)) * whole.std(ddof=1)
-    off, spread = pictures.mean(axis=0) - truth, pictures.var(axis=0, ddof=1) / runs
-    assert np.mean(off**2) < 1.25 * np.mean(spread)  # 1 without bias; the truth adds some percent
 
 
 def test_kernels_are_compiled_once(tmp_path):

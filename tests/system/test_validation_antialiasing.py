@@ -10,7 +10,7 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba import filters
 from mrt_mitsuba.validation.studies import antialiasing
-from mrt_mitsuba.validation.tools.study import Picture, Study, Table
+from mrt_mitsuba.validation.tools.study import Picture, findings
 
 TINY = antialiasing.Extent((0,), ("report",), (2, 4), 8, (80, 60), 1, (60, 45), 8, (4, 16))
 
@@ -20,22 +20,11 @@ def tiny(monkeypatch, variant):
     monkeypatch.setattr(antialiasing, "QUICK", TINY)
 
 
-def _run() -> Study:
-    study = Study("antialiasing", antialiasing.TITLE)
-    antialiasing.run(study, quick=True)
-    return study
-
-
-def _missed(study: Study) -> set[str]:
-    return {bound.name for bound in study.bounds if not bound.holds}
-
-
 def test_bounds_hold_and_everything_is_shown():
-    study = _run()
-    assert not _missed(study)
-    tables = {part.name: part for part in study.parts if isinstance(part, Table)}
-    assert tables.keys() == {"modes", "box-filter", "path", "noise"}
-    assert len(tables["modes"].rows) == 4 * 2
+    study = findings(antialiasing.run, quick=True)
+    assert study.passed, study.missed
+    assert study.tables.keys() == {"modes", "box-filter", "path", "noise"}
+    assert len(study.tables["modes"].rows) == 4 * 2
     picture = next(part for part in study.parts if isinstance(part, Picture))
     assert picture.image.shape == (60, 3 * 80 + 2 * 4, 3)
     assert set(np.unique(picture.image)) == {0.0, 0.5, 1.0}
@@ -56,7 +45,7 @@ def test_a_ray_too_many_is_noticed(monkeypatch):
         return dataclasses.replace(result, rays=more)
 
     _spoil(monkeypatch, change)
-    assert any("camera rays" in name for name in _missed(_run()))
+    assert any("camera rays" in name for name in findings(antialiasing.run, quick=True).missed)
 
 
 def test_a_refinement_that_changes_nothing_is_noticed(monkeypatch):
@@ -69,10 +58,13 @@ def test_a_refinement_that_changes_nothing_is_noticed(monkeypatch):
         return dataclasses.replace(result, image=one) if result.image.shape == one.shape else result
 
     _spoil(monkeypatch, change)
-    assert any("error of sobel" in name for name in _missed(_run()))
+    assert any("error of sobel" in name for name in findings(antialiasing.run, quick=True).missed)
 
 
 def test_a_detector_that_ignores_the_variance_is_noticed(monkeypatch):
     sobel = filters.sobel_edges
     monkeypatch.setattr(filters, "sobel_edges", lambda image, variance=None: sobel(image))
-    assert "noise: share of flat pixels refined, 4 rays a pixel or more" in _missed(_run())
+    assert (
+        "noise: share of flat pixels refined, 4 rays a pixel or more"
+        in findings(antialiasing.run, quick=True).missed
+    )

@@ -14,7 +14,7 @@ from mrt_mitsuba.validation.studies import cost, savings
 from mrt_mitsuba.validation.tools import kernels
 from mrt_mitsuba.validation.tools.costs import record, scene_cost
 from mrt_mitsuba.validation.tools.knobs import load
-from mrt_mitsuba.validation.tools.study import Study, Table
+from mrt_mitsuba.validation.tools.study import findings
 from mrt_mitsuba.validation.tools.warm import measure, ratio
 
 TINY = cost.Extent((40, 30), 2, (0,), 1, (32, 24))
@@ -53,11 +53,10 @@ def test_small_study_holds(monkeypatch, variant):
     monkeypatch.setattr(cost, "QUICK", TINY)
     few = savings.forced()[:2]
     monkeypatch.setattr(savings, "forced", lambda: few)
-    study = Study("cost", cost.TITLE)
-    cost.run(study, quick=True)
-    assert study.passed, [str(bound) for bound in study.bounds if not bound.holds]
+    study = findings(cost.run, quick=True)
+    assert study.passed, study.missed
     assert not study.goals  # so small a picture says nothing of speed
-    tables = {part.name: part for part in study.parts if isinstance(part, Table)}
+    tables = study.tables
     assert tables.keys() == {"passes", "kernels", "floor", "plan"}
     assert sum(row[-1] for row in tables["kernels"].rows) == pytest.approx(1)
     launches = [sum(row[i] for row in tables[name].rows) for name, i in (("passes", 5), ("kernels", 4))]
@@ -95,6 +94,4 @@ def test_something_visible_forced_in_is_noticed(monkeypatch, variant):
     plain = report_scene(0)
     bright = dataclasses.replace(plain, lights=(*plain.lights, plain.lights[0]))
     monkeypatch.setattr(savings, "forced", lambda: [savings.Forced("a light", plain, bright)])
-    study = Study("cost", cost.TITLE)
-    savings.table(study, size=(32, 24), aa=1, repeats=1)
-    assert not study.passed
+    assert not findings(savings.table, size=(32, 24), aa=1, repeats=1).passed

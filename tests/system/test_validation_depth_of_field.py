@@ -11,7 +11,7 @@ import pytest
 from mrt_mitsuba import filters
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.studies import depth_of_field as dof
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.study import findings
 
 TINY = dof.Extent((96, 72), 2, 16)
 
@@ -41,9 +41,8 @@ def test_fit_finds_a_lens_that_is_there(monkeypatch):
 def test_bounds_hold_and_a_worse_filter_is_noticed(monkeypatch, variant):
     monkeypatch.setattr(dof, "QUICK", TINY)
     monkeypatch.setattr(dof, "SCENES", (3,))
-    study = Study("depth-of-field", dof.TITLE)
-    dof.run(study, quick=True)
-    assert study.passed, [str(bound) for bound in study.bounds]
+    study = findings(dof.run, quick=True)
+    assert study.passed, study.missed
     right = filters.gaussian_dof
 
     def moved(image, depth, *, mode, **focus):
@@ -52,6 +51,4 @@ def test_bounds_hold_and_a_worse_filter_is_noticed(monkeypatch, variant):
         return np.roll(blurred, 1, axis=1) if mode == "corrected" else blurred
 
     monkeypatch.setattr(filters, "gaussian_dof", moved)
-    study = Study("depth-of-field", dof.TITLE)
-    dof.run(study, quick=True)
-    assert any("corrected / report" in bound.name for bound in study.bounds if not bound.holds)
+    assert any("corrected / report" in name for name in findings(dof.run, quick=True).missed)

@@ -11,7 +11,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.studies import error_vs_time
 from mrt_mitsuba.validation.tools import knobs
 from mrt_mitsuba.validation.tools.precision import Point
-from mrt_mitsuba.validation.tools.study import Plot, Study, Table
+from mrt_mitsuba.validation.tools.study import Study, findings
 
 SETTINGS = knobs.Extent((40, 30), (1, 4), 24, (1, 16), 256)
 
@@ -37,18 +37,15 @@ def test_advice_is_the_fastest_that_is_good_enough():
 def _run(monkeypatch, quick: bool = True, **scenes: tuple[int, ...]) -> Study:
     monkeypatch.setattr(error_vs_time, "QUICK", error_vs_time.Extent(SETTINGS, scenes, 1))
     monkeypatch.setattr(error_vs_time, "FULL", error_vs_time.Extent(SETTINGS, scenes, 2))
-    study = Study("error-vs-time", error_vs_time.TITLE)
-    error_vs_time.run(study, quick=quick)
-    return study
+    return findings(error_vs_time.run, quick=quick)
 
 
 @pytest.mark.parametrize("quick", [True, False])
 def test_small_study_holds(quick, monkeypatch, variant):
     study = _run(monkeypatch, quick, sampling=(0,), path=(0,))
-    assert study.passed, [str(bound) for bound in study.bounds if not bound.holds]
-    plots = {part.name for part in study.parts if isinstance(part, Plot)}
+    assert study.passed, study.missed
+    plots, tables = study.plots.keys(), study.tables
     assert {f"scene 0, {name}-diagram" for name in ("sampling", "path")} <= plots
-    tables = {part.name: part for part in study.parts if isinstance(part, Table)}
     assert ("choose" in tables) != quick  # one repeat says nothing of time
     assert quick or (tables["choose"].first and tables["choose"].rows[0][0] == 0)
     assert any("strip" in name for name in plots) != quick
@@ -73,5 +70,4 @@ def test_faults_are_noticed(trade, wrong, bound, monkeypatch, variant):
         return dataclasses.replace(made, cases=cases, reference=reference)
 
     monkeypatch.setitem(knobs.TRADES, trade, broken)
-    missed = [b.name for b in _run(monkeypatch, **{trade: (0,)}).bounds if not b.holds]
-    assert any(bound in name for name in missed)
+    assert any(bound in name for name in _run(monkeypatch, **{trade: (0,)}).missed)

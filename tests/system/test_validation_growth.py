@@ -9,7 +9,7 @@ import pytest
 
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.studies import growth
-from mrt_mitsuba.validation.tools.study import Plot, Study, Table
+from mrt_mitsuba.validation.tools.study import Study, findings
 
 
 def test_exponents_are_recovered_with_an_interval():
@@ -53,19 +53,16 @@ def test_series_grow_in_what_they_are_named_after(what):
     assert sizes[what] == pytest.approx(49, abs=1)  # two triangles fill a square
 
 
-def _run(monkeypatch, repeats: int = 1, **sizes) -> tuple[Study, set[str], dict[str, Table]]:
+def _run(monkeypatch, repeats: int = 1, **sizes) -> Study:
     monkeypatch.setattr(growth, "QUICK", growth.Extent(sizes, repeats))
-    study = Study("growth", growth.TITLE)
-    growth.run(study, quick=True)
-    plots = {part.name for part in study.parts if isinstance(part, Plot)}
-    return study, plots, {part.name: part for part in study.parts if isinstance(part, Table)}
+    return findings(growth.run, quick=True)
 
 
 def test_small_study_holds_and_draws(monkeypatch, variant):
-    study, plots, tables = _run(monkeypatch, 2, lights=(1, 9, 12))
-    assert study.passed, [str(bound) for bound in study.bounds if not bound.holds]
-    assert plots == {"growth"} and tables.keys() == {"exponents", "growth"}
-    rows = tables["growth"].rows
+    study = _run(monkeypatch, 2, lights=(1, 9, 12))
+    assert study.passed, study.missed
+    assert study.plots.keys() == {"growth"} and study.tables.keys() == {"exponents", "growth"}
+    rows = study.tables["growth"].rows
     assert [row[1] for row in rows] == [1, 9, 12]
     assert rows[1][-1] == pytest.approx(rows[2][-1], rel=0.01) and rows[1][-1] > 0  # a loop over lights
 
@@ -78,6 +75,6 @@ def test_code_that_grows_is_noticed(monkeypatch, variant):
         return dataclasses.replace(scene, planes=scene.planes * count), (32, 24), {"aa": 1}
 
     monkeypatch.setitem(growth.SERIES, "planes", planes)
-    study, plots, tables = _run(monkeypatch, planes=(1, 2, 6))
+    study = _run(monkeypatch, planes=(1, 2, 6))
     assert [bound.holds for bound in study.bounds if "operations" in bound.name] == [False]
-    assert not plots and tables.keys() == {"growth"}
+    assert not study.plots and study.tables.keys() == {"growth"}

@@ -6,19 +6,13 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba.validation.studies import objects
-from mrt_mitsuba.validation.tools.study import Study, Table
-
-
-def run() -> Study:
-    study = Study("objects", objects.TITLE)
-    objects.run(study, quick=True)
-    return study
+from mrt_mitsuba.validation.tools.study import findings
 
 
 def test_every_bound_holds(variant) -> None:
-    study = run()
-    assert study.passed, [str(bound) for bound in study.bounds if not bound.holds]
-    (table,) = (part for part in study.parts if isinstance(part, Table))
+    study = findings(objects.run, quick=True)
+    assert study.passed, study.missed
+    (table,) = study.tables.values()
     errors = [row[2] for row in table.rows]
     assert [row[0] for row in table.rows] == list(objects.SEGMENTS) and errors == sorted(errors, reverse=True)
 
@@ -31,7 +25,7 @@ def test_every_bound_holds(variant) -> None:
 def test_a_wrong_mesh_is_rejected(wrong, bound, variant, monkeypatch: pytest.MonkeyPatch) -> None:
     right = objects.search
     monkeypatch.setattr(objects, "search", lambda cone, ray: right({**cone, **wrong}, ray))
-    assert any(bound in b.name for b in run().bounds if not b.holds)
+    assert any(bound in name for name in findings(objects.run, quick=True).missed)
 
 
 def test_cones_are_compared_with_spheres_of_their_size(variant) -> None:
@@ -42,7 +36,6 @@ def test_cones_are_compared_with_spheres_of_their_size(variant) -> None:
         np.testing.assert_allclose(ends.mean(axis=0), sphere.center)
         assert np.linalg.norm(ends[0] - ends[1]) == pytest.approx(2 * sphere.radius)
         assert (cone.radius, cone.material) == (sphere.radius, sphere.material)
-    study = Study("objects", objects.TITLE)
-    objects.compare_with_spheres(study, width=40, height=30, samples=(1,))
-    (table,) = (part for part in study.parts if isinstance(part, Table))
+    found = findings(objects.compare_with_spheres, width=40, height=30, samples=(1,))
+    (table,) = found.tables.values()
     assert len(table.rows) == 1 and table.rows[0][3] > 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mrt_mitsuba.validation.studies import rivals, roughconductor
-from mrt_mitsuba.validation.tools.study import Study, Table
+from mrt_mitsuba.validation.tools.study import findings
 
 TINY = rivals.Extent((48, 36), 16, (0,), 2)
 
@@ -11,11 +11,10 @@ TINY = rivals.Extent((48, 36), 16, (0,), 2)
 def test_both_sides_show_the_same_light_and_goals_do_not_decide(monkeypatch, variant):
     monkeypatch.setattr(rivals, "FULL", TINY)
     monkeypatch.setattr(rivals, "DIRECT_GOAL", 0.0)  # out of reach
-    study = Study("rivals", rivals.TITLE)
-    rivals.run(study, quick=False)
-    assert study.passed, [str(bound) for bound in study.bounds if not bound.holds]
+    study = findings(rivals.run, quick=False)
+    assert study.passed, study.missed
     assert {goal.verdict for goal in study.goals if "direct" in goal.name} == {"slower"}
-    (table,) = (part for part in study.parts if isinstance(part, Table))
+    (table,) = study.tables.values()
     assert len(table.rows) == rivals.PAIRS == 4
     assert all(row[3] > 0 and row[5] > 0 for row in table.rows)
 

@@ -19,7 +19,7 @@ from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.plugins import lobes
 from mrt_mitsuba.validation import cli
 from mrt_mitsuba.validation.studies import bsdf_laws, metals, roughconductor
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.study import findings
 
 for needed in cli.EXTRAS:
     pytest.importorskip(needed)
@@ -85,17 +85,6 @@ def clamp(patch: pytest.MonkeyPatch) -> None:
 MISTAKES = (radiance, roughness, fresnel, flipped, clamp)
 
 
-def findings(*parts: Callable[..., None]) -> Study:
-    study = Study("test", "test")
-    for part in parts:
-        part(study, quick=True)
-    return study
-
-
-def missed(study: Study) -> set[str]:
-    return {bound.name for bound in study.bounds if not bound.holds}
-
-
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_command_fails_where_the_bsdf_is_broken(mistake: Break, monkeypatch, tmp_path: Path, capsys) -> None:
     mistake(monkeypatch)
@@ -115,9 +104,9 @@ def test_command_passes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("mistake", [radiance, roughness, flipped])
 def test_values_are_not_roughconductors_where_the_bsdf_is_broken(mistake: Break, monkeypatch) -> None:
     monkeypatch.setattr(roughconductor.runtime, "usable_variants", lambda: ["llvm_ad_rgb"])
-    assert not missed(findings(roughconductor.pointwise))
+    assert not findings(roughconductor.pointwise, quick=True).missed
     mistake(monkeypatch)
-    assert any(name.startswith("value") for name in missed(findings(roughconductor.pointwise)))
+    assert any(name.startswith("value") for name in findings(roughconductor.pointwise, quick=True).missed)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +124,7 @@ def test_values_are_not_roughconductors_where_the_bsdf_is_broken(mistake: Break,
 )
 def test_the_law_that_is_broken_is_named(mistake: Break, part, names: set[str], monkeypatch) -> None:
     mistake(monkeypatch)
-    assert missed(findings(part)) == names
+    assert findings(part, quick=True).missed == names
 
 
 # ------------------------------ compare_roughconductor ------------------------------
@@ -214,7 +203,7 @@ def test_wrong_fresnel_of_metals_is_seen(monkeypatch) -> None:
     monkeypatch.setattr(metals, "f0_of_conductor", lambda eta, k: ((eta - 1) / (eta + 1)) ** 2)
     monkeypatch.setattr(metals, "preset_names", lambda: ["Au"])
     monkeypatch.setattr(metals, "show_ball", lambda *arguments: None)
-    assert missed(findings(metals.run)) == {
+    assert findings(metals.run, quick=True).missed == {
         "F₀ of 1 metals against the exact value, relative",
         "Schlick against exact under even light, worst metal",
     }

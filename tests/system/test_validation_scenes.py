@@ -19,7 +19,7 @@ from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles import filters
 from mrt_mitsuba.validation.oracles.reference import reference_render
 from mrt_mitsuba.validation.studies import scenes
-from mrt_mitsuba.validation.tools.study import Plot, Study, Table
+from mrt_mitsuba.validation.tools.study import Study, findings
 
 pytestmark = pytest.mark.skipif(
     runtime.obstacle(runtime.FAST) is not None, reason="scalar variants take minutes"
@@ -34,12 +34,11 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 def test_the_study_holds_and_tells_all_it_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("MRT_REFERENCE", str(tmp_path))  # nothing there
-    study = Study("scenes", scenes.TITLE)
-    scenes.run(study, quick=True)
-    assert study.passed, [str(b) for b in study.bounds if not b.holds]
-    rows = [row[0] for part in study.parts if isinstance(part, Table) for row in part.rows]
+    study = findings(scenes.run, quick=True)
+    assert study.passed, study.missed
+    rows = [row[0] for table in study.tables.values() for row in table.rows]
     assert rows == list(scenes.CASES)
-    assert any(isinstance(part, Plot) for part in study.parts)
+    assert study.plots
     assert any(isinstance(part, str) and "MRT_REFERENCE" in part for part in study.parts)
 
 
@@ -85,9 +84,7 @@ def verdict(number: int, scene: Scene | None = None, **integrator: Any) -> Study
     """Judge a scene, changed or drawn otherwise, by the truth of the unchanged one."""
     right = report_scene(number)
     image = scenes.draw(scene or right, SIZE, **integrator)
-    study = Study("scenes", scenes.TITLE)
-    scenes.hold(study, str(number), scenes.judge(image, right), 0.0)
-    return study
+    return findings(scenes.hold, name=str(number), judgement=scenes.judge(image, right), cut=0.0)
 
 
 @pytest.mark.parametrize("name", MISTAKES)

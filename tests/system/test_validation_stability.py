@@ -17,31 +17,21 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.plugins import fresnel, lobes, microfacet, scene_data
 from mrt_mitsuba.validation.studies import stability
 from mrt_mitsuba.validation.studies.stability import bsdf, cases, filters, finite, formulas, geometry
-from mrt_mitsuba.validation.tools.study import Plot, Study, Table
+from mrt_mitsuba.validation.tools.study import Study, findings
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-
-def run(part: ModuleType) -> Study:
-    study = Study("stability", stability.TITLE)
-    part.run(study, quick=True)
-    return study
-
-
-def missed(part: ModuleType) -> set[str]:
-    return {bound.name for bound in run(part).bounds if not bound.holds}
 
 
 @pytest.fixture(scope="module")
 def whole() -> Iterator[Study]:
     runtime.use(runtime.FAST)
-    yield run(stability)
+    yield findings(stability.run, quick=True)
 
 
 def test_every_case_holds_and_is_a_row_with_a_mark(whole: Study) -> None:
-    assert [bound.name for bound in whole.bounds if not bound.holds] == []
+    assert whole.missed == set()
     assert len(whole.bounds) > 150
-    tables = [p for p in whole.parts if isinstance(p, Table) and tuple(p.columns) == cases.COLUMNS]
+    tables = [table for table in whole.tables.values() if tuple(table.columns) == cases.COLUMNS]
     titles = ["Reflectance", "Geometry", "Light transport", "Filters", "Finite and not negative"]
     assert [t.title for t in tables] == titles
     rows = [row for table in tables for row in table.rows]
@@ -52,17 +42,15 @@ def test_every_case_holds_and_is_a_row_with_a_mark(whole: Study) -> None:
 
 
 def test_there_are_heat_maps_of_three_formulas(whole: Study) -> None:
-    plots = {p.name: p.figure for p in whole.parts if isinstance(p, Plot)}
-    assert set(plots) == {"bsdf-cosine", "bsdf-steepness", "fresnel"}
-    for figure in plots.values():
+    assert set(whole.plots) == {"bsdf-cosine", "bsdf-steepness", "fresnel"}
+    for figure in whole.plots.values():
         titles = [panel.get_title() for panel in figure.axes[:3]]
         assert titles == ["report", "roughconductor", "mrt_bsdf"]
 
 
 def test_worst_cases_can_be_read_back(whole: Study) -> None:
     """The hexadecimal inputs of the worst D give the error of the table."""
-    table = next(p for p in whole.parts if isinstance(p, Table) and p.name == "bsdf-worst")
-    title, error, steepness, inputs = table.rows[0]
+    title, error, steepness, inputs = whole.tables["bsdf-worst"].rows[0]
     numbers = [float.fromhex(word) for word in re.findall(r"-?0x[0-9a-f.]+p[+-]\d+", inputs)]
     assert title == "D" and len(numbers) == 8
     wi, wo, (alpha, ior) = np.array(numbers[:3]), np.array(numbers[3:6]), numbers[6:]
@@ -134,4 +122,4 @@ def test_a_loss_of_care_misses_its_bounds(
 ) -> None:
     for place, name, value in changes:
         monkeypatch.setattr(place, name, value)
-    assert expected <= missed(part)
+    assert expected <= findings(part.run, quick=True).missed

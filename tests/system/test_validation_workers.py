@@ -9,12 +9,11 @@ import pytest
 
 from mrt_mitsuba.output.files import write_exr
 from mrt_mitsuba.validation.studies import workers
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.study import findings
 
 
 def test_quick_study_holds(variant):
-    study = Study("workers", workers.TITLE)
-    workers.run(study, quick=True)
+    study = findings(workers.run, quick=True)
     assert study.passed and not study.goals
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -84,21 +83,6 @@ def test_hits_lie_on_their_sphere(others: dict[str, Any]) -> None:
     assert np.abs(found.n[met] - outwards).max() < (few / radius if not others else 1e-3)
 
 
-@pytest.mark.parametrize("above", [True, False])
-def test_two_sided_materials_are_lit_on_either_side(above: bool) -> None:
-    """Seen and lit from above or from below, a two-sided floor is the same; below, others are black."""
-    z = 1 if above else -1
-    light = {"light": {"type": "mrt_light", "position": [1, 0, 2 * z]}}
-    ray = (0.1, 0.2, 5 * z), (0, 0, -z)
-    diffuse = {"type": "diffuse", "reflectance": 0.6}
-    both = radiance({**light, "floor": {**FLOOR, "bsdf": {"type": "twosided", "bsdf": diffuse}}}, *ray)
-    one = radiance({**light, "floor": {**FLOOR, "bsdf": diffuse}}, *ray)
-    to_light = np.array([0.9, -0.2, 2])
-    expected = 0.6 / np.pi * 2 / np.linalg.norm(to_light)
-    np.testing.assert_allclose(both, expected, rtol=1e-5)
-    np.testing.assert_allclose(one, expected if above else 0, rtol=1e-5)
-
-
 def test_mirrors_follow_the_interpolated_normal() -> None:
     """A flat triangle whose normals lean by 30°, seen from above, shows what is at 60° from the zenith."""
     mesh = mi.Mesh("leaning", 3, 1, has_vertex_normals=True)
@@ -140,17 +124,3 @@ def test_a_bounce_costs_what_the_index_leaves_of_ten(ior: float, bounces: int) -
     ray = mi.Ray3f(mi.Point3f(0, 0, 0.5), mi.Vector3f(0, 0, -1))
     tracer.prepare(scene)
     assert np.array(tracer.trace(scene, None, ray).bounces).item() == bounces
-
-
-def test_lobes_are_chosen_by_their_mean_reflectance() -> None:
-    """Whatever their colours: 2/3 of cyan gloss against 1/6 of red paint is four in five."""
-    colors = {"specular_reflectance": [0, 1, 1], "diffuse_reflectance": [0.5, 0, 0]}
-    rgb = {name: {"type": "rgb", "value": value} for name, value in colors.items()}
-    bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": "unity", **rgb})
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, 100_000)
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    si.wi = mi.Vector3f(0, 0, 1)
-    drawn, _ = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
-    # four standard deviations of a share of 100,000
-    assert np.mean(np.array(drawn.sampled_component) == 1) == pytest.approx(0.8, abs=0.005)

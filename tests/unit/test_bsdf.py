@@ -227,13 +227,15 @@ def test_context_selects_lobes(diffuse, specular) -> None:
     assert (evaluate(b, *lobe_pairs(10, 0.4), context(5))[0] == 0).all()
 
 
-def test_lobes_are_chosen_by_their_reflectance() -> None:
-    """Half the light in each: half the samples in each, and weights that hardly vary."""
-    wi = at_angle(0)
-    drawn = draw(bsdf(alpha=0.1, fresnel="unity", diffuse_reflectance=1.0), wi, 100_000)
-    share = (drawn.component == 1).mean()
-    assert share == pytest.approx(0.5, abs=5 * 0.5 / np.sqrt(100_000))
-    assert drawn.weight.max() < 2.01
+@pytest.mark.parametrize(
+    ("diffuse", "specular", "share"), [((1, 1, 1), (1, 1, 1), 0.5), ((0.5, 0, 0), (0, 1, 1), 0.8)]
+)
+def test_lobes_are_chosen_by_their_mean_reflectance(diffuse: tuple, specular: tuple, share: float) -> None:
+    """Two thirds of the light in cyan gloss and a sixth in red paint: four in five. Weights hardly vary."""
+    colors = {"diffuse_reflectance": rgb(diffuse), "specular_reflectance": rgb(specular)}
+    drawn = draw(bsdf(alpha=0.1, fresnel="unity", **colors), at_angle(0), 100_000)
+    assert (drawn.component == 1).mean() == pytest.approx(share, abs=5 * 0.5 / np.sqrt(100_000))
+    assert drawn.weight.max() < 1.005 * max(max(diffuse) / (1 - share), max(specular) / share)
 
 
 def test_colours_and_numbers_from_textures() -> None:

@@ -17,7 +17,8 @@ from mrt_mitsuba.validation.checks.shape import LAWS
 pytestmark = pytest.mark.usefixtures("variant")
 
 OPEN = {"watertight"}
-CONE = {"apex": [0, 1, 0], "base_center": [0, 0, 0], "radius": 0.5}
+MIRRORED = {"to_world": [1, -1, 1]}
+CONE = {"apex": [0, 1, 0], "base_center": [0, 0, 0], "radius": 0.5, **MIRRORED}
 
 # Parameters, laws that are known to fail, and those that make no sense; docs/check_your_plugin.md says why
 SHAPES: dict[str, tuple[dict[str, Any], set[str], set[str]]] = {
@@ -28,12 +29,16 @@ SHAPES: dict[str, tuple[dict[str, Any], set[str], set[str]]] = {
     "cylinder": ({}, {"far"}, OPEN),
     "mrt_plane": ({"normal": [0, 1, 0]}, set(), OPEN | {"scale"}),
     "mrt_cone": (CONE, {"far"}, set()),
+    "mrt_cylinder": ({"p0": [0, 1, 0], "p1": [0, 0, 0], "radius": 0.5, **MIRRORED}, {"far"}, set()),
+    "mrt_capsule": ({"p0": [0, 1, 0], "p1": [0, 0, 0], "radius": 0.5, **MIRRORED}, {"far"}, set()),
 }
 
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_stock_shapes_and_ours(name: str) -> None:
     parameters, known, senseless = SHAPES[name]
+    if "to_world" in parameters:
+        parameters = parameters | {"to_world": mi.ScalarTransform4f().scale(parameters["to_world"])}
     check = mrt.check_shape({"type": name, **parameters}, quick=True)
     assert set(check.failed) == known, str(check)
     assert {law.name for law in check.laws.values() if law.skipped} == senseless, str(check)

@@ -118,22 +118,6 @@ def test_bounding_box(name: str) -> None:
     np.testing.assert_allclose(np.array(mesh.bbox().max), high, atol=1e-4 * RADIUS)
 
 
-@pytest.mark.parametrize("scale", [[1, 1, 1], [1, -1, 1], [2, 0.5, -3]])
-@pytest.mark.parametrize("name", SHAPES)
-def test_closed_and_facing_outwards(name: str, scale: list[float]) -> None:
-    """The volume by the divergence theorem: a hole or a face turned inside out would change it."""
-    mesh = shape(name, to_world=mi.ScalarTransform4f().scale(scale).translate([1, 2, 3]))
-    buffers, triangles = mi.traverse(mesh), triangles_of(mesh)
-    volume = np.einsum("ij,ij->i", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])).sum() / 6
-    height = {"cone": HEIGHT / 3, "cylinder": HEIGHT, "capsule": HEIGHT + 4 / 3 * RADIUS}[name]
-    solid = np.pi * RADIUS**2 * height * abs(np.prod(scale))
-    assert volume == pytest.approx(solid, rel=2e-4)  # a polygon of 256 sides in place of the circle: 1e-4
-    normals = buffers["vertex_normals"].numpy().reshape(-1, 3)
-    corner = normals[buffers["faces"].numpy().reshape(-1, 3)].mean(axis=1)
-    faces = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    assert (np.einsum("ij,ij->i", faces, corner) > 0).all()
-
-
 def test_open_cone_has_no_base() -> None:
     up = mi.Ray3f([0.5, -5, 0.5], [0, 1, 0])
     for capped, t in ((True, 5.4), (False, 5 + 1.5 - 1.1 * 0.2 / RADIUS)):
@@ -193,22 +177,6 @@ def test_update_of_parameters_equals_construction() -> None:
         assert np.allclose(list(mesh.frame().z), list(wanted.frame().z))
 
 
-def test_as_an_emitter() -> None:
-    """Under an area light the flux out of the shape is π · radiance · area, and each part gets its share."""
-    cone = shape("cone", emitter={"type": "area", "radiance": 2.0})
-    assert cone.is_emitter()
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, 200_000)
-    sample = cone.sample_position(0, sampler.next_2d())
-    assert dr.allclose(sample.pdf * cone.surface_area(), 1, rtol=1e-5)
-    axis = mi.Normal3f([0.3 / HEIGHT, -1.1 / HEIGHT, 0.4 / HEIGHT])
-    on_base = dr.mean(dr.select(dr.dot(sample.n, axis) > 0.99, 1.0, 0.0))[0]
-    share = np.pi * RADIUS**2 / AREA["cone"]
-    assert on_base == pytest.approx(
-        share, abs=4 * np.sqrt(share * (1 - share) / 200_000) + 1e-4
-    )  # 4 sigma, mesh
-
-
 def test_scenes_keep_the_shapes_apart() -> None:
     """Mitsuba merges meshes that share a material; a merged cone would have lost its frame."""
     scene = mi.load_dict({
@@ -244,13 +212,3 @@ def test_wrong_parameters_are_named(change: dict, words: list[str]) -> None:
 def test_missing_points_are_named(missing: str) -> None:
     with pytest.raises(RuntimeError, match=f'"{missing}" is missing'):
         mi.load_dict({key: value for key, value in SHAPES["cone"].items() if key != missing})
-
-
-def test_scalar_variant_has_the_same_mesh() -> None:
-    buffers = {}
-    for variant in ("llvm_ad_rgb", "scalar_rgb"):
-        runtime.use(variant)
-        buffers[variant] = {k: np.array(v) for k, v in mi.traverse(shape("cone")).items() if "vertex" in k}
-    for key, values in buffers["llvm_ad_rgb"].items():
-        # One rounding: the scalar variant keeps parameters in double precision until the mesh is made
-        np.testing.assert_allclose(values, buffers["scalar_rgb"][key], atol=2.4e-7)

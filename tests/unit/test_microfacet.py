@@ -9,7 +9,7 @@ from pathlib import Path
 import drjit.scalar
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from mpmath import mp
 from scipy.integrate import quad
@@ -33,10 +33,6 @@ COSINES = st.floats(1e-4, 1)
 
 # The negative ones of scene 2
 NEGATIVE_ALPHAS = (-0.0432, -0.0432 + 0.1 / 3)
-
-# The report's rational fit (and Mitsuba's, which is the same) exceeds 1 just below b = 1.6, where it hands
-# over to 1: its largest value, at b = 1.589, is 1.0000613, and at the hand-over 1.0000569
-FIT_EXCESS = 6.2e-5
 
 
 def direction(cos_theta: float, phi: float = 0.3) -> Vector:
@@ -152,25 +148,17 @@ def test_visible_microfacets_fill_the_projected_surface(alpha: float, cos_theta:
     assert smith_g1(v, alpha) * total == pytest.approx(cos_theta, rel=3.6e-3)
 
 
-@given(cos_theta=COSINES, alpha=ALPHAS)
-def test_g1_is_a_fraction(cos_theta: float, alpha: float) -> None:
+@given(cos_theta=COSINES, alpha=st.one_of(ALPHAS, st.sampled_from(NEGATIVE_ALPHAS)))
+def test_g1_is_that_of_fifty_digits(cos_theta: float, alpha: float) -> None:
+    """With the sign of alpha, which D does not have; of a vector of any length."""
     v = direction(cos_theta)
-    g1 = smith_g1(v, alpha)
-    assert 0 <= g1 <= 1 + FIT_EXCESS
-    assert smith_g1_over_cos(v, alpha) == pytest.approx(g1 / cos_theta, rel=1e-14)
-    assert smith_g1(v * 7, alpha) == pytest.approx(g1, rel=1e-14)  # of any length
-    # rougher surfaces and flatter directions are in shadow more
-    assert smith_g1(v, 1.1 * alpha) <= g1 + FIT_EXCESS
-    assert smith_g1(direction(0.9 * cos_theta), alpha) <= g1 + FIT_EXCESS
-
-
-@given(alpha=ALPHAS)
-def test_g1_hands_over_to_one_without_a_visible_step(alpha: float) -> None:
-    """The step is at b = 1 / (alpha tan θ) = 1.6, none but the 5.7e-5 that the formula itself has there."""
-    r = np.array([1 - 1e-12, 1 + 1e-12]) / (1.6 * alpha)
-    fitted, one = (smith_g1(Vector(x, 0, 1), alpha) for x in r[::-1])
-    assert one == 1
-    assert fitted == pytest.approx(1.0000569, abs=1e-7)
+    assume(abs(v[2] / np.hypot(v[0], v[1]) / alpha - 1.6) > 1e-12 if cos_theta < 1 else alpha > 0)
+    truth = float(exact.smith_g1(v, alpha))
+    assert smith_g1(v, alpha) == pytest.approx(truth, rel=1e-12)
+    assert smith_g1(v * 7, alpha) == pytest.approx(truth, rel=1e-12)
+    assert smith_g1_over_cos(v, alpha) == pytest.approx(truth / cos_theta, rel=1e-12)
+    assert beckmann_d(0.001, alpha) == beckmann_d(0.001, -alpha)
+    assert smith_g1(Vector(0, 0, 1), alpha) == 1  # straight up there is no sign: b is infinite
 
 
 @given(cos_theta=st.floats(0, 1e-6), alpha=ALPHAS)
@@ -179,16 +167,6 @@ def test_g1_over_cos_is_finite_at_grazing(cos_theta: float, alpha: float) -> Non
     v = direction(cos_theta)
     assert smith_g1_over_cos(v, alpha) == pytest.approx(3.535 / alpha, rel=3e-3)
     assert smith_g1(v, alpha) <= 3.54e-6 / alpha
-
-
-@pytest.mark.parametrize("alpha", NEGATIVE_ALPHAS)
-def test_negative_roughness_keeps_its_sign_in_g_only(alpha: float) -> None:
-    for cos_theta in (0.99, 0.6, 0.05):
-        v = direction(cos_theta)
-        assert beckmann_d(0.001, alpha) == beckmann_d(0.001, -alpha)
-        assert smith_g1(v, alpha) == pytest.approx(float(exact.smith_g1(v, alpha)), rel=1e-13)
-        assert smith_g1(v, alpha) != pytest.approx(smith_g1(v, -alpha), rel=1e-6)
-    assert smith_g1(Vector(0, 0, 1), alpha) == 1  # straight up there is no sign: b is infinite
 
 
 @given(alpha=st.floats(-1, 1).filter(lambda a: abs(a) > 1e-6), u1=st.floats(0, 0.999), u2=st.floats(0, 1))

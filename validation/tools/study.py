@@ -7,7 +7,7 @@ it is given; ``report`` turns the result into a table on the terminal, ``summary
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -116,7 +116,21 @@ class Study:
 
     @property
     def passed(self) -> bool:
-        return bool(self.bounds) and all(bound.holds for bound in self.bounds)
+        return bool(self.bounds) and not self.missed
+
+    @property
+    def missed(self) -> set[str]:
+        """Return the names of the bounds that do not hold."""
+        return {bound.name for bound in self.bounds if not bound.holds}
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        return {part.name: part for part in self.parts if isinstance(part, Table)}
+
+    @property
+    def plots(self) -> dict[str, Any]:
+        """Return the figures."""
+        return {part.name: part.figure for part in self.parts if isinstance(part, Plot)}
 
     def at_most(self, name: str, measured: float, limit: float, note: str) -> Bound:
         """Hold a figure to an upper bound; ``note``: why it is this one."""
@@ -183,15 +197,21 @@ class Study:
             "goals": [goal.as_dict() | {"verdict": goal.verdict} for goal in self.goals],
             "figures": {name: _plain(value) for name, value in self.figures.items()},
             "tables": {
-                part.name: {
-                    "title": part.title,
-                    "columns": list(part.columns),
-                    "rows": [[_plain(value) for value in row] for row in part.rows],
+                name: {
+                    "title": table.title,
+                    "columns": list(table.columns),
+                    "rows": [[_plain(value) for value in row] for row in table.rows],
                 }
-                for part in self.parts
-                if isinstance(part, Table)
+                for name, table in self.tables.items()
             },
         }
+
+
+def findings(part: Callable[..., None], **options: Any) -> Study:
+    """Return what a part of a study, or the ``run`` of a whole one, finds."""
+    study = Study("", "")
+    part(study, **options)
+    return study
 
 
 def _plain(value: Any) -> Any:

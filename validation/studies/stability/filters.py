@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -58,8 +59,21 @@ class _Case:
     name: str
     what: str
     expected: str
+    limit: float
     measure: Callable[[], float]
-    limit: float = 0.0
+
+
+CASES: list[_Case] = []
+
+
+def _case(name: str, what: str, expected: str = "none", limit: float = 0.0, *arguments: Any) -> Any:
+    """Make a function one of the cases, or one more with other arguments; ``what`` says what it returns."""
+
+    def add(measure: Callable[..., float]) -> Callable[..., float]:
+        CASES.append(_Case(name, what, expected, limit, partial(measure, *arguments)))
+        return measure
+
+    return add
 
 
 def _constant(shape: Sequence[int], value: float) -> np.ndarray:
@@ -88,8 +102,14 @@ def _depths(shape: Sequence[int], seed: int = 2) -> np.ndarray:
 # ------------------------------------------------ Figures --------------------------------------------------
 
 
+@_case(
+    "constant pictures, blur",
+    "1×1 … 40×30, values 1e-25, 0.3, 1e30: relative change",
+    "a mean of equals",
+    MEAN,
+    (1e-25, 0.3, 1e30),
+)
 def _constant_blur(values: Sequence[float]) -> float:
-    """Return the largest relative change of a constant picture by the blur, over sizes, values and modes."""
     changes = [
         np.abs(_blurred(_constant(shape, value), _depths(shape), mode) / value - 1).max()
         for shape in SHAPES
@@ -99,8 +119,8 @@ def _constant_blur(values: Sequence[float]) -> float:
     return float(np.max(changes))
 
 
+@_case("constant pictures, edges", "1×1 … 40×30, values 0.5, 100, 1e6: edge pixels, all detectors")
 def _constant_edges() -> float:
-    """Return the edge pixels in bright constant pictures of all sizes, seen at one distance."""
     return float(
         sum(
             np.asarray(find(_constant(shape, value), np.full(shape, 3, np.float32)).mask).sum()
@@ -111,8 +131,13 @@ def _constant_edges() -> float:
     )
 
 
+@_case(
+    "range of a blur",
+    "values to 1e20, negative ones too: how far means leave their range",
+    "not at all",
+    MEAN,
+)
 def _outside_range() -> float:
-    """Return the largest amount by which blurred values leave the range of their sources, relative to it."""
     excess = 0.0
     for shape in SHAPES:
         for mode in MODES:
@@ -124,22 +149,36 @@ def _outside_range() -> float:
     return excess
 
 
+@_case("infinity in a picture, blur", "the same", "none: damage stays local", 0.0, np.inf)
+@_case(
+    "NaN in a picture, blur",
+    "other pixels that are not finite afterwards",
+    "none: damage stays local",
+    0.0,
+    np.nan,
+)
 def _spread_of_damage(value: float) -> float:
-    """Return the other pixels that a damaged one makes not finite, in both modes of the blur."""
     image, depth = _noise((40, 30)), _depths((40, 30))
     image[20, 15, 1] = value
     return float(sum((~np.isfinite(_blurred(image, depth, mode)).all(axis=-1)).sum() - 1 for mode in MODES))
 
 
+@_case("NaN in a picture, kept", "1 if the pixel itself is hidden", "it stays to be seen")
 def _damage_kept() -> float:
-    """Return 1 if a damaged pixel is not returned as it is."""
     image, depth = _noise((40, 30)), _depths((40, 30))
     image[20, 15, 1] = np.nan
     return float(any(not np.isnan(_blurred(image, depth, mode)[20, 15, 1]) for mode in MODES))
 
 
+@_case("infinity in a picture, edges", "the same", "none", 0.0, np.inf)
+@_case(
+    "NaN in a picture, edges",
+    "pixels not marked in its 3×3, or marked elsewhere",
+    "none: reported, and local",
+    0.0,
+    np.nan,
+)
 def _damage_reported(value: float) -> float:
-    """Return the pixels around a damaged one that are not infinite edges, and such edges elsewhere."""
     wrong = 0
     for name, find in EDGES.items():
         image, depth = _constant((12, 10), 0.5), np.full((12, 10), 3, np.float32)
@@ -155,8 +194,13 @@ def _damage_reported(value: float) -> float:
     return float(wrong)
 
 
+@_case(
+    "Sobel beyond 0 … 1",
+    "error of the value at steps above 1 and below 0",
+    "one grey level on either side",
+    8.0,
+)
 def _sobel_range() -> float:
-    """Return the largest error of Sobel's value at a step between two greys, both above 1, or one below 0."""
     errors = []
     for low, high in ((2.0, 3.0), (10.0, 4000.0), (-1.0, 0.5), (-2.0, -1.0), (-0.001, 0.001)):
         image = _constant((5, 6), low)
@@ -169,8 +213,8 @@ def _sobel_range() -> float:
     return float(max(errors))
 
 
+@_case("focal distance 0", "calls that do not return the very picture, for none, 0 and -1")
 def _no_focus() -> float:
-    """Return the calls without a focal distance that do not give back the very picture."""
     image, depth = _noise((8, 9)), _depths((8, 9))
     return float(
         sum(
@@ -181,8 +225,15 @@ def _no_focus() -> float:
     )
 
 
+@_case("the corrected blur", "the same", "sums of 81 products, and quotients of them", 1e-6, "corrected")
+@_case(
+    "the report's blur",
+    "30×24, all amounts: largest difference from float64 loops",
+    "sums of 32 products",
+    1e-6,
+    "report",
+)
 def _loops(mode: str) -> float:
-    """Largest difference of a blur from float64 loops, with all amounts before and behind the focus."""
     image, depth = _noise((30, 24)), _depths((30, 24))
     amount = loops.blur_amount(depth, BLUR["focal_distance"], BLUR["focal_range"])
     if mode == "report":
@@ -193,8 +244,8 @@ def _loops(mode: str) -> float:
     return float(np.abs(_blurred(image, depth, mode) - truth).max())
 
 
+@_case("edges", "30×24 in patches: pixels that float64 loops decide otherwise, or see another value in")
 def _edge_loops() -> float:
-    """Pixels of luma and sobel that float64 loops decide otherwise, but for those on the threshold."""
     image = np.repeat(np.repeat(_noise((10, 8)), 3, axis=0), 3, axis=1)
     wrong = 0
     for name in ("luma", "sobel"):
@@ -205,8 +256,8 @@ def _edge_loops() -> float:
     return float(wrong)
 
 
+@_case("blur in the middle", "change at the border")
 def _border() -> float:
-    """Return the difference at the border, where nothing is blurred, between a picture and a part of it."""
     image, depth = _noise((40, 30)), np.full((40, 30), 2.0, np.float32)
     depth[18:22, 13:17] = 30.0
     worst = 0.0
@@ -221,8 +272,8 @@ def _border() -> float:
     return worst
 
 
+@_case("huge ranges, blur", "values that are not finite, pictures 1e-38 … 1e34, depths 1e-30 … 1e30")
 def _huge_range() -> float:
-    """Return the values that are not finite in blurred pictures of 1e-38 to 1e34, with any focal range."""
     image = (10 ** np.random.default_rng(5).uniform(-38, 34, (20, 20, 3))).astype(np.float32)
     depth = (10 ** np.random.default_rng(6).uniform(-30, 30, (20, 20))).astype(np.float32)
     return float(
@@ -235,16 +286,16 @@ def _huge_range() -> float:
     )
 
 
+@_case("huge ranges, edges", "NaN among the values, pictures to ±1e34")
 def _edges_finite() -> float:
-    """Return the NaN among the values of detectors on pictures between -1e34 and 1e34."""
     rng = np.random.default_rng(7)
     image = (10 ** rng.uniform(-38, 34, (20, 20, 3)) * rng.choice([-1, 1], (20, 20, 3))).astype(np.float32)
     depth = (10 ** rng.uniform(-37, 37, (20, 20))).astype(np.float32)
     return float(sum(np.isnan(np.asarray(find(image, depth).value)).sum() for find in EDGES.values()))
 
 
+@_case("senseless arguments", "calls that are not refused with a UsageError")
 def _refused() -> float:
-    """Return the senseless arguments that are not refused with a ``UsageError``."""
     image, depth = _noise((4, 4)), _depths((4, 4))
     calls: Sequence[Callable[[], Any]] = (
         lambda: filters.gaussian_dof(image, depth, focal_distance=np.nan),
@@ -266,87 +317,3 @@ def _raises_usage_error(call: Callable[[], Any]) -> bool:
     except UsageError:
         return True
     return False
-
-
-# One line for each case
-CASES = (
-    _Case(
-        "the report's blur",
-        "30×24, all amounts: largest difference from float64 loops",
-        "sums of 32 products",
-        lambda: _loops("report"),
-        1e-6,
-    ),
-    _Case(
-        "the corrected blur",
-        "the same",
-        "sums of 81 products, and quotients of them",
-        lambda: _loops("corrected"),
-        1e-6,
-    ),
-    _Case(
-        "edges",
-        "30×24 in patches: pixels that float64 loops decide otherwise, or see another value in",
-        "none",
-        _edge_loops,
-    ),
-    _Case(
-        "constant pictures, blur",
-        "1×1 … 40×30, values 1e-25, 0.3, 1e30: relative change",
-        "a mean of equals",
-        lambda: _constant_blur((1e-25, 0.3, 1e30)),
-        MEAN,
-    ),
-    _Case(
-        "constant pictures, edges",
-        "1×1 … 40×30, values 0.5, 100, 1e6: edge pixels, all detectors",
-        "none",
-        _constant_edges,
-    ),
-    _Case(
-        "range of a blur",
-        "values to 1e20, negative ones too: how far means leave their range",
-        "not at all",
-        _outside_range,
-        MEAN,
-    ),
-    _Case(
-        "NaN in a picture, blur",
-        "other pixels that are not finite afterwards",
-        "none: damage stays local",
-        lambda: _spread_of_damage(np.nan),
-    ),
-    _Case(
-        "infinity in a picture, blur",
-        "other pixels that are not finite afterwards",
-        "none: damage stays local",
-        lambda: _spread_of_damage(np.inf),
-    ),
-    _Case("NaN in a picture, kept", "1 if the pixel itself is hidden", "it stays to be seen", _damage_kept),
-    _Case(
-        "NaN in a picture, edges",
-        "pixels not marked in its 3×3, or marked elsewhere",
-        "none: reported, and local",
-        lambda: _damage_reported(np.nan),
-    ),
-    _Case("infinity in a picture, edges", "the same", "none", lambda: _damage_reported(np.inf)),
-    _Case(
-        "Sobel beyond 0 … 1",
-        "error of the value at steps above 1 and below 0",
-        "one grey level on either side",
-        _sobel_range,
-        8.0,
-    ),
-    _Case(
-        "focal distance 0", "calls that do not return the very picture, for none, 0 and -1", "none", _no_focus
-    ),
-    _Case("blur in the middle", "change at the border", "none", _border),
-    _Case(
-        "huge ranges, blur",
-        "values that are not finite, pictures 1e-38 … 1e34, depths 1e-30 … 1e30",
-        "none",
-        _huge_range,
-    ),
-    _Case("huge ranges, edges", "NaN among the values, pictures to ±1e34", "none", _edges_finite),
-    _Case("senseless arguments", "calls that are not refused with a UsageError", "none", _refused),
-)
