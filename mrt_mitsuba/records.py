@@ -42,8 +42,9 @@ def _init(kind: Any) -> Any:
         for name, make in made.items():
             values[name] = make()
         values.update(zip(places, args, strict=False))
+        twice = given and args and not given.keys().isdisjoint(places[: len(args)])
         values.update(given)
-        if values.keys() != names or len(args) > len(places) or given.keys() & set(places[: len(args)]):
+        if twice or len(args) > len(places) or values.keys() != names:
             raise TypeError(f"{kind.__name__}({', '.join(places)}) does not take {args}, {given}")
         if after is not None:
             after(self)

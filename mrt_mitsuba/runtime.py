@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import warnings
+from functools import cache
 
 from mrt_mitsuba import llvm
 from mrt_mitsuba.cores import usable_cores
@@ -19,6 +21,7 @@ SLOW = "scalar_rgb"
 one_at_a_time = threading.RLock()
 
 _warned: set[str] = set()
+_used: str | None = None  # the variant that was made current last
 
 
 def use(variant: str | None = None) -> str:
@@ -30,13 +33,22 @@ def use(variant: str | None = None) -> str:
     Raises ``UnknownVariantError`` for a name that this Mitsuba does not know, and ``VariantError`` for one
     that cannot run here.
     """
-    llvm.prepare()
-    check_addresses()
-    with one_at_a_time, held(), rewriting_later():
-        return _use(variant)
+    mitsuba = sys.modules.get("mitsuba")
+    if mitsuba is not None and variant in (None, _used) and mitsuba.variant() == _used is not None:
+        return _used
+    return _use(variant)
 
 
 def _use(variant: str | None) -> str:
+    global _used
+    llvm.prepare()
+    check_addresses()
+    with one_at_a_time, held(), rewriting_later():
+        _used = _set(variant)
+    return _used
+
+
+def _set(variant: str | None) -> str:
     import mitsuba as mi
 
     if variant is None:
@@ -61,7 +73,7 @@ def register() -> None:
 
     They follow every later switch of the variant. Where no variant is set yet, the default one is.
     """
-    use()
+    _use(None)
 
 
 def default_variant() -> str:
@@ -103,6 +115,7 @@ def usable_variants() -> list[str]:
     return [variant for variant in mi.variants() if obstacle(variant) is None]
 
 
+@cache
 def versions() -> dict[str, str]:
     """Return the versions of what decides about pixels."""
     import drjit as dr

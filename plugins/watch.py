@@ -20,6 +20,8 @@ class Notes:
 
     def __init__(self, things: Sequence[Any]) -> None:
         self._watches = [Watch(thing) for thing in things]
+        self._entries = [entry for watch in self._watches for entry in watch.entries]
+        self._state = _look(self._entries)[0]
         self._values: dict[int, dict[Callable, Any]] = {id(thing): {} for thing in things}
 
     def read(self, function: Callable[[Any], Value], thing: Any) -> Value:
@@ -31,6 +33,10 @@ class Notes:
 
     def refresh(self) -> bool:
         """Forget what was read of objects that have changed; return whether there is any."""
+        state = _look(self._entries)[0]  # of all at once, as mostly nothing has changed
+        if state == self._state:
+            return False
+        self._state = state
         changed = [watch for watch in self._watches if watch.changed()]
         for watch in changed:
             self._values[id(watch.thing)].clear()
@@ -47,26 +53,27 @@ class Watch:
         self.thing = thing
         collector = _collector(mi.variant())(thing, [])
         thing.traverse(collector)
-        self._entries = collector.entries
-        self._state, values = self._look()
+        self.entries = collector.entries
+        self._state, values = _look(self.entries)
         self._held = [type(v)(v) for v in values]  # get_property shows the parameter itself
-
-    def _look(self) -> tuple[list[Any], list[Any]]:
-        """Return what tells the parameters apart, and the parameters."""
-        values = [v if kind is None else mi.get_property(v, kind, node) for v, kind, node in self._entries]
-        if not is_jit():
-            return [np.array(v).tobytes() for v in values], []
-        numbers = [v for v in values if isinstance(v, (bool, int, float))]
-        # Derivatives are suspended while Mitsuba renders for the first time
-        return [dr.grad_enabled(values), *numbers, *dr.detail.collect_indices(values)], values
 
     def changed(self) -> bool:
         """Return whether a parameter has changed since the last call."""
-        state, values = self._look()
+        state, values = _look(self.entries)
         if state == self._state:
             return False
         self._state, self._held = state, [type(v)(v) for v in values]
         return True
+
+
+def _look(entries: Sequence[tuple[Any, Any, Any]]) -> tuple[list[Any], list[Any]]:
+    """Return what tells parameters apart, and the parameters."""
+    values = [v if kind is None else mi.get_property(v, kind, node) for v, kind, node in entries]
+    if not is_jit():
+        return [np.array(v).tobytes() for v in values], []
+    numbers = [v for v in values if isinstance(v, (bool, int, float))]
+    # Derivatives are suspended while Mitsuba renders for the first time
+    return [dr.grad_enabled(values), *numbers, *dr.detail.collect_indices(values)], values
 
 
 @cache

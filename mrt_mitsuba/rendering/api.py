@@ -184,15 +184,13 @@ def render_with(
         with sized(source):
             result = _render(source, settings, budget, kernels, start)
     log.info("%d kernels: compiled in %.3f s, ran for %.3f s", kernels.launches, kernels.compile, kernels.run)
-    total = time.perf_counter() - start
-    timings = replace(result.timings, total=total, compile=kernels.compile, kernels=kernels.run)
-    return replace(result, timings=timings, kernel_launches=kernels.launches)
+    return result
 
 
 def _render(
     source: Source, settings: RenderSettings, budget: Budget, kernels: Kernels, start: float
 ) -> Result:
-    """Render an open scene; what its kernels took in all is not in the result."""
+    """Render an open scene."""
     shader = shader_for(source.scene, source.integrator)
     facts = _facts(source, shader, settings)
     settings = decided(settings, facts)
@@ -208,7 +206,28 @@ def _render(
     total: dict[str, np.ndarray] = {}
     for passes in _each_picture(job, tracer, plan, exposures, settings):
         _add(total, passes.run())
-    options = settings.in_force(
+    image, layers = _mean(total, plan)
+    kernels.collect()
+    seconds = time.perf_counter() - start
+    return Result(
+        image,
+        layers,
+        plan,
+        Timings(seconds, load, kernels.compile, kernels.run, job.passes),
+        tracer.rays,
+        kernels.launches,
+        _in_force(settings, plan, source),
+        runtime.versions(),
+        view.matrices(),
+        frozenset(budget.pictures),
+        passes.error,
+        tuple(passes.rounds),
+    )
+
+
+def _in_force(settings: RenderSettings, plan: Plan, source: Source) -> dict[str, Any]:
+    """Return the options that shaped the picture, with what was decided about them."""
+    return settings.in_force(
         width=plan.width,
         height=plan.height,
         fresnel=source.fresnel,
@@ -217,21 +236,6 @@ def _render(
         variant=plan.variant,
         integrator=plan.integrator,
         layers=tuple(name for name in settings.layers if name in plan.layers),
-    )
-    image, layers = _mean(total, plan)
-    return Result(
-        image,
-        layers,
-        plan,
-        Timings(0.0, load, 0.0, 0.0, job.passes),
-        tracer.rays,
-        0,
-        options,
-        runtime.versions(),
-        view.matrices(),
-        frozenset(budget.pictures),
-        passes.error,
-        tuple(passes.rounds),
     )
 
 

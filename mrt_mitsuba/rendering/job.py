@@ -13,6 +13,8 @@ from mrt_mitsuba.rendering.progress import Advance, Progress
 
 log = logging.getLogger(__name__)
 
+SECONDS = 0.1  # between two looks at what kernels took
+
 
 @dataclass
 class Kernels:
@@ -22,12 +24,13 @@ class Kernels:
     launches: int = 0
     compile: float = 0.0
     run: float = 0.0
+    collected: float = 0.0  #: when that was done last
 
     def collect(self) -> None:
         """Add up what Dr.Jit recorded since the last call. Records hold the kernels' text: many take room."""
         import drjit as dr
 
-        records = dr.kernel_history()
+        self.collected, records = time.perf_counter(), dr.kernel_history()
         self.progress.kernels(records)
         own = [record for record in records if record["type"] == dr.KernelType.JIT]
         self.launches += len(own)
@@ -37,14 +40,13 @@ class Kernels:
 
 @contextmanager
 def counting_kernels(progress: Progress) -> Iterator[Kernels]:
-    """Let Dr.Jit record its kernels meanwhile, and add them up."""
+    """Let Dr.Jit record its kernels meanwhile, to be collected."""
     import drjit as dr
 
     kernels = Kernels(progress)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         yield kernels
-        kernels.collect()
 
 
 @dataclass
@@ -65,7 +67,8 @@ class Job:
 
             def advance_and_collect(steps: int) -> None:
                 advance(steps)
-                self.kernels.collect()
+                if time.perf_counter() - self.kernels.collected > SECONDS:
+                    self.kernels.collect()
 
             yield advance_and_collect
             self.kernels.collect()

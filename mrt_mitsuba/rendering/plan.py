@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import groupby
 
 from mrt_mitsuba.errors import UsageError
@@ -152,7 +153,7 @@ class Plan(RenderFacts):
         """Names of the passes."""
         return frozenset(step.name for step in self.passes)
 
-    @property
+    @cached_property
     def seen(self) -> Region:
         """The region with the pixels around it that filters look at."""
         reach = (edges.REACH if self.detector else 0) + (dof.REACH if self.blur else 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 from mrt_mitsuba.errors import UsageError
@@ -135,9 +136,11 @@ class RenderSettings:
     region: tuple[int, int, int, int] | None = option(None, rectangle())
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            if "kind" in field.metadata:
-                object.__setattr__(self, field.name, checked(field, getattr(self, field.name)))
+        kind: Any = type(self)
+        values = vars(self)
+        for field in _fields(kind):
+            if values[field.name] is not field.default:
+                values[field.name] = checked(field, values[field.name])
         self.model()  # checks what shows nothing
 
     @classmethod
@@ -173,6 +176,12 @@ class RenderSettings:
         names = (*(name for name in TABLE if name != "memory"), "params", "region")
         values = {name: getattr(self, name) for name in names} | decided
         return {name: value for name, value in values.items() if value is not None}
+
+
+@cache
+def _fields(kind: Any) -> list[dataclasses.Field[Any]]:
+    """Return the fields that are options."""
+    return [field for field in dataclasses.fields(kind) if "kind" in field.metadata]
 
 
 #: The options of a render by name, without those that only Python can give

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -79,12 +79,32 @@ class View:
         """
         import mitsuba as mi
 
-        film, parameters = self.sensor.film(), mi.traverse(self.sensor)
+        film, found = self.sensor.film(), _collector(mi.variant())(self.sensor)
         # copies share the numbers, and stay as they are when the sensor's change
-        numbers = {name: type(v)(v) for name in _PINHOLE if name in parameters for v in (parameters[name],)}
+        numbers = {name: type(value)(value) for name, value in found.values.items()}
         sizes = tuple(np.array(getattr(film, name)(), float) for name in ("size", "crop_size", "crop_offset"))
         world = self.sensor.world_transform().matrix
         return Matrices(type(world)(world), numbers, sizes)
+
+
+@cache
+def _collector(variant: str) -> type:
+    """Return the class of what collects a sensor's numbers, for a variant; ``mi.traverse`` takes ten times as
+    long."""
+    import mitsuba as mi
+
+    class Collector(mi.TraversalCallback):
+        def __init__(self, sensor: Any) -> None:
+            super().__init__()
+            self.sensor, self.values = sensor, dict[str, Any]()
+            sensor.traverse(self)
+
+        def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
+            if name in _PINHOLE:
+                value = value if cpptype is None else mi.get_property(value, cpptype, self.sensor)
+                self.values[name] = value
+
+    return Collector
 
 
 _PINHOLE = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, SupportsIndex
+from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.memory import Budget
@@ -98,7 +98,7 @@ def reopen_scene(
     budget: Budget,
 ) -> Source:
     """Open a scene as ``open_scene`` does, for callers who leave it as it is; numbered ones may be kept."""
-    numbered = isinstance(scene, SupportsIndex) and not params and not model.keys() - {"convention"}
+    numbered = hasattr(scene, "__index__") and not params and not model.keys() - {"convention"}
     if not numbered or report_scene(operator.index(scene)).pictures:
         how: dict[str, Any] = {"size": size, "fresnel": fresnel, "integrator": integrator, "sensor": sensor}
         return open_scene(scene, **how, params=params, model=model, budget=budget)
@@ -147,7 +147,7 @@ def _model(scene: Any, options: Mapping[str, Any]) -> tuple[str, Scene | None]:
     """Return the name and the model of a scene in the report's terms; no model of any other."""
     if isinstance(scene, Scene):
         return scene.title or "a scene", scene
-    if isinstance(scene, SupportsIndex):
+    if hasattr(scene, "__index__"):
         number = operator.index(scene)
         return str(number), report_scene(number)
     if is_obj(scene):
