@@ -17,6 +17,9 @@ import numpy as np
 # Up to this many lights the kernel holds the code of each; beyond, it loops over them
 UNROLLED_LIGHTS = 8
 
+# With fewer objects, looking up what is in the way of a light takes as long as searching for it
+LEAST_BUFFERED = 64
+
 BUDGETS = ("report", "plain")
 
 
@@ -42,6 +45,9 @@ class Reason(str, Enum):
     ISOTROPIC = "isotropic"  # no material asks how the surface is turned
     NATIVE_SHAPES = "native-shapes"  # shapes other than plain spheres
     INSTANCES = "instances"
+    OTHER_LIGHTS = "other-lights"  # a light other than mrt_light, or not known by its numbers
+    MANY_LIGHTS = "many-lights"
+    FEW_OBJECTS = "few-objects"
     OTHER_BSDF = "other-bsdf"  # a BSDF other than mrt_bsdf
     MIXED_FRESNEL = "mixed-fresnel"
     VARYING = "varying"  # a parameter varies over the surface, or has no place in the table
@@ -139,6 +145,7 @@ class KernelPlan:
     quadrics: tuple[str, ...]  #: kinds of exact quadrics; others are traced as meshes
     planes: bool  #: analytic planes, else they are traced as meshes
     lights: str  #: "none", "unrolled", "loop" that calls each, or "table": a loop over their numbers
+    buffers: bool  #: lists of what may be in the way of a light, in place of a search
     touching: bool  #: shadow rays that end short of lights on surfaces
     random: bool  #: random numbers
     emission: bool  #: surfaces that emit
@@ -210,6 +217,7 @@ def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
         coherent=unless("coherent", (facts.meshes == 0, Reason.NO_MESHES)),
         quadrics=_quadrics(facts, unless),
         planes=unless("planes", (facts.planes == 0, Reason.NO_PLANES)),
+        buffers=_buffers(facts, spheres, lights, unless),
         touching=unless("touching", (not facts.touching, Reason.APART)),
         random=unless("random", (facts.random_lights == 0, Reason.DELTA_LIGHTS)),
         emission=unless("emission", (facts.surface_emitters == 0, Reason.NO_SURFACE_EMITTERS)),
@@ -242,6 +250,19 @@ def _lights(facts: SceneFacts, unless: Unless) -> str:
     lit = unless("lights", (facts.lights == 0, Reason.NO_LIGHTS), (black, Reason.BLACK))
     unrolled = facts.lights <= UNROLLED_LIGHTS or not facts.vectorised
     return ("unrolled" if unrolled else "table" if facts.tabled else "loop") if lit else "none"
+
+
+def _buffers(facts: SceneFacts, spheres: str, lights: str, unless: Unless) -> bool:
+    objects = facts.native_shapes + sum(count for _, count in facts.quadrics)
+    return unless(
+        "buffers",
+        (lights == "none", Reason.NO_LIGHTS),
+        (not facts.vectorised, Reason.SCALAR_VARIANT),
+        (not facts.tabled, Reason.OTHER_LIGHTS),
+        (lights != "unrolled", Reason.MANY_LIGHTS),
+        (facts.native_shapes > 0 and spheres != "table", Reason.NATIVE_SHAPES),
+        (objects < LEAST_BUFFERED, Reason.FEW_OBJECTS),
+    )
 
 
 def _mirrors(facts: SceneFacts, settings: Settings, affordable: Sequence[Mirror], unless: Unless) -> bool:

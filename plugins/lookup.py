@@ -12,18 +12,18 @@ import numpy as np
 from .variants import is_jit, pointer
 
 
-def aligned(values: np.ndarray) -> mi.Float:
-    """Return numbers as a flat float32 array at a multiple of 64 bytes.
+def aligned(values: np.ndarray, kind: Any = np.float32) -> Any:
+    """Return numbers as a flat array, of float32 or uint32, at a multiple of 64 bytes.
 
     Dr.Jit uses arrays of numpy where they lie, and most lie elsewhere. Only from aligned ones does a kernel
     read several numbers in a row in one go, which makes one that searches a tree half as fast again; and both
     kernels would be compiled and kept.
     """
     size = np.size(values)
-    room = np.empty(size + 16, np.float32)
+    room = np.empty(size + 16, kind)
     first = -room.ctypes.data % 64 // 4
     room[first : first + size] = np.ravel(values)
-    return mi.Float(room[first : first + size])
+    return (mi.Float if kind is np.float32 else mi.UInt32)(room[first : first + size])
 
 
 class Table:

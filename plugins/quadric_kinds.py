@@ -143,3 +143,24 @@ class QuadricTable:
         low = np.minimum(self.origins - start, self.origins + axis - end)
         high = np.maximum(self.origins + start, self.origins + axis + end)
         return np.stack([low, high], axis=1)
+
+    def balls(self) -> np.ndarray:
+        """Return balls [n, 4] (centre, radius) around the objects."""
+        columns = np.linalg.inv(self.rows)
+        ends = [columns * np.array(semi_axes) for semi_axes in KINDS[self.kind].ends]
+        first, last = (np.linalg.norm(end, ord=2, axis=(1, 2)) for end in ends)
+        axis = columns[:, :, 2] * self.extents[:, None]
+        squared = (axis**2).sum(axis=1)
+        longer = np.divide(last**2 - first**2, 2 * squared, out=np.zeros_like(squared), where=squared > 0)
+        middle = axis * np.clip(0.5 + longer, 0, 1)[:, None]
+        radius = np.sqrt(
+            np.maximum(
+                *(
+                    (way**2).sum(axis=1)
+                    + 2 * np.linalg.norm(np.einsum("nij,ni->nj", end, way), axis=1)
+                    + r**2
+                    for end, way, r in zip(ends, (-middle, axis - middle), (first, last), strict=True)
+                )
+            )
+        )
+        return np.concatenate([self.origins + middle, radius[:, None]], axis=1)

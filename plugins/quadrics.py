@@ -29,6 +29,8 @@ class Quadrics:
         self.flipped = any(t.flipped for t in tables)
         boxes = np.concatenate([t.boxes() for t in tables])
         tree = self.tree = Tree(boxes)
+        self.balls = np.zeros((tree.leaves, 4))
+        self.balls[tree.leaf_of] = np.concatenate([t.balls() for t in tables])
         table = np.zeros((tree.leaves, 4, 4), np.float32)
         table[tree.leaf_of] = _numbers(tables, self.kinds, boxes)
         self.table = aligned(table)
@@ -49,6 +51,10 @@ class Quadrics:
     def occluded(self, ray: Any, active: Any) -> Any:
         """Return whether there is a quadric before ``ray.maxt``."""
         return active & (self._walk(ray, active, any_hit=True)[0] < ray.maxt)
+
+    def block(self, leaf: Any, ray: Any) -> Any:
+        """Return whether a quadric is before ``ray.maxt``."""
+        return self._meet(leaf, ray).t < ray.maxt
 
     def _walk(self, ray: Any, active: Any, *, any_hit: bool) -> tuple[Any, Any, Any]:
         def visit(leaf: Any, state: tuple) -> tuple:

@@ -16,6 +16,7 @@ import numpy as np
 from .emission import MOST_EMITTERS, arriving, brightness, place
 from .hit_errors import CURVED, HitErrors
 from .kernel_plan import CutOff, KernelPlan, Mirror, Reason, SceneFacts
+from .light_buffer import LightBuffer, light_buffer
 from .merged_bsdf import MergedBSDF, uniform_materials
 from .mesh_api import ray_flags, surface_interaction, vertex_version
 from .parameters import ParameterError
@@ -25,7 +26,7 @@ from .protocols import MirrorBSDF, PlaneShape, QuadricShape
 from .quadric_kinds import KINDS
 from .quadrics import quadrics_of
 from .replay import held
-from .spheres import Spheres, is_plain_sphere, is_sphere
+from .spheres import SphereBlockers, Spheres, is_plain_sphere, is_sphere
 from .touching import any_touching
 from .variants import but_not, is_jit, varies
 from .watch import Notes
@@ -188,6 +189,7 @@ class SceneData:
     errors: HitErrors
     spheres: Spheres | None
     lights: Lights
+    buffers: list[tuple[LightBuffer, Any]]  # what may be in the way of the lights, with what tests it
 
     def __init__(self, reading: SceneReading, plan: KernelPlan, before: SceneData | None = None) -> None:
         self.reading, self.facts = reading, reading.facts
@@ -202,9 +204,10 @@ class SceneData:
             if before and self._same_lights(before)
             else Lights(reading.lights, reading.numbers, plan.lights)
         )
+        self.buffers = before.buffers if before and self._same_places(before) else self._light_buffers()
         self.environment = reading.environment
         self.merged = MergedBSDF(reading.shapes, reading.materials) if plan.merged else None
-        parts = self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged
+        parts = self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged, self.buffers
         self._arrays = held([*parts, self.environment])
         self.ray_flags = ray_flags(
             textures=plan.textures, shading_frames=plan.shading_frames, tangents=plan.tangents
@@ -214,6 +217,24 @@ class SceneData:
         now, then = self.reading, before.reading
         same = (now.lights, now.numbers, self.plan.lights) == (then.lights, then.numbers, before.plan.lights)
         return same and now.numbers is not None
+
+    def _same_places(self, before: SceneData) -> bool:
+        same_shapes = self.spheres is before.spheres and self.quadrics is before.quadrics
+        return same_shapes and self._places() == before._places() and self.plan.buffers == before.plan.buffers
+
+    def _places(self) -> list[list[float]]:
+        return [position for position, _ in self.reading.numbers or ()]
+
+    def _light_buffers(self) -> list[tuple[LightBuffer, Any]]:
+        """Return lists of what may be in the way of the lights, with what tests it; empty for none."""
+        if not self.plan.buffers:
+            return []
+        things = [] if self.quadrics is None else [self.quadrics]
+        if self.plan.bvh:
+            things.append(SphereBlockers(self.reading.native))
+        pairs = [(light_buffer(np.array(self._places()), t.balls), t) for t in things]
+        buffers = [(buffer, thing) for buffer, thing in pairs if buffer is not None]
+        return buffers if len(buffers) == len(pairs) else []
 
     def _trace_shapes(self, plan: KernelPlan) -> None:
         reading = self.reading
@@ -307,8 +328,10 @@ class SceneData:
             self.spheres.put_back(si, found)
         return si, found, self.errors.size(si, found)
 
-    def occluded(self, scene: mi.Scene, hit: Hit, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Bool:
-        """Return whether anything blocks the segment from ``hit`` to the light sample ``ds``."""
+    def occluded(
+        self, scene: mi.Scene, hit: Hit, light: Any, ds: mi.DirectionSample3f, active: mi.Bool
+    ) -> mi.Bool:
+        """Return whether anything blocks the segment from ``hit`` to the sample ``ds`` of a light."""
         o = self._off_surface(hit, ds.d)
         to_light = (ds.p - o) * (1 - TOUCHING) if self.plan.touching else ds.p - o
         blocked = self.planes.separate(o, o + to_light if self.plan.touching else ds.p)
@@ -317,6 +340,11 @@ class SceneData:
         # Stop short of a light that has a surface of its own
         reach = 1 - mi.math.ShadowEpsilon if self.plan.emission else 1
         ray = mi.Ray3f(o, to_light, reach, hit.si.time, hit.si.wavelengths)
+        for buffer, things in self.buffers:
+            test = partial(things.block, ray=ray)
+            blocked |= buffer.any(light, to_light, but_not(active, blocked), test)
+        if self.buffers:
+            return blocked
         if self.plan.bvh:
             blocked |= (self.bvh or scene).ray_test(ray, self.plan.coherent, but_not(active, blocked))
         if self.quadrics is not None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from .lookup import ByShape
+from .lookup import ByShape, Table
+from .variants import first
 
 
 class Spheres:
@@ -51,6 +54,28 @@ class Spheres:
         return mi.Point3f(row.x, row.y, row.z), row.w
 
 
+class SphereBlockers:
+    """Mitsuba's spheres in the way of shadow rays."""
+
+    def __init__(self, shapes: Sequence[mi.Shape]) -> None:
+        frames = [_to_world(s).matrix for s in shapes]
+        numbers = np.array([[first(m[row][column]) for row in range(3) for column in (0, 3)] for m in frames])
+        # To the last bit, which boxes do not have
+        self.balls = np.column_stack([numbers[:, 1::2], np.linalg.norm(numbers[:, ::2], axis=1)])
+        self.table = Table(mi.Vector4f, self.balls.tolist())
+
+    def block(self, index: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
+        """Return whether a sphere is in the way of a ray: to the bit what Mitsuba says."""
+        row = self.table(index, mi.Bool(True))
+        o = ray.o - mi.Point3f(row.x, row.y, row.z)
+        a, b = dr.squared_norm(ray.d), 2 * dr.dot(o, ray.d)
+        c = dr.squared_norm(o) - dr.square(row.w)
+        q = -0.5 * (b + dr.copysign(dr.sqrt(dr.fma(b, b, -(4 * a * c))), b))  # NaN where it misses
+        one, other = q / a, c / q
+        near, far = dr.minimum(one, other), dr.maximum(one, other)
+        return (near <= ray.maxt) & (far >= 0) & ((near >= 0) | (far <= ray.maxt))
+
+
 def is_sphere(shape: Any) -> bool:
     """Return whether a shape is Mitsuba's ``sphere``."""
     return shape.shape_type() == +mi.ShapeType.Sphere
@@ -59,6 +84,27 @@ def is_sphere(shape: Any) -> bool:
 def is_plain_sphere(shape: Any) -> bool:
     """Return whether a shape is a sphere that faces outwards and does not emit."""
     return is_sphere(shape) and not (shape.has_flipped_normals() or shape.is_emitter())
+
+
+def _to_world(sphere: Any) -> Any:
+    """Return the transform of a sphere: a tenth of the time that ``mi.traverse`` takes."""
+    found = _finder(mi.variant())()
+    sphere.traverse(found)
+    return mi.get_property(*found.entry, sphere)
+
+
+@cache
+def _finder(variant: str) -> type:
+    """Return the class of what finds a transform, for a variant: there is none before one is chosen."""
+
+    class Finder(mi.TraversalCallback):
+        """Keeps the parameter ``to_world``."""
+
+        def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
+            if name == "to_world":
+                self.entry = value, cpptype
+
+    return Finder
 
 
 def center_and_radius(shape: Any) -> list[float]:

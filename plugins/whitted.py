@@ -41,6 +41,7 @@ class Trace:
 class LightSample:
     """One light as seen from a hit."""
 
+    number: Any  # of the light
     ds: mi.DirectionSample3f
     wo: mi.Vector3f  # local direction to it
     weight: mi.UnpolarizedSpectrum  # what arrives from there, over the density of the direction
@@ -302,7 +303,9 @@ class MrtWhitted(mi.SamplingIntegrator):
         si, radiance = hit.si, mi.UnpolarizedSpectrum(0)
         if data.plan.emission:
             radiance += mi.unpolarized_spectrum(si.emitter(scene, hit.found).eval(si, hit.found))
-        samples = [self._light_sample(data, light, sampler, hit) for light in data.lights.each]
+        samples = [
+            self._light_sample(data, k, light, sampler, hit) for k, light in enumerate(data.lights.each)
+        ]
         values, reflectance, int_ior = data.eval_bsdf(
             hit, [s.wo for s in samples], [s.facing for s in samples], data.plan.mirrors
         )
@@ -333,7 +336,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         def step(
             i: mi.UInt32, radiance: mi.UnpolarizedSpectrum, shadow_rays: mi.UInt32, sampler: mi.Sampler
         ) -> tuple:
-            sample = self._light_sample(data, data.lights.at(i, hit.found), sampler, hit)
+            sample = self._light_sample(data, i, data.lights.at(i, hit.found), sampler, hit)
             (value,), _, _ = data.eval_bsdf(hit, [sample.wo], [sample.facing], mirror=False)
             lit, traced = self._visible_part(data, scene, hit, throughput, sample, value)
             return i + 1, radiance + lit, shadow_rays + traced, sampler
@@ -342,7 +345,9 @@ class MrtWhitted(mi.SamplingIntegrator):
         state = dr.while_loop(state, lambda i, *_: hit.found & (i < data.lights.count), step, label="lights")
         return state[1], state[2]
 
-    def _light_sample(self, data: SceneData, light: mi.Emitter, sampler: mi.Sampler, hit: Hit) -> LightSample:
+    def _light_sample(
+        self, data: SceneData, number: Any, light: mi.Emitter, sampler: mi.Sampler, hit: Hit
+    ) -> LightSample:
         """Return the direction to a light and what arrives from it, if nothing is in between."""
         u = sampler.next_2d(hit.found) if data.plan.random else mi.Point2f(0.5)
         ds, weight = light.sample_direction(hit.si, u, hit.found)
@@ -350,7 +355,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         facing = hit.found & (ds.pdf > 0)
         if not data.plan.two_sided:
             facing &= mi.Frame3f.cos_theta(wo) > 0
-        return LightSample(ds, wo, mi.unpolarized_spectrum(weight), facing)
+        return LightSample(number, ds, wo, mi.unpolarized_spectrum(weight), facing)
 
     def _visible_part(
         self,
@@ -368,7 +373,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         share = dr.max(dr.abs(throughput * value))
         matters = share * data.plan.cut_off.lights > self.min_contribution
         traced = sample.facing & matters
-        visible = but_not(sample.facing, data.occluded(scene, hit, sample.ds, traced))
+        visible = but_not(sample.facing, data.occluded(scene, hit, sample.number, sample.ds, traced))
         return dr.select(visible, value, 0), dr.select(traced, mi.UInt32(1), mi.UInt32(0))
 
     def _sky(self, data: SceneData, ray: mi.Ray3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:

@@ -28,6 +28,9 @@ LIGHT = {"type": "mrt_light", "position": [2, 4, 3]}
 LAMP = {"type": "sphere", "center": [0, 3, 0], "radius": 0.2, "emitter": {"type": "area"}}
 BRUSHED = {"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.4}
 GLASS = {"type": "sphere", "radius": 0.7, "bsdf": {"type": "dielectric"}}
+CROWD = {
+    f"ball_{i}": {**SPHERE, "center": [i % 8 - 4, i // 8 - 4, -(i % 3)], "radius": 0.3} for i in range(64)
+}
 MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
 
 
@@ -72,6 +75,7 @@ CHOICES = {
     "quadrics": ({"a": CONE, "b": SPHERE, "light": LIGHT}, (), False),
     "planes": ({"a": {"type": "mrt_plane", "normal": [0, 1, 0]}, "b": SPHERE, "light": LIGHT}, False, False),
     "lights": ({"a": SPHERE, "light": LIGHT}, "loop", True),
+    "buffers": ({**CROWD, "light": LIGHT}, False, True),
     "touching": ({"a": SPHERE, "light": {"type": "mrt_light", "position": [0, 0.7, 0]}}, False, False),
     "random": ({"a": SPHERE, "lamp": LAMP}, False, False),
     "emission": ({"a": SPHERE, "lamp": LAMP}, False, False),

@@ -331,6 +331,6 @@ def test_kernel_does_not_grow_with_the_number_of_cones() -> None:
             dr.eval(mi.render(loaded, spp=1))
             return [entry["operation_count"] for entry in dr.kernel_history([dr.KernelType.JIT])]
 
-    few = operations(2)
+    few, many = operations(2), operations(100)  # many: with light buffers
     assert max(few) > 1000
-    assert operations(100) == operations(1000) == few
+    assert operations(50) == few != many == operations(1000)
