@@ -7,7 +7,7 @@ import logging
 import os
 import subprocess
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -61,11 +61,11 @@ class Engine:
             raise UsageError("the dashboard needs Bokeh: pip install bokeh, or leave dashboard out")
 
     @contextmanager
-    def connected(self, folder: str, jobs: int) -> Iterator[tuple[Client, worker.House]]:
-        """Give a client with workers that see a folder, and what they are to know.
+    def connected(self, folder: str, jobs: int) -> Iterator[tuple[Client, Callable[[], worker.House]]]:
+        """Give a client, and what waits for its workers and returns what they are to know.
 
-        Workers of this machine, as many as there are jobs at most, end with the block. Raises
-        ``ClusterError`` or ``OutputError`` if workers cannot be used.
+        Workers of this machine, as many as there are jobs at most, end with the block. Both raise
+        ``ClusterError`` or ``OutputError`` if workers cannot be used, such as those that do not see a folder.
         """
         from distributed import Client
 
@@ -78,8 +78,12 @@ class Engine:
                     client = stack.enter_context(_client(stack.enter_context(self._local(expected))))
                 else:
                     client = stack.enter_context(_client(self.cluster))
-            sharing = inspect(client, folder, expected)
-            yield client, worker.House(sharing, self.renew, self.cluster is None, versions())
+
+            def ready() -> worker.House:
+                sharing = inspect(client, folder, expected)
+                return worker.House(sharing, self.renew, self.cluster is None, versions())
+
+            yield client, ready
 
     def _local(self, count: int) -> Any:
         """Return a scheduler in this process, and workers in processes of their own with one thread for jobs.

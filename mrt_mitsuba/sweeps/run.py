@@ -74,24 +74,27 @@ def sweep(
     planned = jobs(scene, grid or {}, zipped, options)
     if tiles is not None:
         _check_tiles(tiles, png, planned)
-    check_parameters(planned)
     folder = _folder(out)
     table = Table(folder, tuple(grid or {}), {job.name: job.parameters for job in planned})
     shown = TerminalProgress(unit=" pictures") if progress is None else progress
     with TemporaryDirectory(prefix=".mrt-", dir=folder, ignore_cleanup_errors=True) as scratch:
         tasks = [_task(job, folder, scratch, png) for job in planned]
-        table.keep([task.name for task in tasks if resume and is_fresh(task)], named(versions()))
-        rest = [task for task in tasks if task.name not in table]
+        fresh = {task.name for task in tasks if resume and is_fresh(task)}
+        rest = [task for task in tasks if task.name not in fresh]
         mosaics = [Mosaic.of(task, tiles) for task in rest] if tiles else []
         steps = len(rest) + sum(len(mosaic.tiles) for mosaic in mosaics)
-        if rest:
-            with engine.connected(scratch, steps) as (client, house):
-                work = Work(client, house, retries)
-                with table.writing(), shown.stage("Sweep", steps) as advance:
-                    pending = work.submit_tiles(mosaics, resume) if tiles else work.submit(rest)
-                    work.finish(pending, table, advance)
-                if not tiles:
-                    work.write_sheet(os.path.join(folder, SHEET), tasks)
+        if not rest:
+            table.keep(fresh, named(versions()))
+            return table
+        with engine.connected(scratch, steps) as (client, ready):
+            check_parameters(planned)  # while workers start
+            work = Work(client, ready(), retries)
+            table.keep(fresh, named(versions()))
+            with table.writing(), shown.stage("Sweep", steps) as advance:
+                pending = work.submit_tiles(mosaics, resume) if tiles else work.submit(rest)
+                work.finish(pending, table, advance)
+            if not tiles:
+                work.write_sheet(os.path.join(folder, SHEET), tasks)
     return table
 
 

@@ -7,7 +7,7 @@ import io
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -70,7 +70,7 @@ class Table:
         if time.monotonic() > self._written + PAUSE:
             self.write()
 
-    def keep(self, names: Sequence[str], versions: str) -> None:
+    def keep(self, names: Collection[str], versions: str) -> None:
         """Add the rows of jobs whose pictures an earlier sweep made, as far as its table knows them."""
         known = _read(self.path)
         for name in names:

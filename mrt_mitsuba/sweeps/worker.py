@@ -9,7 +9,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mrt_mitsuba.cores import affinity, usable_cores
@@ -24,6 +24,7 @@ TOPIC = "mrt-sweep"
 ENDED = "mrt-sweep-ended"
 MADE_WITH = "mrt:sweep"  # header attribute: fingerprint of scene, settings and versions
 THUMBNAIL = 160  # pixels, the longer side
+ENOUGH = 0.2  # seconds of a batch, after which it ends
 PAUSE = 0.5  # seconds before a worker ends, in which the client fetches the facts about its last job
 
 _one_at_a_time = threading.Lock()  # Dr.Jit is not safe with several Python threads
@@ -108,17 +109,28 @@ def is_fresh(task: Task) -> bool:
     return header.get(MADE_WITH) == task.made_with
 
 
-def render_task(task: Task, house: House) -> dict[str, Any]:
-    """Render a picture and write it; return its facts for the table, or the reason why there is none.
+def render_batch(tasks: Sequence[Task], house: House) -> dict[str, Any]:
+    """Render pictures one after the other, as many as take little time; return the facts of the last.
 
     Errors that are not this project's are raised: a repetition may help, where memory or a device ran out.
     """
+    start = time.monotonic()
+    for task in tasks:
+        found = _render_task(task, house)
+        if time.monotonic() > start + ENOUGH:
+            break
+    return found
+
+
+def _render_task(task: Task, house: House) -> dict[str, Any]:
+    """Render a picture and write it; return its facts for the table, or the reason why there is none."""
     from distributed import Reschedule, get_worker
 
     global _done
     worker, note = get_worker(), os.path.join(task.scratch, f"{task.name}.json")
     with _one_at_a_time:
         if found := _read_note(note):  # done, but the worker was gone before it could report
+            worker.log_event(ENDED, (task.key, found))
             return found
         if _done >= house.renew and (worker.nanny or house.local):
             _renew(worker)

@@ -307,6 +307,37 @@ def test_a_worker_killed_in_mid_job_costs_one_retry(mortal, tmp_path: Path) -> N
     assert pictures(out) == [f"seed={n}.exr" for n in range(6)] and not left_over(out)
 
 
+@pytest.mark.parametrize("what", ["fails", "dies"])
+def test_a_batch_of_small_jobs_suffers_from_none_of_them(mortal, tmp_path: Path, what: str) -> None:
+    from distributed import Client
+
+    def spoil() -> None:
+        from mrt_mitsuba.sweeps import worker
+
+        def render(task: Any, own: Any) -> Any:
+            if task.arguments["seed"] == 42 and what == "dies":
+                time.sleep(0.1)  # in which the scheduler learns that it has begun
+                os._exit(1)
+            if task.arguments["seed"] == 42:
+                raise RuntimeError("out of luck")
+            return alone(task, own)
+
+        alone, worker._render = worker._render, render
+
+    with Client(mortal().address, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=PATIENCE)
+        client.run(spoil)
+        sweep = Background(3, tmp_path / "out", grid={"seed": range(200)}, cluster=client, **SMALL)
+        table = sweep.end()
+        tasks = {key for _, key in client.get_events("mrt-sweep")}
+    attempts = [row["attempts"] for row in table.rows]
+    assert len(tasks) == len(attempts) == 200 and attempts[:42] + attempts[43:] == [1] * 199
+    if what == "fails":
+        assert attempts[42] == 3 and [row["error"] for row in table.failed] == ["RuntimeError: out of luck"]
+    else:  # with what spoils it
+        assert 2 <= attempts[42] <= 3 and not table.failed
+
+
 def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(tmp_path: Path) -> None:
     import psutil
 
@@ -406,7 +437,8 @@ def test_a_gpu_is_pinned_to_each_worker(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,GPU-7")
     engine = Engine(None, None, 2, 1000, None, "cuda_ad_rgb")
-    with engine.connected(str(tmp_path), 9) as (client, _):
+    with engine.connected(str(tmp_path), 9) as (client, ready):
+        ready()
         found = client.run(os.getenv, "CUDA_VISIBLE_DEVICES")
     assert sorted(found.values()) == ["5", "GPU-7"]
 
