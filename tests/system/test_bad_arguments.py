@@ -100,16 +100,9 @@ def test_scene_dict_refuses(arguments: dict[str, Any], text: str) -> None:
         mrt.scene_dict(0, **arguments)
 
 
-def test_results_are_not_saved_under_other_endings(tmp_path: Path) -> None:
-    result = mrt.render(0, **SMALL)
-    for name, text in (
-        ("a.jpg", "must end in .png or .exr"),
-        ("none/a.png", "does not exist; create it first"),
-    ):
-        with pytest.raises(mrt.OutputError, match=re.escape(text)):
-            result.save(tmp_path / name)
+def test_results_are_not_saved_by_another_tone_map(tmp_path: Path) -> None:
     with pytest.raises(mrt.UsageError, match="tonemap='neon': must be report or srgb"):
-        result.save(tmp_path / "a.png", tonemap="neon")
+        mrt.render(0, **SMALL).save(tmp_path / "a.png", tonemap="neon")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -51,16 +51,6 @@ def test_reflections_come_and_go_with_the_material(variant: str) -> None:
     assert drawn(scene) == pytest.approx(0.35, rel=1e-4)
 
 
-def test_light_follows_its_parameters() -> None:
-    scene = mirror(specular_reflectance=0.0, diffuse_reflectance=0.5)
-    before = drawn(scene)
-    assert 0.05 < before < 0.2
-    update(scene, "light.intensity.value", 0.5)
-    assert drawn(scene) == pytest.approx(0.5 * before, rel=1e-5)
-    update(scene, "light.position", [0, 3, -4])
-    assert drawn(scene) == 0
-
-
 def test_a_later_scene_is_not_taken_for_an_earlier_one() -> None:
     """Python gives the id of a scene that is gone to the next; an integrator may have read the first."""
     integrator = mi.load_dict({"type": "mrt_whitted", "max_depth": 1})
