@@ -20,7 +20,9 @@ class Canvas:
 
     A lane adds up what the rays of one pixel give to one of its neighbours, for all neighbours in reach. What
     it gives to the same neighbour lies at the same distance from it, along rows that are padded by the reach.
-    All sums are formed in the same order every time, and no two lanes write to one place.
+    All sums are formed in the same order every time, and no two lanes write to one place; those along a row
+    in single precision, those of rows in double, so that pictures are the same wherever wavefronts are cut
+    between rows.
     """
 
     def __init__(self, film: Film, rays: np.ndarray, channels: int, *, moments: bool) -> None:
@@ -71,15 +73,24 @@ class Canvas:
         dr.eval(more)
         for total, found in zip(self._moments, more, strict=True):
             total[start:stop] += np.asarray(found)
-        count, step = len(self._sums), max(1, MOST_SUMS // ((2 * reach + 1) * len(self._sums)))
-        for first in range(-reach, reach + 1, step):
-            down = range(first, min(first + step, reach + 1))
+        rows = max(1, MOST_SUMS // ((2 * reach + 1) * len(self._sums)))
+        for first in range(-reach, reach + 1, rows):
+            down = range(first, min(first + rows, reach + 1))
             given = runs.given(film, place, values, down)
             dr.eval(given)
-            steps = (y * self._width + x for y in down for x in range(-reach, reach + 1))
-            for index, along in enumerate(steps):
-                for total, found in zip(self._sums, given[index * count :], strict=False):
-                    total[start + along : stop + along] += np.asarray(found)
+            for index, step in enumerate(down):
+                near = self._row(given[index * len(given) // len(down) :], stop - start)
+                low = start + step * self._width - reach
+                self._sums[:, low : low + near.shape[1]] += near
+
+    def _row(self, given: Sequence[Any], lanes: int) -> np.ndarray:
+        """Return sums of what lanes give to neighbours in one row, [channels + 1, lanes + 2 reach]."""
+        count, reach = len(self._sums), self._film.reach
+        near = np.zeros((count, lanes + 2 * reach), np.asarray(given[0]).dtype)
+        for step in range(2 * reach + 1):
+            for total, found in zip(near, given[step * count :], strict=False):
+                total[step : step + lanes] += np.asarray(found)
+        return near
 
     def _runs(self, start: int, ends: np.ndarray, shares: np.ndarray) -> _Runs:
         """Return the rays of places in padded pictures from ``start`` on, given where they end."""

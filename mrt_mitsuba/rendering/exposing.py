@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,15 @@ class Groups:
         begin = self._ends[run] - self.counts[run]
         low, high = np.maximum(begin, start), np.minimum(self._ends[run], stop)
         return Groups(self.size, self.pixels[run], high - low, self.first[run] + self.size * (low - begin))
+
+    def cuts(self, most: int, width: int) -> list[int]:
+        """Return where to cut into parts of no more than ``most`` groups: between rows where that can be."""
+        ends = self._ends[np.diff(self.pixels // width, append=-1) != 0]  # of rows
+        cuts = [0]
+        while cuts[-1] < len(self):
+            whole = ends[: np.searchsorted(ends, cuts[-1] + most, "right")]
+            cuts.append(int(whole[-1]) if len(whole) and whole[-1] > cuts[-1] else cuts[-1] + most)
+        return cuts
 
     def one_by_one(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the pixel of each group, and the number of its first ray."""
@@ -205,9 +215,9 @@ class Exposer:
         # where pixels have one group each, and its rays reach no other, sums of groups are what is wanted
         canvas = Canvas(film, rays, kept, moments=moments) if film.reach or progressive else None
         total = np.zeros((0 if canvas else kept + 3 * moments, rays.size))
-        step = max(1, self.workspace.rays_at_once(2 * kept) // groups.size)
-        for start in range(0, len(groups), step):
-            part = groups.part(start, start + step)
+        most = max(1, self.workspace.rays_at_once(2 * kept) // groups.size)
+        for start, stop in pairwise(groups.cuts(most, film.width)):
+            part = groups.part(start, stop)
             planes = self._wavefront(part, _Start(seed, start, progressive), canvas, moments)
             for row, plane in zip(total, planes, strict=False):
                 row[part.pixels] = np.broadcast_to(plane, len(part))

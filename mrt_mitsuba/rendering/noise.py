@@ -23,7 +23,7 @@ from mrt_mitsuba.rendering.exposing import Exposed, Exposer, Groups, Stack, box_
 
 HALVES = 2
 TILE = 16  # pixels, under a filter
-GROUP = 8  # rays that are traced together; two groups to a pixel begin
+GROUP = 4  # rays that are traced together; two groups to a pixel begin
 STEP = (
     1.25  # times the rays there are must be there after another round: a short one costs more than it brings
 )
@@ -106,10 +106,10 @@ class Halves(Stack):
 
     def variance(self) -> np.ndarray:
         """Return the estimated variance of each channel in the picture, [H, W, 3], without the border."""
-        moments = self._moments()
-        rays = self.rows(self.rays)[..., None]
-        each = (_smoothed(moments, box_mean(moments, 1, (1, 2)), rays, 8) / rays).sum(0)
-        spread = np.moveaxis(self.film.spread_out(np.moveaxis(each, -1, 0)), 0, -1)
+        moments, rays = self._moments(), self.rows(self.rays)
+        each = (moments / rays[..., None]).sum(0)
+        each = _smoothed(each, box_mean(each, 1), rays.mean(0)[..., None], 8)
+        spread = channels_last(self.film.spread_out(np.moveaxis(each, -1, 0)))
         return self.film.picture(spread / 4 * self._better(moments.mean(-1))[..., None])
 
     def samples(self) -> np.ndarray:
@@ -221,7 +221,7 @@ def _blocks(values: np.ndarray, side: int) -> np.ndarray:
 
 
 def _smoothed(variance: np.ndarray, around: np.ndarray, rays: np.ndarray, worth: float) -> np.ndarray:
-    """Return variances [2, H, W, ...] drawn towards their means in windows, the less the more rays."""
+    """Return variances [..., H, W, ...] drawn towards their means in windows, the less the more rays."""
     share = 1.0 if math.isinf(worth) else worth / (rays + worth)
     return np.asarray(variance + share * (around - variance))
 
