@@ -53,16 +53,17 @@ class Watch(Progress):
 
     @contextlib.contextmanager
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Callable[[int], None]]:
-        """Look at all processes below this one after each job."""
+        """Look at all processes below this one after each job, or batch of small ones."""
         import psutil
 
-        done = itertools.count(1)
+        done = 0
 
         def advance(steps: int) -> None:
-            count = next(done)
+            nonlocal done
+            done += steps
             for child in psutil.Process().children(recursive=True):
                 with contextlib.suppress(psutil.Error):
-                    self.memory.setdefault(child.pid, []).append((count, child.memory_info().rss))
+                    self.memory.setdefault(child.pid, []).append((done, child.memory_info().rss))
 
         yield advance
 
