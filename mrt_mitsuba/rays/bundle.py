@@ -40,7 +40,8 @@ class Bundle:
 
     def part(self, start: int, stop: int) -> Bundle:
         """Return the bundle of the pixels ``start`` to ``stop − 1``."""
-        return replace(self, pixels=self.pixels[start:stop])
+        whole = start == 0 and stop == len(self.pixels)
+        return self if whole else replace(self, pixels=self.pixels[start:stop])
 
     @property
     def form(self) -> tuple[Any, ...]:

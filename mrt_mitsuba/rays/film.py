@@ -59,7 +59,7 @@ class Film:
 
     def framed(self, picture: np.ndarray, value: float) -> np.ndarray:
         """Return a picture [H, W] with the film's border around it, of one value."""
-        return np.pad(picture, self.border, constant_values=value)
+        return np.pad(picture, self.border, constant_values=value) if self.border else picture
 
     def toned(self, color: Any) -> Any:
         """Return linear sRGB as the film keeps it."""

@@ -146,7 +146,7 @@ USES = {
         derived(1, d=2) == derived(1),
         single(1) == single(1),
     ),
-    "hash": lambda base, derived, named, single: (hash(base(1)), hash(derived(1)), named() in {named()}),
+    "hash": lambda base, derived, named, single: (base(1) in {base(1)}, derived(1, c=[2]) in {derived(1)}),
     "replace": lambda base, derived, named, single: dataclasses.replace(derived(1, c=[2]), a=5),
     "apart": lambda base, derived, named, single: derived(1).c is derived(1).c,
     "fields": lambda base, derived, named, single: [f.name for f in dataclasses.fields(derived)],
