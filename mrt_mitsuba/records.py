@@ -38,6 +38,9 @@ def _init(kind: Any) -> Any:
 
     def __init__(self: Any, *args: Any, **given: Any) -> None:
         values = vars(self)
+        if len(args) == len(names) == len(places) and not given and after is None:  # the usual way
+            values.update(zip(places, args, strict=True))
+            return
         values.update(defaults)
         for name, make in made.items():
             values[name] = make()

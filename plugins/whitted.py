@@ -165,9 +165,12 @@ class MrtWhitted(mi.SamplingIntegrator):
     def prepare(self, scene: mi.Scene, plan: KernelPlan | None = None) -> SceneData:
         """Make the data of the kernels; cheap where nothing has changed since the last call.
 
-        A ``plan`` of one's own holds until the scene changes; without one, that of ``kernel_plan`` does.
+        A ``plan`` of one's own is made for the facts that were read last, and holds until the scene changes;
+        without one, that of ``kernel_plan`` does.
         """
-        reading = self._read(scene)
+        reading = self._reading
+        if plan is None or reading is None or not reading.is_of(scene):
+            reading = self._read(scene)
         self._given_plan = self._given_plan if plan is None else plan
         plan = self._given_plan or self.kernel_plan(reading.facts)
         data = self._data
