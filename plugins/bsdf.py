@@ -134,16 +134,13 @@ class MrtBSDF(mi.BSDF):
         """Return the parameters as plain numbers, or why they are none."""
         if not self._is_uniform():
             return Reason.VARYING
-        if self._needs_gradients():
+        values = numbers, (diffuse, specular) = self._uniform_values()
+        if dr.grad_enabled(values):
             return Reason.GRADIENTS
-        numbers, (diffuse, specular) = self._uniform_values()
         return UniformMaterial(*(tuple(first(x) for x in values) for values in (numbers, diffuse, specular)))
 
     def _is_uniform(self) -> bool:
         return self.f0 is None and not self._varies(*(getattr(self, name) for name in (*NUMBERS, *COLORS)))
-
-    def _needs_gradients(self) -> bool:
-        return dr.grad_enabled(self._uniform_values())
 
     def _uniform_values(self) -> tuple[list[mi.Float], list[mi.UnpolarizedSpectrum]]:
         point = _PointParameters(self, dr.zeros(mi.SurfaceInteraction3f), True)

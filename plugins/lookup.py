@@ -55,11 +55,11 @@ class ByShape:
             self.shapes = shapes  # alive, or their ids could pass to others
             self.rows = {id(s): kind(row) for s, row in zip(shapes, rows, strict=True)}
             return
-        ids = dr.reinterpret_array(mi.UInt32, pointer("Shape", shapes))
-        size = dr.max(ids)[0] + 1
+        ids = np.array(dr.reinterpret_array(mi.UInt32, pointer("Shape", shapes)))
+        size = int(ids.max()) + 1
         width = 1 if kind is mi.Float else dr.size_v(kind)
         table = np.tile(np.float32(fallback), size).reshape(size, width)
-        table[np.array(ids)] = np.reshape(rows, (-1, width))
+        table[ids] = np.reshape(rows, (-1, width))
         self.table = aligned(table)
         self.size = dr.opaque(mi.UInt32, size)
         dr.make_opaque(self.fallback)
