@@ -42,9 +42,9 @@ def test_crossing_point() -> None:
     assert acceleration.crossing(loop, {10: 1e3, 100: 1e3}) == float("inf")
 
 
-def lit(rng: np.random.Generator, count: int, place: np.ndarray) -> mi.Ray3f:
-    """Rays from random points in and around the cube [−1, 1]³ to a light."""
-    o = mi.Point3f((rng.uniform(-1.2, 1.2, (count, 3)) * rng.choice([1, 3], (count, 1))).T)
+def lit(origins: np.ndarray, place: np.ndarray) -> mi.Ray3f:
+    """Rays from points to a light."""
+    o = mi.Point3f(origins.T)
     ray = mi.Ray3f(o, mi.Point3f(place.tolist()) - o, 1, 0, [])
     dr.eval(ray)
     return ray
@@ -53,12 +53,15 @@ def lit(rng: np.random.Generator, count: int, place: np.ndarray) -> mi.Ray3f:
 PLACES = [(0.1, 0.2, 0.3), (0, 0, 0), (1.02, 1.02, 1.02), (5, 0, 0), (-40, 3, 2), (0, -2000, 0)]
 
 
+@pytest.mark.parametrize(("size", "shift"), [(1, 0), (1e6, 0), (1e-6, 0), (1, 300)])
 @pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder", "capsule"])
-def test_light_buffers_find_what_a_search_finds(kind: str) -> None:
+def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: float) -> None:
     """Spheres: to the bit what Embree finds; quadrics: what the tree does. Lights are inside and far off."""
     rng = np.random.default_rng(3)
-    starts, radii = rng.uniform(-1, 1, (300, 3)), rng.uniform(0.02, 0.12, 300)
+    starts, radii = rng.uniform(-1, 1, (300, 3)), size * rng.uniform(0.02, 0.12, 300)
     ends = starts + rng.normal(scale=0.1, size=(300, 3))
+    origins = rng.uniform(-1.2, 1.2, (50_000, 3)) * rng.choice([1, 3], (50_000, 1))
+    starts, ends, origins, places = (size * (p + shift) for p in (starts, ends, origins, np.array(PLACES)))
     if kind == "sphere":
         nodes = {f"s{i}": {"type": "sphere", "center": c, "radius": r}
                  for i, (c, r) in enumerate(zip(starts.tolist(), radii.tolist(), strict=True))}  # fmt: skip
@@ -70,10 +73,10 @@ def test_light_buffers_find_what_a_search_finds(kind: str) -> None:
         group = mi.load_dict({"type": "mrt_group", "kind": kind, "numbers": mi.Bitmap(numbers)})
         things = Quadrics([group])
         search = partial(things.occluded, active=mi.Bool(True))
-    buffer = light_buffer(np.array(PLACES), things.balls)
+    buffer = light_buffer(places, things.balls)
     assert buffer is not None
-    for number, place in enumerate(PLACES):
-        ray = lit(rng, 50_000, np.array(place))
+    for number, place in enumerate(places):
+        ray = lit(origins, place)
         test = partial(things.block, ray=ray)
         found = np.array(buffer.any(mi.UInt32(number), ray.d, mi.Bool(True), test))
         expected = np.array(search(ray))
