@@ -17,8 +17,9 @@ import numpy as np
 # Up to this many lights the kernel holds the code of each; beyond, it loops over them
 UNROLLED_LIGHTS = 8
 
-# With fewer objects, looking up what is in the way of a light takes as long as searching for it
-LEAST_BUFFERED = 64
+# With fewer objects, looking up what is in the way of a light takes as long as searching for it; with more
+# pairs of an object and a light, the lists are too long for a processor's caches
+LEAST_BUFFERED, MOST_PAIRS = 64, 2**17
 
 BUDGETS = ("report", "plain")
 
@@ -46,8 +47,8 @@ class Reason(str, Enum):
     NATIVE_SHAPES = "native-shapes"  # shapes other than plain spheres
     INSTANCES = "instances"
     OTHER_LIGHTS = "other-lights"  # a light other than mrt_light, or not known by its numbers
-    MANY_LIGHTS = "many-lights"
     FEW_OBJECTS = "few-objects"
+    MANY_PAIRS = "many-pairs"  # of an object and a light
     OTHER_BSDF = "other-bsdf"  # a BSDF other than mrt_bsdf
     MIXED_FRESNEL = "mixed-fresnel"
     VARYING = "varying"  # a parameter varies over the surface, or has no place in the table
@@ -259,9 +260,9 @@ def _buffers(facts: SceneFacts, spheres: str, lights: str, unless: Unless) -> bo
         (lights == "none", Reason.NO_LIGHTS),
         (not facts.vectorised, Reason.SCALAR_VARIANT),
         (not facts.tabled, Reason.OTHER_LIGHTS),
-        (lights != "unrolled", Reason.MANY_LIGHTS),
         (facts.native_shapes > 0 and spheres != "table", Reason.NATIVE_SHAPES),
         (objects < LEAST_BUFFERED, Reason.FEW_OBJECTS),
+        (objects * facts.lights > MOST_PAIRS, Reason.MANY_PAIRS),
     )
 
 

@@ -19,9 +19,8 @@ import numpy as np
 
 from .lookup import aligned
 
-# With more cells, more objects in them, or more pairs of an object and a light, rays walk down a tree: lists
-# would take more memory and time than they save
-MOST_CELLS, MOST_LISTED, MOST_PAIRS = 2**21, 2**22, 2**20
+# With more cells, or more objects in all of them, lists would take more memory and time than they save
+MOST_CELLS, MOST_LISTED = 2**21, 2**22
 
 # Directions in float32 are off by less, in radians; so are places in cells
 _OFF_ANGLE, _OFF_CELL = 2e-6, 1e-3
@@ -78,8 +77,6 @@ def light_buffer(places: np.ndarray, balls: np.ndarray) -> LightBuffer | None:
     None where they would be too long.
     """
     lights, count = len(places), len(balls)
-    if lights == 0 or lights * count > MOST_PAIRS:
-        return None
     faces = [_face(places, balls, side) for side in range(6)]
     size = 2 ** int(np.ceil(np.log2(4 * np.sqrt(count))))
     while size >= 2:

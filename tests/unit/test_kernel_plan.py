@@ -129,6 +129,9 @@ def test_kernel_obeys(name: str) -> None:
         ({"a": SPHERE}, "lights", Reason.NO_LIGHTS),
         ({"a": SPHERE, "light": LIGHT}, "random", Reason.DELTA_LIGHTS),
         ({"a": SPHERE, "light": LIGHT}, "touching", Reason.APART),
+        ({"a": SPHERE, "light": LIGHT}, "buffers", Reason.FEW_OBJECTS),
+        ({**CROWD, "light": {"type": "point"}}, "buffers", Reason.OTHER_LIGHTS),
+        ({**CROWD, "light": LIGHT, "b": MESH}, "buffers", Reason.NATIVE_SHAPES),
         ({"a": SPHERE}, "emission", Reason.NO_SURFACE_EMITTERS),
         ({"a": SPHERE}, "sky", Reason.NO_SKY),
         ({"a": {**SPHERE, "bsdf": MATTE}}, "mirrors", Reason.NO_MIRRORS),
@@ -152,6 +155,14 @@ def test_kernel_obeys(name: str) -> None:
 )
 def test_reasons(content: dict[str, Any], name: str, reason: Reason) -> None:
     assert plan_of(**content).reason(name) is reason
+
+
+def test_no_light_buffers_where_they_would_be_too_long() -> None:
+    loaded = scene(**CROWD, light=LIGHT)
+    integrator = loaded.integrator()
+    facts = replace(integrator.scene_facts(loaded), lights=2**11)
+    assert integrator.kernel_plan(facts).buffers
+    assert integrator.kernel_plan(replace(facts, lights=2**11 + 1)).reason("buffers") is Reason.MANY_PAIRS
 
 
 def test_a_plan_holds_until_the_scene_changes() -> None:

@@ -60,7 +60,7 @@ def _hovering() -> Scene:
 
 
 def _crowded(lights: int) -> Scene:
-    """Return a few hundred objects of all kinds, looked up in trees and, under few lights, in light buffers."""
+    """Return a few hundred objects of all kinds, looked up in trees and in light buffers."""
     rng = np.random.default_rng(5)
     kinds: dict[str, list[Any]] = {"spheres": [], "cones": [], "cylinders": []}
     for i in range(330):
@@ -105,7 +105,7 @@ CASES = {
     "9": Case(report_scene(9), 9e-7),
     "hovering": Case(_hovering(), 6e-7, fresnel="schlick"),
     "crowded": Case(_crowded(12), 1e-5, (160, 120), (80, 60), "schlick"),
-    "crowded, few lights": Case(_crowded(4), 7e-6, (160, 120), (80, 60), "schlick"),
+    "crowded, unrolled": Case(_crowded(4), 7e-6, (160, 120), (80, 60), "schlick"),
 }
 
 
