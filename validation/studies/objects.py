@@ -77,8 +77,8 @@ def compare_with_spheres(study: Study, *, width: int, height: int, samples: tupl
         "A thousand cones against a thousand spheres, seconds of a whole picture",
         ["aa", "cones", "spheres", "ratio", "quartiles"],
         rows,
-        "Spheres are searched and intersected by Embree, cones by this project's tree in Dr.Jit; shadow rays of "
-        "both look objects up in light buffers.",
+        "Spheres are searched and intersected by Embree, cones by this project's tree in Dr.Jit; shadow rays "
+        "look both up in light buffers.",
     )
 
 
