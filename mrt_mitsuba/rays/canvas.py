@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from mrt_mitsuba.rays.divisor import Divisor
 from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.records import dataclass
 
+MOST_LANES = 2**17  # of a kernel, each with as many sums
 MOST_SUMS = 128  # in a kernel: more take longer to compile, with fewer each ray is read more often
 
 
@@ -58,17 +60,34 @@ class Canvas:
             pixels: where they start, ascending; those of the second picture follow on those of the first.
             rays: how many start there, one after the other.
         """
-        import drjit as dr
-
         reach, film = self._film.reach, self._film
         row, column = np.divmod(pixels, film.width)
-        padded = (row + (2 * (row // film.height) + 1) * reach) * self._width + column + reach
-        start, stop = int(padded[0]), int(padded[-1]) + 1
+        row += (2 * (row // film.height) + 1) * reach
+        before, shares = np.cumsum(rays) - rays, 1 / self._rays.ravel()[pixels]
+        cuts = np.flatnonzero(np.diff(row // max(1, MOST_LANES // self._width), prepend=-1))
+        for low, high in pairwise([*cuts, len(pixels)]):
+            part = slice(low, high)
+            padded = row[part] * self._width + column[part] + reach
+            self._put(place, values, padded, int(before[low]), rays[part], shares[part])
+
+    def _put(
+        self,
+        place: Any,
+        values: Sequence[Any],
+        pixels: np.ndarray,
+        before: int,
+        rays: np.ndarray,
+        shares: np.ndarray,
+    ) -> None:
+        """Add the rays of some pixels, numbered with the padding, after so many others."""
+        import drjit as dr
+
+        reach, start, stop = self._film.reach, int(pixels[0]), int(pixels[-1]) + 1
         # one more than there are lanes, so that Dr.Jit gathers them: to load them, it would compile another
         # kernel for every alignment of NumPy's memory
-        counts, shares = np.zeros(stop - start + 1, np.uint32), np.zeros(stop - start + 1, np.float32)
-        counts[padded - start + 1], shares[padded - start] = rays, 1 / self._rays.ravel()[pixels]
-        runs = self._runs(start, np.cumsum(counts, dtype=np.uint32), shares)
+        counts, weights = np.zeros(stop - start + 1, np.uint32), np.zeros(stop - start + 1, np.float32)
+        counts[pixels - start + 1], weights[pixels - start] = rays, shares
+        runs = self._runs(start, np.uint32(before) + np.cumsum(counts, dtype=np.uint32), weights)
         more = runs.moments(values[:3]) if len(self._moments) else []
         dr.eval(more)
         for total, found in zip(self._moments, more, strict=True):
@@ -76,7 +95,7 @@ class Canvas:
         rows = max(1, MOST_SUMS // ((2 * reach + 1) * len(self._sums)))
         for first in range(-reach, reach + 1, rows):
             down = range(first, min(first + rows, reach + 1))
-            given = runs.given(film, place, values, down)
+            given = runs.given(self._film, place, values, down)
             dr.eval(given)
             for index, step in enumerate(down):
                 near = self._row(given[index * len(given) // len(down) :], stop - start)

@@ -132,6 +132,35 @@ def test_peak_memory_stays_within_the_budget(run_python) -> None:
     assert tiled == whole
 
 
+OWN = (
+    PEAK.replace(
+        "def render(size, memory):",
+        """
+def render(size, memory):
+    film = {"type": "hdrfilm", "width": size, "height": size}  # its filter reaches two pixels far
+    ball = {"type": "sphere", "bsdf": {"type": "mrt_bsdf"}}
+    scene = {"type": "scene", "ball": ball, "sky": {"type": "constant"}}
+    scene["sensor"] = {"type": "perspective", "film": film}
+    image = mrt.render(scene, integrator="path", aamode="noise", spp=16, memory=memory).image
+    return hashlib.sha256(image.tobytes()).hexdigest()
+
+def unused(size, memory):""",
+    )
+    .replace("112M", "400M")
+    .replace("1536", "720")
+)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs Linux to measure memory")
+def test_peak_memory_of_a_film_stays_within_the_budget(run_python) -> None:
+    done = run_python(OWN)
+    assert done.returncode == 0, done.stderr
+    (tiled, least), (whole, most) = json.loads(done.stdout)
+    budget = 400 * 2**20
+    assert least < budget < most, (least, most)
+    assert tiled == whole
+
+
 # ------------------------------------------------ Signals -----------------------------------------------
 
 
