@@ -31,7 +31,7 @@ STEP = (
 # Candidates for the smoothing of variances: half the width of a window, and how many rays its mean is worth
 _WINDOWS = {1: (8, 32), 2: (32, math.inf), 4: (math.inf,), 8: (math.inf,)}
 _FLOORS = (0.003, 0.03, 0.2, 1.0)  # share of the picture's mean in the variance of every pixel
-_JUDGES = 2**13  # pixels, about, that choose among the candidates
+_JUDGES = 2**12  # pixels, about, that choose among the candidates
 _REGION = 8  # half the width of the windows in which rays are compared with independent ones
 
 
@@ -173,18 +173,19 @@ class Halves(Stack):
         mean = measured.mean((1, 2))[:, None, None]
         step = max(1, math.isqrt(measured[0].size // _JUDGES))
         judges, other = (slice(None), *[slice(None, None, step)] * 2), measured[::-1, ::step, ::step]
-        best, least, lowest = measured, math.inf, 0.0
+        least, lowest, window, weight = math.inf, 0.0, measured, 0.0
         for width, worths in _WINDOWS.items():
             if width < self.film.reach:
                 continue
             around = box_mean(measured, width, (1, 2))
             for worth in worths:
-                smooth = _smoothed(measured, around, rays, worth)
+                smooth = _smoothed(measured[judges], around[judges], rays[judges], worth)
                 for floor in _FLOORS:
-                    deviation = np.sqrt((1 - floor) * smooth[judges] + floor * mean + 1e-30)
+                    deviation = np.sqrt((1 - floor) * smooth + floor * mean + 1e-30)
                     cost = ((other / deviation).mean((1, 2)) * deviation.mean((1, 2))).sum()
                     if cost < least:
-                        best, least, lowest = smooth, cost, floor
+                        least, lowest, window, weight = cost, floor, around, worth
+        best = _smoothed(measured, window, rays, weight)
         return ((1 - lowest) * best + lowest * mean + 1e-30)[::-1].reshape(HALVES, -1)
 
     def _moments(self) -> np.ndarray:

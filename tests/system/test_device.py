@@ -75,7 +75,7 @@ def test_make_test_gpu_runs_its_selection_where_it_is_told_to(tmp_path: Path) ->
         )
 
     found = run("llvm")
-    assert found.returncode == 0 and "test_light_follows_its_parameters" in found.stdout
+    assert found.returncode == 0 and "test_light_buffers_follow_the_light" in found.stdout
     assert "test_make_test_gpu" not in found.stdout  # no picture, no device
     if "cuda_ad_rgb" not in mi.variants() or runtime.obstacle("cuda_ad_rgb"):
         missing = run("cuda")
