@@ -12,8 +12,9 @@ from pathlib import Path
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.records import dataclass
 
-# For every pixel and channel that is kept
+# For every pixel: what is kept, by channel, and what Pillow needs to write a PNG
 BYTES_PER_CHANNEL = 4
+BYTES_TO_WRITE = 4
 
 # A wavefront's arrays, per ray and channel: what the kernel writes, what is formed of it, and the part before
 BYTES_PER_CHANNEL_OF_RAY = 12
@@ -106,7 +107,7 @@ class Workspace:
         ``rays_per_pixel``: which are traced at once. Raises ``UsageError`` where that does not suffice.
         """
         pixels = width * height
-        finished = pixels * pictures * channels * BYTES_PER_CHANNEL + BYTES_OF_KERNELS
+        finished = pixels * (pictures * channels * BYTES_PER_CHANNEL + BYTES_TO_WRITE) + BYTES_OF_KERNELS
         finished += budget.taken
         least = max(
             max(min(LEAST_RAYS, pixels), rays_per_pixel) * channels * BYTES_PER_CHANNEL_OF_RAY,

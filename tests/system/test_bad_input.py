@@ -77,7 +77,7 @@ OUTPUTS: list[Case] = [
 ]
 
 SIZES: list[Case] = [
-    ({}, "out width=16384 height=16384 aa=1 memory=512M", 2, "needs 3.1 GiB of memory, and 512 MiB"),
+    ({}, "out width=16384 height=16384 aa=1 memory=512M", 2, "needs 4.1 GiB of memory, and 512 MiB"),
     ({}, "out width=65536 height=65536 aa=1 memory=16G", 2, "choose a smaller width and height"),
     ({}, "out width=65537", 2, "from 1 to 65536"),
     (xml("", LARGE), "out scene=a.xml memory=512M", 2, "a picture of 99999x99999 pixels needs"),

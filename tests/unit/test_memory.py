@@ -30,17 +30,17 @@ def test_less_memory_gives_smaller_parts():
 @pytest.mark.parametrize(
     ("more", "needed"),
     [
-        # 2^28 pixels of three floats, 24 rows under a filter, kernels: 3.1 GiB
-        ({}, "3.1 GiB"),
+        # 2^28 pixels of three floats, four bytes to write them, 24 rows under a filter, kernels: 4.1 GiB
+        ({}, "4.1 GiB"),
         # twice the floats
-        ({"pictures": 2}, "6.1 GiB"),
+        ({"pictures": 2}, "7.1 GiB"),
         # 2^26 rays of three floats each, three times
-        ({"rays_per_pixel": 2**26}, "5.3 GiB"),
+        ({"rays_per_pixel": 2**26}, "6.3 GiB"),
     ],
 )
 def test_a_picture_that_does_not_fit_is_refused_with_both_sizes(more, needed):
-    with pytest.raises(UsageError, match=f"16384x16384 pixels needs {needed} of memory, and 3.0 GiB may be"):
-        Workspace.next_to(16384, 16384, 3, budget=Budget(3 * GIB), **more)
+    with pytest.raises(UsageError, match=f"16384x16384 pixels needs {needed} of memory, and 4.0 GiB may be"):
+        Workspace.next_to(16384, 16384, 3, budget=Budget(4 * GIB), **more)
 
 
 def test_by_default_half_of_what_is_free(monkeypatch):
