@@ -76,10 +76,12 @@ def light_buffer(places: np.ndarray, balls: np.ndarray) -> LightBuffer | None:
 
     None where they would be too long.
     """
-    lights, count = len(places), len(balls)
+    lights, count, least = len(places), len(balls), 2
+    if 6 * lights * least**2 > MOST_CELLS:
+        return None
     faces = [_face(places, balls, side) for side in range(6)]
     size = 2 ** int(np.ceil(np.log2(4 * np.sqrt(count))))
-    while size >= 2:
+    while size >= least:
         listed = sum(int(f.areas(size).sum()) for f in faces)
         if 6 * lights * size**2 <= MOST_CELLS and listed <= MOST_LISTED:
             return LightBuffer(faces, lights, size)
