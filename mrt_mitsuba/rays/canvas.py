@@ -145,12 +145,12 @@ class _Runs:
         rows = [dr.opaque(mi.Float, step) for step in down]
 
         def one(ray: Any) -> list[Any]:
+            channels = [*(dr.gather(mi.Float, value, ray) for value in values), mi.Float(1)]
             if not film.reach:
-                return [*(dr.gather(mi.Float, value, ray) for value in values), mi.Float(1)]
+                return channels
             x = dr.gather(mi.Float, place.x, ray) - (self.column + 0.5)
             y = dr.gather(mi.Float, place.y, ray) - (self.row + 0.5)
             along = [rfilter.eval(step - x) for step in across]
-            channels = [*(dr.gather(mi.Float, value, ray) for value in values), mi.Float(1)]
             shown = ([value * rfilter.eval(step - y) for value in channels] for step in rows)
             return [value * weight for values in shown for weight in along for value in values]
 
