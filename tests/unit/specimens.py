@@ -47,6 +47,10 @@ def _unscaled(bs, weight, u, ctx):
     return weight * bs.eta**2 if ctx.mode == mi.TransportMode.Radiance else weight
 
 
+def _turned(wo):
+    return mi.Vector3f(0.8 * wo.x - 0.6 * wo.y, 0.6 * wo.x + 0.8 * wo.y, wo.z)
+
+
 def _brighter(value, wi, wo):
     return 1.8 * value * (1 + 0.56 * (1 - abs(wi.z)) ** 8) * (1 + 0.56 * (1 - abs(wo.z)) ** 8)
 
@@ -79,6 +83,7 @@ CHANGES = {
     "no eta^2 in single directions": (GLASS, "sample", _weight(_unscaled), {"reciprocity"}),
     "eta inverted": (GLASS, "sample", _member("eta", lambda eta: 1 / eta), {"reciprocity"}),
     "directions not of length 1": (MIRROR, "sample", _member("wo", lambda wo: 1.01 * wo), {"finite"}),
+    "mirror turned": (MIRROR, "sample", _member("wo", _turned), {"reciprocity"}),
     "mirror called glossy": (
         MIRROR,
         "sample",

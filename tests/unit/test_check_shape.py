@@ -19,6 +19,11 @@ pytestmark = pytest.mark.usefixtures("variant")
 OPEN = {"watertight"}
 MIRRORED = {"to_world": [1, -1, 1]}
 CONE = {"apex": [0, 1, 0], "base_center": [0, 0, 0], "radius": 0.5, **MIRRORED}
+ELLIPSOIDS = {
+    "centers": np.float32([[0, 0, 0], [2, 0, 0]]),
+    "scales": np.float32([[0.3, 0.2, 0.4], [0.1, 0.3, 0.2]]),
+    "quaternions": np.float32([[0, 0, 0, 1], [0.5, 0.5, 0.5, 0.5]]),
+}
 
 # Parameters, laws that are known to fail, and those that make no sense; docs/check_your_plugin.md says why
 SHAPES: dict[str, tuple[dict[str, Any], set[str], set[str]]] = {
@@ -27,6 +32,7 @@ SHAPES: dict[str, tuple[dict[str, Any], set[str], set[str]]] = {
     "disk": ({}, set(), OPEN),
     "cube": ({}, set(), set()),
     "cylinder": ({}, {"far"}, OPEN),
+    "ellipsoidsmesh": (ELLIPSOIDS, {"watertight"}, {"scale"}),
     "mrt_plane": ({"normal": [0, 1, 0]}, set(), OPEN | {"scale"}),
     "mrt_cone": (CONE, {"far"}, set()),
     "mrt_cylinder": ({"p0": [0, 1, 0], "p1": [0, 0, 0], "radius": 0.5, **MIRRORED}, {"far"}, set()),
@@ -39,7 +45,8 @@ def test_stock_shapes_and_ours(name: str) -> None:
     parameters, known, senseless = SHAPES[name]
     if "to_world" in parameters:
         parameters = parameters | {"to_world": mi.ScalarTransform4f().scale(parameters["to_world"])}
-    check = mrt.check_shape({"type": name, **parameters}, quick=True)
+    tensors = {key: mi.TensorXf(x) for key, x in parameters.items() if isinstance(x, np.ndarray)}
+    check = mrt.check_shape({"type": name, **parameters, **tensors}, quick=True)
     assert set(check.failed) == known, str(check)
     assert {law.name for law in check.laws.values() if law.skipped} == senseless, str(check)
     assert list(check.laws) == list(LAWS)

@@ -28,6 +28,7 @@ QUICK_ANGLES = (0, 50, 85, 140)
 FIT = 5e-3  # the rational fits of Smith's G₁ in use are off by up to 0.35 %, and the densities with them
 POINTWISE = 2e-3  # relative, beyond what rounding explains
 ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32
+NARROW = 16 * ROUNDED  # width of a lobe that rounded directions do not resolve
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class Case:
         wi, uv = direction(cos, phi), self.rng.random((count, 2), np.float32)
         samples = self.probe.sample(wi, self.uniform(count), uv)
         usable = np.isfinite(samples.wo).all(axis=1) & ~samples.delta & (samples.weight != 0).any(axis=1)
-        usable &= self.rng.random(count) < 0.75
+        usable &= (self.rng.random(count) < 0.75) & ~narrow(wi, samples)
         other = direction(self.rng.uniform(-1, 1, count), self.rng.uniform(0, 2 * np.pi, count))
         wo = unit(np.where(usable[:, None], samples.wo, other))
         value, pdf = self.probe.both(wi, wo, uv)
@@ -165,14 +166,25 @@ def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:
     return ~s.delta & np.isfinite(pdf) & (pdf > 0) & ~refused
 
 
+def narrow(wi: Array, s: Samples) -> Array:
+    """Return where samples are of a component whose lobe is narrower than rounded directions resolve."""
+    drawn, found = ~s.delta & (s.pdf > 0), np.zeros(len(s.pdf), bool)
+    density = s.pdf * np.abs(wi[..., 2])  # as one over the area of a lobe that is seen from ``wi``
+    for component in np.unique(s.component[drawn]):
+        part = drawn & (s.component == component)
+        found |= part & (np.median(density[part]) > NARROW**-2)
+    return found
+
+
 def excess(one: Array, other: Array, allowed: Array) -> Array:
     """Return [N]: how far two arrays [N, …] differ beyond ``8 * allowed``, relative to the larger one.
 
-    The brightest channel counts as the size. What is not finite is left to the law ``finite``.
+    The brightest channel counts as the size; below 1e-20, an exponential may have underflowed or not. What is
+    not finite is left to the law ``finite``.
     """
     one, other, allowed = (np.reshape(x, (len(one), -1)).astype(np.float64) for x in (one, other, allowed))
     size = np.maximum(np.abs(one), np.abs(other)).max(axis=1, keepdims=True)
-    beyond = np.maximum(np.abs(one - other) - 8 * allowed, 0) / np.where(size > 1e-30, size, np.inf)
+    beyond = np.maximum(np.abs(one - other) - 8 * allowed, 0) / np.where(size > 1e-20, size, np.inf)
     return np.where(np.isfinite(beyond), beyond, 0).max(axis=1)
 
 

@@ -38,6 +38,8 @@ def _holds(law: Law, case: Case, key: str) -> bool:
     with changed(case, key, _inside):
         found, attached, broken = _derivatives(case, key)
         slope, error = _differences(case, key)
+    if not attached and not slope.any():
+        law.notes.append(f"{key} changes no value")
     off, few = np.abs(found - slope), _lit(case)
     known = np.isfinite(error)
     if known.sum() < 20:

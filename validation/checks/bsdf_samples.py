@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 
 from mrt_mitsuba.validation.checks import snippets
-from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, View, excess, live
+from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, View, excess, live, narrow
 from mrt_mitsuba.validation.checks.law import LEVEL, SIGMAS, Law, Skip
 from mrt_mitsuba.validation.checks.probe import Array, context, direction, is_scalar, unit
 from mrt_mitsuba.validation.checks.sphere import DEPTH, Cells, Integrals, encode, integrate
@@ -75,8 +75,11 @@ def _cells(case: Case) -> Iterator[tuple[View, Cells | None]]:
         held = (
             np.bincount(cells.find(encode(pilot)), minlength=len(cells.start)) if len(pilot) else np.zeros(1)
         )
-        narrow = held[cells.level == DEPTH] if len(pilot) else held
-        yield view, (None if narrow[narrow > 4 * most].sum() > 0.01 * len(pilot) else cells)
+        finest = held[cells.level == DEPTH] if len(pilot) else held
+        # at the normal, all azimuths of the finest cells are one place
+        centre = (np.hypot(*pilot.T[:2]) < np.sqrt(2) * 0.5**DEPTH).sum()
+        blurred = max(finest[finest > 4 * most].sum(), centre) > 0.01 * len(pilot)
+        yield view, (None if blurred else cells)
 
 
 def _mirrored(wi: Array, rng: np.random.Generator, count: int = 600) -> Array:
@@ -95,7 +98,7 @@ def _chi_square(found: Integrals, codes: Array, count: int) -> tuple[float, tupl
     used = (seen_in > 0) | (expected_in > 1e-6)
     pull = (seen_in - expected_in)[used] ** 2 / np.maximum(expected_in + variance_in, 1e-6)[used]
     cell = int(np.argmax(np.abs(seen - expected) / np.sqrt(expected + variance + 1)))
-    return float(stats.chi2.sf(pull.sum(), len(pull))), found.cells.bounds(cell)
+    return float(stats.chi2.sf(pull.sum(), max(len(pull), 1))), found.cells.bounds(cell)
 
 
 def weights(law: Law, case: Case) -> None:
@@ -133,6 +136,7 @@ def _mismatch(case: Case, view: View) -> dict[str, Array]:
         return value / np.where(pdf > 0, pdf, np.inf)[:, None]
 
     counts = live(view.wi, few, *case.probe.both(wis, wo, uvs)) | (few.weight != 0).any(axis=1) & ~few.delta
+    counts &= ~narrow(view.wi, few)
     return {
         what: np.where(counts, excess(stated, function(wis, wo, uvs), case.spread(function, wis, wo, uvs)), 0)
         for what, stated, function in (

@@ -10,7 +10,7 @@ import numpy as np
 from mrt_mitsuba.validation.checks import noise, snippets
 from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, changed, excess, parameters
 from mrt_mitsuba.validation.checks.law import Law, Skip
-from mrt_mitsuba.validation.checks.probe import Array, direction
+from mrt_mitsuba.validation.checks.probe import Array, direction, unit
 
 EITHER_WAY = "light can be followed either way; transmitted radiance scales by the squared index"
 BEYOND = "relative, beyond 8 times what the rounding of directions explains"
@@ -71,12 +71,24 @@ def _delta_either_way(law: Law, case: Case) -> None:
     wi = direction(case.rng.uniform(-1, 1, count), case.rng.uniform(0, 2 * np.pi, count))
     uv, first, second = case.rng.random((count, 2), np.float32), case.uniform(count), case.uniform(count)
     there = case.probe.sample(wi, first, uv)
-    wo = np.where(np.isfinite(there.wo), there.wo, 1)
+    wo = unit(np.where(np.isfinite(there.wo), there.wo, 1))
     back = case.probe.sample(wo, second, uv)
-    met = there.delta & (there.type == back.type) & (there.component == back.component)
-    met &= (np.abs(back.wo - wi) < 1e-3).all(axis=1) & (np.abs(wi[:, 2] * wo[:, 2]) > 1e-3)
-    if met.sum() < 20:
+    same = there.delta & (there.type == back.type) & (there.component == back.component)
+    same &= np.abs(wi[:, 2] * wo[:, 2]) > 1e-3
+    returned = (np.abs(unit(back.wo) - wi) < 1e-3).all(axis=1)
+    if same.sum() < 20:
         return
+
+    def show(i: int) -> str:
+        return case.snippet(snippets.DELTA_RECIPROCITY, wi=wi[i], uv=uv[i], u=first[i], back=second[i])
+
+    law.at_least(
+        "share of single directions (delta) that the way back returns to",
+        returned[same].mean(),
+        0.05,
+        "light can be followed either way; of several directions, the way back may draw another",
+        show(int((same & ~returned).argmax())),
+    )
 
     def followed(i: Array, _: Array, t: Array, u: Array) -> Array:
         s = case.probe.sample(i, u, t)
@@ -88,13 +100,11 @@ def _delta_either_way(law: Law, case: Case) -> None:
     allowed = case.spread(followed, *ways[0]) + case.spread(followed, *ways[1])
     law.most(
         f"probability x weight x eta^2 of a single direction (delta) against that of the way back, {BEYOND}",
-        np.where(met, excess(forth, back_again, allowed), 0),
+        np.where(same & returned, excess(forth, back_again, allowed), 0),
         POINTWISE,
         EITHER_WAY,
-        lambda i: case.snippet(
-            snippets.DELTA_RECIPROCITY, wi=wi[i], uv=uv[i], u=first[i], back=second[i]
-        ),
-    )  # fmt: skip
+        show,
+    )
 
 
 # ------------------------------------------------ Finite --------------------------------------------------
@@ -195,7 +205,8 @@ def roundoff(law: Law, case: Case) -> None:
     """Noise of float32 evaluation beyond what the rounding of the directions explains."""
     case.need_smooth()
     lit = case.pairs.only((np.abs(case.pairs.wi[:, 2]) > 0.1) & (np.abs(case.pairs.wo[:, 2]) > 0.1))
-    lit = lit.only((lit.pdf > 0) & (lit.value.max(axis=1) > 1e-20))
+    # far off a lobe, an exponent of 40 makes 40 roundings of one: of nothing
+    lit = lit.only((lit.pdf > 1e-3) & (lit.value.max(axis=1) > 1e-20))
     few = lit.only(slice(0, case.count(500, 2000)))
     if len(few.pdf) < 20:
         raise Skip("too few pairs of directions with a value")
@@ -206,6 +217,8 @@ def roundoff(law: Law, case: Case) -> None:
             return function(x[:, :3], x[:, 3:], np.tile(few.uv, (len(x) // len(few.uv), 1)))
 
         found = noise.measure(at, inputs, seed=case.seed)
+        if np.isnan(found.noise).mean() > 0.25:
+            raise Skip("values change too fast for float32 steps to tell noise")
         lost = np.where(np.isfinite(found.lost(noise.ALLOWANCE)), found.lost(noise.ALLOWANCE), 0)
         measured = float(np.quantile(lost, 0.9))
         i = int(np.abs(lost - measured).argmin())

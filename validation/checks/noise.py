@@ -33,8 +33,8 @@ class Noise:
     stride: Array  # the most float32 steps between points of its line
 
     def lost(self, allowance: float) -> Array:
-        """Return noise over what inputs and ``allowance`` roundings of the function's own explain."""
-        return self.noise / np.hypot(self.explained, allowance)
+        """Return noise over what inputs, rounded twice, and ``allowance`` other roundings explain."""
+        return self.noise / np.hypot(2 * self.explained, allowance)
 
 
 def ecnoise(lines: Array) -> Array:
@@ -42,7 +42,7 @@ def ecnoise(lines: Array) -> Array:
 
     The first order k counts from which on three estimates agree to a factor of four and whose differences
     have both signs. If none is so, it is the smallest of all; or NaN where the line is too long to tell, for
-    the values change along it by more than ``STEEP`` of the largest.
+    the values change along it by more than ``STEEP`` of the largest; and NaN wherever they change by half.
     """
     table, gamma, levels, signs = lines.astype(np.float64), 1.0, [], []
     for k in range(1, len(lines)):
@@ -50,12 +50,12 @@ def ecnoise(lines: Array) -> Array:
         levels.append(np.sqrt(gamma * (table**2).mean(axis=0)))
         signs.append((table.min(axis=0) < 0) & (table.max(axis=0) > 0))
     level = np.array(levels)
-    steep = np.ptp(lines, axis=0) > STEEP * np.abs(lines).max(axis=0)
-    found = np.where(steep, np.nan, level[:-2].min(axis=0))
+    change = np.ptp(lines, axis=0) / np.abs(lines).max(axis=0)
+    found = np.where(change > STEEP, np.nan, level[:-2].min(axis=0))
     for k in reversed(range(len(level) - 2)):
         three = level[k : k + 3]
         found = np.where(signs[k] & (three.max(axis=0) <= 4 * three.min(axis=0)), level[k], found)
-    return found
+    return np.where(change > 0.5, np.nan, found)
 
 
 def steps_away(x: Array, count: Array) -> Array:

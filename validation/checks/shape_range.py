@@ -81,8 +81,12 @@ def far(law: Law, case: Case) -> None:
         "the origin is rounded, and some dozen operations with it",
         lambda i: case.snippet(origin[i], d[i], snippets.TWICE, other=closer[i]),
     )
-    # a rounded origin moves the line: only what is surely met counts
+    # a rounded origin moves the line: only what all lines around it meet counts
     bad = steep & through & (np.linalg.norm(here.p - met.p[few], axis=1) < 20 * ROUNDING * distance)
+    across = unit(np.cross(d, case.units(len(d))))
+    for side in (across, -across, np.cross(d, across), np.cross(across, d)):
+        beside = trace(case.target, (closer + 4 * ROUNDING * distance * side).astype(np.float32), d)
+        bad &= beside.found & ((beside.n * here.n).sum(axis=1) > 0.9)
     i = int(bad.argmax())
     law.at_most(
         "share of rays from afar that miss what they meet from nearby, or meet it elsewhere",

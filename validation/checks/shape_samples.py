@@ -79,6 +79,9 @@ def _doubled(case: Case, p: Array, n: Array) -> Array:
 
 def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
     """Random lines cross a surface in proportion to its area, whatever its form (Crofton)."""
+    if not case.behind.found.mean() > 0.5:
+        law.notes.append("rays pass it from behind: their crossings do not count its area")
+        return
     count = case.count(2**16, 2**18)
     radius = 0.5 * case.size * 1.001
     d = case.units(count)

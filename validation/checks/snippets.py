@@ -109,9 +109,10 @@ print(forth, "should be", back)
 DELTA_RECIPROCITY = (
     _POINT
     + """
+# the way back should lead to where it came from, with the same product
 for u in ({u}, {back}):
     bs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))
-    print("probability x weight x eta^2:", bs.pdf * weight * bs.eta**2, "the way back should have the same")
+    print(si.wi, "->", bs.wo, "probability x weight x eta^2:", bs.pdf * weight * bs.eta**2)
     si.wi = bs.wo
 """
 )
