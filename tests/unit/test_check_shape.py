@@ -93,11 +93,6 @@ def flipped(si: Any, ray: Any) -> Any:
     return si
 
 
-def with_hole(si: Any, ray: Any) -> Any:
-    si.t = dr.select((si.uv.x < 0.1) & (si.uv.y < 0.1), dr.inf, si.t)
-    return si
-
-
 def deaf_to_its_limit(si: Any, ray: Any) -> Any:
     return Wrapped().scene.ray_intersect(mi.Ray3f(ray.o, ray.d))
 

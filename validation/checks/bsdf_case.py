@@ -169,10 +169,11 @@ def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:
 def narrow(wi: Array, s: Samples) -> Array:
     """Return where samples are of a component whose lobe is narrower than rounded directions resolve."""
     drawn, found = ~s.delta & (s.pdf > 0), np.zeros(len(s.pdf), bool)
-    density = s.pdf * np.abs(wi[..., 2])  # as one over the area of a lobe that is seen from ``wi``
+    # a lobe of width w along the plane of incidence is w cos θ wide across: density 1 / (w² cos θ)
+    sharpness = s.pdf / np.abs(wi[..., 2])
     for component in np.unique(s.component[drawn]):
         part = drawn & (s.component == component)
-        found |= part & (np.median(density[part]) > NARROW**-2)
+        found |= part & (np.median(sharpness[part]) > NARROW**-2)
     return found
 
 
