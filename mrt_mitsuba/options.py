@@ -55,34 +55,30 @@ def _numeric(
     convert: Callable[[Any], Any],
     within: Callable[[Any], bool],
 ) -> Kind:
+    check = _such(lambda value: not isinstance(value, bool | str) and within(value), convert)
+    return Kind(form, allowed, lambda text: read(plain(text)), check)
+
+
+def _such(allowed: Callable[[Any], Any], convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return the check that takes what is ``allowed``, and converts it."""
+
     def check(value: Any) -> Any:
-        if isinstance(value, bool | str) or not within(value):
+        if not allowed(value):
             raise ValueError
         return convert(value)
 
-    return Kind(form, allowed, lambda text: read(plain(text)), check)
+    return check
 
 
 def choice(*names: str) -> Kind:
     """Return the kind of a choice among names."""
-
-    def check(value: Any) -> str:
-        if value not in names:
-            raise ValueError
-        return str(value)
-
-    return Kind("|".join(names), either(names), str, check)
+    return Kind("|".join(names), either(names), str, _such(names.__contains__, str))
 
 
 def switch() -> Kind:
     """Return the kind of yes or no."""
     words = {"1": True, "0": False, "yes": True, "no": False, "true": True, "false": False}
-
-    def check(value: Any) -> bool:
-        if value not in (False, True):
-            raise ValueError
-        return bool(value)
-
+    check = _such((False, True).__contains__, bool)
     return Kind("1|0", "1 or 0", lambda text: words.get(text.lower()), check)
 
 
@@ -154,12 +150,7 @@ def size() -> Kind:
 
 def word() -> Kind:
     """Return the kind of names made of letters, digits and underscores, such as variants."""
-
-    def check(value: Any) -> str:
-        if not (isinstance(value, str) and value.isidentifier()):
-            raise ValueError
-        return value
-
+    check = _such(lambda value: isinstance(value, str) and value.isidentifier(), str)
     return Kind("NAME", "a name such as llvm_ad_rgb or scalar_rgb", str, check)
 
 
@@ -170,13 +161,7 @@ def anything() -> Kind:
 
 def function() -> Kind:
     """Return the kind of what can be called."""
-
-    def check(value: Any) -> Any:
-        if not callable(value):
-            raise ValueError
-        return value
-
-    return Kind("", "a function", str, check)
+    return Kind("", "a function", str, _such(callable, lambda value: value))
 
 
 def rectangle() -> Kind:
@@ -193,19 +178,9 @@ def rectangle() -> Kind:
 
 def parameters() -> Kind:
     """Return the kind of dicts of values by names of an XML file or keys of ``mi.traverse``."""
-
-    def check(value: Any) -> dict[str, Any]:
-        value = dict(value)
-        if not all(isinstance(key, str) and key for key in value):
-            raise ValueError
-        return value
-
-    return Kind(
-        "",
-        "a dict of values by names of an XML file or keys of mi.traverse, such as material_0.alpha",
-        str,
-        check,
-    )
+    allowed = "a dict of values by names of an XML file or keys of mi.traverse, such as material_0.alpha"
+    check = _such(lambda value: all(isinstance(key, str) and key for key in value), lambda value: value)
+    return Kind("", allowed, str, lambda value: check(dict(value)))
 
 
 def path() -> Kind:

@@ -132,19 +132,13 @@ class MrtBSDF(mi.BSDF):
 
     def uniform(self) -> UniformMaterial | Reason:
         """Return the parameters as plain numbers, or why they are none."""
-        if not self._is_uniform():
+        if self.f0 is not None or self._varies(*(getattr(self, name) for name in (*NUMBERS, *COLORS))):
             return Reason.VARYING
-        values = numbers, (diffuse, specular) = self._uniform_values()
+        point = _PointParameters(self, dr.zeros(mi.SurfaceInteraction3f), True)
+        values = [point.alpha, point.int_ior, point.ext_ior], point.diffuse, point.specular
         if dr.grad_enabled(values):
             return Reason.GRADIENTS
-        return UniformMaterial(*(tuple(first(x) for x in values) for values in (numbers, diffuse, specular)))
-
-    def _is_uniform(self) -> bool:
-        return self.f0 is None and not self._varies(*(getattr(self, name) for name in (*NUMBERS, *COLORS)))
-
-    def _uniform_values(self) -> tuple[list[mi.Float], list[mi.UnpolarizedSpectrum]]:
-        point = _PointParameters(self, dr.zeros(mi.SurfaceInteraction3f), True)
-        return [point.alpha, point.int_ior, point.ext_ior], [point.diffuse, point.specular]
+        return UniformMaterial(*(tuple(map(first, value)) for value in values))
 
     # -------------------------------------- Value and density ------------------------------------------
 
@@ -240,44 +234,32 @@ class MrtBSDF(mi.BSDF):
         return f"MrtBSDF[fresnel={self.fresnel}, " + ", ".join(f"{n}={getattr(self, n)}" for n in names) + "]"
 
 
+def _number(name: str) -> Any:
+    def read(point: _PointParameters) -> mi.Float:
+        parameter = getattr(point.bsdf, name)
+        if isinstance(parameter, mi.Texture):
+            return parameter.eval_1(point.si, point.active)
+        return parameter if is_jit() else first(parameter)
+
+    return cached_property(read)
+
+
+def _color(name: str) -> Any:
+    def read(point: _PointParameters) -> mi.UnpolarizedSpectrum | None:
+        texture = getattr(point.bsdf, name)
+        return None if texture is None else texture.eval(point.si, point.active)
+
+    return cached_property(read)
+
+
 class _PointParameters:
     """The parameters at a surface point; each is read when it is first asked for, and once."""
 
+    alpha, int_ior, ext_ior = map(_number, NUMBERS)
+    diffuse, specular, f0 = map(_color, (*COLORS, "f0"))
+
     def __init__(self, bsdf: MrtBSDF, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
-        self._bsdf, self._si, self._active = bsdf, si, active
-
-    def _number(self, name: str) -> mi.Float:
-        parameter = getattr(self._bsdf, name)
-        if isinstance(parameter, mi.Texture):
-            return parameter.eval_1(self._si, self._active)
-        return parameter if is_jit() else first(parameter)
-
-    def _color(self, texture: mi.Texture) -> mi.UnpolarizedSpectrum:
-        return texture.eval(self._si, self._active)
-
-    @cached_property
-    def alpha(self) -> mi.Float:
-        return self._number("alpha")
-
-    @cached_property
-    def int_ior(self) -> mi.Float:
-        return self._number("int_ior")
-
-    @cached_property
-    def ext_ior(self) -> mi.Float:
-        return self._number("ext_ior")
-
-    @cached_property
-    def diffuse(self) -> mi.UnpolarizedSpectrum:
-        return self._color(self._bsdf.diffuse_reflectance)
-
-    @cached_property
-    def specular(self) -> mi.UnpolarizedSpectrum:
-        return self._color(self._bsdf.specular_reflectance)
-
-    @cached_property
-    def f0(self) -> mi.UnpolarizedSpectrum | None:
-        return None if self._bsdf.f0 is None else self._color(self._bsdf.f0)
+        self.bsdf, self.si, self.active = bsdf, si, active
 
 
 MergeableBSDF.register(MrtBSDF)

@@ -51,9 +51,10 @@ class HitErrors:
         """Return the largest coordinate of the shape."""
         return mi.Float(0) if self.sizes is None else self.sizes(si, found)
 
-    def of_flat(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Float:
-        """Return the bound at a hit on a flat shape; inf on a curved one."""
-        assert self.flat is not None
+    def of_flat(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Float | None:
+        """Return the bound at a hit on a flat shape; inf on a curved one, None where all are."""
+        if self.flat is None:
+            return None
         row = self.flat(si, found)
         width = mi.Vector3f(row.x, row.y, row.z)
         return FLAT * (dr.dot(dr.abs(si.n), dr.abs(si.p) + width) + row.w)

@@ -282,7 +282,7 @@ class SceneData:
         # What lies behind a plane need not be looked for
         ray = mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths)
         si, found, scale = self._intersect_shapes(scene, ray, active)
-        flat = self._error_of_flat(si, found)
+        flat = self.errors.of_flat(si, found)
         if self.quadrics is not None:
             reach = dr.select(found, si.t, ray.maxt)
             quadric = self.quadrics.intersect(
@@ -303,11 +303,6 @@ class SceneData:
         si.time, si.wavelengths = ray.time, ray.wavelengths
         error = CURVED * dr.maximum(scale, dr.max(dr.abs(si.p)))
         return Hit(si, found, error if flat is None else dr.minimum(error, flat))
-
-    def _error_of_flat(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Float | None:
-        if self.errors.flat is None:
-            return None
-        return self.errors.of_flat(si, found)
 
     def _intersect_shapes(
         self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool

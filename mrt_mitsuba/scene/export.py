@@ -71,22 +71,16 @@ def write_xml(
     return [*files.values(), os.fspath(path)]
 
 
-def xml_text(scene: int | Scene, *, flavor: str = "mrt", fresnel: str = "schlick") -> str:
-    """Return the XML of a scene. Raises ``SceneError`` for what needs files next to it; see ``write_xml``."""
-    if flavor not in FLAVORS:
-        raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
-    return _text_of(scene_dict(scene, fresnel=fresnel), scene, flavor)
-
-
 def _text_of(mine: dict[str, Any], scene: int | Scene, flavor: str) -> str:
     """Return the XML of a dict of this project's plugins."""
     import mitsuba as mi
 
     for name, node in mine.items():
         kind = node["type"] if isinstance(node, dict) else ""
-        if kind in _WITHOUT_XML:
+        if kind == "mrt_group":
             raise SceneError(
-                f"{name} cannot be written as XML: {kind} is made of arrays; {_WITHOUT_XML[kind]}"
+                f"{name} cannot be written as XML: {kind} is made of arrays; render it from Python, or "
+                "write at most 1000 spheres or 100 objects of another kind"
             )
     mine = {name: _with_whole_path(node) for name, node in mine.items()}
     model = scene if isinstance(scene, Scene) else report_scene(scene)
@@ -236,10 +230,6 @@ _TUBES = ("mrt_cylinder", "mrt_capsule")
 _AS_MESHES = {f"mrt_{kind}" for kind in OBJECTS} - {"mrt_sphere", *_TUBES}
 # Shapes that are written as files next to the XML
 _IN_FILES = {"mrt": {"mrt_mesh"}, "stock": {"mrt_mesh", *_AS_MESHES}}
-_WITHOUT_XML = {
-    "mrt_mesh": "write_xml, or mrt export, puts it into a file next to the XML",
-    "mrt_group": "render it from Python, or write at most 1000 spheres or 100 objects of another kind",
-}
 _WITHOUT_STOCK = {
     **dict.fromkeys(_AS_MESHES, "is a mesh to them; write_xml, or mrt export, puts it into a file"),
     "mrt_mesh": "is made of arrays, and ply reads a file; write_xml, or mrt export, writes it",
