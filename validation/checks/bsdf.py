@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
@@ -26,8 +27,6 @@ def check_bsdf(bsdf: Any, *, quick: bool = False, seed: int = 0, only: Iterable[
     ``quick``: fewer angles and samples. ``only``: names of ``LAWS``. A loaded BSDF skips what has to load it
     again. Raises ``UsageError`` for anything else, and ``SceneError`` for a dict that Mitsuba cannot load.
     """
-    import mitsuba as mi
-
     runtime.use()
     recipe = Recipe.of(bsdf)
     loaded = bsdf if recipe.description is None else recipe.open()
@@ -43,8 +42,6 @@ def check_bsdf(bsdf: Any, *, quick: bool = False, seed: int = 0, only: Iterable[
 
 def variants(law: Law, case: Case) -> None:
     """Values in the scalar variant, and in the spectral one where colours are grey."""
-    import mitsuba as mi
-
     here = mi.variant()
     case.recipe.load()
     few = case.pairs.only(slice(0, case.count(200, 800)))
@@ -70,8 +67,6 @@ def variants(law: Law, case: Case) -> None:
 
 def _there(law: Law, case: Case, other: str, few: Any) -> tuple[Array, Array] | None:
     """Return value and density in another variant; None where it or the plugin is not available."""
-    import mitsuba as mi
-
     if runtime.obstacle(other):
         law.notes.append(f"{other} cannot run here")
         return None
@@ -91,8 +86,6 @@ def _there(law: Law, case: Case, other: str, few: Any) -> tuple[Array, Array] | 
 
 
 def _others(here: str, grey: bool, law: Law) -> list[str]:
-    import mitsuba as mi
-
     known = set(mi.variants())
     pairs = (("llvm_ad_", "scalar_"), ("cuda_ad_", "scalar_"), ("scalar_", "llvm_ad_"))
     found = [here.replace(a, b) for a, b in pairs if here.startswith(a) and here.replace(a, b) in known]
@@ -106,8 +99,6 @@ def _others(here: str, grey: bool, law: Law) -> list[str]:
 
 def switch(law: Law, case: Case) -> None:
     """Values after a switch to another variant and back, of the BSDF as it was and loaded anew."""
-    import mitsuba as mi
-
     here = mi.variant()
     other = (
         "scalar_rgb"

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks import snippets
@@ -155,8 +157,6 @@ def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:
     Weight 0 is how ``sample`` refuses: its direction is then any, or on the wrong side. It may also be that
     the value is 0 there, or that the weight is wrong; but then the stated density is that of the direction.
     """
-    import mitsuba as mi
-
     across = wi[..., 2] * s.wo[:, 2] < 0
     astray = (
         np.where(across, s.type & int(mi.BSDFFlags.Reflection), s.type & int(mi.BSDFFlags.Transmission)) != 0
@@ -191,9 +191,6 @@ def excess(one: Array, other: Array, allowed: Array) -> Array:
 
 def parameters(case: Case) -> list[tuple[str, Any]]:
     """Return the parameters that hold floating-point numbers which are amounts."""
-    import drjit as dr
-    import mitsuba as mi
-
     params = mi.traverse(case.bsdf)
     found = []
     for key in params.keys():  # noqa: SIM118 - SceneParameters is not a dict
@@ -212,8 +209,6 @@ def parameters(case: Case) -> list[tuple[str, Any]]:
 @contextmanager
 def changed(case: Case, key: str, change: Any) -> Iterator[Any]:
     """Change a parameter for a while."""
-    import mitsuba as mi
-
     params = mi.traverse(case.bsdf)
     before = params[key] if isinstance(params[key], float) else type(params[key])(params[key])
     params[key] = change(before)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks import snippets
@@ -16,8 +18,6 @@ GRADIENT = 2e-2  # relative; differences of two widths agree better
 
 def gradients(law: Law, case: Case) -> None:
     """Forward derivatives of the mean value by every differentiable parameter, against differences."""
-    import mitsuba as mi
-
     if is_scalar() or "_ad_" not in mi.variant():
         raise Skip(f"{mi.variant()} has no derivatives")
     case.need_smooth()
@@ -77,9 +77,6 @@ def _lit(case: Case) -> Pairs:
 
 def _values(case: Case) -> Any:
     """Return values at pairs as a Dr.Jit array with derivatives, each over what it is without a change."""
-    import drjit as dr
-    import mitsuba as mi
-
     few = _lit(case)
     wi, wo = (mi.Vector3f(np.ascontiguousarray(x.T)) for x in (few.wi, few.wo))
     si = interaction(wi, mi.Point2f(np.ascontiguousarray(few.uv.T)))
@@ -91,9 +88,6 @@ def _values(case: Case) -> Any:
 
 def _derivatives(case: Case, key: str) -> tuple[Array, bool, Array]:
     """Return derivatives by a shift of the parameter, if there is a way to it at all, and which are none."""
-    import drjit as dr
-    import mitsuba as mi
-
     shift = mi.Float(0)
     dr.enable_grad(shift)
     with changed(case, key, lambda old: type(old)(old + shift)):
@@ -116,8 +110,6 @@ def _differences(case: Case, key: str) -> tuple[Array, Array]:
     either side are apart: where a value has a kink, as at the end of a range, either one is a derivative.
     Where a lobe is so narrow that it moves away within every width, differences say nothing: infinity.
     """
-    import mitsuba as mi
-
     value = abs(float(np.mean(np.array(mi.traverse(case.bsdf)[key]))))
     steps = np.array(WIDTHS) * (value or 0.05)
 

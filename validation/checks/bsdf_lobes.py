@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks import snippets
@@ -55,8 +56,6 @@ def components(law: Law, case: Case) -> None:
 
 
 def _updated(law: Law, case: Case, count: int) -> None:
-    import mitsuba as mi
-
     if case.recipe.description is not None:
         copy = case.recipe.load()
         params = mi.traverse(copy)
@@ -83,8 +82,6 @@ def _wrong_side(case: Case, component: int, flags: int, value: Array) -> tuple[i
 
 
 def _allowed(flags: int, wi: Array, wo: Array, *, smooth: bool) -> Array:
-    import mitsuba as mi
-
     f = mi.BSDFFlags
     reflects = f.DiffuseReflection, f.GlossyReflection, *(() if smooth else (f.DeltaReflection,))
     transmits = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from mrt_mitsuba.validation.checks.law import Law, Skip
@@ -23,7 +24,6 @@ class Case:
 
     def sample(self) -> tuple[Array, ...]:
         """Return direction, distance, density, density again, whether delta, weight and value of samples."""
-        import drjit as dr
 
         def call(mi: Any, p: Any, u: Any) -> list[Any]:
             it = dr.zeros(mi.SurfaceInteraction3f)

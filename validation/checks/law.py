@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import UsageError
@@ -176,8 +177,6 @@ def examine(
     quick: bool = False,
 ) -> Check:
     """Check laws one by one; what a plugin raises fails the law during which it did."""
-    import mitsuba as mi
-
     chosen = list(laws if only is None else only)
     unknown = [name for name in chosen if name not in laws]
     if unknown:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.scene.loading import load_dict
@@ -37,8 +38,6 @@ class Recipe:
 
     def load(self) -> Any:
         """Load it in the current variant. Raises ``Skip`` without a dict."""
-        import mitsuba as mi
-
         if self.description is None:
             raise Skip("a loaded object was given: this needs the dict that it is made from")
         return mi.load_dict(_made(self.description))
@@ -49,8 +48,6 @@ class Recipe:
 
     def scene(self) -> Any:
         """Load a scene that holds the shape alone, or an instance with its group. Raises ``Skip`` as well."""
-        import mitsuba as mi
-
         given = self.description or {}
         groups = [
             key for key, value in given.items() if isinstance(value, dict) and value["type"] == "shapegroup"
@@ -77,8 +74,6 @@ def _kept(value: Any) -> Any:
 
 
 def _made(value: Any) -> Any:
-    import mitsuba as mi
-
     if isinstance(value, dict):
         return {key: _made(entry) for key, entry in value.items()}
     if isinstance(value, Transform):

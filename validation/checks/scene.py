@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
@@ -188,8 +190,6 @@ def _hunt(source: Any, quick: bool, seed: int) -> Fault | None:
 
 def _bad(source: Any, spp: int, seed: int) -> np.ndarray:
     """Return which pixels are not finite. [H, W]"""
-    import mitsuba as mi
-
     picture = mi.render(source.scene, integrator=source.integrator, sensor=source.sensor, spp=spp, seed=seed)
     return ~np.isfinite(np.array(picture)).all(axis=-1)
 
@@ -208,8 +208,6 @@ def _seen_again(source: Any, crop: tuple[int, int, int, int], most: int, seed: i
 @contextmanager
 def _cropped(sensor: Any, crop: tuple[int, int, int, int]) -> Iterator[None]:
     """Crop the film for a while."""
-    import mitsuba as mi
-
     params = mi.traverse(sensor)
     before = {key: type(params[key])(params[key]) for key in ("film.crop_size", "film.crop_offset")}
 
@@ -227,8 +225,6 @@ def _cropped(sensor: Any, crop: tuple[int, int, int, int]) -> Iterator[None]:
 
 def _culprit(source: Any, spp: int, seed: int) -> str:
     """Follow paths through the crop, and name the object whose own numbers are first not finite."""
-    import mitsuba as mi
-
     if mi.variant().startswith("scalar"):
         return "something that scalar variants do not reveal: check it in a vectorised one"
     counts: Counter[str] = Counter()
@@ -242,8 +238,6 @@ def _culprit(source: Any, spp: int, seed: int) -> str:
 
 def _camera_rays(source: Any, rng: Any) -> Any:
     """Return rays through random points of the film's crop."""
-    import mitsuba as mi
-
     draw = rng.next_float32
     # the unit square covers the crop of a cropped film
     ray, _ = source.sensor.sample_ray(draw(), draw(), mi.Point2f(draw(), draw()), mi.Point2f(draw(), draw()))
@@ -252,9 +246,6 @@ def _camera_rays(source: Any, rng: Any) -> Any:
 
 def _follow(source: Any, count: int, seed: int) -> Counter[str]:
     """Trace one batch of paths; return how often each object was the first to give an infinity or NaN."""
-    import drjit as dr
-    import mitsuba as mi
-
     scene, ctx, rng = source.scene, mi.BSDFContext(), mi.PCG32(count, initstate=seed)
     ray, active, draw = _camera_rays(source, rng), mi.Bool(True), rng.next_float32
     counts: Counter[str] = Counter()
@@ -304,9 +295,6 @@ def _name(plugin: Any) -> str:
 
 
 def _not_finite(*values: Any) -> Any:
-    import drjit as dr
-    import mitsuba as mi
-
     bad = mi.Bool(False)
     for value in values:
         for component in [value] if dr.depth_v(value) == 1 else value:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
@@ -28,8 +29,6 @@ def check_shape(
     ``quick``: fewer rays. ``only``: names of ``LAWS``. Raises ``UsageError`` for anything else, and
     ``SceneError`` for a dict that Mitsuba cannot load.
     """
-    import mitsuba as mi
-
     runtime.use()
     recipe = Recipe.of(shape)
     loaded = shape if recipe.description is None else recipe.open()
@@ -69,8 +68,6 @@ def bbox(law: Law, case: Case) -> None:
 
 def variants(law: Law, case: Case) -> None:
     """Hits in the scalar variant against those in the vectorised one."""
-    import mitsuba as mi
-
     case.recipe.with_()
     here = mi.variant()
     swap = ("scalar_", "llvm_ad_") if is_scalar() else (here.split("_")[0] + "_ad_", "scalar_")

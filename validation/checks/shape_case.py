@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import UsageError
@@ -72,8 +73,6 @@ class Case:
     seed: int
 
     def __post_init__(self) -> None:
-        import mitsuba as mi
-
         self.rng = np.random.default_rng(self.seed)
         self.target = self.shape
         if isinstance(self.shape, mi.Shape):
@@ -185,8 +184,6 @@ def leave(p: Array, n: Array, d: Array) -> Array:
 
 def corners(shape: Any) -> Array | None:
     """Return the vertices of a mesh and the middles of its edges; None for other shapes."""
-    import mitsuba as mi
-
     if not isinstance(shape, mi.Mesh):
         return None
     params = mi.traverse(shape)

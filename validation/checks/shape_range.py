@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks import snippets
@@ -16,8 +17,6 @@ FAR = 1e4  # sizes away
 
 def scale(law: Law, case: Case) -> None:
     """A millionth and a million times the size: the same, scaled. Powers of two leave no roundings."""
-    import mitsuba as mi
-
     given = (case.recipe.with_().description or {}).get("to_world")
     matrix = given.matrix if isinstance(given, Transform) else np.eye(4)
     o, d, seen = case.seen

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from scipy import stats
 
@@ -136,8 +137,6 @@ def _directions(law: Law, case: Case, u: Array) -> None:
     o = case.around(count)
 
     def sample(mi: Any, origin: Any, second: Any) -> list[Any]:
-        import drjit as dr
-
         it = dr.zeros(mi.Interaction3f)
         it.p = origin
         ds = case.shape.sample_direction(it, second)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from scipy import stats
 
@@ -134,8 +135,6 @@ def _roundoff(law: Law, case: Case) -> None:
 
 def normals(law: Law, case: Case) -> None:
     """Unit length, outwards, as the partial derivatives and differences have it."""
-    import mitsuba as mi
-
     o, d, met = case.met
     length = np.abs(np.linalg.norm(np.stack([met.n, met.shading]).astype(np.float64), axis=-1) - 1).max(
         axis=0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks.recipe import source
@@ -219,8 +220,6 @@ SWITCH = (
 
 def bsdf(loaded: Any, description: dict[str, Any] | None, body: str, names: Mapping[str, Any]) -> str:
     """Return a program that loads a BSDF, sets ``names`` and runs ``body``."""
-    import mitsuba as mi
-
     variant = mi.variant()
     if "PCG32(n)" in body:
         variant = variant.replace("scalar_", "llvm_ad_")
@@ -325,14 +324,10 @@ print("pdf_position() / density:", dr.min(ratio), "...", dr.max(ratio))
 
 def shape(loaded: Any, description: dict[str, Any] | None, body: str, names: Mapping[str, Any]) -> str:
     """Return a program that loads a shape, sets ``names`` and runs ``body``."""
-    import mitsuba as mi
-
     shown = {key: _literal(value) for key, value in names.items()}
     return head("shape", loaded, description, mi.variant()) + body.format(**shown)
 
 
 def positions(loaded: Any, description: dict[str, Any] | None) -> str:
     """Return the program about sampled positions."""
-    import mitsuba as mi
-
     return head("shape", loaded, description, mi.variant().replace("scalar_", "llvm_ad_")) + POSITIONS

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
@@ -73,8 +75,6 @@ def methods(count: int) -> tuple[dict[str, Callable[[], np.ndarray]], dict[str, 
 
     The spheres are random ones in the cube [−1, 1]³ that fill a hundredth of it, however many they are.
     """
-    import mitsuba as mi
-
     centers = np.random.default_rng(count).uniform(-1, 1, (count, 3)).astype(np.float32)
     radius = float((0.08 / count * 3 / (4 * np.pi)) ** (1 / 3))
     few = int(np.clip(TESTS / count, 4096, MOST_RAYS))
@@ -92,9 +92,6 @@ def methods(count: int) -> tuple[dict[str, Callable[[], np.ndarray]], dict[str, 
 
 def _rays(count: int) -> Any:
     """Return the first ``count`` of a fixed sequence of rays."""
-    import drjit as dr
-    import mitsuba as mi
-
     rng = np.random.default_rng(7)
     numbers = rng.normal(size=(MOST_RAYS, 3)), rng.uniform(-1, 1, (MOST_RAYS, 3))
     origin, target = (n[:count] for n in numbers)
@@ -106,8 +103,6 @@ def _rays(count: int) -> Any:
 
 
 def _loop(centers: np.ndarray, radius: float, ray: Any) -> Callable[[], np.ndarray]:
-    import drjit as dr
-    import mitsuba as mi
 
     from mrt_mitsuba.plugins.intersect import intersect_sphere
 
@@ -124,7 +119,6 @@ def _loop(centers: np.ndarray, radius: float, ray: Any) -> Callable[[], np.ndarr
 
 
 def _tree(centers: np.ndarray, radius: float, ray: Any) -> Callable[[], np.ndarray]:
-    import mitsuba as mi
 
     from mrt_mitsuba.plugins.quadrics import Quadrics
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
@@ -128,8 +129,6 @@ def _compare_modes(study: Study, extent: Extent) -> None:
 
 
 def _load(scene: dict[str, Any]) -> Any:
-    import mitsuba as mi
-
     mrt.register()
     return mi.load_dict(scene)
 
@@ -254,8 +253,6 @@ def _show_contours(study: Study, number: int, rows: Sequence[Row]) -> None:
 
 def _compare_with_mitsuba(study: Study, *, quick: bool) -> None:
     """Compare lattices with random samples that Mitsuba places and filters itself, on scene 3."""
-    import mitsuba as mi
-
     width, height, spp = (96, 72, 1024) if quick else (200, 150, 8192)
     scene = _load(mrt.scene_dict(3, width=width, height=height, fresnel="dielectric"))
     whitted = {"type": "mrt_whitted", "min_contribution": 0.0}
@@ -313,8 +310,6 @@ def variance_error(detector: str, *, spp: int, lattice: str) -> float:
 
     Behind a veil that stops half of the rays: of n zeros and ones with mean m, it is m (1 - m) / (n - 1).
     """
-    import mitsuba as mi
-
     black = {"type": "diffuse", "reflectance": 0.0}
     film = {"type": "hdrfilm", "width": 40, "height": 30, "rfilter": {"type": "box"}}
     look = mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, 1], [0, 1, 0])

@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
@@ -47,8 +48,6 @@ class Step:
 
 def without_approximations(number: int, *, width: int, height: int, spp: int) -> list[Step]:
     """Return the report's picture and those with ever fewer approximations, down to the stock flavour."""
-    import mitsuba as mi
-
     size: dict[str, Any] = {"width": width, "height": height}
     scene = report_scene(number)
     plain = physical(scene)
@@ -97,8 +96,6 @@ def physical(scene: Scene, *, least_alpha: float = 1e-4, diffuse: bool = True) -
 
 def path_estimate(nodes: dict[str, Any], *, spp: int, seed: int = 0, integrator: Any = PATH) -> Estimate:
     """Return the mean of RENDERS independent renders through the pixels' centres."""
-    import mitsuba as mi
-
     scene = mi.load_dict(nodes)
     return estimate(
         [

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import product
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
@@ -96,8 +97,6 @@ def run(study: Study, *, quick: bool) -> None:
 
 def load(**parameters: Any) -> Any:
     """Return an ``mrt_bsdf``."""
-    import mitsuba as mi
-
     return mi.load_dict({"type": "mrt_bsdf", **parameters})
 
 
@@ -161,8 +160,6 @@ def _report_albedo() -> float:
 
 def dielectric_terms(study: Study, *, quick: bool) -> None:
     """Compare ``roughdielectric``'s reflection and factors with ours, the diffuse term with ``diffuse``."""
-    import mitsuba as mi
-
     errors: dict[str, float] = dict.fromkeys(("D", "G", "F", "reflection", "diffuse"), 0.0)
     for alpha, ior in product((0.02, 0.1, 0.3, 0.7, 1.0), (1.1, 1.5, 2.4)):
         wi, wo = lobe_pairs(2_000 if quick else 20_000, alpha)
@@ -197,8 +194,6 @@ def dielectric_terms(study: Study, *, quick: bool) -> None:
 
 def _factors(alpha: float, ior: float, wi: Any, wo: Any) -> dict[str, float]:
     """Return ratios of values that differ in one factor only, so that each is seen through the BSDF."""
-    import mitsuba as mi
-
     i, o = mi.Vector3f(wi.T), mi.Vector3f(wo.T)
     h = mi.Vector3f(
         ((wi.astype(float) + wo) / np.linalg.norm(wi.astype(float) + wo, axis=-1, keepdims=True)).T

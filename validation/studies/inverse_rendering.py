@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.tools.bsdf_probe import rgb
@@ -17,8 +19,6 @@ NAMES = ("ball.bsdf.alpha", "ball.bsdf.diffuse_reflectance.value")
 
 def run(study: Study, *, quick: bool) -> None:
     """Start from a wrong guess, follow the gradient of the squared difference, and compare with the truth."""
-    import mitsuba as mi
-
     target = np.array(mi.render(_scene(ALPHA, KD), spp=256, seed=1000))
     scene = _scene(START_ALPHA, START_KD)
     first = np.array(mi.render(scene, spp=64, seed=2000))
@@ -43,8 +43,6 @@ def run(study: Study, *, quick: bool) -> None:
 
 
 def _scene(alpha: float, kd: tuple[float, float, float]) -> Any:
-    import mitsuba as mi
-
     look = mi.ScalarTransform4f().look_at([0, -4, 0], [0, 0, 0], [0, 0, 1])
     film = {
         "type": "hdrfilm",
@@ -84,8 +82,6 @@ def _descend(scene: Any, target: Any, *, spp: int) -> np.ndarray:
     Every picture has the same seed, and one light leaves no noise but that of the points in a pixel: the
     difference is a smooth function of the parameters.
     """
-    import drjit as dr
-    import mitsuba as mi
     from scipy.optimize import minimize
 
     parameters = mi.traverse(scene)

@@ -11,6 +11,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
@@ -83,8 +85,6 @@ def compare_with_spheres(study: Study, *, width: int, height: int, samples: tupl
 
 
 def _mesh_errors(study: Study, count: int) -> None:
-    import mitsuba as mi
-
     ray = _rays(count)
     exact = _exact(ray, mi.load_dict(CONE).frame())
     with study.stage("Mesh cones", 1) as advance:
@@ -139,17 +139,12 @@ def _relative_error(found: np.ndarray, exact: np.ndarray) -> np.ndarray:
 
 def search(cone: dict[str, Any], ray: Any) -> Callable[[], np.ndarray]:
     """Return a function that returns the distances [N] of rays to a mesh cone, inf for none."""
-    import mitsuba as mi
-
     scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "cone": cone})
     return lambda: np.array(scene.ray_intersect_preliminary(ray).t)
 
 
 def _rays(count: int) -> Any:
     """Return rays from a sphere around the cone towards points near its axis."""
-    import drjit as dr
-    import mitsuba as mi
-
     rng = np.random.default_rng(3)
     o = rng.normal(size=(count, 3))
     o = 4 * o / np.linalg.norm(o, axis=1, keepdims=True) + MIDDLE

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
@@ -131,8 +132,6 @@ def _without_reflection(scene: Scene) -> Scene:
 
 def _textured(description: dict[str, Any]) -> dict[str, Any]:
     """Return the same colours, each as a picture of one colour."""
-    import mitsuba as mi
-
     for node in description.values():
         if isinstance(node, dict) and node.get("type") == "mrt_bsdf":
             colour = np.full((2, 2, 3), node["diffuse_reflectance"]["value"], np.float32)

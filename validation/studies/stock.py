@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
@@ -83,8 +84,6 @@ def compare_direct(scene: Scene, light: int, *, width: int, height: int) -> Dire
 
     One light at a time, since ``direct`` picks one at random.
     """
-    import mitsuba as mi
-
     scene = dataclasses.replace(scene, lights=(scene.lights[light],))
     size: dict[str, Any] = {"width": width, "height": height}
     nodes = mrt.scene_dict(scene, fresnel="dielectric", **size)
@@ -199,8 +198,6 @@ def gloss_limit(alphas: Sequence[float], *, width: int, height: int, spp: int, s
 
 
 def _shiny_spheres(alpha: float, width: int, height: int) -> dict[str, Any]:
-    import mitsuba as mi
-
     scene = report_scene(0)
     black: dict[str, Any] = {"alpha": alpha, "ior": 3.0, "diffuse": (0, 0, 0), "specular": (1, 1, 1)}
     spheres = [
@@ -253,8 +250,6 @@ def _gloss(study: Study, quick: bool) -> None:
 
 def _materials(study: Study) -> None:
     """Check what the report does not have: Mitsuba's integrators draw it alike, ray by ray."""
-    import mitsuba as mi
-
     for name, (shapes, theirs, spp, limit) in _stock_scenes().items():
         nodes = {**_view(), **shapes}
         ours = {"type": "mrt_whitted", "clamp": False, "bounce_budget": "plain", "max_depth": 5}
@@ -270,8 +265,6 @@ def _materials(study: Study) -> None:
 
 
 def _view() -> dict[str, Any]:
-    import mitsuba as mi
-
     look = mi.ScalarTransform4f().look_at([0, -1, 5], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 64, "height": 48, "rfilter": {"type": "box"}}
     return {"type": "scene", "sensor": {"type": "perspective", "fov": 40, "to_world": look, "film": film}}
@@ -279,8 +272,6 @@ def _view() -> dict[str, Any]:
 
 def _stock_scenes() -> dict[str, tuple[dict[str, Any], dict[str, Any], int, float]]:
     """Return shapes, Mitsuba's integrator, rays a pixel, and the difference that counts, by name."""
-    import mitsuba as mi
-
     turn = mi.ScalarTransform4f().translate([0, 1, 0]).rotate([1, 0, 0], -90).scale(3)  # seen from below
     paper = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.6}}
     lamp = {"type": "point", "position": [1, -2, 1], "intensity": 10.0}
@@ -321,8 +312,6 @@ def _waves() -> np.ndarray:
 
 def _smooth_ball() -> dict[str, Any]:
     """Return a coarse ball whose corners have the normals of a sphere."""
-    import mitsuba as mi
-
     mesh = torus((0, 0, 0), 0.9, 0.5, report_scene(0).spheres[0].material, rings=16, sides=8)
     around = mesh.vertices * [1, 1, 0]
     middle = 0.9 * around / np.linalg.norm(around, axis=1, keepdims=True)

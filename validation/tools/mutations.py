@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
@@ -105,8 +106,6 @@ def trials(counts: Sequence[int], *, width: int, height: int) -> list[Trial]:
 def _without_clamp(spp: int, size: dict[str, Any]) -> Comparison:
     """Return ``mrt_whitted`` with and without clamp, in Mitsuba's own render loop: at random places in the
     pixels."""
-    import mitsuba as mi
-
     scene = mi.load_dict(mrt.scene_dict(CLAMPED_SCENE, fresnel="dielectric", **size))
 
     def drawn(clamp: bool, seed: int) -> Estimate:

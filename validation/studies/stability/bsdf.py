@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.oracles import exact
@@ -111,14 +112,10 @@ class FresnelGrid:
         )
 
     def errors(self, fresnel: Callable[[Any, Any], Any]) -> np.ndarray:
-        import mitsuba as mi
-
         return _relative(fresnel(mi.Float(self.cosines), mi.Float(self.iors)), self.truth)
 
 
 def _errors(formula: Any, lobes: Lobes, truth: Truth, angles: FresnelGrid) -> Errors:
-    import mitsuba as mi
-
     alpha = mi.Float(lobes.alpha)
     dr.enable_grad(alpha)
     terms = formula.terms(mi.Vector3f(lobes.wi.T), mi.Vector3f(lobes.wo.T), alpha, mi.Float(lobes.ior))
@@ -205,8 +202,6 @@ def _conditioning(cases: Cases, lobes: Lobes) -> None:
 
 def _total_reflection(cases: Cases) -> None:
     """Measure F around the critical angle, where it ends in a square root: errors are those of g = 0."""
-    import mitsuba as mi
-
     iors = np.repeat(np.array([0.5, 0.9, 0.99, 0.9999], np.float32), 81)
     critical = np.sqrt((1 - np.float64(iors)) * (1 + np.float64(iors)))
     steps = np.tile(np.arange(-40, 41), 4)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import filters, runtime
@@ -34,8 +35,6 @@ def run(study: Study, *, quick: bool) -> None:
     """Make the table of cases, in both kinds of variants."""
     del quick  # all of it is quick
     cases = Cases(study, "filters", "Filters")
-    import mitsuba as mi
-
     before = mi.variant()
     for variant in (before, runtime.SLOW):
         runtime.use(variant)

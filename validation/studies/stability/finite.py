@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.plugins.intersect import (
@@ -61,8 +62,6 @@ class _Draw:
     """Random numbers of N lanes; every third is an extreme one."""
 
     def __init__(self, count: int, seed: int) -> None:
-        import mitsuba as mi
-
         self.count = count
         self._generator = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))
 
@@ -82,8 +81,6 @@ class _Draw:
 
     def unit(self) -> Any:
         """Return a unit vector, often with components that are 0 or tiny."""
-        import mitsuba as mi
-
         v = self.vector(mi.Vector3f)
         length = dr.norm(v)
         usable = (length > 1e-15) & (length < 1e15)
@@ -91,16 +88,12 @@ class _Draw:
 
     def local(self) -> Any:
         """Return a direction by its cosine to +z."""
-        import mitsuba as mi
-
         z = self._or(COSINES, 2 * self._generator.next_float32() - 1)
         sine, cosine = dr.sincos(2 * dr.pi * self.uniform())
         r = dr.sqrt(dr.maximum((1 - z) * (1 + z), 0))
         return mi.Vector3f(r * cosine, r * sine, z)
 
     def _or(self, extremes: Sequence[float], ordinary: Any) -> Any:
-        import mitsuba as mi
-
         table = mi.Float(np.array(extremes, np.float32))
         index = mi.UInt32(self._generator.next_float32() * 3 * len(extremes))
         extreme = index < len(extremes)
@@ -109,8 +102,6 @@ class _Draw:
 
 def _bad(*values: Any) -> Any:
     """Return where any of several numbers or colours is not finite, or negative."""
-    import mitsuba as mi
-
     result = mi.Bool(False)
     for value in values:
         for component in [value] if dr.depth_v(value) == 1 else value:
@@ -129,8 +120,6 @@ def _bsdf(form: str, visible: bool) -> Callable[[_Draw], Any]:
     """Return value, density, sample and mirror reflectance, with an alpha and indices for each lane."""
 
     def evaluate(draw: _Draw) -> Any:
-        import mitsuba as mi
-
         bsdf = mi.load_dict(
             {
                 "type": "mrt_bsdf",
@@ -160,8 +149,6 @@ def _bsdf(form: str, visible: bool) -> Callable[[_Draw], Any]:
 
 
 def _light(draw: _Draw) -> Any:
-    import mitsuba as mi
-
     light = mi.load_dict({"type": "mrt_light", "intensity": 1e3})
     parameters = mi.traverse(light)
     parameters["position"] = draw.vector(mi.Point3f)
@@ -175,8 +162,6 @@ def _light(draw: _Draw) -> Any:
 
 
 def _texture(draw: _Draw) -> Any:
-    import mitsuba as mi
-
     texels = np.random.default_rng(9).random((5, 7, 3)).astype(np.float32)
     texture = mi.load_dict({"type": "mrt_texture", "bitmap": mi.Bitmap(texels)})
     si = dr.zeros(mi.SurfaceInteraction3f, draw.count)
@@ -186,15 +171,11 @@ def _texture(draw: _Draw) -> Any:
 
 
 def _plane(draw: _Draw) -> Any:
-    import mitsuba as mi
-
     t = intersect_plane(draw.vector(mi.Point3f), draw.unit(), draw.unit(), draw.coordinate())
     return ~(t > 0)
 
 
 def _sphere(draw: _Draw) -> Any:
-    import mitsuba as mi
-
     o, d, center = draw.vector(mi.Point3f), draw.unit(), draw.vector(mi.Point3f)
     return ~(intersect_sphere(o, d, center, draw.log(1e-6, 1e6, (1e-7, 0.5, 1, 1e7))) > 0)
 
@@ -203,8 +184,6 @@ def _quadric(to_frame: Any, intersect: Any, surface: Any) -> Callable[[_Draw], A
     """Return a check of distance and normal of a random shape in each lane; some rays start at its end."""
 
     def evaluate(draw: _Draw) -> Any:
-        import mitsuba as mi
-
         end, axis = draw.vector(mi.Point3f), draw.unit()
         frame = to_frame(
             end, end + axis * draw.log(1e-2, 1e2, (1e-3, 1, 1e3)), draw.log(1e-2, 1e2, (1e-3, 1, 1e3))
@@ -222,8 +201,6 @@ def _quadric(to_frame: Any, intersect: Any, surface: Any) -> Callable[[_Draw], A
 
 def _whitted(draw: _Draw) -> Any:
     """Return bad results of random rays through a scene of every kind of shape, some from inside."""
-    import mitsuba as mi
-
     scene = mi.load_dict(_everything().to_dict())
     integrator = mi.load_dict({"type": "mrt_whitted", "clamp": False, "min_contribution": 0.0})
     integrator.prepare(scene)

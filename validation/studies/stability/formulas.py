@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 from mrt_mitsuba.plugins import fresnel, microfacet
 
@@ -77,8 +78,6 @@ class Mitsuba:
     name = "roughconductor"
 
     def terms(self, wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
-        import mitsuba as mi
-
         microfacets = mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, alpha)
         h = dr.normalize(wi + wo)
         d, g = microfacets.eval(h), microfacets.G(wi, wo, h)
@@ -86,8 +85,6 @@ class Mitsuba:
         return Terms(d, g, value, d * microfacets.smith_g1(wi, h) / (4 * wi.z))
 
     def fresnel(self, cos_theta: Any, ior: Any) -> Any:
-        import mitsuba as mi
-
         return mi.fresnel_conductor(cos_theta, mi.Complex2f(ior, 0))
 
 
@@ -97,8 +94,6 @@ class Ours:
     name = "mrt_bsdf"
 
     def __init__(self) -> None:
-        import mitsuba as mi
-
         self.bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": "dielectric", "diffuse_reflectance": 0.0})
 
     def terms(self, wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
@@ -109,8 +104,6 @@ class Ours:
 
     def _plugin(self, wi: Any, wo: Any, alpha: Any, ior: Any) -> tuple[Any, Any]:
         """Return the plugin itself, given one alpha and index for each pair of directions."""
-        import mitsuba as mi
-
         parameters = mi.traverse(self.bsdf)
         for name, values in (("alpha", alpha), ("int_ior", ior)):
             parameters[name] = type(parameters[name])(values)

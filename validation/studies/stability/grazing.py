@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.scene.model import Cone, Cylinder, Material
@@ -56,8 +57,6 @@ def grazing_cases(cases: Cases, *, quick: bool) -> None:
 
 def _upright(kind: str, rng: np.random.Generator) -> tuple[list[Any], np.ndarray, dict[str, Any]]:
     """Return twenty objects apart from each other, as such, as numbers [20, 7], and as a group."""
-    import mitsuba as mi
-
     things, make = [], KINDS[kind]
     for x in range(20):
         base, radius = np.array([1.7 * x, 0.3 * x, 0], np.float32), np.float32(rng.uniform(0.2, 0.6))
@@ -126,8 +125,6 @@ def _exact(things: list[Any], which: np.ndarray, o: np.ndarray, d: np.ndarray) -
 
 def traced(shape: dict[str, Any], o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which rays [N, 3] ``mrt_whitted`` finds to meet a shape, and how far away."""
-    import mitsuba as mi
-
     scene = mi.load_dict({"type": "scene", "shape": shape})
     integrator = mi.load_dict({"type": "mrt_whitted"})
     integrator.prepare(scene)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.scene.model import Cone, Cylinder, Material, Mesh, Plane, Sphere
@@ -79,8 +80,6 @@ MATTE = Material(0.0, 1.0, (0, 0, 0), (1, 1, 1))
 
 def _triangle_dict(size: float) -> dict[str, Any]:
     """Return the triangle, mirrored and of size 1, with what puts it right."""
-    import mitsuba as mi
-
     positions = mi.Bitmap((CORNERS * [1, 1, -1]).astype(np.float32)[np.newaxis])
     faces = mi.Bitmap(np.array([[[0, 2, 1]]], np.uint32))
     right = mi.ScalarTransform4f().scale([size, size, -size])
@@ -272,8 +271,6 @@ def stand_in_cases(cases: Cases) -> None:
     A side is a turn of 2π / 256 wide: the mesh lies within r (π / 256)² / 2 of the surface, and its normals
     and texture coordinates are off by half a side at most, where a triangle ends in the apex.
     """
-    import mitsuba as mi
-
     o, d = _rays(1.0, 4.0, 20_000)
     for solid in (s for s in SOLIDS if s.name in ("cone", "cylinder")):
         single = {**solid.to_dict(1.0), "segments": SIDES}
@@ -322,8 +319,6 @@ def _around(cases: Cases, solid: Solid, shape: dict[str, Any], o: Any, d: Any) -
 
 def _met(shape: dict[str, Any], o: np.ndarray, d: np.ndarray, *, exact: bool = False) -> Any:
     """Return interactions of rays with the mesh of a shape, or with its exact surface."""
-    import mitsuba as mi
-
     scene, rays = mi.load_dict({"type": "scene", "shape": shape}), mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T))
     if not exact:
         return scene.ray_intersect(rays)
@@ -417,8 +412,6 @@ def _light(size: float) -> np.ndarray:
 
 def _trace(solid: Solid, size: float, o: np.ndarray, d: np.ndarray) -> _Traced:
     """Trace rays with ``mrt_whitted`` against a white mirror of that form under one light."""
-    import mitsuba as mi
-
     mirror = {"type": "mrt_bsdf", "fresnel": "unity", "alpha": 1.0, "diffuse_reflectance": 1.0}
     scene = mi.load_dict(
         {

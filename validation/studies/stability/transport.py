@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
@@ -221,8 +222,6 @@ def _cut_offs(cases: Cases) -> None:
 
 def _bounces(cases: Cases, depths: Sequence[int]) -> None:
     """Check a ray to and fro between two mirrors: the geometric sum of what both send back."""
-    import mitsuba as mi
-
     before = mi.variant()
     variants = {before: (0.5, 0.999, 1.0, 1.5), runtime.SLOW: (0.999,)}
     for variant, reflectances in variants.items():
@@ -262,8 +261,6 @@ def _corridor(reflectance: float) -> dict[str, Any]:
 
 
 def _to_and_fro(scene: Any, clamp: bool, depth: int) -> float:
-    import mitsuba as mi
-
     integrator = mi.load_dict(
         {
             "type": "mrt_whitted",
