@@ -49,14 +49,12 @@ def _holds(law: Law, case: Case, key: str) -> bool:
     beyond = np.maximum(off - error, 0)[usual].sum()
     measured = beyond / max(np.abs(slope)[usual].sum(), np.abs(found)[usual].sum(), 1e-30)
     show = case.at(snippets.GRADIENT, few, key=key)
-    law.at_most(
+    what = (
         f"derivative of values by {key}{'' if attached else ' (detached)'}, relative, beyond the error of "
-        "differences",
-        measured,
-        GRADIENT,
-        "differences of two widths agree better than that, or the difference is allowed for",
-        show(int(np.where(usual, off, 0).argmax())),
+        "differences"
     )
+    why = "differences of two widths agree better than that, or the difference is allowed for"
+    law.at_most(what, measured, GRADIENT, why, show(int(np.where(usual, off, 0).argmax())))
     why = "one of them spoils a whole gradient"
     law.none(f"derivatives by {key} that are not finite, of finite values", broken, why, show)
     return attached or measured <= GRADIENT

@@ -20,24 +20,14 @@ def components(law: Law, case: Case) -> None:
     flags = [int(bsdf.flags(i)) for i in range(count)]
     apart = bin(np.bitwise_or.reduce(flags or [0]) ^ int(bsdf.flags())).count("1")
     why = "flags() is the union of flags(i)"
-    law.at_most(
-        "flags of the whole that no component has, or the other way around",
-        apart,
-        0,
-        why,
-        case.snippet(snippets.FLAGS),
-    )
+    what = "flags of the whole that no component has, or the other way around"
+    law.at_most(what, apart, 0, why, case.snippet(snippets.FLAGS))
     _updated(law, case, count)
     parts = [case.probe.eval(pairs.wi, pairs.wo, pairs.uv, context(i)) for i in range(count)]
     allowed = case.spread(case.probe.eval, pairs.wi, pairs.wo, pairs.uv)
     error = excess(np.sum(parts, axis=0), pairs.value, allowed)
-    law.most(
-        "sum of the components against the whole, relative",
-        error,
-        1e-4,
-        "a sum",
-        case.at(snippets.PARTS, pairs),
-    )
+    what = "sum of the components against the whole, relative"
+    law.most(what, error, 1e-4, "a sum", case.at(snippets.PARTS, pairs))
     why = "reflection stays on its side, transmission crosses, lobes of one direction have no value"
     sides = [_wrong_side(case, i, flag, parts[i]) for i, flag in enumerate(flags)]
     samples = [_wrong_samples(case, i, flag) for i, flag in enumerate(flags)]
@@ -46,13 +36,8 @@ def components(law: Law, case: Case) -> None:
         ("sample()", samples, snippets.COMPONENT_SAMPLE),
     ):
         total, shown = sum(count for count, _ in faults), max(faults, key=lambda fault: fault[0])[1]
-        law.at_most(
-            f"results of {kind} that contradict the component's flags",
-            total,
-            0,
-            why,
-            case.snippet(body, **shown),
-        )
+        what = f"results of {kind} that contradict the component's flags"
+        law.at_most(what, total, 0, why, case.snippet(body, **shown))
 
 
 def _updated(law: Law, case: Case, count: int) -> None:

@@ -37,13 +37,9 @@ def sampling(law: Law, case: Case) -> None:
         case.snippet(snippets.SAMPLING, wi=view.wi, uv=view.uv, cell=cell),
     )
     view, _, _, share = max(tests, key=lambda test: test[3])
-    law.at_most(
-        f"integral of pdf() less the share of samples it stands for, beyond {SIGMAS} standard errors",
-        share,
-        FIT,
-        "rational fits of Smith's G1 in common use are off by 0.35 %",
-        case.snippet(snippets.NORMALISED, wi=view.wi, uv=view.uv),
-    )
+    what = f"integral of pdf() less the share of samples it stands for, beyond {SIGMAS} standard errors"
+    why = "rational fits of Smith's G1 in common use are off by 0.35 %"
+    law.at_most(what, share, FIT, why, case.snippet(snippets.NORMALISED, wi=view.wi, uv=view.uv))
     if blurred:
         law.notes.append(f"{blurred} angles left out: lobe too narrow for float32 directions to resolve")
 
@@ -111,12 +107,10 @@ def weights(law: Law, case: Case) -> None:
                 worst.get(what, (-1.0, view, 0)), (float(error[i]), view, i), key=lambda w: w[0]
             )
     for what, (most, view, i) in worst.items():
+        title = f"{what}, relative, beyond 8 times what the rounding of directions explains"
+        why = "the same formula, evaluated once more at a rounded direction"
         law.at_most(
-            f"{what}, relative, beyond 8 times what the rounding of directions explains",
-            most,
-            POINTWISE,
-            "the same formula, evaluated once more at a rounded direction",
-            case.snippet(snippets.WEIGHT, wi=view.wi, uv=view.uv, u=view.u[i]),
+            title, most, POINTWISE, why, case.snippet(snippets.WEIGHT, wi=view.wi, uv=view.uv, u=view.u[i])
         )
     _discrete(law, case)
     if not law.parts:
@@ -160,13 +154,9 @@ def _discrete(law: Law, case: Case) -> None:
             off = max(abs(here.mean() - stated) - SIGMAS * error, 0)
             worst, where = max((worst, where), (off, view), key=lambda pair: pair[0])
     if where is not None:
-        law.at_most(
-            f"probability of a single direction (delta) less its share, beyond {SIGMAS} standard errors",
-            worst,
-            POINTWISE,
-            "a count",
-            case.snippet(snippets.DISCRETE, wi=where.wi, uv=where.uv),
-        )
+        what = f"probability of a single direction (delta) less its share, beyond {SIGMAS} standard errors"
+        why = "a count"
+        law.at_most(what, worst, POINTWISE, why, case.snippet(snippets.DISCRETE, wi=where.wi, uv=where.uv))
 
 
 def energy(law: Law, case: Case) -> None:
@@ -179,22 +169,15 @@ def energy(law: Law, case: Case) -> None:
             apart.append((off, view))
     albedo, wi, uv = max(brightest, key=lambda found: found[0])
     show = case.snippet(snippets.ALBEDO, wi=wi, uv=uv)
-    law.at_most(
-        f"largest albedo, less {SIGMAS} standard errors",
-        albedo,
-        1 + FIT,
-        "no more light leaves than arrives; 0.5 % for fits of G1",
-        show,
-    )
+    what = f"largest albedo, less {SIGMAS} standard errors"
+    law.at_most(what, albedo, 1 + FIT, "no more light leaves than arrives; 0.5 % for fits of G1", show)
     if apart:
         error, view = max(apart, key=lambda found: found[0])
-        law.at_most(
-            f"albedo by quadrature of eval() against mean weight, relative, beyond {SIGMAS} standard errors",
-            error,
-            2 * FIT,
-            "0.5 % for fits of G1 in the density",
-            case.snippet(snippets.ALBEDO, wi=view.wi, uv=view.uv),
+        what = (
+            f"albedo by quadrature of eval() against mean weight, relative, beyond {SIGMAS} standard errors"
         )
+        why = "0.5 % for fits of G1 in the density"
+        law.at_most(what, error, 2 * FIT, why, case.snippet(snippets.ALBEDO, wi=view.wi, uv=view.uv))
 
 
 def _grazing(case: Case) -> list[tuple[float, Array, Array]]:

@@ -57,13 +57,9 @@ def bbox(law: Law, case: Case) -> None:
     p = np.concatenate(points)
     out = np.maximum(case.box[0] - p, p - case.box[1]).max(axis=1) / case.size
     i = int(out.argmax())
-    law.at_most(
-        "points outside the bounding box, in sizes",
-        max(out[i], 0),
-        1e-5,
-        "some roundings",
-        case.snippet(o[min(i, len(o) - 1)], d[min(i, len(o) - 1)]),
-    )
+    what = "points outside the bounding box, in sizes"
+    why = "some roundings"
+    law.at_most(what, max(out[i], 0), 1e-5, why, case.snippet(o[min(i, len(o) - 1)], d[min(i, len(o) - 1)]))
 
 
 def variants(law: Law, case: Case) -> None:
@@ -92,20 +88,11 @@ def variants(law: Law, case: Case) -> None:
     scale = np.abs(o).max(axis=1) + seen.t
     error = np.where(both, np.abs(there.t - seen.t) / (ROUNDING * scale), 0)
     i = int((bad if bad.any() else error).argmax())
-    law.at_most(
-        f"share of rays answered otherwise in {other}",
-        bad.mean(),
-        2e-3,
-        "outlines hang on roundings",
-        case.snippet(o[i], d[i]),
-    )
-    law.at_most(
-        f"distance in {other}, off by roundings of the largest number",
-        error.max(),
-        4 * HIT_ROUNDINGS,
-        "some dozen operations each, and another cosine with the surface",
-        case.snippet(o[i], d[i]),
-    )
+    what = f"share of rays answered otherwise in {other}"
+    law.at_most(what, bad.mean(), 2e-3, "outlines hang on roundings", case.snippet(o[i], d[i]))
+    what = f"distance in {other}, off by roundings of the largest number"
+    why = "some dozen operations each, and another cosine with the surface"
+    law.at_most(what, error.max(), 4 * HIT_ROUNDINGS, why, case.snippet(o[i], d[i]))
 
 
 LAWS = {

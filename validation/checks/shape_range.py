@@ -38,23 +38,16 @@ def scale(law: Law, case: Case) -> None:
             raise Skip("to_world does not scale all of it (of curves, the radius stays)")
         there = trace(recipe.scene(), (o * 2.0**power).astype(np.float32), d)
         bad = steep & (there.found != seen.found)
-        law.none(
-            f"rays answered otherwise at 2^{power} of the size",
-            bad,
-            "scaling by a power of two rounds nothing; grazing rays are left out",
-            case.at(o, d, snippets.SCALED, power=power),
-        )
+        what = f"rays answered otherwise at 2^{power} of the size"
+        why = "scaling by a power of two rounds nothing; grazing rays are left out"
+        law.none(what, bad, why, case.at(o, d, snippets.SCALED, power=power))
         both = steep & there.found & seen.found
         apart = np.where(both, np.abs(there.t / 2.0**power - seen.t) / np.where(both, seen.t, 1), 0)
         turned = np.where(both, 1 - (there.n * seen.n).sum(axis=1), 0)
         error = np.maximum(apart, turned)
-        law.most(
-            f"distance (relative) or normal at 2^{power} of the size, off",
-            error,
-            HIT_ROUNDINGS * ROUNDING,
-            "some dozen operations, on scaled numbers",
-            case.at(o, d, snippets.SCALED, power=power),
-        )
+        what = f"distance (relative) or normal at 2^{power} of the size, off"
+        why = "some dozen operations, on scaled numbers"
+        law.most(what, error, HIT_ROUNDINGS * ROUNDING, why, case.at(o, d, snippets.SCALED, power=power))
 
 
 def far(law: Law, case: Case) -> None:
@@ -87,13 +80,9 @@ def far(law: Law, case: Case) -> None:
         beside = trace(case.target, (closer + 4 * ROUNDING * distance * side).astype(np.float32), d)
         bad &= beside.found & ((beside.n * here.n).sum(axis=1) > 0.9)
     i = int(bad.argmax())
-    law.at_most(
-        "share of rays from afar that miss what they meet from nearby, or meet it elsewhere",
-        bad.mean(),
-        2e-3,
-        "outlines are as wide as the rounding of the distance",
-        case.snippet(origin[i], d[i], snippets.TWICE, other=closer[i]),
-    )
+    what = "share of rays from afar that miss what they meet from nearby, or meet it elsewhere"
+    why = "outlines are as wide as the rounding of the distance"
+    law.at_most(what, bad.mean(), 2e-3, why, case.snippet(origin[i], d[i], snippets.TWICE, other=closer[i]))
 
 
 def finite(law: Law, case: Case) -> None:

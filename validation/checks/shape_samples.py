@@ -34,13 +34,9 @@ def sampling(law: Law, case: Case) -> None:
         ("density of a position against pdf_position()", np.abs(pdf / again - 1).max()),
         ("mean of 1 / density against surface_area()", abs(np.mean(1 / pdf) / area - 1)),
     ):
-        law.at_most(
-            f"{what}, relative",
-            measured,
-            1e-3,
-            "the same number",
-            snippets.positions(case.shape, case.recipe.description),
-        )
+        title = f"{what}, relative"
+        why = "the same number"
+        law.at_most(title, measured, 1e-3, why, snippets.positions(case.shape, case.recipe.description))
     _on_the_surface(law, case, p, n)
     _area(law, case, p, n, area)
     _directions(law, case, u)
@@ -53,13 +49,8 @@ def _on_the_surface(law: Law, case: Case, p: Array, n: Array) -> None:
     away = np.where(back.found, np.linalg.norm(back.p - p, axis=1), np.inf) / case.size
     # another part of the surface may be nearer than a hundredth of the size
     off = np.quantile(away, 0.9)
-    law.at_most(
-        "sampled positions off the surface, 9 in 10, in sizes",
-        off,
-        1e-4,
-        "a few roundings",
-        case.snippet(start[0], -n[0]),
-    )
+    what = "sampled positions off the surface, 9 in 10, in sizes"
+    law.at_most(what, off, 1e-4, "a few roundings", case.snippet(start[0], -n[0]))
     alike = np.maximum((n * back.shading).sum(axis=1), (n * back.n).sum(axis=1))
     turned = 1 - alike / np.linalg.norm(n, axis=1)
     law.at_most(
@@ -151,25 +142,17 @@ def _directions(law: Law, case: Case, u: Array) -> None:
     error = np.where(drawn, np.abs(pdf / again - 1)[:, 0], 0)
     i = int(error.argmax())
     # near an outline the cosine, and the density with it, hangs on roundings
-    law.at_most(
-        "density of a direction against pdf_direction(), relative, 99 in 100",
-        np.quantile(error, 0.99),
-        1e-2,
-        "the same number; near outlines it hangs on roundings",
-        case.snippet(o[i], d[i]),
-    )
+    what = "density of a direction against pdf_direction(), relative, 99 in 100"
+    why = "the same number; near outlines it hangs on roundings"
+    law.at_most(what, np.quantile(error, 0.99), 1e-2, why, case.snippet(o[i], d[i]))
     met = trace(case.target, o, d.astype(np.float32))
     steep = np.abs((met.n * d).sum(axis=1)) > FLAT
     bad = drawn & steep & met.found & (met.t > dist[:, 0] * (1 + 1e-3))
     lost = drawn & ~met.found
     i = int((bad | lost).argmax())
-    law.at_most(
-        "share of sampled directions that miss the shape, or reach it behind the sampled point",
-        (bad | lost).mean(),
-        1e-2,
-        "outlines hang on roundings; small leaks are watertight's business",
-        case.snippet(o[i], d[i]),
-    )
+    what = "share of sampled directions that miss the shape, or reach it behind the sampled point"
+    why = "outlines hang on roundings; small leaks are watertight's business"
+    law.at_most(what, (bad | lost).mean(), 1e-2, why, case.snippet(o[i], d[i]))
     visible = drawn & met.found & (met.t > dist[:, 0] * (1 - 1e-3))
     weight = np.where(visible, 1 / np.where(drawn, pdf[:, 0], 1), 0)
     _solid_angle(law, case, *_moments(case, o, d, met.p, weight))

@@ -56,13 +56,9 @@ def hits(law: Law, case: Case) -> None:
             return case.snippet(o[i], d[i], snippets.MAXT, maxt=limit[i])
 
         for name, found in zip(("ray_test()", "ray_intersect()"), tested(maxt), strict=True):
-            law.share(
-                f"share of rays on which {name} is wrong {what}",
-                counts & (found != expected),
-                5e-4 if maxt is None else 0,
-                "one question, one answer; rays that graze are left out, but for those that just miss",
-                show,
-            )
+            title = f"share of rays on which {name} is wrong {what}"
+            why = "one question, one answer; rays that graze are left out, but for those that just miss"
+            law.share(title, counts & (found != expected), 5e-4 if maxt is None else 0, why, show)
 
 
 def surface(law: Law, case: Case) -> None:
@@ -71,13 +67,8 @@ def surface(law: Law, case: Case) -> None:
     largest = np.maximum(np.abs(o).max(axis=1), np.abs(met.p).max(axis=1)) + met.t
     along = o.astype(np.float64) + met.t[:, None].astype(np.float64) * d
     error = np.abs(along - met.p).max(axis=1) / (ROUNDING * largest)
-    law.most(
-        "hit point off the ray at its distance, in roundings of the largest number",
-        error,
-        HIT_ROUNDINGS,
-        "some dozen operations",
-        case.at(o, d),
-    )
+    what = "hit point off the ray at its distance, in roundings of the largest number"
+    law.most(what, error, HIT_ROUNDINGS, "some dozen operations", case.at(o, d))
     count = case.count(10**5, 10**6)
     few = met.only(case.rng.integers(len(met.t), size=count))
     away = case.units(count)
@@ -88,12 +79,8 @@ def surface(law: Law, case: Case) -> None:
     # another part may truly be that near, in a hollow edge
     same = near(few.p, again.p) & (turn > np.where(again.part == few.part, 0.9, 0.9999))
     bad = again.found & same & (np.abs(cos) > FLAT)
-    law.none(
-        f"rays from the surface, of {count}, that meet it where they start",
-        bad,
-        "self-intersections are dark spots; grazing rays are left out",
-        case.at(start, away),
-    )
+    what = f"rays from the surface, of {count}, that meet it where they start"
+    law.none(what, bad, "self-intersections are dark spots; grazing rays are left out", case.at(start, away))
     before = met.p - 1e-3 * case.size * d
     close = trace(case.target, before.astype(np.float32), d)
     law.share(
@@ -124,13 +111,9 @@ def _roundoff(law: Law, case: Case) -> None:
         lost = np.nan_to_num(found.lost(noise.ALLOWANCE), posinf=0)
         measured = float(np.quantile(lost, 0.9))
         i = int(np.abs(lost - measured).argmin())
-        law.at_most(
-            f"noise of the {what} over that of {noise.ALLOWANCE:g} roundings with a rounded ray, 9 in 10",
-            measured,
-            noise.LOST,
-            "digits are lost inside that could be kept",
-            case.snippet(o[i], d[i]),
-        )
+        title = f"noise of the {what} over that of {noise.ALLOWANCE:g} roundings with a rounded ray, 9 in 10"
+        why = "digits are lost inside that could be kept"
+        law.at_most(title, measured, noise.LOST, why, case.snippet(o[i], d[i]))
 
 
 def normals(law: Law, case: Case) -> None:
@@ -144,13 +127,9 @@ def normals(law: Law, case: Case) -> None:
         o, d, seen = case.seen
         judged, even = case.lines
         flipped = isinstance(case.shape, mi.Shape) and case.shape.has_flipped_normals()
-        law.share(
-            f"share of rays from outside whose normal points {'outwards' if flipped else 'inwards'}",
-            judged & even & (((seen.n * d).sum(axis=1) > 0) != flipped),
-            1e-3,
-            "a closed shape has an outside; what edges hide is left room for",
-            case.at(o, d),
-        )
+        what = f"share of rays from outside whose normal points {'outwards' if flipped else 'inwards'}"
+        why = "a closed shape has an outside; what edges hide is left room for"
+        law.share(what, judged & even & (((seen.n * d).sum(axis=1) > 0) != flipped), 1e-3, why, case.at(o, d))
     else:
         law.notes.append("open: there is no outside for normals to point to")
     o, d, met = case.met
@@ -161,13 +140,9 @@ def normals(law: Law, case: Case) -> None:
     if usable.any():
         slant = np.maximum(*(np.abs((unit(v) * met.n).sum(axis=1)) for v in (met.du, met.dv)))
         slant = np.where(usable & np.isfinite(slant), slant, 0)
-        law.most(
-            "cosine between the normal and a partial derivative of the point",
-            slant,
-            1e-3,
-            "both are known to a few roundings; near a pole the derivatives are short",
-            case.at(o, d),
-        )
+        what = "cosine between the normal and a partial derivative of the point"
+        why = "both are known to a few roundings; near a pole the derivatives are short"
+        law.most(what, slant, 1e-3, why, case.at(o, d))
     _differences(law, case)
 
 
@@ -177,12 +152,10 @@ def _two_sides(law: Law, case: Case) -> None:
     back = case.behind
     same = back.found & near(met.p, back.p) & (back.part == met.part)
     if same.sum() > 20:
+        what = "share of normals that turn where the same point is met from behind"
+        why = "a surface has one normal; thin parts are left room for"
         law.share(
-            "share of normals that turn where the same point is met from behind",
-            same & ((back.n * met.n).sum(axis=1) < -0.5),
-            1e-3,
-            "a surface has one normal; thin parts are left room for",
-            case.at(o, d, snippets.BEHIND),
+            what, same & ((back.n * met.n).sum(axis=1) < -0.5), 1e-3, why, case.at(o, d, snippets.BEHIND)
         )
 
 
@@ -232,13 +205,9 @@ def watertight(law: Law, case: Case) -> None:
     if not case.closed:
         raise Skip("the shape is open: lines do not leave it as often as they enter")
     judged, even = case.lines
-    law.share(
-        f"share of lines, of {judged.sum()}, that cross the surface an odd number of times",
-        judged & ~even,
-        1e-3,
-        "near sharp edges, the offset of a ray that goes on leads out again; grazing lines are left out",
-        case.at(*case.seen[:2]),
-    )
+    what = f"share of lines, of {judged.sum()}, that cross the surface an odd number of times"
+    why = "near sharp edges, the offset of a ray that goes on leads out again; grazing lines are left out"
+    law.share(what, judged & ~even, 1e-3, why, case.at(*case.seen[:2]))
     inside = _inside(case)
     if inside is None:
         law.notes.append("no room inside to start rays in")

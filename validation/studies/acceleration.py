@@ -57,12 +57,8 @@ def run(study: Study, *, quick: bool) -> None:
     ]
     study.table("rays", "Million rays a second", ["objects", *METHODS.values()], rows)
     for name, share in worst.items():
-        study.at_most(
-            f"{METHODS[name]}: rays with another nearest hit than the loop's",
-            share,
-            1e-4,
-            "a share; grazing rays may go either way in float32. One box in a thousand lost shows",
-        )
+        why = "a share; grazing rays may go either way in float32. One box in a thousand lost shows"
+        study.at_most(f"{METHODS[name]}: rays with another nearest hit than the loop's", share, 1e-4, why)
     for name in () if quick else ("tree", "bvh"):
         study.record(f"{name}_pays_from_objects", crossing(rates["loop"], rates[name]))
     lines = {title: (list(rates[name]), list(rates[name].values())) for name, title in METHODS.items()}

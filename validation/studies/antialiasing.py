@@ -118,13 +118,8 @@ def _compare_modes(study: Study, extent: Extent) -> None:
                     _show_contours(study, number, rows)
                 gc.collect()  # scenes that stay alive slow down the kernels of later ones
                 advance(1)
-    study.table(
-        "modes",
-        f"Error to aa={extent.reference_aa} of the same lattice, {width}x{height}",
-        COLUMNS,
-        table,
-        "Seconds are medians of warm runs, each setting in turn.",
-    )
+    title = f"Error to aa={extent.reference_aa} of the same lattice, {width}x{height}"
+    study.table("modes", title, COLUMNS, table, "Seconds are medians of warm runs, each setting in turn.")
     study.record("scenes where sobel or geometry reach the error of full in a third of its time", reached)
 
 
@@ -243,12 +238,8 @@ def _show_contours(study: Study, number: int, rows: Sequence[Row]) -> None:
     aa = min(row.aa for row in rows)
     masks = [_samples(row.warm.result) > 1 for row in rows if row.aa == aa and row.mode != "none"]
     found = [filters.EdgeMap(mask=mask, value=mask.astype(np.float32)) for mask in masks]
-    study.picture(
-        f"contours-{number}",
-        f"Scene {number}: refined pixels",
-        filters.contours(*found),
-        "Left to right: luma, sobel, geometry.",
-    )
+    caption = "Left to right: luma, sobel, geometry."
+    study.picture(f"contours-{number}", f"Scene {number}: refined pixels", filters.contours(*found), caption)
 
 
 def _compare_with_mitsuba(study: Study, *, quick: bool) -> None:
@@ -292,17 +283,15 @@ def _compare_modes_over_path(study: Study, extent: Extent) -> None:
     scene = _load(lit_by_a_sphere(*extent.light_size))
     rows = _rows(scene, extent, reference_aa=8, reference_spp=extent.light_spp, lattice="report", spp=8)
     width, height = extent.light_size
-    study.table(
-        "path",
-        f"Mitsuba's path under an area light, 8 rays for each sample, {width}x{height}",
-        COLUMNS,
-        _cells("0, area light", "report", rows),
+    title = f"Mitsuba's path under an area light, 8 rays for each sample, {width}x{height}"
+    note = (
         f"Error to aa=8 with {extent.light_spp} rays for each sample. Most of it is noise, which falls with "
         f"every "
         f"ray, wherever it goes; so the error follows the number of rays, and adaptive sampling only spares "
         f"those that "
-        f"sharp edges do not need.",
+        f"sharp edges do not need."
     )
+    study.table("path", title, COLUMNS, _cells("0, area light", "report", rows), note)
 
 
 def variance_error(detector: str, *, spp: int, lattice: str) -> float:
@@ -349,31 +338,17 @@ def _chase_noise(study: Study, extent: Extent) -> None:
             blind = np.asarray(find(mrt.render(scene, **centre, spp=spp).image).mask)[1:-1, 1:-1]
             seen = seen[1:-1, 1:-1]
             rows.append((detector, spp, seen[flat].mean(), seen[edge].mean(), blind[flat].mean()))
-    study.table(
-        "noise",
-        "Does a detector chase noise? Share of pixels refined",
-        ("detector", "rays a pixel", "flat", "edges", "flat, without the variance"),
-        rows,
-        f"Flat: luma contrast below {FLAT} in the converged picture; edges: above {EDGE}.",
-    )
-    study.at_most(
-        "noise: share of flat pixels refined, 4 rays a pixel or more",
-        max(r[2] for r in rows if r[1] >= 4),
-        0.03,
-        "three deviations: 0.3 % for one normal value; estimated from 4 samples, tails are longer",
-    )
-    study.at_least(
-        "noise: share of edges found with 16 rays a pixel",
-        min(r[3] for r in rows if r[1] == 16),
-        0.55,
-        "noise of 0.03, edges from a contrast of 0.2: at three deviations either way, most of them",
-    )
-    study.at_least(
-        "noise: the same flat pixels without the variance",
-        min(r[4] for r in rows),
-        0.3,
-        "shows that there is noise to chase",
-    )
+    columns = ("detector", "rays a pixel", "flat", "edges", "flat, without the variance")
+    note = f"Flat: luma contrast below {FLAT} in the converged picture; edges: above {EDGE}."
+    study.table("noise", "Does a detector chase noise? Share of pixels refined", columns, rows, note)
+    what = "noise: share of flat pixels refined, 4 rays a pixel or more"
+    why = "three deviations: 0.3 % for one normal value; estimated from 4 samples, tails are longer"
+    study.at_most(what, max(r[2] for r in rows if r[1] >= 4), 0.03, why)
+    what = "noise: share of edges found with 16 rays a pixel"
+    why = "noise of 0.03, edges from a contrast of 0.2: at three deviations either way, most of them"
+    study.at_least(what, min(r[3] for r in rows if r[1] == 16), 0.55, why)
+    what = "noise: the same flat pixels without the variance"
+    study.at_least(what, min(r[4] for r in rows), 0.3, "shows that there is noise to chase")
 
 
 def _contrast(image: np.ndarray) -> np.ndarray:

@@ -150,21 +150,15 @@ def run(study: Study, *, quick: bool) -> None:
             rest.append([number, *(v.p for v in (found.pixel, found.tile, found.image)), found.rel_rmse])
             advance(1)
     figures = ["mean difference", "% of pixels > 1/255", "mean left to the stock flavour", "FLIP left"]
-    study.table(
-        "approximations",
-        "What each of the report's approximations changes",
-        ["scene", "changed, too", *figures],
-        rows,
-        f"Path pictures have {spp} samples a pixel; what is left to the stock flavour holds their noise.",
-    )
-    study.table(
-        "rest",
-        "With those switched off, and nothing diffuse: p values of equality",
-        ["scene", "pixel", "tile", "image", "relRMSE"],
-        rest,
+    title = "What each of the report's approximations changes"
+    note = f"Path pictures have {spp} samples a pixel; what is left to the stock flavour holds their noise."
+    study.table("approximations", title, ["scene", "changed, too", *figures], rows, note)
+    title = "With those switched off, and nothing diffuse: p values of equality"
+    note = (
         f"path, {RENDERS} renders each, roughness at least {ALPHA_FOR_TESTS:g}. The same scenes with "
-        "mistakes in them are rejected: see the table of mutations.",
+        "mistakes in them are rejected: see the table of mutations."
     )
+    study.table("rest", title, ["scene", "pixel", "tile", "image", "relRMSE"], rest, note)
 
 
 def _chain(study: Study, number: int, steps: list[Step]) -> list[list[Any]]:

@@ -127,18 +127,10 @@ def furnace(study: Study, *, quick: bool) -> None:
         curves(lines, "angle of incidence [°]", "albedo", log=False, level=1),
         "Light that a second bounce between facets would bring back is missing, the more the rougher.",
     )
-    study.at_most(
-        "largest albedo of a lobe with F = 1, Ks = 1",
-        np.max(albedos_found),
-        1 + G1_FIT,
-        "the error of G₁'s rational fit",
-    )
-    study.at_least(
-        "albedo of a lobe with F = 1, Ks = 1, alpha = 0.1, head on",
-        albedos_found[0][0],
-        1 - G1_FIT,
-        "hardly any facet hides another",
-    )
+    what = "largest albedo of a lobe with F = 1, Ks = 1"
+    study.at_most(what, np.max(albedos_found), 1 + G1_FIT, "the error of G₁'s rational fit")
+    what = "albedo of a lobe with F = 1, Ks = 1, alpha = 0.1, head on"
+    study.at_least(what, albedos_found[0][0], 1 - G1_FIT, "hardly any facet hides another")
     study.record("largest albedo of the report's materials, at 0 to 85 degrees", _report_albedo())
 
 
@@ -225,12 +217,9 @@ def published(study: Study, *, quick: bool) -> None:
     study.table(
         "published", "Albedos published for this family of BSDFs", ["angle °", "ours", "published"], rows
     )
-    study.at_most(
-        "published albedos, relative",
-        largest(abs(ours / known - 1) for _, ours, known in rows),
-        3e-3,
-        "they were published from a Monte Carlo quadrature with about 1e-3 of noise",
-    )
+    what = "published albedos, relative"
+    why = "they were published from a Monte Carlo quadrature with about 1e-3 of noise"
+    study.at_most(what, largest(abs(ours / known - 1) for _, ours, known in rows), 3e-3, why)
 
 
 def never_negative(study: Study, *, quick: bool) -> None:

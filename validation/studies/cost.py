@@ -71,21 +71,15 @@ def _default_render(study: Study, extent: Extent) -> None:
             gc.collect()
             advance(1)
     what = f"of the default render, {width}x{height}, aa={extent.aa}"
-    study.table(
-        "passes",
-        f"Passes {what}",
-        PASS_COLUMNS,
-        passes,
-        "Beyond its kernels a pass takes what Python and Dr.Jit need to write them down, whatever the size.",
+    note = (
+        "Beyond its kernels a pass takes what Python and Dr.Jit need to write them down, whatever the size."
     )
-    study.table(
-        "kernels",
-        f"Kernels {what}",
-        KERNEL_COLUMNS,
-        rows,
+    study.table("passes", f"Passes {what}", PASS_COLUMNS, passes, note)
+    note = (
         "Compile: of a first run without cached kernels (what a cache holds takes none). Code: what Dr.Jit "
-        "takes to write the code, every time. Names like BlockReduce are Dr.Jit's own.",
+        "takes to write the code, every time. Names like BlockReduce are Dr.Jit's own."
     )
+    study.table("kernels", f"Kernels {what}", KERNEL_COLUMNS, rows, note)
 
 
 def _pass_rows(number: int, timings: Any, found: Sequence[Kernel]) -> list[tuple[Any, ...]]:
@@ -119,15 +113,13 @@ def _floors(study: Study, extent: Extent, *, goals: bool) -> None:
             rows.append(_floor_row(study, number, extent, goals))
             gc.collect()
             advance(1)
-    study.table(
-        "floor",
-        f"Every pixel supersampled, {extent.size[0]}x{extent.size[1]}, aa={extent.aa}",
-        FLOOR_COLUMNS,
-        rows,
+    title = f"Every pixel supersampled, {extent.size[0]}x{extent.size[1]}, aa={extent.aa}"
+    note = (
         "Floor: the same rays, recorded, through Mitsuba's ray queries alone, in turn with renders. What is "
         "not in kernels does not grow with the picture: the larger it is, the nearer the ratio of the "
-        "kernels.",
+        "kernels."
     )
+    study.table("floor", title, FLOOR_COLUMNS, rows, note)
 
 
 def _floor_row(study: Study, number: int, extent: Extent, goals: bool) -> tuple[Any, ...]:

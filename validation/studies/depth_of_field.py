@@ -83,13 +83,9 @@ def run(study: Study, *, quick: bool) -> None:
             _hold(study, number, found)
             _show(study, number, found)
             advance(1)
-    study.table(
-        "errors",
-        "RMSE to a lens",
-        ("scene", "filter", "region", "pixels", "RMSE", "RMSE / without"),
-        rows,
-        "Near depth steps: within 8 pixels of an outline. At the border: within 8 pixels of it.",
-    )
+    columns = ("scene", "filter", "region", "pixels", "RMSE", "RMSE / without")
+    note = "Near depth steps: within 8 pixels of an outline. At the border: within 8 pixels of it."
+    study.table("errors", "RMSE to a lens", columns, rows, note)
 
 
 def compare(scene: Scene, extent: Extent) -> Comparison:
@@ -215,9 +211,5 @@ def _show(study: Study, number: int, found: Comparison) -> None:
         f"pictures-{number}", f"Scene {number}", sheet, f"Left to right: {', '.join(order)}.", exr=True
     )
     errors = np.concatenate([np.abs(found.pictures[m] - found.pictures["thinlens"]) for m in MODES], axis=1)
-    study.picture(
-        f"errors-{number}",
-        f"Scene {number}: difference from the lens, five times",
-        5 * errors,
-        f"Left to right: {', '.join(MODES)}.",
-    )
+    title = f"Scene {number}: difference from the lens, five times"
+    study.picture(f"errors-{number}", title, 5 * errors, f"Left to right: {', '.join(MODES)}.")

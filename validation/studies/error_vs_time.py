@@ -95,14 +95,9 @@ def _answer(study: Study, samplings: Mapping[int, Findings]) -> None:
     if len(samplings) > 1:
         every = [found.points for found in samplings.values()]
         rows.append(["all of these", *(for_all(every, error) for error in ANSWERS)])
-    study.table(
-        "choose",
-        "Which settings for an error of x?",
-        ["scene", *(f"RMSE at most {error:g}" for error in ANSWERS)],
-        rows,
-        "The fastest of all modes of anti-aliasing, amounts and lattices: aamode, aa, lattice.",
-        first=True,
-    )
+    columns = ["scene", *(f"RMSE at most {error:g}" for error in ANSWERS)]
+    note = "The fastest of all modes of anti-aliasing, amounts and lattices: aamode, aa, lattice."
+    study.table("choose", "Which settings for an error of x?", columns, rows, note, first=True)
 
 
 # ------------------- What must hold: facts that no load on the machine changes -------------------
@@ -120,52 +115,37 @@ def _of_number(names: Iterable[str], pattern: str) -> list[str]:
 
 
 def _hold_reference(study: Study, where: str, found: Findings, least: float) -> None:
-    study.at_most(
-        f"{where}: error of the reference / least error it judges",
-        found.reference_error / least,
-        0.5,
-        "then it changes no error by more than an eighth, and the judge is better than the judged",
-    )
+    what = f"{where}: error of the reference / least error it judges"
+    why = "then it changes no error by more than an eighth, and the judge is better than the judged"
+    study.at_most(what, found.reference_error / least, 0.5, why)
 
 
 def _hold_sampling(study: Study, where: str, found: Findings) -> None:
     few, *_, many = _of_number(found.points, "none aa={} centered")
     amounts = [float(name.split()[1][3:]) for name in (few, many)]
-    study.at_most(
-        f"{where}: RMSE of {many} / {few}",
-        _rmse(found, many) / _rmse(found, few),
-        2 * amounts[0] / amounts[1],
-        "an edge of the lattice is known to 1 / aa; twice that: samples that do not help leave 1",
-    )
+    what = f"{where}: RMSE of {many} / {few}"
+    why = "an edge of the lattice is known to 1 / aa; twice that: samples that do not help leave 1"
+    study.at_most(what, _rmse(found, many) / _rmse(found, few), 2 * amounts[0] / amounts[1], why)
     _hold_reference(study, where, found, _rmse(found, many))
 
 
 def _hold_whitted(study: Study, where: str, found: Findings) -> None:
     cut_off = f"min_contribution={255 * knobs.CUT_OFFS[1]:g}/255"
-    study.at_most(
-        f"{where}: largest error of the default cut-off",
-        found.points[cut_off].difference.largest,
-        INVISIBLE,
-        "half a step of 8 bits, as promised; a cut-off that is 16 times too large leaves more",
-    )
+    what = f"{where}: largest error of the default cut-off"
+    why = "half a step of 8 bits, as promised; a cut-off that is 16 times too large leaves more"
+    study.at_most(what, found.points[cut_off].difference.largest, INVISIBLE, why)
     first, *_, last = knobs.DEPTHS
-    study.at_least(
-        f"{where}: RMSE of max_depth={first} - that of {last}",
-        _rmse(found, f"max_depth={first}") - _rmse(found, f"max_depth={last}"),
-        3e-4,
-        "seen is 6e-4 (scene 9) and above; a limit that has no effect leaves 0",
-    )
+    what = f"{where}: RMSE of max_depth={first} - that of {last}"
+    why = "seen is 6e-4 (scene 9) and above; a limit that has no effect leaves 0"
+    study.at_least(what, _rmse(found, f"max_depth={first}") - _rmse(found, f"max_depth={last}"), 3e-4, why)
 
 
 def _hold_path(study: Study, where: str, found: Findings) -> None:
     few, *_, many = _of_number(found.points, "path spp={}")
     spp = [float(name.split("=")[1]) for name in (few, many)]
-    study.at_most(
-        f"{where}: |RMSE of {many} / {few} / theory - 1|",
-        abs(_rmse(found, many) / _rmse(found, few) / (spp[0] / spp[1]) ** 0.5 - 1),
-        0.15,
-        "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15",
-    )
+    what = f"{where}: |RMSE of {many} / {few} / theory - 1|"
+    why = "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15"
+    study.at_most(what, abs(_rmse(found, many) / _rmse(found, few) / (spp[0] / spp[1]) ** 0.5 - 1), 0.15, why)
     _hold_reference(study, where, found, _rmse(found, many))
 
 

@@ -122,12 +122,8 @@ def run(study: Study, *, quick: bool) -> None:
     study.table(
         "exhaustive", "Largest errors", columns, rows, note + " 1 ulp: the step between float32 numbers."
     )
-    study.at_most(
-        "error of the float64 reference against 50 digits, ulp of float32",
-        confirmed,
-        1e-6,
-        "some dozen roundings of float64, 2e-9 of a float32 step each",
-    )
+    what = "error of the float64 reference against 50 digits, ulp of float32"
+    study.at_most(what, confirmed, 1e-6, "some dozen roundings of float64, 2e-9 of a float32 step each")
 
 
 def _chunks(stride: int) -> Iterator[Any]:

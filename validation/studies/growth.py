@@ -104,12 +104,9 @@ def run(study: Study, *, quick: bool) -> None:
     for what, found in series.items():
         *smaller, largest = found.values()
         for name, limit in (("operations", MOST_CODE), ("kernels", 1)):
-            study.at_most(
-                f"{what}: {name} at {max(found)} / at smaller sizes",
-                getattr(largest, name) / max(getattr(f, name) for f in smaller),
-                limit,
-                "numbers are data, not code; a loop that is unrolled makes it as many times longer",
-            )
+            title = f"{what}: {name} at {max(found)} / at smaller sizes"
+            why = "numbers are data, not code; a loop that is unrolled makes it as many times longer"
+            study.at_most(title, getattr(largest, name) / max(getattr(f, name) for f in smaller), limit, why)
 
 
 def _exponents(study: Study, series: Mapping[str, Mapping[int, Found]]) -> None:

@@ -30,12 +30,8 @@ def run(study: Study, *, quick: bool) -> None:
         np.concatenate([target, first, last], axis=1),
         f"Roughness and diffuse colour follow the gradient of the picture, {len(path) - 1} renders long.",
     )
-    study.plot(
-        "inverse-path",
-        "Inverse rendering: the parameters by render",
-        _figure(path),
-        "Dashed: the values with which the given picture was rendered.",
-    )
+    caption = "Dashed: the values with which the given picture was rendered."
+    study.plot("inverse-path", "Inverse rendering: the parameters by render", _figure(path), caption)
     alpha, kd = path[-1, 0], path[-1, 1:]
     why = "the two pictures sample their pixels at different points"
     study.at_most("roughness recovered from a picture, error", abs(alpha - ALPHA), 1e-4, why)

@@ -123,35 +123,21 @@ def run(study: Study, *, quick: bool) -> None:
     metals.sort(key=lambda metal: -metal.worst[0])
     _hold(study, metals)
     _tabulate(study, metals)
-    study.plot(
-        "metals",
-        f"Schlick − exact, {len(metals)} materials by angle",
-        _map(metals),
-        "The channel with the largest error. Red: Schlick is too bright. Worst at the top.",
-    )
-    study.plot(
-        "metals-worst",
-        f"The worst, {metals[0].name}: reflectance by angle",
-        _curves(metals[0]),
-        "Solid: exact. Dashed: Schlick. The dip towards grazing angles is what Schlick lacks.",
-    )
+    caption = "The channel with the largest error. Red: Schlick is too bright. Worst at the top."
+    study.plot("metals", f"Schlick − exact, {len(metals)} materials by angle", _map(metals), caption)
+    title = f"The worst, {metals[0].name}: reflectance by angle"
+    caption = "Solid: exact. Dashed: Schlick. The dip towards grazing angles is what Schlick lacks."
+    study.plot("metals-worst", title, _curves(metals[0]), caption)
     show_ball(study, metals[0], quick)
 
 
 def _hold(study: Study, metals: Sequence[Metal]) -> None:
     normal = np.max([np.abs(metal.error[0] / metal.exact[0]) for metal in metals])
-    study.at_most(
-        f"F₀ of {len(metals)} metals against the exact value, relative",
-        normal,
-        1e-5,
-        "the same number by two formulas, a few roundings",
-    )
-    study.at_most(
-        "Schlick against exact under even light, worst metal",
-        np.max([m.albedo_error for m in metals]),
-        0.05,
-        "what its missing dip towards grazing angles costs, there where least light comes from",
-    )
+    what = f"F₀ of {len(metals)} metals against the exact value, relative"
+    study.at_most(what, normal, 1e-5, "the same number by two formulas, a few roundings")
+    what = "Schlick against exact under even light, worst metal"
+    why = "what its missing dip towards grazing angles costs, there where least light comes from"
+    study.at_most(what, np.max([m.albedo_error for m in metals]), 0.05, why)
     study.record("Schlick against exact, worst metal and angle", metals[0].worst[0])
     study.record(
         "Schlick against exact, median over metals of the worst angle",
@@ -162,13 +148,8 @@ def _hold(study: Study, metals: Sequence[Metal]) -> None:
 def _tabulate(study: Study, metals: Sequence[Metal]) -> None:
     rows = [[m.name, *(float(x) for x in m.f0), m.worst[0], m.worst[1], m.albedo_error] for m in metals]
     columns = ["material", "F₀ red", "F₀ green", "F₀ blue", "largest error", "at °", "under even light"]
-    study.table(
-        "metals",
-        "Schlick against exact, by material",
-        columns,
-        rows,
-        "Errors are differences of reflectance, of the worst channel.",
-    )
+    note = "Errors are differences of reflectance, of the worst channel."
+    study.table("metals", "Schlick against exact, by material", columns, rows, note)
 
 
 def _map(metals: Sequence[Metal]) -> Any:
@@ -208,10 +189,6 @@ def show_ball(study: Study, metal: Metal, quick: bool) -> None:
     ours = {"type": "mrt_bsdf", "f0": rgb(metal.f0.tolist()), "diffuse_reflectance": 0.0, **common}
     theirs = {"type": "roughconductor", "material": metal.name, "distribution": "beckmann", **common}
     pictures = [np.array(mi.render(ball_scene(bsdf, size=size), spp=spp, seed=0)) for bsdf in (ours, theirs)]
-    study.picture(
-        "metal",
-        f"{metal.name}, where Schlick is worst: ours, Mitsuba's, |difference| × 5",
-        side_by_side(*pictures, gain=5),
-        "A ball of roughness 0.1 under the path integrator.",
-        exr=True,
-    )
+    title = f"{metal.name}, where Schlick is worst: ours, Mitsuba's, |difference| × 5"
+    caption = "A ball of roughness 0.1 under the path integrator."
+    study.picture("metal", title, side_by_side(*pictures, gain=5), caption, exr=True)

@@ -74,14 +74,12 @@ def compare_with_spheres(study: Study, *, width: int, height: int, samples: tupl
             t = ratio(*(partial(mrt.render, scene, aa=aa) for scene in (cones, spheres)), repeats=3)
             rows.append([aa, t.seconds, t.other_seconds, t.median, f"{t.low:.2f} to {t.high:.2f}"])
             advance(1)
-    study.table(
-        "thousand_cones",
-        "A thousand cones against a thousand spheres, seconds of a whole picture",
-        ["aa", "cones", "spheres", "ratio", "quartiles"],
-        rows,
+    title = "A thousand cones against a thousand spheres, seconds of a whole picture"
+    note = (
         "Spheres are searched and intersected by Embree, cones by this project's tree in Dr.Jit; shadow rays "
-        "look both up in light buffers.",
+        "look both up in light buffers."
     )
+    study.table("thousand_cones", title, ["aa", "cones", "spheres", "ratio", "quartiles"], rows, note)
 
 
 def _mesh_errors(study: Study, count: int) -> None:
@@ -94,12 +92,8 @@ def _mesh_errors(study: Study, count: int) -> None:
     slope = -float(np.polyfit(np.log(SEGMENTS), np.log(list(errors.values())), 1)[0])
     rows = [[n, 2 * n, error, 1e3 * warm[n].seconds] for n, error in errors.items()]
     study.table("mesh_cones", f"Mesh cones, {count} rays", ["sides", "triangles", "mean error", "ms"], rows)
-    study.at_most(
-        "slope of the error of a mesh cone: |exponent - 2|",
-        abs(slope - 2),
-        SLOPE,
-        "theory: 2, and rims and the apex; a mesh wider by a thousandth is beyond",
-    )
+    why = "theory: 2, and rims and the apex; a mesh wider by a thousandth is beyond"
+    study.at_most("slope of the error of a mesh cone: |exponent - 2|", abs(slope - 2), SLOPE, why)
     study.at_most(
         "mean error at 256 sides, the default",
         errors[256],
@@ -107,12 +101,9 @@ def _mesh_errors(study: Study, count: int) -> None:
         CONE["radius"] * (np.pi / 256) ** 2 / 2 / 3,
         "the chord's height over the distance; half as many sides leave four times as much",
     )
-    study.at_most(
-        "rays that meet another part, or nothing, at 256 sides",
-        other_hits(warm[256].result, exact),
-        1e-3,
-        "a share: silhouette, rim and apex within a chord's height, a few times 7.5e-5; a leak adds to it",
-    )
+    what = "rays that meet another part, or nothing, at 256 sides"
+    why = "a share: silhouette, rim and apex within a chord's height, a few times 7.5e-5; a leak adds to it"
+    study.at_most(what, other_hits(warm[256].result, exact), 1e-3, why)
     caption = "Both axes logarithmic; the dashed line has slope 2."
     sides, means = np.array(list(errors), float), list(errors.values())
     lines = {"mean error": (sides, means), "slope 2": (sides, means[0] * (sides / sides[0]) ** -2)}

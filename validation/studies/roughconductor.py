@@ -157,21 +157,14 @@ def pointwise(study: Study, *, quick: bool) -> None:
     rows: list[list[Any]] = [
         [*where, p.value, p.pdf_visible, p.pdf_plain, len(p.judged)] for where, p in found
     ]
-    study.table(
-        "pointwise",
-        "Largest relative differences from roughconductor",
-        ["variant", "alpha", "pairs", "value", "density, visible", "density, D", "judged"],
-        rows,
-        "Judged: pairs at grazing angles whose densities of plain D sampling differ by more, up to 10.",
-    )
+    columns = ["variant", "alpha", "pairs", "value", "density, visible", "density, D", "judged"]
+    note = "Judged: pairs at grazing angles whose densities of plain D sampling differ by more, up to 10."
+    study.table("pointwise", "Largest relative differences from roughconductor", columns, rows, note)
     names = ("value", "density of visible normals", "density of plain D sampling")
     for column, name in enumerate(names, start=3):
-        study.at_most(
-            f"{name}, relative, {len(variants)} variants",
-            largest(row[column] for row in rows),
-            POINTWISE,
-            "exp of up to 16, of arguments right to a few roundings",
-        )
+        what = f"{name}, relative, {len(variants)} variants"
+        why = "exp of up to 16, of arguments right to a few roundings"
+        study.at_most(what, largest(row[column] for row in rows), POINTWISE, why)
     _hold_judged(study, [judged for _, p in found for judged in p.judged])
 
 
@@ -196,12 +189,8 @@ def _hold_judged(study: Study, judged: Sequence[tuple[float, float]]) -> None:
     if judged:
         errors = np.array(judged)
         study.record("their largest error among these", errors[:, 1].max())
-        study.at_most(
-            "our largest error where the densities differ, against 50 digits",
-            errors[:, 0].max(),
-            POINTWISE,
-            "the same, of D alone",
-        )
+        what = "our largest error where the densities differ, against 50 digits"
+        study.at_most(what, errors[:, 0].max(), POINTWISE, "the same, of D alone")
 
 
 # --------------------------------------------- Pictures ---------------------------------------------
@@ -347,18 +336,11 @@ def rendered(study: Study, *, quick: bool) -> None:
 
 def _hold_pictures(study: Study, found: RoughconductorComparison) -> None:
     at = f"alpha {found.alpha:g}"
-    study.at_most(
-        f"share of pixels that differ with the same random numbers, {at}",
-        found.errors["pixels that differ, with the same random numbers"],
-        5e-3,
-        "paths that rounding sends past an edge; the ball covers a third of the picture",
-    )
-    study.at_least(
-        f"p of the difference with independent numbers, {at}",
-        found.test.p,
-        LEVEL,
-        "pixels, tiles and the picture, with Šidák's correction",
-    )
+    what = f"share of pixels that differ with the same random numbers, {at}"
+    why = "paths that rounding sends past an edge; the ball covers a third of the picture"
+    study.at_most(what, found.errors["pixels that differ, with the same random numbers"], 5e-3, why)
+    what = f"p of the difference with independent numbers, {at}"
+    study.at_least(what, found.test.p, LEVEL, "pixels, tiles and the picture, with Šidák's correction")
     study.record(f"relRMSE of the averages, {at}", found.test.rel_rmse)
     study.record(f"time, ours over theirs, {at}", found.timings["ratio"])
     study.picture(
@@ -439,12 +421,8 @@ def efficiency(study: Study, *, quick: bool) -> None:
     study.plot(
         "efficiency", "Error at equal time, ours over Mitsuba's", _bars(rows), "Below 1 ours is the better."
     )
-    study.at_most(
-        "variance at equal sample count, ours over theirs",
-        largest(ratios),
-        1.1,
-        "the same sampling; the variances of a thousand pixels are known to a few percent",
-    )
+    why = "the same sampling; the variances of a thousand pixels are known to a few percent"
+    study.at_most("variance at equal sample count, ours over theirs", largest(ratios), 1.1, why)
     study.record("equal-time error, ours over theirs, median", statistics.median(row[-1] for row in rows))
 
 

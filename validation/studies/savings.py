@@ -49,27 +49,21 @@ def table(study: Study, *, size: tuple[int, int], aa: int, repeats: int) -> None
             rows.append(_row(case, size, aa, repeats))
             gc.collect()  # scenes that stay alive slow down the kernels of later ones
             advance(1)
-    study.table(
-        "plan",
-        f"What the plan saves on a scene that does not need it, {size[0]}x{size[1]}, aa={aa}",
-        (
-            "left out",
-            "s without",
-            "s with",
-            "saves, s",
-            "with / without",
-            "quartiles",
-            "change of the picture",
-        ),
-        rows,
-        "Scene 0 without what is named, and with it forced in, in turn; medians of ratios.",
+    title = f"What the plan saves on a scene that does not need it, {size[0]}x{size[1]}, aa={aa}"
+    columns = (
+        "left out",
+        "s without",
+        "s with",
+        "saves, s",
+        "with / without",
+        "quartiles",
+        "change of the picture",
     )
-    study.at_most(
-        "plan: largest change of the picture by what is left out",
-        max(row[-1] for row in rows),
-        INVISIBLE,
-        "half a step of an 8-bit picture; a lamp that is left out changes hundreds",
-    )
+    note = "Scene 0 without what is named, and with it forced in, in turn; medians of ratios."
+    study.table("plan", title, columns, rows, note)
+    what = "plan: largest change of the picture by what is left out"
+    why = "half a step of an 8-bit picture; a lamp that is left out changes hundreds"
+    study.at_most(what, max(row[-1] for row in rows), INVISIBLE, why)
 
 
 def renders(case: Forced, size: tuple[int, int], aa: int) -> list[Callable[..., Any]]:

@@ -200,15 +200,13 @@ def run(study: Study, *, quick: bool) -> None:
             shown = [np.median(found.error), np.quantile(found.error, 0.99), found.error.max(), cut.max()]
             rows.append([name, "{}x{}".format(*size), *map(float, shown), *map(found.count, REASONS)])
             advance(1)
-    study.table(
-        "scenes",
-        "Our pictures against the float64 tracer",
-        ["scene", "size", "median", "99 %", "largest", "cut-off", *REASONS],
-        rows,
-        note="One sample per pixel, no path cut; then how much cutting dim paths changes. Fresnel is exact, "
+    columns = ["scene", "size", "median", "99 %", "largest", "cut-off", *REASONS]
+    note = (
+        "One sample per pixel, no path cut; then how much cutting dim paths changes. Fresnel is exact, "
         "and Schlick's in the last two scenes. "
-        "Pixels off by more than 1/255 are counted by reason.",
+        "Pixels off by more than 1/255 are counted by reason."
     )
+    study.table("scenes", "Our pictures against the float64 tracer", columns, rows, note=note)
     _lattices(study)
     _pictures(study, judged)
     _original(study, quick)
@@ -245,13 +243,11 @@ def _pictures(study: Study, judged: dict[str, Judgement]) -> None:
         for axis in (left, right):
             axis.set(xticks=[], yticks=[])
     axes[0][1].legend(loc="upper right", fontsize="x-small")
-    study.plot(
-        "differences",
-        "Where float32 and float64 differ",
-        figure,
+    caption = (
         "Left: our picture. Right: the largest difference in a channel, on a logarithmic scale. Circles: "
-        "pixels off by more than 1/255, by reason.",
+        "pixels off by more than 1/255, by reason."
     )
+    study.plot("differences", "Where float32 and float64 differ", figure, caption)
 
 
 def _original(study: Study, quick: bool) -> None:
@@ -270,11 +266,9 @@ def _original(study: Study, quick: bool) -> None:
         rows.append([number, *means, *shares])
         name, why = f"scene {number}: our mean difference over the original's", "the same task, done better"
         study.at_most(name, means[0] / means[1], 1.0, why)
-    study.table(
-        "original",
-        "The original's renders, judged by the same truth",
-        ["scene", "mean, ours", "mean, original", "% off, ours", "% off, original"],
-        rows,
-        note="The truth has no self-intersection; most of what the original is off by is shadow acne near "
-        "terminators.",
+    columns = ["scene", "mean, ours", "mean, original", "% off, ours", "% off, original"]
+    note = (
+        "The truth has no self-intersection; most of what the original is off by is shadow acne near "
+        "terminators."
     )
+    study.table("original", "The original's renders, judged by the same truth", columns, rows, note=note)

@@ -214,21 +214,14 @@ def _gloss(study: Study, quick: bool) -> None:
         {"width": 64, "height": 48, "spp": 64} if quick else {"width": 160, "height": 120, "spp": 512}
     )
     found = gloss_limit(alphas, **size)
-    study.at_most(
-        f"gloss of alpha {alphas[-1]:g} against the mirror term",
-        found.errors[-1],
-        2e-3,
-        "what is left is noise, as wide as the lobe",
-    )
+    what = f"gloss of alpha {alphas[-1]:g} against the mirror term"
+    study.at_most(what, found.errors[-1], 2e-3, "what is left is noise, as wide as the lobe")
     study.at_least(
         "slope of that difference over alpha", found.slope, 0.9, "blur itself has slope 2, noise slope 1"
     )
-    study.table(
-        "gloss",
-        "Glossy reflection of path against the mirror term",
-        ["alpha", "mean relative difference"],
-        list(zip(found.alphas, found.errors, strict=True)),
-    )
+    title = "Glossy reflection of path against the mirror term"
+    columns = ["alpha", "mean relative difference"]
+    study.table("gloss", title, columns, list(zip(found.alphas, found.errors, strict=True)))
     study.plot(
         "gloss",
         "Gloss becomes a mirror",

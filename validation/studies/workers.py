@@ -130,13 +130,9 @@ def _times(study: Study, folder: Path, extent: Extent, counts: Sequence[int]) ->
         span, why = (min(best), max(best)), "two workers halve it but for their start"
         study.goal("time of a sweep / a loop", statistics.median(best), FASTER, why, interval=span)
     costs = [_overhead(folder / f"small-{turn}", extent.small) for turn in range(extent.turns)]
-    study.goal(
-        "milliseconds of a job outside its render",
-        statistics.median(costs),
-        OVERHEAD,
-        "one worker, 64x48: the time of a long sweep less that of a short one",
-        interval=(min(costs), max(costs)),
-    )
+    what = "milliseconds of a job outside its render"
+    reason = "one worker, 64x48: the time of a long sweep less that of a short one"
+    study.goal(what, statistics.median(costs), OVERHEAD, reason, interval=(min(costs), max(costs)))
 
 
 def loop(folder: Path, extent: Extent) -> None:

@@ -77,14 +77,11 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
         )
     ahead = {point.name for point in front(list(found.points.values())) if found.repeats > 1}
     rows = [_row(number, point, point.name in ahead) for number, point in numbered(found)]
-    study.table(
-        f"{prefix}points",
-        f"{title}: every case",
-        COLUMNS,
-        rows,
+    note = (
         "Seconds: medians of warm renders without loading the scene; cold: a first run. Errors in units of "
-        "linear light. Ahead: no other case has less error in less time.",
+        "linear light. Ahead: no other case has less error in less time."
     )
+    study.table(f"{prefix}points", f"{title}: every case", COLUMNS, rows, note)
     if found.failed:
         reasons = [list(item) for item in found.failed.items()]
         study.table(f"{prefix}failed", f"{title}: cases that failed", ["case", "why"], reasons)

@@ -192,12 +192,10 @@ def _conditioning(cases: Cases, lobes: Lobes) -> None:
     for alpha in (1e-3, 1e-4, 1e-6):
         here = np.isclose(ALPHAS[lobes.cell[:, 0]], alpha) & (lobes.steepness <= STEEPNESS[5])
         here &= COSINES[lobes.cell[:, 1]] == 0.5
-        cases.beyond_float32(
-            f"D of a neighbouring direction, alpha {alpha:g}",
-            "largest relative change of D at 60° when x and y of one direction move by one float32 step",
-            float(change[here].max()) if here.any() else np.inf,
-            "directions are float32: neighbouring ones, equal to a renderer, have values this far apart",
-        )
+        name = f"D of a neighbouring direction, alpha {alpha:g}"
+        what = "largest relative change of D at 60° when x and y of one direction move by one float32 step"
+        why = "directions are float32: neighbouring ones, equal to a renderer, have values this far apart"
+        cases.beyond_float32(name, what, float(change[here].max()) if here.any() else np.inf, why)
 
 
 def _total_reflection(cases: Cases) -> None:
@@ -231,13 +229,9 @@ def _table_by_alpha(study: Study, lobes: Lobes, found: Sequence[Errors]) -> None
             errors = [e.of["value"][here] for e in found]
             rows.append((f"{alpha:g}", int(here.sum()), *(f(e) for e in errors for f in (np.median, np.max))))
     columns = ("alpha", "pairs", *(f"{e.formula}, {what}" for e in found for what in ("median", "largest")))
-    study.table(
-        "bsdf-by-alpha",
-        "Relative error of BSDF cos where D is at least 1e-7 of its peak",
-        columns,
-        rows,
-        "roughconductor raises alpha to 1e-4, and its Fresnel term cancels for an IOR near 1.",
-    )
+    title = "Relative error of BSDF cos where D is at least 1e-7 of its peak"
+    note = "roughconductor raises alpha to 1e-4, and its Fresnel term cancels for an IOR near 1."
+    study.table("bsdf-by-alpha", title, columns, rows, note)
 
 
 def _worst_cases(study: Study, lobes: Lobes, angles: FresnelGrid, ours: Errors) -> None:
@@ -251,12 +245,8 @@ def _worst_cases(study: Study, lobes: Lobes, angles: FresnelGrid, ours: Errors) 
             inputs += f"alpha {hexadecimal([lobes.alpha[i]])}, IOR {hexadecimal([lobes.ior[i]])}"
         steepness = "" if name == "f" else float(lobes.steepness[i])
         rows.append((title, float(ours.of[name][i]), steepness, inputs))
-    study.table(
-        "bsdf-worst",
-        "The worst of the whole grid, with their inputs",
-        ("quantity", "relative error", "tan²θh/alpha²", "inputs"),
-        rows,
-    )
+    heading = "The worst of the whole grid, with their inputs"
+    study.table("bsdf-worst", heading, ("quantity", "relative error", "tan²θh/alpha²", "inputs"), rows)
 
 
 # ----------------------------------------------- Heat maps -------------------------------------------------
@@ -270,12 +260,10 @@ def _heat_maps(study: Study, lobes: Lobes, angles: FresnelGrid, found: Sequence[
     ends = [f"{t:.3g}" for t in STEEPNESS[1:]]
     title = "Largest relative error of the lobe without its Fresnel term, D G₁ / (4 cos θi)"
     maps = [_grid(lobes.cell[:, 1], lobes.cell[:, 0], e, (len(COSINES), len(ALPHAS))) for e in errors]
-    study.plot(
-        "bsdf-cosine",
-        title,
-        _figure(maps, titles, ("alpha", alphas), ("cos θi", cosines)),
-        "By roughness and angle, over all angles off the mirror direction down to D at 1e-20 of its peak.",
+    caption = (
+        "By roughness and angle, over all angles off the mirror direction down to D at 1e-20 of its peak."
     )
+    study.plot("bsdf-cosine", title, _figure(maps, titles, ("alpha", alphas), ("cos θi", cosines)), caption)
     maps = [_grid(lobes.cell[:, 2], lobes.cell[:, 0], e, (len(ends), len(ALPHAS))) for e in errors]
     study.plot(
         "bsdf-steepness",

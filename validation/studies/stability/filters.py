@@ -44,12 +44,8 @@ def run(study: Study, *, quick: bool) -> None:
                 cases.at_most(name, case.what, case.expected, case.measure(), case.limit)
         finally:
             runtime.use(before)
-    cases.beyond_float32(
-        "constant pictures of 1e-30, blur",
-        "relative change",
-        _constant_blur((1e-30,)),
-        "the smallest weights are 2⁻³⁰: their products are below the least normal float32 and become 0",
-    )
+    why = "the smallest weights are 2⁻³⁰: their products are below the least normal float32 and become 0"
+    cases.beyond_float32("constant pictures of 1e-30, blur", "relative change", _constant_blur((1e-30,)), why)
     cases.close()
 
 

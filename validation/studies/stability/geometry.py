@@ -40,12 +40,8 @@ def run(study: Study, *, quick: bool) -> None:
     grazing_cases(cases, quick=quick)
     _scenes(study, cases, quick=quick)
     cases.close("A rounding is 2⁻²⁴ = 6e-8. Truth: the same rays in float64.")
-    study.table(
-        "geometry-worst",
-        "The rays with the largest errors",
-        ("object", "figure", "roundings", "inputs"),
-        worst,
-    )
+    title = "The rays with the largest errors"
+    study.table("geometry-worst", title, ("object", "figure", "roundings", "inputs"), worst)
 
 
 def _scenes(study: Study, cases: Cases, *, quick: bool) -> None:
@@ -76,13 +72,9 @@ def _scenes(study: Study, cases: Cases, *, quick: bool) -> None:
                 step = f"{n * 2**-23:.0e} scene sizes"
                 why = f"coordinates have steps of {step} there: normals, highlights and outlines move"
                 cases.beyond_float32(title, what, share, why)
-    study.table(
-        "translation",
-        "Share of pixels that differ after the scene was moved by so many scene sizes",
-        ("scene", "size", *(f"{n:g}" for n in TRANSLATIONS)),
-        rows,
-        "float32 gives out gradually: a scene belongs within a few of its sizes around the origin.",
-    )
+    heading = "Share of pixels that differ after the scene was moved by so many scene sizes"
+    note = "float32 gives out gradually: a scene belongs within a few of its sizes around the origin."
+    study.table("translation", heading, ("scene", "size", *(f"{n:g}" for n in TRANSLATIONS)), rows, note)
 
 
 def scaled(scene: Scene, factor: float) -> Scene:

@@ -245,21 +245,11 @@ def _apex_cases(cases: Cases, count: int, rng: np.random.Generator) -> None:
         far = traced.found & (traced.t > OUTLINE * ROUNDING)
         if name == "inwards":
             error = np.abs(np.where(far, traced.t, np.inf) - to_base).max() / ROUNDING
-            cases.at_most(
-                "cone, from its apex inwards",
-                "distance to the base, error in roundings; inf: not met",
-                "the base",
-                error,
-                ACROSS,
-            )
+            what = "distance to the base, error in roundings; inf: not met"
+            cases.at_most("cone, from its apex inwards", what, "the base", error, ACROSS)
         else:
-            cases.at_most(
-                "cone, from its apex outwards",
-                "rays that meet the cone away from the apex",
-                "none",
-                far.sum(),
-                0,
-            )
+            what = "rays that meet the cone away from the apex"
+            cases.at_most("cone, from its apex outwards", what, "none", far.sum(), 0)
 
 
 SIDES = 256  # of a stand-in mesh, its default
