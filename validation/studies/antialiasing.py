@@ -211,9 +211,8 @@ def _read(study: Study, number: int, rows: Sequence[Row]) -> bool:
         share = best.warm.seconds / target.warm.seconds
         study.record(f"scene {number}: time of the cheapest equal error / full", share)
         text = (
-            f"{name}: {best.mode} at aa={best.aa} reaches its error ({best.error:.2g} to "
-            f"{target.error:.2g}) with "
-            f"{best.rays / target.rays:.0%} of the rays, in {share:.0%} of the time."
+            f"{name}: {best.mode} at aa={best.aa} reaches its error ({best.error:.2g} to {target.error:.2g}) "
+            f"with {best.rays / target.rays:.0%} of the rays, in {share:.0%} of the time."
         )
         if share > THIRD:
             text += (
@@ -225,10 +224,8 @@ def _read(study: Study, number: int, rows: Sequence[Row]) -> bool:
     near = min((row for row in rows if row.mode in ("sobel", "geometry")), key=lambda row: row.error)
     study.text(
         f"{name}: neither sobel nor geometry reaches its error of {target.error:.2g}. The nearest is "
-        f"{near.mode} at "
-        f"aa={near.aa} with {near.error:.2g}, and {near.unrefined_share:.0%} of its squared error lies in "
-        f"pixels "
-        f"that it left alone: faint or unseen by it."
+        f"{near.mode} at aa={near.aa} with {near.error:.2g}, and {near.unrefined_share:.0%} of its squared "
+        "error lies in pixels that it left alone: faint or unseen by it."
     )
     return False
 
@@ -286,10 +283,8 @@ def _compare_modes_over_path(study: Study, extent: Extent) -> None:
     title = f"Mitsuba's path under an area light, 8 rays for each sample, {width}x{height}"
     note = (
         f"Error to aa=8 with {extent.light_spp} rays for each sample. Most of it is noise, which falls with "
-        f"every "
-        f"ray, wherever it goes; so the error follows the number of rays, and adaptive sampling only spares "
-        f"those that "
-        f"sharp edges do not need."
+        "every ray, wherever it goes; so the error follows the number of rays, and adaptive sampling only "
+        "spares those that sharp edges do not need."
     )
     study.table("path", title, COLUMNS, _cells("0, area light", "report", rows), note)
 

@@ -195,12 +195,10 @@ def _hold(study: Study, number: int, found: Comparison) -> None:
     best = min(by_region, key=by_region.__getitem__)
     study.text(
         f"Scene {number}: the lens nearest to the report's blur has an aperture of radius "
-        f"{found.lens.radius:.3g} and "
-        f"is focused at {found.lens.focus:.3g}. The corrected filter has {by_region['all']:.0%} of the "
-        f"report's error, "
-        f"and gains most {best} ({by_region[best]:.0%}). Both keep what no filter over one picture can "
-        f"know: what "
-        f"blurred things hide, and that the report's amounts do not follow a lens."
+        f"{found.lens.radius:.3g} and is focused at {found.lens.focus:.3g}. The corrected filter has "
+        f"{by_region['all']:.0%} of the report's error, and gains most {best} ({by_region[best]:.0%}). Both "
+        "keep what no filter over one picture can know: what blurred things hide, and that the report's "
+        "amounts do not follow a lens."
     )
 
 

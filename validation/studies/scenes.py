@@ -202,9 +202,8 @@ def run(study: Study, *, quick: bool) -> None:
             advance(1)
     columns = ["scene", "size", "median", "99 %", "largest", "cut-off", *REASONS]
     note = (
-        "One sample per pixel, no path cut; then how much cutting dim paths changes. Fresnel is exact, "
-        "and Schlick's in the last two scenes. "
-        "Pixels off by more than 1/255 are counted by reason."
+        "One sample per pixel, no path cut; then how much cutting dim paths changes. Fresnel is exact, and "
+        "Schlick's in the last two scenes. Pixels off by more than 1/255 are counted by reason."
     )
     study.table("scenes", "Our pictures against the float64 tracer", columns, rows, note=note)
     _lattices(study)

@@ -74,11 +74,9 @@ def run(study: Study, *, quick: bool) -> None:
     _conditioning(cases, lobes)
     _total_reflection(cases)
     cases.close(
-        "Relative errors at the same float32 numbers against 50 digits. Directions are "
-        "what their components say, and "
-        "the half vector is their sum; the gradient's error is relative to the sum of the "
-        "sizes of its terms, since "
-        "their sum passes through zero."
+        "Relative errors at the same float32 numbers against 50 digits. Directions are what their components "
+        "say, and the half vector is their sum; the gradient's error is relative to the sum of the sizes of "
+        "its terms, since their sum passes through zero."
     )
     _table_by_alpha(study, lobes, found)
     _worst_cases(study, lobes, angles, found[-1])
