@@ -43,15 +43,13 @@ def run(study: Study, *, quick: bool) -> None:
     counts = COUNTS[::2][:4] if quick else COUNTS
     rates: dict[str, dict[int, float]] = {name: {} for name in METHODS}
     worst = {"tree": 0.0, "bvh": 0.0}
-    with study.stage("Acceleration", len(counts)) as advance:
-        for count in counts:
-            runs, rays = methods(count)
-            warm = measure(runs)
-            for name, result in warm.items():
-                rates[name][count] = rays[name] / result.seconds
-            for name in worst.keys() & warm.keys():
-                worst[name] = max(worst[name], disagreement(warm[name].result, warm["loop"].result))
-            advance(1)
+    for count in study.each("Acceleration", counts):
+        runs, rays = methods(count)
+        warm = measure(runs)
+        for name, result in warm.items():
+            rates[name][count] = rays[name] / result.seconds
+        for name in worst.keys() & warm.keys():
+            worst[name] = max(worst[name], disagreement(warm[name].result, warm["loop"].result))
     rows = [
         [n, *(f"{rates[name][n] / 1e6:.3g}" if n in rates[name] else "-" for name in METHODS)] for n in counts
     ]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any
 
 import mitsuba as mi
@@ -13,28 +13,13 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import filters
+from mrt_mitsuba.validation.tools.knobs import load
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.warm import Warm, measure
 
 TITLE = "Anti-aliasing: adaptive against full"
 
 MODES = ("none", "luma", "sobel", "geometry")
-COLUMNS = (
-    "scene",
-    "lattice",
-    "mode",
-    "aa",
-    "RMSE",
-    "error / full",
-    "rays",
-    "rays / full",
-    "seconds",
-    "time / full",
-    "spread",
-    "pixels refined",
-    "error in the others",
-)
-
 # An error counts as that of full supersampling up to here; a twentieth is less than doubling aa changes by a
 # factor of 2
 SAME_ERROR = 1.05
@@ -105,27 +90,17 @@ def run(study: Study, *, quick: bool) -> None:
 def _compare_modes(study: Study, extent: Extent) -> None:
     width, height = extent.size
     table, reached = [], 0
-    with study.stage("Anti-aliasing", len(extent.scenes) * len(extent.lattices)) as advance:
-        for number in extent.scenes:
-            for lattice in extent.lattices:
-                rows = _rows(
-                    _load(mrt.scene_dict(number, width=width, height=height)), extent, lattice=lattice
-                )
-                table += _cells(str(number), lattice, rows)
-                if lattice == "report":
-                    reached += _read(study, number, rows)
-                    _hold(study, f"scene {number}", rows)
-                    _show_contours(study, number, rows)
-                gc.collect()  # scenes that stay alive slow down the kernels of later ones
-                advance(1)
+    for number, lattice in study.each("Anti-aliasing", [*product(extent.scenes, extent.lattices)]):
+        scene = load(mrt.scene_dict(number, width=width, height=height))
+        rows = _rows(scene, extent, lattice=lattice)
+        table += _cells(str(number), lattice, rows)
+        if lattice == "report":
+            reached += _read(study, number, rows)
+            _hold(study, f"scene {number}", rows)
+            _show_contours(study, number, rows)
     title = f"Error to aa={extent.reference_aa} of the same lattice, {width}x{height}"
-    study.table("modes", title, COLUMNS, table, "Seconds are medians of warm runs, each setting in turn.")
+    study.records("modes", title, table, "Seconds are medians of warm runs, each setting in turn.")
     study.record("scenes where sobel or geometry reach the error of full in a third of its time", reached)
-
-
-def _load(scene: dict[str, Any]) -> Any:
-    mrt.register()
-    return mi.load_dict(scene)
 
 
 def _rows(
@@ -141,15 +116,12 @@ def _rows(
         for mode in MODES
         for aa in extent.amounts
     }
-    return [
-        _row(mode, aa, warm, reference) for (mode, aa), warm in measure(runs, repeats=extent.repeats).items()
-    ]
-
-
-def _row(mode: str, aa: int, warm: Warm, reference: np.ndarray) -> Row:
-    squared = np.square(warm.result.image - reference).mean(axis=-1)
-    alone = squared[_samples(warm.result) == 1].sum() / max(squared.sum(), 1e-300)
-    return Row(mode, aa, warm, float(np.sqrt(squared.mean())), float(alone))
+    rows = []
+    for (mode, aa), warm in measure(runs, repeats=extent.repeats).items():
+        squared = np.square(warm.result.image - reference).mean(axis=-1)
+        alone = squared[_samples(warm.result) == 1].sum() / max(squared.sum(), 1e-300)
+        rows.append(Row(mode, aa, warm, float(np.sqrt(squared.mean())), float(alone)))
+    return rows
 
 
 def _samples(result: Any) -> np.ndarray:
@@ -157,31 +129,36 @@ def _samples(result: Any) -> np.ndarray:
     return result.layers.get("samples.Y", full)
 
 
-def _cells(scene: str, lattice: str, rows: Sequence[Row]) -> list[tuple[Any, ...]]:
-    full = {row.aa: row for row in rows if row.mode == "none"}
+def _full(rows: Sequence[Row]) -> dict[int, Row]:
+    """Return full supersampling by aa."""
+    return {row.aa: row for row in rows if row.mode == "none"}
+
+
+def _cells(scene: str, lattice: str, rows: Sequence[Row]) -> list[dict[str, Any]]:
     return [
-        (
-            scene,
-            lattice,
-            row.mode,
-            row.aa,
-            row.error,
-            row.error / full[row.aa].error,
-            row.rays,
-            row.rays / full[row.aa].rays,
-            row.warm.seconds,
-            row.warm.seconds / full[row.aa].warm.seconds,
-            row.warm.spread,
-            row.refined,
-            row.unrefined_share,
-        )
+        {
+            "scene": scene,
+            "lattice": lattice,
+            "mode": row.mode,
+            "aa": row.aa,
+            "RMSE": row.error,
+            "error / full": row.error / full.error,
+            "rays": row.rays,
+            "rays / full": row.rays / full.rays,
+            "seconds": row.warm.seconds,
+            "time / full": row.warm.seconds / full.warm.seconds,
+            "spread": row.warm.spread,
+            "pixels refined": row.refined,
+            "error in the others": row.unrefined_share,
+        }
         for row in rows
+        for full in [_full(rows)[row.aa]]
     ]
 
 
 def _hold(study: Study, name: str, rows: Sequence[Row]) -> None:
     """Bound what holds on any machine: rays and errors."""
-    full = {row.aa: row for row in rows if row.mode == "none"}
+    full = _full(rows)
     off = [row.rays - _expected_rays(row) for row in rows if row.mode != "none"]
     title = f"{name}: camera rays other than one a pixel and aa² - 1 in refined ones"
     study.at_most(title, max(map(abs, off)), 0, "a count")
@@ -201,10 +178,9 @@ def _expected_rays(row: Row) -> int:
 
 def _read(study: Study, number: int, rows: Sequence[Row]) -> bool:
     """Say what it takes to reach the error of full supersampling, or why it is not to be had for a third."""
-    target = max((row for row in rows if row.mode == "none"), key=lambda row: row.aa)
-    good = [
-        row for row in rows if row.mode in ("sobel", "geometry") and row.error <= SAME_ERROR * target.error
-    ]
+    target = max(_full(rows).values(), key=lambda row: row.aa)
+    sparing = [row for row in rows if row.mode in ("sobel", "geometry")]
+    good = [row for row in sparing if row.error <= SAME_ERROR * target.error]
     best = min(good, key=lambda row: row.warm.seconds, default=None)
     name = f"Scene {number}, full supersampling at aa={target.aa}"
     if best is not None:
@@ -221,7 +197,7 @@ def _read(study: Study, number: int, rows: Sequence[Row]) -> bool:
             )
         study.text(text)
         return share <= THIRD
-    near = min((row for row in rows if row.mode in ("sobel", "geometry")), key=lambda row: row.error)
+    near = min(sparing, key=lambda row: row.error)
     study.text(
         f"{name}: neither sobel nor geometry reaches its error of {target.error:.2g}. The nearest is "
         f"{near.mode} at aa={near.aa} with {near.error:.2g}, and {near.unrefined_share:.0%} of its squared "
@@ -242,7 +218,7 @@ def _show_contours(study: Study, number: int, rows: Sequence[Row]) -> None:
 def _compare_with_mitsuba(study: Study, *, quick: bool) -> None:
     """Compare lattices with random samples that Mitsuba places and filters itself, on scene 3."""
     width, height, spp = (96, 72, 1024) if quick else (200, 150, 8192)
-    scene = _load(mrt.scene_dict(3, width=width, height=height, fresnel="dielectric"))
+    scene = load(mrt.scene_dict(3, width=width, height=height, fresnel="dielectric"))
     whitted = {"type": "mrt_whitted", "min_contribution": 0.0}
     runs = [mi.render(scene, integrator=mi.load_dict(whitted), spp=spp // 4, seed=k) for k in range(4)]
     truth = np.mean(runs, axis=0)
@@ -277,7 +253,7 @@ def lit_by_a_sphere(width: int, height: int) -> dict[str, Any]:
 
 
 def _compare_modes_over_path(study: Study, extent: Extent) -> None:
-    scene = _load(lit_by_a_sphere(*extent.light_size))
+    scene = load(lit_by_a_sphere(*extent.light_size))
     rows = _rows(scene, extent, reference_aa=8, reference_spp=extent.light_spp, lattice="report", spp=8)
     width, height = extent.light_size
     title = f"Mitsuba's path under an area light, 8 rays for each sample, {width}x{height}"
@@ -286,7 +262,7 @@ def _compare_modes_over_path(study: Study, extent: Extent) -> None:
         "every ray, wherever it goes; so the error follows the number of rays, and adaptive sampling only "
         "spares those that sharp edges do not need."
     )
-    study.table("path", title, COLUMNS, _cells("0, area light", "report", rows), note)
+    study.records("path", title, _cells("0, area light", "report", rows), note)
 
 
 def variance_error(detector: str, *, spp: int, lattice: str) -> float:
@@ -321,7 +297,7 @@ def variance_error(detector: str, *, spp: int, lattice: str) -> float:
 
 def _chase_noise(study: Study, extent: Extent) -> None:
     """Count refined pixels where the converged picture is flat, and where it has an edge."""
-    scene = _load(lit_by_a_sphere(*extent.light_size))
+    scene = load(lit_by_a_sphere(*extent.light_size))
     centre: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}  # where the detectors look
     truth = mrt.render(scene, **centre, spp=16 * extent.light_spp, seed=78).image
     contrast = _contrast(truth)

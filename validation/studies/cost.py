@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -41,9 +40,6 @@ PASS_COLUMNS = ("scene", "pass", "seconds", "share", "in kernels, s", "launches"
 WEIGHTS = ("launches", "size", "operations", "compile", "codegen", "seconds")
 KERNEL_COLUMNS = ("scene", "pass", "kernel", "hash", "launches", "threads", "operations", "compile, s",
                   "code, s", "running, s", "share")  # fmt: skip
-FLOOR_COLUMNS = ("scene", "seconds", "spread", "in kernels", "launches", "compile, s", "camera rays",
-                 "mirror rays", "shadow rays", "million rays / s", "floor, s", "seconds / floor",
-                 "kernels / floor")  # fmt: skip
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -62,14 +58,11 @@ def _default_render(study: Study, extent: Extent) -> None:
     width, height = extent.size
     passes: list[tuple[Any, ...]] = []
     rows: list[tuple[Any, ...]] = []
-    with study.stage("Passes and kernels", len(extent.scenes)) as advance:
-        for number in extent.scenes:
-            render = partial(mrt.render, number, width=width, height=height, aa=extent.aa)
-            found = kernels.profile(render, repeats=extent.repeats)
-            passes += _pass_rows(number, render().timings, found)
-            rows += _kernel_rows(number, found)
-            gc.collect()
-            advance(1)
+    for number in study.each("Passes and kernels", extent.scenes):
+        render = partial(mrt.render, number, width=width, height=height, aa=extent.aa)
+        found = kernels.profile(render, repeats=extent.repeats)
+        passes += _pass_rows(number, render().timings, found)
+        rows += _kernel_rows(number, found)
     what = f"of the default render, {width}x{height}, aa={extent.aa}"
     note = (
         "Beyond its kernels a pass takes what Python and Dr.Jit need to write them down, whatever the size."
@@ -107,46 +100,43 @@ def _kernel_rows(number: int, found: Sequence[Kernel]) -> list[tuple[Any, ...]]:
 
 
 def _floors(study: Study, extent: Extent, *, goals: bool) -> None:
-    rows = []
-    with study.stage("Floor of the rays", len(extent.scenes)) as advance:
-        for number in extent.scenes:
-            rows.append(_floor_row(study, number, extent, goals))
-            gc.collect()
-            advance(1)
+    scenes = study.each("Floor of the rays", extent.scenes)
+    rows = [_floor_row(study, number, extent, goals) for number in scenes]
     title = f"Every pixel supersampled, {extent.size[0]}x{extent.size[1]}, aa={extent.aa}"
     note = (
         "Floor: the same rays, recorded, through Mitsuba's ray queries alone, in turn with renders. What is "
         "not in kernels does not grow with the picture: the larger it is, the nearer the ratio of the "
         "kernels."
     )
-    study.table("floor", title, FLOOR_COLUMNS, rows, note)
+    study.records("floor", title, rows, note)
 
 
-def _floor_row(study: Study, number: int, extent: Extent, goals: bool) -> tuple[Any, ...]:
-    """Return ``FLOOR_COLUMNS``; the recorded rays are held to those that the integrator counts."""
+def _floor_row(study: Study, number: int, extent: Extent, goals: bool) -> dict[str, Any]:
+    """Return a row of the table of floors; the recorded rays are held to those that the integrator counts."""
     found = scene_cost(number, extent.size, extent.aa, repeats=extent.repeats)
     time, floor = found.floor, found.floor.other_seconds
-    study.at_most(
-        f"scene {number}: share of rays recorded or counted, but not both",
-        found.share_off,
-        MOST_OFF,
+    what = f"scene {number}: share of rays recorded or counted, but not both"
+    why = (
         "recording takes the loop apart; other code rounds a few rays to the other side of an edge. One kind "
-        "of ray that is not counted, or counted twice, leaves tens of percent",
+        "of ray that is not counted, or counted twice, leaves tens of percent"
     )
+    study.at_most(what, found.share_off, MOST_OFF, why)
     if goals and number in GOAL_SCENES:
         quartiles = f"quartiles {time.low:.3g} and {time.high:.3g} of {extent.repeats} ratios"
         interval = (time.low, time.high)
         study.goal(f"scene {number}: seconds / floor", time.median, FLOOR_GOAL, quartiles, interval=interval)
-    return (
-        number,
-        found.warm.seconds,
-        found.warm.spread,
-        found.in_kernels,
-        sum(k.launches for k in found.each),
-        found.compile,
-        *(found.counted[kind] for kind in ("primary", "mirror", "shadow")),
-        found.rays_per_second / 1e6,
-        floor,
-        time.median,
-        found.in_kernels / floor,
-    )
+    return {
+        "scene": number,
+        "seconds": found.warm.seconds,
+        "spread": found.warm.spread,
+        "in kernels": found.in_kernels,
+        "launches": sum(k.launches for k in found.each),
+        "compile, s": found.compile,
+        "camera rays": found.counted["primary"],
+        "mirror rays": found.counted["mirror"],
+        "shadow rays": found.counted["shadow"],
+        "million rays / s": found.rays_per_second / 1e6,
+        "floor, s": floor,
+        "seconds / floor": time.median,
+        "kernels / floor": found.in_kernels / floor,
+    }

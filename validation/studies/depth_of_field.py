@@ -76,16 +76,13 @@ def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
     extent = QUICK if quick else FULL
     rows = []
-    with study.stage("Depth of field", len(SCENES)) as advance:
-        for number in SCENES:
-            found = compare(report_scene(number), extent)
-            rows += _rows(number, found)
-            _hold(study, number, found)
-            _show(study, number, found)
-            advance(1)
-    columns = ("scene", "filter", "region", "pixels", "RMSE", "RMSE / without")
+    for number in study.each("Depth of field", SCENES):
+        found = compare(report_scene(number), extent)
+        rows += _rows(number, found)
+        _hold(study, number, found)
+        _show(study, number, found)
     note = "Near depth steps: within 8 pixels of an outline. At the border: within 8 pixels of it."
-    study.table("errors", "RMSE to a lens", columns, rows, note)
+    study.records("errors", "RMSE to a lens", rows, note)
 
 
 def compare(scene: Scene, extent: Extent) -> Comparison:
@@ -162,16 +159,16 @@ def _regions(sharp: Any) -> dict[str, np.ndarray]:
     }
 
 
-def _rows(number: int, found: Comparison) -> list[tuple[Any, ...]]:
+def _rows(number: int, found: Comparison) -> list[dict[str, Any]]:
     return [
-        (
-            number,
-            name,
-            region,
-            int(mask.sum()),
-            found.error(name, region),
-            found.error(name, region) / found.error("sharp", region),
-        )
+        {
+            "scene": number,
+            "filter": name,
+            "region": region,
+            "pixels": int(mask.sum()),
+            "RMSE": found.error(name, region),
+            "RMSE / without": found.error(name, region) / found.error("sharp", region),
+        }
         for name in ("sharp", *MODES)
         for region, mask in found.regions.items()
         if mask.any()

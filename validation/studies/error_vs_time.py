@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -48,26 +47,23 @@ def run(study: Study, *, quick: bool) -> None:
     extent = QUICK if quick else FULL
     jobs = [(name, number) for name, numbers in extent.scenes.items() for number in numbers]
     samplings: dict[int, Findings] = {}
-    with study.stage("Error against time", len(jobs)) as advance:
-        for name, number in jobs:
-            trade = knobs.TRADES[name](number, extent.settings)
-            found = error_vs_time(
-                trade.scene,
-                trade.cases,
-                reference=trade.reference,
-                repeats=extent.repeats,
-                shared=trade.shared,
-                strips=name in PICTURES and not quick,
-            )
-            where = f"scene {number}, {name}"
-            describe(study, found, where, f"Scene {number}: {trade.title}", trade.truth)
-            if not found.failed:
-                HOLD[name](study, where, found)
-            if name == "sampling":
-                samplings[number] = found
-            del trade, found
-            gc.collect()  # scenes that stay alive slow down the kernels of later ones
-            advance(1)
+    for name, number in study.each("Error against time", jobs):
+        trade = knobs.TRADES[name](number, extent.settings)
+        found = error_vs_time(
+            trade.scene,
+            trade.cases,
+            reference=trade.reference,
+            repeats=extent.repeats,
+            shared=trade.shared,
+            strips=name in PICTURES and not quick,
+        )
+        where = f"scene {number}, {name}"
+        describe(study, found, where, f"Scene {number}: {trade.title}", trade.truth)
+        if not found.failed:
+            HOLD[name](study, where, found)
+        if name == "sampling":
+            samplings[number] = found
+        del trade, found  # the scenes with them
     if extent.repeats > 1:  # else a disturbance would decide
         _answer(study, samplings)
 

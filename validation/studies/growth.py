@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -47,6 +46,12 @@ class Found:
     operations: int  # of them together
     compile: float  # seconds
 
+    def row(self, what: str, size: int) -> dict[str, Any]:
+        """Return a row of the study's table."""
+        times = {"seconds": self.warm.seconds, "spread": self.warm.spread, "compile, s": self.compile}
+        code = {"kernels": self.kernels, "operations": self.operations}
+        return {"what grows": what, "size": size, **times, **code}
+
 
 @dataclass(frozen=True)
 class Exponent:
@@ -79,28 +84,18 @@ class Exponent:
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study. A quick one gives no times: it holds the code alone."""
     extent = QUICK if quick else FULL
-    series: dict[str, dict[int, Found]] = {}
-    with study.stage("Growth", sum(map(len, extent.sizes.values()))) as advance:
-        for what, sizes in extent.sizes.items():
-            series[what] = {}
-            for size in sizes:
-                series[what][size] = _measure(SERIES[what](size), extent.repeats)
-                gc.collect()  # scenes that stay alive slow down the kernels of later ones
-                advance(1)
+    series: dict[str, dict[int, Found]] = {what: {} for what in extent.sizes}
+    jobs = [(what, size) for what, sizes in extent.sizes.items() for size in sizes]
+    for what, size in study.each("Growth", jobs):
+        series[what][size] = _measure(SERIES[what](size), extent.repeats)
     if extent.repeats > 1:
         _exponents(study, series)
-    study.table(
-        "growth",
-        "Time and code against the size of the task",
-        ("what grows", "size", "seconds", "spread", "compile, s", "kernels", "operations"),
-        [
-            (what, size, f.warm.seconds, f.warm.spread, f.compile, f.kernels, f.operations)
-            for what, found in series.items()
-            for size, f in found.items()
-        ],
+    rows = [series[what][size].row(what, size) for what, size in jobs]
+    note = (
         "Seconds: medians of warm renders. Kernels and operations: different kernels, and the length of "
-        "their code.",
+        "their code."
     )
+    study.records("growth", "Time and code against the size of the task", rows, note)
     for what, found in series.items():
         *smaller, largest = found.values()
         for name, limit in (("operations", MOST_CODE), ("kernels", 1)):
@@ -111,18 +106,17 @@ def run(study: Study, *, quick: bool) -> None:
 
 def _exponents(study: Study, series: Mapping[str, Mapping[int, Found]]) -> None:
     exponents = {what: fit({n: f.warm.seconds for n, f in found.items()}) for what, found in series.items()}
-    study.table(
-        "exponents",
-        "Exponents of growth, over the larger half of the sizes",
-        ("what grows", "from", "to", "exponent", f"{LEVEL:.0%} interval", "reading"),
-        [
-            (what, e.sizes[0], e.sizes[-1], e.value, f"{e.low:.2f} to {e.high:.2f}", e.reading())
-            for what, e in exponents.items()
-        ],
+    title = "Exponents of growth, over the larger half of the sizes"
+    columns = ("what grows", "from", "to", "exponent", f"{LEVEL:.0%} interval", "reading")
+    rows = [
+        (what, e.sizes[0], e.sizes[-1], e.value, f"{e.low:.2f} to {e.high:.2f}", e.reading())
+        for what, e in exponents.items()
+    ]
+    note = (
         "Exponent 1: in proportion; 0: no growth. The interval is that of the slope of a straight line "
-        "through the logarithms; wide where that is no straight line.",
-        first=True,
+        "through the logarithms; wide where that is no straight line."
     )
+    study.table("exponents", title, columns, rows, note, first=True)
     largest = [f"{max(f)} {what} in {f[max(f)].warm.seconds:.2g} s" for what, f in series.items()]
     caption = f"The largest of each: {', '.join(largest)}. The line is the fit."
     study.plot("growth", "Time against the size of the task", _figure(series, exponents), caption)

@@ -88,6 +88,13 @@ class Finding:
     time: Ratio
     means: float  # of the pictures, theirs over ours
 
+    def row(self) -> dict[str, Any]:
+        """Return what the study's table has."""
+        pair, time = self.pair, self.time
+        names = {"ours": pair.ours, "theirs": pair.theirs, "scene": pair.scene}
+        seconds = {"ours, s": time.seconds, "theirs, s": time.other_seconds, "ratio": time.median}
+        return {**names, **seconds, "quartiles": f"{time.low:.3g} to {time.high:.3g}", "goal": pair.goal}
+
     def as_dict(self) -> dict[str, Any]:
         """Return what the benchmark's file has."""
         return {**asdict(self.time), "goal": self.pair.goal}
@@ -110,18 +117,9 @@ def run(study: Study, *, quick: bool) -> None:
             off = abs(one.means / one.pair.brightness - 1)
             note = "the same light, else it would be no comparison; the rest is noise. One light less shows"
             study.at_most(f"{name}: difference of the means", off, SAME_MEAN, note)
-    study.table(
-        "rivals",
-        f"Seconds of ours over theirs, {extent.size[0]}x{extent.size[1]}, {extent.spp} samples a pixel",
-        ("ours", "theirs", "scene", "ours, s", "theirs, s", "ratio", "quartiles", "goal"),
-        [
-            (p.ours, p.theirs, p.scene, t.seconds, t.other_seconds, t.median, f"{t.low:.3g} to {t.high:.3g}",
-             p.goal)
-            for one in found for p, t in [(one.pair, one.time)]
-        ],
-        "Taken in turn, medians of ratios.",
-        first=True,
-    )  # fmt: skip
+    title = f"Seconds of ours over theirs, {extent.size[0]}x{extent.size[1]}, {extent.spp} samples a pixel"
+    rows = [one.row() for one in found]
+    study.records("rivals", title, rows, "Taken in turn, medians of ratios.", first=True)
 
 
 def compare(extent: Extent) -> Iterator[Finding]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -43,27 +42,13 @@ class Forced:
 
 def table(study: Study, *, size: tuple[int, int], aa: int, repeats: int) -> None:
     """Add the table of what is left out, and hold the pictures to be the same."""
-    cases, rows = forced(), []
-    with study.stage("What the plan saves", len(cases)) as advance:
-        for case in cases:
-            rows.append(_row(case, size, aa, repeats))
-            gc.collect()  # scenes that stay alive slow down the kernels of later ones
-            advance(1)
+    rows = [_row(case, size, aa, repeats) for case in study.each("What the plan saves", forced())]
     title = f"What the plan saves on a scene that does not need it, {size[0]}x{size[1]}, aa={aa}"
-    columns = (
-        "left out",
-        "s without",
-        "s with",
-        "saves, s",
-        "with / without",
-        "quartiles",
-        "change of the picture",
-    )
     note = "Scene 0 without what is named, and with it forced in, in turn; medians of ratios."
-    study.table("plan", title, columns, rows, note)
+    study.records("plan", title, rows, note)
     what = "plan: largest change of the picture by what is left out"
     why = "half a step of an 8-bit picture; a lamp that is left out changes hundreds"
-    study.at_most(what, max(row[-1] for row in rows), INVISIBLE, why)
+    study.at_most(what, max(row["change of the picture"] for row in rows), INVISIBLE, why)
 
 
 def renders(case: Forced, size: tuple[int, int], aa: int) -> list[Callable[..., Any]]:
@@ -75,13 +60,19 @@ def renders(case: Forced, size: tuple[int, int], aa: int) -> list[Callable[..., 
     return [partial(mrt.render, scene, **{**options, **m}) for scene, m in zip(scenes, more, strict=True)]
 
 
-def _row(case: Forced, size: tuple[int, int], aa: int, repeats: int) -> tuple[Any, ...]:
+def _row(case: Forced, size: tuple[int, int], aa: int, repeats: int) -> dict[str, Any]:
     without, forced_in = renders(case, size, aa)
     change = float(np.abs(without().image - forced_in().image).max())
     time = ratio(forced_in, without, repeats=repeats)
-    saved = time.seconds - time.other_seconds
-    quartiles = f"{time.low:.3g} to {time.high:.3g}"
-    return (case.what, time.other_seconds, time.seconds, saved, time.median, quartiles, change)
+    return {
+        "left out": case.what,
+        "s without": time.other_seconds,
+        "s with": time.seconds,
+        "saves, s": time.seconds - time.other_seconds,
+        "with / without": time.median,
+        "quartiles": f"{time.low:.3g} to {time.high:.3g}",
+        "change of the picture": change,
+    }
 
 
 def forced() -> list[Forced]:

@@ -6,15 +6,18 @@ it is given; ``report`` turns the result into a table on the terminal, ``summary
 
 from __future__ import annotations
 
+import gc
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from mrt_mitsuba.rendering.progress import Progress
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,12 @@ class Study:
             raise ValueError(f"table {name}: {wrong[0]} does not fit the columns {columns}")
         self.parts.append(Table(name, title, columns, rows, note, first))
 
+    def records(
+        self, name: str, title: str, rows: Sequence[Mapping[str, Any]], note: str = "", *, first: bool = False
+    ) -> None:
+        """Add a table of rows that name their values: the columns are those of the first row."""
+        self.table(name, title, list(rows[0]), [list(row.values()) for row in rows], note, first=first)
+
     def plot(self, name: str, title: str, figure: Any, caption: str = "") -> None:
         """Add a matplotlib figure."""
         self.parts.append(Plot(name, title, figure, caption))
@@ -187,6 +196,14 @@ class Study:
         """Show progress; the value is called with the number of steps just done."""
         with self.progress.stage(title, total) as advance:
             yield advance
+
+    def each(self, title: str, items: Collection[Item]) -> Iterator[Item]:
+        """Yield items and show progress; frees scenes, which would slow down the kernels of later ones."""
+        with self.stage(title, len(items)) as advance:
+            for item in items:
+                yield item
+                gc.collect()
+                advance(1)
 
     def summary(self) -> Mapping[str, Any]:
         """Return the study as JSON-ready values; numbers that JSON cannot hold become text."""
