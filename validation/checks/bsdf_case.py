@@ -129,7 +129,7 @@ class Case:
         return largest
 
     def snippet(self, body: str, **names: Any) -> str:
-        return snippets.bsdf(self.bsdf, self.recipe.description, body, names)
+        return snippets.program("bsdf", self.bsdf, self.recipe.description, body, **names)
 
     def at(self, body: str, pairs: Pairs, **more: Any) -> Callable[[int], str]:
         """Return what makes the snippet of one pair."""

@@ -159,7 +159,12 @@ class Case:
         return met & clear, even
 
     def snippet(self, o: Array, d: Array, body: str = snippets.RAY, **names: Any) -> str:
-        return snippets.shape(self.shape, self.recipe.description, body, {"o": o, "d": d, **names})
+        return snippets.program("shape", self.shape, self.recipe.description, body, o=o, d=d, **names)
+
+    @property
+    def positions(self) -> str:
+        """Return the snippet about sampled positions."""
+        return snippets.program("shape", self.shape, self.recipe.description, snippets.POSITIONS)
 
     def at(self, o: Array, d: Array, body: str = snippets.RAY, **names: Any) -> Callable[[int], str]:
         """Return what makes the snippet of one ray of many."""

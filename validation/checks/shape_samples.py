@@ -8,7 +8,6 @@ import drjit as dr
 import numpy as np
 from scipy import stats
 
-from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.law import LEVEL, SIGMAS, Law, Skip
 from mrt_mitsuba.validation.checks.probe import Array, lanes, unit
 from mrt_mitsuba.validation.checks.shape_case import FLAT, Case, leave, near, trace, walk
@@ -36,7 +35,7 @@ def sampling(law: Law, case: Case) -> None:
     ):
         title = f"{what}, relative"
         why = "the same number"
-        law.at_most(title, measured, 1e-3, why, snippets.positions(case.shape, case.recipe.description))
+        law.at_most(title, measured, 1e-3, why, case.positions)
     _on_the_surface(law, case, p, n)
     _area(law, case, p, n, area)
     _directions(law, case, u)
@@ -86,12 +85,10 @@ def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
         points.append(hit.p[~_doubled(case, hit.p, hit.n)])
     estimate = 2 * np.pi * radius**2 * crossed.mean()
     error = 2 * np.pi * radius**2 * crossed.std() / np.sqrt(count)
+    what = f"surface_area() against that by crossings of lines, relative, beyond {SIGMAS} standard errors"
+    why = "lines that graze may cross twice within the offset of a spawned ray"
     law.at_most(
-        f"surface_area() against that by crossings of lines, relative, beyond {SIGMAS} standard errors",
-        max(abs(estimate - area) - SIGMAS * error, 0) / area,
-        1e-2 + doubled.mean(),
-        "lines that graze may cross twice within the offset of a spawned ray",
-        snippets.positions(case.shape, case.recipe.description),
+        what, max(abs(estimate - area) - SIGMAS * error, 0) / area, 1e-2 + doubled.mean(), why, case.positions
     )
     _uniform(law, case, p[~doubled], np.concatenate(points), max((crossed**2).sum() / crossed.sum(), 1))
 
@@ -113,13 +110,9 @@ def _uniform(law: Law, case: Case, p: Array, points: Array, bunch: float) -> Non
     pull = (sampled / total[0] - crossing / total[1]) ** 2
     mean = (sampled + crossing) / sum(total)
     statistic = (pull / (mean / total[0] + bunch * mean / total[1] + (2e-3 * mean) ** 2))[used].sum()
-    law.at_least(
-        "chance of such counts in parts of the surface if positions follow its area",
-        float(stats.chi2.sf(statistic, max(used.sum() - 1, 1))),
-        LEVEL,
-        "a false alarm in a million checks",
-        snippets.positions(case.shape, case.recipe.description),
-    )
+    what = "chance of such counts in parts of the surface if positions follow its area"
+    why = "a false alarm in a million checks"
+    law.at_least(what, float(stats.chi2.sf(statistic, max(used.sum() - 1, 1))), LEVEL, why, case.positions)
 
 
 def _directions(law: Law, case: Case, u: Array) -> None:
@@ -165,14 +158,12 @@ def _solid_angle(law: Law, case: Case, mean: Array, variance: Array) -> None:
     met = trace(case.target, o, away)
     expected, other = _moments(case, o, away, met.p, np.where(met.found, CONE, 0))
     off = np.abs(mean - expected) - SIGMAS * np.sqrt(variance + other)
-    law.at_most(
+    what = (
         "solid angle of what is visible, or its middle or width, by samples against uniform directions, "
-        f"beyond {SIGMAS} standard errors",
-        max(off.max(), 0) / expected[0],
-        1e-2,
-        "the mean of 1 / density over what is seen; lines that graze are left room for",
-        snippets.positions(case.shape, case.recipe.description),
+        f"beyond {SIGMAS} standard errors"
     )
+    why = "the mean of 1 / density over what is seen; lines that graze are left room for"
+    law.at_most(what, max(off.max(), 0) / expected[0], 1e-2, why, case.positions)
 
 
 SINE = 1 / 3  # of the angle between the middle and the rim of the sphere around, from 1.5 sizes away
