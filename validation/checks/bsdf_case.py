@@ -15,15 +15,13 @@ import numpy as np
 from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.law import Skip
 from mrt_mitsuba.validation.checks.probe import (
-    SCALAR_SHARE,
     Array,
     Probe,
     Samples,
     direction,
-    is_scalar,
     unit,
 )
-from mrt_mitsuba.validation.checks.recipe import Recipe
+from mrt_mitsuba.validation.checks.recipe import Subject, row
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
 QUICK_ANGLES = (0, 50, 85, 140)
@@ -49,22 +47,12 @@ class View:
 
 
 @dataclass
-class Case:
+class Case(Subject):
     """A BSDF under examination, and what several laws need to know of it."""
 
-    bsdf: Any
-    recipe: Recipe
-    quick: bool
-    seed: int
-
     def __post_init__(self) -> None:
-        self.probe = Probe(self.bsdf)
-        self.rng = np.random.default_rng(self.seed)
-
-    def count(self, quick: int, full: int) -> int:
-        """Return how many lanes to use."""
-        number = quick if self.quick else full
-        return max(int(number * SCALAR_SHARE), 64) if is_scalar() else number
+        super().__post_init__()
+        self.probe = Probe(self.plugin)
 
     def uniform(self, count: int) -> Array:
         return self.rng.random((count, 3), np.float32)
@@ -85,7 +73,7 @@ class Case:
 
     def copy(self) -> Case:
         """Return a case whose parameters can be changed, with a BSDF of its own if it can be loaded."""
-        loaded = self.bsdf if self.recipe.description is None else self.recipe.load()
+        loaded = self.plugin if self.recipe.description is None else self.recipe.load()
         made = Case(loaded, self.recipe, self.quick, self.seed)
         made.pairs = self.pairs
         return made
@@ -129,11 +117,12 @@ class Case:
         return largest
 
     def snippet(self, body: str, **names: Any) -> str:
-        return snippets.program("bsdf", self.bsdf, self.recipe.description, body, **names)
+        return snippets.program("bsdf", self.plugin, self.recipe.description, body, **names)
 
     def at(self, body: str, pairs: Pairs, **more: Any) -> Callable[[int], str]:
-        """Return what makes the snippet of one pair."""
-        return lambda i: self.snippet(body, wi=pairs.wi[i], uv=pairs.uv[i], wo=pairs.wo[i], **more)
+        """Return what makes the snippet of one pair; arrays have a row for each."""
+        names = {"wi": pairs.wi, "uv": pairs.uv, "wo": pairs.wo, **more}
+        return lambda i: self.snippet(body, **row(names, i))
 
 
 @dataclass(frozen=True)
@@ -191,7 +180,7 @@ def excess(one: Array, other: Array, allowed: Array) -> Array:
 
 def parameters(case: Case) -> list[tuple[str, Any]]:
     """Return the parameters that hold floating-point numbers which are amounts."""
-    params = mi.traverse(case.bsdf)
+    params = mi.traverse(case.plugin)
     found = []
     for key in params.keys():  # noqa: SIM118 - SceneParameters is not a dict
         try:
@@ -209,7 +198,7 @@ def parameters(case: Case) -> list[tuple[str, Any]]:
 @contextmanager
 def changed(case: Case, key: str, change: Any) -> Iterator[Any]:
     """Change a parameter for a while."""
-    params = mi.traverse(case.bsdf)
+    params = mi.traverse(case.plugin)
     before = params[key] if isinstance(params[key], float) else type(params[key])(params[key])
     params[key] = change(before)
     params.update()

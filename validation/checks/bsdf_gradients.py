@@ -24,7 +24,7 @@ def gradients(law: Law, case: Case) -> None:
     if not len(_lit(case).wi):
         raise Skip("values are 0")
     case = case.copy()
-    params = mi.traverse(case.bsdf)
+    params = mi.traverse(case.plugin)
     keys = [k for k, _ in parameters(case) if not params.flags(k) & int(mi.ParamFlags.NonDifferentiable)]
     if not keys:
         raise Skip("traverse() marks no parameter as differentiable")
@@ -79,7 +79,7 @@ def _values(case: Case) -> Any:
     wi, wo = (mi.Vector3f(np.ascontiguousarray(x.T)) for x in (few.wi, few.wo))
     si = interaction(wi, mi.Point2f(np.ascontiguousarray(few.uv.T)))
     scale = np.maximum(few.value.max(axis=1), 1e-3 * few.value.max())
-    value = mi.unpolarized_spectrum(case.bsdf.eval(context(), si, wo))
+    value = mi.unpolarized_spectrum(case.plugin.eval(context(), si, wo))
     total = sum(value[i] for i in range(len(value))) / mi.Float(scale.astype(np.float32))
     return dr.select(dr.isfinite(total), total, 0)
 
@@ -108,7 +108,7 @@ def _differences(case: Case, key: str) -> tuple[Array, Array]:
     either side are apart: where a value has a kink, as at the end of a range, either one is a derivative.
     Where a lobe is so narrow that it moves away within every width, differences say nothing: infinity.
     """
-    value = abs(float(np.mean(np.array(mi.traverse(case.bsdf)[key]))))
+    value = abs(float(np.mean(np.array(mi.traverse(case.plugin)[key]))))
     steps = np.array(WIDTHS) * (value or 0.05)
 
     def at(shift: float) -> Array:

@@ -15,7 +15,7 @@ from mrt_mitsuba.validation.checks.probe import Array, context, direction
 
 def components(law: Law, case: Case) -> None:
     """Flags of components against what they do; their sum against the whole; ``ctx.component``."""
-    bsdf, pairs = case.bsdf, case.pairs
+    bsdf, pairs = case.plugin, case.pairs
     count = bsdf.component_count()
     flags = [int(bsdf.flags(i)) for i in range(count)]
     apart = bin(np.bitwise_or.reduce(flags or [0]) ^ int(bsdf.flags())).count("1")

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import mitsuba as mi
 import numpy as np
 
+from mrt_mitsuba import runtime
 from mrt_mitsuba.scene.loading import load_dict
-from mrt_mitsuba.validation.checks.law import Skip
+from mrt_mitsuba.validation.checks.law import Skip, class_name
+from mrt_mitsuba.validation.checks.probe import SCALAR_SHARE, is_scalar
+
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,61 @@ class Recipe:
         if self.description is None:
             raise Skip("a loaded object was given: this needs the dict that it is made from")
         return Recipe({**self.description, **_kept(changes)})
+
+
+@dataclass
+class Subject:
+    """A plugin under examination, and how thorough to be."""
+
+    plugin: Any
+    recipe: Recipe
+    quick: bool
+    seed: int
+
+    def __post_init__(self) -> None:
+        self.rng = np.random.default_rng(self.seed)
+
+    def count(self, quick: int, full: int) -> int:
+        """Return how many lanes to use."""
+        number = quick if self.quick else full
+        return max(int(number * SCALAR_SHARE), 64) if is_scalar() else number
+
+
+def opened(given: Any) -> tuple[Any, Recipe, str]:
+    """Return a plugin by its dict, or one that is loaded, with its recipe and name."""
+    runtime.use()
+    recipe = Recipe.of(given)
+    if recipe.description is None:
+        return given, recipe, class_name(given)
+    return recipe.open(), recipe, recipe.description["type"]
+
+
+def row(names: Mapping[str, Any], i: int) -> dict[str, Any]:
+    """Return values by name, of arrays one row."""
+    return {name: value[i] if isinstance(value, np.ndarray) else value for name, value in names.items()}
+
+
+def other_kind() -> str:
+    """Return the scalar variant of a vectorised one, or the other way around."""
+    here = mi.variant()
+    return here.replace("scalar_", "llvm_ad_") if is_scalar() else f"scalar_{here.split('_', 2)[-1]}"
+
+
+def elsewhere(other: str, call: Callable[[], Found]) -> Found:
+    """Return what a function gives in another variant. Raises ``Skip`` where variant or plugin is missing."""
+    if other not in mi.variants() or runtime.obstacle(other):
+        raise Skip(f"{other} cannot run here")
+    here = mi.variant()
+    try:
+        runtime.use(other)
+        return call()
+    except RuntimeError as problem:
+        if "not found" not in str(problem):
+            raise
+        register = "register it there (mi.detail.add_variant_callback)"
+        raise Skip(f"{other} does not know the plugin: {register}") from problem
+    finally:
+        mi.set_variant(here)
 
 
 def _kept(value: Any) -> Any:

@@ -8,12 +8,11 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.checks.law import Check, Law, Skip, class_name, examine
+from mrt_mitsuba.validation.checks.law import Check, Law, examine
 from mrt_mitsuba.validation.checks.noise import ROUNDING
-from mrt_mitsuba.validation.checks.probe import is_scalar, lanes
-from mrt_mitsuba.validation.checks.recipe import Recipe
+from mrt_mitsuba.validation.checks.probe import lanes
+from mrt_mitsuba.validation.checks.recipe import elsewhere, opened, other_kind
 from mrt_mitsuba.validation.checks.shape_case import FLAT, HIT_ROUNDINGS, Case, corners, trace
 from mrt_mitsuba.validation.checks.shape_range import far, finite, scale
 from mrt_mitsuba.validation.checks.shape_samples import sampling
@@ -29,29 +28,25 @@ def check_shape(
     ``quick``: fewer rays. ``only``: names of ``LAWS``. Raises ``UsageError`` for anything else, and
     ``SceneError`` for a dict that Mitsuba cannot load.
     """
-    runtime.use()
-    recipe = Recipe.of(shape)
-    loaded = shape if recipe.description is None else recipe.open()
+    loaded, recipe, name = opened(shape)
     if not all(hasattr(loaded, name) for name in ("ray_intersect", "ray_test", "bbox")):
         raise UsageError(
             f"{type(loaded).__name__} is not a shape of {mi.variant()}: give a dict or a loaded shape"
         )
-    name = recipe.description["type"] if recipe.description else class_name(loaded)
-    with np.errstate(all="ignore"):
-        return examine(name, Case(loaded, recipe, quick, seed), LAWS, only=only, quick=quick)
+    return examine(name, Case(loaded, recipe, quick, seed), LAWS, only=only, quick=quick)
 
 
 def bbox(law: Law, case: Case) -> None:
     """Whatever is hit or sampled lies in the bounding box."""
     o, d, met = case.met
     points = [met.p]
-    ends = corners(case.shape)
+    ends = corners(case.plugin)
     if ends is not None:
         points.append(ends)
-    elif hasattr(case.shape, "sample_position"):
+    elif hasattr(case.plugin, "sample_position"):
         try:
             u = case.rng.random((len(o), 2), np.float32)
-            points += lanes(lambda mi, x: [case.shape.sample_position(0, x).p], ("Point2f", u))
+            points += lanes(lambda mi, x: [case.plugin.sample_position(0, x).p], ("Point2f", u))
         except RuntimeError:
             law.notes.append("sample_position() is not there")
     p = np.concatenate(points)
@@ -65,23 +60,10 @@ def bbox(law: Law, case: Case) -> None:
 def variants(law: Law, case: Case) -> None:
     """Hits in the scalar variant against those in the vectorised one."""
     case.recipe.with_()
-    here = mi.variant()
-    swap = ("scalar_", "llvm_ad_") if is_scalar() else (here.split("_")[0] + "_ad_", "scalar_")
-    other = here.replace(*swap)
-    if other not in mi.variants() or runtime.obstacle(other):
-        raise Skip(f"{other} cannot run here")
+    other = other_kind()
     few = slice(0, case.count(500, 2000))
     o, d, seen = case.seen[0][few], case.seen[1][few], case.seen[2].only(few)
-    try:
-        mi.set_variant(other)
-        runtime.use(other)
-        there = trace(case.recipe.scene(), o, d)
-    except RuntimeError as problem:
-        if "not found" not in str(problem):
-            raise
-        raise Skip(f"{other} does not know the plugin: register it there, too") from problem
-    finally:
-        mi.set_variant(here)
+    there = elsewhere(other, lambda: trace(case.recipe.scene(), o, d))
     steep = np.abs((seen.n * d).sum(axis=1)) > FLAT
     bad = (there.found != seen.found) & (steep | ~seen.found)
     both = there.found & seen.found & steep

@@ -14,8 +14,8 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.law import Skip
 from mrt_mitsuba.validation.checks.noise import ROUNDING
-from mrt_mitsuba.validation.checks.probe import SCALAR_SHARE, Array, is_scalar, lanes, unit
-from mrt_mitsuba.validation.checks.recipe import Recipe
+from mrt_mitsuba.validation.checks.probe import Array, lanes, unit
+from mrt_mitsuba.validation.checks.recipe import Subject, row
 
 OFFSET = 1500 * ROUNDING  # of the origin of a spawned ray from its surface, over 1 + max |p|
 FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
@@ -64,40 +64,31 @@ def walk(target: Any, o: Array, d: Array, first: Hits | None = None) -> Iterator
 
 
 @dataclass
-class Case:
+class Case(Subject):
     """A shape under examination, rays towards it and what they meet."""
 
-    shape: Any
-    recipe: Recipe
-    quick: bool
-    seed: int
-
     def __post_init__(self) -> None:
-        self.rng = np.random.default_rng(self.seed)
-        self.target = self.shape
-        if isinstance(self.shape, mi.Shape):
-            name = self.shape.id()
-            if self.shape.class_name() == "Instance":
+        super().__post_init__()
+        self.target = self.plugin
+        if isinstance(self.plugin, mi.Shape):
+            name = self.plugin.id()
+            if self.plugin.class_name() == "Instance":
                 if self.recipe.description is None:
                     raise UsageError("a loaded instance does not give its group away: give a dict of both")
                 self.target = self.recipe.scene()
             else:
-                self.target = mi.load_dict({"type": "scene", "shape": self.shape})
-                self.shape.set_id(name)  # which the scene has changed
-        box = self.shape.bbox()
+                self.target = mi.load_dict({"type": "scene", "shape": self.plugin})
+                self.plugin.set_id(name)  # which the scene has changed
+        box = self.plugin.bbox()
         low, high = (np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max))
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (high >= low).all()):
             raise UsageError(f"the bounding box of the shape is {low} … {high}: it must be finite")
         self.box = low, high  # as the shape has it, which may be wrong
-        ends = corners(self.shape)
+        ends = corners(self.plugin)
         if ends is not None:
             low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
         self.low, self.high, self.middle = low, high, (low + high) / 2
         self.size = float(np.linalg.norm(high - low))
-
-    def count(self, quick: int, full: int) -> int:
-        number = quick if self.quick else full
-        return max(int(number * SCALAR_SHARE), 64) if is_scalar() else number
 
     def units(self, count: int) -> Array:
         return unit(self.rng.normal(size=(count, 3)))
@@ -159,16 +150,16 @@ class Case:
         return met & clear, even
 
     def snippet(self, o: Array, d: Array, body: str = snippets.RAY, **names: Any) -> str:
-        return snippets.program("shape", self.shape, self.recipe.description, body, o=o, d=d, **names)
+        return snippets.program("shape", self.plugin, self.recipe.description, body, o=o, d=d, **names)
 
     @property
     def positions(self) -> str:
         """Return the snippet about sampled positions."""
-        return snippets.program("shape", self.shape, self.recipe.description, snippets.POSITIONS)
+        return snippets.program("shape", self.plugin, self.recipe.description, snippets.POSITIONS)
 
     def at(self, o: Array, d: Array, body: str = snippets.RAY, **names: Any) -> Callable[[int], str]:
-        """Return what makes the snippet of one ray of many."""
-        return lambda i: self.snippet(o[i], d[i], body, **names)
+        """Return what makes the snippet of one ray of many; arrays have a row for each."""
+        return lambda i: self.snippet(o[i], d[i], body, **row(names, i))
 
 
 def offset(p: Array) -> Array:

@@ -66,23 +66,19 @@ def far(law: Law, case: Case) -> None:
     # near an edge, a rounded origin decides which of two faces is met
     same = (there.n * here.n).sum(axis=1) > 0.9
     error = np.where(steep & same & ~through, error, 0)
-    law.most(
-        "hit point from afar against the same from nearby, in roundings of the distance",
-        error,
-        HIT_ROUNDINGS,
-        "the origin is rounded, and some dozen operations with it",
-        lambda i: case.snippet(origin[i], d[i], snippets.TWICE, other=closer[i]),
-    )
+    what = "hit point from afar against the same from nearby, in roundings of the distance"
+    why = "the origin is rounded, and some dozen operations with it"
+    show = case.at(origin, d, snippets.TWICE, other=closer)
+    law.most(what, error, HIT_ROUNDINGS, why, show)
     # a rounded origin moves the line: only what all lines around it meet counts
     bad = steep & through & (np.linalg.norm(here.p - met.p[few], axis=1) < 20 * ROUNDING * distance)
     across = unit(np.cross(d, case.units(len(d))))
     for side in (across, -across, np.cross(d, across), np.cross(across, d)):
         beside = trace(case.target, (closer + 4 * ROUNDING * distance * side).astype(np.float32), d)
         bad &= beside.found & ((beside.n * here.n).sum(axis=1) > 0.9)
-    i = int(bad.argmax())
     what = "share of rays from afar that miss what they meet from nearby, or meet it elsewhere"
     why = "outlines are as wide as the rounding of the distance"
-    law.at_most(what, bad.mean(), 2e-3, why, case.snippet(origin[i], d[i], snippets.TWICE, other=closer[i]))
+    law.share(what, bad, 2e-3, why, show)
 
 
 def finite(law: Law, case: Case) -> None:
@@ -97,7 +93,7 @@ def finite(law: Law, case: Case) -> None:
         met.p[pick(len(met.p), size=count)],
         case.middle + case.size * 10.0 ** case.rng.uniform(0, 5, (count, 1)) * case.units(count),
     ]
-    ends = corners(case.shape)
+    ends = corners(case.plugin)
     if ends is not None:
         kinds.append(ends[pick(len(ends), size=count)])
     o = np.choose(pick(len(kinds), size=count)[:, None], kinds).astype(np.float32)

@@ -15,18 +15,18 @@ from mrt_mitsuba.validation.checks.shape_case import FLAT, Case, leave, near, tr
 
 def sampling(law: Law, case: Case) -> None:
     """Positions by area, judged by where lines cross the surface; directions, and the densities of both."""
-    if not hasattr(case.shape, "sample_position"):
+    if not hasattr(case.plugin, "sample_position"):
         raise Skip("there is no sample_position()")
     count = case.count(2**14, 2**17)
     u = case.rng.random((count, 2), np.float32)
 
     def positions(mi: Any, second: Any) -> list[Any]:
-        ps = case.shape.sample_position(0, second)
-        return [ps.p, ps.n, ps.pdf, case.shape.pdf_position(ps)]
+        ps = case.plugin.sample_position(0, second)
+        return [ps.p, ps.n, ps.pdf, case.plugin.pdf_position(ps)]
 
     try:
         p, n, pdf, again = lanes(positions, ("Point2f", u))
-        area = float(np.ravel(np.array(case.shape.surface_area()))[0])
+        area = float(np.ravel(np.array(case.plugin.surface_area()))[0])
     except RuntimeError as problem:
         raise Skip(f"positions cannot be sampled: {str(problem).strip().splitlines()[-1][:120]}") from problem
     for what, measured in (
@@ -47,9 +47,8 @@ def _on_the_surface(law: Law, case: Case, p: Array, n: Array) -> None:
     back = trace(case.target, start, unit(-n))
     away = np.where(back.found, np.linalg.norm(back.p - p, axis=1), np.inf) / case.size
     # another part of the surface may be nearer than a hundredth of the size
-    off = np.quantile(away, 0.9)
     what = "sampled positions off the surface, 9 in 10, in sizes"
-    law.at_most(what, off, 1e-4, "a few roundings", case.snippet(start[0], -n[0]))
+    law.quantile(what, away, 0.9, 1e-4, "a few roundings", case.at(start, -n))
     alike = np.maximum((n * back.shading).sum(axis=1), (n * back.n).sum(axis=1))
     turned = 1 - alike / np.linalg.norm(n, axis=1)
     law.at_most(
@@ -123,8 +122,8 @@ def _directions(law: Law, case: Case, u: Array) -> None:
     def sample(mi: Any, origin: Any, second: Any) -> list[Any]:
         it = dr.zeros(mi.Interaction3f)
         it.p = origin
-        ds = case.shape.sample_direction(it, second)
-        return [ds.d, ds.dist, ds.pdf, case.shape.pdf_direction(it, ds)]
+        ds = case.plugin.sample_direction(it, second)
+        return [ds.d, ds.dist, ds.pdf, case.plugin.pdf_direction(it, ds)]
 
     try:
         d, dist, pdf, again = lanes(sample, ("Point3f", o), ("Point2f", u))
@@ -133,19 +132,17 @@ def _directions(law: Law, case: Case, u: Array) -> None:
         return
     drawn = pdf[:, 0] > 0
     error = np.where(drawn, np.abs(pdf / again - 1)[:, 0], 0)
-    i = int(error.argmax())
     # near an outline the cosine, and the density with it, hangs on roundings
     what = "density of a direction against pdf_direction(), relative, 99 in 100"
     why = "the same number; near outlines it hangs on roundings"
-    law.at_most(what, np.quantile(error, 0.99), 1e-2, why, case.snippet(o[i], d[i]))
+    law.quantile(what, error, 0.99, 1e-2, why, case.at(o, d))
     met = trace(case.target, o, d.astype(np.float32))
     steep = np.abs((met.n * d).sum(axis=1)) > FLAT
     bad = drawn & steep & met.found & (met.t > dist[:, 0] * (1 + 1e-3))
-    lost = drawn & ~met.found
-    i = int((bad | lost).argmax())
+    bad |= drawn & ~met.found
     what = "share of sampled directions that miss the shape, or reach it behind the sampled point"
     why = "outlines hang on roundings; small leaks are watertight's business"
-    law.at_most(what, (bad | lost).mean(), 1e-2, why, case.snippet(o[i], d[i]))
+    law.share(what, bad, 1e-2, why, case.at(o, d))
     visible = drawn & met.found & (met.t > dist[:, 0] * (1 - 1e-3))
     weight = np.where(visible, 1 / np.where(drawn, pdf[:, 0], 1), 0)
     _solid_angle(law, case, *_moments(case, o, d, met.p, weight))

@@ -51,10 +51,7 @@ def hits(law: Law, case: Case) -> None:
     ):
         counts = steep & seen.found if maxt is not None else steep
         limit = np.full(len(o), np.inf, np.float32) if maxt is None else maxt
-
-        def show(i: int, limit: Array = limit) -> str:
-            return case.snippet(o[i], d[i], snippets.MAXT, maxt=limit[i])
-
+        show = case.at(o, d, snippets.MAXT, maxt=limit)
         for name, found in zip(("ray_test()", "ray_intersect()"), tested(maxt), strict=True):
             title = f"share of rays on which {name} is wrong {what}"
             why = "one question, one answer; rays that graze are left out, but for those that just miss"
@@ -109,11 +106,9 @@ def _roundoff(law: Law, case: Case) -> None:
 
         found = noise.measure(function, inputs, size=size, strides=(64,), seed=case.seed)
         lost = np.nan_to_num(found.lost(noise.ALLOWANCE), posinf=0)
-        measured = float(np.quantile(lost, 0.9))
-        i = int(np.abs(lost - measured).argmin())
         title = f"noise of the {what} over that of {noise.ALLOWANCE:g} roundings with a rounded ray, 9 in 10"
         why = "digits are lost inside that could be kept"
-        law.at_most(title, measured, noise.LOST, why, case.snippet(o[i], d[i]))
+        law.quantile(title, lost, 0.9, noise.LOST, why, case.at(o, d))
 
 
 def normals(law: Law, case: Case) -> None:
@@ -126,7 +121,7 @@ def normals(law: Law, case: Case) -> None:
     if case.closed:
         o, d, seen = case.seen
         judged, even = case.lines
-        flipped = isinstance(case.shape, mi.Shape) and case.shape.has_flipped_normals()
+        flipped = isinstance(case.plugin, mi.Shape) and case.plugin.has_flipped_normals()
         what = f"share of rays from outside whose normal points {'outwards' if flipped else 'inwards'}"
         why = "a closed shape has an outside; what edges hide is left room for"
         law.share(what, judged & even & (((seen.n * d).sum(axis=1) > 0) != flipped), 1e-3, why, case.at(o, d))
@@ -181,15 +176,9 @@ def _differences(law: Law, case: Case) -> None:
         error = np.maximum(2 * narrow - wide, 0)
         if np.isfinite(error).sum() < 20 or (what.startswith("step") and not met.du.any()):
             continue
-        measured = float(np.nanquantile(error, 0.95))
-        i = int(np.nanargmin(np.abs(error - measured)))
-        law.at_most(
-            f"{what}, 95 in 100",
-            measured,
-            1e-2,
-            "extrapolated to no step; edges may part neighbours",
-            case.snippet(o[i], d[i], snippets.NEIGHBOUR, aside=aside[i], size=case.size),
-        )
+        why = "extrapolated to no step; edges may part neighbours"
+        show = case.at(o, d, snippets.NEIGHBOUR, aside=aside, size=case.size)
+        law.quantile(f"{what}, 95 in 100", error, 0.95, 1e-2, why, show)
 
 
 def watertight(law: Law, case: Case) -> None:
@@ -224,7 +213,7 @@ def watertight(law: Law, case: Case) -> None:
         "million",
         case.snippet(o[bad.argmax()], d[bad.argmax()]),
     )
-    ends = corners(case.shape)
+    ends = corners(case.plugin)
     if ends is not None:  # the ray tracer's doing, whatever the mesh
         out = ~trace(case.target, o, unit(ends[case.rng.integers(len(ends), size=count)] - o)).found
         if out.any():

@@ -245,6 +245,4 @@ def _literal(value: Any) -> str:
     if isinstance(value, np.ndarray):
         inner = ", ".join(str(x) for x in value.astype(np.float32))
         return f"[{inner}]" if value.dtype != np.float32 or len(value) not in (2, 3) else inner
-    if isinstance(value, (float, np.floating)):
-        return repr(float(value))
-    return repr(value)
+    return repr(value.item() if isinstance(value, np.generic) else value)
