@@ -14,13 +14,7 @@ import numpy as np
 
 from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.law import Skip
-from mrt_mitsuba.validation.checks.probe import (
-    Array,
-    Probe,
-    Samples,
-    direction,
-    unit,
-)
+from mrt_mitsuba.validation.checks.probe import Array, Probe, Samples, direction, unit
 from mrt_mitsuba.validation.checks.recipe import Subject, row
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below

@@ -67,10 +67,7 @@ def without_approximations(number: int, *, width: int, height: int, spp: int) ->
         ("diffuse light refracted: stock flavour", stock, PATH, spp),
     ]
     return [
-        Step(
-            what,
-            mrt.render(mi.load_dict(nodes), integrator=integrator, spp=count, **AT_CENTRES).image,
-        )
+        Step(what, mrt.render(mi.load_dict(nodes), integrator=integrator, spp=count, **AT_CENTRES).image)
         for what, nodes, integrator, count in scenes
     ]
 

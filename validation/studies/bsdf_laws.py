@@ -81,14 +81,7 @@ def run(study: Study, *, quick: bool) -> None:
         "follow the stated density and carry value over density, light can be followed either way, no more "
         "comes out than goes in, and derivatives are those of the values."
     )
-    laws = (
-        general,
-        furnace,
-        dielectric_terms,
-        published,
-        never_negative,
-        inverse_rendering.run,
-    )
+    laws = (general, furnace, dielectric_terms, published, never_negative, inverse_rendering.run)
     with study.stage("laws", len(laws)) as advance:
         for law in laws:
             law(study, quick=quick)

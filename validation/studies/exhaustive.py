@@ -58,9 +58,7 @@ def _g1(alpha: float) -> Formula:
 
 FORMULAS = (
     Formula(
-        "Schlick, F0 = 0.04",
-        lambda c: fresnel_schlick(c, float(F0)),
-        lambda c: exact.fresnel_schlick(c, F0),
+        "Schlick, F0 = 0.04", lambda c: fresnel_schlick(c, float(F0)), lambda c: exact.fresnel_schlick(c, F0)
     ),
     Formula(
         "exact Fresnel, into n = 1.5",

@@ -59,13 +59,7 @@ def _scene(alpha: float, kd: tuple[float, float, float]) -> Any:
         {
             "type": "scene",
             "integrator": {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0},
-            "sensor": {
-                "type": "perspective",
-                "fov": 32,
-                "to_world": look,
-                "film": film,
-                "sampler": sampler,
-            },
+            "sensor": {"type": "perspective", "fov": 32, "to_world": look, "film": film, "sampler": sampler},
             "lamp": {"type": "point", "position": [-2, -4, 2], "intensity": 60.0},
             "ball": {"type": "sphere", "bsdf": ball},
         }

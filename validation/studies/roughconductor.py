@@ -19,13 +19,7 @@ from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies import metals
 from mrt_mitsuba.validation.tools import image_tests
 from mrt_mitsuba.validation.tools.ball import ball_scene, side_by_side
-from mrt_mitsuba.validation.tools.bsdf_probe import (
-    Array,
-    evaluate,
-    largest,
-    lobe_pairs,
-    relative_error,
-)
+from mrt_mitsuba.validation.tools.bsdf_probe import Array, evaluate, largest, lobe_pairs, relative_error
 from mrt_mitsuba.validation.tools.image_tests import Comparison
 from mrt_mitsuba.validation.tools.study import Study
 

@@ -45,10 +45,7 @@ SHINY = Material(1.5, 0.1, (0.9, 0.8, 0.7), (0.1, 0.1, 0.1))
 
 def _hovering() -> Scene:
     """Return cones and cylinders in the air, seen level with the base of one and from below the others."""
-    cones = (
-        Cone((0, 1.2, 0), (0, 0.5, 0), 0.5, GREY),
-        Cone((1.3, 0.6, -0.3), (1.0, 1.5, 0.2), 0.4, SHINY),
-    )
+    cones = (Cone((0, 1.2, 0), (0, 0.5, 0), 0.5, GREY), Cone((1.3, 0.6, -0.3), (1.0, 1.5, 0.2), 0.4, SHINY))
     cylinders = (
         Cylinder((-1.2, 0.9, 0), (-1.2, 1.6, 0.1), 0.35, SHINY),
         Cylinder((0.1, 0, 0.9), (0.1, 0.3, 0.9), 0.3, GREY),

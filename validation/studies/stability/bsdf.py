@@ -150,31 +150,17 @@ def _hold(cases: Cases, lobes: Lobes, found: Sequence[Errors], wrong: Errors) ->
         usual, everywhere = BOUND_OF.get(name, (BOUND, BOUND_EVERYWHERE))
         where = "cosines 1e-7 … 1, IOR 1e-3 … 1e6" if name == "f" else "alpha 1e-4 … 1, D ≥ 1e-7 of its peak"
         # the grid holds a thousand points and more, so that the 99.9th percentile is one of its last
-        cases.at_most(
-            f"{title}, p99.9",
-            where,
-            "a few roundings",
-            np.quantile(error, 0.999),
-            usual,
-            fault=(least, np.quantile(fault, 0.999)),
-        )
-        cases.at_most(
-            f"{title}, largest",
-            "the whole grid: alpha 1e-8 … 100, D ≥ 1e-20 of its peak",
-            "a few roundings, which exp enlarges by up to 46",
-            ours.of[name].max(),
-            everywhere,
-            fault=(least, wrong.of[name].max()),
-        )
+        of_ours, of_fault = (np.quantile(x, 0.999) for x in (error, fault))
+        cases.at_most(f"{title}, p99.9", where, "a few roundings", of_ours, usual, fault=(least, of_fault))
+        where = "the whole grid: alpha 1e-8 … 100, D ≥ 1e-20 of its peak"
+        expected = "a few roundings, which exp enlarges by up to 46"
+        of_ours, of_fault = (e.of[name].max() for e in (ours, wrong))
+        cases.at_most(f"{title}, largest", where, expected, of_ours, everywhere, fault=(least, of_fault))
+    what = "relative error of D by cosines of normalised vectors"
+    why = "lost to cancellation: a study that cannot see this would be blind"
     for alpha in (1e-4, 1e-3):
-        here = lobes.in_bound & np.isclose(ALPHAS[lobes.cell[:, 0]], alpha)
-        cases.at_least(
-            f"the report's form, median at alpha {alpha:g}",
-            "relative error of D by cosines of normalised vectors",
-            "lost to cancellation: a study that cannot see this would be blind",
-            np.median(report.of["d"][here]),
-            10 * BOUND,
-        )
+        median = np.median(report.of["d"][lobes.in_bound & np.isclose(ALPHAS[lobes.cell[:, 0]], alpha)])
+        cases.at_least(f"the report's form, median at alpha {alpha:g}", what, why, median, 10 * BOUND)
 
 
 def _decade(cosines: np.ndarray) -> np.ndarray:
@@ -204,16 +190,10 @@ def _total_reflection(cases: Cases) -> None:
     cosines = (critical.astype(np.float32).view(np.int32) + steps.astype(np.int32)).view(np.float32)
     grid = FresnelGrid.at(cosines, iors)
     found = _numbers(Ours().fresnel(mi.Float(grid.cosines), mi.Float(grid.iors)))
-    cases.at_most(
-        "F at the critical angle",
-        "the 40 float32 cosines on either side of it, IOR 0.5 … 0.9999",
-        "√ of a rounding: 1 - F is 4 g / (η² cos θ) there, and g² is known to a rounding of cos²",
-        np.abs(found / grid.truth - 1).max(),
-        16 * np.sqrt(ROUNDING),
-    )
-    cases.at_least(
-        "F at the critical angle, smallest", "the same", "reached from both sides", found.min(), 0.9
-    )
+    name, what = "F at the critical angle", "the 40 float32 cosines on either side of it, IOR 0.5 … 0.9999"
+    why = "√ of a rounding: 1 - F is 4 g / (η² cos θ) there, and g² is known to a rounding of cos²"
+    cases.at_most(name, what, why, np.abs(found / grid.truth - 1).max(), 16 * np.sqrt(ROUNDING))
+    cases.at_least(f"{name}, smallest", "the same", "reached from both sides", found.min(), 0.9)
 
 
 # ------------------------------------------------ Tables ---------------------------------------------------
@@ -251,33 +231,24 @@ def _worst_cases(study: Study, lobes: Lobes, angles: FresnelGrid, ours: Errors) 
 
 
 def _heat_maps(study: Study, lobes: Lobes, angles: FresnelGrid, found: Sequence[Errors]) -> None:
-    errors = [e.of["pdf"] for e in found]
-    titles = [e.formula for e in found]
-    alphas = [f"{a:g}" for a in ALPHAS]
-    cosines = [f"{c:g}" for c in COSINES]
-    ends = [f"{t:.3g}" for t in STEEPNESS[1:]]
-    title = "Largest relative error of the lobe without its Fresnel term, D G₁ / (4 cos θi)"
-    maps = [_grid(lobes.cell[:, 1], lobes.cell[:, 0], e, (len(COSINES), len(ALPHAS))) for e in errors]
-    caption = (
-        "By roughness and angle, over all angles off the mirror direction down to D at 1e-20 of its peak."
-    )
-    study.plot("bsdf-cosine", title, _figure(maps, titles, ("alpha", alphas), ("cos θi", cosines)), caption)
-    maps = [_grid(lobes.cell[:, 2], lobes.cell[:, 0], e, (len(ends), len(ALPHAS))) for e in errors]
-    study.plot(
-        "bsdf-steepness",
-        title,
-        _figure(maps, titles, ("alpha", alphas), ("tan²θh/alpha² below", ends)),
-        "By roughness and angle off the mirror direction. Blank: no pair of float32 directions lies there.",
-    )
+    alphas = ("alpha", [f"{a:g}" for a in ALPHAS])
+    cosines = ("cos θi", [f"{c:g}" for c in COSINES])
+    steep = ("tan²θh/alpha² below", [f"{t:.3g}" for t in STEEPNESS[1:]])
     values, index = np.unique(angles.iors, return_inverse=True)
-    maps = [_grid(_decade(angles.cosines), index, e.of["f"], (DECADES, len(values))) for e in found]
-    iors = [f"1{n - 1:+.0e}" if 0 < abs(n - 1) < 1e-3 else f"{n:g}" for n in np.float64(values)]
-    study.plot(
-        "fresnel",
-        "Largest relative error of F",
-        _figure(maps, titles, ("IOR", iors), ("cos θ down to", [f"1e-{k + 1}" for k in range(DECADES)])),
-        "By index of refraction and angle.",
-    )
+    iors = ("IOR", [f"1{n - 1:+.0e}" if 0 < abs(n - 1) < 1e-3 else f"{n:g}" for n in np.float64(values)])
+    decades = ("cos θ down to", [f"1e-{k + 1}" for k in range(DECADES)])
+    lobe = "Largest relative error of the lobe without its Fresnel term, D G₁ / (4 cos θi)"
+    a, c, s = lobes.cell.T
+    for name, title, quantity, (column, x), (row, y), caption in (
+        ("bsdf-cosine", lobe, "pdf", (a, alphas), (c, cosines), "By roughness and angle, over all angles off "
+         "the mirror direction down to D at 1e-20 of its peak."),
+        ("bsdf-steepness", lobe, "pdf", (a, alphas), (s, steep), "By roughness and angle off the mirror "
+         "direction. Blank: no pair of float32 directions lies there."),
+        ("fresnel", "Largest relative error of F", "f", (index, iors), (_decade(angles.cosines), decades),
+         "By index of refraction and angle."),
+    ):  # fmt: skip
+        maps = [_grid(row, column, e.of[quantity], (len(y[1]), len(x[1]))) for e in found]
+        study.plot(name, title, _figure(maps, [e.formula for e in found], x, y), caption)
 
 
 def _grid(row: np.ndarray, column: np.ndarray, error: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -52,23 +52,12 @@ class Cases:
 
     def close(self, note: str = "") -> None:
         """Give table and bounds to the study."""
-        for bound in self.bounds:
-            self.study.bounds.append(bound)
+        self.study.bounds += self.bounds
         self.study.table(self.name, self.title, COLUMNS, self.rows, note)
 
     def _add(self, bound: Bound, what: str, expected: str) -> None:
-        name = bound.name.removeprefix(f"{self.title}: ")
-        sign = "<=" if bound.at_most else ">="
-        self.rows.append(
-            (
-                name,
-                what,
-                expected,
-                bound.measured,
-                f"{sign} {bound.limit:.3g}",
-                "ok" if bound.holds else "MISSED",
-            )
-        )
+        name, limit = bound.name.removeprefix(f"{self.title}: "), f"{bound.sign} {bound.limit:.3g}"
+        self.rows.append((name, what, expected, bound.measured, limit, bound.verdict))
         self.bounds.append(bound)
 
 

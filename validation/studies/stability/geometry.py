@@ -45,27 +45,18 @@ def run(study: Study, *, quick: bool) -> None:
 
 
 def _scenes(study: Study, cases: Cases, *, quick: bool) -> None:
-    rows = []
+    rows, what = [], "share of pixels that differ by more than 2/255"
     numbers = (0, 2, 3) if quick else range(5)  # scene 2 shows the horizon, which a far plane can cut off
     for number in numbers:
         scene = report_scene(number)
         base = picture(scene)
         for factor in SCALES[::5] if quick else SCALES:
             share = _differing(picture(scaled(scene, factor)), base)
-            cases.at_most(
-                f"scene {number} times {factor:g}",
-                "share of pixels that differ by more than 2/255",
-                "the same picture",
-                share,
-                SHARE_SCALED,
-            )
+            cases.at_most(f"scene {number} times {factor:g}", what, "the same picture", share, SHARE_SCALED)
         shares = [_differing(picture(moved(scene, n)), base) for n in TRANSLATIONS]
         rows.append((str(number), size(scene), *shares))
         for n, share in zip(TRANSLATIONS, shares, strict=True):
-            title, what = (
-                f"scene {number} moved by {n:g} sizes",
-                "share of pixels that differ by more than 2/255",
-            )
+            title = f"scene {number} moved by {n:g} sizes"
             if n <= HOLDS_TO:
                 cases.at_most(title, what, "the same picture", share, max(SHARE_MOVED * n, SHARE_SCALED))
             else:

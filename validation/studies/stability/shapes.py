@@ -86,67 +86,45 @@ def _triangle_dict(size: float) -> dict[str, Any]:
     return {"type": "mrt_mesh", "positions": positions, "faces": faces, "to_world": right}
 
 
-def _axis_dict(kind: str, first: str, second: str) -> Callable[[float], dict[str, Any]]:
-    def make(size: float) -> dict[str, Any]:
-        return {
-            "type": kind,
-            first: _scaled(APEX, size),
-            second: _scaled(BASE, size),
-            "radius": _single(CONE_RADIUS * size),
-        }
+def _axial(kind: Any, first: str, second: str) -> Solid:
+    """Return a cone or a cylinder, whose ends go by these names."""
+    name = kind.__name__.lower()
 
-    return make
+    def nodes(size: float) -> dict[str, Any]:
+        ends = {first: _scaled(APEX, size), second: _scaled(BASE, size)}
+        return {"type": f"mrt_{name}", **ends, "radius": _single(CONE_RADIUS * size)}
+
+    def exact(size: float) -> Any:
+        ends = np.multiply(APEX, size), np.multiply(BASE, size)
+        return reference.Axial([kind(*ends, CONE_RADIUS * size, MATTE)])
+
+    return Solid(name, nodes, exact, True, 30)
 
 
-def _ends(size: float) -> Any:
-    return np.multiply(APEX, size), np.multiply(BASE, size), CONE_RADIUS * size, MATTE
-
-
-SOLIDS = (
-    Solid(
-        "sphere",
-        lambda s: {"type": "sphere", "radius": _single(s)},
-        lambda s: reference.Spheres([Sphere((0, 0, 0), s, MATTE)]),
-        True,
-        12,
-    ),
-    Solid(
-        "sphere among others",
-        lambda s: {"type": "sphere", "radius": _single(s)},
-        lambda s: reference.Spheres([Sphere((0, 0, 0), s, MATTE)]),
-        True,
-        12,
-        among_others=True,
-    ),
-    Solid(
-        "plane",
-        lambda s: {"type": "mrt_plane", "normal": NORMAL_OF_PLANE.tolist(), "distance": PLANE_DISTANCE * s},
-        lambda s: reference.Planes([Plane(tuple(NORMAL_OF_PLANE), PLANE_DISTANCE * s, MATTE)]),
-        False,
-        3,
-    ),
-    Solid(
-        "triangle",
-        _triangle_dict,
-        lambda s: reference.Triangles(Mesh(CORNERS * s, np.array([[0, 1, 2]]), MATTE)),
-        False,
-        6,
-    ),
-    Solid(
-        "cone",
-        _axis_dict("mrt_cone", "apex", "base_center"),
-        lambda s: reference.Axial([Cone(*_ends(s))]),
-        True,
-        30,
-    ),
-    Solid(
-        "cylinder",
-        _axis_dict("mrt_cylinder", "p0", "p1"),
-        lambda s: reference.Axial([Cylinder(*_ends(s))]),
-        True,
-        30,
-    ),
+SPHERE = Solid(
+    "sphere",
+    lambda s: {"type": "sphere", "radius": _single(s)},
+    lambda s: reference.Spheres([Sphere((0, 0, 0), s, MATTE)]),
+    True,
+    12,
 )
+PLANE = Solid(
+    "plane",
+    lambda s: {"type": "mrt_plane", "normal": NORMAL_OF_PLANE.tolist(), "distance": PLANE_DISTANCE * s},
+    lambda s: reference.Planes([Plane(tuple(NORMAL_OF_PLANE), PLANE_DISTANCE * s, MATTE)]),
+    False,
+    3,
+)
+TRIANGLE = Solid(
+    "triangle",
+    _triangle_dict,
+    lambda s: reference.Triangles(Mesh(CORNERS * s, np.array([[0, 1, 2]]), MATTE)),
+    False,
+    6,
+)
+CONE, CYLINDER = _axial(Cone, "apex", "base_center"), _axial(Cylinder, "p0", "p1")
+AMONG_OTHERS = replace(SPHERE, name="sphere among others", among_others=True)
+SOLIDS = (SPHERE, AMONG_OTHERS, PLANE, TRIANGLE, CONE, CYLINDER)
 
 
 def shape_cases(cases: Cases, worst: list[tuple[str, str, float, str]], *, quick: bool) -> None:
@@ -160,41 +138,29 @@ def shape_cases(cases: Cases, worst: list[tuple[str, str, float, str]], *, quick
 
 
 def _hold(cases: Cases, solid: Solid, cells: Sequence[_Cell]) -> None:
-    name, what = solid.name, f"sizes 1e-6 … 1e6, from 1e-6 to {FARTHEST:g} sizes away and from inside"
-    cases.at_least(
-        f"{name}, rays that hit", what, "the figures below mean something", sum(c.hits for c in cells), 500
-    )
-    cases.at_most(
-        f"{name}, place",
-        f"{what}: worst distance error across the surface, in float32 roundings of the largest coordinate",
-        "a few roundings",
-        max(c.across for c in cells),
-        ACROSS,
-        fault=("hits 1 in 100,000 further away", max(c.fault.across for c in cells)),
-    )
-    cases.at_most(
-        f"{name}, normal",
-        "its worst angle times the cosine of incidence, in roundings of the largest coordinate over the size",
-        "a few roundings",
-        max(c.normal for c in cells),
-        solid.normal,
-        fault=("normals turned by 2 in 100,000", max(c.fault.normal for c in cells)),
-    )
-    expected = "none"
+    name, where = solid.name, f"sizes 1e-6 … 1e6, from 1e-6 to {FARTHEST:g} sizes away and from inside"
+    hits, why = sum(c.hits for c in cells), "the figures below mean something"
+    cases.at_least(f"{name}, rays that hit", where, why, hits, 500)
+    largest = "roundings of the largest coordinate"
+    for title, member, what, limit, fault in (
+        ("place", "across", f"{where}: worst distance error across the surface, in float32 {largest}",
+         ACROSS, "hits 1 in 100,000 further away"),
+        ("normal", "normal", f"its worst angle times the cosine of incidence, in {largest} over the size",
+         solid.normal, "normals turned by 2 in 100,000"),
+    ):  # fmt: skip
+        found, made = (max(getattr(c, member) for c in of) for of in (cells, [c.fault for c in cells]))
+        cases.at_most(f"{name}, {title}", what, "a few roundings", found, limit, fault=(fault, made))
+    astray = f"rays that hit nothing or miss, further than {OUTLINE} roundings off the outline"
     for title, member, what in (
-        (
-            "hits and misses",
-            "wrong",
-            f"rays that hit nothing or miss, further than {OUTLINE} roundings off the outline",
-        ),
+        ("hits and misses", "wrong", astray),
         ("leaks", "leaks", "rays from inside that meet nothing"),
         ("mirror rays", "self_hits", "mirror rays that meet the surface they leave"),
         ("shadow rays", "self_shadows", "points that their own surface hides from a light above it"),
         ("finite", "not_finite", "distances and normals that are no finite numbers"),
     ):
-        bad, faults = (sum(getattr(c, member) for c in found) for found in (cells, [c.fault for c in cells]))
+        bad, faults = (sum(getattr(c, member) for c in of) for of in (cells, [c.fault for c in cells]))
         seen = None if member == "leaks" and not solid.closed else ("one ray in ten", faults)
-        cases.at_most(f"{name}, {title}", what, expected, bad, 0, fault=seen)
+        cases.at_most(f"{name}, {title}", what, "none", bad, 0, fault=seen)
 
 
 def start_cases(cases: Cases, *, quick: bool) -> None:
@@ -216,17 +182,13 @@ def start_cases(cases: Cases, *, quick: bool) -> None:
             lost += int((~traced.found).sum())
             not_finite += int((~np.isfinite(traced.n)).any(axis=1).sum())
         what = f"{count} points rounded to float32, at sizes 1e-6, 1 and 1e6"
-        cases.at_most(
-            f"{solid.name}, from its surface inwards", f"{what}: rays that meet nothing", "none", lost, 0
-        )
-        cases.at_most(
-            f"{solid.name}, from its surface inwards, finite", what, "finite normals", not_finite, 0
-        )
+        name = f"{solid.name}, from its surface inwards"
+        cases.at_most(name, f"{what}: rays that meet nothing", "none", lost, 0)
+        cases.at_most(f"{name}, finite", what, "finite normals", not_finite, 0)
     _apex_cases(cases, count, rng)
 
 
 def _apex_cases(cases: Cases, count: int, rng: np.random.Generator) -> None:
-    cone = next(s for s in SOLIDS if s.name == "cone")
     apex, base = (np.array(end, np.float32) for end in (APEX, BASE))
     axis = np.float64(base) - apex
     height = np.linalg.norm(axis)
@@ -234,22 +196,21 @@ def _apex_cases(cases: Cases, count: int, rng: np.random.Generator) -> None:
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     tangent = CONE_RADIUS / height
     o = np.broadcast_to(apex, (count, 3))
-    for name, slopes in (
-        ("inwards", rng.uniform(0, 0.99, count)),
-        ("outwards", rng.uniform(1.01, 30, count)),
-    ):
+
+    def traced(slopes: np.ndarray) -> tuple[_Traced, np.ndarray, np.ndarray]:
+        """Return what is met, where it is away from the apex, and how far the base is."""
         d = axis / height + aside * (tangent * slopes)[:, None]
         d /= np.linalg.norm(d, axis=1, keepdims=True)
-        traced = _trace(cone, 1.0, o, d.astype(np.float32))
-        to_base = height / (d @ (axis / height))
-        far = traced.found & (traced.t > OUTLINE * ROUNDING)
-        if name == "inwards":
-            error = np.abs(np.where(far, traced.t, np.inf) - to_base).max() / ROUNDING
-            what = "distance to the base, error in roundings; inf: not met"
-            cases.at_most("cone, from its apex inwards", what, "the base", error, ACROSS)
-        else:
-            what = "rays that meet the cone away from the apex"
-            cases.at_most("cone, from its apex outwards", what, "none", far.sum(), 0)
+        found = _trace(CONE, 1.0, o, d.astype(np.float32))
+        return found, found.found & (found.t > OUTLINE * ROUNDING), height / (d @ (axis / height))
+
+    found, far, to_base = traced(rng.uniform(0, 0.99, count))
+    error = np.abs(np.where(far, found.t, np.inf) - to_base).max() / ROUNDING
+    what = "distance to the base, error in roundings; inf: not met"
+    cases.at_most("cone, from its apex inwards", what, "the base", error, ACROSS)
+    _, far, _ = traced(rng.uniform(1.01, 30, count))
+    what = "rays that meet the cone away from the apex"
+    cases.at_most("cone, from its apex outwards", what, "none", far.sum(), 0)
 
 
 SIDES = 256  # of a stand-in mesh, its default
@@ -262,7 +223,7 @@ def stand_in_cases(cases: Cases) -> None:
     and texture coordinates are off by half a side at most, where a triangle ends in the apex.
     """
     o, d = _rays(1.0, 4.0, 20_000)
-    for solid in (s for s in SOLIDS if s.name in ("cone", "cylinder")):
+    for solid in (CONE, CYLINDER):
         single = {**solid.to_dict(1.0), "segments": SIDES}
         numbers = mi.Bitmap(np.array([[*np.add(APEX, 1), *np.add(BASE, 1), CONE_RADIUS]], np.float32))
         group = {"type": "mrt_group", "kind": solid.name, "numbers": numbers, "segments": SIDES}
