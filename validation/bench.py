@@ -12,10 +12,8 @@ import argparse
 import gc
 import json
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -148,13 +146,8 @@ def _command(number: int, extent: Extent) -> float:
     """Return the seconds of the command with its default options but for the size."""
     with tempfile.TemporaryDirectory() as folder:
         size = [f"{name}={getattr(extent, name)}" for name in ("width", "height", "aa")]
-        start = time.perf_counter()
-        subprocess.run(
-            [sys.executable, "-m", "mrt_mitsuba.command.main", f"{folder}/out", str(number), *size],
-            check=True,
-            stdout=subprocess.DEVNULL,
-        )
-        return time.perf_counter() - start
+        command = [sys.executable, "-m", "mrt_mitsuba.command.main", f"{folder}/out", str(number)]
+        return turns.seconds([*command, *size])
 
 
 def table(now: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> str:

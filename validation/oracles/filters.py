@@ -1,19 +1,17 @@
 """The filters in plain float64, as the truth for the fast ones.
 
-Written to be read next to the definitions, and for finite numbers only: those of the original ray tracer one
-pixel after the other, the corrected blur one neighbour after the other.
+Written to be read next to the definitions, and for finite numbers only: detectors by SciPy's filters, the
+original's blur one pixel after the other, the corrected one one neighbour after the other.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-
-SOBEL_X = ((-1, 0, 1), (-2, 0, 2), (-1, 0, 1))
-SOBEL_Y = ((-1, -2, -1), (0, 0, 0), (1, 2, 1))
+from scipy.ndimage import maximum_filter, minimum_filter, sobel
 
 
 @dataclass(frozen=True)
@@ -33,14 +31,10 @@ def luma_edges(image: np.ndarray) -> ReferenceEdges:
     """Return the contrast of ``√(0.299 R + 0.587 G + 0.114 B)`` in the 3×3 neighbourhood."""
     red, green, blue = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
     luma = np.sqrt(0.299 * red + 0.587 * green + 0.114 * blue)
-    result = _empty(luma.shape)
-    for row, column, window in _windows(luma):
-        contrast = window.max() - window.min() + 0.05
-        threshold = max(0.0312, 0.125 * window.max())
-        result.value[row, column] = contrast
-        result.margin[row, column] = abs(contrast - threshold)
-        result.mask[row, column] = not contrast < threshold
-    return result
+    largest = maximum_filter(luma, 3)
+    contrast = largest - minimum_filter(luma, 3) + 0.05
+    threshold = np.maximum(0.0312, 0.125 * largest)
+    return _inside(~(contrast < threshold), contrast, np.abs(contrast - threshold))
 
 
 def sobel_edges(image: np.ndarray) -> ReferenceEdges:
@@ -52,28 +46,14 @@ def sobel_edges(image: np.ndarray) -> ReferenceEdges:
     red, green, blue = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
     exact = 255 * (0.07 * red + 0.72 * green + 0.21 * blue)
     from_whole = np.where(np.abs(exact) < 0.5, 1.0, np.abs(exact - np.round(exact)))
-    grey = np.trunc(exact)
-    result = _empty(grey.shape)
-    for row, column, window in _windows(grey):
-        gx = sum(SOBEL_X[i][j] * window[i, j] for i in range(3) for j in range(3))
-        gy = sum(SOBEL_Y[i][j] * window[i, j] for i in range(3) for j in range(3))
-        result.value[row, column] = abs(gx) + abs(gy)
-        result.mask[row, column] = abs(gx) + abs(gy) > 0
-        result.margin[row, column] = from_whole[row - 1 : row + 2, column - 1 : column + 2].min()
-    return result
+    gradient = sum(np.abs(sobel(np.trunc(exact), axis)) for axis in (0, 1))
+    return _inside(gradient > 0, gradient, minimum_filter(from_whole, 3))
 
 
 def blur_amount(depth: np.ndarray, focal_distance: float, focal_range: float) -> np.ndarray:
     """Return the height map: ``clamp(|focal_distance − depth| − focal_range, 0, 8)``, and 8 for a miss."""
-    amount = np.zeros(depth.shape)
-    for row in range(depth.shape[0]):
-        for column in range(depth.shape[1]):
-            distance = float(depth[row, column])
-            if distance <= 0 or distance == math.inf:
-                amount[row, column] = 8
-            else:
-                amount[row, column] = min(max(abs(focal_distance - distance) - focal_range, 0), 8)
-    return amount
+    amount = np.clip(np.abs(focal_distance - depth.astype(np.float64)) - focal_range, 0, 8)
+    return np.where((depth <= 0) | np.isinf(depth), 8, amount)
 
 
 def gaussian_dof(image: np.ndarray, amount: np.ndarray) -> np.ndarray:
@@ -145,13 +125,8 @@ def _light(radius: np.ndarray, steps: Sequence[tuple[int, int]]) -> np.ndarray:
     return np.asarray(sum(_cover(radius, dx, dy) for dx, dy in steps))
 
 
-def _empty(shape: tuple[int, ...]) -> ReferenceEdges:
-    return ReferenceEdges(np.zeros(shape, dtype=bool), np.zeros(shape), np.full(shape, np.inf))
-
-
-def _windows(plane: np.ndarray) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Yield row, column and 3×3 window of every pixel that is not on the border."""
-    height, width = plane.shape
-    for row in range(1, height - 1):
-        for column in range(1, width - 1):
-            yield row, column, plane[row - 1 : row + 2, column - 1 : column + 2]
+def _inside(mask: np.ndarray, value: np.ndarray, margin: np.ndarray) -> ReferenceEdges:
+    """Return a detector's result; the border, whose windows are not whole, is surely no edge."""
+    inner = np.zeros(mask.shape, bool)
+    inner[1:-1, 1:-1] = True
+    return ReferenceEdges(mask & inner, np.where(inner, value, 0), np.where(inner, margin, np.inf))

@@ -14,6 +14,7 @@ import numpy as np
 import mrt_mitsuba as mrt
 from mrt_mitsuba import filters
 from mrt_mitsuba.validation.tools.knobs import load
+from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, camera
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.warm import Warm, measure
 
@@ -271,23 +272,15 @@ def variance_error(detector: str, *, spp: int, lattice: str) -> float:
     Behind a veil that stops half of the rays: of n zeros and ones with mean m, it is m (1 - m) / (n - 1).
     """
     black = {"type": "diffuse", "reflectance": 0.0}
-    film = {"type": "hdrfilm", "width": 40, "height": 30, "rfilter": {"type": "box"}}
-    look = mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, 1], [0, 1, 0])
     scene = {
         "type": "scene",
-        "sensor": {"type": "perspective", "film": film, "to_world": look},
+        "sensor": camera([0, 0, 0], [0, 0, 1], [0, 1, 0], 40, 30),
         "integrator": {"type": "path", "rr_depth": 100},
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}},
         "veil": {"type": "sphere", "radius": 2, "bsdf": {"type": "mask", "opacity": 0.5, "nested": black}},
     }
-    options: dict[str, Any] = {
-        "spp": spp,
-        "aa": 1,
-        "aamode": detector,
-        "layers": ["edges"],
-        "lattice": lattice,
-    }
-    found = mrt.render(mi.load_dict(scene), **options)
+    options: dict[str, Any] = {"aa": 1, "aamode": detector, "layers": ["edges"], "lattice": lattice}
+    found = mrt.render(mi.load_dict(scene), spp=spp, **options)
     mean = found.image
     expected = getattr(filters, f"{detector}_edges")(mean, variance=mean * (1 - mean) / (spp - 1)).value
     # whole numbers, or roundings of a mean of squares; a value next to none may be none
@@ -298,15 +291,15 @@ def variance_error(detector: str, *, spp: int, lattice: str) -> float:
 def _chase_noise(study: Study, extent: Extent) -> None:
     """Count refined pixels where the converged picture is flat, and where it has an edge."""
     scene = load(lit_by_a_sphere(*extent.light_size))
-    centre: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}  # where the detectors look
-    truth = mrt.render(scene, **centre, spp=16 * extent.light_spp, seed=78).image
+    # where the detectors look
+    truth = mrt.render(scene, **AT_CENTRES, spp=16 * extent.light_spp, seed=78).image
     contrast = _contrast(truth)
     flat, edge = contrast < FLAT, contrast > EDGE
     rows = []
     for detector, find in (("luma", filters.luma_edges), ("sobel", filters.sobel_edges)):
         for spp in extent.noise_spp:
             seen = _samples(mrt.render(scene, aa=2, aamode=detector, lattice="report", spp=spp)) > 1
-            blind = np.asarray(find(mrt.render(scene, **centre, spp=spp).image).mask)[1:-1, 1:-1]
+            blind = np.asarray(find(mrt.render(scene, **AT_CENTRES, spp=spp).image).mask)[1:-1, 1:-1]
             seen = seen[1:-1, 1:-1]
             rows.append((detector, spp, seen[flat].mean(), seen[edge].mean(), blind[flat].mean()))
     columns = ("detector", "rays a pixel", "flat", "edges", "flat, without the variance")

@@ -20,6 +20,7 @@ from mrt_mitsuba.scene.model import Material, Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.tools.gallery import gallery
 from mrt_mitsuba.validation.tools.image_tests import Comparison, Estimate, compare, estimate, flip
+from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, with_materials
 from mrt_mitsuba.validation.tools.study import Study
 
 PATH = {"type": "path", "max_depth": 4}
@@ -33,9 +34,6 @@ LEVEL = (
 
 # Seeds are fixed, so what such a bound can fail for is a change; by as much as this, it does
 POWER = "least fault: the mistakes of the table of mutations, 2 % of the light and 5 % of alpha among them"
-
-# One ray at a time through the pixel's centre, as the report's lattice has it
-AT_CENTRES: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}
 
 
 @dataclass(frozen=True)
@@ -83,12 +81,7 @@ def physical(scene: Scene, *, least_alpha: float = 1e-4, diffuse: bool = True) -
             clipped["diffuse"] = (0.0, 0.0, 0.0)
         return dataclasses.replace(m, alpha=max(abs(m.alpha), least_alpha), **clipped)
 
-    def change(thing: Any) -> Any:
-        return dataclasses.replace(thing, material=material(thing.material))
-
-    return dataclasses.replace(
-        scene, spheres=tuple(map(change, scene.spheres)), planes=tuple(map(change, scene.planes))
-    )
+    return with_materials(scene, material)
 
 
 def path_estimate(nodes: dict[str, Any], *, spp: int, seed: int = 0, integrator: Any = PATH) -> Estimate:
@@ -138,18 +131,19 @@ def run(study: Study, *, quick: bool) -> None:
     size: dict[str, Any] = {"width": 64, "height": 48} if quick else {"width": 160, "height": 120}
     spp = 64 if quick else 256
     rows, rest = [], []
-    with study.stage("Approximations", len(numbers)) as advance:
-        comparisons = compare_rest(numbers, spp=spp // 4, **size)
-        for number, found in zip(numbers, comparisons, strict=True):
-            rows += _chain(study, number, without_approximations(number, spp=spp, **size))
-            name = f"scene {number}: p that black mrt_bsdf and roughplastic make the same picture"
-            study.at_least(name, found.p, LEVEL, POWER)
-            rest.append([number, *(v.p for v in (found.pixel, found.tile, found.image)), found.rel_rmse])
-            advance(1)
-    figures = ["mean difference", "% of pixels > 1/255", "mean left to the stock flavour", "FLIP left"]
+    comparisons = compare_rest(numbers, spp=spp // 4, **size)
+    for number, found in study.each("Approximations", [*zip(numbers, comparisons, strict=True)]):
+        steps = without_approximations(number, spp=spp, **size)
+        pictures = gallery({step.change: step.image for step in steps})
+        title = f"Scene {number}, one approximation less at a time"
+        study.plot(f"approximations_{number}", title, pictures)
+        rows += _rows(number, steps)
+        name = f"scene {number}: p that black mrt_bsdf and roughplastic make the same picture"
+        study.at_least(name, found.p, LEVEL, POWER)
+        rest.append([number, *(v.p for v in (found.pixel, found.tile, found.image)), found.rel_rmse])
     title = "What each of the report's approximations changes"
     note = f"Path pictures have {spp} samples a pixel; what is left to the stock flavour holds their noise."
-    study.table("approximations", title, ["scene", "changed, too", *figures], rows, note)
+    study.records("approximations", title, rows, note)
     title = "With those switched off, and nothing diffuse: p values of equality"
     note = (
         f"path, {RENDERS} renders each, roughness at least {ALPHA_FOR_TESTS:g}. The same scenes with "
@@ -158,28 +152,18 @@ def run(study: Study, *, quick: bool) -> None:
     study.table("rest", title, ["scene", "pixel", "tile", "image", "relRMSE"], rest, note)
 
 
-def _chain(study: Study, number: int, steps: list[Step]) -> list[list[Any]]:
-    pictures = {step.change: step.image for step in steps}
-    title = f"Scene {number}, one approximation less at a time"
-    study.plot(f"approximations_{number}", title, gallery(pictures))
-    return _rows(number, steps)
-
-
-def _rows(number: int, steps: list[Step]) -> list[list[Any]]:
+def _rows(number: int, steps: list[Step]) -> list[dict[str, Any]]:
     stock = np.maximum(steps[-1].image, 0)
     exposures, rows = None, []
     for before, step in zip([steps[0], *steps[:-1]], steps, strict=True):
         change = np.abs(step.image - before.image)
         perceived = flip(stock, np.maximum(step.image, 0), exposures=exposures)
         exposures = perceived.exposures
-        rows.append(
-            [
-                number,
-                step.change,
-                float(change.mean()),
-                100 * float(np.mean(change.max(axis=-1) > 1 / 255)),
-                float(np.abs(step.image - stock).mean()),
-                perceived.mean,
-            ]
-        )
+        figures = {
+            "mean difference": float(change.mean()),
+            "% of pixels > 1/255": 100 * float(np.mean(change.max(axis=-1) > 1 / 255)),
+            "mean left to the stock flavour": float(np.abs(step.image - stock).mean()),
+            "FLIP left": perceived.mean,
+        }
+        rows.append({"scene": number, "changed, too": step.change, **figures})
     return rows

@@ -15,6 +15,7 @@ from mrt_mitsuba.scene.model import Light, Scene
 from mrt_mitsuba.scene.report import report_scene, scene_of_spheres
 from mrt_mitsuba.scene.shapes import terrain
 from mrt_mitsuba.validation.tools import kernels
+from mrt_mitsuba.validation.tools.gallery import panels
 from mrt_mitsuba.validation.tools.knobs import load
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.warm import Warm, measure
@@ -146,11 +147,9 @@ def fit(seconds: Mapping[int, float]) -> Exponent:
 
 
 def _figure(series: Mapping[str, Mapping[int, Found]], exponents: Mapping[str, Exponent]) -> Any:
-    from matplotlib.figure import Figure
-
     rows = -(-len(series) // 2)
-    figure = Figure(figsize=(9, 2.6 * rows), layout="constrained")
-    axes = figure.subplots(rows, 2, squeeze=False).ravel()
+    figure, grid = panels(9, 2.6 * rows, rows, 2, squeeze=False)
+    axes = grid.ravel()
     for axis in axes[len(series) :]:
         axis.remove()
     for axis, (what, found) in zip(axes, series.items(), strict=False):

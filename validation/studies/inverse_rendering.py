@@ -9,6 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.tools.bsdf_probe import rgb
+from mrt_mitsuba.validation.tools.gallery import panels
+from mrt_mitsuba.validation.tools.scenery import camera
 from mrt_mitsuba.validation.tools.study import Study
 
 ALPHA, KD = 0.25, (0.6, 0.35, 0.15)  # to be found
@@ -39,29 +41,15 @@ def run(study: Study, *, quick: bool) -> None:
 
 
 def _scene(alpha: float, kd: tuple[float, float, float]) -> Any:
-    look = mi.ScalarTransform4f().look_at([0, -4, 0], [0, 0, 0], [0, 0, 1])
-    film = {
-        "type": "hdrfilm",
-        "width": SIZE,
-        "height": SIZE,
-        "rfilter": {"type": "box"},
-        "pixel_format": "rgb",
-    }
-    sampler = {"type": "stratified"}
-    ball = {
-        "type": "mrt_bsdf",
-        "alpha": alpha,
-        "diffuse_reflectance": rgb(kd),
-        "specular_reflectance": 0.8,
-        "fresnel": "dielectric",
-    }
+    sampler = {"sampler": {"type": "stratified"}}
+    paint = {"diffuse_reflectance": rgb(kd), "specular_reflectance": 0.8, "fresnel": "dielectric"}
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0},
-            "sensor": {"type": "perspective", "fov": 32, "to_world": look, "film": film, "sampler": sampler},
+            "sensor": camera([0, -4, 0], [0, 0, 0], [0, 0, 1], SIZE, SIZE, fov=32, **sampler),
             "lamp": {"type": "point", "position": [-2, -4, 2], "intensity": 60.0},
-            "ball": {"type": "sphere", "bsdf": ball},
+            "ball": {"type": "sphere", "bsdf": {"type": "mrt_bsdf", "alpha": alpha, **paint}},
         }
     )
 
@@ -97,10 +85,7 @@ def _descend(scene: Any, target: Any, *, spp: int) -> np.ndarray:
 
 
 def _figure(path: np.ndarray) -> Any:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6, 4))
-    axes = figure.subplots()
+    figure, axes = panels(6, 4)
     labels, colors = ("α", "Kd red", "Kd green", "Kd blue"), ("black", "tab:red", "tab:green", "tab:blue")
     for values, true, label, color in zip(path.T, (ALPHA, *KD), labels, colors, strict=True):
         axes.plot(values, color=color, label=label)

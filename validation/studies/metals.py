@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mrt_mitsuba.validation.tools.ball import ball_scene, side_by_side
 from mrt_mitsuba.validation.tools.bsdf_probe import interaction, rgb
+from mrt_mitsuba.validation.tools.gallery import panels
 from mrt_mitsuba.validation.tools.study import Study
 
 ANGLES = np.arange(0.0, 90.0)  # degrees
@@ -114,13 +115,7 @@ def exact_reflectance(cos_theta: Array, eta: Array, k: Array) -> Array:
 
 def run(study: Study, *, quick: bool) -> None:
     """Check every preset, with a table, a map over metal and angle, and a picture of the worst metal."""
-    names = preset_names()
-    with study.stage("metals", len(names)) as advance:
-        metals = []
-        for name in names:
-            metals.append(measure(name))
-            advance(1)
-    metals.sort(key=lambda metal: -metal.worst[0])
+    metals = sorted(map(measure, preset_names()), key=lambda metal: -metal.worst[0])
     _hold(study, metals)
     _tabulate(study, metals)
     caption = "The channel with the largest error. Red: Schlick is too bright. Worst at the top."
@@ -153,10 +148,7 @@ def _tabulate(study: Study, metals: Sequence[Metal]) -> None:
 
 
 def _map(metals: Sequence[Metal]) -> Any:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 2 + 0.12 * len(metals)))
-    axes = figure.subplots()
+    figure, axes = panels(7, 2 + 0.12 * len(metals))
     signed = [np.take_along_axis(m.error, np.abs(m.error).argmax(axis=1)[:, None], 1)[:, 0] for m in metals]
     limit = max(np.abs(row).max() for row in signed)
     shown = axes.imshow(
@@ -169,10 +161,7 @@ def _map(metals: Sequence[Metal]) -> Any:
 
 
 def _curves(metal: Metal) -> Any:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6, 4))
-    axes = figure.subplots()
+    figure, axes = panels(6, 4)
     for channel, color in enumerate(("tab:red", "tab:green", "tab:blue")):
         axes.plot(ANGLES, metal.exact[:, channel], color=color)
         axes.plot(ANGLES, metal.schlick[:, channel], color=color, linestyle="--")

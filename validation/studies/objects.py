@@ -69,11 +69,9 @@ def compare_with_spheres(study: Study, *, width: int, height: int, samples: tupl
     # A thousand spheres are shapes of Mitsuba's each; one more, and they would be searched as cones are
     spheres, cones = (load(scene.to_dict(width=width, height=height)) for scene in crowd(1000))
     rows = []
-    with study.stage("Thousand cones", len(samples)) as advance:
-        for aa in samples:
-            t = ratio(*(partial(mrt.render, scene, aa=aa) for scene in (cones, spheres)), repeats=3)
-            rows.append([aa, t.seconds, t.other_seconds, t.median, f"{t.low:.2f} to {t.high:.2f}"])
-            advance(1)
+    for aa in study.each("Thousand cones", samples):
+        t = ratio(*(partial(mrt.render, scene, aa=aa) for scene in (cones, spheres)), repeats=3)
+        rows.append([aa, t.seconds, t.other_seconds, t.median, f"{t.low:.2f} to {t.high:.2f}"])
     title = "A thousand cones against a thousand spheres, seconds of a whole picture"
     note = (
         "Spheres are searched and intersected by Embree, cones by this project's tree in Dr.Jit; shadow rays "
@@ -85,22 +83,17 @@ def compare_with_spheres(study: Study, *, width: int, height: int, samples: tupl
 def _mesh_errors(study: Study, count: int) -> None:
     ray = _rays(count)
     exact = _exact(ray, mi.load_dict(CONE).frame())
-    with study.stage("Mesh cones", 1) as advance:
-        warm = measure({n: search({**CONE, "segments": n}, ray) for n in SEGMENTS})
-        advance(1)
+    warm = measure({n: search({**CONE, "segments": n}, ray) for n in SEGMENTS})
     errors = {n: mesh_error(run.result, exact) for n, run in warm.items()}
     slope = -float(np.polyfit(np.log(SEGMENTS), np.log(list(errors.values())), 1)[0])
     rows = [[n, 2 * n, error, 1e3 * warm[n].seconds] for n, error in errors.items()]
     study.table("mesh_cones", f"Mesh cones, {count} rays", ["sides", "triangles", "mean error", "ms"], rows)
     why = "theory: 2, and rims and the apex; a mesh wider by a thousandth is beyond"
     study.at_most("slope of the error of a mesh cone: |exponent - 2|", abs(slope - 2), SLOPE, why)
-    study.at_most(
-        "mean error at 256 sides, the default",
-        errors[256],
-        # The height of a chord of 2π/n over an arc of radius r is r (π/n)²/2; rays are 3 to 5 long
-        CONE["radius"] * (np.pi / 256) ** 2 / 2 / 3,
-        "the chord's height over the distance; half as many sides leave four times as much",
-    )
+    # The height of a chord of 2π/n over an arc of radius r is r (π/n)²/2; rays are 3 to 5 long
+    chord = CONE["radius"] * (np.pi / 256) ** 2 / 2 / 3
+    why = "the chord's height over the distance; half as many sides leave four times as much"
+    study.at_most("mean error at 256 sides, the default", errors[256], chord, why)
     what = "rays that meet another part, or nothing, at 256 sides"
     why = "a share: silhouette, rim and apex within a chord's height, a few times 7.5e-5; a leak adds to it"
     study.at_most(what, other_hits(warm[256].result, exact), 1e-3, why)

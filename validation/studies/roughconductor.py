@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import statistics
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,8 +19,10 @@ from mrt_mitsuba.validation.studies import metals
 from mrt_mitsuba.validation.tools import image_tests
 from mrt_mitsuba.validation.tools.ball import ball_scene, side_by_side
 from mrt_mitsuba.validation.tools.bsdf_probe import Array, evaluate, largest, lobe_pairs, relative_error
+from mrt_mitsuba.validation.tools.gallery import panels
 from mrt_mitsuba.validation.tools.image_tests import Comparison
 from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.warm import in_turns, timed
 
 TITLE = "The BSDF against Mitsuba's roughconductor"
 
@@ -56,25 +57,14 @@ def run(study: Study, *, quick: bool) -> None:
 
 def ours(alpha: float, *, visible: bool = True, **more: Any) -> dict[str, Any]:
     """Return ``mrt_bsdf`` with F = 1 and no diffuse part."""
-    return {
-        "type": "mrt_bsdf",
-        "alpha": alpha,
-        "fresnel": "unity",
-        "diffuse_reflectance": 0.0,
-        "sample_visible": visible,
-        **more,
-    }
+    form = {"type": "mrt_bsdf", "fresnel": "unity", "diffuse_reflectance": 0.0}
+    return {**form, "alpha": alpha, "sample_visible": visible, **more}
 
 
 def theirs(alpha: float, *, visible: bool = True) -> dict[str, Any]:
     """Return ``roughconductor`` with F = 1."""
-    return {
-        "type": "roughconductor",
-        "material": "none",
-        "distribution": "beckmann",
-        "alpha": alpha,
-        "sample_visible": visible,
-    }
+    form = {"type": "roughconductor", "material": "none", "distribution": "beckmann"}
+    return {**form, "alpha": alpha, "sample_visible": visible}
 
 
 @dataclass(frozen=True)
@@ -167,13 +157,10 @@ def _measure_pointwise(
 ) -> list[tuple[tuple[str, float, int], Pointwise]]:
     """Return variant, roughness and number of pairs of each comparison, and what it found."""
     before, found = runtime.use(), []
-    with study.stage("points", len(variants) * len(ALPHAS)) as advance:
-        for variant in variants:
-            runtime.use(variant)
-            pairs = SCALAR_PAIRS if is_scalar() else count
-            for alpha in ALPHAS:
-                found.append(((variant, alpha, pairs), compare_pointwise(alpha, count=pairs)))
-                advance(1)
+    for variant in study.each("points", variants):
+        runtime.use(variant)
+        pairs = SCALAR_PAIRS if is_scalar() else count
+        found += [((variant, alpha, pairs), compare_pointwise(alpha, count=pairs)) for alpha in ALPHAS]
     runtime.use(before)
     return found
 
@@ -216,13 +203,8 @@ class RoughconductorComparison:
         write_exr(path, self.images["ours"], layers, header)
 
     def __str__(self) -> str:
-        rows = {
-            **self.errors,
-            **{
-                f"{name} [s]" if name != "ratio" else "time, ours / theirs": value
-                for name, value in self.timings.items()
-            },
-        }
+        seconds = {f"{name} [s]": self.timings[name] for name in ("ours", "theirs")}
+        rows = {**self.errors, **seconds, "time, ours / theirs": self.timings["ratio"]}
         verdict = "equal" if self.equal else "different"
         lines = [f"  {name:<44} {value:.4g}" for name, value in rows.items()]
         return "\n".join([f"mrt_bsdf and roughconductor, alpha = {self.alpha:g}: {verdict}", *lines])
@@ -255,15 +237,10 @@ def compare_roughconductor(
         raise UsageError(f"alpha={alpha!r}: roughconductor is compared for a roughness in (0, 1]")
     runtime.use(runtime.FAST)
     points = compare_pointwise(alpha, count=pairs)
-    stacks, seconds = _render_both(
-        [ours(alpha, visible=sample_visible), theirs(alpha, visible=sample_visible)],
-        size=size,
-        spp=spp,
-        renders=renders,
-        seed=seed,
-    )
+    pair = [bsdf(alpha, visible=sample_visible) for bsdf in (ours, theirs)]
+    stacks, seconds = _render_both(pair, size=size, spp=spp, renders=renders, seed=seed)
     first, second = (stack.mean(axis=0) for stack in stacks)
-    test = image_tests.compare(*(image_tests.estimate(stack) for stack in stacks), level=LEVEL)
+    test = image_tests.compare(*map(image_tests.estimate, stacks), level=LEVEL)
     errors = {
         "value": points.value,
         "density of visible normals": points.pdf_visible,
@@ -288,15 +265,14 @@ def _render_both(
     scenes = [ball_scene(bsdf, size=size, studio=studio) for bsdf in bsdfs]
     for scene in scenes:
         np.array(mi.render(scene, spp=spp))  # compiles
-    stacks: list[list[Array]] = [[] for _ in scenes]
-    seconds: list[list[float]] = [[] for _ in scenes]
-    for number in range(renders):
-        for index, scene in enumerate(scenes):
-            start = time.perf_counter()
-            picture = np.array(mi.render(scene, spp=spp, seed=seed + 1 + number * len(scenes) + index))
-            seconds[index].append(time.perf_counter() - start)
-            stacks[index].append(picture)
-    return [np.stack(stack) for stack in stacks], [statistics.median(times) for times in seconds]
+
+    def side(index: int) -> Callable[[int], tuple[Array, float]]:
+        seeds = range(seed + 1 + index, seed + 1 + index + renders * len(scenes), len(scenes))
+        return lambda turn: timed(lambda: np.array(mi.render(scenes[index], spp=spp, seed=seeds[turn])))
+
+    found = [zip(*runs, strict=True) for runs in in_turns([*map(side, range(len(scenes)))], renders)]
+    pictures, seconds = zip(*found, strict=True)
+    return [np.stack(stack) for stack in pictures], [statistics.median(times) for times in seconds]
 
 
 def same_numbers(alpha: float, *, size: int = 96, spp: int = 16) -> float:
@@ -319,13 +295,14 @@ def rendered(study: Study, *, quick: bool) -> None:
         {"size": 64, "spp": 8, "renders": 64} if quick else {"size": 128, "spp": 8, "renders": 96}
     )
     alphas = (POWER_ALPHA,) if quick else (0.03, 0.1, POWER_ALPHA)
-    with study.stage("pictures", len(alphas) + len(MUTATIONS)) as advance:
-        for alpha in alphas:
-            _hold_pictures(study, compare_roughconductor(alpha, **settings))
-            advance(1)
-        for name, change in MUTATIONS.items():
-            _hold_power(study, name, change, settings)
-            advance(1)
+    for alpha in study.each("pictures", alphas):
+        _hold_pictures(study, compare_roughconductor(alpha, **settings))
+    for name, change in study.each("mistakes", MUTATIONS.items()):
+        broken = {**ours(POWER_ALPHA), **change}
+        stacks, _ = _render_both([broken, theirs(POWER_ALPHA)], seed=100, **settings)
+        test = image_tests.compare(*map(image_tests.estimate, stacks), level=LEVEL)
+        why = "the test of pictures must see this error"
+        study.at_most(f"p of the difference with {name}", test.p, LEVEL, why)
 
 
 def _hold_pictures(study: Study, found: RoughconductorComparison) -> None:
@@ -343,16 +320,6 @@ def _hold_pictures(study: Study, found: RoughconductorComparison) -> None:
         side_by_side(found.images["ours"], found.images["theirs"], gain=20),
         f"{found.samples} samples per pixel each, independent: the difference is noise.",
         exr=True,
-    )
-
-
-def _hold_power(study: Study, name: str, change: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
-    """Hold that the same test of pictures rejects a small error of ours."""
-    broken = {**ours(POWER_ALPHA), **change}
-    stacks, _ = _render_both([broken, theirs(POWER_ALPHA)], seed=100, **settings)
-    test = image_tests.compare(*(image_tests.estimate(stack) for stack in stacks), level=LEVEL)
-    study.at_most(
-        f"p of the difference with {name}", test.p, LEVEL, "the test of pictures must see this error"
     )
 
 
@@ -390,42 +357,31 @@ def efficiency(study: Study, *, quick: bool) -> None:
     """Compare noise at equal sample counts, which is held, and at equal time, which is recorded."""
     settings = {"size": 64, "spp": 16, "renders": 12} if quick else {"size": 96, "spp": 16, "renders": 32}
     alphas = (0.1, 0.5) if quick else (0.02, 0.1, 0.3, 0.6)
-    rows: list[list[Any]] = []
-    ratios = []
-    with study.stage("noise", len(alphas)) as advance:
-        for alpha in alphas:
-            found = measure_efficiency(alpha, **settings)
-            for visible in (True, False):
-                one, other = found["ours", visible], found["theirs", visible]
-                ratios.append(one.variance / other.variance)
-                rows.append(
-                    [
-                        alpha,
-                        "visible" if visible else "D",
-                        ratios[-1],
-                        one.seconds / other.seconds,
-                        one.equal_time_error / other.equal_time_error,
-                    ]
-                )
-            advance(1)
-    columns = ["alpha", "sampling", "variance", "time", "equal-time error"]
-    study.table(
-        "efficiency", "Ours over Mitsuba's", columns, rows, "Times: medians of renders taken in turn."
-    )
-    study.plot(
-        "efficiency", "Error at equal time, ours over Mitsuba's", _bars(rows), "Below 1 ours is the better."
-    )
+    rows: list[dict[str, Any]] = []
+    for alpha in study.each("noise", alphas):
+        found = measure_efficiency(alpha, **settings)
+        for visible in (True, False):
+            one, other = found["ours", visible], found["theirs", visible]
+            ratios = {
+                "variance": one.variance / other.variance,
+                "time": one.seconds / other.seconds,
+                "equal-time error": one.equal_time_error / other.equal_time_error,
+            }
+            rows.append({"alpha": alpha, "sampling": "visible" if visible else "D", **ratios})
+    study.records("efficiency", "Ours over Mitsuba's", rows, "Times: medians of renders taken in turn.")
+    title = "Error at equal time, ours over Mitsuba's"
+    study.plot("efficiency", title, _bars(rows), "Below 1 ours is the better.")
     why = "the same sampling; the variances of a thousand pixels are known to a few percent"
-    study.at_most("variance at equal sample count, ours over theirs", largest(ratios), 1.1, why)
-    study.record("equal-time error, ours over theirs, median", statistics.median(row[-1] for row in rows))
+    most = largest(row["variance"] for row in rows)
+    study.at_most("variance at equal sample count, ours over theirs", most, 1.1, why)
+    median = statistics.median(row["equal-time error"] for row in rows)
+    study.record("equal-time error, ours over theirs, median", median)
 
 
-def _bars(rows: Sequence[Sequence[Any]]) -> Any:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6, 3.5))
-    axes = figure.subplots()
-    axes.bar([f"α {row[0]:g}\n{row[1]}" for row in rows], [row[-1] for row in rows])
+def _bars(rows: Sequence[Mapping[str, Any]]) -> Any:
+    figure, axes = panels(6, 3.5)
+    names = [f"α {row['alpha']:g}\n{row['sampling']}" for row in rows]
+    axes.bar(names, [row["equal-time error"] for row in rows])
     axes.axhline(1, color="black", linewidth=0.8)
     axes.set(ylabel="error at equal time, ratio")
     return figure

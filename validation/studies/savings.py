@@ -15,6 +15,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Cone, Plane, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.tools.knobs import load
+from mrt_mitsuba.validation.tools.scenery import with_materials
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.warm import ratio
 
@@ -78,7 +79,8 @@ def _row(case: Forced, size: tuple[int, int], aa: int, repeats: int) -> dict[str
 def forced() -> list[Forced]:
     """Return every kind of thing that a plan leaves out."""
     plain = report_scene(0)
-    dull, stuff = _without_reflection(plain), plain.spheres[0].material
+    dull = with_materials(plain, lambda m: dataclasses.replace(m, specular=(0, 0, 0)))  # nothing reflects
+    stuff = plain.spheres[0].material
     all_paths = {"integrator": {"type": "mrt_whitted", "min_contribution": 0.0}}
     dark = dataclasses.replace(plain, lights=())
     # with a cut-off of zero, a light too dim to be seen still gets its shadow rays
@@ -102,17 +104,6 @@ def forced() -> list[Forced]:
         Forced("edge pass (aa=1)", plain, shared={"aa": 1}, more={"aamode": "sobel", "layers": ["edges"]}),
         Forced("layers (not asked for)", plain, more={"layers": list(LAYERS)}),
     ]
-
-
-def _without_reflection(scene: Scene) -> Scene:
-    """Return the scene with black mirror colours: nothing reflects."""
-
-    def dull(thing: Any) -> Any:
-        return dataclasses.replace(thing, material=dataclasses.replace(thing.material, specular=(0, 0, 0)))
-
-    return dataclasses.replace(
-        scene, spheres=tuple(map(dull, scene.spheres)), planes=tuple(map(dull, scene.planes))
-    )
 
 
 def _textured(description: dict[str, Any]) -> dict[str, Any]:

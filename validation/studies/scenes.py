@@ -19,6 +19,7 @@ from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles.reference import reference_render
+from mrt_mitsuba.validation.tools.gallery import panels
 from mrt_mitsuba.validation.tools.sensitivity import sensitivity
 from mrt_mitsuba.validation.tools.study import Study
 
@@ -187,16 +188,14 @@ def original_renders() -> Path | None:
 def run(study: Study, *, quick: bool) -> None:
     """Judge our pictures, and the original's where they are at hand."""
     judged, rows = {}, []
-    with study.stage("Scenes in float64", len(CASES)) as advance:
-        for name, case in CASES.items():
-            size = case.quick if quick else case.size
-            form: dict[str, Any] = {"fresnel": case.fresnel}
-            found = judged[name] = judge(draw(case.scene, size, **form), case.scene, **form)
-            cut = np.abs(draw(case.scene, size, **form, cut=True) - found.image)
-            hold(study, name, found, float(cut.max()))
-            shown = [np.median(found.error), np.quantile(found.error, 0.99), found.error.max(), cut.max()]
-            rows.append([name, "{}x{}".format(*size), *map(float, shown), *map(found.count, REASONS)])
-            advance(1)
+    for name, case in study.each("Scenes in float64", CASES.items()):
+        size = case.quick if quick else case.size
+        form: dict[str, Any] = {"fresnel": case.fresnel}
+        found = judged[name] = judge(draw(case.scene, size, **form), case.scene, **form)
+        cut = np.abs(draw(case.scene, size, **form, cut=True) - found.image)
+        hold(study, name, found, float(cut.max()))
+        shown = [np.median(found.error), np.quantile(found.error, 0.99), found.error.max(), cut.max()]
+        rows.append([name, "{}x{}".format(*size), *map(float, shown), *map(found.count, REASONS)])
     columns = ["scene", "size", "median", "99 %", "largest", "cut-off", *REASONS]
     note = (
         "One sample per pixel, no path cut; then how much cutting dim paths changes. Fresnel is exact, and "
@@ -224,10 +223,8 @@ def _lattices(study: Study) -> None:
 
 def _pictures(study: Study, judged: dict[str, Judgement]) -> None:
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8, 2.6 * len(judged)), layout="constrained")
-    axes = figure.subplots(len(judged), 2)
+    figure, axes = panels(8, 2.6 * len(judged), len(judged), 2)
     for (left, right), (name, judgement) in zip(axes, judged.items(), strict=True):
         left.imshow(np.clip(judgement.image, 0, 1))
         left.set_ylabel(f"scene {name}")

@@ -18,6 +18,7 @@ from mrt_mitsuba.validation.oracles.reference import camera_directions, referenc
 from mrt_mitsuba.validation.studies import approximations
 from mrt_mitsuba.validation.tools import mutations
 from mrt_mitsuba.validation.tools.gallery import curves, gallery
+from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, camera, with_materials
 from mrt_mitsuba.validation.tools.sensitivity import sensitivity
 from mrt_mitsuba.validation.tools.study import Study
 
@@ -77,6 +78,19 @@ class DirectComparison:
         """Pixels off for no reason."""
         return int(np.sum(self.off & ~self.edge & ~self.steep))
 
+    def figures(self) -> dict[str, float]:
+        """Return what the study's table has."""
+        near, off = self.error[~self.beyond], self.off
+        return {
+            "median": float(np.median(near)),
+            "99.9 %": float(np.quantile(near, 0.999)),
+            "off by > 1e-5": int(off.sum()),
+            "on an edge": int((off & self.edge).sum()),
+            "in a steep highlight": int((off & ~self.edge & self.steep).sum()),
+            "beyond the stand-in": int(self.beyond.sum()),
+            "without a reason": self.unexplained,
+        }
+
 
 def compare_direct(scene: Scene, light: int, *, width: int, height: int) -> DirectComparison:
     """Render a scene with one of its lights, as a stock point light with falloff, by ``mrt_whitted`` and by
@@ -92,8 +106,7 @@ def compare_direct(scene: Scene, light: int, *, width: int, height: int) -> Dire
     loaded = mi.load_dict(nodes)
     whitted = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
     ours, theirs = (
-        mrt.render(loaded, integrator=integrator, aa=1, aamode="none", lattice="report").image
-        for integrator in (whitted, "direct")
+        mrt.render(loaded, integrator=integrator, **AT_CENTRES).image for integrator in (whitted, "direct")
     )
     exact: dict[str, Any] = {"max_depth": 1, "clamp": False, **size}
     found = sensitivity(scene, displacement=DISPLACEMENT, **exact)
@@ -123,41 +136,26 @@ def _beyond_stand_in(scene: Scene, reference: Any, extent: float = 100.0) -> np.
 
 def _direct(study: Study, quick: bool) -> None:
     size: dict[str, Any] = {"width": 120, "height": 90} if quick else {"width": 320, "height": 240}
-    rows: list[list[Any]] = []
+    rows: list[dict[str, Any]] = []
     numbers = (0, 1, 2, 3) if quick else (0, 1, 2, 3, 4)
-    with study.stage("Direct light", len(numbers)) as advance:
-        for number in numbers:
-            scene = report_scene(number)
-            found = [compare_direct(scene, light, **size) for light in range(len(scene.lights))]
-            for light, c in enumerate(found):
-                near = c.error[~c.beyond]
-                counts = (c.off, c.off & c.edge, c.off & ~c.edge & c.steep, c.beyond)
-                shown = [
-                    float(np.median(near)),
-                    float(np.quantile(near, 0.999)),
-                    *(int(np.sum(x)) for x in counts),
-                ]
-                rows.append([number, light, *shown, c.unexplained])
-            advance(1)
-            name, share = f"direct light, scene {number}", max(c.off.mean() for c in found)
-            median = max(float(np.median(c.error[~c.beyond])) for c in found)
-            study.at_most(
-                f"{name}: median difference", median, 3e-7, "least fault: 1 in a million of the light"
-            )
-            why = "edges and what hides lights; measured 7 in 76,800, and 36 among the 600 spheres of scene 4"
-            study.at_most(f"{name}: share of pixels off by > 1e-5", share, DIRECT_SHARE, why)
-            why = "each is held to an edge, a steep highlight or the start of Mitsuba's shadow rays"
-            study.at_most(f"{name}: of these without a reason", sum(c.unexplained for c in found), 0, why)
-    study.table(
-        "direct",
-        "mrt_whitted without bounces and clamp against direct, light by light",
-        ["scene", "light", "median", "99.9 %", "off by > 1e-5", "on an edge", "in a steep highlight",
-         "beyond the stand-in", "without a reason"],
-        rows,
+    for number in study.each("Direct light", numbers):
+        scene = report_scene(number)
+        found = [compare_direct(scene, light, **size) for light in range(len(scene.lights))]
+        rows += [{"scene": number, "light": light, **c.figures()} for light, c in enumerate(found)]
+        name, share = f"direct light, scene {number}", max(c.off.mean() for c in found)
+        median, why = max(c.figures()["median"] for c in found), "least fault: 1 in a million of the light"
+        study.at_most(f"{name}: median difference", median, 3e-7, why)
+        why = "edges and what hides lights; measured 7 in 76,800, and 36 among the 600 spheres of scene 4"
+        study.at_most(f"{name}: share of pixels off by > 1e-5", share, DIRECT_SHARE, why)
+        why = "each is held to an edge, a steep highlight or the start of Mitsuba's shadow rays"
+        study.at_most(f"{name}: of these without a reason", sum(c.unexplained for c in found), 0, why)
+    note = (
         "Stock point light, no sky. Differences relative to 1 + value. To direct, a plane is a square of "
         "side 100: beyond, there is nothing. Mitsuba's shadow rays start 9e-5 (1 + |p|) off their surface, "
-        "ours a few roundings: edges of shadows differ where the tracer says that this matters.",
-    )  # fmt: skip
+        "ours a few roundings: edges of shadows differ where the tracer says that this matters."
+    )
+    title = "mrt_whitted without bounces and clamp against direct, light by light"
+    study.records("direct", title, rows, note)
 
 
 # ------------------------------------- The mirror as the limit of gloss -------------------------------------
@@ -175,22 +173,15 @@ class GlossLimit:
 
 def gloss_limit(alphas: Sequence[float], *, width: int, height: int, spp: int, seed: int = 0) -> GlossLimit:
     """Render four black, shiny spheres in a smooth environment, as mirrors and with gloss."""
+    whitted = {"type": "mrt_whitted", "min_contribution": 0.0}
     nodes = _shiny_spheres(alphas[0], width, height)
-    mirror = mrt.render(
-        nodes,
-        aa=1,
-        aamode="none",
-        lattice="report",
-        layers=["depth"],
-        integrator={"type": "mrt_whitted", "min_contribution": 0.0},
-    )
+    mirror = mrt.render(nodes, **AT_CENTRES, layers=["depth"], integrator=whitted)
     sphere = np.isfinite(mirror.layers["depth.Z"])
     pictures, errors = [mirror.image], []
     for i, alpha in enumerate(alphas):
         path = {"type": "path", "max_depth": 8, "rr_depth": 100}
-        centre: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}
         spheres = _shiny_spheres(alpha, width, height)
-        gloss = mrt.render(spheres, **centre, spp=spp, seed=seed + i, integrator=path).image
+        gloss = mrt.render(spheres, **AT_CENTRES, spp=spp, seed=seed + i, integrator=path).image
         pictures.append(gloss)
         errors.append(float(np.abs(gloss - mirror.image)[sphere].mean() / mirror.image[sphere].mean()))
     slope = float(np.polyfit(np.log(alphas), np.log(errors), 1)[0])
@@ -200,10 +191,8 @@ def gloss_limit(alphas: Sequence[float], *, width: int, height: int, spp: int, s
 def _shiny_spheres(alpha: float, width: int, height: int) -> dict[str, Any]:
     scene = report_scene(0)
     black: dict[str, Any] = {"alpha": alpha, "ior": 3.0, "diffuse": (0, 0, 0), "specular": (1, 1, 1)}
-    spheres = [
-        dataclasses.replace(s, material=dataclasses.replace(s.material, **black)) for s in scene.spheres
-    ]
-    scene = dataclasses.replace(scene, spheres=tuple(spheres), planes=(), lights=())
+    scene = with_materials(scene, lambda m: dataclasses.replace(m, **black))
+    scene = dataclasses.replace(scene, planes=(), lights=())
     nodes = mrt.scene_dict(scene, width=width, height=height, fresnel="dielectric")
     return {**nodes, "sky": {"type": "envmap", "bitmap": mi.Bitmap(_waves())}}
 
@@ -216,23 +205,13 @@ def _gloss(study: Study, quick: bool) -> None:
     found = gloss_limit(alphas, **size)
     what = f"gloss of alpha {alphas[-1]:g} against the mirror term"
     study.at_most(what, found.errors[-1], 2e-3, "what is left is noise, as wide as the lobe")
-    study.at_least(
-        "slope of that difference over alpha", found.slope, 0.9, "blur itself has slope 2, noise slope 1"
-    )
-    title = "Glossy reflection of path against the mirror term"
-    columns = ["alpha", "mean relative difference"]
-    study.table("gloss", title, columns, list(zip(found.alphas, found.errors, strict=True)))
-    study.plot(
-        "gloss",
-        "Gloss becomes a mirror",
-        curves(
-            {f"slope {found.slope:.2f}": (found.alphas, found.errors)},
-            "alpha",
-            "mean relative difference",
-            ticks=alphas,
-        ),
-        "Difference between path with mrt_bsdf and the mirror rays of mrt_whitted.",
-    )
+    why = "blur itself has slope 2, noise slope 1"
+    study.at_least("slope of that difference over alpha", found.slope, 0.9, why)
+    title, error = "Glossy reflection of path against the mirror term", "mean relative difference"
+    study.table("gloss", title, ["alpha", error], list(zip(found.alphas, found.errors, strict=True)))
+    line = {f"slope {found.slope:.2f}": (found.alphas, found.errors)}
+    caption = "Difference between path with mrt_bsdf and the mirror rays of mrt_whitted."
+    study.plot("gloss", "Gloss becomes a mirror", curves(line, "alpha", error, ticks=alphas), caption)
     names = ["mirror of mrt_whitted", *(f"path, alpha {alpha:g}" for alpha in alphas)]
     figure = gallery(dict(zip(names, found.pictures, strict=True)), columns=3)
     study.plot("gloss_pictures", "Gloss, and the mirror", figure)
@@ -244,10 +223,11 @@ def _gloss(study: Study, quick: bool) -> None:
 def _materials(study: Study) -> None:
     """Check what the report does not have: Mitsuba's integrators draw it alike, ray by ray."""
     for name, (shapes, theirs, spp, limit) in _stock_scenes().items():
-        nodes = {**_view(), **shapes}
+        sensor = camera([0, -1, 5], [0, 0, 0], [0, 1, 0], 64, 48, fov=40)
+        nodes = {"type": "scene", "sensor": sensor, **shapes}
         ours = {"type": "mrt_whitted", "clamp": False, "bounce_budget": "plain", "max_depth": 5}
         images = [
-            mrt.render(mi.load_dict(nodes), integrator=i, spp=spp, seed=3, **approximations.AT_CENTRES).image
+            mrt.render(mi.load_dict(nodes), integrator=i, spp=spp, seed=3, **AT_CENTRES).image
             for i in (ours, theirs)
         ]
         off = np.abs(images[0] - images[1]).max(axis=-1) > limit * (1 + images[1].max(axis=-1))
@@ -255,12 +235,6 @@ def _materials(study: Study) -> None:
         study.at_most(f"{name}: share of pixels off", off.mean(), 2e-3, why)
         seen, why = (images[1] > 1e-3).any(axis=-1).mean(), "a black picture would be no comparison"
         study.at_least(f"{name}: share of pixels to compare", seen, 0.1, why)
-
-
-def _view() -> dict[str, Any]:
-    look = mi.ScalarTransform4f().look_at([0, -1, 5], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 64, "height": 48, "rfilter": {"type": "box"}}
-    return {"type": "scene", "sensor": {"type": "perspective", "fov": 40, "to_world": look, "film": film}}
 
 
 def _stock_scenes() -> dict[str, tuple[dict[str, Any], dict[str, Any], int, float]]:
@@ -279,11 +253,8 @@ def _stock_scenes() -> dict[str, tuple[dict[str, Any], dict[str, Any], int, floa
     }
     turned = {name: {"type": name, **numbers, "flip_normals": True} for name, numbers in kinds.items()}
     lit = {"ball": {"type": "sphere", "center": [1, 0, 0]}, "lamp": lamp}
-    bumps = {
-        "type": "bumpmap",
-        "texture": {"type": "bitmap", "bitmap": mi.Bitmap(0.5 * _waves())},
-        "scale": 0.4,
-    }
+    height = {"type": "bitmap", "bitmap": mi.Bitmap(0.5 * _waves())}
+    bumps = {"type": "bumpmap", "texture": height, "scale": 0.4}
     return {
         "two-sided paper from behind": ({"paper": {"type": "rectangle", "to_world": turn, "bsdf": paper},
                                          "lamp": lamp}, direct, 1, 1e-5),

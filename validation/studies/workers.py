@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import itertools
 import statistics
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,6 +19,7 @@ from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.warm import timed
 
 TITLE = "Many renders on several processes"
 
@@ -92,39 +93,32 @@ def run(study: Study, *, quick: bool) -> None:
         study.at_least("pictures", len(names), extent.alphas * len(AA), "one of each combination")
         if extent.turns:
             warm = 2 * FIRST_JOBS
-            title, why = (
-                "memory of a worker over that after its first jobs",
-                "a leak would grow with each of 400 renders",
-            )
+            title = "memory of a worker over that after its first jobs"
+            why = "a leak would grow with each of 400 renders"
             study.at_most(title, watch.growth(warm), GROWTH, why)
             _times(study, Path(folder), extent, counts)
 
 
 def _times(study: Study, folder: Path, extent: Extent, counts: Sequence[int]) -> None:
     taken: dict[int, list[float]] = {count: [] for count in (0, *counts)}
-    with study.stage("Workers", extent.turns * len(taken)) as advance:
-        for turn in range(extent.turns):
-            for count, seconds in taken.items():
-                out = folder / f"{turn}-{count}"
-                out.mkdir()
-                start = time.perf_counter()
-                sweep(out, extent, count) if count else loop(out, extent)
-                seconds.append(time.perf_counter() - start)
-                advance(1)
+    for turn, count in study.each("Workers", [*itertools.product(range(extent.turns), taken)]):
+        out = folder / f"{turn}-{count}"
+        out.mkdir()
+        run = partial(sweep, workers=count) if count else loop
+        taken[count].append(timed(partial(run, out, extent))[1])
     ratios = {n: [own / one for own, one in zip(taken[n], taken[0], strict=True)] for n in counts}
     jobs = extent.alphas * len(AA)
-    study.table(
-        "workers",
-        f"{jobs} renders of scene {SCENE}, {extent.size[0]}x{extent.size[1]}, on {usable_cores()} cores",
-        ("workers", "seconds", "fastest", "slowest", "of the loop's time"),
-        [
-            (n or "a loop", statistics.median(s), min(s), max(s), statistics.median(ratios[n]) if n else 1.0)
-            for n, s in taken.items()
-        ],
+    title = f"{jobs} renders of scene {SCENE}, {extent.size[0]}x{extent.size[1]}, on {usable_cores()} cores"
+    columns = ("workers", "seconds", "fastest", "slowest", "of the loop's time")
+    rows = [
+        (n or "a loop", statistics.median(s), min(s), max(s), statistics.median(ratios[n]) if n else 1.0)
+        for n, s in taken.items()
+    ]
+    note = (
         "A loop: the same renders and files in this process, one after the other. The seconds of a sweep "
-        "hold the start of its workers and its contact sheet.",
-        first=True,
+        "hold the start of its workers and its contact sheet."
     )
+    study.table("workers", title, columns, rows, note, first=True)
     if usable_cores() > 1:
         best = ratios[usable_cores()]
         span, why = (min(best), max(best)), "two workers halve it but for their start"
@@ -158,32 +152,17 @@ def alphas(extent: Extent) -> list[float]:
 
 def same(a: Path, b: Path) -> bool:
     """Return whether two files hold the same picture and layers."""
-    one, other = read_exr(a), read_exr(b)
-    pairs: list[tuple[Mapping[str, Any], Mapping[str, Any]]] = [
-        ({"": one.image}, {"": other.image}),
-        (one.layers, other.layers),
-    ]
-    return all(
-        p.keys() == q.keys() and all(np.array_equal(p[name], q[name], equal_nan=True) for name in p)
-        for p, q in pairs
-    )
+    one, other = ({"": exr.image, **exr.layers} for exr in map(read_exr, (a, b)))
+    return one.keys() == other.keys() and all(np.array_equal(one[k], other[k], equal_nan=True) for k in one)
 
 
 def _overhead(folder: Path, count: int) -> float:
     """Return the milliseconds of a job beyond what its render and its file take."""
     few, spans = max(1, count // 10), []
+    options: dict[str, Any] = {"workers": 1, "progress": Progress(), "width": 64, "height": 48, "aa": 1}
     for number in (few, count):
-        start = time.perf_counter()
-        table = mrt.sweep(
-            SCENE,
-            folder / str(number),
-            grid={"seed": range(number)},
-            workers=1,
-            progress=Progress(),
-            width=64,
-            height=48,
-            aa=1,
-        )
-        spans.append(time.perf_counter() - start)
+        grid = {"seed": range(number)}
+        table, seconds = timed(partial(mrt.sweep, SCENE, folder / str(number), grid=grid, **options))
+        spans.append(seconds)
     job = statistics.median(row["seconds"] for row in table.rows)
     return 1e3 * ((spans[1] - spans[0]) / (count - few) - job)

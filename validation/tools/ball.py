@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba.validation.tools.bsdf_probe import Array, rgb
+from mrt_mitsuba.validation.tools.scenery import camera
 
 
 def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96, studio: bool = False) -> Any:
@@ -18,15 +19,6 @@ def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96, studio: bool = False)
     """
     import mitsuba as mi
 
-    look = mi.ScalarTransform4f().look_at([0, -4, 1.6], [0, 0, 0.6], [0, 0, 1])
-    film = {
-        "type": "hdrfilm",
-        "width": size,
-        "height": size * 3 // 4,
-        "rfilter": {"type": "box"},
-        "pixel_format": "rgb",
-        "component_format": "float32",
-    }
     ground = {
         "type": "rectangle",
         "to_world": mi.ScalarTransform4f().scale(4),
@@ -41,7 +33,7 @@ def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96, studio: bool = False)
         {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": 5},
-            "sensor": {"type": "perspective", "fov": 32, "to_world": look, "film": film},
+            "sensor": camera([0, -4, 1.6], [0, 0, 0.6], [0, 0, 1], size, size * 3 // 4, fov=32),
             "ball": {"type": "sphere", "center": [0, 0, 0.7], "radius": 0.7, "bsdf": dict(bsdf)},
             **({"sky": _fields()} if studio else around),
         }

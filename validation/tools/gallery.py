@@ -10,19 +10,28 @@ import numpy as np
 from mrt_mitsuba.output.files import to_8bit
 
 
-def gallery(pictures: Mapping[str, np.ndarray], *, columns: int = 2) -> Any:
-    """Return a matplotlib figure of linear pictures [H, W, 3] of one size, as sRGB, ``columns`` to a row."""
+def panels(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Any, Any]:
+    """Return a matplotlib figure of a size in inches, and its axes."""
     from matplotlib.figure import Figure
 
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, **options)
+
+
+def gallery(
+    pictures: Mapping[str, np.ndarray], *, columns: int = 2, width: float = 8, title: float = 0.35
+) -> Any:
+    """Return a matplotlib figure of linear pictures [H, W, 3] of one size, as sRGB, ``columns`` to a row.
+
+    ``width`` of the figure and height of a ``title`` are in inches.
+    """
     rows = -(-len(pictures) // columns)
-    height, width, _ = next(iter(pictures.values())).shape
-    cell = 8 / columns
-    figure = Figure(figsize=(8, rows * (cell * height / width + 0.35)), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axis in axes:
+    high, wide, _ = next(iter(pictures.values())).shape
+    figure, axes = panels(width, rows * (width / columns * high / wide + title), rows, columns, squeeze=False)
+    for axis in axes.ravel():
         axis.set_axis_off()
-    for axis, (name, image) in zip(axes, pictures.items(), strict=False):
-        axis.imshow(to_8bit(image, "srgb"))
+    for axis, (name, image) in zip(axes.ravel(), pictures.items(), strict=False):
+        axis.imshow(to_8bit(image, "srgb"), interpolation="nearest")
         axis.set_title(name, fontsize="small")
     return figure
 
@@ -38,10 +47,7 @@ def curves(
     ticks: Sequence[float] = (),
 ) -> Any:
     """Return a matplotlib figure of curves (x, y) by name; ``level``: a horizontal line to compare with."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = panels(6.4, 4.2)
     for name, (x, y) in series.items():
         (axes.loglog if log else axes.plot)(x, y, "--" if name in dashed else "o-", markersize=4, label=name)
     if ticks:

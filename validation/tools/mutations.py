@@ -121,9 +121,7 @@ def run(study: Study, *, quick: bool) -> None:
     """Check that every mistake is found at the largest count, and none where there is none."""
     counts = (4, 16) if quick else (4, 16, 64, 256)
     size: dict[str, Any] = {"width": 64, "height": 48} if quick else {"width": 120, "height": 90}
-    with study.stage("Mutations", 1) as advance:
-        found = trials(counts, **size)
-        advance(1)
+    found = trials(counts, **size)
     by_mistake = {trial.mistake: [t for t in found if t.mistake == trial.mistake] for trial in found}
     for name, series in by_mistake.items():
         if name == NONE:

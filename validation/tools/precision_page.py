@@ -8,30 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.output.files import to_8bit
+from mrt_mitsuba.validation.tools.gallery import gallery, panels
 from mrt_mitsuba.validation.tools.intervals import Estimate
 from mrt_mitsuba.validation.tools.precision import Findings, Interval, Point, Strip
 from mrt_mitsuba.validation.tools.study import Study
 
 TITLE = "Error against time"
-COLUMNS = (
-    "#",
-    "case",
-    "seconds",
-    "interval, s",
-    "cold, s",
-    "of it compiling, s",
-    "RMSE",
-    "interval",
-    "|bias|",
-    "interval of it",
-    "1 / (variance × s)",
-    "relMSE",
-    "largest",
-    "FLIP",
-    "rays",
-    "ahead",
-)
 MARKERS = "osD^vP*X<>hp"
 LABELLED = 30  # points up to which each has its number in the diagram; of more only those ahead
 PANEL = (160, 120)  # pixels of a larger picture that a strip shows
@@ -81,7 +63,7 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
         "Seconds: medians of warm renders without loading the scene; cold: a first run. Errors in units of "
         "linear light. Ahead: no other case has less error in less time."
     )
-    study.table(f"{prefix}points", f"{title}: every case", COLUMNS, rows, note)
+    study.records(f"{prefix}points", f"{title}: every case", rows, note)
     if found.failed:
         reasons = [list(item) for item in found.failed.items()]
         study.table(f"{prefix}failed", f"{title}: cases that failed", ["case", "why"], reasons)
@@ -113,15 +95,26 @@ def front(points: Sequence[Point]) -> list[Point]:
     return best
 
 
-def _row(number: int, p: Point, ahead: bool) -> tuple[Any, ...]:
+def _row(number: int, p: Point, ahead: bool) -> dict[str, Any]:
     d = p.difference
-    error = (p.rmse, _interval(p.rmse_interval)) if p.resolved else ("at the floor", "")
-    bias = (p.bias, _interval(p.bias_interval)) if np.isfinite(p.bias) else ("–", "")
-    time = (p.seconds, _interval(p.seconds_interval), p.cold, p.compile)
-    efficiency = p.efficiency if np.isfinite(p.efficiency) else "–"
-    shown = "–" if d.flip is None else d.flip
-    others = (efficiency, d.rel_mse, d.largest, shown, sum(p.rays.values()), "yes" if ahead else "")
-    return (number, p.name, *time, *error, *bias, *others)
+    return {
+        "#": number,
+        "case": p.name,
+        "seconds": p.seconds,
+        "interval, s": _interval(p.seconds_interval),
+        "cold, s": p.cold,
+        "of it compiling, s": p.compile,
+        "RMSE": p.rmse if p.resolved else "at the floor",
+        "interval": _interval(p.rmse_interval) if p.resolved else "",
+        "|bias|": p.bias if np.isfinite(p.bias) else "–",
+        "interval of it": _interval(p.bias_interval) if np.isfinite(p.bias) else "",
+        "1 / (variance × s)": p.efficiency if np.isfinite(p.efficiency) else "–",
+        "relMSE": d.rel_mse,
+        "largest": d.largest,
+        "FLIP": "–" if d.flip is None else d.flip,
+        "rays": sum(p.rays.values()),
+        "ahead": "yes" if ahead else "",
+    }
 
 
 def _interval(ends: Interval) -> str:
@@ -137,10 +130,7 @@ def _caption(found: Findings) -> str:
 
 def diagram(found: Findings) -> Any:
     """Return the work-precision diagram: RMSE against seconds, both with intervals, and the floor."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = panels(9, 6)
     points, floor = list(found.points.values()), found.reference_error
     errors = [p.rmse for p in points if p.rmse > 0] + ([floor] if floor else [])
     bottom = 0.4 * min(errors, default=1e-6)  # where cases without error are drawn
@@ -199,25 +189,14 @@ def _label_between_decades(axis: Any) -> None:
 
 def strip_figure(found: Findings, strip: Strip) -> Any:
     """Return the pictures of a strip side by side, the reference last, each with its seconds and error."""
-    from matplotlib.figure import Figure
-
-    images = [panel.image for panel in strip.panels]
-    cut = _most_different(np.stack(images), found.reference)
-    titles = [
-        f"{p.name}\n{p.seconds:.3g} s, RMSE {np.sqrt(np.mean((p.image - found.reference) ** 2)):.2g}"
-        for p in strip.panels
-    ]
-    columns = min(4, len(images) + 1)
-    rows = -(-(len(images) + 1) // columns)
-    ratio = found.reference[cut].shape[0] / found.reference[cut].shape[1]
-    figure = Figure(figsize=(10, rows * (10 / columns * ratio + 0.6)), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axis in axes:
-        axis.axis("off")
-    for axis, image, title in zip(axes, [*images, found.reference], [*titles, "reference"], strict=False):
-        axis.imshow(to_8bit(np.asarray(image[cut], np.float32), "srgb"), interpolation="nearest")
-        axis.set_title(title, fontsize=8)
-    return figure
+    cut = _most_different(np.stack([panel.image for panel in strip.panels]), found.reference)
+    pictures = {}
+    for p in strip.panels:
+        rmse = np.sqrt(np.mean((p.image - found.reference) ** 2))
+        pictures[f"{p.name}\n{p.seconds:.3g} s, RMSE {rmse:.2g}"] = p.image
+    pictures["reference"] = found.reference
+    cuts = {title: np.asarray(picture[cut], np.float32) for title, picture in pictures.items()}
+    return gallery(cuts, columns=min(4, len(cuts)), width=10, title=0.6)
 
 
 def _most_different(images: np.ndarray, reference: np.ndarray) -> tuple[slice, slice]:

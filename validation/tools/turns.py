@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import json
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mrt_mitsuba.validation.tools import small_renders
+from mrt_mitsuba.validation.tools.warm import Ratio, in_turns, timed
 
 # What any program on Mitsuba waits for: import, variant, one kernel
 BARE = """
@@ -44,51 +44,38 @@ class Waits:
     high: float | None = None
 
     @classmethod
-    def of(cls, name: str, ours: Sequence[float], theirs: Sequence[float]) -> Waits:
+    def of(cls, name: str, ours: Sequence[float], *theirs: Sequence[float]) -> Waits:
         """Return what pairs of seconds, taken in turns, say."""
         if not theirs:
-            return cls(name, float(np.median(ours)), None)
-        low, ratio, high = np.quantile(np.divide(ours, theirs), (0.25, 0.5, 0.75)).tolist()
-        return cls(name, float(np.median(ours)), float(np.median(theirs)), ratio, low, high)
+            return cls(name, statistics.median(ours), None)
+        found = Ratio.of(ours, *theirs)
+        return cls(name, found.seconds, found.other_seconds, found.median, found.low, found.high)
 
 
 def waits(before: str | None, turns: int, cases: Sequence[str] | None = None) -> list[Waits]:
     """Measure the start and the cases, in turns with the Python ``before`` that has an earlier version."""
     names = list(small_renders.CASES) if cases is None else list(cases)
     with tempfile.TemporaryDirectory() as folder:
+        bare = [sys.executable, "-c", BARE]
         command = [sys.executable, "-m", "mrt_mitsuba.command.main", f"{folder}/out", "0", "quiet=1"]
-        pair = lambda: _seconds(command), lambda: _seconds([sys.executable, "-c", BARE])
-        found = [Waits.of(START, *_in_turns(pair, turns))]
-    if not names:
-        return found
-    sides = [lambda: _small(sys.executable, names)]
-    if before is not None:
-        sides.append(lambda: _small(before, names))
-    runs: list[list[Mapping[str, float]]] = _in_turns(sides, turns)
-    for name in names:
-        ours, theirs = ([run[name] for run in side] for side in (*runs, *([[]] if before is None else [])))
-        found.append(Waits.of(name, ours, theirs))
-    return found
+        found = [Waits.of(START, *_warm([partial(seconds, c) for c in (command, bare)], turns))]
+    pythons = [sys.executable, *([] if before is None else [before])]
+    runs = _warm([partial(_small, python, names) for python in pythons], turns) if names else []
+    return found + [Waits.of(name, *([run[name] for run in side] for side in runs)) for name in names]
 
 
-def _in_turns(sides: Sequence[Callable[[], Any]], turns: int) -> list[list[Any]]:
-    """Return what each side gives in each turn; the first to go changes. One turn before does not count."""
-    results: list[list[Any]] = [[] for _ in sides]
-    for turn in range(turns + 1):
-        order = range(len(sides)) if turn % 2 else reversed(range(len(sides)))
-        for index in order:
-            result = sides[index]()
-            if turn:
-                results[index].append(result)
-    return results
+def _warm(sides: Sequence[Callable[[], Any]], turns: int) -> list[list[Any]]:
+    """Return what each side gives in each turn. One turn before does not count."""
+    for side in sides:
+        side()
+    return in_turns([lambda _, side=side: side() for side in sides], turns)  # type: ignore[misc]
 
 
-def _seconds(command: Sequence[str]) -> float:
-    # as after installation: Python compiles a module once
+def seconds(command: Sequence[str]) -> float:
+    """Return the seconds of a command, as after installation: Python compiles a module once."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    start = time.perf_counter()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, timeout=600, env=environment)
-    return time.perf_counter() - start
+    silent: dict[str, Any] = {"check": True, "stdout": subprocess.DEVNULL, "timeout": 600}
+    return timed(lambda: subprocess.run(command, env=environment, **silent))[1]
 
 
 def _small(python: str, names: Sequence[str]) -> Mapping[str, float]:

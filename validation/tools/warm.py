@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -37,12 +37,31 @@ def measure(
     for turn in range(repeats):
         for name, run in runs.items():
             if turn < LEAST_REPEATS or sum(times[name]) < enough:
-                times[name].append(_seconds(run))
+                times[name].append(timed(run)[1])
     found = {}
     for name, seconds in times.items():
         median = statistics.median(seconds)
         found[name] = Warm(results[name], median, (max(seconds) - min(seconds)) / median)
     return found
+
+
+def timed(run: Callable[[], Any]) -> tuple[Any, float]:
+    """Return what a function returns, and its seconds."""
+    start = time.perf_counter()
+    result = run()
+    return result, time.perf_counter() - start
+
+
+def in_turns(sides: Sequence[Callable[[int], Any]], turns: int) -> list[list[Any]]:
+    """Return what each side gives for the number of each turn, so that a load on the machine meets all.
+
+    The order changes from turn to turn.
+    """
+    results: list[list[Any]] = [[] for _ in sides]
+    for turn in range(turns):
+        for index in range(len(sides)) if turn % 2 == 0 else reversed(range(len(sides))):
+            results[index].append(sides[index](turn))
+    return results
 
 
 @dataclass(frozen=True)
@@ -55,25 +74,15 @@ class Ratio:
     seconds: float  # medians of the one and of the other
     other_seconds: float
 
+    @classmethod
+    def of(cls, seconds: Sequence[float], others: Sequence[float]) -> Ratio:
+        """Return what pairs of seconds say."""
+        low, median, high = np.quantile(np.divide(seconds, others), (0.25, 0.5, 0.75)).tolist()
+        return cls(median, low, high, statistics.median(seconds), statistics.median(others))
+
 
 def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> Ratio:
-    """Compare two runs in pairs, so that a load on the machine meets both; the first goes second next time.
-
-    Both run once before, which compiles their kernels.
-    """
-    pair = (run, other)
-    times: list[list[float]] = [[], []]
-    for one in pair:
-        one()
-    for number in range(repeats):
-        for index in (0, 1) if number % 2 == 0 else (1, 0):
-            times[index].append(_seconds(pair[index]))
-    ratios = [a / b for a, b in zip(*times, strict=True)]
-    low, median, high = (float(q) for q in np.quantile(ratios, (0.25, 0.5, 0.75)))
-    return Ratio(median, low, high, *(statistics.median(t) for t in times))
-
-
-def _seconds(run: Callable[[], Any]) -> float:
-    start = time.perf_counter()
+    """Compare two runs in turns. Both run once before, which compiles their kernels."""
     run()
-    return time.perf_counter() - start
+    other()
+    return Ratio.of(*in_turns([lambda _: timed(run)[1], lambda _: timed(other)[1]], repeats))

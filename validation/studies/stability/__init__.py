@@ -12,7 +12,5 @@ PARTS = (bsdf, geometry, transport, filters, finite)
 
 def run(study: Study, *, quick: bool) -> None:
     """Run all parts, each with its tables: reflectance, geometry, light, filters, finite results."""
-    with study.stage(TITLE, len(PARTS)) as advance:
-        for part in PARTS:
-            part.run(study, quick=quick)
-            advance(1)
+    for part in study.each(TITLE, PARTS):
+        part.run(study, quick=quick)

@@ -21,6 +21,7 @@ from mrt_mitsuba.validation.studies.stability.lobes import (
     Truth,
     lobes_with_truth,
 )
+from mrt_mitsuba.validation.tools.gallery import panels
 from mrt_mitsuba.validation.tools.study import Study
 
 QUANTITIES = {
@@ -261,16 +262,14 @@ def _grid(row: np.ndarray, column: np.ndarray, error: np.ndarray, shape: tuple[i
 def _figure(maps: Sequence[np.ndarray], titles: Sequence[str], x: tuple, y: tuple) -> Any:
     """Return heat maps side by side on one logarithmic scale from a rounding to 1."""
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
-    panels = figure.subplots(1, len(maps), sharey=True)
-    for panel, values, title in zip(panels, maps, titles, strict=True):
+    figure, axes = panels(13, 4.2, 1, len(maps), sharey=True)
+    for panel, values, title in zip(axes, maps, titles, strict=True):
         shown = panel.imshow(np.clip(values, ROUNDING, 1), norm=LogNorm(ROUNDING, 1), aspect="auto")
         panel.set_title(title)
         panel.set_xlabel(x[0])
         panel.set_xticks(range(len(x[1])), x[1], rotation=90)
-    panels[0].set_ylabel(y[0])
-    panels[0].set_yticks(range(len(y[1])), y[1])
-    figure.colorbar(shown, ax=panels, label="relative error (1 and more in one colour)")
+    axes[0].set_ylabel(y[0])
+    axes[0].set_yticks(range(len(y[1])), y[1])
+    figure.colorbar(shown, ax=axes, label="relative error (1 and more in one colour)")
     return figure
