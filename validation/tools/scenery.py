@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+
 from mrt_mitsuba.scene.model import Material, Scene
 
 # One ray at a time through the pixel's centre, as the report's lattice has it
@@ -36,3 +38,19 @@ def with_materials(scene: Scene, change: Callable[[Material], Material]) -> Scen
         return tuple(dataclasses.replace(t, material=change(t.material)) for t in things)
 
     return dataclasses.replace(scene, spheres=changed(scene.spheres), planes=changed(scene.planes))
+
+
+def rays(o: np.ndarray, d: np.ndarray) -> Any:
+    """Return rays from points [N, 3] in directions [N, 3]."""
+    import mitsuba as mi
+
+    return mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T))
+
+
+def traced(scene: Any, ray: Any, **parameters: Any) -> Any:
+    """Return what ``mrt_whitted`` with these parameters finds along rays."""
+    import mitsuba as mi
+
+    integrator = mi.load_dict({"type": "mrt_whitted", **parameters})
+    integrator.prepare(scene)
+    return integrator.trace(scene, None, ray)

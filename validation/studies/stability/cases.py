@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
+import mitsuba as mi
+
+from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.tools.study import Bound, Study
 
 COLUMNS = ("case", "what", "expected", "measured", "bound", "")
@@ -64,3 +67,14 @@ class Cases:
 def hexadecimal(values: Iterable[float]) -> str:
     """Return numbers in Python's exact notation, which ``float.fromhex`` reads back."""
     return " ".join(float(value).hex() for value in values)
+
+
+def both_variants() -> Iterator[str]:
+    """Go through the current variant and the scalar one; yield what to add to the names of cases."""
+    before = mi.variant()
+    yield ""
+    runtime.use(runtime.SLOW)
+    try:
+        yield f" ({runtime.SLOW})"
+    finally:
+        runtime.use(before)

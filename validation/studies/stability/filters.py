@@ -9,13 +9,12 @@ from functools import partial
 from itertools import product
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba import filters, runtime
+from mrt_mitsuba import filters
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.oracles import filters as loops
-from mrt_mitsuba.validation.studies.stability.cases import Cases
+from mrt_mitsuba.validation.studies.stability.cases import Cases, both_variants
 from mrt_mitsuba.validation.tools.study import Study
 
 SHAPES = ((1, 1), (1, 17), (17, 1), (2, 2), (3, 3), (1, 2), (40, 30))
@@ -37,15 +36,9 @@ def run(study: Study, *, quick: bool) -> None:
     """Make the table of cases, in both kinds of variants."""
     del quick  # all of it is quick
     cases = Cases(study, "filters", "Filters")
-    before = mi.variant()
-    for variant in (before, runtime.SLOW):
-        runtime.use(variant)
-        try:
-            for case in CASES:
-                name = case.name if variant == before else f"{case.name} ({variant})"
-                cases.at_most(name, case.what, case.expected, case.measure(), case.limit)
-        finally:
-            runtime.use(before)
+    for suffix in both_variants():
+        for case in CASES:
+            cases.at_most(case.name + suffix, case.what, case.expected, case.measure(), case.limit)
     why = "the smallest weights are 2⁻³⁰: their products are below the least normal float32 and become 0"
     cases.beyond_float32("constant pictures of 1e-30, blur", "relative change", _constant_blur((1e-30,)), why)
     cases.close()

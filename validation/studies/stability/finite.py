@@ -24,6 +24,7 @@ from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.validation.studies.stability.cases import Cases
 from mrt_mitsuba.validation.studies.stability.transport import BASE
+from mrt_mitsuba.validation.tools.scenery import traced
 from mrt_mitsuba.validation.tools.study import Study
 
 AT_ONCE = 2_500_000
@@ -120,15 +121,8 @@ def _bsdf(form: str, visible: bool) -> Callable[[_Draw], Any]:
     """Return value, density, sample and mirror reflectance, with an alpha and indices for each lane."""
 
     def evaluate(draw: _Draw) -> Any:
-        bsdf = mi.load_dict(
-            {
-                "type": "mrt_bsdf",
-                "fresnel": form,
-                "sample_visible": visible,
-                "specular_reflectance": 100.0,
-                "diffuse_reflectance": 2.0,
-            }
-        )
+        bright = {"specular_reflectance": 100.0, "diffuse_reflectance": 2.0}
+        bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": form, "sample_visible": visible, **bright})
         parameters = mi.traverse(bsdf)
         sign = dr.select(draw.uniform() < 0.8, mi.Float(1), -1)
         parameters["alpha"] = sign * draw.log(1e-9, 1e3, ALPHAS)
@@ -202,9 +196,8 @@ def _quadric(to_frame: Any, intersect: Any, surface: Any) -> Callable[[_Draw], A
 def _whitted(draw: _Draw) -> Any:
     """Return bad results of random rays through a scene of every kind of shape, some from inside."""
     scene = mi.load_dict(_everything().to_dict())
-    integrator = mi.load_dict({"type": "mrt_whitted", "clamp": False, "min_contribution": 0.0})
-    integrator.prepare(scene)
-    trace = integrator.trace(scene, None, mi.Ray3f(draw.vector(mi.Point3f), draw.unit()))
+    ray = mi.Ray3f(draw.vector(mi.Point3f), draw.unit())
+    trace = traced(scene, ray, clamp=False, min_contribution=0.0)
     si = trace.hit.si
     lost = trace.hit.found & (~dr.isfinite(si.t) | _not_unit(si.n))
     bad = _bad(trace.radiance, trace.direct) | lost

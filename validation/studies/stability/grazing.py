@@ -10,6 +10,7 @@ import numpy as np
 from mrt_mitsuba.scene.model import Cone, Cylinder, Material
 from mrt_mitsuba.validation.oracles import reference
 from mrt_mitsuba.validation.studies.stability.cases import Cases
+from mrt_mitsuba.validation.tools import scenery
 
 ROUNDING = 2.0**-24
 MATTE = Material(0.0, 1.0, (0, 0, 0), (1, 1, 1))
@@ -111,7 +112,5 @@ def _exact(things: list[Any], which: np.ndarray, o: np.ndarray, d: np.ndarray) -
 def traced(shape: dict[str, Any], o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which rays [N, 3] ``mrt_whitted`` finds to meet a shape, and how far away."""
     scene = mi.load_dict({"type": "scene", "shape": shape})
-    integrator = mi.load_dict({"type": "mrt_whitted"})
-    integrator.prepare(scene)
-    hit = integrator.trace(scene, None, mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T))).hit
+    hit = scenery.traced(scene, scenery.rays(o, d)).hit
     return np.array(hit.found), np.array(hit.si.t, np.float64)

@@ -12,6 +12,7 @@ import numpy as np
 from mrt_mitsuba.scene.model import Cone, Cylinder, Material, Mesh, Plane, Sphere
 from mrt_mitsuba.validation.oracles import reference
 from mrt_mitsuba.validation.studies.stability.cases import Cases, hexadecimal
+from mrt_mitsuba.validation.tools.scenery import rays, traced
 
 ROUNDING = 2.0**-24
 DECADES = 10.0 ** np.arange(-6, 7, 2)
@@ -270,10 +271,8 @@ def _around(cases: Cases, solid: Solid, shape: dict[str, Any], o: Any, d: Any) -
 
 def _met(shape: dict[str, Any], o: np.ndarray, d: np.ndarray, *, exact: bool = False) -> Any:
     """Return interactions of rays with the mesh of a shape, or with its exact surface."""
-    scene, rays = mi.load_dict({"type": "scene", "shape": shape}), mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T))
-    if not exact:
-        return scene.ray_intersect(rays)
-    return mi.load_dict({"type": "mrt_whitted"}).trace(scene, None, rays).hit.si
+    scene, ray = mi.load_dict({"type": "scene", "shape": shape}), rays(o, d)
+    return traced(scene, ray).hit.si if exact else scene.ray_intersect(ray)
 
 
 # --------------------------------------------- Measuring ---------------------------------------------------
@@ -364,19 +363,15 @@ def _light(size: float) -> np.ndarray:
 def _trace(solid: Solid, size: float, o: np.ndarray, d: np.ndarray) -> _Traced:
     """Trace rays with ``mrt_whitted`` against a white mirror of that form under one light."""
     mirror = {"type": "mrt_bsdf", "fresnel": "unity", "alpha": 1.0, "diffuse_reflectance": 1.0}
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "solid": {**solid.to_dict(size), "bsdf": mirror},
-            **({"other": _aside(size)} if solid.among_others else {}),
-            "light": {"type": "mrt_light", "position": _light(size).tolist()},
-        }
-    )
+    nodes = {"solid": {**solid.to_dict(size), "bsdf": mirror}}
+    nodes |= {"other": _aside(size)} if solid.among_others else {}
+    light = {"type": "mrt_light", "position": _light(size).tolist()}
+    scene = mi.load_dict({"type": "scene", **nodes, "light": light})
     integrator = mi.load_dict({"type": "mrt_whitted", "min_contribution": 0.0, "bounce_budget": "plain"})
     # Its mirror rays meet nothing and would be left out; here they are to show that they do not meet it
     facts = replace(integrator.scene_facts(scene), alone=False)
     integrator.prepare(scene, integrator.kernel_plan(facts))
-    found = integrator.trace(scene, None, mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T)))
+    found = integrator.trace(scene, None, rays(o, d))
     si, hit = found.hit.si, np.array(found.hit.found)
     t = np.where(hit, np.array(si.t, np.float64), np.inf)
     return _Traced(hit, t, np.array(si.n, np.float64).T, np.array(found.direct[0]), np.array(found.bounces))

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from itertools import product
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba import runtime
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles.reference import reference_render, specular_lobe
-from mrt_mitsuba.validation.studies.stability.cases import Cases
+from mrt_mitsuba.validation.studies.stability.cases import Cases, both_variants
+from mrt_mitsuba.validation.tools.scenery import traced
 from mrt_mitsuba.validation.tools.study import Study
 
 WIDTH, HEIGHT = 64, 48
@@ -94,6 +95,7 @@ def _hall(specular: float, light: float = 1.0, ior: float = 1.5) -> Scene:
     return Scene(Camera((0.0, 0.1, 1.0), (0.05, 0.0, -2.0)), (0.2, 0.3, 0.4), (lamp,), (ball,), walls)
 
 
+FORMS = ("dielectric", "schlick")
 FULL, OPEN = {"fresnel": "unity"}, {"clamp": False}
 
 # One line for each case
@@ -222,37 +224,23 @@ def _cut_offs(cases: Cases) -> None:
 
 def _bounces(cases: Cases, depths: Sequence[int]) -> None:
     """Check a ray to and fro between two mirrors: the geometric sum of what both send back."""
-    before = mi.variant()
-    variants = {before: (0.5, 0.999, 1.0, 1.5), runtime.SLOW: (0.999,)}
-    for variant, reflectances in variants.items():
-        runtime.use(variant)
-        try:
-            for reflectance in reflectances:
-                scene = mi.load_dict(_corridor(reflectance))
-                for clamp in (True, False):
-                    truth = np.cumsum(_direct(reflectance, clamp) * reflectance ** np.arange(10))
-                    found = [_to_and_fro(scene, clamp, depth) for depth in depths]
-                    name = f"one to ten bounces, Ks {reflectance:g}, clamp {'on' if clamp else 'off'}"
-                    cases.at_most(
-                        name if variant == before else f"{name} ({variant})",
-                        "relative error of the light that a ray between facing mirrors collects, "
-                        "for every number of bounces",
-                        "the geometric sum, ever growing",
-                        np.abs(np.array(found) / truth[np.array(depths) - 1] - 1).max(),
-                        2e-6,  # ten additions and products, and the reflectance itself
-                    )
-        finally:
-            runtime.use(before)
+    what = (
+        "relative error of the light that a ray between facing mirrors collects, for every number of bounces"
+    )
+    for suffix in both_variants():
+        for reflectance, clamp in product((0.999,) if suffix else (0.5, 0.999, 1.0, 1.5), (True, False)):
+            scene = mi.load_dict(_corridor(reflectance))
+            truth = np.cumsum(_direct(reflectance, clamp) * reflectance ** np.arange(10))
+            found = [_to_and_fro(scene, clamp, depth) for depth in depths]
+            error = np.abs(np.array(found) / truth[np.array(depths) - 1] - 1).max()
+            name = f"one to ten bounces, Ks {reflectance:g}, clamp {'on' if clamp else 'off'}{suffix}"
+            # ten additions and products, and the reflectance itself
+            cases.at_most(name, what, "the geometric sum, ever growing", error, 2e-6)
 
 
 def _corridor(reflectance: float) -> dict[str, Any]:
-    material = {
-        "type": "mrt_bsdf",
-        "fresnel": "unity",
-        "alpha": 0.5,
-        "diffuse_reflectance": 0.25,
-        "specular_reflectance": reflectance,
-    }
+    form = {"type": "mrt_bsdf", "fresnel": "unity", "alpha": 0.5, "diffuse_reflectance": 0.25}
+    material = {**form, "specular_reflectance": reflectance}
     walls = {
         f"wall_{k}": {"type": "mrt_plane", "normal": [0, 0, k], "distance": 1.0, "bsdf": material}
         for k in (1, -1)
@@ -261,18 +249,9 @@ def _corridor(reflectance: float) -> dict[str, Any]:
 
 
 def _to_and_fro(scene: Any, clamp: bool, depth: int) -> float:
-    integrator = mi.load_dict(
-        {
-            "type": "mrt_whitted",
-            "clamp": clamp,
-            "max_depth": depth,
-            "bounce_budget": "plain",
-            "min_contribution": 0.0,
-        }
-    )
-    integrator.prepare(scene)
-    radiance = integrator.trace(scene, None, mi.Ray3f(mi.Point3f(0, 0, 0.5), mi.Vector3f(0, 0, -1))).radiance
-    value = radiance[0]
+    ray = mi.Ray3f(mi.Point3f(0, 0, 0.5), mi.Vector3f(0, 0, -1))
+    settings: dict[str, Any] = {"bounce_budget": "plain", "min_contribution": 0.0}
+    value = traced(scene, ray, clamp=clamp, max_depth=depth, **settings).radiance[0]
     return float(value if isinstance(value, float) else value[0])
 
 
@@ -287,10 +266,9 @@ def _direct(reflectance: float, clamp: bool) -> float:
 
 
 def _whole_renders(cases: Cases, *, quick: bool) -> None:
-    for number in (2, 3) if quick else range(5):
-        for fresnel in ("dielectric",) if quick else ("dielectric", "schlick"):
-            for clamp in (False,) if quick else (True, False):
-                image = _render(report_scene(number), fresnel=fresnel, clamp=clamp)
-                bad = int((~(image >= 0) | np.isinf(image)).sum())
-                name = f"scene {number}, {fresnel}, clamp {'on' if clamp else 'off'}"
-                cases.at_most(name, "values that are not finite, or negative", "none", bad, 0)
+    every = (2, 3) if quick else range(5), FORMS[: 1 if quick else 2], (False,) if quick else (True, False)
+    for number, fresnel, clamp in product(*every):
+        image = _render(report_scene(number), fresnel=fresnel, clamp=clamp)
+        bad = int((~(image >= 0) | np.isinf(image)).sum())
+        name = f"scene {number}, {fresnel}, clamp {'on' if clamp else 'off'}"
+        cases.at_most(name, "values that are not finite, or negative", "none", bad, 0)
