@@ -42,7 +42,7 @@ def _run(monkeypatch, quick: bool = True, **scenes: tuple[int, ...]) -> Study:
 
 @pytest.mark.parametrize("quick", [True, False])
 def test_small_study_holds(quick, monkeypatch, variant):
-    study = _run(monkeypatch, quick, sampling=(0,), path=(0,))
+    study = _run(monkeypatch, quick, sampling=(0,), whitted=(0,), path=(0,))
     assert study.passed, study.missed
     plots, tables = study.plots.keys(), study.tables
     assert {f"scene 0, {name}-diagram" for name in ("sampling", "path")} <= plots

@@ -85,7 +85,7 @@ def whitted(number: int, extent: Extent) -> Trade:
         "no cut-off, max_depth=10, exact Fresnel, the same rays",
         {**cases, "fresnel=schlick": {"scene": extent.scene(number)}},
         integrator(min_contribution=0.0),
-        {"aa": 2, "aamode": "none"},
+        {"aa": 2, "aamode": "none", "lattice": "report"},
     )
 
 
