@@ -22,9 +22,7 @@ from typing import Any
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.output.replacing import replacing
-from mrt_mitsuba.validation.studies import rivals
-from mrt_mitsuba.validation.tools import device_bench, kernels, machine, turns
-from mrt_mitsuba.validation.tools.costs import scene_cost
+from mrt_mitsuba.validation.tools import kernels, machine, turns
 from mrt_mitsuba.validation.tools.report import prepare
 from mrt_mitsuba.validation.tools.study import Goal
 
@@ -101,15 +99,19 @@ class Extent:
     aa: int
     scenes: Sequence[int]
     repeats: int
-    rivals: rivals.Extent
+    rivals: Mapping[str, Any]  # that of the study
 
 
-FULL = Extent(800, 600, 4, (0, 1, 2, 3, 4), 5, rivals.Extent((400, 300), 16, (0, 1, 2, 3, 4), 5))
-QUICK = Extent(80, 60, 2, (3,), 1, rivals.Extent((40, 30), 4, (0,), 1))
+RIVALS_FULL = {"size": (400, 300), "spp": 16, "scenes": (0, 1, 2, 3, 4), "repeats": 5}
+RIVALS_QUICK = {"size": (40, 30), "spp": 4, "scenes": (0,), "repeats": 1}
+FULL = Extent(800, 600, 4, (0, 1, 2, 3, 4), 5, RIVALS_FULL)
+QUICK = Extent(80, 60, 2, (3,), 1, RIVALS_QUICK)
 
 
 def bench(extent: Extent = FULL) -> dict[str, Any]:
     """Measure; return what ``SCHEMA`` describes."""
+    from mrt_mitsuba.validation.studies import rivals  # not before ``own_cache``
+
     mrt.register()
     options = {**asdict(extent), "aamode": "none"}
     return {
@@ -118,11 +120,13 @@ def bench(extent: Extent = FULL) -> dict[str, Any]:
         "versions": machine.versions(),
         "options": json.loads(json.dumps(options)),  # as it is read back
         "scenes": {str(number): _scene(number, extent) for number in extent.scenes},
-        "rivals": {one.pair.name: one.as_dict() for one in rivals.compare(extent.rivals)},
+        "rivals": {one.pair.name: one.as_dict() for one in rivals.compare(rivals.Extent(**extent.rivals))},
     }
 
 
 def _scene(number: int, extent: Extent) -> dict[str, Any]:
+    from mrt_mitsuba.validation.tools.costs import scene_cost
+
     found = scene_cost(number, (extent.width, extent.height), extent.aa, repeats=extent.repeats)
     gc.collect()  # scenes that stay alive slow down the kernels of later ones
     kernels.forget()
@@ -186,6 +190,8 @@ def read(path: Path) -> dict[str, Any]:
 
 def _special(given: argparse.Namespace) -> int:
     """Measure small renders, or a device; write JSON."""
+    from mrt_mitsuba.validation.tools import device_bench
+
     if given.small:
         waits = turns.waits(given.before, given.turns)
         print(turns.table(waits))

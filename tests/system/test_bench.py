@@ -91,3 +91,11 @@ def test_a_place_that_cannot_be_written_is_found_before_measuring(tmp_path, caps
 def test_schema_is_printed(capsys):
     assert bench.main(["--schema"]) == 0
     assert json.loads(capsys.readouterr().out) == bench.SCHEMA
+
+
+def test_the_place_of_kernels_can_be_chosen_in_time(run_python):
+    """Dr.Jit reads it once, when it is imported."""
+    modules = (
+        "from mrt_mitsuba.validation import bench, cli; from mrt_mitsuba.validation.tools import commands"
+    )
+    assert run_python(f"import sys; {modules}; print('drjit' in sys.modules)").stdout == "False\n"

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 Array = np.ndarray
@@ -14,8 +16,6 @@ SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others cal
 
 def is_scalar() -> bool:
     """Return whether the current variant takes one direction at a time."""
-    import mitsuba as mi
-
     return mi.variant().startswith("scalar")
 
 
@@ -33,8 +33,6 @@ class Samples:
     @property
     def delta(self) -> Array:
         """Where the sample comes from a lobe that is one direction only. [N]"""
-        import mitsuba as mi
-
         return (self.type & int(mi.BSDFFlags.Delta)) != 0
 
     def only(self, keep: Any) -> Samples:
@@ -43,8 +41,6 @@ class Samples:
 
 def context(component: int | None = None, *, importance: bool = False) -> Any:
     """Return a ``BSDFContext`` for one component or all."""
-    import mitsuba as mi
-
     made = mi.BSDFContext(mi.TransportMode.Importance if importance else mi.TransportMode.Radiance)
     if component is not None:
         made.component = component
@@ -53,9 +49,6 @@ def context(component: int | None = None, *, importance: bool = False) -> Any:
 
 def interaction(wi: Any, uv: Any) -> Any:
     """Return a point of the plane z = 0, with its whole frame: bump and normal maps need it."""
-    import drjit as dr
-    import mitsuba as mi
-
     si = dr.zeros(mi.SurfaceInteraction3f, 1 if is_scalar() else dr.width(wi))
     si.wi, si.uv, si.t = wi, uv, 1
     si.n, si.p = mi.Normal3f(0, 0, 1), mi.Point3f(uv.x, uv.y, 0)
@@ -124,9 +117,6 @@ class Probe:
 
 
 def _unpolarized(value: Any) -> Any:
-    import drjit as dr
-    import mitsuba as mi
-
     return mi.unpolarized_spectrum(value) if dr.depth_v(value) > 1 else value
 
 
@@ -135,9 +125,6 @@ def lanes(call: Callable[..., list[Any]], *columns: tuple[str, Array]) -> list[A
 
     Return its values as arrays [N, k].
     """
-    import drjit as dr
-    import mitsuba as mi
-
     count = len(columns[0][1])
     if is_scalar():
         rows = [

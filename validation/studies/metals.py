@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,8 +63,6 @@ def f0_of_conductor(eta: Array, k: Array) -> Array:
 
 def preset_names() -> list[str]:
     """Return every material preset of this Mitsuba that ``roughconductor`` takes."""
-    import mitsuba as mi
-
     folder = Path(mi.__file__).parent / "data" / "ior"
     return sorted(path.name.removesuffix(".eta.spd") for path in folder.glob("*.eta.spd"))
 
@@ -73,8 +72,6 @@ def measure(name: str) -> Metal:
 
     Schlick's term is what ``mrt_bsdf`` gives to the mirror direction, with ``f0`` from the indices.
     """
-    import mitsuba as mi
-
     with _silent():
         parameters = mi.traverse(mi.load_dict({"type": "roughconductor", "material": name}))
     eta, k = (np.ravel(parameters[f"{key}.value"]).astype(float) for key in ("eta", "k"))
@@ -88,8 +85,6 @@ def measure(name: str) -> Metal:
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
     """Silence Mitsuba about spectra without a colour in RGB: it takes the nearest."""
-    import mitsuba as mi
-
     before = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)
     try:
@@ -100,8 +95,6 @@ def _silent() -> Iterator[None]:
 
 def exact_reflectance(cos_theta: Array, eta: Array, k: Array) -> Array:
     """Return Mitsuba's Fresnel term of conductors, [angles, channels]."""
-    import mitsuba as mi
-
     cosine = mi.Float(cos_theta)
     columns = [
         np.array(mi.fresnel_conductor(cosine, mi.Complex2f(float(n), float(x))))
@@ -171,8 +164,6 @@ def _curves(metal: Metal) -> Any:
 
 def show_ball(study: Study, metal: Metal, quick: bool) -> None:
     """Show a ball of the metal, both ways, and the difference."""
-    import mitsuba as mi
-
     size, spp = QUICK_PICTURE if quick else PICTURE
     common = {"alpha": 0.1}
     ours = {"type": "mrt_bsdf", "f0": rgb(metal.f0.tolist()), "diffuse_reflectance": 0.0, **common}

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
@@ -52,8 +53,6 @@ class Extent:
 
     def render(self, nodes: Any, integrator: Any = None) -> Callable[[], np.ndarray]:
         """Return Mitsuba's own way to a picture [H, W, 3]; by default with the scene's integrator."""
-        import mitsuba as mi
-
         scene = load(nodes)
         chosen = scene.integrator() if integrator is None else mi.load_dict(integrator)
         return lambda: np.array(mi.render(scene, integrator=chosen, spp=self.spp))

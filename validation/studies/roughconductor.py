@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -83,8 +84,6 @@ def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> Pointwise:
     Mitsuba's density of plain D sampling divides by ωo·h and so feels the rounding of the length of ωo, by
     6e-8 / |ωi + ωo|². Where |ωi + ωo|² < ``SHORT`` and the densities differ, 50 digits judge both.
     """
-    import mitsuba as mi
-
     wi, wo = lobe_pairs(count, alpha, seed=seed)
     found = {}
     for visible in (True, False):
@@ -260,8 +259,6 @@ def _render_both(
     bsdfs: Sequence[Mapping[str, Any]], *, size: int, spp: int, renders: int, seed: int, studio: bool = False
 ) -> tuple[list[Array], list[float]]:
     """Return renders [N, H, W, 3] of each material, with other seeds, in turn, and their median seconds."""
-    import mitsuba as mi
-
     scenes = [ball_scene(bsdf, size=size, studio=studio) for bsdf in bsdfs]
     for scene in scenes:
         np.array(mi.render(scene, spp=spp))  # compiles
@@ -282,8 +279,6 @@ def same_numbers(alpha: float, *, size: int = 96, spp: int = 16) -> float:
     that rounding sends past the other side of an edge goes on differently; anything else would show in most
     pixels of the ball.
     """
-    import mitsuba as mi
-
     scenes = (ball_scene(bsdf(alpha, visible=False), size=size) for bsdf in (ours, theirs))
     one, other = (np.array(mi.render(scene, spp=spp, seed=1)) for scene in scenes)
     return float((np.abs(one - other) > 1e-4 * np.maximum(other, other.mean())).any(axis=-1).mean())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.tools.bsdf_probe import Array, rgb
@@ -17,8 +18,6 @@ def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96, studio: bool = False)
     In the ``studio`` it is alone under a sky of bright and dark fields: all noise is then that of its
     samples, and no light comes back from a floor in rare bright ones.
     """
-    import mitsuba as mi
-
     ground = {
         "type": "rectangle",
         "to_world": mi.ScalarTransform4f().scale(4),
@@ -42,8 +41,6 @@ def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96, studio: bool = False)
 
 def _fields() -> dict[str, Any]:
     """Return a sky of 16 × 8 fields with random brightness, a decade from the median to the brighter ones."""
-    import mitsuba as mi
-
     fields = 10 ** np.random.default_rng(0).normal(-0.5, 0.5, (8, 16, 1)) * np.ones(3)
     return {"type": "envmap", "bitmap": mi.Bitmap(fields.astype(np.float32))}
 

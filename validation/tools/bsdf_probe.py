@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks import probe
@@ -49,8 +50,6 @@ def lobe_pairs(count: int, alpha: float, *, least_cos: float = 0.02, seed: int =
 
 def interaction(wi: Array, uv: Array | None = None) -> Any:
     """Return a surface point seen from directions [N, 3] or [3], at texture coordinates [N, 2] or [2]."""
-    import mitsuba as mi
-
     uv = np.zeros(2) if uv is None else uv
     columns = (np.ascontiguousarray(np.transpose(x), np.float32) for x in (wi, uv))
     return probe.interaction(*(kind(x) for kind, x in zip((mi.Vector3f, mi.Point2f), columns, strict=True)))

@@ -11,6 +11,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.tools import kernels
 from mrt_mitsuba.validation.tools.knobs import load
@@ -35,9 +38,6 @@ class Recorder:
         return self.scene.ray_test(ray, coherent, active)
 
     def _keep(self, kind: str, ray: Any, coherent: bool, active: Any) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         active = mi.Bool(active) & dr.full(mi.Bool, True, dr.width(ray.o))
         index = dr.compress(active)
         if dr.width(index) == 0:
@@ -54,9 +54,6 @@ class Recorder:
 
     def finish(self) -> None:
         """Take out single rays, which had to wait for the end of the loop."""
-        import drjit as dr
-        import mitsuba as mi
-
         for place, ray, index in self.single:
             kept = dr.gather(mi.Ray3f, ray, index)
             dr.eval(kept)
@@ -65,8 +62,6 @@ class Recorder:
 
     def counts(self) -> dict[str, int]:
         """Return the number of rays of each kind."""
-        import drjit as dr
-
         counts: Counter[str] = Counter()
         for kind, _, rays in self.waves:
             counts[kind] += dr.width(rays)
@@ -74,8 +69,6 @@ class Recorder:
 
     def replay(self) -> None:
         """Ask again about all rays."""
-        import drjit as dr
-
         for kind, coherent, rays in self.waves:
             if kind == "shadow":
                 dr.eval(self.scene.ray_test(rays, coherent))
@@ -87,8 +80,6 @@ class Recorder:
 
 def record(scene: Any, **options: Any) -> Recorder:
     """Return the rays that a render by ``mrt_whitted`` asks Mitsuba about, by an integrator that records."""
-    import drjit as dr
-    import mitsuba as mi
 
     from mrt_mitsuba.plugins.whitted import MrtWhitted
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
@@ -91,8 +92,6 @@ def _ours(scene: Any) -> Callable[[], np.ndarray]:
 
 
 def _theirs(scene: Any, integrator: dict[str, Any]) -> Callable[[], np.ndarray]:
-    import mitsuba as mi
-
     chosen = mi.load_dict(integrator)
     return lambda: np.array(mi.render(scene, integrator=chosen, spp=1))
 

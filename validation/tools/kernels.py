@@ -42,7 +42,7 @@ class Kernel:
 
 @contextmanager
 def own_cache() -> Iterator[None]:
-    """Let Dr.Jit keep its kernels in a new folder, for ``forget`` to work; to be entered before it starts."""
+    """Let Dr.Jit keep its kernels in a new folder, for ``forget`` to work; enter before it is imported."""
     with tempfile.TemporaryDirectory(prefix=PREFIX, ignore_cleanup_errors=True) as folder:
         before, os.environ[CACHE] = os.environ.get(CACHE), folder
         try:

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
+
 import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.studies.depth_of_field import fit_lens
@@ -46,8 +48,6 @@ class Extent:
 
 def load(scene: Options) -> Any:
     """Return a Mitsuba scene of a dict with our plugins."""
-    import mitsuba as mi
-
     mrt.register()
     return mi.load_dict(scene)
 

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.scene.model import Material, Scene
@@ -23,8 +24,6 @@ def camera(
     **more: Any,
 ) -> dict[str, Any]:
     """Return a perspective camera whose film has a box filter, as a Mitsuba dict."""
-    import mitsuba as mi
-
     film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
     film |= {"pixel_format": "rgb", "component_format": "float32"}
     look = mi.ScalarTransform4f().look_at(origin, target, up)
@@ -42,15 +41,11 @@ def with_materials(scene: Scene, change: Callable[[Material], Material]) -> Scen
 
 def rays(o: np.ndarray, d: np.ndarray) -> Any:
     """Return rays from points [N, 3] in directions [N, 3]."""
-    import mitsuba as mi
-
     return mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T))
 
 
 def traced(scene: Any, ray: Any, **parameters: Any) -> Any:
     """Return what ``mrt_whitted`` with these parameters finds along rays."""
-    import mitsuba as mi
-
     integrator = mi.load_dict({"type": "mrt_whitted", **parameters})
     integrator.prepare(scene)
     return integrator.trace(scene, None, ray)
