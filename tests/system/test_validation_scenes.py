@@ -12,22 +12,17 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba import runtime
 from mrt_mitsuba.output.files import read_exr
-from mrt_mitsuba.scene.model import Scene
+from mrt_mitsuba.scene.model import Material, Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles import filters
 from mrt_mitsuba.validation.oracles.reference import reference_render
 from mrt_mitsuba.validation.studies import scenes
+from mrt_mitsuba.validation.tools.scenery import with_materials
 from mrt_mitsuba.validation.tools.study import Study, findings
-
-pytestmark = pytest.mark.skipif(
-    runtime.obstacle(runtime.FAST) is not None, reason="scalar variants take minutes"
-)
 
 SIZE = (80, 60)
 PLACES = {"width": 80, "height": 60}
-
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -48,13 +43,10 @@ def test_the_study_holds_and_tells_all_it_found(monkeypatch: pytest.MonkeyPatch,
 def altered(scene: Scene, **changes: Any) -> Scene:
     """A scene with every material changed; a value is a function of the old one."""
 
-    def change(thing: Any) -> Any:
-        new = {name: value(getattr(thing.material, name)) for name, value in changes.items()}
-        return dataclasses.replace(thing, material=dataclasses.replace(thing.material, **new))
+    def change(m: Material) -> Material:
+        return dataclasses.replace(m, **{name: value(getattr(m, name)) for name, value in changes.items()})
 
-    return dataclasses.replace(
-        scene, spheres=tuple(map(change, scene.spheres)), planes=tuple(map(change, scene.planes))
-    )
+    return with_materials(scene, change)
 
 
 def lit(scene: Scene, factor: float) -> Scene:
@@ -149,15 +141,6 @@ def test_adaptive(number: int, aamode: str) -> None:
     same = refined == edges
     truth = np.where(edges[..., None], every.mean(axis=0), every[0])
     assert_equal(result.image[same][None], truth[same][None], number)
-
-
-def test_centered_lattice_and_schlick() -> None:
-    places = [(x, y) for x in (-0.25, 0.25) for y in (-0.25, 0.25)]
-    truth = [
-        reference_render(report_scene(0), displacement=p, fresnel="schlick", **PLACES).image for p in places
-    ]
-    found = ours(0, aamode="none", lattice="centered", fresnel="schlick").image
-    assert_equal(found, np.mean(truth, axis=0), 0)
 
 
 def test_the_originals_renders_are_judged_where_they_are_at_hand(original_data: Path) -> None:

@@ -144,9 +144,8 @@ def register() -> None:
             self.alpha = updatable(props.get("alpha", 0.2))
             self.kd, self.ks = (1.05, 0.0) if self.mistake == "albedo 1.05" else (0.4, 0.4)
             f = mi.BSDFFlags
-            diffuse = (
-                f.DiffuseTransmission if self.mistake == "wrong hemisphere flag" else f.DiffuseReflection
-            )
+            wrong = self.mistake == "wrong hemisphere flag"
+            diffuse = f.DiffuseTransmission if wrong else f.DiffuseReflection
             self.m_components = [diffuse | f.FrontSide, f.GlossyReflection | f.FrontSide]
             self.m_flags = self.m_components[0] | self.m_components[1]
 

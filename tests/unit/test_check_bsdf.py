@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from unit import specimens
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
@@ -20,16 +20,6 @@ from mrt_mitsuba.validation.studies.stability.formulas import Ours, Report
 from mrt_mitsuba.validation.studies.stability.lobes import lobes_with_truth
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-
-def _specimens() -> Any:
-    spec = importlib.util.spec_from_file_location("specimens", Path(__file__).with_name("specimens.py"))
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-specimens = _specimens()
 
 
 @pytest.fixture
