@@ -56,6 +56,11 @@ class Lens:
     radius: float
     focus: float
 
+    def through(self, nodes: dict[str, Any]) -> dict[str, Any]:
+        """Return a scene's dict with its camera behind the lens."""
+        lens = {"type": "thinlens", "aperture_radius": self.radius, "focus_distance": self.focus}
+        return {**nodes, "sensor": {**nodes["sensor"], **lens}}
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -88,16 +93,8 @@ def run(study: Study, *, quick: bool) -> None:
 def compare(scene: Scene, extent: Extent) -> Comparison:
     """Blur a sharp render with each filter, and render it through the fitted lens."""
     width, height = extent.size
-    sharp = mrt.render(
-        scene,
-        width=width,
-        height=height,
-        aa=extent.aa,
-        aamode="none",
-        lattice="centered",
-        focaldist=0,
-        layers=["depth", "normal"],
-    )
+    options: dict[str, Any] = {"aa": extent.aa, "aamode": "none", "lattice": "centered", "focaldist": 0}
+    sharp = mrt.render(scene, width=width, height=height, layers=["depth", "normal"], **options)
     depth = sharp.layers["depth.Z"]
     focus: dict[str, Any] = {"focal_distance": scene.focal_distance, "focal_range": scene.focal_range}
     pictures = {"sharp": sharp.image}
@@ -131,15 +128,9 @@ def disc_radius(amount: np.ndarray) -> np.ndarray:
 
 def _through(lens: Lens, scene: Scene, extent: Extent, seed: int) -> np.ndarray:
     width, height = extent.size
-    description = scene.to_dict(width=width, height=height)
-    description["sensor"] |= {
-        "type": "thinlens",
-        "aperture_radius": lens.radius,
-        "focus_distance": lens.focus,
-    }
-    return mrt.render(
-        description, aa=extent.aa, aamode="none", lattice="centered", spp=extent.spp, seed=seed
-    ).image
+    nodes = lens.through(scene.to_dict(width=width, height=height))
+    options: dict[str, Any] = {"aa": extent.aa, "aamode": "none", "lattice": "centered"}
+    return mrt.render(nodes, **options, spp=extent.spp, seed=seed).image
 
 
 def _regions(sharp: Any) -> dict[str, np.ndarray]:

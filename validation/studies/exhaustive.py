@@ -114,12 +114,9 @@ def run(study: Study, *, quick: bool) -> None:
             study.at_most(
                 f"{formula.name}: largest error, ulp", found.worst, BOUND, "a rounding for each step"
             )
-    columns = ["formula", "cosines", "largest error, ulp", "at the cosine", "by 50 digits, ulp"]
-    columns += [*(f"share above {step:g} ulp" for step in STEPS), "flushed to 0", "all at cosines up to"]
     note = f"Every {stride}th float32 cosine." if quick else "Every float32 cosine in [0, 1]."
-    study.table(
-        "exhaustive", "Largest errors", columns, rows, note + " 1 ulp: the step between float32 numbers."
-    )
+    note += " 1 ulp: the step between float32 numbers."
+    study.records("exhaustive", "Largest errors", rows, note)
     what = "error of the float64 reference against 50 digits, ulp of float32"
     study.at_most(what, confirmed, 1e-6, "some dozen roundings of float64, 2e-9 of a float32 step each")
 
@@ -159,20 +156,19 @@ def _reference_error(formula: Formula, worst: float) -> float:
     return float((np.abs(found - truth) / np.spacing(truth.astype(np.float32)).astype(np.float64)).max())
 
 
-def _row(formula: Formula, found: Found) -> list[Any]:
+def _row(formula: Formula, found: Found) -> dict[str, Any]:
     from drjit.llvm import Float
 
     value = float(formula.evaluate(dr.opaque(Float, found.cosine))[0])
     truth = formula.truth(found.cosine)
     judged = float(abs(exact.number(value) - truth) / float(np.spacing(np.float32(truth))))
-    share = [float(above / found.count) for above in found.above]
-    return [
-        formula.name,
-        found.count,
-        found.worst,
-        float(found.cosine).hex(),
-        judged,
-        *share,
-        found.flushed,
-        found.brightest,
-    ]
+    return {
+        "formula": formula.name,
+        "cosines": found.count,
+        "largest error, ulp": found.worst,
+        "at the cosine": float(found.cosine).hex(),
+        "by 50 digits, ulp": judged,
+        **{f"share above {s:g} ulp": float(n / found.count) for s, n in zip(STEPS, found.above, strict=True)},
+        "flushed to 0": found.flushed,
+        "all at cosines up to": found.brightest,
+    }

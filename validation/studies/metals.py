@@ -12,9 +12,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mrt_mitsuba.validation.tools.ball import ball_scene, side_by_side
 from mrt_mitsuba.validation.tools.bsdf_probe import interaction, rgb
 from mrt_mitsuba.validation.tools.gallery import panels
+from mrt_mitsuba.validation.tools.scenery import ball_scene, side_by_side
 from mrt_mitsuba.validation.tools.study import Study
 
 ANGLES = np.arange(0.0, 90.0)  # degrees

@@ -18,10 +18,10 @@ from mrt_mitsuba.validation.checks.probe import is_scalar
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies import metals
 from mrt_mitsuba.validation.tools import image_tests
-from mrt_mitsuba.validation.tools.ball import ball_scene, side_by_side
 from mrt_mitsuba.validation.tools.bsdf_probe import Array, evaluate, largest, lobe_pairs, relative_error
 from mrt_mitsuba.validation.tools.gallery import panels
 from mrt_mitsuba.validation.tools.image_tests import Comparison
+from mrt_mitsuba.validation.tools.scenery import ball_scene, side_by_side
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.warm import in_turns, timed
 

@@ -68,13 +68,8 @@ def measure(variant: str, extent: Extent = FULL) -> Iterator[Row]:
         for name, ours, theirs in _scenes(extent, width, height):
             render = _ours(ours)
             for other, integrator in THEIRS.items():
-                yield Row(
-                    name,
-                    width,
-                    height,
-                    other,
-                    ratio(render, _theirs(theirs, integrator), repeats=extent.repeats),
-                )
+                time = ratio(render, _theirs(theirs, integrator), repeats=extent.repeats)
+                yield Row(name, width, height, other, time)
             del render
             gc.collect()  # scenes that stay alive slow down the kernels of later ones
 

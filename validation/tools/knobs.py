@@ -113,10 +113,7 @@ def lens(number: int, extent: Extent) -> Trade:
     width, height = extent.size
     shared: Options = {"aa": 2, "aamode": "none", "lattice": "centered"}
     sharp = mrt.render(load(extent.scene(number)), **shared, layers=["depth"])
-    found = fit_lens(report_scene(number), sharp.layers["depth.Z"])
-    through = extent.scene(number)
-    radius_and_focus = {"aperture_radius": found.radius, "focus_distance": found.focus}
-    through["sensor"] = {**through["sensor"], "type": "thinlens", **radius_and_focus}
+    through = fit_lens(report_scene(number), sharp.layers["depth.Z"]).through(extent.scene(number))
     cases: dict[str, Options] = {
         f"filter {dof}": {"scene": number, "width": width, "height": height, "dof": dof}
         for dof in ("report", "corrected")
