@@ -14,7 +14,7 @@ import numpy as np
 
 from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.law import Skip
-from mrt_mitsuba.validation.checks.probe import Array, Probe, Samples, direction, unit
+from mrt_mitsuba.validation.checks.probe import Array, Lanes, Probe, Samples, direction, unit
 from mrt_mitsuba.validation.checks.recipe import Subject, row
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
@@ -120,7 +120,7 @@ class Case(Subject):
 
 
 @dataclass(frozen=True)
-class Pairs:
+class Pairs(Lanes):
     """N pairs of directions, and what ``eval`` and ``pdf`` give."""
 
     wi: Array
@@ -129,9 +129,6 @@ class Pairs:
     value: Array  # [N, channels]
     pdf: Array
     eta: Array  # index of refraction at wo over that at wi
-
-    def only(self, keep: Array | slice) -> Pairs:
-        return Pairs(*(x[keep] for x in vars(self).values()))
 
 
 def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:

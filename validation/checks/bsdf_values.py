@@ -98,13 +98,11 @@ def _delta_either_way(law: Law, case: Case) -> None:
     # next to total reflection, a rounding of the direction is a percent of what is transmitted
     forth, back_again = (followed(*way) for way in ways)
     allowed = case.spread(followed, *ways[0]) + case.spread(followed, *ways[1])
-    law.most(
-        f"probability x weight x eta^2 of a single direction (delta) against that of the way back, {BEYOND}",
-        np.where(same & returned, excess(forth, back_again, allowed), 0),
-        POINTWISE,
-        EITHER_WAY,
-        show,
+    what = (
+        f"probability x weight x eta^2 of a single direction (delta) against that of the way back, {BEYOND}"
     )
+    error = np.where(same & returned, excess(forth, back_again, allowed), 0)
+    law.most(what, error, POINTWISE, EITHER_WAY, show)
 
 
 # ------------------------------------------------ Finite --------------------------------------------------
@@ -149,36 +147,23 @@ def _finite(law: Law, case: Case, extremes: tuple, known: Array, setting: tuple 
     s = case.probe.sample(wi, u, uv)
     lit = (s.weight != 0).any(axis=1)  # else nothing more is read
     length = np.linalg.norm(s.wo.astype(np.float64), axis=1)
-    kinds = (
-        "eval()",
-        "pdf()",
-        "eval_pdf()",
-        "weights of samples",
-        "densities of samples",
-        "directions of samples",
-    )
-    faults = np.array([
-        _bad(value),
-        _bad(pdf),
-        _bad(together[0]) | _bad(together[1]),
-        _bad(s.weight),
-        lit & _bad(s.pdf),
-        lit & ~(np.abs(length - 1) < 1e-3),
-    ])  # fmt: skip
+    kinds = {
+        "eval()": _bad(value),
+        "pdf()": _bad(pdf),
+        "eval_pdf()": _bad(together[0]) | _bad(together[1]),
+        "weights of samples": _bad(s.weight),
+        "densities of samples": lit & _bad(s.pdf),
+        "directions of samples": lit & ~(np.abs(length - 1) < 1e-3),
+    }
+    faults = np.array(list(kinds.values()))
     new = faults & ~known
     kind, i = np.unravel_index(int(new.argmax()), new.shape)
     where = f" with {setting[0]} = {setting[1]:g}" if setting else ""
     named = [f"{name} {count}" for name, count in zip(kinds, new.sum(axis=1), strict=True) if count]
-    law.at_most(
-        f"results not finite, or negative{where}: {', '.join(named) or 'none'}",
-        new.sum(),
-        0,
-        "one such number spoils a picture",
-        case.snippet(
-            snippets.FINITE_SAMPLE if kind > 2 else snippets.FINITE,
-            wi=wi[i], uv=uv[i], wo=wo[i], u=u[i], setting=setting,
-        ),
-    )  # fmt: skip
+    what = f"results not finite, or negative{where}: {', '.join(named) or 'none'}"
+    body = snippets.FINITE_SAMPLE if kind > 2 else snippets.FINITE
+    show = case.snippet(body, wi=wi[i], uv=uv[i], wo=wo[i], u=u[i], setting=setting)
+    law.at_most(what, new.sum(), 0, "one such number spoils a picture", show)
     return faults
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -19,8 +19,19 @@ def is_scalar() -> bool:
     return mi.variant().startswith("scalar")
 
 
+class Lanes:
+    """The base of dataclasses of arrays that have a row for each lane."""
+
+    def only(self: Kept, keep: Any) -> Kept:
+        """Return some of the lanes."""
+        return type(self)(*(value[keep] for value in vars(self).values()))
+
+
+Kept = TypeVar("Kept", bound=Lanes)
+
+
 @dataclass(frozen=True)
-class Samples:
+class Samples(Lanes):
     """The returned values of ``sample`` for N lanes."""
 
     wo: Array  # [N, 3]
@@ -34,9 +45,6 @@ class Samples:
     def delta(self) -> Array:
         """Where the sample comes from a lobe that is one direction only. [N]"""
         return (self.type & int(mi.BSDFFlags.Delta)) != 0
-
-    def only(self, keep: Any) -> Samples:
-        return Samples(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
 def context(component: int | None = None, *, importance: bool = False) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +14,7 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.law import Skip
 from mrt_mitsuba.validation.checks.noise import ROUNDING
-from mrt_mitsuba.validation.checks.probe import Array, lanes, unit
+from mrt_mitsuba.validation.checks.probe import Array, Lanes, lanes, unit
 from mrt_mitsuba.validation.checks.recipe import Subject, row
 
 OFFSET = 1500 * ROUNDING  # of the origin of a spawned ray from its surface, over 1 + max |p|
@@ -24,7 +24,7 @@ MOST_HITS = 16  # along a line
 
 
 @dataclass(frozen=True)
-class Hits:
+class Hits(Lanes):
     """The hits of N rays."""
 
     found: Array  # bool [N]
@@ -36,9 +36,6 @@ class Hits:
     dv: Array
     uv: Array  # [N, 2]
     part: Array  # index of the triangle or the like [N]
-
-    def only(self, keep: Any) -> Hits:
-        return Hits(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
 def trace(target: Any, o: Array, d: Array) -> Hits:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mrt_mitsuba.validation.checks.probe import Lanes
+
 Array = np.ndarray
 DEPTH = 17  # the finest cell is a hundred times what float32 rounding moves a direction by
 HEMISPHERE = 4**DEPTH  # codes of each
@@ -44,7 +46,7 @@ def _corner(start: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class Cells:
+class Cells(Lanes):
     """Cells that cover the sphere, in the order of their codes."""
 
     start: Array  # int64 [C]
@@ -65,11 +67,7 @@ class Cells:
         return Cells(np.concatenate(starts), np.concatenate(levels)).sorted()
 
     def sorted(self) -> Cells:
-        order = np.argsort(self.start)
-        return Cells(self.start[order], self.level[order])
-
-    def only(self, keep: Array) -> Cells:
-        return Cells(self.start[keep], self.level[keep])
+        return self.only(np.argsort(self.start))
 
     def find(self, codes: Array) -> Array:
         """Return the index of the cell in which each direction lies."""

@@ -255,9 +255,8 @@ def _random_scenes(cases: Cases, count: int) -> None:
         described["integrator"] = {"type": "mrt_whitted", "clamp": bool(seed % 2)}
         image = render(described, aa=1, lattice="report").image
         bad += int((~(image >= 0) | np.isinf(image)).sum())
-    cases.at_most(
-        "random scenes", f"{count} pictures of extreme objects, materials and lights", "none", bad, 0
-    )
+    what = f"{count} pictures of extreme objects, materials and lights"
+    cases.at_most("random scenes", what, "none", bad, 0)
 
 
 def _random_scene(rng: np.random.Generator) -> Scene:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from mpmath import mp, mpf
 
+from mrt_mitsuba.validation.checks.probe import Lanes
 from mrt_mitsuba.validation.oracles import exact
 
 ALPHAS = 10.0 ** np.arange(-8, 3)
@@ -22,7 +22,7 @@ CANDIDATES = 3000  # for each roughness and cosine, of which a few are kept for 
 
 
 @dataclass(frozen=True)
-class Lobes:
+class Lobes(Lanes):
     """N pairs of directions: what their float32 components say, and so the sum that is their half vector."""
 
     wi: np.ndarray  # float32 [N, 3]
@@ -34,9 +34,6 @@ class Lobes:
 
     def __len__(self) -> int:
         return len(self.alpha)
-
-    def only(self, keep: Any) -> Lobes:
-        return Lobes(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     @property
     def in_bound(self) -> np.ndarray:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.scene.model import Cone, Cylinder, Material, Mesh, Plane, Sphere
+from mrt_mitsuba.validation.checks.probe import Lanes
 from mrt_mitsuba.validation.oracles import reference
 from mrt_mitsuba.validation.studies.stability.cases import Cases, hexadecimal
 from mrt_mitsuba.validation.tools.scenery import rays, traced
@@ -295,7 +296,7 @@ class _Cell:
 
 
 @dataclass(frozen=True)
-class _Traced:
+class _Traced(Lanes):
     """The findings of the integrator along N rays."""
 
     found: np.ndarray
@@ -303,9 +304,6 @@ class _Traced:
     n: np.ndarray  # [N, 3]
     direct: np.ndarray
     bounces: np.ndarray
-
-    def only(self, keep: slice) -> _Traced:
-        return _Traced(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     def with_faults(self) -> _Traced:
         """Return hits 1 in 100,000 further away, normals turned by 2; of ten rays, one is lost, one dark,

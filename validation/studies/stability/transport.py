@@ -209,14 +209,10 @@ def _cut_offs(cases: Cases) -> None:
             _render(scene, fresnel="dielectric", clamp=clamp, least=least)
             for least in (0.0, CUT_OFF, 1e3 * CUT_OFF)
         )
-        cases.at_most(
-            f"cut-off under {name}",
-            f"largest change by it{'' if clamp else ', without clamp'}",
-            "a sixteenth of an 8-bit step, as promised",
-            np.abs(cut - whole).max(),
-            CUT_OFF,
-            fault=("paths cut at 1000 times as much", np.abs(more - whole).max()),
-        )
+        what = f"largest change by it{'' if clamp else ', without clamp'}"
+        expected, change = "a sixteenth of an 8-bit step, as promised", np.abs(cut - whole).max()
+        fault = ("paths cut at 1000 times as much", np.abs(more - whole).max())
+        cases.at_most(f"cut-off under {name}", what, expected, change, CUT_OFF, fault=fault)
 
 
 # -------------------------------------------- Bounces in closed form ---------------------------------------
