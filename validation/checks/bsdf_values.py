@@ -82,13 +82,9 @@ def _delta_either_way(law: Law, case: Case) -> None:
     def show(i: int) -> str:
         return case.snippet(snippets.DELTA_RECIPROCITY, wi=wi[i], uv=uv[i], u=first[i], back=second[i])
 
-    law.at_least(
-        "share of single directions (delta) that the way back returns to",
-        returned[same].mean(),
-        0.05,
-        "light can be followed either way; of several directions, the way back may draw another",
-        show(int((same & ~returned).argmax())),
-    )
+    what = "share of single directions (delta) that the way back returns to"
+    why = "light can be followed either way; of several directions, the way back may draw another"
+    law.at_least(what, returned[same].mean(), 0.05, why, show(int((same & ~returned).argmax())))
 
     def followed(i: Array, _: Array, t: Array, u: Array) -> Array:
         s = case.probe.sample(i, u, t)
