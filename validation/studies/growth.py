@@ -172,20 +172,7 @@ def _figure(series: Mapping[str, Mapping[int, Found]], exponents: Mapping[str, E
 # -------------------------------------------- What grows --------------------------------------------
 
 
-SMALL = (160, 120)
-
-
-def _pixels(count: int) -> Job:
-    side = round(count**0.5)
-    return report_scene(3), (side, side), {"aa": 1}
-
-
-def _samples(count: int) -> Job:
-    return report_scene(3), SMALL, {"aa": round(count**0.5)}
-
-
-def _spheres(count: int) -> Job:
-    return scene_of_spheres(count), SMALL, {"aa": 4}
+SMALL, WHITTED = (160, 120), {"type": "mrt_whitted"}
 
 
 def _triangles(count: int) -> Job:
@@ -205,17 +192,13 @@ def _lights(count: int) -> Job:
     return dataclasses.replace(report_scene(0), lights=tuple(lights)), SMALL, {"aa": 1}
 
 
-def _bounces(limit: int) -> Job:
-    return report_scene(3), SMALL, {"aa": 4, "integrator": {"type": "mrt_whitted", "max_depth": limit}}
-
-
 SERIES: dict[str, Callable[[int], Job]] = {
-    "pixels": _pixels,
-    "samples a pixel": _samples,
-    "spheres": _spheres,
+    "pixels": lambda n: (report_scene(3), (round(n**0.5), round(n**0.5)), {"aa": 1}),
+    "samples a pixel": lambda n: (report_scene(3), SMALL, {"aa": round(n**0.5)}),
+    "spheres": lambda n: (scene_of_spheres(n), SMALL, {"aa": 4}),
     "triangles": _triangles,
     "lights": _lights,
-    "bounces": _bounces,
+    "bounces": lambda n: (report_scene(3), SMALL, {"aa": 4, "integrator": {**WHITTED, "max_depth": n}}),
 }
 FULL = Extent(
     {
