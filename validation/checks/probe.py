@@ -128,6 +128,15 @@ def _unpolarized(value: Any) -> Any:
     return mi.unpolarized_spectrum(value) if dr.depth_v(value) > 1 else value
 
 
+def not_finite(*values: Any, least: float = -np.inf) -> Any:
+    """Return where any of several numbers or colours is not finite, or below ``least``."""
+    bad = mi.Bool(False)
+    for value in values:
+        for component in [value] if dr.depth_v(value) == 1 else value:
+            bad |= ~(component >= least) | ~dr.isfinite(component)
+    return bad
+
+
 def lanes(call: Callable[..., list[Any]], *columns: tuple[str, Array]) -> list[Array]:
     """Call ``call(mi, …)`` with columns [N] or [N, k] as Mitsuba types, in scalar variants once for each row.
 

@@ -21,6 +21,7 @@ from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.validation.checks import emitter
 from mrt_mitsuba.validation.checks.bsdf import check_bsdf
 from mrt_mitsuba.validation.checks.law import TITLE, Check, Law, class_name, examine
+from mrt_mitsuba.validation.checks.probe import not_finite
 from mrt_mitsuba.validation.checks.shape import check_shape
 from mrt_mitsuba.validation.tools import report
 
@@ -262,18 +263,18 @@ def _follow(source: Any, count: int, seed: int) -> Counter[str]:
     for _ in range(DEPTH):
         si = scene.ray_intersect(ray, active)
         met = si.emitter(scene, active)
-        active &= note(_not_finite(met.eval(si, active)), _emitter, met, emitters)
+        active &= note(not_finite(met.eval(si, active)), _emitter, met, emitters)
         active &= si.is_valid()
-        bad = _not_finite(si.p, si.n, si.sh_frame.n, si.uv)
+        bad = not_finite(si.p, si.n, si.sh_frame.n, si.uv)
         active &= note(bad, lambda shape: f"the shape {_name(shape)}", si.shape, shapes)
         ds, light = scene.sample_emitter_direction(si, mi.Point2f(draw(), draw()), True, active)
-        active &= note(_not_finite(light), _emitter, ds.emitter, emitters)
+        active &= note(not_finite(light), _emitter, ds.emitter, emitters)
         bsdf = si.bsdf(ray)
         value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active & (ds.pdf > 0))
         bs, weight = bsdf.sample(ctx, si, draw(), mi.Point2f(draw(), draw()), active)
         lit = dr.any(mi.unpolarized_spectrum(weight) != 0)
-        bad = _not_finite(mi.unpolarized_spectrum(value), pdf, mi.unpolarized_spectrum(weight))
-        bad |= lit & _not_finite(bs.wo, bs.pdf)
+        bad = not_finite(mi.unpolarized_spectrum(value), pdf, mi.unpolarized_spectrum(weight))
+        bad |= lit & not_finite(bs.wo, bs.pdf)
         active &= lit & note(bad, _bsdf_on, si.shape, shapes)
         ray = si.spawn_ray(si.to_world(bs.wo))
         dr.eval(ray, active, rng)
@@ -292,14 +293,6 @@ def _bsdf_on(shape: Any) -> str:
 
 def _name(plugin: Any) -> str:
     return f"{class_name(plugin)} {plugin.id()!r}"
-
-
-def _not_finite(*values: Any) -> Any:
-    bad = mi.Bool(False)
-    for value in values:
-        for component in [value] if dr.depth_v(value) == 1 else value:
-            bad |= ~dr.isfinite(component)
-    return bad
 
 
 # ------------------------------------------------ The command ---------------------------------------------

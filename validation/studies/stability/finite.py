@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -22,6 +23,7 @@ from mrt_mitsuba.plugins.intersect import (
 )
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Cone, Cylinder, Light, Material, Plane, Scene, Sphere
+from mrt_mitsuba.validation.checks.probe import not_finite
 from mrt_mitsuba.validation.studies.stability.cases import Cases
 from mrt_mitsuba.validation.studies.stability.transport import BASE
 from mrt_mitsuba.validation.tools.scenery import traced
@@ -101,13 +103,7 @@ class _Draw:
         return dr.select(extreme, dr.gather(mi.Float, table, index, extreme), ordinary)
 
 
-def _bad(*values: Any) -> Any:
-    """Return where any of several numbers or colours is not finite, or negative."""
-    result = mi.Bool(False)
-    for value in values:
-        for component in [value] if dr.depth_v(value) == 1 else value:
-            result |= ~(component >= 0) | ~dr.isfinite(component)
-    return result
+_bad = partial(not_finite, least=0)
 
 
 def _not_unit(v: Any) -> Any:
