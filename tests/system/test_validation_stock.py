@@ -11,24 +11,21 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.studies import approximations, stock
-from mrt_mitsuba.validation.tools import mutations
 from mrt_mitsuba.validation.tools.image_tests import compare
+from mrt_mitsuba.validation.tools.study import findings
 
 SMALL = {"width": 64, "height": 48}
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-# -------------------------------------------- Direct light --------------------------------------------
+
+NAMES = ["direct", "gloss", "materials", "approximations", "mutations"]
 
 
-@pytest.mark.parametrize(("number", "light"), [(0, 0), (1, 1), (2, 1), (3, 2)])
-def test_direct_light_equals_mitsubas_pixel_by_pixel(number: int, light: int) -> None:
-    found = stock.compare_direct(report_scene(number), light, **SMALL)
-    assert found.unexplained == 0
-    assert (found.ours > 0.05).any(axis=-1).mean() > 0.05  # there is something to compare
-    assert found.beyond.mean() < 0.1
-    # edges and highlights of a hundredth of a pixel: a handful at most
-    assert found.off.sum() <= 5
+@pytest.mark.parametrize("part", stock.PARTS, ids=NAMES)
+def test_every_part_of_the_study_holds(part) -> None:
+    study = findings(part, quick=True)
+    assert study.passed, study.missed
 
 
 def test_direct_light_of_another_light_is_different() -> None:
@@ -47,19 +44,6 @@ def test_beyond_its_stand_in_a_plane_is_not_compared() -> None:
     assert not found.theirs[found.beyond].any()
 
 
-# ------------------------------------------ Gloss and lattices ------------------------------------------
-
-
-def test_gloss_becomes_a_mirror() -> None:
-    found = stock.gloss_limit((0.2, 0.02, 0.002), width=32, height=24, spp=32)
-    assert found.errors[0] > 0.05
-    assert found.errors[-1] < 2e-3
-    assert found.slope > 0.9
-
-
-# ---------------------------------------- Approximations in turn ----------------------------------------
-
-
 def test_each_approximation_changes_what_it_says() -> None:
     """Scene 1: the clamp matters in highlights, falloff nearly everywhere, and none is the last picture but
     the last."""
@@ -75,10 +59,6 @@ def test_each_approximation_changes_what_it_says() -> None:
     assert all(c.max() > 1 / 255 for c in change)
 
 
-def test_without_what_differs_the_rest_agrees() -> None:
-    assert not approximations.compare_rest([3], **SMALL, spp=8)[0].rejects
-
-
 def test_with_diffuse_parts_the_materials_differ() -> None:
     """The comparison that lets black materials pass sees that roughplastic refracts the diffuse light."""
     scene = approximations.physical(report_scene(3), least_alpha=approximations.ALPHA_FOR_TESTS)
@@ -88,13 +68,3 @@ def test_with_diffuse_parts_the_materials_differ() -> None:
         approximations.path_estimate(nodes, spp=4, seed=seed) for nodes, seed in ((ours, 0), (theirs, 100))
     )
     assert compare(*pair).detected_by == ("pixel", "tile", "image")
-
-
-# ---------------------------------------------- Mutations ----------------------------------------------
-
-
-def test_every_mistake_is_found_and_nothing_else() -> None:
-    found = {trial.mistake: trial.found for trial in mutations.trials((16,), **SMALL)}
-    assert set(found) == {mutations.NONE, mutations.CLAMP, *(m.name for m in mutations.MISTAKES)}
-    for name, comparison in found.items():
-        assert comparison.rejects == (name != mutations.NONE), name
