@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
+from mrt_mitsuba.plugins.intersect import intersect_sphere
 from mrt_mitsuba.validation.tools.gallery import curves
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.warm import measure
@@ -97,8 +98,6 @@ def _rays(count: int) -> Any:
 
 
 def _loop(centers: np.ndarray, radius: float, ray: Any) -> Callable[[], np.ndarray]:
-
-    from mrt_mitsuba.plugins.intersect import intersect_sphere
 
     flat = mi.Float(centers.ravel())
     count, size = dr.opaque(mi.UInt32, len(centers)), dr.opaque(mi.Float, radius)

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import filters
@@ -134,8 +135,6 @@ def _through(lens: Lens, scene: Scene, extent: Extent, seed: int) -> np.ndarray:
 
 
 def _regions(sharp: Any) -> dict[str, np.ndarray]:
-    from scipy.ndimage import binary_dilation
-
     depth = sharp.layers["depth.Z"]
     normal = np.stack([sharp.layers[f"normal.{axis}"] for axis in "XYZ"], axis=-1)
     border = np.ones(depth.shape, bool)

@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Light, Scene
@@ -137,8 +138,6 @@ def _measure(job: Job, repeats: int) -> Found:
 
 def fit(seconds: Mapping[int, float]) -> Exponent:
     """Return the exponent of time over size, of the larger half of the sizes, and at least four of them."""
-    from scipy import stats
-
     sizes = sorted(seconds)[-max(4, (len(seconds) + 1) // 2) :]
     line = stats.linregress(np.log(sizes), np.log([seconds[n] for n in sizes]))
     freedom = len(sizes) - 2

@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.optimize import minimize
 
 from mrt_mitsuba.validation.tools.bsdf_probe import rgb
 from mrt_mitsuba.validation.tools.gallery import panels
@@ -60,8 +61,6 @@ def _descend(scene: Any, target: Any, *, spp: int) -> np.ndarray:
     Every picture has the same seed, and one light leaves no noise but that of the points in a pixel: the
     difference is a smooth function of the parameters.
     """
-    from scipy.optimize import minimize
-
     parameters = mi.traverse(scene)
     path = []
 

@@ -17,6 +17,7 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
+from mrt_mitsuba.plugins.intersect import Frame, intersect_cone
 from mrt_mitsuba.scene.model import Cone, Scene
 from mrt_mitsuba.scene.report import scene_of_spheres
 from mrt_mitsuba.validation.tools.gallery import curves
@@ -141,8 +142,6 @@ def _rays(count: int) -> Any:
 def _exact(ray: Any, frame: Any) -> np.ndarray:
     """Return distances of the quadric in float64, inf for none."""
     from drjit.llvm.ad import Array3f64
-
-    from mrt_mitsuba.plugins.intersect import Frame, intersect_cone
 
     wide = Frame(Array3f64(frame.origin), *(Array3f64(row) for row in (frame.x, frame.y, frame.z)))
     return np.array(intersect_cone(Array3f64(ray.o), Array3f64(ray.d), wide).t)

@@ -11,9 +11,11 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.output.files import write_exr
 from mrt_mitsuba.validation.checks.probe import is_scalar
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies import metals
@@ -109,8 +111,6 @@ def renormalised(density: Array, wi: Array, alpha: float) -> Array:
 
     It takes the rational fit of G₁(ωi) for the normaliser 1 / (1 + Λ(ωi)), and is off by up to 0.4 %.
     """
-    from scipy.special import erf
-
     z, across = wi[:, 2].astype(float), np.hypot(wi[:, 0].astype(float), wi[:, 1])
     b = z / np.maximum(alpha * across, 1e-30)
     smith = (erf(b) - 1) / 2 + np.exp(-(np.minimum(b, 30) ** 2)) / (2 * np.sqrt(np.pi) * b)
@@ -195,8 +195,6 @@ class RoughconductorComparison:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an EXR: ours as R, G, B, and the layers "theirs" and "difference". Raises ``OutputError``."""
-        from mrt_mitsuba.output.files import write_exr
-
         layers = {name: self.images[name] for name in ("theirs", "difference")}
         header = {"mrt:alpha": self.alpha, "mrt:errors": dict(self.errors), "mrt:timings": dict(self.timings)}
         write_exr(path, self.images["ours"], layers, header)

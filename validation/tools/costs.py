@@ -80,7 +80,6 @@ class Recorder:
 
 def record(scene: Any, **options: Any) -> Recorder:
     """Return the rays that a render by ``mrt_whitted`` asks Mitsuba about, by an integrator that records."""
-
     from mrt_mitsuba.plugins.whitted import MrtWhitted
 
     class Recording(MrtWhitted):

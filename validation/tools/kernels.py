@@ -10,7 +10,7 @@ import statistics
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -79,14 +79,10 @@ def profile(render: Callable[..., Any], *, repeats: int = 3) -> list[Kernel]:
     compiled = {kernel.key: kernel for kernel in _watched(render)}
     runs = [{kernel.key: kernel for kernel in _watched(render)} for _ in range(repeats)]
     return [
-        Kernel(
-            *last.key,
-            last.launches,
-            last.size,
-            last.operations,
-            last.codegen,
-            compiled[key].compile if key in compiled else 0.0,
-            statistics.median(run[key].seconds for run in runs if key in run),
+        replace(
+            last,
+            compile=compiled[key].compile if key in compiled else 0.0,
+            seconds=statistics.median(run[key].seconds for run in runs if key in run),
         )
         for key, last in runs[-1].items()
     ]
