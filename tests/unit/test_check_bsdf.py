@@ -107,7 +107,7 @@ def test_stock_bsdfs_fail_what_is_known(name: str, capsys) -> None:
     assert set(check.failed) == known, str(check)
     for law in check.laws.values():
         for part in law.parts:
-            if not part.holds:
+            if not part.holds or name == "dielectric":  # every snippet of one
                 run(part.snippet)
 
 
