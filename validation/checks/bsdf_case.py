@@ -181,7 +181,7 @@ def parameters(case: Case) -> list[tuple[str, Any]]:
         numeric = isinstance(value, float) or (
             dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)
         )
-        if numeric and "to_uv" not in key and np.size(np.array(value)) > 0:
+        if numeric and not key.endswith(("to_uv", ".wavelengths")) and np.size(np.array(value)) > 0:
             found.append((key, value))
     return found
 

@@ -31,6 +31,8 @@ def gradients(law: Law, case: Case) -> None:
     detached = [key for key in keys if not _holds(law, case, key)]
     if detached:
         law.notes.append(f"detached: {', '.join(detached)}")
+    if not law.parts:
+        raise Skip("; ".join(law.notes))
 
 
 def _holds(law: Law, case: Case, key: str) -> bool:
@@ -85,10 +87,10 @@ def _values(case: Case) -> Any:
 
 
 def _derivatives(case: Case, key: str) -> tuple[Array, bool, Array]:
-    """Return derivatives by a shift of the parameter, if there is a way to it at all, and which are none."""
+    """Return derivatives by ``_moved``, if there is a way to the parameter at all, and which are none."""
     shift = mi.Float(0)
     dr.enable_grad(shift)
-    with changed(case, key, lambda old: type(old)(old + shift)):
+    with changed(case, key, lambda old: _moved(old, shift)):
         values = _values(case)
         if not dr.grad_enabled(values):
             none = np.zeros(dr.width(values))
@@ -96,6 +98,12 @@ def _derivatives(case: Case, key: str) -> tuple[Array, bool, Array]:
         dr.forward(shift)
         found = np.array(dr.grad(values), np.float64)
         return np.nan_to_num(found, posinf=0, neginf=0), True, ~np.isfinite(found)
+
+
+def _moved(old: Any, shift: Any) -> Any:
+    """Return a parameter with ``shift`` of each number added: a spectrum's may be of many sizes."""
+    usual = float(np.mean(np.abs(np.array(old)))) or 0.05
+    return type(old)(old + dr.select(old == 0, usual, dr.abs(dr.detach(old))) * shift)
 
 
 WIDTHS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  # of differences, over the parameter
@@ -108,16 +116,14 @@ def _differences(case: Case, key: str) -> tuple[Array, Array]:
     either side are apart: where a value has a kink, as at the end of a range, either one is a derivative.
     Where a lobe is so narrow that it moves away within every width, differences say nothing: infinity.
     """
-    value = abs(float(np.mean(np.array(mi.traverse(case.plugin)[key]))))
-    steps = np.array(WIDTHS) * (value or 0.05)
 
     def at(shift: float) -> Array:
-        with changed(case, key, lambda old: type(old)(old + shift)):
+        with changed(case, key, lambda old: _moved(old, shift)):
             return np.array(_values(case), np.float64)
 
     here = at(0.0)
-    ends = np.array([(at(step), at(-step)) for step in steps.tolist()])
-    across = 2 * steps[:, None]
+    ends = np.array([(at(step), at(-step)) for step in WIDTHS])
+    across = 2 * np.array(WIDTHS)[:, None]
     slopes = (ends[:, 0] - ends[:, 1]) / across
     bent = np.abs(ends[:, 0] - 2 * here + ends[:, 1])
     sides = np.where(bent <= 0.25 * np.abs(here), bent / across, np.inf)

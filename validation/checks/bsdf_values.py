@@ -10,7 +10,7 @@ import numpy as np
 from mrt_mitsuba.validation.checks import noise, snippets
 from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, changed, excess, parameters
 from mrt_mitsuba.validation.checks.law import Law, Skip
-from mrt_mitsuba.validation.checks.probe import Array, direction, unit
+from mrt_mitsuba.validation.checks.probe import Array, direction, is_scalar, unit
 
 EITHER_WAY = "light can be followed either way; transmitted radiance scales by the squared index"
 BEYOND = "relative, beyond 8 times what the rounding of directions explains"
@@ -31,6 +31,8 @@ def eval_pdf(law: Law, case: Case) -> None:
         error = excess(one, other, case.spread(single, p.wi, p.wo, p.uv))
         name = f"{what} of eval_pdf() against that of the single function, {BEYOND}"
         law.most(name, error, 1e-4, "two ways to the same number", case.at(snippets.PAIR, p))
+    if is_scalar():  # where Mitsuba takes ``active`` out of its plugins
+        return
     lit = np.any([(v != 0).any(axis=1) for v in case.probe.inactive(p.wi, p.wo, p.uv)], axis=0)
     why = "a sum over lanes must not hold those that are switched off"
     law.none("values that are not 0 where active is False", lit, why, case.at(snippets.INACTIVE, p))
@@ -171,7 +173,8 @@ def _ends(case: Case) -> Iterator[tuple[str, float]]:
     """Yield every number, colour or bitmap of the BSDF at the ends of its likely range, one at a time."""
     for key, value in parameters(case):
         number = float(np.mean(np.array(value)))
-        if key.split(".")[-2 if key.endswith(".value") else -1] in INDICES and number <= 1:
+        name = key.removesuffix(".value").removesuffix(".values").split(".")[-1]
+        if name in INDICES and (number <= 1 or key.endswith(".values")):
             ends = 0.5 * number, 2.0 * number  # of metals: 0 makes no sense there
         else:
             ends = (0.0, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)

@@ -62,23 +62,18 @@ def far(law: Law, case: Case) -> None:
     steep = here.found & (cos > 4 * FLAT)
     distance = FAR * case.size
     error = np.linalg.norm(there.p.astype(np.float64) - here.p, axis=1) * cos / (ROUNDING * distance)
-    through = ~there.found | (error > 4 * HIT_ROUNDINGS)
-    # near an edge, a rounded origin decides which of two faces is met
-    same = (there.n * here.n).sum(axis=1) > 0.9
-    error = np.where(steep & same & ~through, error, 0)
-    what = "hit point from afar against the same from nearby, in roundings of the distance"
-    why = "the origin is rounded, and some dozen operations with it"
-    show = case.at(origin, d, snippets.TWICE, other=closer)
-    law.most(what, error, HIT_ROUNDINGS, why, show)
+    through = ~there.found | (error > HIT_ROUNDINGS)
     # a rounded origin moves the line: only what all lines around it meet counts
     bad = steep & through & (np.linalg.norm(here.p - met.p[few], axis=1) < 20 * ROUNDING * distance)
     across = unit(np.cross(d, case.units(len(d))))
     for side in (across, -across, np.cross(d, across), np.cross(across, d)):
         beside = trace(case.target, (closer + 4 * ROUNDING * distance * side).astype(np.float32), d)
         bad &= beside.found & ((beside.n * here.n).sum(axis=1) > 0.9)
-    what = "share of rays from afar that miss what they meet from nearby, or meet it elsewhere"
-    why = "outlines are as wide as the rounding of the distance"
-    law.share(what, bad, 2e-3, why, show)
+    what = (
+        f"share of rays from afar that miss what is met from nearby, or meet it {HIT_ROUNDINGS} roundings off"
+    )
+    why = "the origin is rounded, and some dozen operations with it; next to edges, more hangs on them"
+    law.share(what, bad, 2e-3, why, case.at(origin, d, snippets.TWICE, other=closer))
 
 
 def finite(law: Law, case: Case) -> None:
