@@ -116,25 +116,50 @@ def _mesh(**arrays: np.ndarray) -> dict[str, Any]:
     return {"type": "mrt_mesh", **{name: mi.Bitmap(array) for name, array in arrays.items()}}
 
 
-# What the tests of each plugin do not have: parameters that all plugins read by the same functions
+UP = {"type": "mrt_plane", "normal": [0, 1, 0]}
 PLUGINS: list[tuple[dict[str, Any], str]] = [
+    ({"type": "mrt_bsdf", "alpha": NAN}, '"alpha" is nan, but must be a finite number'),
+    ({"type": "mrt_bsdf", "alpha": INFINITE}, '"alpha" is inf'),
     ({"type": "mrt_bsdf", "alpha": 1e39}, '"alpha" is 1e+39, but must be a finite number'),
+    ({"type": "mrt_bsdf", "alpha": "rough"}, "\"alpha\" is 'rough', but must be a number"),
+    ({"type": "mrt_bsdf", "alpha": True}, '"alpha" is True, but must be a number'),
+    ({"type": "mrt_bsdf", "int_ior": 0.0}, '"int_ior" is 0.0, but must be a finite number > 0'),
+    ({"type": "mrt_bsdf", "int_ior": -1.5}, '"int_ior" is -1.5'),
     ({"type": "mrt_bsdf", "int_ior": 1e-39}, '"int_ior" is 1e-39, but must be a finite number > 0'),
+    ({"type": "mrt_bsdf", "ext_ior": 0.0}, '"ext_ior" is 0.0'),
     ({"type": "mrt_bsdf", "diffuse_reflectance": NAN}, '"diffuse_reflectance" is nan, but must be finite'),
     ({"type": "mrt_bsdf", "diffuse_reflectance": "red"}, "is 'red', but must be a number, a colour"),
     ({"type": "mrt_bsdf", "specular_reflectance": {"type": "rgb", "value": [1, -1, 1]}}, "not negative"),
     ({"type": "mrt_bsdf", "fresnel": {"type": "rgb", "value": 1}}, "one of schlick, dielectric, unity"),
+    ({"type": "mrt_bsdf", "fresnel": "exact"}, "\"fresnel\" is 'exact', but must be one of schlick,"),
+    ({"type": "mrt_bsdf", "f0": 0.1, "fresnel": "unity"}, '"f0" has no meaning with fresnel="unity"'),
+    ({"type": "mrt_bsdf", "sample_visible": 1}, '"sample_visible" is 1, but must be true or false'),
     ({"type": "mrt_bsdf", "aplha": 0.1}, '"aplha"'),
     ({"type": "mrt_light", "intensity": INFINITE}, '"intensity" is inf, but must be finite'),
     ({"type": "mrt_light", "position": [0, 1e39, 0]}, "three finite numbers"),
+    ({"type": "mrt_light", "position": [0, NAN, 0]}, '"position" is'),
+    ({"type": "mrt_light", "position": [0, INFINITE, 0]}, '"position" is'),
+    ({"type": "mrt_light", "position": 3.0}, '"position" is 3.0, but must be three finite numbers'),
+    ({"type": "mrt_light", "to_world": 1.0}, '"to_world"'),
+    ({"type": "mrt_light", "falloff": True}, '"falloff"'),
+    ({"type": "mrt_plane"}, '"normal" is missing; give three numbers'),
+    (UP | {"normal": [0, 0, 0]}, '"normal" is [0, 0, 0], but must be a vector of non-zero length'),
+    (UP | {"normal": [0, NAN, 0]}, '"normal" is'),
+    (UP | {"distance": INFINITE}, '"distance" is inf, but must be a finite number'),
+    (UP | {"extent": 0.0}, '"extent" is 0.0, but must be a finite number > 0'),
+    (UP | {"radius": 2.0}, '"radius"'),
+    (UP | {"to_world": 2.0}, 'mrt_plane: "to_world" is not accepted'),
     ({"type": "mrt_whitted", "sky": -1.0}, '"sky" is -1.0, but must be finite and not negative'),
     ({"type": "mrt_whitted", "max_depth": 1.5}, '"max_depth" is 1.5, but must be an integer from 1 to'),
     ({"type": "mrt_whitted", "max_depth": 2**32}, "but must be an integer from 1 to 4294967295"),
+    ({"type": "mrt_texture"}, "give one of"),
+    ({"type": "mrt_texture", "filename": "nothing.png"}, "nothing.png"),
     ({"type": "mrt_texture", "filename": 3}, '"filename" is 3, but must be a text that is not empty'),
     ({"type": "mrt_texture", "bitmap": 3}, '"bitmap" is 3, but must be a mi.Bitmap'),
 ]
 
 
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
 @pytest.mark.parametrize(("plugin", "text"), PLUGINS, ids=range(len(PLUGINS)))
 def test_plugins_name_the_parameter(variant: str, plugin: dict[str, Any], text: str) -> None:
     import mitsuba as mi

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nodes import rgb, sensor
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
@@ -19,26 +20,18 @@ for needed in ("matplotlib", "jinja2", "scipy", "flip_evaluator"):
 
 SIZE = (32, 24)
 ONE_RAY = {"aa": 1, "aamode": "none"}
-# A diffuse floor under a bright sky: every path is one bounce, tame noise, and the same for path and direct
-FLOOR = {
-    "type": "scene",
-    "sensor": {
-        "type": "perspective",
-        "to_world": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 3], [0, 0, 0, 1]],
-        "film": {"type": "hdrfilm", "width": SIZE[0], "height": SIZE[1], "rfilter": {"type": "box"}},
-    },
-    "sky": {"type": "constant"},
-    "ball": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "diffuse"}},
-    "light": {"type": "point", "position": [2, 2, 2], "intensity": {"type": "rgb", "value": 9.0}},
-}
 
 
 @pytest.fixture
 def scene(variant):
-    import mitsuba as mi
-
-    up = mi.ScalarTransform4f().look_at(origin=[0, 1, 3], target=[0, 0, 0], up=[0, 1, 0])
-    return {**FLOOR, "sensor": {**FLOOR["sensor"], "to_world": up}}
+    """A diffuse ball under a bright sky: every path is one bounce, noise is tame, path is direct."""
+    return {
+        "type": "scene",
+        "sensor": sensor([0, 1, 3], [0, 0, 0], SIZE),
+        "sky": {"type": "constant"},
+        "ball": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "diffuse"}},
+        "light": {"type": "point", "position": [2, 2, 2], "intensity": rgb(9.0, 9.0, 9.0)},
+    }
 
 
 def path(spp: int, **more: object) -> dict[str, object]:

@@ -317,29 +317,6 @@ def test_loads_from_xml(variant: str) -> None:
     assert "fresnel=dielectric" in str(b) and "1.38" in str(b)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"alpha": float("nan")}, '"alpha" is nan, but must be a finite number'),
-        ({"alpha": float("inf")}, '"alpha" is inf'),
-        ({"alpha": "rough"}, "\"alpha\" is 'rough', but must be a number"),
-        ({"alpha": True}, '"alpha" is True, but must be a number'),
-        ({"int_ior": 0.0}, '"int_ior" is 0.0, but must be a finite number > 0'),
-        ({"int_ior": -1.5}, '"int_ior" is -1.5'),
-        ({"ext_ior": 0.0}, '"ext_ior" is 0.0'),
-        ({"fresnel": "exact"}, "\"fresnel\" is 'exact', but must be one of schlick, dielectric, unity"),
-        ({"f0": 0.1, "fresnel": "unity"}, '"f0" has no meaning with fresnel="unity"'),
-        ({"sample_visible": 1}, '"sample_visible" is 1, but must be true or false'),
-        ({"roughness": 0.1}, '"roughness"'),
-    ],
-)
-def test_wrong_parameters_are_named(variant: str, parameters: dict, message: str) -> None:
-    with pytest.raises(RuntimeError) as raised:
-        bsdf(**parameters)
-    assert message in str(raised.value) and "mrt_bsdf" in str(raised.value)
-
-
 def test_unknown_attributes_are_named() -> None:
     b, si = bsdf(), interaction(np.array([0, 0, 1.0]))
     assert (

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import rgb
 from unit import specimens
 
 import mrt_mitsuba as mrt
@@ -150,10 +151,19 @@ def test_an_instance_skips_what_has_to_load_it(registered) -> None:
 
 
 @pytest.mark.parametrize(
-    "variant", ["scalar_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"], indirect=True
+    ("variant", "bsdf"),
+    [
+        ("scalar_rgb", {"type": "mrt_bsdf", "alpha": 0.3}),
+        ("scalar_rgb", {"type": "diffuse"}),  # in which Mitsuba leaves ``active`` out
+        ("llvm_ad_mono_polarized", {"type": "mrt_bsdf", "alpha": 0.3}),
+        # three coefficients of sizes far apart, and numbers that are wavelengths
+        ("llvm_ad_spectral", {"type": "mrt_bsdf", "diffuse_reflectance": rgb(0.7, 0.1, 0.3)}),
+        ("llvm_ad_spectral", {"type": "roughconductor", "material": "Cu"}),
+    ],
+    indirect=["variant"],
 )
-def test_other_variants(variant: str) -> None:
-    check = mrt.check_bsdf({"type": "mrt_bsdf", "alpha": 0.3}, quick=True)
+def test_other_variants(variant: str, bsdf: dict[str, Any]) -> None:
+    check = mrt.check_bsdf(bsdf, quick=True)
     holds(check)
     assert check.variant == variant == mi.variant()
 

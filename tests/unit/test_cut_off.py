@@ -9,16 +9,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import rgb, sensor
 
 from mrt_mitsuba.plugins.kernel_plan import Reason
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 STEP = 1 / 255  # of an 8-bit picture
-
-
-def rgb(*values: float) -> dict[str, Any]:
-    return {"type": "rgb", "value": list(values)}
 
 
 def glass(specular: float = 0.2, **more: Any) -> dict[str, Any]:
@@ -59,11 +56,8 @@ def hidden_lights() -> dict[str, Any]:
 
 
 def loaded(content: dict[str, Any]) -> mi.Scene:
-    look = mi.ScalarTransform4f().look_at([0.3, 1, 6], [0, 0.1, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 96, "height": 64, "component_format": "float32"}
-    film["rfilter"] = {"type": "box"}
-    sensor = {"type": "perspective", "fov": 40, "to_world": look, "film": film}
-    return mi.load_dict({"type": "scene", "sensor": sensor, **content})
+    view = sensor([0.3, 1, 6], [0, 0.1, 0], (96, 64), fov=40)
+    return mi.load_dict({"type": "scene", "sensor": view, **content})
 
 
 def picture(scene: mi.Scene, **options: Any) -> np.ndarray:

@@ -12,16 +12,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import rgb, sensor
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 # Finite differences are taken over the rays that the derivatives are: Mitsuba draws others for the picture
 RAYS = {"spp": 16, "seed": 2}
 WITH_GRADIENTS = {"spp": 16, "seed": 1, "seed_grad": 2}
-
-
-def rgb(*values: float) -> dict[str, Any]:
-    return {"type": "rgb", "value": list(values)}
 
 
 MATERIAL = {
@@ -35,13 +32,10 @@ MATERIAL = {
 
 def scene(**more: Any) -> mi.Scene:
     """A sphere that fills the picture, so that no silhouette moves in it, and one behind the camera."""
-    look = mi.ScalarTransform4f().look_at([0, 0.5, 3], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 16, "height": 12, "component_format": "float32"}
-    film["rfilter"] = {"type": "box"}
     return mi.load_dict({
         "type": "scene",
         "integrator": {"type": "mrt_whitted", "max_depth": 1},
-        "sensor": {"type": "perspective", "fov": 25, "to_world": look, "film": film},
+        "sensor": sensor([0, 0.5, 3], [0, 0, 0], (16, 12), fov=25),
         "light": {"type": "mrt_light", "position": [2, 3, 5], "intensity": rgb(1.1, 1.0, 0.9)},
         "lamp": {"type": "point", "position": [-2, 2, 4], "intensity": rgb(5, 4, 3)},
         "sky": {"type": "constant", "radiance": 0.3},

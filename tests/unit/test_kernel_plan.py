@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import sensor
 
 from mrt_mitsuba.plugins.kernel_plan import CutOff, KernelPlan, Reason
 
@@ -46,10 +47,8 @@ def smooth_mesh() -> mi.Mesh:
 
 
 def scene(**content: Any) -> mi.Scene:
-    look = mi.ScalarTransform4f().look_at([0, 1, 6], [0, 0.4, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 24, "height": 16, "component_format": "float32"}
-    sensor = {"type": "perspective", "fov": 40, "to_world": look, "film": film}
-    return mi.load_dict({"type": "scene", "integrator": {"type": "mrt_whitted"}, "sensor": sensor, **content})
+    view = sensor([0, 1, 6], [0, 0.4, 0], (24, 16), rfilter="gaussian", fov=40)
+    return mi.load_dict({"type": "scene", "integrator": {"type": "mrt_whitted"}, "sensor": view, **content})
 
 
 def plan_of(**content: Any) -> KernelPlan:

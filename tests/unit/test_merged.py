@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import rgb, sensor
 
 from mrt_mitsuba.plugins import lookup
 from mrt_mitsuba.plugins.lobes import Lobes
@@ -16,18 +17,12 @@ from mrt_mitsuba.plugins.lobes import Lobes
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def rgb(*values: float) -> dict[str, Any]:
-    return {"type": "rgb", "value": list(values)}
-
-
 def spheres(count: int, **more: Any) -> dict[str, Any]:
     """A row of spheres before a plane, no two materials alike: reflections of one in the other."""
-    look = mi.ScalarTransform4f().look_at([0, 3, 9], [0, 0.5, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 48, "height": 24, "component_format": "float32"}
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "mrt_whitted"},
-        "sensor": {"type": "perspective", "fov": 50, "to_world": look, "film": film},
+        "sensor": sensor([0, 3, 9], [0, 0.5, 0], (48, 24), rfilter="gaussian", fov=50),
         "sky": {"type": "constant", "radiance": 0.3},
         "light": {"type": "mrt_light", "position": [3, 6, 5]},
         "floor": {"type": "mrt_plane", "normal": [0, 1, 0], "bsdf": {"type": "mrt_bsdf", "alpha": 0.3}},

@@ -11,18 +11,14 @@ import pytest
 
 import mrt_mitsuba
 from mrt_mitsuba import records
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    tomllib = pytest.importorskip("tomli")
+from mrt_mitsuba.command.words import read_toml
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_every_package_is_listed() -> None:
     """pyproject.toml lists them by hand; a folder that it lacks would be missing from the wheel."""
-    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    settings = read_toml(ROOT / "pyproject.toml")["tool"]["setuptools"]
     places = settings["package-dir"]
     found = set()
     for package, folder in places.items():

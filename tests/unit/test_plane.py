@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import sensor
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -91,12 +92,7 @@ def test_stock_integrators_draw_a_rectangle(integrator: str) -> None:
         scene = {
             "type": "scene",
             "integrator": {"type": integrator},
-            "sensor": {
-                "type": "perspective",
-                "to_world": transform.look_at([2, -6, 3], [0, 0, 0], [0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": 16, "height": 12, "component_format": "float32"}
-                | {"rfilter": {"type": "box"}},
-            },
+            "sensor": sensor([2, -6, 3], [0, 0, 0], (16, 12), up=[0, 0, 1]),
             "light": {"type": "point", "position": [0, 0, 3], "intensity": 10.0},
             "shape": {**shape, "bsdf": {"type": "diffuse", "reflectance": 0.6}},
         }
@@ -140,26 +136,3 @@ def test_loads_from_xml(variant: str) -> None:
     np.testing.assert_array_equal(mesh.unit_normal, [0, 1, 0])
     np.testing.assert_array_equal(corners(mesh)[:, 1], np.float32(-0.2))
     assert np.ptp(corners(mesh)[:, 0]) == 8
-
-
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({}, '"normal" is missing; give three numbers'),
-        ({"normal": [0, 0, 0]}, '"normal" is [0, 0, 0], but must be a vector of non-zero length'),
-        ({"normal": [0, float("nan"), 0]}, '"normal" is'),
-        ({"normal": [0, 1, 0], "distance": float("inf")}, '"distance" is inf, but must be a finite number'),
-        ({"normal": [0, 1, 0], "extent": 0.0}, '"extent" is 0.0, but must be a finite number > 0'),
-        ({"normal": [0, 1, 0], "radius": 2.0}, '"radius"'),
-    ],
-)
-def test_wrong_parameters_are_named(variant: str, parameters: dict, message: str) -> None:
-    with pytest.raises(RuntimeError) as raised:
-        mi.load_dict({"type": "mrt_plane", **parameters})
-    assert message in str(raised.value) and "mrt_plane" in str(raised.value)
-
-
-def test_to_world_is_refused() -> None:
-    with pytest.raises(RuntimeError, match=r'mrt_plane: "to_world" is not accepted'):
-        plane(to_world=mi.ScalarTransform4f().scale(2))

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import sensor
 
 from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.rendering.api import render
@@ -20,11 +21,9 @@ def test_large_surfaces_near_the_origin_have_no_dark_spots(variant: str, kind: s
         "sphere": [[0, -1000, 0, 1000]],
         "cylinder": [[-900, -1000, 0, 900, -1000, 0, 1000]],
     }[kind]
-    look = mi.ScalarTransform4f().look_at([0.3, 2, 3], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 160, "height": 120, "rfilter": {"type": "box"}}
     scene = {
         "type": "scene",
-        "sensor": {"type": "perspective", "fov": 20, "to_world": look, "film": film},
+        "sensor": sensor([0.3, 2, 3], [0, 0, 0], (160, 120), fov=20),
         "light": {"type": "mrt_light", "position": [0.3, 2, 3]},
         "large": {"type": "mrt_group", "kind": kind, "numbers": mi.Bitmap(np.array(numbers, np.float32))},
     }
@@ -84,15 +83,12 @@ def floor(kind: str, half: float, turn: mi.ScalarTransform4f) -> dict[str, Any]:
 def test_a_grain_on_a_wide_floor_has_its_shadow(variant: str, kind: str, place: tuple, half: float) -> None:
     """A ball of radius 0.005, as ``direct`` draws it."""
     turn = mi.ScalarTransform4f().translate(list(place)).rotate([1, 0, 0], -90)
-    look = mi.ScalarTransform4f().translate(list(place)) @ mi.ScalarTransform4f().look_at(
-        [0.05, 0.06, 0.05], [0, 0.005, 0], [0, 1, 0]
-    )
-    film = {"type": "hdrfilm", "width": 160, "height": 120, "rfilter": {"type": "box"}}
+    eye, goal = np.add(place, [0.05, 0.06, 0.05]).tolist(), np.add(place, [0, 0.005, 0]).tolist()
     grain = {"type": "sphere", "center": [place[0], place[1] + 0.005, place[2]], "radius": 0.005}
     lamp = [place[0] + 0.3, place[1] + 0.5, place[2] - 0.2]
     scene = mi.load_dict({
         "type": "scene", "floor": floor(kind, half, turn), "grain": grain,
-        "sensor": {"type": "perspective", "fov": 25, "near_clip": 1e-3, "to_world": look, "film": film},
+        "sensor": sensor(eye, goal, (160, 120), fov=25, near_clip=1e-3),
         "light": {"type": "point", "position": lamp},
     })  # fmt: skip
     ours = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
@@ -129,11 +125,9 @@ def test_rays_leave_triangles_of_every_form(variant: str, scale: float) -> None:
 
 @pytest.mark.parametrize("size", [1e-9, 1e-12, 1e11, 1e15])
 def test_meshes_that_rays_cannot_meet_are_refused(variant: str, size: float) -> None:
-    look = mi.ScalarTransform4f().look_at([0, 0, 6 * size], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 4, "height": 3}
     scene = {
         "type": "scene",
-        "sensor": {"type": "perspective", "to_world": look, "film": film},
+        "sensor": sensor([0, 0, 6 * size], [0, 0, 0], (4, 3)),
         "floor": floor("mesh", 0.5 * size, mi.ScalarTransform4f()),
     }
     with pytest.raises(SceneError, match=r'the mesh "floor" is .* across .*: scale the scene'):
@@ -148,14 +142,12 @@ def test_meshes_are_drawn_at_every_size_that_is_taken(variant: str, size: float)
     faces = rng.permuted(np.tile(np.arange(60, dtype=np.uint32), (40, 1)), axis=1)[np.newaxis, :, :3]
 
     def picture(s: float) -> np.ndarray:
-        look = mi.ScalarTransform4f().look_at([0, 0, 6 * s], [0, 0, 0], [0, 1, 0])
-        film = {"type": "hdrfilm", "width": 48, "height": 36, "rfilter": {"type": "box"}}
-        sensor = {"type": "perspective", "fov": 30, "near_clip": 0.01 * s, "far_clip": 1e4 * s}
+        clips = {"near_clip": 0.01 * s, "far_clip": 1e4 * s}
         mesh = {"type": "mrt_mesh", "positions": mi.Bitmap((corners * s).astype(np.float32))}
         scene = {
             "type": "scene",
             "embree_use_robust_intersections": True,
-            "sensor": {**sensor, "to_world": look, "film": film},
+            "sensor": sensor([0, 0, 6 * s], [0, 0, 0], (48, 36), fov=30, **clips),
             "light": {"type": "mrt_light", "position": [2 * s, 3 * s, 5 * s]},
             "mesh": {**mesh, "faces": mi.Bitmap(np.ascontiguousarray(faces)), "bsdf": {"type": "mrt_bsdf"}},
         }

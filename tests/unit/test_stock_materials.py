@@ -8,6 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import sensor
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -19,12 +20,9 @@ SQUARE = {"type": "rectangle"}
 
 def pictures(shape: dict[str, Any], material: dict[str, Any], **options: Any) -> list[np.ndarray]:
     """The scene by ``mrt_whitted`` and by ``direct``."""
-    look = mi.ScalarTransform4f().look_at([0, 1, 6], [0, 0.2, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 96, "height": 64, "component_format": "float32"}
-    film["rfilter"] = {"type": "box"}
     scene = mi.load_dict({
         "type": "scene",
-        "sensor": {"type": "perspective", "fov": 40, "to_world": look, "film": film},
+        "sensor": sensor([0, 1, 6], [0, 0.2, 0], (96, 64), fov=40),
         "light": {"type": "point", "position": [2, 4, 5], "intensity": 10.0},
         "shape": {**shape, "bsdf": material},
     })  # fmt: skip

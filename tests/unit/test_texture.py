@@ -79,12 +79,6 @@ def test_scalar_variant(picture) -> None:
     np.testing.assert_allclose(np.array(got), expected(values, np.array(0.3), np.array(0.9)), atol=1e-7)
 
 
-@pytest.mark.parametrize(("keys", "words"), [({}, "one of"), ({"filename": "nothing.png"}, "nothing.png")])
-def test_wrong_parameters_are_named(keys: dict, words: str) -> None:
-    with pytest.raises(RuntimeError, match=f"mrt_texture.*{words}"):
-        mi.load_dict({"type": "mrt_texture", **keys})
-
-
 # A square of side 2 in the plane z = 0, facing +z, whose texture coordinates run along x and y
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
 SQUARE_UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)

@@ -1,0 +1,27 @@
+"""Nodes of Mitsuba scenes that tests are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mitsuba as mi
+
+
+def rgb(*values: float) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(values)}
+
+
+def sensor(
+    origin: Sequence[float],
+    target: Sequence[float],
+    size: tuple[int, int],
+    *,
+    up: Sequence[float] = (0, 1, 0),
+    rfilter: str = "box",
+    **more: Any,
+) -> dict[str, Any]:
+    """A camera, and a film of width and height."""
+    look = mi.ScalarTransform4f().look_at(list(origin), list(target), list(up))
+    film = {"type": "hdrfilm", "width": size[0], "height": size[1], "component_format": "float32"}
+    return {"type": "perspective", "to_world": look, "film": {**film, "rfilter": {"type": rfilter}}, **more}
