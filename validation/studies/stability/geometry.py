@@ -51,9 +51,9 @@ def _scenes(study: Study, cases: Cases, *, quick: bool) -> None:
         scene = report_scene(number)
         base = picture(scene)
         for factor in SCALES[::5] if quick else SCALES:
-            share = _differing(picture(scaled(scene, factor)), base)
+            share = _differing(picture(placed(scene, factor)), base)
             cases.at_most(f"scene {number} times {factor:g}", what, "the same picture", share, SHARE_SCALED)
-        shares = [_differing(picture(moved(scene, n)), base) for n in TRANSLATIONS]
+        shares = [_differing(picture(placed(scene, sizes=n)), base) for n in TRANSLATIONS]
         rows.append((str(number), size(scene), *shares))
         for n, share in zip(TRANSLATIONS, shares, strict=True):
             title = f"scene {number} moved by {n:g} sizes"
@@ -68,12 +68,17 @@ def _scenes(study: Study, cases: Cases, *, quick: bool) -> None:
     study.table("translation", heading, ("scene", "size", *(f"{n:g}" for n in TRANSLATIONS)), rows, note)
 
 
-def scaled(scene: Scene, factor: float) -> Scene:
-    """Return the scene with all lengths multiplied."""
+def placed(scene: Scene, factor: float = 1.0, sizes: float = 0.0) -> Scene:
+    """Return the scene with all lengths multiplied, or shifted by a multiple of its size, along no axis."""
+    way = np.array([0.48, -0.6, 0.64]) * sizes * size(scene)
 
     def by(p: Any) -> tuple[float, float, float]:
-        x, y, z = (c * factor for c in p)
+        x, y, z = (np.array(p) * factor + way).tolist()
         return (x, y, z)
+
+    def distance(plane: Any) -> float:
+        normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
+        return float(plane.distance * factor - normal @ way)
 
     camera = scene.camera
     return replace(
@@ -81,29 +86,7 @@ def scaled(scene: Scene, factor: float) -> Scene:
         camera=Camera(by(camera.position), by(camera.target), camera.up, camera.hfov),
         lights=tuple(replace(light, position=by(light.position)) for light in scene.lights),
         spheres=tuple(replace(s, center=by(s.center), radius=s.radius * factor) for s in scene.spheres),
-        planes=tuple(replace(p, distance=p.distance * factor) for p in scene.planes),
-    )
-
-
-def moved(scene: Scene, sizes: float) -> Scene:
-    """Return the scene shifted by a multiple of its size, along no axis."""
-    way = np.array([0.48, -0.6, 0.64]) * sizes * size(scene)
-
-    def by(p: Any) -> tuple[float, float, float]:
-        x, y, z = (float(c + w) for c, w in zip(p, way, strict=True))
-        return (x, y, z)
-
-    def shifted(plane: Any) -> Any:
-        normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
-        return replace(plane, distance=float(plane.distance - normal @ way))
-
-    camera = scene.camera
-    return replace(
-        scene,
-        camera=Camera(by(camera.position), by(camera.target), camera.up, camera.hfov),
-        lights=tuple(replace(light, position=by(light.position)) for light in scene.lights),
-        spheres=tuple(replace(s, center=by(s.center)) for s in scene.spheres),
-        planes=tuple(shifted(p) for p in scene.planes),
+        planes=tuple(replace(p, distance=distance(p)) for p in scene.planes),
     )
 
 
