@@ -15,8 +15,7 @@ from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.scene.shapes import torus
 from mrt_mitsuba.validation.oracles.reference import camera_directions, reference_render
-from mrt_mitsuba.validation.studies import approximations
-from mrt_mitsuba.validation.tools import mutations
+from mrt_mitsuba.validation.studies import approximations, mutations
 from mrt_mitsuba.validation.tools.gallery import curves, gallery
 from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, camera, with_materials
 from mrt_mitsuba.validation.tools.sensitivity import sensitivity

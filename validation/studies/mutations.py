@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
@@ -32,12 +31,7 @@ SCENE = 0
 CLAMPED_SCENE = 1
 
 
-@dataclass(frozen=True)
-class Mistake:
-    """A change of a scene's dict that a comparison must notice."""
-
-    name: str
-    change: Callable[[dict[str, Any]], dict[str, Any]]
+Change = Callable[[dict[str, Any]], dict[str, Any]]  # of a scene's dict
 
 
 def _scaled_lights(nodes: dict[str, Any]) -> dict[str, Any]:
@@ -51,56 +45,42 @@ def _scaled_lights(nodes: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _each_material(**changes: Callable[[Any], Any]) -> Callable[[dict[str, Any]], dict[str, Any]]:
-    def change(nodes: dict[str, Any]) -> dict[str, Any]:
-        return {
-            name: {**node, **{key: f(node[key]) for key, f in changes.items()}}
-            if isinstance(node, dict) and node["type"] == "mrt_bsdf"
-            else node
-            for name, node in nodes.items()
-        }
+def _each_material(key: str, change: Callable[[Any], Any]) -> Change:
+    def changed(node: Any) -> Any:
+        ours = isinstance(node, dict) and node["type"] == "mrt_bsdf"
+        return {**node, key: change(node[key])} if ours else node
 
-    return change
+    return lambda nodes: {name: changed(node) for name, node in nodes.items()}
 
 
-MISTAKES = (
-    Mistake("radiance x 1.02", _scaled_lights),
-    Mistake("alpha x 1.05", _each_material(alpha=lambda alpha: 1.05 * alpha)),
-    Mistake(
-        "flipped normal of one sphere",
-        lambda nodes: {**nodes, "sphere_0": {**nodes["sphere_0"], "flip_normals": True}},
-    ),
-    Mistake("dropped light", lambda nodes: {name: node for name, node in nodes.items() if name != "light_1"}),
-    Mistake("schlick for dielectric", _each_material(fresnel=lambda _: "schlick")),
-)
-CLAMP = "dropped clamp"
-NONE = "none"
+NONE, CLAMP = "none", "dropped clamp"
+MISTAKES: dict[str, Change] = {
+    NONE: dict,
+    "radiance x 1.02": _scaled_lights,
+    "alpha x 1.05": _each_material("alpha", lambda alpha: 1.05 * alpha),
+    "flipped normal of one sphere": lambda n: {**n, "sphere_0": {**n["sphere_0"], "flip_normals": True}},
+    "dropped light": lambda nodes: {name: node for name, node in nodes.items() if name != "light_1"},
+    "schlick for dielectric": _each_material("fresnel", lambda _: "schlick"),
+}
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One mistake at one sample count: what the tests said."""
+def trials(counts: Sequence[int], *, width: int, height: int) -> dict[str, dict[int, Comparison]]:
+    """Compare Mitsuba's ``roughplastic`` with ``mrt_bsdf``, right and wrong, by samples of each render.
 
-    mistake: str
-    samples: int  # of each pixel, in all renders
-    found: Comparison
-
-
-def trials(counts: Sequence[int], *, width: int, height: int) -> list[Trial]:
-    """Compare Mitsuba's ``roughplastic`` with ``mrt_bsdf``, right and wrong; ``counts``: samples of each
-    render."""
+    Return what the tests say, by mistake and by samples of each pixel in all renders.
+    """
     size: dict[str, Any] = {"width": width, "height": height}
     scene: Scene = physical(report_scene(SCENE), diffuse=False)
     stock = mrt.scene_dict(scene, flavor="stock", **size)
     ours = finite(mrt.scene_dict(scene, fresnel="dielectric", **size), stock)
-    result = []
+    found: dict[str, dict[int, Comparison]] = {name: {} for name in (*MISTAKES, CLAMP)}
     for spp in counts:
         theirs = path_estimate(stock, spp=spp, seed=1000)
-        for mistake in (Mistake(NONE, dict), *MISTAKES):
-            found = compare(path_estimate(mistake.change(ours), spp=spp), theirs, level=LEVEL)
-            result.append(Trial(mistake.name, RENDERS * spp, found))
-        result.append(Trial(CLAMP, RENDERS * spp, _without_clamp(spp, size)))
-    return result
+        for name, change in MISTAKES.items():
+            wrong = path_estimate(change(ours), spp=spp)
+            found[name][RENDERS * spp] = compare(wrong, theirs, level=LEVEL)
+        found[CLAMP][RENDERS * spp] = _without_clamp(spp, size)
+    return found
 
 
 def _without_clamp(spp: int, size: dict[str, Any]) -> Comparison:
@@ -122,34 +102,29 @@ def run(study: Study, *, quick: bool) -> None:
     counts = (4, 16) if quick else (4, 16, 64, 256)
     size: dict[str, Any] = {"width": 64, "height": 48} if quick else {"width": 120, "height": 90}
     found = trials(counts, **size)
-    by_mistake = {trial.mistake: [t for t in found if t.mistake == trial.mistake] for trial in found}
-    for name, series in by_mistake.items():
+    for name, series in found.items():
+        p = series[max(series)].p
         if name == NONE:
-            study.at_least("p of equality without a mistake", series[-1].found.p, LEVEL, POWER)
+            study.at_least("p of equality without a mistake", p, LEVEL, POWER)
         else:
-            study.at_most(f"p of equality with {name}", series[-1].found.p, LEVEL, "it must be seen")
+            study.at_most(f"p of equality with {name}", p, LEVEL, "it must be seen")
     caption = (
         "Probability of such a difference between equal pictures; below the dashed line they are rejected."
     )
-    lines = {  # a smaller p is as certain
-        name: ([t.samples for t in series], [max(t.found.p, 1e-40) for t in series])
-        for name, series in by_mistake.items()
-    }
-    samples = [trial.samples for trial in by_mistake[NONE]]
-    figure = curves(lines, "samples a pixel", "p of equality", level=LEVEL, ticks=samples)
+    # a smaller p is as certain
+    lines = {name: (list(s), [max(c.p, 1e-40) for c in s.values()]) for name, s in found.items()}
+    figure = curves(lines, "samples a pixel", "p of equality", level=LEVEL, ticks=list(found[NONE]))
     study.plot("mutations", "How soon a mistake is found", figure, caption)
-    study.table(
-        "mutations",
-        "Which test finds which mistake, at how many samples",
-        ["mistake", "samples a pixel", "found by", "p pixel", "p tile", "p image", "relRMSE"],
-        [_row(trial) for series in by_mistake.values() for trial in series],
+    rows = [_row(name, samples, c) for name, series in found.items() for samples, c in series.items()]
+    note = (
         f"mrt_bsdf with the mistake against roughplastic, under path, {RENDERS} renders each; the clamp: "
-        f"mrt_whitted against itself. Equal pictures are rejected once in {1 / LEVEL:g} times.",
+        f"mrt_whitted against itself. Equal pictures are rejected once in {1 / LEVEL:g} times."
     )
+    study.records("mutations", "Which test finds which mistake, at how many samples", rows, note)
 
 
-def _row(trial: Trial) -> list[Any]:
-    found = trial.found
+def _row(mistake: str, samples: int, found: Comparison) -> dict[str, Any]:
     questions = ", ".join(found.detected_by) or "-"
-    values = (found.pixel.p, found.tile.p, found.image.p, found.rel_rmse)
-    return [trial.mistake, trial.samples, questions, *values]
+    each = {f"p {v.name}": v.p for v in (found.pixel, found.tile, found.image)}
+    named = {"mistake": mistake, "samples a pixel": samples, "found by": questions}
+    return {**named, **each, "relRMSE": found.rel_rmse}
