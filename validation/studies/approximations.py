@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -36,23 +35,16 @@ LEVEL = (
 POWER = "least fault: the mistakes of the table of mutations, 2 % of the light and 5 % of alpha among them"
 
 
-@dataclass(frozen=True)
-class Step:
-    """A picture on the way, and what is new in it."""
-
-    change: str
-    image: np.ndarray
-
-
-def without_approximations(number: int, *, width: int, height: int, spp: int) -> list[Step]:
-    """Return the report's picture and those with ever fewer approximations, down to the stock flavour."""
+def without_approximations(number: int, *, width: int, height: int, spp: int) -> dict[str, np.ndarray]:
+    """Return the report's picture and those with ever fewer approximations, by what is new in each."""
     size: dict[str, Any] = {"width": width, "height": height}
     scene = report_scene(number)
     plain = physical(scene)
     stock = mrt.scene_dict(scene, flavor="stock", **size)
     exact: dict[str, Any] = {"fresnel": "dielectric", **size}
-    lamps = {name: node for name, node in stock.items() if name.startswith("light_")}
-    squares = {name: node for name, node in stock.items() if name.startswith("plane_")}
+    lamps, squares = (
+        {name: node for name, node in stock.items() if name.startswith(kind)} for kind in ("light_", "plane_")
+    )
     ours, ours_plain = mrt.scene_dict(scene, **exact), mrt.scene_dict(plain, **exact)
     unclamped = {"type": "mrt_whitted", "clamp": False}
     scenes: list[tuple[str, dict[str, Any], dict[str, Any], int]] = [
@@ -64,10 +56,10 @@ def without_approximations(number: int, *, width: int, height: int, spp: int) ->
         ("gloss and indirect light, by path", {**ours_plain, **lamps, **squares}, PATH, spp),
         ("diffuse light refracted: stock flavour", stock, PATH, spp),
     ]
-    return [
-        Step(what, mrt.render(mi.load_dict(nodes), integrator=integrator, spp=count, **AT_CENTRES).image)
+    return {
+        what: mrt.render(mi.load_dict(nodes), integrator=integrator, spp=count, **AT_CENTRES).image
         for what, nodes, integrator, count in scenes
-    ]
+    }
 
 
 def physical(scene: Scene, *, least_alpha: float = 1e-4, diffuse: bool = True) -> Scene:
@@ -133,11 +125,10 @@ def run(study: Study, *, quick: bool) -> None:
     rows, rest = [], []
     comparisons = compare_rest(numbers, spp=spp // 4, **size)
     for number, found in study.each("Approximations", [*zip(numbers, comparisons, strict=True)]):
-        steps = without_approximations(number, spp=spp, **size)
-        pictures = gallery({step.change: step.image for step in steps})
+        pictures = without_approximations(number, spp=spp, **size)
         title = f"Scene {number}, one approximation less at a time"
-        study.plot(f"approximations_{number}", title, pictures)
-        rows += _rows(number, steps)
+        study.plot(f"approximations_{number}", title, gallery(pictures))
+        rows += _rows(number, pictures)
         name = f"scene {number}: p that black mrt_bsdf and roughplastic make the same picture"
         study.at_least(name, found.p, LEVEL, POWER)
         rest.append([number, *(v.p for v in (found.pixel, found.tile, found.image)), found.rel_rmse])
@@ -152,18 +143,19 @@ def run(study: Study, *, quick: bool) -> None:
     study.table("rest", title, ["scene", "pixel", "tile", "image", "relRMSE"], rest, note)
 
 
-def _rows(number: int, steps: list[Step]) -> list[dict[str, Any]]:
-    stock = np.maximum(steps[-1].image, 0)
+def _rows(number: int, pictures: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    *_, last = pictures.values()
+    before, stock = pictures["the report's picture"], np.maximum(last, 0)
     exposures, rows = None, []
-    for before, step in zip([steps[0], *steps[:-1]], steps, strict=True):
-        change = np.abs(step.image - before.image)
-        perceived = flip(stock, np.maximum(step.image, 0), exposures=exposures)
-        exposures = perceived.exposures
+    for what, image in pictures.items():
+        change = np.abs(image - before)
+        perceived = flip(stock, np.maximum(image, 0), exposures=exposures)
+        before, exposures = image, perceived.exposures
         figures = {
             "mean difference": float(change.mean()),
             "% of pixels > 1/255": 100 * float(np.mean(change.max(axis=-1) > 1 / 255)),
-            "mean left to the stock flavour": float(np.abs(step.image - stock).mean()),
+            "mean left to the stock flavour": float(np.abs(image - stock).mean()),
             "FLIP left": perceived.mean,
         }
-        rows.append({"scene": number, "changed, too": step.change, **figures})
+        rows.append({"scene": number, "changed, too": what, **figures})
     return rows
