@@ -205,7 +205,7 @@ def roundoff(law: Law, case: Case) -> None:
             raise Skip("values change too fast for float32 steps to tell noise")
         lost = np.nan_to_num(found.lost(noise.ALLOWANCE), posinf=0)
         title = f"noise of {what} over that of {noise.ALLOWANCE:g} roundings with rounded directions, 9 in 10"
-        why = "sound formulas stay below 1.5; beyond, digits are lost inside that could be kept"
+        why = "sound formulas stay below 1.6; beyond, digits are lost inside that could be kept"
         show = case.at(snippets.NOISE, few, function=what[:-2], stride=found.stride)
         law.quantile(title, lost, 0.9, noise.LOST, why, show)
         if not law.parts[-1].holds:

@@ -16,7 +16,7 @@ import numpy as np
 Array = np.ndarray
 ROUNDING = 2.0**-24
 ALLOWANCE = 8.0  # roundings that a formula of some dozen operations may make of its own
-LOST = 2.5  # sound formulas stay below 1.5, in a hundred runs each
+LOST = 2.5  # sound formulas stay below 1.6
 STEEP = 0.05
 POINTS = 9  # of each line; Moré and Wild find seven to nine enough
 STRIDES = (2, 64, 2**11, 2**15)  # the most float32 steps from one to the next
