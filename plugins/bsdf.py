@@ -8,14 +8,15 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .emission import largest
 from .fresnel import f0_from_ior
-from .kernel_plan import Mirror, Reason, UniformMaterial
+from .kernel_plan import MaterialRows, Mirror, Reason
 from .lobes import ALPHA_MAX, ALPHA_MIN, Lobes, Pair
 from .parameters import ParameterError, choice, flag, number, spectrum
 from .protocols import MergeableBSDF
-from .variants import first, is_jit, updatable, varies
+from .variants import first, is_jit, updatable, varies, varies_by_face
 
 FRESNEL_FORMS = ("schlick", "dielectric", "unity")
 
@@ -130,15 +131,21 @@ class MrtBSDF(mi.BSDF):
         """Return the lobes at a surface point."""
         return Lobes(self.fresnel, _PointParameters(self, si, active), si.wi, visible=self.sample_visible)
 
-    def uniform(self) -> UniformMaterial | Reason:
-        """Return the parameters as plain numbers, or why they are none."""
-        if self.f0 is not None or self._varies(*(getattr(self, name) for name in (*NUMBERS, *COLORS))):
+    def rows(self, points: mi.SurfaceInteraction3f | None = None) -> MaterialRows | Reason:
+        """Return the parameters as plain numbers, or why they are none.
+
+        ``points``: one surface point on each object of a shape, for textures that vary from face to face.
+        """
+        varying = [p for p in (getattr(self, name) for name in (*NUMBERS, *COLORS)) if self._varies(p)]
+        if self.f0 is not None or not all(points is not None and varies_by_face(p) for p in varying):
             return Reason.VARYING
-        point = _PointParameters(self, dr.zeros(mi.SurfaceInteraction3f), True)
+        count = 1 if points is None else dr.width(points)
+        point = _PointParameters(self, dr.zeros(mi.SurfaceInteraction3f) if points is None else points, True)
         values = [point.alpha, point.int_ior, point.ext_ior], point.diffuse, point.specular
         if dr.grad_enabled(values):
             return Reason.GRADIENTS
-        return UniformMaterial(*(tuple(map(first, value)) for value in values))
+        rows = (np.stack([np.broadcast_to(x, count) for x in value], axis=1) for value in values)
+        return MaterialRows(*rows)
 
     # -------------------------------------- Value and density ------------------------------------------
 

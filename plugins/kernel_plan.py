@@ -20,6 +20,8 @@ UNROLLED_LIGHTS = 8
 # With fewer objects, looking up what is in the way of a light takes as long as searching for it; with more
 # pairs of an object and a light, the lists are too long for a processor's caches
 LEAST_BUFFERED, MOST_PAIRS = 64, 2**17
+# Beyond, lists of what the eye sees take longer to make than they save
+MOST_SEEN = 2**14
 
 BUDGETS = ("report", "plain")
 
@@ -48,7 +50,9 @@ class Reason(str, Enum):
     INSTANCES = "instances"
     OTHER_LIGHTS = "other-lights"  # a light other than mrt_light, or not known by its numbers
     FEW_OBJECTS = "few-objects"
+    MANY_OBJECTS = "many-objects"
     MANY_PAIRS = "many-pairs"  # of an object and a light
+    OTHER_CAMERA = "other-camera"  # the first is no pinhole, or there is none
     OTHER_BSDF = "other-bsdf"  # a BSDF other than mrt_bsdf
     MIXED_FRESNEL = "mixed-fresnel"
     VARYING = "varying"  # a parameter varies over the surface, or has no place in the table
@@ -72,12 +76,12 @@ class Mirror:
 
 
 @dataclass(frozen=True)
-class UniformMaterial:
-    """Parameters of an ``mrt_bsdf`` that are the same everywhere, as plain numbers."""
+class MaterialRows:
+    """Parameters of an ``mrt_bsdf`` as plain numbers: one row, or one for each object of a group."""
 
-    numbers: tuple[float, ...]  # alpha, int_ior, ext_ior
-    diffuse: tuple[float, ...]  # of each channel
-    specular: tuple[float, ...]
+    numbers: np.ndarray  # [n, 3]: alpha, int_ior, ext_ior
+    diffuse: np.ndarray  # [n, channels]
+    specular: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,7 @@ class SceneFacts:
     two_sided: bool  #: is a material lit from behind
     unmergeable: Reason | None  #: why the materials cannot be looked up in one table
     tabled: bool  #: can the lights be
+    pinhole: bool  #: do all rays of the first camera come from one point
 
 
 @dataclass(frozen=True)
@@ -147,6 +152,7 @@ class KernelPlan:
     planes: bool  #: analytic planes, else they are traced as meshes
     lights: str  #: "none", "unrolled", "loop" that calls each, or "table": a loop over their numbers
     buffers: bool  #: lists of what may be in the way of a light, in place of a search
+    eye: bool  #: lists of the quadrics that are seen from the camera, in place of a search for its rays
     touching: bool  #: shadow rays that end short of lights on surfaces
     random: bool  #: random numbers
     emission: bool  #: surfaces that emit
@@ -219,6 +225,7 @@ def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
         quadrics=_quadrics(facts, unless),
         planes=unless("planes", (facts.planes == 0, Reason.NO_PLANES)),
         buffers=_buffers(facts, spheres, lights, unless),
+        eye=_eye(facts, unless),
         touching=unless("touching", (not facts.touching, Reason.APART)),
         random=unless("random", (facts.random_lights == 0, Reason.DELTA_LIGHTS)),
         emission=unless("emission", (facts.surface_emitters == 0, Reason.NO_SURFACE_EMITTERS)),
@@ -263,6 +270,17 @@ def _buffers(facts: SceneFacts, spheres: str, lights: str, unless: Unless) -> bo
         (facts.native_shapes > 0 and spheres != "table", Reason.NATIVE_SHAPES),
         (objects < LEAST_BUFFERED, Reason.FEW_OBJECTS),
         (objects * facts.lights > MOST_PAIRS, Reason.MANY_PAIRS),
+    )
+
+
+def _eye(facts: SceneFacts, unless: Unless) -> bool:
+    quadrics = sum(count for _, count in facts.quadrics)
+    return unless(
+        "eye",
+        (not facts.vectorised, Reason.SCALAR_VARIANT),
+        (quadrics < LEAST_BUFFERED, Reason.FEW_OBJECTS),
+        (quadrics > MOST_SEEN, Reason.MANY_OBJECTS),
+        (not facts.pinhole, Reason.OTHER_CAMERA),
     )
 
 

@@ -1,4 +1,5 @@
-"""Many ``mrt_bsdf`` evaluated as one, whose parameters are those of the shape that was hit.
+"""Many ``mrt_bsdf`` evaluated as one, whose parameters are those of the shape, or of the object of a group,
+that was hit.
 
 Mitsuba calls each BSDF of a scene in turn, and the Python code of each runs to record the call: 1 ms for an
 instance, at every render. This one is recorded once, for any number of materials. It is not an ``mi.BSDF``:
@@ -13,21 +14,37 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from .kernel_plan import Reason, UniformMaterial
+from .kernel_plan import MaterialRows, Reason
 from .lobes import Lobes, Pair
-from .lookup import ByShape
-from .protocols import MergeableBSDF
+from .lookup import ByShape, aligned
+from .protocols import MergeableBSDF, QuadricShape
 from .variants import is_jit
 
+# Objects of a group are told apart by the faces of their stand-ins, up to so many in float32
+MOST_FACES = 2**20
 
-def uniform_materials(
+
+def material_rows(
     shapes: Sequence[mi.Shape], read: Callable[[Callable, Any], Any]
-) -> dict[int, UniformMaterial] | Reason:
-    """Return the materials by the ids of the shapes' BSDFs, or why they have no place in one table.
+) -> list[MaterialRows] | Reason:
+    """Return the materials of the shapes, or why they have no place in one table.
 
-    ``read(function, bsdf)``: what the function returns of the BSDF, see ``watch.Notes``.
+    ``read(function, thing)``: what the function returns of a BSDF or a shape, see ``watch.Notes``.
     """
+    obstacle = _obstacle(shapes)
+    rows: list[MaterialRows] = []
+    for shape in shapes if obstacle is None else ():
+        found = read(_of_objects, shape) if varies_by_object(shape) else read(_of_bsdf, shape.bsdf())
+        if isinstance(found, Reason):
+            return found
+        rows.append(found)
+    return obstacle or rows
+
+
+def _obstacle(shapes: Sequence[mi.Shape]) -> Reason | None:
+    """Return what keeps materials out of a table, whatever their parameters."""
     bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
     if not is_jit():
         return Reason.SCALAR_VARIANT
@@ -38,29 +55,46 @@ def uniform_materials(
         return Reason.INSTANCES
     if not bsdfs or not all(isinstance(b, MergeableBSDF) for b in bsdfs.values()):
         return Reason.OTHER_BSDF
-    if len({b.fresnel for b in bsdfs.values()}) != 1:
-        return Reason.MIXED_FRESNEL
-    materials = {}
-    for key, bsdf in bsdfs.items():
-        found = materials[key] = read(_uniform, bsdf)
-        if isinstance(found, Reason):
-            return found
-    return materials
+    return Reason.MIXED_FRESNEL if len({b.fresnel for b in bsdfs.values()}) != 1 else None
 
 
-def _uniform(bsdf: MergeableBSDF) -> UniformMaterial | Reason:
-    return bsdf.uniform()
+def varies_by_object(shape: Any) -> bool:
+    """Return whether a shape is of quadrics whose materials differ, or vary in another way."""
+    exact = isinstance(shape, QuadricShape)
+    return exact and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.SpatiallyVarying)
+
+
+def _of_bsdf(bsdf: MergeableBSDF) -> MaterialRows | Reason:
+    return bsdf.rows()
+
+
+def _of_objects(shape: Any) -> MaterialRows | Reason:
+    faces = shape.quadrics().first_faces
+    if faces[-1] >= MOST_FACES:
+        return Reason.VARYING
+    points = dr.zeros(mi.SurfaceInteraction3f, len(faces))
+    points.shape, points.prim_index = mi.ShapePtr(shape), mi.UInt32(faces.astype(np.uint32))
+    return shape.bsdf().rows(points)
 
 
 class MergedBSDF:
-    """Tables of the parameters of the shapes' materials, and the lobes that they make."""
+    """Tables of the parameters of the materials, and the lobes that they make."""
 
-    def __init__(self, shapes: Sequence[mi.Shape], materials: dict[int, UniformMaterial]) -> None:
-        rows = [materials[id(s.bsdf())] for s in shapes]
+    def __init__(self, shapes: Sequence[mi.Shape], materials: Sequence[MaterialRows]) -> None:
         self.fresnel = shapes[0].bsdf().fresnel
-        self.numbers = _by_shape(shapes, [m.numbers for m in rows])
-        self.diffuse = _by_shape(shapes, [m.diffuse for m in rows])
-        self.specular = _by_shape(shapes, [m.specular for m in rows])
+        columns = zip(*((m.numbers, m.diffuse, m.specular) for m in materials), strict=True)
+        rows: list[Any] = [_padded(np.concatenate(column)) for column in columns]
+        counts = [len(m.numbers) for m in materials]
+        if max(counts) == 1:
+            tables: list[Any] = [ByShape(mi.Vector4f, shapes, row, [1] * 4) for row in rows]
+        else:
+            places = [
+                (first, 1 / shape.quadrics().first_faces[1] if count > 1 else 0)
+                for shape, first, count in zip(shapes, np.cumsum([0, *counts[:-1]]), counts, strict=True)
+            ]
+            by_shape = ByShape(mi.Vector2f, shapes, places, [0, 0])
+            tables = [_ByObject(by_shape, row) for row in rows]
+        self.numbers, self.diffuse, self.specular = tables
 
     def lobes(self, si: mi.SurfaceInteraction3f) -> Lobes:
         """Return the lobes at a surface point."""
@@ -108,5 +142,17 @@ class _Row:
     f0: None = None
 
 
-def _by_shape(shapes: Sequence[mi.Shape], rows: list[tuple[float, ...]]) -> ByShape:
-    return ByShape(mi.Vector4f, shapes, [[*row, *[0] * (4 - len(row))] for row in rows], [1] * 4)
+class _ByObject:
+    """Rows of numbers for the objects of some shapes, looked up for the one that was hit."""
+
+    def __init__(self, places: ByShape, rows: np.ndarray) -> None:
+        self.places, self.rows = places, aligned(rows)  # first row of each shape, objects per face
+
+    def __call__(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Vector4f:
+        first, per_face = self.places(si, found)
+        row = mi.UInt32(first) + mi.UInt32((mi.Float(si.prim_index) + 0.5) * per_face)
+        return dr.gather(mi.Vector4f, self.rows, row)
+
+
+def _padded(rows: np.ndarray) -> np.ndarray:
+    return np.pad(rows, ((0, 0), (0, 4 - rows.shape[1])))

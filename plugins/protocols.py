@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from .intersect import Frame
-    from .kernel_plan import KernelPlan, Mirror, Reason, SceneFacts, UniformMaterial
+    from .kernel_plan import KernelPlan, MaterialRows, Mirror, Reason, SceneFacts
     from .quadric_kinds import QuadricTable
 
 
@@ -106,5 +106,8 @@ class MergeableBSDF(MirrorBSDF):
     fresnel: str  # one of the forms of mrt_bsdf
 
     @abstractmethod
-    def uniform(self) -> UniformMaterial | Reason:
-        """Return the parameters as plain numbers, or why they are none."""
+    def rows(self, points: Any = None) -> MaterialRows | Reason:
+        """Return the parameters as plain numbers, or why they are none.
+
+        ``points``: one surface point on each object of a shape, for textures that vary from face to face.
+        """

@@ -133,34 +133,16 @@ class QuadricTable:
         extents = np.broadcast_to(np.array(frame.extent, float), len(numbers))
         return cls(kind, frame.origin.array(), rows, extents, faces * np.arange(len(numbers)), flipped)
 
+    def hulls(self) -> np.ndarray:
+        """Return the ellipsoids [n, 2, 3, 4] whose convex hull each is: three semi-axes, centre."""
+        columns = np.linalg.inv(self.rows)
+        axis = columns[:, :, 2] * self.extents[:, None]
+        semi_axes = [columns * np.array(end) for end in KINDS[self.kind].ends]
+        centers = np.stack([self.origins, self.origins + axis], axis=1)
+        return np.concatenate([np.stack(semi_axes, axis=1), centers[..., None]], axis=3)
+
     def boxes(self) -> np.ndarray:
         """Return the bounding boxes [n, 2, 3]."""
-        columns = np.linalg.inv(self.rows)
-        start, end = (
-            np.sqrt((columns**2 * np.array(semi_axes)).sum(axis=2)) for semi_axes in KINDS[self.kind].ends
-        )
-        axis = columns[:, :, 2] * self.extents[:, None]
-        low = np.minimum(self.origins - start, self.origins + axis - end)
-        high = np.maximum(self.origins + start, self.origins + axis + end)
-        return np.stack([low, high], axis=1)
-
-    def balls(self) -> np.ndarray:
-        """Return balls [n, 4] (centre, radius) around the objects."""
-        columns = np.linalg.inv(self.rows)
-        ends = [columns * np.array(semi_axes) for semi_axes in KINDS[self.kind].ends]
-        first, last = (np.linalg.norm(end, ord=2, axis=(1, 2)) for end in ends)
-        axis = columns[:, :, 2] * self.extents[:, None]
-        squared = (axis**2).sum(axis=1)
-        longer = np.divide(last**2 - first**2, 2 * squared, out=np.zeros_like(squared), where=squared > 0)
-        middle = axis * np.clip(0.5 + longer, 0, 1)[:, None]
-        radius = np.sqrt(
-            np.maximum(
-                *(
-                    (way**2).sum(axis=1)
-                    + 2 * np.linalg.norm(np.einsum("nij,ni->nj", end, way), axis=1)
-                    + r**2
-                    for end, way, r in zip(ends, (-middle, axis - middle), (first, last), strict=True)
-                )
-            )
-        )
-        return np.concatenate([self.origins + middle, radius[:, None]], axis=1)
+        hulls = self.hulls()
+        half, centers = np.sqrt((hulls[..., :3] ** 2).sum(axis=3)), hulls[..., 3]
+        return np.stack([(centers - half).min(axis=1), (centers + half).max(axis=1)], axis=1)

@@ -10,9 +10,10 @@ import numpy as np
 
 from .intersect import LATERAL, Frame, SurfaceHit, SurfacePoint
 from .lookup import aligned
+from .point_buffer import PointBuffer
 from .quadric_kinds import KINDS, QuadricTable
 from .tree import Tree
-from .variants import is_jit, pointer
+from .variants import but_not, is_jit, pointer
 
 
 class Quadrics:
@@ -22,15 +23,13 @@ class Quadrics:
     """
 
     def __init__(self, shapes: list) -> None:
-        tables = [s.quadrics() for s in shapes]
+        tables = self._quadrics = [s.quadrics() for s in shapes]
         counts = [len(t.rows) for t in tables]
         self.count = sum(counts)
         self.kinds = sorted({t.kind for t in tables})  # the kernel holds these only
         self.flipped = any(t.flipped for t in tables)
         boxes = np.concatenate([t.boxes() for t in tables])
         tree = self.tree = Tree(boxes)
-        self.balls = np.zeros((tree.leaves, 4))
-        self.balls[tree.leaf_of] = np.concatenate([t.balls() for t in tables])
         table = np.zeros((tree.leaves, 4, 4), np.float32)
         table[tree.leaf_of] = _numbers(tables, self.kinds, boxes)
         self.table = aligned(table)
@@ -44,19 +43,28 @@ class Quadrics:
         frames = [s.moving_frame() for s in shapes]
         self.moving = [(k, f) for k, f in zip(leaves, frames, strict=True) if f is not None]
 
-    def intersect(self, ray: Any, active: Any) -> tuple[Any, Any, Any]:
-        """Return distance, place in the tables and part of the nearest quadric; ``ray.maxt`` for none."""
-        return self._walk(ray, active, any_hit=False)
+    def intersect(self, ray: Any, active: Any, eye: PointBuffer | None = None) -> tuple[Any, Any, Any]:
+        """Return distance, place in the tables and part of the nearest quadric; ``ray.maxt`` for none.
+
+        ``eye``: lists for a point from which most rays come.
+        """
+        return self._walk(ray, active, any_hit=False, eye=eye)
 
     def occluded(self, ray: Any, active: Any) -> Any:
         """Return whether there is a quadric before ``ray.maxt``."""
         return active & (self._walk(ray, active, any_hit=True)[0] < ray.maxt)
 
+    def hulls(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return what holds the quadrics, ellipsoids [n, 2, 3, 4], and their places in the tables."""
+        return np.concatenate([t.hulls() for t in self._quadrics]), self.tree.leaf_of
+
     def block(self, leaf: Any, ray: Any) -> Any:
         """Return whether a quadric is before ``ray.maxt``."""
         return self._meet(leaf, ray).t < ray.maxt
 
-    def _walk(self, ray: Any, active: Any, *, any_hit: bool) -> tuple[Any, Any, Any]:
+    def _walk(
+        self, ray: Any, active: Any, *, any_hit: bool, eye: PointBuffer | None = None
+    ) -> tuple[Any, Any, Any]:
         def visit(leaf: Any, state: tuple) -> tuple:
             hit = self._meet(leaf, ray)
             closer = hit.t < state[0]
@@ -64,6 +72,10 @@ class Quadrics:
                     dr.select(closer, hit.part, state[2]))  # fmt: skip
 
         state = mi.Float(ray.maxt), mi.UInt32(0), mi.Int32(LATERAL)
+        if eye is not None:
+            from_eye = eye.starts_ray(mi.UInt32(0), ray)
+            state = eye.nearest(mi.UInt32(0), ray, active & from_eye, visit, state)
+            active = but_not(active, from_eye)
         return self.tree.walk(ray, active, visit, state, any_hit=any_hit)
 
     def _row(self, leaf: Any, active: Any = True) -> tuple[Frame, Any, Any]:
@@ -150,7 +162,7 @@ class ScalarQuadrics:
         self.kinds = sorted({o.kind for o in self.objects})
         self.count = len(self.objects)
 
-    def intersect(self, ray: Any, active: bool) -> tuple[float, int, int]:
+    def intersect(self, ray: Any, active: bool, eye: None = None) -> tuple[float, int, int]:
         best = (ray.maxt, 0, LATERAL)
         for k, thing in enumerate(self.objects if active else ()):
             hit = KINDS[thing.kind].intersect(ray.o, ray.d, thing.frame)

@@ -16,11 +16,11 @@ import numpy as np
 from .emission import MOST_EMITTERS, arriving, brightness, place
 from .hit_errors import CURVED, HitErrors
 from .kernel_plan import CutOff, KernelPlan, Mirror, Reason, SceneFacts
-from .light_buffer import LightBuffer, light_buffer
-from .merged_bsdf import MergedBSDF, uniform_materials
+from .merged_bsdf import MergedBSDF, material_rows, varies_by_object
 from .mesh_api import ray_flags, surface_interaction, vertex_version
 from .parameters import ParameterError
 from .planes import Planes
+from .point_buffer import PointBuffer, point_buffer
 from .point_lights import Lights, numbers_of
 from .protocols import MirrorBSDF, PlaneShape, QuadricShape
 from .quadric_kinds import KINDS
@@ -76,7 +76,7 @@ class SceneReading:
         self.environment, self.emitters = scene.environment(), scene.emitters()
         self.bsdfs = _once(s.bsdf() for s in self.shapes)
         known = before is not None and before.objects == self.objects and before.bsdfs == self.bsdfs
-        self.notes: Notes = before.notes if before and known else Notes(_once([*self.bsdfs, *self.emitters]))
+        self.notes: Notes = before.notes if before and known else self._new_notes()
         self.forms = [_shape_state(s) for s in self.shapes]
         self.planes = [s for s in self.shapes if isinstance(s, PlaneShape)]
         self.quadrics = [s for s in self.shapes if isinstance(s, QuadricShape)]
@@ -89,10 +89,15 @@ class SceneReading:
         self.brightness = [read(brightness, e) for e in self.emitters]
         self.lights = self._lights()
         self.numbers = numbers_of(self.lights, read)
-        materials = uniform_materials(self.shapes, read)
+        self.eye = _eye(scene)
+        materials = material_rows(self.shapes, read)
         self.unmergeable = materials if isinstance(materials, Reason) else None
-        self.materials = {} if isinstance(materials, Reason) else materials
+        self.materials = [] if isinstance(materials, Reason) else materials
         self.facts = self._read_facts(self._touching(before))
+
+    def _new_notes(self) -> Notes:
+        groups = [s for s in self.shapes if varies_by_object(s)]
+        return Notes(_once([*self.bsdfs, *self.emitters, *groups]))
 
     def is_of(self, scene: mi.Scene) -> bool:
         """Return whether this scene was read.
@@ -105,9 +110,9 @@ class SceneReading:
         """Return whether it is another scene, or was changed since."""
         if not self.is_of(scene) or self.notes.refresh() or self._moving() != self.moving:
             return True
-        return [_shape_state(s) for s in self.shapes] != self.forms or self.bsdfs != _once(
-            s.bsdf() for s in self.shapes
-        )
+        if [_shape_state(s) for s in self.shapes] != self.forms or _eye(scene) != self.eye:
+            return True
+        return self.bsdfs != _once(s.bsdf() for s in self.shapes)
 
     def same_shapes(self, other: SceneReading) -> bool:
         """Return whether no shape was moved or edited between two readings."""
@@ -159,15 +164,16 @@ class SceneReading:
             specular=self._has_lobe("specular"),
             mirrors=tuple(read(_mirror, b) for b in self.bsdfs if has_mirror(b)),
             oriented=any(self._read_of_bsdfs(is_oriented)),
-            textured=any(self._read_of_bsdfs(is_textured)),
+            textured=self.unmergeable is not None and any(self._read_of_bsdfs(is_textured)),
             two_sided=any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in self.bsdfs),
             unmergeable=self.unmergeable,
             tabled=self.numbers is not None,
+            pinhole=self.eye is not None,
         )
 
     def _has_lobe(self, name: str) -> bool:
         """Return whether a material may have such a lobe; those outside the table may."""
-        return self.unmergeable is not None or any(any(getattr(m, name)) for m in self.materials.values())
+        return self.unmergeable is not None or any(getattr(m, name).any() for m in self.materials)
 
     def _alone(self) -> bool:
         """Return whether there is one object only, convex, which reflects on its outside."""
@@ -189,7 +195,8 @@ class SceneData:
     errors: HitErrors
     spheres: Spheres | None
     lights: Lights
-    buffers: list[tuple[LightBuffer, Any]]  # what may be in the way of the lights, with what tests it
+    buffers: list[tuple[PointBuffer, Any]]  # what may be in the way of the lights, with what tests it
+    eye: PointBuffer | None  # what of the quadrics the camera may see
 
     def __init__(self, reading: SceneReading, plan: KernelPlan, before: SceneData | None = None) -> None:
         self.reading, self.facts = reading, reading.facts
@@ -205,10 +212,11 @@ class SceneData:
             else Lights(reading.lights, reading.numbers, plan.lights)
         )
         self.buffers = before.buffers if before and self._same_places(before) else self._light_buffers()
+        self.eye = before.eye if before and self._same_view(before) else self._eye_buffer()
         self.environment = reading.environment
         self.merged = MergedBSDF(reading.shapes, reading.materials) if plan.merged else None
-        parts = self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged, self.buffers
-        self._arrays = held([*parts, self.environment])
+        parts = self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged
+        self._arrays = held([*parts, self.buffers, self.eye, self.environment])
         self.ray_flags = ray_flags(
             textures=plan.textures, shading_frames=plan.shading_frames, tangents=plan.tangents
         )
@@ -225,16 +233,25 @@ class SceneData:
     def _places(self) -> list[list[float]]:
         return [position for position, _ in self.reading.numbers or ()]
 
-    def _light_buffers(self) -> list[tuple[LightBuffer, Any]]:
+    def _light_buffers(self) -> list[tuple[PointBuffer, Any]]:
         """Return lists of what may be in the way of the lights, with what tests it; empty for none."""
         if not self.plan.buffers:
             return []
         things = [] if self.quadrics is None else [self.quadrics]
         if self.plan.bvh:
             things.append(SphereBlockers(self.reading.native))
-        pairs = [(light_buffer(np.array(self._places()), t.balls), t) for t in things]
+        pairs = [(point_buffer(np.array(self._places()), *t.hulls()), t) for t in things]
         buffers = [(buffer, thing) for buffer, thing in pairs if buffer is not None]
         return buffers if len(buffers) == len(pairs) else []
+
+    def _same_view(self, before: SceneData) -> bool:
+        same_eye = self.reading.eye == before.reading.eye and self.plan.eye == before.plan.eye
+        return same_eye and self.quadrics is before.quadrics
+
+    def _eye_buffer(self) -> PointBuffer | None:
+        if not self.plan.eye or self.quadrics is None:
+            return None
+        return point_buffer(np.array([self.reading.eye]), *self.quadrics.hulls())
 
     def _trace_shapes(self, plan: KernelPlan) -> None:
         reading = self.reading
@@ -276,8 +293,11 @@ class SceneData:
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 
-    def intersect(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> Hit:
-        """Return the nearest hit among Mitsuba's shapes, the quadrics and the analytic planes."""
+    def intersect(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, *, from_eye: bool = False) -> Hit:
+        """Return the nearest hit among Mitsuba's shapes, the quadrics and the analytic planes.
+
+        ``from_eye``: most rays come from the camera.
+        """
         t, plane, on_plane = self.planes.intersect(ray, active)
         # What lies behind a plane need not be looked for
         ray = mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths)
@@ -285,9 +305,8 @@ class SceneData:
         flat = self.errors.of_flat(si, found)
         if self.quadrics is not None:
             reach = dr.select(found, si.t, ray.maxt)
-            quadric = self.quadrics.intersect(
-                mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths), active
-            )
+            nearer = mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths)
+            quadric = self.quadrics.intersect(nearer, active, self.eye if from_eye else None)
             closer = active & (quadric[0] < reach)
             self.quadrics.put_into(si, ray, quadric, closer, tangents=self.plan.tangents)
             scale = dr.select(closer, self.quadrics.scale(quadric[1], closer), scale)
@@ -490,6 +509,15 @@ def _scene_of(shapes: list[mi.Shape]) -> mi.Scene | None:
 def _once(things: Iterable[Any]) -> list[Any]:
     """Return each object once."""
     return list({id(thing): thing for thing in things}.values())
+
+
+def _eye(scene: mi.Scene) -> list[float] | None:
+    """Return where all rays of the first camera come from; None where that is no point."""
+    sensor = next(iter(scene.sensors()), None)
+    if sensor is None or sensor.class_name() != "PerspectiveCamera":
+        return None
+    place = np.array(sensor.world_transform().translation(), float).ravel()
+    return place.tolist() if place.shape == (3,) and np.isfinite(place).all() else None
 
 
 def _objects(scene: mi.Scene) -> list[Any]:

@@ -61,8 +61,14 @@ class SphereBlockers:
         frames = [_to_world(s).matrix for s in shapes]
         numbers = np.array([[first(m[row][column]) for row in range(3) for column in (0, 3)] for m in frames])
         # To the last bit, which boxes do not have
-        self.balls = np.column_stack([numbers[:, 1::2], np.linalg.norm(numbers[:, ::2], axis=1)])
-        self.table = Table(mi.Vector4f, self.balls.tolist())
+        self._balls = np.column_stack([numbers[:, 1::2], np.linalg.norm(numbers[:, ::2], axis=1)])
+        self.table = Table(mi.Vector4f, self._balls.tolist())
+
+    def hulls(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the spheres as ellipsoids [n, 1, 3, 4], three semi-axes and centre, and their numbers."""
+        centers, radii = self._balls[:, :3, None], self._balls[:, 3, None, None]
+        hulls = np.concatenate([np.eye(3) * radii, centers], axis=2)
+        return hulls[:, None], np.arange(len(hulls))
 
     def block(self, index: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
         """Return whether a sphere is in the way of a ray: to the bit what Mitsuba says."""

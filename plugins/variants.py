@@ -36,3 +36,8 @@ def but_not(mask: mi.Bool, excluded: mi.Bool) -> mi.Bool:
 def varies(texture: mi.Texture) -> bool:
     """Return whether a texture varies over a surface; Mitsuba's ``mesh_attribute`` denies that it does."""
     return texture.is_spatially_varying() or texture.class_name() == "MeshAttribute"
+
+
+def varies_by_face(texture: mi.Texture) -> bool:
+    """Return whether a texture is the same all over each face of a mesh."""
+    return texture.class_name() == "MeshAttribute" and 'name = "face_' in str(texture)

@@ -210,7 +210,7 @@ class MrtWhitted(mi.SamplingIntegrator):
 
         # ------------------------------ The camera ray, first of a peeled loop ------------------------------
         active = mi.Bool(active)
-        hit = data.intersect(scene, ray, active)
+        hit = data.intersect(scene, ray, active, from_eye=True)
         shading = self._shade(data, scene, sampler, ray, hit, mi.UnpolarizedSpectrum(1), active)
         if not data.plan.mirrors:
             return Trace(shading.radiance, shading.radiance, hit, mi.UInt32(0), shading.shadow_rays)

@@ -1,7 +1,8 @@
-"""Searches for what a ray meets: trees and light buffers find the same; the study's crossing point is one."""
+"""Searches for what a ray meets: trees and lists find the same; the study's crossing point is one."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -10,8 +11,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import mrt_mitsuba.plugins.point_buffer as lists_module
 from mrt_mitsuba.plugins.axial_mesh import Placement
-from mrt_mitsuba.plugins.light_buffer import light_buffer
+from mrt_mitsuba.plugins.point_buffer import point_buffer
 from mrt_mitsuba.plugins.quadric_kinds import KINDS, QuadricTable
 from mrt_mitsuba.plugins.quadrics import Quadrics
 from mrt_mitsuba.plugins.spheres import SphereBlockers
@@ -53,15 +55,32 @@ def lit(origins: np.ndarray, place: np.ndarray) -> mi.Ray3f:
 PLACES = [(0.1, 0.2, 0.3), (0, 0, 0), (1.02, 1.02, 1.02), (5, 0, 0), (-40, 3, 2), (0, -2000, 0)]
 
 
-@pytest.mark.parametrize(("size", "shift"), [(1, 0), (1e6, 0), (1e-6, 0), (1, 300)])
-@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder", "capsule"])
-def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: float) -> None:
-    """Spheres: to the bit what Embree finds; quadrics: what the tree does. Lights are inside and far off."""
+SCALES = pytest.mark.parametrize(("size", "shift"), [(1, 0), (1e6, 0), (1e-6, 0), (1, 300)])
+
+
+def crowd(size: float, shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Ends and radii of objects, and points within and without."""
     rng = np.random.default_rng(3)
     starts, radii = rng.uniform(-1, 1, (300, 3)), size * rng.uniform(0.02, 0.12, 300)
     ends = starts + rng.normal(scale=0.1, size=(300, 3))
-    origins = rng.uniform(-1.2, 1.2, (50_000, 3)) * rng.choice([1, 3], (50_000, 1))
-    starts, ends, origins, places = (size * (p + shift) for p in (starts, ends, origins, np.array(PLACES)))
+    points = rng.uniform(-1.2, 1.2, (50_000, 3)) * rng.choice([1, 3], (50_000, 1))
+    starts, ends, points = (size * (p + shift) for p in (starts, ends, points))
+    return starts, ends, radii, points
+
+
+def group(kind: str, *columns: np.ndarray) -> mi.Shape:
+    numbers = np.column_stack(columns).astype(np.float32)
+    return mi.load_dict({"type": "mrt_group", "kind": kind, "numbers": mi.Bitmap(numbers)})
+
+
+@SCALES
+@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder", "capsule"])
+def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: float) -> None:
+    """Spheres: to the bit what Embree finds; quadrics: what the tree does. Lights are inside and far off.
+
+    The last is within an object, near its surface.
+    """
+    starts, ends, radii, origins = crowd(size, shift)
     if kind == "sphere":
         nodes = {f"s{i}": {"type": "sphere", "center": c, "radius": r}
                  for i, (c, r) in enumerate(zip(starts.tolist(), radii.tolist(), strict=True))}  # fmt: skip
@@ -69,24 +88,48 @@ def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: f
         things: Any = SphereBlockers(scene.shapes())
         search = scene.ray_test
     else:
-        numbers = np.column_stack([starts, ends, radii]).astype(np.float32)
-        group = mi.load_dict({"type": "mrt_group", "kind": kind, "numbers": mi.Bitmap(numbers)})
-        things = Quadrics([group])
+        things = Quadrics([group(kind, starts, ends, radii)])
         search = partial(things.occluded, active=mi.Bool(True))
-    buffer = light_buffer(places, things.balls)
+    within = starts[0] + 0.97 * radii[0] * np.array([-0.8, 0.36, 0.48])
+    places = np.concatenate([size * (np.array(PLACES) + shift), [within]])
+    buffer = point_buffer(places, *things.hulls())
     assert buffer is not None
     for number, place in enumerate(places):
         ray = lit(origins, place)
         test = partial(things.block, ray=ray)
         found = np.array(buffer.any(mi.UInt32(number), ray.d, mi.Bool(True), test))
         expected = np.array(search(ray))
-        assert 0.02 < expected.mean() < 0.98
+        assert 0.02 < expected.mean() <= (0.98 if number < len(PLACES) else 1)
         np.testing.assert_array_equal(found, expected)
 
 
-def test_balls_hold_their_objects() -> None:
-    """Vertices of the stand-in of each quadric, of any shear, are inside its ball, which is not far wider."""
+@SCALES
+@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder", "capsule"])
+def test_lists_for_the_eye_find_what_a_search_finds(kind: str, size: float, shift: float) -> None:
+    """Also where the eye is within an object as large as all others together, and for rays from elsewhere."""
+    starts, ends, radii, targets = crowd(size, shift)
+    ends[0], radii[0] = starts[0] + size * 0.7, size * 0.8
+    quadrics = Quadrics(
+        [group(kind, starts, radii) if kind == "sphere" else group(kind, starts, ends, radii)]
+    )
+    for place in size * (np.array(PLACES[:5]) + shift):
+        eye = point_buffer(place[None], *quadrics.hulls())
+        ray = lit(targets, place)
+        ray.o, ray.d, ray.maxt = mi.Point3f(place.tolist()) - ray.d * 0.01, -ray.d, dr.inf
+        assert dr.all(eye.starts_ray(mi.UInt32(0), ray))
+        other = mi.Ray3f(ray.o, mi.Vector3f(ray.d.z, ray.d.x, ray.d.y))  # and some the other way
+        assert np.mean(eye.starts_ray(mi.UInt32(0), other).numpy()) < 0.01
+        for rays in (ray, other):
+            found = [part.numpy() for part in quadrics.intersect(rays, mi.Bool(True), eye)]
+            expected = [part.numpy() for part in quadrics.intersect(rays, mi.Bool(True))]
+            assert np.isfinite(expected[0]).mean() > 0.02
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_hulls_hold_their_objects() -> None:
+    """In any direction, a hull reaches a little further than the stand-in of its quadric, of any shear."""
     rng = np.random.default_rng(4)
+    directions = rng.normal(size=(50, 3))
     for kind in KINDS:
         points = rng.uniform(-1, 1, (40, 3 * KINDS[kind].points))
         numbers = np.column_stack([points, rng.uniform(0.05, 2, 40)])
@@ -94,15 +137,56 @@ def test_balls_hold_their_objects() -> None:
         skew[:3, :3] += rng.uniform(-0.4, 0.4, (3, 3))
         place = Placement({"to_world": mi.ScalarTransform4f(skew.tolist())})
         table = QuadricTable.of_numbers(kind, numbers, 1, place, flipped=False)
-        balls = table.balls()
+        axes, centers = table.hulls()[..., :3], table.hulls()[..., 3]  # [n, 2, 3, 3], [n, 2, 3]
+        reach = (centers @ directions.T + np.linalg.norm(directions @ axes, axis=3)).max(axis=1)
         local = KINDS[kind].mesh(64).placed(table.extents[:, None])
         world = local @ np.linalg.inv(table.rows).transpose(0, 2, 1) + table.origins[:, None]
-        share = np.linalg.norm(world - balls[:, None, :3], axis=2).max(axis=1) / balls[:, 3]
-        assert share.min() > 0.6 and share.max() <= 1 + 1e-6, kind
+        vertices = (world @ directions.T).max(axis=1)
+        width = vertices + (world @ -directions.T).max(axis=1)
+        # that of a sphere is an octahedron
+        assert (reach - vertices <= (0.4 if kind == "sphere" else 0.01) * width).all(), kind
+        assert (vertices <= reach + 1e-6 * width).all(), kind
 
 
-def test_no_light_buffers_where_lists_would_be_long() -> None:
-    places, balls = np.zeros((3, 3)), np.tile([0.0, 0, 5, 1], (50, 1))
-    assert light_buffer(places, balls) is not None
-    assert light_buffer(np.zeros((2**17, 3)), balls) is None
-    assert light_buffer(places, np.tile([0.0, 0, 0, 1], (2**17, 1))) is None  # the lights are in all of them
+def test_no_lists_where_they_would_be_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lists(points: int, depth: float, count: int) -> Any:
+        ball = np.concatenate([np.eye(3), [[0], [0], [depth]]], axis=1)
+        return point_buffer(np.zeros((points, 3)), np.tile(ball, (count, 1, 1, 1)), np.arange(count))
+
+    assert lists(3, 5, 50) is not None
+    assert lists(2**17, 5, 50) is None
+    monkeypatch.setattr(lists_module, "MOST_LISTED", 6 * 2**2 * 3 * 50 - 1)
+    assert lists(3, 5, 50) is not None
+    assert lists(3, 0, 50) is None  # the points are in all of them, which are in all cells
+
+
+def test_lists_for_the_eye_leave_pictures_as_they_are() -> None:
+    """Of any camera: the first, for which they are, another, one with a lens, and one that is moved."""
+    starts, ends, radii, _ = crowd(1, 0)
+    look = mi.ScalarTransform4f().look_at([0.4, 0.3, 3], [0, 0, 0], [0, 1, 0])
+    aside = mi.ScalarTransform4f().look_at([3, 0.3, 1], [0, 0, 0], [0, 1, 0])
+    # Other filters add up in any order
+    film = {"type": "hdrfilm", "width": 40, "height": 30, "filter": {"type": "box"}}
+    camera = {"type": "perspective", "fov": 50, "film": film, "to_world": look}
+    scene = mi.load_dict({
+        "type": "scene", "integrator": {"type": "mrt_whitted"}, "cones": group("cone", starts, ends, radii),
+        "sensor_0": camera, "sensor_1": {**camera, "to_world": aside},
+        "sensor_2": {**camera, "type": "thinlens", "aperture_radius": 0.1, "focus_distance": 3.0},
+        "light": {"type": "mrt_light", "position": [3, 5, 4]}, "sky": {"type": "constant", "radiance": 0.2},
+    })  # fmt: skip
+    integrator = scene.integrator()
+
+    def pictures() -> list[np.ndarray]:
+        return [np.array(mi.render(scene, sensor=k, spp=4)) for k in range(3)]
+
+    plan = integrator.prepare(scene).plan
+    assert plan.eye
+    found = pictures()
+    assert min(picture.std() for picture in found) > 0.01
+    integrator.prepare(scene, replace(plan, eye=False))
+    np.testing.assert_array_equal(found, pictures())
+    parameters = mi.traverse(scene)
+    parameters["sensor_0.to_world"] = aside
+    parameters.update()
+    np.testing.assert_array_equal(pictures()[0], found[1])
+    assert integrator.prepare(scene).plan.eye

@@ -32,6 +32,12 @@ GLASS = {"type": "sphere", "radius": 0.7, "bsdf": {"type": "dielectric"}}
 CROWD = {
     f"ball_{i}": {**SPHERE, "center": [i % 8 - 4, i // 8 - 4, -(i % 3)], "radius": 0.3} for i in range(64)
 }
+GROUP = {
+    "type": "mrt_group",
+    "numbers": mi.Bitmap(np.array([[i % 8 - 4, i // 8 - 4, -(i % 3), 0.3] for i in range(64)], np.float32)),
+    "face_gloss": mi.Bitmap(np.linspace(0.1, 0.9, 64, dtype=np.float32)[:, None]),
+    "bsdf": {"type": "mrt_bsdf", "specular_reflectance": {"type": "mesh_attribute", "name": "face_gloss"}},
+}
 MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
 
 
@@ -75,6 +81,7 @@ CHOICES = {
     "planes": ({"a": {"type": "mrt_plane", "normal": [0, 1, 0]}, "b": SPHERE, "light": LIGHT}, False, False),
     "lights": ({"a": SPHERE, "light": LIGHT}, "loop", True),
     "buffers": ({**CROWD, "light": LIGHT}, False, True),
+    "eye": ({"a": GROUP, "light": LIGHT}, False, True),
     "touching": ({"a": SPHERE, "light": {"type": "mrt_light", "position": [0, 0.7, 0]}}, False, False),
     "random": ({"a": SPHERE, "lamp": LAMP}, False, False),
     "emission": ({"a": SPHERE, "lamp": LAMP}, False, False),
@@ -131,11 +138,14 @@ def test_kernel_obeys(name: str) -> None:
         ({"a": SPHERE, "light": LIGHT}, "buffers", Reason.FEW_OBJECTS),
         ({**CROWD, "light": {"type": "point"}}, "buffers", Reason.OTHER_LIGHTS),
         ({**CROWD, "light": LIGHT, "b": MESH}, "buffers", Reason.NATIVE_SHAPES),
+        ({**CROWD, "a": CONE}, "eye", Reason.FEW_OBJECTS),
+        ({"a": GROUP, "sensor": {"type": "orthographic"}}, "eye", Reason.OTHER_CAMERA),
         ({"a": SPHERE}, "emission", Reason.NO_SURFACE_EMITTERS),
         ({"a": SPHERE}, "sky", Reason.NO_SKY),
         ({"a": {**SPHERE, "bsdf": MATTE}}, "mirrors", Reason.NO_MIRRORS),
         ({"a": SPHERE, "integrator": {"type": "mrt_whitted", "max_depth": 1}}, "mirrors", Reason.MAX_DEPTH),
         ({"a": SPHERE}, "textures", Reason.UNIFORM),
+        ({"a": GROUP}, "textures", Reason.UNIFORM),
         ({"a": SPHERE}, "tangents", Reason.ISOTROPIC),
         ({"a": {**SPHERE, "bsdf": BRUSHED}}, "spheres", Reason.TANGENTS),
         ({"a": {**SPHERE, "bsdf": MATTE}}, "lobes", Reason.NO_SPECULAR),
@@ -162,6 +172,28 @@ def test_no_light_buffers_where_they_would_be_too_long() -> None:
     facts = replace(integrator.scene_facts(loaded), lights=2**11)
     assert integrator.kernel_plan(facts).buffers
     assert integrator.kernel_plan(replace(facts, lights=2**11 + 1)).reason("buffers") is Reason.MANY_PAIRS
+
+
+def test_no_lists_for_the_eye_of_too_many_objects() -> None:
+    loaded = scene(a=GROUP)
+    integrator = loaded.integrator()
+    facts = replace(integrator.scene_facts(loaded), quadrics=(("sphere", 2**14), ("cone", 1)))
+    assert integrator.kernel_plan(facts).reason("eye") is Reason.MANY_OBJECTS
+
+
+def test_materials_of_the_objects_of_a_group_are_looked_up_in_the_table() -> None:
+    """As by a call to the BSDF, next to other shapes; not where a texture varies over an object."""
+    loaded = scene(a=GROUP, b=SPHERE, c={**GROUP, "bsdf": MATTE}, light=LIGHT)
+    integrator = loaded.integrator()
+    plan = integrator.prepare(loaded).plan
+    assert plan.merged and not plan.textures
+    table = np.array(mi.render(loaded, spp=4, seed=1))
+    integrator.prepare(loaded, replace(plan, merged=False))
+    np.testing.assert_allclose(table, np.array(mi.render(loaded, spp=4, seed=1)), atol=1e-6)
+    attribute = {"type": "mesh_attribute", "name": "vertex_gloss"}
+    for texture in (TEXTURE, attribute):
+        other = {**GROUP, "bsdf": {"type": "mrt_bsdf", "specular_reflectance": texture}}
+        assert plan_of(a=other).reason("merged") is Reason.VARYING
 
 
 def test_a_plan_holds_until_the_scene_changes() -> None:

@@ -98,6 +98,7 @@ CHANGES: dict[str, tuple[str, dict[str, Any]]] = {
     "no light": ("lights", {"light": None}),
     "many lights": ("lights", {f"light_{i}": {**LIGHT, "position": [i, 5, 2]} for i in range(8)}),
     "many spheres": ("buffers", {f"ball_{i}": {**BALL, "center": [i, 0, -9]} for i in range(64)}),
+    "many cones": ("eye", {f"cone_{i}": {**CONE, "apex": [i, 2, -9]} for i in range(64)}),
     "a light on a sphere": ("touching", {"ball": BALL, "light": {**LIGHT, "position": [0, 1, -4]}}),
     "random": ("random", {"lamp": LAMP}),
     "emission": ("emission", {"lamp": LAMP}),

@@ -76,7 +76,7 @@ def compare_with_spheres(study: Study, *, width: int, height: int, samples: tupl
     title = "A thousand cones against a thousand spheres, seconds of a whole picture"
     note = (
         "Spheres are searched and intersected by Embree, cones by this project's tree in Dr.Jit; shadow rays "
-        "look both up in light buffers."
+        "look both up in lists around the lights, camera rays cones in lists around the eye."
     )
     study.table("thousand_cones", title, ["aa", "cones", "spheres", "ratio", "quartiles"], rows, note)
 
