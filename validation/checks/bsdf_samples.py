@@ -54,8 +54,7 @@ def _counted(case: Case, view: View, cells: Cells) -> tuple[float, tuple, float]
         return np.maximum(case.probe.pdf(wis, wo, uvs), 0)[:, None]
 
     codes = encode(view.samples.wo[-count:][alive])
-    hint = np.bincount(cells.find(codes), minlength=len(cells.start))
-    found = integrate(pdf, cells, case.rng, counts=hint, samples=count)
+    found = integrate(pdf, cells, case.rng, codes, np.ones(len(codes)), count)
     off = np.sqrt(alive.var() / count + found.variance.sum())
     share = max(abs(alive.mean() - found.mean.sum()) - SIGMAS * off, 0)
     return (*_chi_square(found, codes, count), share)
@@ -215,8 +214,7 @@ def _albedo(case: Case, view: View, cells: Cells | None) -> tuple[float, float |
         return values
 
     smooth = np.where(drawn.delta[:, None], 0, weight)
-    hint = np.bincount(cells.find(encode(drawn.wo)), smooth[:, 0], len(cells.start))
-    found = integrate(value, cells, case.rng, counts=hint, samples=count)
+    found = integrate(value, cells, case.rng, encode(drawn.wo), smooth[:, 0], count)
     by_samples, error = smooth.mean(axis=0), smooth.std(axis=0) / np.sqrt(count)
     by_cells, other = found.mean.sum(axis=0), np.sqrt(found.variance.sum(axis=0))
     least = max(least, float((by_cells + mean - by_samples - SIGMAS * (error + other)).max()))

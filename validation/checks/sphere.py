@@ -114,27 +114,36 @@ class Integrals:
 
 
 def integrate(
-    function: Callable[[Array], Array], cells: Cells, rng: np.random.Generator, *, counts: Array, samples: int
+    function: Callable[[Array], Array],
+    cells: Cells,
+    rng: np.random.Generator,
+    codes: Array,
+    weights: Array,
+    samples: int,
 ) -> Integrals:
     """Integrate ``function(directions [N, 3]) -> [N, K]`` over cells; those known too badly are cut further.
 
-    ``counts``: how many of ``samples`` samples fell into each cell, a hint at what the first integrand gives;
-    the integrals are made as certain as so many samples would be.
+    ``codes`` and ``weights`` of ``samples`` samples say what the first integrand gives where; the integrals
+    are made as certain as so many samples would be.
     """
-    done, hint = [], counts / samples
+    done: list[Integrals] = []
+    order = np.argsort(codes)
+    codes, below = codes[order], np.concatenate([[0], np.cumsum(weights[order])]) / samples
     for attempt in range(8):
+        ends = cells.start, cells.start + 4 ** (DEPTH - cells.level)
+        hint = np.diff([below[np.searchsorted(codes, end)] for end in ends], axis=0)[0]
         mean, variance = _estimate(function, cells, rng)
         share = np.abs(mean) / (np.abs(mean).sum(axis=0) + 1e-12)
         spread = variance / (np.abs(mean).sum(axis=0) + 1e-12) ** 2
         # half of what chance does to the count of the samples, or one sample, is known well enough
         bad = (spread > 0.25 * share / samples + 1 / samples**2).any(axis=1)
-        bad |= (hint * samples > 3) & (mean[:, 0] < 0.2 * hint)
+        bad |= (hint * samples > 1.5) & (mean[:, 0] < 0.2 * hint)
         bad &= cells.level < DEPTH
         if attempt == 7 or not bad.any():
             done.append(Integrals(cells, mean, variance))
             break
         done.append(Integrals(cells.only(~bad), mean[~bad], variance[~bad]))
-        cells, hint = cells.only(bad).quartered(), np.repeat(hint[bad] / 4, 4)
+        cells = cells.only(bad).quartered()
     start = np.concatenate([d.cells.start for d in done])
     order = np.argsort(start)
     level, mean, variance = (
