@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -33,25 +32,33 @@ class Canvas:
         Args:
             moments: add up the colours of the rays of each pixel and their squares as well, unfiltered.
         """
-        self._film, self._rays = film, rays
+        self._film, self._pictures = film, len(rays)
         self._width, self._height = (n + 2 * film.reach for n in (film.width, film.height))
-        size = len(rays) * self._height * self._width
+        self._shares = self._padded(np.float32(1 / np.maximum(rays, 1)))
+        size = len(self._shares) - 1
         self._sums, self._moments = np.zeros((channels + 1, size)), np.zeros((6 * moments, size))
 
     @property
     def sums(self) -> np.ndarray:
         """The sums of values and, last, of weights, [pictures, H, W, channels + 1]."""
-        return self._inside(self._sums)
+        return np.moveaxis(self._seen(self._sums), 0, -1)
 
     @property
     def moments(self) -> np.ndarray:
         """The sums of colours and of squared colours, [pictures, H, W, 6]; empty where not asked for."""
-        return self._inside(self._moments)
+        return np.moveaxis(self._seen(self._moments), 0, -1)
 
-    def _inside(self, planes: np.ndarray) -> np.ndarray:
-        padded = planes.reshape(len(planes), len(self._rays), self._height, self._width)
+    def _padded(self, values: np.ndarray) -> np.ndarray:
+        """Return values [pictures, pixels] with padding around each picture and one 0 at the end, flat."""
+        flat = np.zeros(self._pictures * self._height * self._width + 1, values.dtype)
+        self._seen(flat[None, :-1])[0] = values.reshape(self._pictures, *self._film.shape)
+        return flat
+
+    def _seen(self, planes: np.ndarray) -> np.ndarray:
+        """Return a view [planes, pictures, H, W] of what lies within the padding."""
+        padded = planes.reshape(len(planes), self._pictures, self._height, self._width)
         rows, columns = (slice(self._film.reach, n - self._film.reach) for n in padded.shape[2:])
-        return np.moveaxis(padded[..., rows, columns], 0, -1)
+        return padded[..., rows, columns]
 
     def put(self, place: Any, values: Sequence[Any], pixels: np.ndarray, rays: np.ndarray) -> None:
         """Add the values of rays, [channels] each, colours first, at their places on the film.
@@ -60,41 +67,30 @@ class Canvas:
             pixels: where they start, ascending; those of the second picture follow on those of the first.
             rays: how many start there, one after the other.
         """
-        reach, film = self._film.reach, self._film
-        row, column = np.divmod(pixels, film.width)
-        row += (2 * (row // film.height) + 1) * reach
-        before, shares = np.cumsum(rays) - rays, 1 / self._rays.ravel()[pixels]
-        cuts = np.flatnonzero(np.diff(row // max(1, MOST_LANES // self._width), prepend=-1))
-        for low, high in pairwise([*cuts, len(pixels)]):
-            part = slice(low, high)
-            padded = row[part] * self._width + column[part] + reach
-            self._put(place, values, padded, int(before[low]), rays[part], shares[part])
+        counts = np.zeros((self._pictures, self._film.pixels), np.uint32)
+        counts.ravel()[pixels] = rays
+        padded = self._padded(counts)
+        first = np.cumsum(padded, dtype=np.uint32) - padded  # of each place, the number of its first ray
+        low, high = np.searchsorted(first, 0, "right") - 1, np.searchsorted(first, first[-1])
+        lanes = max(1, MOST_LANES // self._width) * self._width
+        for start in range(int(low) // lanes * lanes, int(high), lanes):
+            self._put(place, values, max(start, int(low)), min(start + lanes, int(high)), first)
 
-    def _put(
-        self,
-        place: Any,
-        values: Sequence[Any],
-        pixels: np.ndarray,
-        before: int,
-        rays: np.ndarray,
-        shares: np.ndarray,
-    ) -> None:
-        """Add the rays of some pixels, numbered with the padding, after so many others."""
+    def _put(self, place: Any, values: Sequence[Any], start: int, stop: int, first: np.ndarray) -> None:
+        """Add the rays of padded places from ``start`` to ``stop``, given the number of the first of each."""
         import drjit as dr
 
-        reach, start, stop = self._film.reach, int(pixels[0]), int(pixels[-1]) + 1
+        reach = self._film.reach
         # one more than there are lanes, so that Dr.Jit gathers them: to load them, it would compile another
         # kernel for every alignment of NumPy's memory
-        counts, weights = np.zeros(stop - start + 1, np.uint32), np.zeros(stop - start + 1, np.float32)
-        counts[pixels - start + 1], weights[pixels - start] = rays, shares
-        runs = self._runs(start, np.uint32(before) + np.cumsum(counts, dtype=np.uint32), weights)
+        runs = self._runs(start, first[start : stop + 1], self._shares[start : stop + 1])
         more = runs.moments(values[:3]) if len(self._moments) else []
         dr.eval(more)
         for total, found in zip(self._moments, more, strict=True):
             total[start:stop] += np.asarray(found)
         rows = max(1, MOST_SUMS // ((2 * reach + 1) * len(self._sums)))
-        for first in range(-reach, reach + 1, rows):
-            down = range(first, min(first + rows, reach + 1))
+        for above in range(-reach, reach + 1, rows):
+            down = range(above, min(above + rows, reach + 1))
             given = runs.given(self._film, place, values, down)
             dr.eval(given)
             for index, step in enumerate(down):
@@ -111,19 +107,19 @@ class Canvas:
                 total[step : step + lanes] += np.asarray(found)
         return near
 
-    def _runs(self, start: int, ends: np.ndarray, shares: np.ndarray) -> _Runs:
-        """Return the rays of places in padded pictures from ``start`` on, given where they end."""
+    def _runs(self, start: int, first: np.ndarray, shares: np.ndarray) -> _Runs:
+        """Return the rays of places in padded pictures from ``start`` on, given the first of each."""
         import drjit as dr
         import mitsuba as mi
 
-        lane, ends = dr.arange(mi.UInt32, len(ends) - 1), mi.UInt32(ends)
-        first, last = dr.gather(mi.UInt32, ends, lane), dr.gather(mi.UInt32, ends, lane + 1)
+        lane, numbers = dr.arange(mi.UInt32, len(first) - 1), mi.UInt32(first)
+        begin, end = dr.gather(mi.UInt32, numbers, lane), dr.gather(mi.UInt32, numbers, lane + 1)
         share = dr.gather(mi.Float, mi.Float(shares), lane)
         width, height = _divisors(self._width, self._height, mi.variant())
         row, column = width.divide(lane + dr.opaque(mi.UInt32, start))
         _, row = height.divide(row)
         reach = self._film.reach
-        return _Runs(first, last, share, mi.Float(column) - reach, mi.Float(row) - reach)
+        return _Runs(begin, end, share, mi.Float(column) - reach, mi.Float(row) - reach)
 
 
 @dataclass(frozen=True)

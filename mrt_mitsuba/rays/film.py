@@ -114,14 +114,14 @@ class Film:
         import mitsuba as mi
 
         places = np.arange(-self.reach, self.reach + 1)[:, None] + (np.arange(STEPS) + 0.5) / STEPS - 0.5
-        values = self.sensor.film().rfilter().eval(mi.Float(places.ravel()))
+        values = self.sensor.film().rfilter().eval(mi.Float(places.ravel().tolist()))
         return np.asarray(values, np.float64).reshape(places.shape)
 
     @cached_property
     def spread(self) -> np.ndarray:
         """Share that the rays of the pixels −reach to reach along an axis have in the variance of pixel 0."""
         share = np.square(self.weights).sum(axis=1)
-        return np.asarray(share / share.sum())
+        return np.float32(share / share.sum())
 
     @property
     def correlation(self) -> float:
@@ -143,8 +143,12 @@ class Film:
             padding[axis] = (self.reach, self.reach)
             wide = np.moveaxis(np.pad(variance, padding, mode="edge"), axis, 0)
             count = variance.shape[axis]
-            windows = (share * wide[step : step + count] for step, share in enumerate(self.spread))
-            variance = np.moveaxis(sum(windows, start=np.zeros(())), 0, axis)
+            total = self.spread[self.reach] * wide[self.reach : self.reach + count]
+            for step in range(self.reach):  # filters are symmetric
+                pair = wide[step : step + count] + wide[2 * self.reach - step :][:count]
+                pair *= self.spread[step]
+                total += pair
+            variance = np.moveaxis(total, 0, axis)
         return variance
 
 

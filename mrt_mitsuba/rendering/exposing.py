@@ -19,6 +19,7 @@ from mrt_mitsuba.rays.sequence import pixel_sequence
 from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.rendering.shading import Shader, components
 from mrt_mitsuba.rendering.view import View
+from mrt_mitsuba.rendering.windows import dilated
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,8 @@ class Groups:
 
     def cuts(self, most: int, width: int) -> list[int]:
         """Return where to cut into parts of no more than ``most`` groups: between rows where that can be."""
+        if 0 < len(self) <= most:
+            return [0, len(self)]
         ends = self._ends[np.diff(self.pixels // width, append=-1) != 0]  # of rows
         cuts = [0]
         while cuts[-1] < len(self):
@@ -75,12 +78,15 @@ class Groups:
             cuts.append(int(whole[-1]) if len(whole) and whole[-1] > cuts[-1] else cuts[-1] + most)
         return cuts
 
-    def one_by_one(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pixel of each group, and the number of its first ray."""
-        if len(self) == len(self.pixels):
-            return self.pixels, self.first
-        number = np.arange(len(self)) - np.repeat(self._ends - self.counts, self.counts)
-        return np.repeat(self.pixels, self.counts), np.repeat(self.first, self.counts) + number * self.size
+    @property
+    def places(self) -> np.ndarray:
+        """The place in ``pixels`` of each group."""
+        return np.repeat(np.arange(len(self.pixels), dtype=np.uint32), self.counts)
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """By pixel, the number of a ray in it minus that among the rays of all groups, modulo 2³²."""
+        return (self.first - self.size * (self._ends - self.counts)).astype(np.uint32)
 
 
 @dataclass(frozen=True)
@@ -111,12 +117,12 @@ class Stack:
         """Return numbers of groups [pictures, pixels], one at least wherever the filter reaches from."""
         if not self.film.reach:
             return groups
-        near = dilated(self.rows(groups) > 0, self.film.reach, (1, 2))
+        near = dilated(self.rows(groups) > 0, self.film.reach)
         return np.maximum(groups, near.reshape(groups.shape))
 
     def add(self, exposed: Exposed, chosen: np.ndarray) -> None:
         """Add an exposure that was made for the ``chosen`` pixels [pictures, pixels]."""
-        each = np.where(exposed.rays > 0, 1 / np.maximum(exposed.rays, 1), 1.0)
+        each = np.float32(1 / np.maximum(exposed.rays, 1))
         amount = self.rows(chosen) / self.film.spread_out(self.rows(each))
         self._sums += amount[..., None] * exposed.sums
         self._weights += amount * exposed.weights
@@ -147,31 +153,6 @@ def channels_last(values: np.ndarray) -> np.ndarray:
 def _divided(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return sums [..., channels] over weights [...], as Mitsuba's films divide them."""
     return np.asarray(sums / np.where(weights == 0, 1, weights)[..., None])
-
-
-def box_mean(values: np.ndarray, reach: int, axes: tuple[int, ...] = (0, 1)) -> np.ndarray:
-    """Return the means over windows of 2 reach + 1 values along axes, cut at the border."""
-    for axis in axes:
-        place = np.arange(values.shape[axis])
-        last, before = np.minimum(place + reach, len(place) - 1), np.maximum(place - reach - 1, -1)
-        sums = np.cumsum(values, axis, dtype=np.float64)
-        means = np.take(sums, last, axis)
-        ahead, behind = np.moveaxis(means, axis, 0), np.moveaxis(sums, axis, 0)  # views
-        ahead[reach + 1 :] -= behind[: max(len(place) - reach - 1, 0)]
-        ahead /= (last - before).reshape(-1, *([1] * (values.ndim - 1)))
-        values = means
-    return values
-
-
-def dilated(mask: np.ndarray, reach: int, axes: tuple[int, ...] = (0, 1)) -> np.ndarray:
-    """Return where a mask is true within so many places along axes."""
-    for axis in axes:
-        mask, near = mask.copy(), np.moveaxis(mask, axis, 0)
-        wide = np.moveaxis(mask, axis, 0)  # a view
-        for step in range(1, reach + 1):
-            wide[step:] |= near[:-step]
-            wide[:-step] |= near[step:]
-    return mask
 
 
 @dataclass
@@ -246,12 +227,11 @@ class Exposer:
         squared colours. Return sums of numbers of rays after them."""
         import drjit as dr
 
-        pixels, first = groups.one_by_one()
-        data = _Data.of(pixels, groups.size, start.seed, self.film)
+        data = _Data.of(groups, start, self.film)
         form = groups.size, len(groups), moments, self.film.form, *self.names
 
         def trace() -> list[Any]:
-            place, channels, planes = self._trace(*self._lanes(first, data, start), data)
+            place, channels, planes = self._trace(*self._lanes(groups, data, start), data)
             if canvas is None:
                 planes = [*channels, *(c * c for c in channels[: 3 * moments]), *planes]
                 dr.eval(planes)  # block_reduce would evaluate each plane by itself, in a kernel of its own
@@ -270,17 +250,19 @@ class Exposer:
     def _independent(self) -> bool:
         return bool(self.film.sensor.sampler().class_name() == "IndependentSampler")
 
-    def _lanes(self, first: np.ndarray, data: _Data, start: _Start) -> tuple[Any, Any]:
-        """Return the pixels of the rays of groups that begin with the ``first``, and their sampler."""
+    def _lanes(self, groups: Groups, data: _Data, start: _Start) -> tuple[Any, Any]:
+        """Return the pixels of the rays of groups, and their sampler."""
         import drjit as dr
         import mitsuba as mi
 
-        rays = len(first) * data.each
-        group, number = data.group.divide(dr.arange(mi.UInt32, rays))
-        pixel = dr.gather(mi.UInt32, data.pixels, group)
+        rays = len(groups) * data.each
+        lane = dr.arange(mi.UInt32, rays)
+        group, number = data.group.divide(lane)
+        place = group if data.places is None else dr.gather(mi.UInt32, data.places, group)
+        pixel = dr.gather(mi.UInt32, data.pixels, place)
         if start.progressive:
             sampler = pixel_sequence()
-            number += dr.gather(mi.UInt32, mi.UInt32(first), group)
+            number = lane + dr.gather(mi.UInt32, mi.UInt32(groups.offsets), place)
             sampler.start(number, mi.sample_tea_32(pixel, data.seed)[0])
             _, pixel = data.area.divide(pixel)
         elif self._independent:
@@ -328,7 +310,8 @@ class _Data:
     """The groups of a wavefront and the film as the kernel has them: a PyTree of its data."""
 
     each: int  #: rays of a group
-    pixels: Any  #: of each group
+    places: Any  #: of the groups among the pixels; None where each pixel has one by plan
+    pixels: Any
     seed: Any
     group: Divisor  #: rays of a group, to divide by
     size: Any  #: rays of a group
@@ -336,14 +319,16 @@ class _Data:
     film: Numbers
 
     @classmethod
-    def of(cls, pixels: np.ndarray, size: int, seed: int, film: Film) -> _Data:
-        """Return the data of groups of a size in some pixels."""
+    def of(cls, groups: Groups, start: _Start, film: Film) -> _Data:
+        """Return the data of groups."""
         import mitsuba as mi
 
         variant = mi.variant()
-        group, wide = _size(size, variant)
+        places = mi.UInt32(groups.places) if start.progressive else None
+        group, wide = _size(groups.size, variant)
         area, _ = _size(film.pixels, variant)
-        return cls(size, mi.UInt32(pixels), _seed(seed, variant), group, wide, area, film.numbers())
+        numbers = places, mi.UInt32(groups.pixels), _seed(start.seed, variant)
+        return cls(groups.size, *numbers, group, wide, area, film.numbers())
 
 
 @lru_cache(maxsize=64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mrt_mitsuba.memory import keep_freed_blocks
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.exposure import Exposure
 from mrt_mitsuba.rays.film import Film
@@ -59,6 +60,7 @@ class FilmPasses(Passes):
 
     def _rounds(self, step: Pass) -> None:
         """Expose pixels until the noise is as low as was asked for."""
+        keep_freed_blocks()
         exposer = self._exposer(step)
         halves = Halves(exposer, self._exposure.seed, self._finished if self._plan.blur else None)
         self.rounds = run_rounds(halves, self._film.pixels, self._goal, self._job.stage)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mrt_mitsuba.output.error import ErrorEstimate
-from mrt_mitsuba.rendering.exposing import box_mean
+from mrt_mitsuba.rendering.windows import dilated, window_means
 
 LARGEST_AA = 64
 
@@ -50,13 +50,13 @@ class Levels:
         They leave half of the squared error of ``target`` in the others; those around them are doubled, too.
         """
         change = _squares(self._image, self._coarser)
-        near = box_mean(change, 1)  # a pixel may change little by chance, its neighbours less likely
+        near = window_means(change, 1)  # a pixel may change little by chance, its neighbours less likely
         order = np.argsort(near, axis=None)
         # changes of the sharp picture count, which a blur makes smaller
         allowed = change.sum() * ((target or 0.0) / max(self.error().rmse, 1e-30)) ** 2 / 2
         noisy = np.zeros(self._aa.size, bool)
         noisy[order[np.searchsorted(np.cumsum(near.flat[order]), allowed) :]] = True
-        doubled = (box_mean(noisy.reshape(self._aa.shape), 1) > 0) & (self._aa < LARGEST_AA)
+        doubled = dilated(noisy.reshape(self._aa.shape), 1) & (self._aa < LARGEST_AA)
         chosen = {
             2 * int(aa): np.flatnonzero(doubled & (self._aa == aa)).astype(np.uint32)
             for aa in np.unique(self._aa[doubled])

@@ -19,17 +19,19 @@ import numpy as np
 
 from mrt_mitsuba.filters.dof import REACH
 from mrt_mitsuba.output.error import ErrorEstimate
-from mrt_mitsuba.rendering.exposing import Exposed, Exposer, Groups, Stack, box_mean, channels_last
+from mrt_mitsuba.rendering.exposing import Exposed, Exposer, Groups, Stack, channels_last
+from mrt_mitsuba.rendering.rounds import LEAST_GROWTH
+from mrt_mitsuba.rendering.windows import window_means
 
 HALVES = 2
 TILE = 16  # pixels, under a filter
 GROUP = 4  # rays that are traced together; two groups to a pixel begin
 STEP = (
-    1.25  # times the rays there are must be there after another round: a short one costs more than it brings
+    1.5  # times the rays there are must be there after another round: a short one costs more than it brings
 )
 
 # Candidates for the smoothing of variances: half the width of a window, and how many rays its mean is worth
-_WINDOWS = {1: (8, 32), 2: (32, math.inf), 4: (math.inf,), 8: (math.inf,)}
+_WINDOWS = ((1, 8), (1, 32), (2, 32), (2, math.inf), (4, math.inf), (8, math.inf))
 _FLOORS = (0.003, 0.03, 0.2, 1.0)  # share of the picture's mean in the variance of every pixel
 _JUDGES = 2**12  # pixels, about, that choose among the candidates
 _REGION = 8  # half the width of the windows in which rays are compared with independent ones
@@ -106,11 +108,11 @@ class Halves(Stack):
 
     def variance(self) -> np.ndarray:
         """Return the estimated variance of each channel in the picture, [H, W, 3], without the border."""
-        moments, rays = self._moments(), self.rows(self.rays)
-        each = (moments / rays[..., None]).sum(0)
-        each = _smoothed(each, box_mean(each, 1), rays.mean(0)[..., None], 8)
-        spread = channels_last(self.film.spread_out(np.moveaxis(each, -1, 0)))
-        return self.film.picture(spread / 4 * self._better(moments.mean(-1))[..., None])
+        moments, rays = self._moments()
+        each = np.moveaxis((moments / rays[..., None]).sum(0), -1, 0)
+        each = _smoothed(each, window_means(each, 1), rays.mean(0), 8)
+        spread = channels_last(self.film.spread_out(each))
+        return self.film.picture(spread / 4 * self._better(moments.mean(-1), rays)[..., None])
 
     def samples(self) -> np.ndarray:
         """Return the rays of each pixel, [H, W], without the border."""
@@ -123,11 +125,9 @@ class Halves(Stack):
 
         Enough for an RMSE of ``target``, if that takes a mean of no more than ``most`` rays a pixel in all.
         """
-        variance = self._decisive()
-        deviation, most = np.sqrt(variance), most * self.film.pixels
+        deviation, most = np.sqrt(self._decisive()), most * self.film.pixels
         if target is not None:
-            allowed = (variance / self.rays).sum() * (target / self.error().rmse) ** 2
-            wanted = _water(self.rays, deviation, lambda due: (variance / due).sum() <= allowed)
+            wanted = _quiet(self.rays, deviation, (target / self.error().rmse) ** 2)
             least = self._step * self.rays.sum()
             if least <= wanted.sum() <= most:
                 return self._groups(wanted)
@@ -136,19 +136,25 @@ class Halves(Stack):
         return self._within(most, deviation)
 
     def _within(self, most: float, deviation: np.ndarray) -> np.ndarray | None:
-        """Return numbers of groups that make no more than so many rays in all, and not many fewer."""
-        have, best = float(self.rays.sum()), None
-        low, budget, high = have, most, most
-        for _ in range(6):  # rounding, and pixels under the filter, make of a budget more or less than it is
-            groups = self._groups(_water(self.rays, deviation, lambda due: bool(due.sum() >= budget)))  # noqa: B023
-            if have + self.cost(groups) > most:
-                high = budget
+        """Return numbers of groups that make no more than so many rays in all, and not many fewer.
+
+        Rounding, and pixels under the filter, make of a budget more or less than it is. None where it makes
+        too few to be worth a round.
+        """
+        have, best, spent = float(self.rays.sum()), None, 0.0
+        room = budget = most - have
+        low, left, high, over = 0.0, room, room, 0.0  # budgets, and how far they are from filling the room
+        for _ in range(6):  # the Illinois method: what stays is counted for half
+            groups = self._groups(_water(self.rays, deviation, have + budget))
+            cost = self.cost(groups)
+            if cost <= room:
+                best, spent, low, left, over = groups, cost, budget, room - cost, over / 2
             else:
-                best, low = groups, budget
-            if low == most:
+                high, left, over = budget, left / 2, cost - room
+            if spent >= 0.95 * room or low == high:
                 break
-            budget = (low + high) / 2
-        return best
+            budget = low + 0.98 * (high - low) * left / (left + over)
+        return best if spent >= (LEAST_GROWTH - 1) * have else None
 
     def _groups(self, due: np.ndarray) -> np.ndarray:
         """Return whole numbers of groups for what is due; one at least."""
@@ -168,42 +174,42 @@ class Halves(Stack):
 
     def _decisive(self) -> np.ndarray:
         """Return the variance of a ray's value that decides in each half, [2, pixels]: the other half's."""
-        moments, rays = self._moments().mean(-1), self.rows(self.rays)
-        measured = moments * self._better(moments)
+        moments, rays = self._moments()
+        moments = moments.mean(-1)
+        measured = moments * self._better(moments, rays)
         mean = measured.mean((1, 2))[:, None, None]
+        candidates = [w for w in _WINDOWS if w[0] >= self.film.reach] or _WINDOWS[-1:]
+        around = {width: window_means(measured, width) for width, _ in candidates}
         step = max(1, math.isqrt(measured[0].size // _JUDGES))
-        judges, other = (slice(None), *[slice(None, None, step)] * 2), measured[::-1, ::step, ::step]
-        least, lowest, window, weight = math.inf, 0.0, measured, 0.0
-        for width, worths in _WINDOWS.items():
-            if width < self.film.reach:
-                continue
-            around = box_mean(measured, width, (1, 2))
-            for worth in worths:
-                smooth = _smoothed(measured[judges], around[judges], rays[judges], worth)
-                for floor in _FLOORS:
-                    deviation = np.sqrt((1 - floor) * smooth + floor * mean + 1e-30)
-                    cost = ((other / deviation).mean((1, 2)) * deviation.mean((1, 2))).sum()
-                    if cost < least:
-                        least, lowest, window, weight = cost, floor, around, worth
-        best = _smoothed(measured, window, rays, weight)
-        return ((1 - lowest) * best + lowest * mean + 1e-30)[::-1].reshape(HALVES, -1)
+        some = (slice(None), slice(None, None, step), slice(None, None, step))
+        other = measured[::-1][some]
 
-    def _moments(self) -> np.ndarray:
-        """Return the variance of a ray's value in each half and channel, [2, H, W, 3]."""
-        rays = self.rows(self.rays)[..., None]
-        variance = (self._square - self._total**2 / rays) / np.maximum(rays - 1, 1)
-        return np.maximum(variance, 0)
+        def cost(smooth: np.ndarray, floor: float) -> float:
+            deviation = np.sqrt((1 - floor) * smooth + (floor * mean + 1e-30))
+            return float(((other / deviation).mean((1, 2)) * deviation.mean((1, 2))).sum())
 
-    def _better(self, moments: np.ndarray) -> np.ndarray:
+        smooth = {w: _smoothed(measured[some], around[w[0]][some], rays[some], w[1]) for w in candidates}
+        width, worth = best = min(candidates, key=lambda w: cost(smooth[w], _FLOORS[1]))
+        floor = min(_FLOORS, key=lambda floor: cost(smooth[best], floor))
+        variance = _smoothed(measured, around[width], rays, worth)
+        return ((1 - floor) * variance + (floor * mean + 1e-30))[::-1].reshape(HALVES, -1)
+
+    def _moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variance of a ray in each half and channel, [2, H, W, 3], and its rays, [2, H, W]."""
+        rays = self.rows(self.rays)
+        variance = (self._square - self._total**2 / rays[..., None]) / np.maximum(rays - 1, 1)[..., None]
+        return np.float32(np.maximum(variance, 0)), np.float32(rays)
+
+    def _better(self, moments: np.ndarray, rays: np.ndarray) -> np.ndarray:
         """Return the squared error over that of independent rays whose value has this variance, [H, W].
 
         Below 1 where rays are stratified, and where a filter averages pixels.
         """
-        found = self._squared_error()
-        expected = self.film.spread_out((moments / self.rows(self.rays)).sum(0)) / 4
+        found = np.float32(self._squared_error())
+        expected = self.film.spread_out((moments / rays).sum(0)) / 4
         few = 0.1  # windows without noise take the picture's ratio
-        ratio = box_mean(found, _REGION) + few * found.mean()
-        return ratio / np.maximum(box_mean(expected, _REGION) + few * expected.mean(), 1e-30)
+        found, expected = (window_means(v, _REGION) + few * v.mean() for v in (found, expected))
+        return np.float32(found / np.maximum(expected, 1e-30))
 
     def _inside(self, values: np.ndarray) -> np.ndarray:
         return self.film.picture(values[..., None])[..., 0]
@@ -227,12 +233,34 @@ def _smoothed(variance: np.ndarray, around: np.ndarray, rays: np.ndarray, worth:
     return np.asarray(variance + share * (around - variance))
 
 
-def _water(have: np.ndarray, shape: np.ndarray, enough: Callable[[np.ndarray], bool]) -> np.ndarray:
-    """Return the least multiple of ``shape`` that is ``enough``, where there is not more already."""
-    low, high = 0.0, float((have.max() + 1) / max(shape.mean(), 1e-30))
-    while not enough(np.maximum(have, high * shape)) and high < 1e30:
-        low, high = high, 4 * high
-    while high - low > 1e-3 * high:
-        middle = (low + high) / 2
-        low, high = (low, middle) if enough(np.maximum(have, middle * shape)) else (middle, high)
-    return np.maximum(have, high * shape)
+def _water(have: np.ndarray, shape: np.ndarray, amount: float) -> np.ndarray:
+    """Return a multiple of ``shape``, or what there is where that is more, which sums to ``amount``.
+
+    The sum is convex in the factor, so Newton's steps from above stay above.
+    """
+    factor = amount / shape.sum()
+    for _ in range(20):
+        lacking = factor * shape > have
+        more, less = shape[lacking].sum(), have.sum() - have[lacking].sum()
+        factor, last = max(amount - less, 0) / max(more, 1e-30), factor
+        if factor > 0.999 * last:
+            break
+    return np.maximum(have, factor * shape)
+
+
+def _quiet(have: np.ndarray, deviation: np.ndarray, share: float) -> np.ndarray:
+    """Return a multiple of ``deviation``, or what there is where that is more, which leaves this share of the
+    squared error.
+
+    What is left is concave in the inverse of the factor, so Newton's steps from below stay below.
+    """
+    now = np.square(deviation) / have
+    allowed = share * now.sum()
+    inverse = allowed / deviation.sum()
+    for _ in range(20):
+        lacking = inverse * deviation < now
+        less, more = deviation[lacking].sum(), now.sum() - now[lacking].sum()
+        inverse, last = max(allowed - more, 0) / max(less, 1e-30), inverse
+        if inverse < 1.001 * last:
+            break
+    return np.maximum(have, deviation / max(inverse, 1e-30))

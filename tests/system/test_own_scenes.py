@@ -187,6 +187,13 @@ def test_stated_errors_hold_and_means_are_unbiased():
     assert found.passed, found.missed
 
 
+@pytest.mark.parametrize("spp", [16, 40, 100])
+def test_a_mean_of_rays_is_spent(spp):
+    """No more than asked for, and little less, also under a wide filter: there, tiles share rays out."""
+    spent = mrt.render(_load("area_light"), aamode="noise", spp=spp, seed=1).rounds[-1].spp
+    assert 0.9 * spp <= spent <= spp
+
+
 def test_rays_go_where_the_noise_is():
     """The same error takes fewer rays than Mitsuba takes: in a sky without noise, none but the first."""
     scene = _load("texture_and_sky")

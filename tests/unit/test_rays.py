@@ -9,6 +9,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.rays.canvas import Canvas
 from mrt_mitsuba.rays.divisor import Divisor
 from mrt_mitsuba.rays.film import Film
+from mrt_mitsuba.rendering.windows import dilated, window_means
 
 LARGEST = 2**32 - 1
 
@@ -75,3 +76,19 @@ def test_film_adds_up_what_rays_give_to_pixels_in_reach(kind: str, moments: bool
     assert np.allclose(canvas.sums, expected, rtol=0, atol=1e-5)  # of values about 3
     assert canvas.moments.shape[-1] == 6 * moments
     assert np.allclose(canvas.moments, squares[..., : 6 * moments], rtol=1e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize("reach", [1, 2, 8])
+@pytest.mark.parametrize("shape", [(2, 17, 23), (5, 3)])
+def test_windows_are_those_of_a_loop(shape, reach):
+    """Means and dilations; windows are cut at the border, and may be larger than the picture."""
+    values = np.random.default_rng(reach).exponential(size=shape) ** 8
+    mask = values > 50
+    rows, columns = (
+        [slice(max(at - reach, 0), at + reach + 1) for at in range(count)] for count in shape[-2:]
+    )
+    windows = [[(..., row, column) for column in columns] for row in rows]
+    means = np.array([[values[w].mean((-2, -1)) for w in line] for line in windows])
+    near = np.array([[mask[w].any((-2, -1)) for w in line] for line in windows])
+    assert np.allclose(window_means(values, reach), np.moveaxis(means, (0, 1), (-2, -1)), rtol=1e-13, atol=0)
+    assert np.array_equal(dilated(mask, reach), np.moveaxis(near, (0, 1), (-2, -1)))
