@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .variants import is_jit, pointer
+from .variants import is_jit
 
 
 def aligned(values: np.ndarray, kind: Any = np.float32) -> Any:
@@ -26,23 +26,29 @@ def aligned(values: np.ndarray, kind: Any = np.float32) -> Any:
     return (mi.Float if kind is np.float32 else mi.UInt32)(room[first : first + size])
 
 
+def shape_ids(shapes: Any) -> mi.UInt32:
+    """Return Dr.Jit's numbers of shapes: of pointers among the data of a recorded kernel, it would look at all
+    objects of all scenes whenever the kernel is launched."""
+    return dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes))
+
+
 class Table:
-    """Rows of numbers, or pointers to objects of Mitsuba (``kind`` "Shape", ...), looked up by index."""
+    """Rows of numbers, or shapes (``kind`` "Shape"), looked up by index."""
 
     def __init__(self, kind: Any, rows: Sequence[Any]) -> None:
         self.kind, self.rows = kind, rows
         if not is_jit():
-            self.rows = rows if isinstance(kind, str) else [kind([float(x) for x in row]) for row in rows]
-        elif isinstance(kind, str):
-            self.kind, self.rows = getattr(mi, kind + "Ptr"), pointer(kind, rows)
+            self.rows = rows if kind == "Shape" else [kind([float(x) for x in row]) for row in rows]
         else:
-            self.rows = aligned(np.array(rows))
+            self.rows = shape_ids(rows) if kind == "Shape" else aligned(np.array(rows))
         dr.eval(self.rows)
 
     def __call__(self, index: mi.UInt32, active: mi.Bool) -> Any:
-        if is_jit():
-            return dr.gather(self.kind, self.rows, index, active)
-        return self.rows[index if active else 0]
+        if not is_jit():
+            return self.rows[index if active else 0]
+        if self.kind == "Shape":
+            return dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.rows, index, active))
+        return dr.gather(self.kind, self.rows, index, active)
 
 
 class ByShape:
@@ -55,7 +61,7 @@ class ByShape:
             self.shapes = shapes  # alive, or their ids could pass to others
             self.rows = {id(s): kind(row) for s, row in zip(shapes, rows, strict=True)}
             return
-        ids = np.array(dr.reinterpret_array(mi.UInt32, pointer("Shape", shapes)))
+        ids = np.array(shape_ids(shapes))
         size = int(ids.max()) + 1
         width = 1 if kind is mi.Float else dr.size_v(kind)
         table = np.tile(np.float32(fallback), size).reshape(size, width)

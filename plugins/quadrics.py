@@ -9,11 +9,11 @@ import mitsuba as mi
 import numpy as np
 
 from .intersect import LATERAL, Frame, SurfaceHit, SurfacePoint
-from .lookup import aligned
+from .lookup import aligned, shape_ids
 from .point_buffer import PointBuffer
 from .quadric_kinds import KINDS, QuadricTable
 from .tree import Tree
-from .variants import but_not, is_jit, pointer
+from .variants import but_not, is_jit
 
 
 class Quadrics:
@@ -36,7 +36,7 @@ class Quadrics:
         owner, faces = np.zeros((2, tree.leaves), np.uint32)
         owner[tree.leaf_of] = np.repeat(np.arange(len(shapes)), counts)
         faces[tree.leaf_of] = np.concatenate([t.first_faces for t in tables])
-        self.shapes = dr.gather(mi.ShapePtr, pointer("Shape", shapes), mi.UInt32(owner))
+        self.shapes = dr.gather(mi.UInt32, shape_ids(shapes), mi.UInt32(owner))
         self.faces = mi.UInt32(faces)
         dr.eval(self.shapes, self.faces)
         leaves = tree.leaf_of[np.cumsum([0, *counts[:-1]])].tolist()  # of the first quadric of each shape
@@ -119,7 +119,8 @@ class Quadrics:
                 setattr(si, name, dr.select(where, frame.to_world(chosen), getattr(si, name)))
         if self.flipped:
             surface.n *= side
-        _put_surface(si, t, surface, dr.gather(mi.ShapePtr, self.shapes, leaf, where), where)
+        shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.shapes, leaf, where))
+        _put_surface(si, t, surface, shape, where)
         si.prim_index = dr.select(where, dr.gather(mi.UInt32, self.faces, leaf, where), si.prim_index)
 
     def _surface(self, p: Any, part: Any, frame: Frame, kind: Any) -> SurfacePoint:

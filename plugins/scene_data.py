@@ -17,7 +17,7 @@ from .emission import MOST_EMITTERS, arriving, brightness, place
 from .hit_errors import CURVED, HitErrors
 from .kernel_plan import CutOff, KernelPlan, Mirror, Reason, SceneFacts
 from .merged_bsdf import MergedBSDF, material_rows, varies_by_object
-from .mesh_api import ray_flags, surface_interaction, vertex_version
+from .mesh_api import ray_arrays, ray_flags, surface_interaction, vertex_version
 from .parameters import ParameterError
 from .planes import Planes
 from .point_buffer import PointBuffer, point_buffer
@@ -38,12 +38,8 @@ SMALLEST_MESH, LARGEST_MESH = 1e-8, 1e10
 # sides
 TOUCHING = 2.0**-10
 
-# To launch recorded kernels, Dr.Jit looks at every shape that Mitsuba traces, and at its material: 600 take
-# 20 ms, recording anew takes 3
-MOST_SHAPES = 200
-
 # What ``SceneData`` makes of the shapes, and the decisions that shape it
-OF_SHAPES = ("bvh", "planes", "quadrics", "errors", "spheres")
+OF_SHAPES = ("bvh", "ray_arrays", "planes", "quadrics", "errors", "spheres")
 
 
 def _of_shapes(plan: KernelPlan) -> tuple[Any, ...]:
@@ -190,6 +186,7 @@ class SceneData:
     """
 
     bvh: mi.Scene | None  # of the shapes that only Mitsuba can trace; None: the scene itself
+    ray_arrays: list[Any] | None  # what is read of it; None: not known yet
     planes: Planes
     quadrics: Any
     errors: HitErrors
@@ -262,7 +259,7 @@ class SceneData:
         if others and not plan.bvh:
             raise ValueError(f"the plan leaves {len(others)} shapes untraced: set its bvh to True")
         # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the others only
-        self.bvh = _scene_of(others) if own else None
+        self.bvh, self.ray_arrays = _scene_of(others) if own else None, None
         self.planes = Planes(planes)
         self.quadrics = quadrics_of(exact)
         self.errors = HitErrors(others)
@@ -283,13 +280,14 @@ class SceneData:
 
     def arrays(self, scene: mi.Scene) -> list[Any] | None:
         """Return all that the kernels read; None where they call plugins, which may read anything."""
-        plan, bvh = self.plan, self.bvh or scene
+        plan = self.plan
         tabled = plan.merged and self.lights.known and (plan.spheres == "table" or not plan.bvh)
         plain = self.environment is None or self.environment.class_name() == "ConstantBackgroundEmitter"
-        few = len(self.reading.shapes) <= MOST_SHAPES or not plan.bvh
-        if not (tabled and plain and few and isinstance(bvh, mi.Scene)):
+        if not (tabled and plain):
             return None
-        return [*self._arrays, self.path_limit, *([bvh] if plan.bvh else [])]
+        if self.ray_arrays is None:
+            self.ray_arrays = ray_arrays(self.bvh or scene) if plan.bvh else []
+        return [*self._arrays, self.path_limit, *self.ray_arrays]
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 

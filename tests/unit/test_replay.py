@@ -99,6 +99,25 @@ def test_an_update_shows_from_cold_and_warm(what: str, traced: Calls) -> None:
     assert not np.array_equal(before[0], after[0])
 
 
+def test_spheres_that_move_in_a_scene_of_their_own_are_seen(traced: Calls) -> None:
+    """Rays are traced in the loaded scene itself, which builds its tree anew."""
+    nodes = mrt.scene_dict(3, **SIZE)
+    scene = mi.load_dict({name: node for name, node in nodes.items() if not name.startswith("plane")})
+    for k in range(6):
+        turned = mi.ScalarTransform4f().translate([0.1 * k, 0.4, 0]).rotate([0, 1, 1], 20 * k).scale(0.5)
+        update(scene, "sphere_2.to_world", turned.matrix)
+        assert np.array_equal(picture(scene), anew(scene))
+    assert traced.count == 8
+
+
+def test_many_objects_are_recorded_without_a_look_at_each(traced: Calls) -> None:
+    """Dr.Jit looks at all objects of all scenes where a scene, or a pointer, is among what a kernel reads."""
+    scene = loaded(4)
+    assert np.array_equal(*(picture(scene) for _ in range(2))) and traced.count == 2
+    arrays = scene.integrator().prepare(scene).arrays(scene)
+    assert not any(isinstance(a, mi.Scene | mi.ShapePtr) for a in arrays)
+
+
 def test_many_updates_in_a_row_are_each_seen(traced: Calls) -> None:
     """Dr.Jit gives the indices of arrays that are gone to new ones, so equal indices prove nothing."""
     scene, seen = loaded(), set()
