@@ -57,9 +57,9 @@ class Budget:
     def of(cls, memory: int | None) -> Budget:
         """Return what was asked for, by default half of what is free; never more than the machine has.
 
-        The machine is looked at ten times a second at most.
+        The machine is looked at once a second at most.
         """
-        moment = int(10 * time.monotonic())
+        moment = int(time.monotonic())
         wanted = _look(free_memory, moment) // 2 if memory is None else memory
         return cls(min(wanted, _look(all_memory, moment)))
 

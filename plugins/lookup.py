@@ -27,8 +27,10 @@ def aligned(values: np.ndarray, kind: Any = np.float32) -> Any:
 
 
 def shape_ids(shapes: Any) -> mi.UInt32:
-    """Return Dr.Jit's numbers of shapes: of pointers among the data of a recorded kernel, it would look at all
-    objects of all scenes whenever the kernel is launched."""
+    """Return Dr.Jit's numbers of shapes.
+
+    Of pointers that a recorded kernel reads, it would look at all objects of all scenes at each launch.
+    """
     return dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes))
 
 
@@ -52,7 +54,10 @@ class Table:
 
 
 class ByShape:
-    """Numbers for each of some shapes, looked up for the one that was hit; ``fallback`` for others."""
+    """Numbers for each of some shapes, looked up for the one that was hit; ``fallback`` for others.
+
+    In vectorised variants, a row may have several parts of a kind's width.
+    """
 
     def __init__(self, kind: Any, shapes: Sequence[mi.Shape], rows: Sequence[Any], fallback: Any) -> None:
         self.kind = kind
@@ -64,15 +69,19 @@ class ByShape:
         ids = np.array(shape_ids(shapes))
         size = int(ids.max()) + 1
         width = 1 if kind is mi.Float else dr.size_v(kind)
-        table = np.tile(np.float32(fallback), size).reshape(size, width)
-        table[ids] = np.reshape(rows, (-1, width))
+        numbers = np.reshape(rows, (len(shapes), -1, width))
+        self.parts = numbers.shape[1]
+        table = np.empty((size, self.parts, width), np.float32)
+        table[:] = fallback
+        table[ids] = numbers
         self.table = aligned(table)
         self.size = dr.opaque(mi.UInt32, size)
         dr.make_opaque(self.fallback)
 
-    def __call__(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> Any:
+    def __call__(self, si: mi.SurfaceInteraction3f, found: mi.Bool, part: int = 0) -> Any:
         if not is_jit():
             return self.rows.get(id(si.shape), self.fallback) if found else self.fallback
         ids = dr.reinterpret_array(mi.UInt32, si.shape)
         known = found & (ids < self.size)
-        return dr.select(known, dr.gather(self.kind, self.table, ids, known), self.fallback)
+        index = ids * self.parts + part
+        return dr.select(known, dr.gather(self.kind, self.table, index, known), self.fallback)

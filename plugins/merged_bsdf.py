@@ -78,23 +78,25 @@ def _of_objects(shape: Any) -> MaterialRows | Reason:
 
 
 class MergedBSDF:
-    """Tables of the parameters of the materials, and the lobes that they make."""
+    """A table of the parameters of the materials, and the lobes that they make."""
 
     def __init__(self, shapes: Sequence[mi.Shape], materials: Sequence[MaterialRows]) -> None:
         self.fresnel = shapes[0].bsdf().fresnel
         columns = zip(*((m.numbers, m.diffuse, m.specular) for m in materials), strict=True)
-        rows: list[Any] = [_padded(np.concatenate(column)) for column in columns]
         counts = [len(m.numbers) for m in materials]
+        rows = np.zeros((sum(counts), 3, 4))
+        for part, column in enumerate(columns):
+            values = np.concatenate(column)
+            rows[:, part, : values.shape[1]] = values
         if max(counts) == 1:
-            tables: list[Any] = [ByShape(mi.Vector4f, shapes, row, [1] * 4) for row in rows]
+            self.table: Any = ByShape(mi.Vector4f, shapes, rows, [1] * 4)
         else:
             places = [
                 (first, 1 / shape.quadrics().first_faces[1] if count > 1 else 0)
                 for shape, first, count in zip(shapes, np.cumsum([0, *counts[:-1]]), counts, strict=True)
             ]
             by_shape = ByShape(mi.Vector2f, shapes, places, [0, 0])
-            tables = [_ByObject(by_shape, row) for row in rows]
-        self.numbers, self.diffuse, self.specular = tables
+            self.table = _ByObject(by_shape, rows)
 
     def lobes(self, si: mi.SurfaceInteraction3f) -> Lobes:
         """Return the lobes at a surface point."""
@@ -103,12 +105,9 @@ class MergedBSDF:
     def _row(self, si: mi.SurfaceInteraction3f) -> _Row:
         # One mask for all lights, or they would be looked up for each
         everywhere = mi.Bool(True)
-        alpha, int_ior, ext_ior, _ = self.numbers(si, everywhere)
+        (alpha, int_ior, ext_ior, _), *colors = (self.table(si, everywhere, part) for part in range(3))
         channels = dr.size_v(mi.UnpolarizedSpectrum)
-        diffuse, specular = (
-            mi.UnpolarizedSpectrum(list(color(si, everywhere))[:channels])
-            for color in (self.diffuse, self.specular)
-        )
+        diffuse, specular = (mi.UnpolarizedSpectrum(list(color)[:channels]) for color in colors)
         return _Row(alpha, int_ior, ext_ior, diffuse, specular)
 
     def eval(
@@ -143,16 +142,12 @@ class _Row:
 
 
 class _ByObject:
-    """Rows of numbers for the objects of some shapes, looked up for the one that was hit."""
+    """Rows of three parts for the objects of some shapes, looked up for the one that was hit."""
 
     def __init__(self, places: ByShape, rows: np.ndarray) -> None:
         self.places, self.rows = places, aligned(rows)  # first row of each shape, objects per face
 
-    def __call__(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Vector4f:
+    def __call__(self, si: mi.SurfaceInteraction3f, found: mi.Bool, part: int) -> mi.Vector4f:
         first, per_face = self.places(si, found)
         row = mi.UInt32(first) + mi.UInt32((mi.Float(si.prim_index) + 0.5) * per_face)
-        return dr.gather(mi.Vector4f, self.rows, row)
-
-
-def _padded(rows: np.ndarray) -> np.ndarray:
-    return np.pad(rows, ((0, 0), (0, 4 - rows.shape[1])))
+        return dr.gather(mi.Vector4f, self.rows, 3 * row + part)

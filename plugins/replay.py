@@ -33,7 +33,7 @@ class Replay:
     """Recordings of one kind; ``replay(key, inputs, run)`` returns what ``run()`` does: arrays."""
 
     def __init__(self) -> None:
-        self._asked: dict[Hashable, None] = {}  # keys, the last to be asked for at the end
+        self._asked: dict[_Call, None] = {}  # the last to be asked for at the end
         self._frozen: Any = None
         _all.add(self)
 
@@ -46,19 +46,19 @@ class Replay:
 
         It is recorded when it is asked for again: many a picture is rendered once.
         """
-        again = key in self._asked
-        self._asked[key] = self._asked.pop(key, None)
-        if not again:
+        call = _Call(key, run)
+        again = call in self._asked
+        self._asked[call] = self._asked.pop(call, None)
+        try:
+            if again:
+                if self._frozen is None:
+                    self._frozen = dr.freeze(_run, limit=MOST, warn_after=2**31 - 1)
+                return self._frozen(call, inputs)
             for old in list(self._asked)[:-MOST]:
                 del self._asked[old]
             return run()
-        if self._frozen is None:
-            self._frozen = dr.freeze(_run, limit=MOST, warn_after=2**31 - 1)
-        call = _Call(key, run)
-        try:
-            return self._frozen(call, inputs)
         finally:
-            call.run = None  # a recording keeps the call, and must not keep the scene
+            call.run = None  # a call is kept, and must not keep the scene
 
 
 def held(things: list[Any]) -> list[Any]:
@@ -87,12 +87,13 @@ class _Call:
 
     def __init__(self, key: Hashable, run: Callable[[], Any] | None) -> None:
         self.key, self.run = key, run
+        self._hash = hash(key)  # taken once: keys are long
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Call) and self.key == other.key
 
     def __hash__(self) -> int:
-        return hash(self.key)
+        return self._hash
 
 
 def _run(call: _Call, inputs: Any) -> Any:

@@ -39,7 +39,7 @@ SMALLEST_MESH, LARGEST_MESH = 1e-8, 1e10
 TOUCHING = 2.0**-10
 
 # What ``SceneData`` makes of the shapes, and the decisions that shape it
-OF_SHAPES = ("bvh", "ray_arrays", "planes", "quadrics", "errors", "spheres")
+OF_SHAPES = ("bvh", "ray_arrays", "planes", "quadrics", "errors", "spheres", "shape_arrays")
 
 
 def _of_shapes(plan: KernelPlan) -> tuple[Any, ...]:
@@ -191,6 +191,7 @@ class SceneData:
     quadrics: Any
     errors: HitErrors
     spheres: Spheres | None
+    shape_arrays: list[Any]  # what is in these
     lights: Lights
     buffers: list[tuple[PointBuffer, Any]]  # what may be in the way of the lights, with what tests it
     eye: PointBuffer | None  # what of the quadrics the camera may see
@@ -212,8 +213,7 @@ class SceneData:
         self.eye = before.eye if before and self._same_view(before) else self._eye_buffer()
         self.environment = reading.environment
         self.merged = MergedBSDF(reading.shapes, reading.materials) if plan.merged else None
-        parts = self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged
-        self._arrays = held([*parts, self.buffers, self.eye, self.environment])
+        self._arrays = held([self.lights, self.merged, self.buffers, self.eye, self.environment])
         self.ray_flags = ray_flags(
             textures=plan.textures, shading_frames=plan.shading_frames, tangents=plan.tangents
         )
@@ -264,19 +264,17 @@ class SceneData:
         self.quadrics = quadrics_of(exact)
         self.errors = HitErrors(others)
         self.spheres = Spheres(others) if plan.spheres != "none" else None
+        self.shape_arrays = held([self.planes, self.quadrics, self.errors, self.spheres])
 
     def limit(self, plan: KernelPlan) -> None:
         """Take over a plan that differs in its cut-off alone."""
         self.plan, self.path_limit = plan, plan.cut_off.paths
+        # What shapes the code of the kernels, ``arrays`` being their data
+        self.form: Hashable = replace(plan, cut_off=CutOff(0.0, plan.cut_off.lights))
         if is_jit() and self.path_limit not in (0, math.inf, self.facts.lights + 1):
             self.path_limit = dr.opaque(mi.Float, self.path_limit)  # a brighter sky needs no new kernel
 
     # ------------------------------------------- Replay ------------------------------------------------
-
-    @property
-    def form(self) -> Hashable:
-        """Return what shapes the code of the kernels, ``arrays`` being their data."""
-        return replace(self.plan, cut_off=CutOff(0.0, self.plan.cut_off.lights))
 
     def arrays(self, scene: mi.Scene) -> list[Any] | None:
         """Return all that the kernels read; None where they call plugins, which may read anything."""
@@ -287,7 +285,7 @@ class SceneData:
             return None
         if self.ray_arrays is None:
             self.ray_arrays = ray_arrays(self.bvh or scene) if plan.bvh else []
-        return [*self._arrays, self.path_limit, *self.ray_arrays]
+        return [*self._arrays, self.path_limit, *self.shape_arrays, *self.ray_arrays]
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 

@@ -174,9 +174,12 @@ class MrtWhitted(mi.SamplingIntegrator):
         self._given_plan = self._given_plan if plan is None else plan
         plan = self._given_plan or self.kernel_plan(reading.facts)
         data = self._data
-        if data is not None and data.reading is reading and replace(data.plan, cut_off=plan.cut_off) == plan:
-            data.limit(plan)
-            return data
+        if data is not None and data.reading is reading:
+            if data.plan is plan:
+                return data
+            if replace(data.plan, cut_off=plan.cut_off) == plan:
+                data.limit(plan)
+                return data
         self._data = SceneData(reading, plan, data)
         return self._data
 

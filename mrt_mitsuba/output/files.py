@@ -87,12 +87,15 @@ def write_exr(
 
 def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
     from PIL import Image as PilImage
+    from PIL import PngImagePlugin
 
     height, width = image.shape[:2]
     picture = PilImage.new("RGB", (width, height))
     for row, block in _blocks(image, tonemap):
         picture.paste(PilImage.fromarray(block), (0, row))
-    picture.save(file, format="PNG", compress_type=PNG_RUNS)
+    # as picture.save does, which would import four formats more
+    picture.encoderinfo, picture.encoderconfig = {"compress_type": PNG_RUNS}, ()
+    PilImage.SAVE[PngImagePlugin.PngImageFile.format](picture, file, "")
 
 
 def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Mapping[str, Any]) -> None:

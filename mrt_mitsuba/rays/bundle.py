@@ -7,10 +7,15 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
+
 from mrt_mitsuba.rays.divisor import Divisor
 from mrt_mitsuba.rays.lattice import Lattice
 from mrt_mitsuba.rays.shutter import Number, Shutter
 from mrt_mitsuba.records import dataclass
+
+# Pixels of a bundle, beyond which tracing a few rays more takes longer than to record a kernel anew
+LARGEST_PADDED = 2**14
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,14 @@ class Bundle:
         """Return the bundle of the pixels ``start`` to ``stop − 1``."""
         whole = start == 0 and stop == len(self.pixels)
         return self if whole else replace(self, pixels=self.pixels[start:stop])
+
+    def padded(self) -> Bundle:
+        """Return a small bundle with its last pixel repeated: so there are few sizes."""
+        count = len(self.pixels)
+        if isinstance(self.pixels, range) or count > LARGEST_PADDED:
+            return self
+        more = -count % (1 << max(count.bit_length() - 5, 0))
+        return replace(self, pixels=np.append(self.pixels, self.pixels[-1:].repeat(more)))
 
     @property
     def form(self) -> tuple[Any, ...]:

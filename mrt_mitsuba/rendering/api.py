@@ -9,6 +9,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -194,7 +195,7 @@ def _render(
     shader = shader_for(source.scene, source.integrator)
     facts = _facts(source, shader, settings)
     settings = decided(settings, facts)
-    plan = make_plan(facts, settings)
+    plan = _planned(facts, settings.but(integrator=None, params=None, on_round=None))
     exposures = _exposures(plan, settings.seed)
     job = Job(kernels.progress, _workspace(plan, exposures, budget), kernels)
     job.progress.plan(plan)
@@ -223,6 +224,9 @@ def _render(
         passes.error,
         tuple(passes.rounds),
     )
+
+
+_planned = lru_cache(maxsize=16)(make_plan)  # most renders are like one before
 
 
 def _in_force(settings: RenderSettings, plan: Plan, source: Source) -> dict[str, Any]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.rays.lattice import FILM
 from mrt_mitsuba.rendering.plan import RenderFacts
@@ -28,7 +26,7 @@ def decided(settings: RenderSettings, facts: RenderFacts) -> RenderSettings:
     aa = settings.aa or (1 if aamode == NOISE or (plain and aamode == "none") else 4)
     spp = settings.spp or (film.rays if film and plain and settings.aamode is None else 1)
     most = settings.maxspp or (MAX_SPP if settings.rmse is not None else None)
-    settings = replace(settings, aa=aa, aamode=aamode, lattice=lattice, spp=spp, maxspp=most)
+    settings = settings.but(aa=aa, aamode=aamode, lattice=lattice, spp=spp, maxspp=most)
     _check(settings, facts)
     return settings
 

@@ -16,7 +16,7 @@ from mrt_mitsuba.rays.divisor import Divisor
 from mrt_mitsuba.rays.film import Film, Numbers
 from mrt_mitsuba.rays.sampler import ray_sampler
 from mrt_mitsuba.rays.sequence import pixel_sequence
-from mrt_mitsuba.records import dataclass
+from mrt_mitsuba.records import dataclass, leaves
 from mrt_mitsuba.rendering.shading import Shader, components
 from mrt_mitsuba.rendering.view import View
 from mrt_mitsuba.rendering.windows import dilated
@@ -242,7 +242,7 @@ class Exposer:
 
         # numbered rays of a film without a canvas, which would be written to
         known = canvas is None and self._independent and self.film.form is not None
-        sums = self.shader.replayed(self.view, form, self.layers, data, trace) if known else trace()
+        sums = self.shader.replayed(self.view, form, self.layers, leaves(data), trace) if known else trace()
         dr.eval(sums)
         return sums
 

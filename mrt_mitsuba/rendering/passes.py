@@ -18,7 +18,6 @@ from mrt_mitsuba.rays.bundle import Bundle
 from mrt_mitsuba.rays.exposure import Exposure
 from mrt_mitsuba.rendering.detectors import DETECTORS
 from mrt_mitsuba.rendering.job import Job
-from mrt_mitsuba.rendering.levels import Levels
 from mrt_mitsuba.rendering.plan import BLUR, EDGES, FIRST_HITS, REFINEMENT, RENDERING, ROUNDS, Pass, Plan
 from mrt_mitsuba.rendering.rounds import Goal, run_rounds
 from mrt_mitsuba.rendering.trace import Channels, Tracer
@@ -88,6 +87,8 @@ class Passes:
 
     def _rounds(self, step: Pass) -> None:
         """Double the lattice where that changes pixels, until the error is as small as was asked for."""
+        from mrt_mitsuba.rendering.levels import Levels
+
         for name in step.layers:
             self._add(name)
 

@@ -148,6 +148,12 @@ class RenderSettings:
         """Return the settings for options as Python gives them: a list for a tuple, "4G" for bytes."""
         return cls(**options)
 
+    def but(self, **values: Any) -> RenderSettings:
+        """Return the settings with other values, which are known to be right."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self) | values)
+        return other
+
     @property
     def rmse(self) -> float | None:
         """The error to render to."""

@@ -18,6 +18,7 @@ from mrt_mitsuba.output.layers import AVERAGED, FIRST_HIT, TABLE
 from mrt_mitsuba.output.layers import channels as channel_count
 from mrt_mitsuba.rays.bundle import Bundle, Samples
 from mrt_mitsuba.rays.sampler import ray_sampler
+from mrt_mitsuba.records import leaves
 from mrt_mitsuba.rendering.shading import Shader, components
 from mrt_mitsuba.rendering.view import View
 
@@ -71,7 +72,10 @@ class Tracer:
     def _wavefront(self, bundle: Bundle, names: Sequence[str], seed: int) -> Channels:
         import drjit as dr
 
-        numbers, sampler = bundle.numbers(self.view.width, self.view.height), self._sampler()
+        sampler, pixels = self._sampler(), len(bundle.pixels)
+        if sampler is None:
+            bundle = bundle.padded()
+        numbers = bundle.numbers(self.view.width, self.view.height)
 
         def trace() -> dict[str, list[Any]]:
             samples = bundle.placed(numbers)
@@ -83,12 +87,14 @@ class Tracer:
             return _by_pixel(values, bundle, samples, numbers.share)
 
         if sampler is None:
-            result = self.shader.replayed(self.view, bundle.form, names, numbers, trace)
+            result = self.shader.replayed(self.view, bundle.form, names, leaves(numbers), trace)
         else:
             result = trace()
         dr.eval(result)
         # LLVM's arrays are not copied
-        return {name: [np.asarray(c, np.float32) for c in channels] for name, channels in result.items()}
+        return {
+            name: [np.asarray(c, np.float32)[:pixels] for c in channels] for name, channels in result.items()
+        }
 
     def _one_by_one(self, bundle: Bundle, names: Sequence[str], seed: int) -> Channels:
         pixels = {name: np.zeros((len(bundle.pixels), TABLE[name].channels)) for name in names}

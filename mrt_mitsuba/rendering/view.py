@@ -82,7 +82,7 @@ class View:
         film, found = self.sensor.film(), _collector(mi.variant())(self.sensor)
         # copies share the numbers, and stay as they are when the sensor's change
         numbers = {name: type(value)(value) for name, value in found.values.items()}
-        sizes = tuple(np.array(getattr(film, name)(), float) for name in ("size", "crop_size", "crop_offset"))
+        sizes = film.size(), film.crop_size(), film.crop_offset()
         world = self.sensor.world_transform().matrix
         return Matrices(type(world)(world), numbers, sizes)
 
@@ -127,7 +127,8 @@ class Matrices(Mapping[str, np.ndarray]):
 
     @cached_property
     def _found(self) -> dict[str, np.ndarray]:
-        world, numbers, (size, crop, start) = self._given
+        world, numbers, sizes = self._given
+        size, crop, start = (np.array(pair, float) for pair in sizes)
         to_world = np.array(world, np.float64).reshape(4, 4)
         if not np.isfinite(to_world).all() or np.linalg.matrix_rank(to_world) < 4:
             return {}

@@ -14,7 +14,6 @@ limit of the stack, and Dr.Jit's messages may wait for each other for ever; one 
 from __future__ import annotations
 
 import contextlib
-import html
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -230,6 +229,8 @@ def _end_of_tag(data: bytes, position: int) -> int:
 
 
 def _text(quoted: bytes) -> str:
+    import html
+
     return html.unescape(quoted[1:-1].decode(errors="replace"))
 
 

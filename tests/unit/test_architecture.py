@@ -145,7 +145,7 @@ def test_imports_make_no_cycle() -> None:
 @pytest.mark.parametrize(
     ("room", "others"),
     [
-        ("plugins", {"plugins"}),
+        ("plugins", {"plugins", "records"}),
         ("rays", {"rays", "records"}),
         ("output", {"output", "cores", "errors", "records"}),
         ("filters", {"filters", "errors", "records", "runtime", "output"}),
