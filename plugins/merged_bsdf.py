@@ -84,7 +84,7 @@ class MergedBSDF:
         self.fresnel = shapes[0].bsdf().fresnel
         columns = zip(*((m.numbers, m.diffuse, m.specular) for m in materials), strict=True)
         counts = [len(m.numbers) for m in materials]
-        rows = np.zeros((sum(counts), 3, 4))
+        rows: Any = np.zeros((sum(counts), 3, 4))
         for part, column in enumerate(columns):
             values = np.concatenate(column)
             rows[:, part, : values.shape[1]] = values
