@@ -37,6 +37,9 @@ class Recorder:
         self._keep("shadow", ray, coherent, active)
         return self.scene.ray_test(ray, coherent, active)
 
+    def shapes_dr(self) -> Any:
+        return self.scene.shapes_dr()
+
     def _keep(self, kind: str, ray: Any, coherent: bool, active: Any) -> None:
         active = mi.Bool(active) & dr.full(mi.Bool, True, dr.width(ray.o))
         index = dr.compress(active)
