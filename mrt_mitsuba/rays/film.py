@@ -114,6 +114,7 @@ class Film:
         import mitsuba as mi
 
         places = np.arange(-self.reach, self.reach + 1)[:, None] + (np.arange(STEPS) + 0.5) / STEPS - 0.5
+        # a list is copied; for NumPy's memory, Dr.Jit would compile a kernel for every alignment
         values = self.sensor.film().rfilter().eval(mi.Float(places.ravel().tolist()))
         return np.asarray(values, np.float64).reshape(places.shape)
 

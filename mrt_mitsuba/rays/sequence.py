@@ -61,21 +61,27 @@ def _sequence_class(variant: str) -> type:
         def to_string(self) -> str:
             return "PixelSequence[]"
 
-    def _mixed(bits: Any) -> Any:
-        """Return a hash of 32 bits. Source: C. Wellons, "Prospecting for Hash Functions" (2018)."""
-        bits = (bits ^ (bits >> 16)) * 0x7FEB352D
-        bits = (bits ^ (bits >> 15)) * 0x846CA68B
-        return bits ^ (bits >> 16)
-
-    def _scrambled(bits: Any, a: Any, b: Any) -> Any:
-        """Flip every bit by a hash of the lower ones."""
-        bits = (bits + a) ^ ((bits + a) * (b & 0xFFFFFFFE))
-        bits *= a | 1
-        bits ^= bits * ((a ^ (b >> 16)) & 0xFFFFFFFE)
-        return bits ^ (bits * 0x6C50B47C)
-
-    def _fraction(bits: Any) -> Any:
-        """Return the number in [0, 1) whose binary digits are the bits, lowest first."""
-        return mi.Float(dr.brev(bits) >> 8) * 2.0**-24
-
     return PixelSequence
+
+
+def _mixed(bits: Any) -> Any:
+    """Return a hash of 32 bits. Source: C. Wellons, "Prospecting for Hash Functions" (2018)."""
+    bits = (bits ^ (bits >> 16)) * 0x7FEB352D
+    bits = (bits ^ (bits >> 15)) * 0x846CA68B
+    return bits ^ (bits >> 16)
+
+
+def _scrambled(bits: Any, a: Any, b: Any) -> Any:
+    """Flip every bit by a hash of the lower ones."""
+    bits = (bits + a) ^ ((bits + a) * (b & 0xFFFFFFFE))
+    bits *= a | 1
+    bits ^= bits * ((a ^ (b >> 16)) & 0xFFFFFFFE)
+    return bits ^ (bits * 0x6C50B47C)
+
+
+def _fraction(bits: Any) -> Any:
+    """Return the number in [0, 1) whose binary digits are the bits, lowest first."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return mi.Float(dr.brev(bits) >> 8) * 2.0**-24

@@ -26,9 +26,8 @@ from mrt_mitsuba.rendering.windows import window_means
 HALVES = 2
 TILE = 16  # pixels, under a filter
 GROUP = 4  # rays that are traced together; two groups to a pixel begin
-STEP = (
-    1.5  # times the rays there are must be there after another round: a short one costs more than it brings
-)
+# Times the rays there are must be there after another round: a short one costs more than it brings
+STEP = 1.5
 
 # Candidates for the smoothing of variances: half the width of a window, and how many rays its mean is worth
 _WINDOWS = ((1, 8), (1, 32), (2, 32), (2, math.inf), (4, math.inf), (8, math.inf))
@@ -234,33 +233,29 @@ def _smoothed(variance: np.ndarray, around: np.ndarray, rays: np.ndarray, worth:
 
 
 def _water(have: np.ndarray, shape: np.ndarray, amount: float) -> np.ndarray:
-    """Return a multiple of ``shape``, or what there is where that is more, which sums to ``amount``.
-
-    The sum is convex in the factor, so Newton's steps from above stay above.
-    """
-    factor = amount / shape.sum()
-    for _ in range(20):
-        lacking = factor * shape > have
-        more, less = shape[lacking].sum(), have.sum() - have[lacking].sum()
-        factor, last = max(amount - less, 0) / max(more, 1e-30), factor
-        if factor > 0.999 * last:
-            break
-    return np.maximum(have, factor * shape)
+    """Return a multiple of ``shape``, or what there is where that is more, which sums to ``amount``."""
+    return np.maximum(have, _factor(np.greater, shape, have, amount) * shape)
 
 
 def _quiet(have: np.ndarray, deviation: np.ndarray, share: float) -> np.ndarray:
     """Return a multiple of ``deviation``, or what there is where that is more, which leaves this share of the
-    squared error.
-
-    What is left is concave in the inverse of the factor, so Newton's steps from below stay below.
-    """
+    squared error."""
     now = np.square(deviation) / have
-    allowed = share * now.sum()
-    inverse = allowed / deviation.sum()
-    for _ in range(20):
-        lacking = inverse * deviation < now
-        less, more = deviation[lacking].sum(), now.sum() - now[lacking].sum()
-        inverse, last = max(allowed - more, 0) / max(less, 1e-30), inverse
-        if inverse < 1.001 * last:
-            break
+    inverse = _factor(np.less, deviation, now, share * now.sum())
     return np.maximum(have, deviation / max(inverse, 1e-30))
+
+
+def _factor(chosen: np.ufunc, shape: np.ndarray, given: np.ndarray, amount: float) -> float:
+    """Return the factor by which the greater, or the less, of its product with ``shape`` and what is
+    ``given`` sums to ``amount``.
+
+    By Newton's steps: the sum is convex, or concave, in the factor, and they stay on one side of the root.
+    """
+    factor = amount / shape.sum()
+    for _ in range(20):
+        scaled = chosen(factor * shape, given)
+        rest = given.sum() - given[scaled].sum()
+        factor, last = max(amount - rest, 0) / max(shape[scaled].sum(), 1e-30), factor
+        if abs(factor - last) < 1e-3 * last:
+            break
+    return float(factor)
