@@ -155,6 +155,8 @@ def test_an_instance_skips_what_has_to_load_it(registered) -> None:
     [
         ("scalar_rgb", {"type": "mrt_bsdf", "alpha": 0.3}),
         ("scalar_rgb", {"type": "diffuse"}),  # in which Mitsuba leaves ``active`` out
+        # a lobe 500 times as long as wide, of which so few samples and cells tell little
+        ("scalar_rgb", {"type": "roughconductor", "alpha_u": 0.001, "alpha_v": 0.5}),
         ("llvm_ad_mono_polarized", {"type": "mrt_bsdf", "alpha": 0.3}),
         # three coefficients of sizes far apart, and numbers that are wavelengths
         ("llvm_ad_spectral", {"type": "mrt_bsdf", "diffuse_reflectance": rgb(0.7, 0.1, 0.3)}),
@@ -166,6 +168,17 @@ def test_other_variants(variant: str, bsdf: dict[str, Any]) -> None:
     check = mrt.check_bsdf(bsdf, quick=True)
     holds(check)
     assert check.variant == variant == mi.variant()
+
+
+def test_kernels_do_not_depend_on_numbers() -> None:
+    """Of cells, samples or their places in memory: a check by another seed finds every kernel compiled."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for seed in range(3):
+            dr.kernel_history_clear()
+            mrt.check_bsdf({"type": "roughconductor"}, quick=True, seed=seed)
+            launched = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+            compiled = [k for k in launched if not k["cache_hit"] or k["cache_disk"]]
+            assert len(launched) > 200 and (seed == 0 or not compiled)
 
 
 def test_a_plugin_of_one_variant_only() -> None:

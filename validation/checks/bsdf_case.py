@@ -14,14 +14,16 @@ import numpy as np
 
 from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.law import Skip
-from mrt_mitsuba.validation.checks.probe import Array, Lanes, Probe, Samples, direction, unit
+from mrt_mitsuba.validation.checks.probe import Array, Lanes, Probe, Samples, direction, is_scalar, unit
 from mrt_mitsuba.validation.checks.recipe import Subject, row
+from mrt_mitsuba.validation.checks.sphere import DEPTH, POINTS, Cells, Integrals, encode, integrate
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
 QUICK_ANGLES = (0, 50, 85, 140)
 FIT = 5e-3  # the rational fits of Smith's G₁ in use are off by up to 0.35 %, and the densities with them
 POINTWISE = 2e-3  # relative, beyond what rounding explains
 ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32
+OVERLOOKED = 0.02  # share of samples about which quadrature may know nothing; of lobes it resolves, 0.001
 NARROW = 16 * ROUNDED  # width of a lobe that rounded directions do not resolve
 
 
@@ -34,6 +36,17 @@ class View:
     u: Array  # the random numbers of the samples [N, 3]
     samples: Samples
     density: Array  # pdf() at the samples that count: of lobes with a width, not refused; 0 elsewhere [N]
+
+    @property
+    def pilot(self) -> int:
+        """How many of the samples, the first, make the cells in which the others are judged."""
+        return len(self.density) // 4
+
+    @cached_property
+    def judged(self) -> tuple[Array, float]:
+        """Codes of the other samples that count, and their share."""
+        alive = self.density[self.pilot :] > 0
+        return encode(self.samples.wo[self.pilot :][alive]), float(alive.mean())
 
     def around(self, count: int) -> tuple[Array, Array]:
         """Return ``wi`` and ``uv`` for so many lanes."""
@@ -64,6 +77,11 @@ class Case(Subject):
             value, pdf = self.probe.both(wis, samples.wo, uvs)
             found.append(View(wi, uv, u, samples, np.where(live(wi, samples, value, pdf), pdf, 0)))
         return found
+
+    @cached_property
+    def densities(self) -> list[tuple[View, Integrals | None]]:
+        """The integrals of the density for each view, in cells that resolve it; None where none do."""
+        return [(view, _integrals(self, view)) for view in self.views]
 
     def copy(self) -> Case:
         """Return a case whose parameters can be changed, with a BSDF of its own if it can be loaded."""
@@ -131,6 +149,42 @@ class Pairs(Lanes):
     eta: Array  # index of refraction at wo over that at wi
 
 
+def _integrals(case: Case, view: View) -> Integrals | None:
+    pilot = view.samples.wo[: view.pilot][view.density[: view.pilot] > 0]
+    seeds = encode(np.concatenate([pilot, _mirrored(view.wi, case.rng)]))
+    most = max(view.pilot // 1000, 8)
+    cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
+    if len(pilot):
+        held = np.bincount(cells.find(encode(pilot)), minlength=len(cells.start))[cells.level == DEPTH]
+        # at the normal, all azimuths of the finest cells are one place
+        centre = (np.hypot(*pilot.T[:2]) < np.sqrt(2) * 0.5**DEPTH).sum()
+        if max(held[held > 4 * most].sum(), centre) > 0.01 * len(pilot):
+            return None
+
+    def pdf(wo: Array) -> Array:
+        wis, uvs = view.around(len(wo))
+        return np.maximum(case.probe.pdf(wis, wo, uvs), 0)[:, None]
+
+    codes, share = view.judged
+    found = integrate(pdf, cells, case.rng, codes, np.ones(len(codes)), len(view.density) - view.pilot)
+    return found if found.mean.sum() > share or _overlooked(view, found) < OVERLOOKED else None
+
+
+def _overlooked(view: View, found: Integrals) -> float:
+    """Return the share of samples in cells of whose points less than two are expected where the lobe is."""
+    density = view.density[view.pilot :]
+    cell = found.cells.find(view.judged[0])
+    covered = np.bincount(cell, 1 / (len(density) * density[density > 0]), minlength=len(found.cells.start))
+    fine = covered * POINTS < 2 * found.cells.solid_angle
+    return float(fine[cell].sum() / len(density))
+
+
+def _mirrored(wi: Array, rng: np.random.Generator, count: int = 600) -> Array:
+    """Return directions around the mirror direction at all scales, where unsampled lobes may be."""
+    spread = 10 ** rng.uniform(-4, 0, (count, 1)) * rng.normal(size=(count, 3))
+    return unit(wi * [-1, -1, 1] + spread)
+
+
 def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:
     """Return where samples come from lobes with a width and count for the density.
 
@@ -190,7 +244,7 @@ def parameters(case: Case) -> list[tuple[str, Any]]:
 def changed(case: Case, key: str, change: Any) -> Iterator[Any]:
     """Change a parameter for a while."""
     params = mi.traverse(case.plugin)
-    before = params[key] if isinstance(params[key], float) else type(params[key])(params[key])
+    before = copied(params[key])
     params[key] = change(before)
     params.update()
     try:
@@ -198,3 +252,8 @@ def changed(case: Case, key: str, change: Any) -> Iterator[Any]:
     finally:
         params[key] = before
         params.update()
+
+
+def copied(value: Any) -> Any:
+    """Return a parameter that no longer changes with the BSDF."""
+    return value if isinstance(value, float) else type(value)(value)

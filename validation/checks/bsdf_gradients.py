@@ -9,9 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks import snippets
-from mrt_mitsuba.validation.checks.bsdf_case import Case, Pairs, changed, parameters
+from mrt_mitsuba.validation.checks.bsdf_case import Case, Pairs, changed, copied, parameters
 from mrt_mitsuba.validation.checks.law import Law, Skip
-from mrt_mitsuba.validation.checks.probe import Array, context, interaction, is_scalar
+from mrt_mitsuba.validation.checks.probe import Array, as_mitsuba, context, interaction, is_scalar
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
 
@@ -78,11 +78,11 @@ def _lit(case: Case) -> Pairs:
 def _values(case: Case) -> Any:
     """Return values at pairs as a Dr.Jit array with derivatives, each over what it is without a change."""
     few = _lit(case)
-    wi, wo = (mi.Vector3f(np.ascontiguousarray(x.T)) for x in (few.wi, few.wo))
-    si = interaction(wi, mi.Point2f(np.ascontiguousarray(few.uv.T)))
+    wi, wo = (as_mitsuba("Vector3f", x) for x in (few.wi, few.wo))
+    si = interaction(wi, as_mitsuba("Point2f", few.uv))
     scale = np.maximum(few.value.max(axis=1), 1e-3 * few.value.max())
     value = mi.unpolarized_spectrum(case.plugin.eval(context(), si, wo))
-    total = sum(value[i] for i in range(len(value))) / mi.Float(scale.astype(np.float32))
+    total = sum(value[i] for i in range(len(value))) / as_mitsuba("Float", scale)
     return dr.select(dr.isfinite(total), total, 0)
 
 
@@ -115,11 +115,15 @@ def _differences(case: Case, key: str) -> tuple[Array, Array]:
     That is what the next larger width says otherwise, the rounding of values, and half of what the slopes to
     either side are apart: where a value has a kink, as at the end of a range, either one is a derivative.
     Where a lobe is so narrow that it moves away within every width, differences say nothing: infinity.
+    The parameter is left changed.
     """
+    params = mi.traverse(case.plugin)
+    base = copied(params[key])
 
     def at(shift: float) -> Array:
-        with changed(case, key, lambda old: _moved(old, shift)):
-            return np.array(_values(case), np.float64)
+        params[key] = _moved(base, dr.opaque(mi.Float, shift))
+        params.update()
+        return np.array(_values(case), np.float64)
 
     here = at(0.0)
     ends = np.array([(at(step), at(-step)) for step in WIDTHS])

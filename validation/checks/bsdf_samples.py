@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from scipy import stats
 
 from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, View, excess, live, narrow
 from mrt_mitsuba.validation.checks.law import LEVEL, SIGMAS, Law, Skip
-from mrt_mitsuba.validation.checks.probe import Array, context, direction, is_scalar, unit
-from mrt_mitsuba.validation.checks.sphere import DEPTH, Cells, Integrals, encode, integrate
+from mrt_mitsuba.validation.checks.probe import Array, context, direction
+from mrt_mitsuba.validation.checks.sphere import Cells, Integrals, encode, integrate
 from mrt_mitsuba.validation.tools.image_tests import sidak
 
+UNRESOLVED = "neither float32 directions nor the samples resolve the lobe"
 GRAZING = (83, 86, 88, 89.5, 94, 92, 90.5)  # degrees
 
 
 def sampling(law: Law, case: Case) -> None:
     """Samples against the density in whole cells of equal counts, over both hemispheres."""
     case.need_smooth()
-    tests, blurred = [], 0
-    for view, cells in _cells(case):
-        if cells is None:
-            blurred += 1
-        else:
-            tests.append((view, *_counted(case, view, cells)))
+    tests = [(view, *_counted(view, found)) for view, found in case.densities if found]
+    blurred = len(case.views) - len(tests)
     if not tests:
-        raise Skip("the lobe is too narrow for float32 directions to resolve")
+        raise Skip(f"{UNRESOLVED} at every angle")
     view, p, cell, _ = min(tests, key=lambda test: test[1])
     law.at_least(
         f"chance of such counts if samples follow pdf(), the least of {len(tests)} angles, for their number",
@@ -41,46 +36,16 @@ def sampling(law: Law, case: Case) -> None:
     why = "rational fits of Smith's G1 in common use are off by 0.35 %"
     law.at_most(what, share, FIT, why, case.snippet(snippets.NORMALISED, wi=view.wi, uv=view.uv))
     if blurred:
-        law.notes.append(f"{blurred} angles left out: lobe too narrow for float32 directions to resolve")
+        law.notes.append(f"{UNRESOLVED} at {blurred} angles, which are left out")
 
 
-def _counted(case: Case, view: View, cells: Cells) -> tuple[float, tuple, float]:
+def _counted(view: View, found: Integrals) -> tuple[float, tuple, float]:
     """Return p of the counts, the cell that is most off, and how far the integral is from the share."""
-    count = len(view.density) - len(view.density) // 4
-    alive = view.density[-count:] > 0
-
-    def pdf(wo: Array) -> Array:
-        wis, uvs = view.around(len(wo))
-        return np.maximum(case.probe.pdf(wis, wo, uvs), 0)[:, None]
-
-    codes = encode(view.samples.wo[-count:][alive])
-    found = integrate(pdf, cells, case.rng, codes, np.ones(len(codes)), count)
-    off = np.sqrt(alive.var() / count + found.variance.sum())
-    share = max(abs(alive.mean() - found.mean.sum()) - SIGMAS * off, 0)
-    return (*_chi_square(found, codes, count), share)
-
-
-def _cells(case: Case) -> Iterator[tuple[View, Cells | None]]:
-    """Yield cells for each view, made from a quarter of its samples; None where a lobe is too narrow."""
-    for view in case.views:
-        pilot = view.samples.wo[: len(view.density) // 4][view.density[: len(view.density) // 4] > 0]
-        seeds = encode(np.concatenate([pilot, _mirrored(view.wi, case.rng)]))
-        most = max(len(view.density) // 4 // 1000, 8)
-        cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
-        held = (
-            np.bincount(cells.find(encode(pilot)), minlength=len(cells.start)) if len(pilot) else np.zeros(1)
-        )
-        finest = held[cells.level == DEPTH] if len(pilot) else held
-        # at the normal, all azimuths of the finest cells are one place
-        centre = (np.hypot(*pilot.T[:2]) < np.sqrt(2) * 0.5**DEPTH).sum()
-        blurred = max(finest[finest > 4 * most].sum(), centre) > 0.01 * len(pilot)
-        yield view, (None if blurred else cells)
-
-
-def _mirrored(wi: Array, rng: np.random.Generator, count: int = 600) -> Array:
-    """Return directions around the mirror direction at all scales, where unsampled lobes may be."""
-    spread = 10 ** rng.uniform(-4, 0, (count, 1)) * rng.normal(size=(count, 3))
-    return unit(wi * [-1, -1, 1] + spread)
+    codes, share = view.judged
+    count = len(view.density) - view.pilot
+    off = np.sqrt(share * (1 - share) / count + found.variance.sum())
+    beyond = max(abs(share - found.mean.sum()) - SIGMAS * off, 0)
+    return (*_chi_square(found, codes, count), beyond)
 
 
 def _chi_square(found: Integrals, codes: Array, count: int) -> tuple[float, tuple]:
@@ -161,8 +126,8 @@ def _discrete(law: Law, case: Case) -> None:
 def energy(law: Law, case: Case) -> None:
     """Albedo by sampling and by quadrature, in the mode in which transmitted energy is not rescaled."""
     brightest, apart = _grazing(case), []
-    for view, cells in _cells(case):
-        albedo, off = _albedo(case, view, cells)
+    for view, density in case.densities:
+        albedo, off = _albedo(case, view, density.cells if density else None)
         brightest.append((albedo, view.wi, view.uv))
         if off is not None:
             apart.append((off, view))

@@ -149,17 +149,32 @@ def lanes(call: Callable[..., list[Any]], *columns: tuple[str, Array]) -> list[A
             for i in range(count)
         ]
         return [np.array([np.ravel(value) for value in values]) for values in zip(*rows, strict=True)]
-    arrays = (getattr(mi, k)(np.ascontiguousarray(column.T, np.float32)) for k, column in columns)
     with dr.suspend_grad():
-        found = call(mi, *arrays)
+        found = call(mi, *(as_mitsuba(kind, column) for kind, column in columns))
         dr.eval(found)
     return [_rows(value, count) for value in found]
 
 
+def as_mitsuba(kind: str, column: Array) -> Any:
+    """Return a column [N] or [N, k] as an array of the current variant, of a type of Mitsuba's.
+
+    Dr.Jit compiles a kernel for every number of rows of a matrix, and for every alignment of memory.
+    """
+    return getattr(mi, kind)(*(mi.Float(_aligned(row)) for row in np.atleast_2d(column.T)))
+
+
+def _aligned(row: Array) -> Array:
+    """Return a copy in float32 that begins at a multiple of 64 bytes."""
+    room = np.empty(len(row) + 16, np.float32)
+    start = -room.ctypes.data % 64 // 4
+    room[start : start + len(row)] = row
+    return room[start : start + len(row)]
+
+
 def _rows(value: Any, count: int) -> Array:
     """Return a Dr.Jit array as [N, k]."""
-    found = np.atleast_2d(np.array(value)).T
-    return np.broadcast_to(found, (count, found.shape[-1]))
+    components = [value] if dr.depth_v(value) == 1 else value
+    return np.stack([np.broadcast_to(np.array(component), count) for component in components], axis=-1)
 
 
 def unit(v: Array) -> Array:

@@ -16,6 +16,8 @@ from mrt_mitsuba.validation.checks.probe import Lanes
 
 Array = np.ndarray
 DEPTH = 17  # the finest cell is a hundred times what float32 rounding moves a direction by
+SIDE = 6
+POINTS = SIDE**2  # at which a cell is integrated
 HEMISPHERE = 4**DEPTH  # codes of each
 _MASKS = (
     (16, 0x0000FFFF0000FFFF),
@@ -90,6 +92,12 @@ class Cells(Lanes):
         wo = np.stack([sin * np.cos(phi), sin * np.sin(phi), z], axis=-1).astype(np.float32)
         return wo, 4 * np.pi * r * (width / side) ** 2
 
+    @property
+    def solid_angle(self) -> Array:
+        r, _ = _corner(self.start % HEMISPHERE)
+        width = 0.5**self.level
+        return 2 * np.pi * width * ((r + width) ** 2 - r**2)
+
     def bounds(self, index: int) -> tuple[float, float, float, float, int]:
         """Return r and φ from … to, and the sign of z, of one cell."""
         cell = self.only(np.array([index]))
@@ -154,9 +162,9 @@ def integrate(
 
 
 def _estimate(
-    function: Callable[[Array], Array], cells: Cells, rng: np.random.Generator, side: int = 6
+    function: Callable[[Array], Array], cells: Cells, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    wo, omega = cells.points(side, rng)
+    wo, omega = cells.points(SIDE, rng)
     values = function(wo.reshape(-1, 3))
-    values = np.where(np.isfinite(values), values, 0).reshape(*omega.shape, -1) * omega[..., None] * side**2
-    return values.mean(axis=1), values.var(axis=1) / (side**2 - 1)
+    values = np.where(np.isfinite(values), values, 0).reshape(*omega.shape, -1) * omega[..., None] * POINTS
+    return values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
