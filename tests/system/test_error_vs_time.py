@@ -106,6 +106,9 @@ def test_references_of_other_kinds(variant, tmp_path):
     assert found.points["aa=2"].rmse == pytest.approx(error, rel=1e-5)
     assert found.points["aa=2"].rmse_interval == pytest.approx((error, error), rel=1e-5)  # nothing is random
     assert np.isnan(found.points["aa=2"].efficiency)
+    alone = mrt.error_vs_time(scene, {"aa=2": {"aa": 2}}, reference={"aa": 8}, repeats=1, shared=lattice)
+    third = mrt.render(scene, aa=7, **lattice)  # nothing is random
+    assert alone.reference_error == pytest.approx(mrt.compare(third, best).rmse, rel=1e-5)
     best.save(tmp_path / "best.exr")
     again = mrt.error_vs_time(
         scene, {"aa=2": {"aa": 2}}, reference=tmp_path / "best.exr", repeats=1, shared=lattice

@@ -73,7 +73,7 @@ def far(law: Law, case: Case) -> None:
         f"share of rays from afar that miss what is met from nearby, or meet it {HIT_ROUNDINGS} roundings off"
     )
     why = "the origin is rounded, and some dozen operations with it; next to edges, more hangs on them"
-    law.share(what, bad, 2e-3, why, case.at(origin, d, snippets.TWICE, other=closer))
+    law.share(what, bad, 1e-3, why, case.at(origin, d, snippets.TWICE, other=closer))
 
 
 def finite(law: Law, case: Case) -> None:

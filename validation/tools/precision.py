@@ -178,7 +178,8 @@ class Findings:
         width = max(map(len, [*self.points, *self.failed]), default=0)
         lines = [f"{p.name:<{width}}  {p.time} s, RMSE {p.error}" for p in self.points.values()]
         lines += [f"{name:<{width}}  FAILED {why}" for name, why in self.failed.items()]
-        return "\n".join([*lines, f"the reference's own error: {self.reference_error:.2g}", *self.verdicts])
+        own = f"{self.reference_error:.2g}" if self.reference_error else "not known"
+        return "\n".join([*lines, f"the reference's own error: {own}", *self.verdicts])
 
 
 def _crossing(points: Sequence[Point], error: float, index: np.ndarray) -> np.ndarray:

@@ -72,9 +72,9 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
 def _reference(found: Findings, truth: str) -> str:
     named = f"Reference: {truth}. " if truth else ""
     if found.reference_error == 0:
-        return f"{named}No error of it is known: it was rendered twice with the same result, or given."
+        return f"{named}The error of the reference itself is not known: every RMSE has it in it."
     own = f"{found.reference_error:.2g}"
-    return f"{named}Its own RMSE is about {own}; no claim is made about errors below twice that."
+    return f"{named}The RMSE of the reference itself is about {own}; no claim is made below twice that."
 
 
 def _reached(time: Estimate) -> str:

@@ -57,9 +57,10 @@ def error_vs_time(
         cases: options of ``render`` by a name; names that differ in numbers only make one curve. A case may
             bring a ``scene`` of its own, of the same size.
         reference: options that give the truth. Where something is random, it is rendered as two halves of
-            its ``spp``, with other seeds, and their difference is its own error. Two sets of options, the
-            better first: where nothing is random, what they differ by bounds the error of the first. Or a
-            picture: an array, the path of an EXR or a ``Result``, whose error is read from its layer "error".
+            its ``spp``, with other seeds, and their difference is its own error; elsewhere a render with
+            ``aa`` less by one is compared. Two sets of options, the better first: what they differ by bounds
+            the error of the first. Or a picture: an array, the path of an EXR or a ``Result``, whose error is
+            read from its layer "error".
         repeats: with other seeds, in turn, after a cold and a warm run of each case.
         shared: options of all cases and of the reference.
         errors: RMSEs to give the time for; by default round ones in the range that was measured.
@@ -133,7 +134,11 @@ class _Truth:
     def of(cls, reference: Any, runner: _Runner) -> _Truth:
         if isinstance(reference, Mapping):
             spp = {"spp": int(reference["spp"]) // 2} if reference.get("spp", 1) > 1 else {}
-            first, second = (_picture(runner({**reference, **spp}, seed)) for seed in REFERENCE_SEEDS)
+            results = [runner({**reference, **spp}, seed) for seed in REFERENCE_SEEDS]
+            first, second = map(_picture, results)
+            if (first == second).all() and (aa := results[0].plan.lattice.aa) > 1:
+                coarser = _picture(runner({**reference, "aa": aa - 1}, REFERENCE_SEEDS[0]))
+                return cls((first, first), _rms(first - coarser))
             return cls((first, second), _rms(first - second) / 2)
         if isinstance(reference, Sequence) and not isinstance(reference, str):
             first, second = (_picture(runner(r, s)) for r, s in zip(reference, REFERENCE_SEEDS, strict=True))
