@@ -25,6 +25,10 @@ Path = str | os.PathLike[str]
 # For zlib to look for runs only: as fast as its level 1, and 161 kB for scene 3 in place of 206
 PNG_RUNS = 3
 
+# Smaller pictures are not compressed, which would take several times as long as all other writing, to save
+# less than half of the bytes: the last digits of colours are noise
+COMPRESSED = 2**20  # pixels
+
 _PIXELS = 2**14  # converted to 8 bit at a time, so that intermediate arrays stay in the processor's cache
 
 
@@ -87,26 +91,31 @@ def write_exr(
 
 def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
     from PIL import Image as PilImage
-    from PIL import PngImagePlugin
 
     height, width = image.shape[:2]
     picture = PilImage.new("RGB", (width, height))
     for row, block in _blocks(image, tonemap):
         picture.paste(PilImage.fromarray(block), (0, row))
-    # as picture.save does, which would import four formats more
-    picture.encoderinfo, picture.encoderconfig = {"compress_type": PNG_RUNS}, ()
-    PilImage.SAVE[PngImagePlugin.PngImageFile.format](picture, file, "")
+    picture.save(file, format="PNG", compress_type=PNG_RUNS)
 
 
 def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Mapping[str, Any]) -> None:
     import OpenEXR
 
     attributes = {name: _attribute(value) for name, value in header.items()}
-    attributes |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    kind = compression(image.shape[0] * image.shape[1])
+    attributes |= {"compression": kind, "type": OpenEXR.scanlineimage}
     # The library does not report a full disk when it opens the file itself, so the file is ours.
     picture = OpenEXR.File(attributes, _channels(image, layers))
-    with compressing():
+    with contextlib.nullcontext() if kind == OpenEXR.NO_COMPRESSION else compressing():
         picture.write(_Stream(file))
+
+
+def compression(pixels: int) -> Any:
+    """Return how an EXR of so many pixels is compressed, as the library names it."""
+    import OpenEXR
+
+    return OpenEXR.ZIP_COMPRESSION if pixels >= COMPRESSED else OpenEXR.NO_COMPRESSION
 
 
 @contextlib.contextmanager

@@ -137,7 +137,11 @@ def _header(mosaic: Mosaic, tile: Mapping[str, Any]) -> dict[str, Any]:
     """Return the header that the picture would have in one piece, given that of a tile."""
     import OpenEXR
 
+    from mrt_mitsuba.output.files import compression
+
     header: dict[str, Any] = OpenEXR.Header(mosaic.width, mosaic.height)
+    kind = compression(mosaic.width * mosaic.height)
+    header["compression"] = type(header["compression"])(int(kind))  # an older type of the library
     header |= {name: value for name, value in tile.items() if name not in header and name != "type"}
     options = json.loads(tile["mrt:options"])
     options.pop("region", None)

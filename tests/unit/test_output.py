@@ -328,3 +328,18 @@ def test_matrices_of_the_header_lead_from_rays_to_the_picture(variant: str, name
         x, y, _, w = point @ header["mrt:worldToNDC"]
         np.testing.assert_allclose((x / w, y / w), place, atol=1e-5)  # float32
         assert (point @ header["mrt:worldToCamera"])[2] < 0
+
+
+def test_only_large_pictures_are_compressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the same pixels: compression takes longer than all other writing."""
+    import OpenEXR
+
+    image = np.random.default_rng(0).random((60, 80, 3), np.float32).round(1)
+    output.save(tmp_path / "small.exr", image)
+    monkeypatch.setattr(output, "COMPRESSED", 60 * 80)
+    output.save(tmp_path / "large.exr", image)
+    sizes = [(tmp_path / name).stat().st_size for name in ("small.exr", "large.exr")]
+    assert sizes[0] > image.nbytes > 2 * sizes[1]
+    assert OpenEXR.File(str(tmp_path / "large.exr")).header()["compression"] == OpenEXR.ZIP_COMPRESSION
+    for name in ("small.exr", "large.exr"):
+        np.testing.assert_array_equal(output.read_exr(tmp_path / name).image, image)
