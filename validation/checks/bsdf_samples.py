@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
 
 from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, View, excess, live, narrow
 from mrt_mitsuba.validation.checks.law import LEVEL, SIGMAS, Law, Skip
 from mrt_mitsuba.validation.checks.probe import Array, context, direction
-from mrt_mitsuba.validation.checks.sphere import Cells, Integrals, encode, integrate
+from mrt_mitsuba.validation.checks.sphere import Cells, Integrals, chi_square, encode, integrate
 from mrt_mitsuba.validation.tools.image_tests import sidak
 
 UNRESOLVED = "neither float32 directions nor the samples resolve the lobe"
@@ -45,20 +44,7 @@ def _counted(view: View, found: Integrals) -> tuple[float, tuple, float]:
     count = len(view.density) - view.pilot
     off = np.sqrt(share * (1 - share) / count + found.variance.sum())
     beyond = max(abs(share - found.mean.sum()) - SIGMAS * off, 0)
-    return (*_chi_square(found, codes, count), beyond)
-
-
-def _chi_square(found: Integrals, codes: Array, count: int) -> tuple[float, tuple]:
-    """Return p of the counts, in groups of cells that expect 25 or more, and the cell that is most off."""
-    seen = np.bincount(found.cells.find(codes), minlength=len(found.cells.start))
-    expected, variance = count * found.mean[:, 0], count**2 * found.variance[:, 0]
-    group = np.floor(np.cumsum(expected) / 25).astype(int)
-    group = np.minimum(group, max(group[-1] - 1, 0))
-    seen_in, expected_in, variance_in = (np.bincount(group, x) for x in (seen, expected, variance))
-    used = (seen_in > 0) | (expected_in > 1e-6)
-    pull = (seen_in - expected_in)[used] ** 2 / np.maximum(expected_in + variance_in, 1e-6)[used]
-    cell = int(np.argmax(np.abs(seen - expected) / np.sqrt(expected + variance + 1)))
-    return float(stats.chi2.sf(pull.sum(), max(len(pull), 1))), found.cells.bounds(cell)
+    return (*chi_square(found, codes, count), beyond)
 
 
 def weights(law: Law, case: Case) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from mrt_mitsuba.validation.checks.probe import Lanes
 
@@ -168,3 +169,16 @@ def _estimate(
     values = function(wo.reshape(-1, 3))
     values = np.where(np.isfinite(values), values, 0).reshape(*omega.shape, -1) * omega[..., None] * POINTS
     return values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
+
+
+def chi_square(found: Integrals, codes: Array, count: int) -> tuple[float, tuple]:
+    """Return p of the counts, in groups of cells that expect 25 or more, and the cell that is most off."""
+    seen = np.bincount(found.cells.find(codes), minlength=len(found.cells.start))
+    expected, variance = count * found.mean[:, 0], count**2 * found.variance[:, 0]
+    group = np.floor(np.cumsum(expected) / 25).astype(int)
+    group = np.minimum(group, max(group[-1] - 1, 0))
+    seen_in, expected_in, variance_in = (np.bincount(group, x) for x in (seen, expected, variance))
+    used = (seen_in > 0) | (expected_in > 1e-6)
+    pull = (seen_in - expected_in)[used] ** 2 / np.maximum(expected_in + variance_in, 1e-6)[used]
+    cell = int(np.argmax(np.abs(seen - expected) / np.sqrt(expected + variance + 1)))
+    return float(stats.chi2.sf(pull.sum(), max(len(pull), 1))), found.cells.bounds(cell)
