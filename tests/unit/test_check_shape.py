@@ -115,6 +115,11 @@ def facing(si: Any, ray: Any) -> Any:
     return si
 
 
+def nan_along_z(si: Any, ray: Any) -> Any:
+    si.t = dr.select((ray.d.x == 0) & (ray.d.y == 0), dr.nan, si.t)
+    return si
+
+
 def from_outside(si: Any, ray: Any) -> Any:
     si.t = dr.select(dr.dot(si.n, ray.d) > 0, dr.inf, si.t)
     return si
@@ -136,10 +141,16 @@ MISTAKES: dict[str, tuple[dict[str, Callable[..., Any]], set[str]]] = {
     ),
     "wrong derivative": ({"hit": changed(dp_du=lambda si: 1.5 * si.dp_du)}, {"normals"}),
     "normal towards the ray": ({"hit": facing}, {"normals"}),
-    "met from outside only": ({"hit": from_outside}, {"watertight"}),
-    "a fixed least distance": ({"hit": not_near}, {"surface", "watertight"}),
+    # of which ray_test knows nothing
+    "met from outside only": ({"hit": from_outside}, {"hits", "watertight"}),
+    "a fixed least distance": ({"hit": not_near}, {"hits", "surface", "watertight"}),
     "a box that is too small": ({"bbox": half}, {"bbox"}),
     "ray_test unlike ray_intersect": ({"test": lambda found, ray: found & (ray.d.x < 0.7)}, {"hits"}),
+    "ray_test blind from near by": (
+        {"test": lambda found, ray: found & (dr.max(abs(ray.o)) > 1.5)},
+        {"hits"},
+    ),
+    "NaN for a distance along an axis": ({"hit": nan_along_z}, {"finite"}),
     "maxt ignored": ({"hit": deaf_to_its_limit, "test": lambda found, ray: found | (ray.maxt < 0)}, {"hits"}),
     "hit point below the surface": ({"hit": changed(p=lambda si: si.p - 2e-3 * si.n)}, {"surface"}),
     "NaN along an axis": (

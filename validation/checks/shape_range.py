@@ -105,4 +105,5 @@ def finite(law: Law, case: Case) -> None:
     bad = found.found & ~(
         np.isfinite(numbers).all(axis=1) & np.isfinite(partials).all(axis=1) & (found.t >= 0)
     )
+    bad |= np.isnan(found.t)  # a miss is infinitely far
     law.none("hits with numbers that are not finite", bad, "one NaN spoils a picture", case.at(o, d))

@@ -16,6 +16,7 @@ from mrt_mitsuba.validation.checks.shape_case import (
     FLAT,
     HIT_ROUNDINGS,
     Case,
+    Hits,
     corners,
     leave,
     near,
@@ -27,35 +28,38 @@ NORMAL = 1e-5  # a few roundings of a square root and a quotient
 
 
 def hits(law: Law, case: Case) -> None:
-    """``ray_test``, ``ray_intersect_preliminary`` and ``ray_intersect`` agree, and heed ``maxt``."""
-    o, d, seen = case.seen
+    """``ray_test`` and ``ray_intersect`` agree, and heed ``maxt``, from outside and from the surface."""
+    _agree(law, case, *case.seen, "without a limit", None)
+    o, d, met = case.met
+    before, behind = ((met.t * factor).astype(np.float32) for factor in (1 - 1e-3, 1 + 1e-3))
+    _agree(law, case, o, d, met, "up to just before the hit", before, met=False)
+    _agree(law, case, o, d, met, "up to just behind the hit", behind)
+    away = case.units(len(met.t))
+    start = leave(met.p, met.n, away)
+    _agree(law, case, start, away, trace(case.target, start, away), "that leave the surface", None)
+
+
+def _agree(
+    law: Law, case: Case, o: Array, d: Array, seen: Hits, what: str, maxt: Array | None, *, met: bool = True
+) -> None:
+    """Hold both ways to ask for a hit to what ``ray_intersect`` met without a limit, or to nothing."""
+    limit = np.full(len(o), np.inf, np.float32) if maxt is None else maxt
+
+    def call(mi: Any, origin: Any, direction: Any, most: Any) -> list[Any]:
+        ray = mi.Ray3f(origin, direction)
+        if maxt is not None:
+            ray.maxt = most
+        return [case.target.ray_test(ray), case.target.ray_intersect(ray).is_valid()]
+
+    found = lanes(call, ("Point3f", o), ("Vector3f", d), ("Float", limit))
     steep = ~seen.found | (np.abs((seen.n * d).sum(axis=1)) > FLAT)
-    t = np.where(seen.found, seen.t, 1)
-
-    def tested(maxt: Array | None) -> Array:
-        def call(mi: Any, origin: Any, direction: Any, limit: Any) -> list[Any]:
-            ray = mi.Ray3f(origin, direction)
-            if maxt is not None:
-                ray.maxt = limit
-            return [case.target.ray_test(ray), case.target.ray_intersect(ray).is_valid()]
-
-        limit = t if maxt is None else maxt
-        return np.array(
-            [x[:, 0] for x in lanes(call, ("Point3f", o), ("Vector3f", d), ("Float", limit))], bool
-        )
-
-    for what, maxt, expected in (
-        ("without a limit", None, seen.found),
-        ("up to just before the hit", (t * (1 - 1e-3)).astype(np.float32), np.zeros(len(o), bool)),
-        ("up to just behind the hit", (t * (1 + 1e-3)).astype(np.float32), seen.found),
-    ):
-        counts = steep & seen.found if maxt is not None else steep
-        limit = np.full(len(o), np.inf, np.float32) if maxt is None else maxt
+    for name, answer in zip(("ray_test()", "ray_intersect()"), found, strict=True):
+        wrong = steep & (answer[:, 0].astype(bool) != (seen.found & met))
+        why = "one question, one answer; rays that graze are left out, but for those that just miss"
         show = case.at(o, d, snippets.MAXT, maxt=limit)
-        for name, found in zip(("ray_test()", "ray_intersect()"), tested(maxt), strict=True):
-            title = f"share of rays on which {name} is wrong {what}"
-            why = "one question, one answer; rays that graze are left out, but for those that just miss"
-            law.share(title, counts & (found != expected), 5e-4 if maxt is None else 0, why, show)
+        law.share(
+            f"share of rays {what} on which {name} is wrong", wrong, 5e-4 if maxt is None else 0, why, show
+        )
 
 
 def surface(law: Law, case: Case) -> None:
