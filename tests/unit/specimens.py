@@ -26,6 +26,7 @@ MISTAKES = {
 
 
 DIFFUSE, GLASS, MIRROR = {"type": "diffuse"}, {"type": "dielectric"}, {"type": "conductor"}
+GLOSS = {"type": "roughconductor"}
 GLOSSY, DELTA = (+flag for flag in (mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DeltaReflection))
 
 
@@ -82,6 +83,7 @@ def _nan_at_the_end(bs, weight, u, ctx):
 CHANGES = {
     "no eta^2 in single directions": (GLASS, "sample", _weight(_unscaled), {"reciprocity"}),
     "eta inverted": (GLASS, "sample", _member("eta", lambda eta: 1 / eta), {"reciprocity"}),
+    "eta of 0": (GLOSS, "sample", _member("eta", lambda eta: 0 * eta), {"reciprocity"}),
     "directions not of length 1": (MIRROR, "sample", _member("wo", lambda wo: 1.01 * wo), {"finite"}),
     "mirror turned": (MIRROR, "sample", _member("wo", _turned), {"reciprocity"}),
     "mirror called glossy": (
@@ -93,7 +95,7 @@ CHANGES = {
     "next component": (DIFFUSE, "sample", _member("sampled_component", lambda i: i + 1), {"components"}),
     "NaN at the end of random numbers": (DIFFUSE, "sample", _weight(_nan_at_the_end), {"finite"}),
     "albedo 1.02 near the horizon": (DIFFUSE, "value", _brighter, {"energy"}),
-    "stairs": ({"type": "roughconductor"}, "value", _stairs, {"roundoff"}),
+    "stairs": (GLOSS, "value", _stairs, {"roundoff"}),
     "derivatives that are NaN": ({"type": "specimen"}, "value", _steep, {"gradients"}),
     "other values in scalar variants": (DIFFUSE, "value", _other_in_scalar, {"variants"}),
     "active ignored": (DIFFUSE, "active", None, {"eval_pdf"}),

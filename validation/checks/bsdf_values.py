@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks import noise, snippets
-from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, changed, excess, parameters
+from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, ROUNDED, Case, changed, excess, parameters
 from mrt_mitsuba.validation.checks.law import Law, Skip
 from mrt_mitsuba.validation.checks.probe import Array, direction, is_scalar, unit
 
@@ -43,6 +44,7 @@ def reciprocity(law: Law, case: Case) -> None:
     if case.smooth:
         _smooth_either_way(law, case)
     _delta_either_way(law, case)
+    _reflected(law, case)
     if not law.parts:
         raise Skip("no light was followed either way")
 
@@ -65,6 +67,21 @@ def _smooth_either_way(law: Law, case: Case) -> None:
         EITHER_WAY,
         case.at(snippets.RECIPROCITY, few, eta=few.eta),
     )
+
+
+def _reflected(law: Law, case: Case) -> None:
+    """Light that is reflected stays in its medium: integrators multiply by ``eta`` as they go."""
+    found = []
+    for view in case.views:
+        s = view.samples
+        drawn = ((s.type & int(mi.BSDFFlags.Reflection)) != 0) & (s.weight != 0).any(axis=1)
+        off = np.where(drawn, np.nan_to_num(np.abs(s.eta - 1), nan=np.inf), 0)
+        if drawn.any():
+            found.append((float(off.max()), view, int(off.argmax())))
+    if found:
+        worst, view, i = max(found, key=lambda f: f[0])
+        show = case.snippet(snippets.WEIGHT, wi=view.wi, uv=view.uv, u=view.u[i])
+        law.at_most("index of refraction of reflected samples, less 1", worst, ROUNDED, "one medium", show)
 
 
 def _delta_either_way(law: Law, case: Case) -> None:

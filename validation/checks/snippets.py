@@ -69,7 +69,7 @@ print("integral of pdf() by uniform directions:", dr.mean(bsdf.pdf(ctx, si, wo))
 """
 WEIGHT = """point sample
 pdf = bsdf.pdf(ctx, si, bs.wo)
-print("a sample of density", bs.pdf, "and weight", weight)
+print("a sample of density", bs.pdf, "weight", weight, "and index of refraction", bs.eta)
 print("there, pdf():", pdf, "eval() / pdf():", bsdf.eval(ctx, si, bs.wo) / pdf)
 """
 DISCRETE = """point draw
