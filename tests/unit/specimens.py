@@ -98,6 +98,7 @@ CHANGES = {
     "stairs": (GLOSS, "value", _stairs, {"roundoff"}),
     "derivatives that are NaN": ({"type": "specimen"}, "value", _steep, {"gradients"}),
     "other values in scalar variants": (DIFFUSE, "value", _other_in_scalar, {"variants"}),
+    "black back": (DIFFUSE, "flags", +mi.BSDFFlags.BackSide, {"components"}),
     "active ignored": (DIFFUSE, "active", None, {"eval_pdf"}),
     "density below the horizon": (DIFFUSE, "pdf", _below, {"sampling"}),
 }
@@ -111,8 +112,11 @@ def register() -> None:
             mi.BSDF.__init__(self, props)
             self.nested, name = props["nested"], props["change"]
             self.kind, self.change = CHANGES[name][1:3] if name else ("", None)
-            self.m_components = [int(self.nested.flags(i)) for i in range(self.nested.component_count())]
-            self.m_flags = int(self.nested.flags())
+            more = self.change if self.kind == "flags" else 0
+            self.m_components = [
+                int(self.nested.flags(i)) | more for i in range(self.nested.component_count())
+            ]
+            self.m_flags = int(self.nested.flags()) | more
 
         def traverse(self, callback):
             callback.put("nested", self.nested, mi.ParamFlags.Differentiable)

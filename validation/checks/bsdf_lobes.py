@@ -10,7 +10,8 @@ import numpy as np
 from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.bsdf_case import Case, excess, parameters
 from mrt_mitsuba.validation.checks.law import Law
-from mrt_mitsuba.validation.checks.probe import Array, context, direction
+from mrt_mitsuba.validation.checks.probe import Array, Samples, context, direction
+from mrt_mitsuba.validation.checks.recipe import row
 
 
 def components(law: Law, case: Case) -> None:
@@ -30,7 +31,8 @@ def components(law: Law, case: Case) -> None:
     law.most(what, error, 1e-4, "a sum", case.at(snippets.PARTS, pairs))
     why = "reflection stays on its side, transmission crosses, lobes of one direction have no value"
     sides = [_wrong_side(case, i, flag, parts[i]) for i, flag in enumerate(flags)]
-    samples = [_wrong_samples(case, i, flag) for i, flag in enumerate(flags)]
+    drawn = [_drawn(case, i) for i in range(count)]
+    samples = [_wrong_samples(i, flag, *drawn[i]) for i, flag in enumerate(flags)]
     for kind, faults, body in (
         ("eval()", sides, snippets.SIDE),
         ("sample()", samples, snippets.COMPONENT_SAMPLE),
@@ -38,6 +40,9 @@ def components(law: Law, case: Case) -> None:
         total, shown = sum(count for count, _ in faults), max(faults, key=lambda fault: fault[0])[1]
         what = f"results of {kind} that contradict the component's flags"
         law.at_most(what, total, 0, why, case.snippet(body, **shown))
+    dark = sum(_dark_sides(case, flag, parts[i], *drawn[i]) for i, flag in enumerate(flags))
+    what = "sides that a component's flags name, and from which it is black"
+    law.at_most(what, dark, 0, "a flag without a lobe", case.snippet(snippets.FLAGS))
 
 
 def _updated(law: Law, case: Case, count: int) -> None:
@@ -79,15 +84,30 @@ def _allowed(flags: int, wi: Array, wo: Array, *, smooth: bool) -> Array:
     return np.where(wi[:, 2] * wo[:, 2] > 0, same, other) & np.where(wi[:, 2] > 0, front, back)
 
 
-def _wrong_samples(case: Case, component: int, flags: int) -> tuple[int, dict[str, Any]]:
-    """Count samples of one component that go by another name, kind or side."""
+def _drawn(case: Case, component: int) -> tuple[dict[str, Array], Samples]:
+    """Return where samples of one component were asked for, and what came."""
     count = case.count(2**12, 2**14)
     wi = direction(case.rng.uniform(-1, 1, count), case.rng.uniform(0, 2 * np.pi, count))
     u, uv = case.uniform(count), case.rng.random((count, 2), np.float32)
-    s = case.probe.sample(wi, u, uv, context(component))
-    lit = (s.weight != 0).any(axis=1) & np.isfinite(s.weight).all(axis=1)
-    bad = lit & ((s.component != component) | ((s.type & ~flags) != 0) | (s.type == 0))
+    return {"wi": wi, "uv": uv, "u": u}, case.probe.sample(wi, u, uv, context(component))
+
+
+def _lit(s: Samples) -> Array:
+    return (s.weight != 0).any(axis=1) & np.isfinite(s.weight).all(axis=1)
+
+
+def _wrong_samples(
+    component: int, flags: int, given: dict[str, Array], s: Samples
+) -> tuple[int, dict[str, Any]]:
+    """Count samples of one component that go by another name, kind or side."""
+    bad = (s.component != component) | ((s.type & ~flags) != 0) | (s.type == 0)
     clear = np.abs(s.wo[:, 2]) > 1e-6
-    bad |= lit & clear & ~_allowed(flags, wi, s.wo, smooth=False)
-    i = int(bad.argmax())
-    return int(bad.sum()), {"component": component, "wi": wi[i], "uv": uv[i], "u": u[i], "wo": s.wo[i]}
+    bad = _lit(s) & (bad | clear & ~_allowed(flags, given["wi"], s.wo, smooth=False))
+    return int(bad.sum()), {"component": component, **row({**given, "wo": s.wo}, int(bad.argmax()))}
+
+
+def _dark_sides(case: Case, flags: int, value: Array, given: dict[str, Array], s: Samples) -> int:
+    """Count the sides that flags name and where there is no light, of a component that has some."""
+    wi = np.concatenate([case.pairs.wi[(value != 0).any(axis=1)], given["wi"][_lit(s)]])
+    sides = (mi.BSDFFlags.FrontSide, (wi[:, 2] > 0).any()), (mi.BSDFFlags.BackSide, (wi[:, 2] < 0).any())
+    return sum(bool(flags & int(flag)) and len(wi) > 0 and not lit for flag, lit in sides)
