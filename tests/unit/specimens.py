@@ -20,6 +20,7 @@ MISTAKES = {
     "NaN at roughness 0": {"finite"},
     "eval_pdf unlike eval": {"eval_pdf"},
     "detached gradient": {"gradients"},
+    "update ignored": {"gradients"},
     "wrong hemisphere flag": {"components"},
     "cancelling half vector": {"roundoff"},
 }
@@ -148,6 +149,7 @@ def register() -> None:
             mi.BSDF.__init__(self, props)
             self.mistake = props.get("mistake", "")
             self.alpha = updatable(props.get("alpha", 0.2))
+            self.derived = 1 * self.alpha
             self.kd, self.ks = (1.05, 0.0) if self.mistake == "albedo 1.05" else (0.4, 0.4)
             f = mi.BSDFFlags
             wrong = self.mistake == "wrong hemisphere flag"
@@ -162,7 +164,8 @@ def register() -> None:
             pass
 
         def roughness(self):
-            alpha = self.alpha if is_jit() else first(self.alpha)
+            alpha = self.derived if self.mistake == "update ignored" else self.alpha
+            alpha = alpha if is_jit() else first(alpha)
             return alpha if self.mistake == "NaN at roughness 0" else dr.maximum(alpha, 1e-4)
 
         def lobes(self, ctx, wi, wo, active):

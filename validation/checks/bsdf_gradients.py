@@ -9,9 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks import snippets
-from mrt_mitsuba.validation.checks.bsdf_case import Case, Pairs, changed, copied, parameters
+from mrt_mitsuba.validation.checks.bsdf_case import Case, Pairs, changed, copied, excess, parameters
 from mrt_mitsuba.validation.checks.law import Law, Skip
-from mrt_mitsuba.validation.checks.probe import Array, as_mitsuba, context, interaction, is_scalar
+from mrt_mitsuba.validation.checks.probe import Array, Probe, as_mitsuba, context, interaction, is_scalar
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
 
@@ -42,6 +42,7 @@ def _holds(law: Law, case: Case, key: str) -> bool:
         slope, error = _differences(case, key)
     if not attached and not slope.any():
         law.notes.append(f"{key} changes no value")
+        _reached(law, case, key)
     off, few = np.abs(found - slope), _lit(case)
     known = np.isfinite(error)
     if known.sum() < 20:
@@ -60,6 +61,23 @@ def _holds(law: Law, case: Case, key: str) -> bool:
     why = "one of them spoils a whole gradient"
     law.none(f"derivatives by {key} that are not finite, of finite values", broken, why, show)
     return attached or measured <= GRADIENT
+
+
+def _reached(law: Law, case: Case, key: str) -> None:
+    """A parameter whose updates change no value should change none where it is loaded, either."""
+    name, few = key.removesuffix(".value"), _lit(case)
+    number = float(np.mean(np.array(mi.traverse(case.plugin)[key])))
+    if case.recipe.description is None or "." in name:
+        return
+    try:
+        other = Probe(case.recipe.with_(**{name: 0.8 * number or 0.5}).load())
+    except RuntimeError:  # what is loaded goes by another name, or takes other numbers
+        return
+    allowed = case.spread(case.probe.eval, few.wi, few.wo, few.uv)
+    error = excess(other.eval(few.wi, few.wo, few.uv), few.value, allowed)
+    what = f"values that loading with another {key} changes, but params.update() does not, relative"
+    why = "parameters_changed() has to compute anew what is made of parameters"
+    law.most(what, error, GRADIENT, why, case.at(snippets.GRADIENT, few, key=key))
 
 
 def _inside(value: Any) -> Any:
