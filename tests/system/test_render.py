@@ -278,7 +278,7 @@ def test_other_variants_show_the_same_scene(other_variant):
         ({"aamode": "noise", "lattice": "film", "spp": 16}, {"edges"}),
         ({"integrator": "direct"}, {"error", "variance", "direct", "reflection", "bounces"}),
     ],
-    ids=str,
+    ids=lambda x: ",".join(sorted(x)),
 )
 def test_all_layers_are_those_that_can_be_made(options, missing):
     result = mrt.render(3, width=16, height=12, layers="all", **options)

@@ -179,7 +179,7 @@ TURNS: list[tuple[dict[str, Any], dict[str, Any], set[str]]] = [
 DATA = {"scene", "region", "repeats", "motion_samples", "parts", "left_out"}
 
 
-@pytest.mark.parametrize(("nodes", "options", "turned"), TURNS, ids=lambda x: ",".join(x))
+@pytest.mark.parametrize(("nodes", "options", "turned"), TURNS, ids=lambda x: ",".join(sorted(x)))
 def test_what_turns_the_plan_turns_kernels(
     nodes: dict[str, Any], options: dict[str, Any], turned: set[str]
 ) -> None:
