@@ -66,18 +66,19 @@ def _holds(law: Law, case: Case, key: str) -> bool:
 def _reached(law: Law, case: Case, key: str) -> None:
     """A parameter whose updates change no value should change none where it is loaded, either."""
     name, few = key.removesuffix(".value"), _lit(case)
-    number = float(np.mean(np.array(mi.traverse(case.plugin)[key])))
     if case.recipe.description is None or "." in name:
         return
+    number = 0.8 * float(np.mean(np.array(mi.traverse(case.plugin)[key]))) or 0.5
     try:
-        other = Probe(case.recipe.with_(**{name: 0.8 * number or 0.5}).load())
+        other = Probe(case.recipe.with_(**{name: number}).load())
     except RuntimeError:  # what is loaded goes by another name, or takes other numbers
         return
     allowed = case.spread(case.probe.eval, few.wi, few.wo, few.uv)
-    error = excess(other.eval(few.wi, few.wo, few.uv), few.value, allowed)
+    value = other.eval(few.wi, few.wo, few.uv)
+    error = excess(value, few.value, allowed)
     what = f"values that loading with another {key} changes, but params.update() does not, relative"
     why = "parameters_changed() has to compute anew what is made of parameters"
-    law.most(what, error, GRADIENT, why, case.at(snippets.GRADIENT, few, key=key))
+    law.most(what, error, GRADIENT, why, case.at(snippets.UPDATE, few, key=key, number=number, value=value))
 
 
 def _inside(value: Any) -> Any:

@@ -134,6 +134,13 @@ if dr.grad_enabled(found):
     dr.forward(shift)
 print("derivative:", dr.grad(found), "difference:", (value(1e-3) - value(-1e-3)) / 2e-3)
 """
+UPDATE = """point wo
+params, key = mi.traverse(bsdf), {key!r}
+print("eval():", bsdf.eval(ctx, si, wo))
+params[key] = type(params[key])(params[key] * 0 + {number})
+params.update()
+print("after an update to {number}:", bsdf.eval(ctx, si, wo), "should be", {value})
+"""
 FLAGS = """
 print("flags of the components:", [hex(int(bsdf.flags(i))) for i in range(bsdf.component_count())])
 print("flags of the whole:", hex(int(bsdf.flags())))
