@@ -26,7 +26,7 @@ Path = str | os.PathLike[str]
 PNG_RUNS = 3
 
 # Smaller pictures are not compressed, which would take several times as long as all other writing, to save
-# less than half of the bytes: the last digits of colours are noise
+# a third of the bytes, or two where there is much sky: the last digits of colours are noise
 COMPRESSED = 2**20  # pixels
 
 _PIXELS = 2**14  # converted to 8 bit at a time, so that intermediate arrays stay in the processor's cache

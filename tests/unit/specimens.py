@@ -107,7 +107,11 @@ CHANGES = {
 
 def register() -> None:
     """Define the classes anew for the current variant."""
+    mi.register_bsdf("changed", _changed())
+    mi.register_bsdf("specimen", _specimen())
 
+
+def _changed() -> type:
     class Changed(mi.BSDF):
         def __init__(self, props):
             mi.BSDF.__init__(self, props)
@@ -142,8 +146,10 @@ def register() -> None:
         def to_string(self):
             return f"Changed[{self.kind}]"
 
-    mi.register_bsdf("changed", Changed)
+    return Changed
 
+
+def _specimen() -> type:
     class Specimen(mi.BSDF):
         def __init__(self, props):
             mi.BSDF.__init__(self, props)
@@ -229,4 +235,4 @@ def register() -> None:
         def to_string(self):
             return f"Specimen[{self.mistake or 'sound'}]"
 
-    mi.register_bsdf("specimen", Specimen)
+    return Specimen

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,6 +24,7 @@ FIT = 5e-3  # the rational fits of Smith's G₁ in use are off by up to 0.35 %, 
 POINTWISE = 2e-3  # relative, beyond what rounding explains
 ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32
 OVERLOOKED = 0.02  # share of samples about which quadrature may know nothing; of lobes it resolves, 0.001
+BEYOND = "relative, beyond 8 times what the rounding of directions explains"  # as ``excess`` has it
 NARROW = 16 * ROUNDED  # width of a lobe that rounded directions do not resolve
 
 
@@ -120,13 +121,7 @@ class Case(Subject):
 
     def spread(self, quantity: Any, wi: Array, wo: Array, uv: Array, *others: Array) -> Array:
         """Return the largest change of ``quantity(wi, wo, uv, …)`` as directions move by a rounding."""
-        base = quantity(wi, wo, uv, *others)
-        largest = np.zeros_like(base)
-        for _ in range(6):
-            i, o = (v + ROUNDED * self.rng.normal(size=v.shape).astype(np.float32) for v in (wi, wo))
-            change = np.abs(quantity(i, o, uv, *others) - base)
-            largest = np.maximum(largest, np.where(np.isnan(change), np.inf, change))
-        return largest
+        return spread(lambda i, o: quantity(i, o, uv, *others), (wi, wo), self.rng)
 
     def snippet(self, body: str, **names: Any) -> str:
         return snippets.program("bsdf", self.plugin, self.recipe.description, body, **names)
@@ -209,6 +204,19 @@ def narrow(wi: Array, s: Samples) -> Array:
         part = drawn & (s.component == component)
         found |= part & (np.median(sharpness[part]) > NARROW**-2)
     return found
+
+
+def spread(
+    quantity: Callable[..., Array], directions: Sequence[Array], rng: np.random.Generator, by: float = ROUNDED
+) -> Array:
+    """Return the largest change of a quantity of directions [N, 3] as they move ``by`` so much."""
+    base = quantity(*directions)
+    largest = np.zeros_like(base)
+    for _ in range(6):
+        moved = [v + by * rng.normal(size=v.shape).astype(np.float32) for v in directions]
+        change = np.abs(quantity(*moved) - base)
+        largest = np.maximum(largest, np.where(np.isnan(change), np.inf, change))
+    return largest
 
 
 def excess(one: Array, other: Array, allowed: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mrt_mitsuba.validation.checks import snippets
-from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, View, excess, live, narrow
+from mrt_mitsuba.validation.checks.bsdf_case import BEYOND, FIT, POINTWISE, Case, View, excess, live, narrow
 from mrt_mitsuba.validation.checks.law import LEVEL, SIGMAS, Law, Skip
 from mrt_mitsuba.validation.checks.probe import Array, context, direction
 from mrt_mitsuba.validation.checks.sphere import Cells, Integrals, chi_square, encode, integrate
@@ -57,7 +57,7 @@ def weights(law: Law, case: Case) -> None:
                 worst.get(what, (-1.0, view, 0)), (float(error[i]), view, i), key=lambda w: w[0]
             )
     for what, (most, view, i) in worst.items():
-        title = f"{what}, relative, beyond 8 times what the rounding of directions explains"
+        title = f"{what}, {BEYOND}"
         why = "the same formula, evaluated once more at a rounded direction"
         law.at_most(
             title, most, POINTWISE, why, case.snippet(snippets.WEIGHT, wi=view.wi, uv=view.uv, u=view.u[i])

@@ -9,12 +9,19 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks import noise, snippets
-from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, ROUNDED, Case, changed, excess, parameters
+from mrt_mitsuba.validation.checks.bsdf_case import (
+    BEYOND,
+    POINTWISE,
+    ROUNDED,
+    Case,
+    changed,
+    excess,
+    parameters,
+)
 from mrt_mitsuba.validation.checks.law import Law, Skip
 from mrt_mitsuba.validation.checks.probe import Array, direction, is_scalar, unit
 
 EITHER_WAY = "light can be followed either way; transmitted radiance scales by the squared index"
-BEYOND = "relative, beyond 8 times what the rounding of directions explains"
 
 
 def eval_pdf(law: Law, case: Case) -> None:

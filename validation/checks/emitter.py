@@ -10,15 +10,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.validation.checks.bsdf_case import ROUNDED, excess
+from mrt_mitsuba.validation.checks.bsdf_case import BEYOND, ROUNDED, excess, spread
 from mrt_mitsuba.validation.checks.law import LEVEL, Law, Skip
-from mrt_mitsuba.validation.checks.probe import Array, Lanes, is_scalar, lanes
+from mrt_mitsuba.validation.checks.probe import Array, Lanes, at_wavelengths, is_scalar, lanes
 from mrt_mitsuba.validation.checks.sphere import Cells, chi_square, encode, integrate
 
 SAME = 1e-3  # relative: the same formula, evaluated once more
 TURNED = 4 * ROUNDED  # a direction passes through angles, a transform, and back
 WHY = "one number"
-BEYOND = "relative, beyond 8 times what the rounding of directions explains"
 LENGTH = 1e-4  # relative: a square root, and the difference of two points
 
 
@@ -96,22 +95,14 @@ class Case:
         s = self.samples
         if not self.around:
             return np.zeros_like(s.pdf), np.zeros_like(s.value)
-        base, largest = self.seen(s.d), [np.zeros_like(s.pdf), np.zeros_like(s.value)]
-        for _ in range(6):
-            moved = self.seen(s.d + TURNED * self.rng.normal(size=s.d.shape).astype(np.float32))
-            largest = [
-                np.maximum(most, np.abs(now - before))
-                for most, now, before in zip(largest, moved, base, strict=True)
-            ]
-        return largest[0], largest[1]
+        pdf, *light = spread(lambda d: np.column_stack(self.seen(d)), [s.d], self.rng, TURNED).T
+        return pdf, np.stack(light, axis=-1)
 
 
 def _seen_from(p: Any) -> Any:
     it = dr.zeros(mi.SurfaceInteraction3f)
     it.p = p
-    if mi.is_spectral:
-        it.wavelengths = type(it.wavelengths)(450, 500, 550, 600)
-    return it
+    return at_wavelengths(it)
 
 
 def density(law: Law, case: Case) -> None:

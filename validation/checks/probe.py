@@ -10,6 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mrt_mitsuba.plugins.lookup import aligned
+
 Array = np.ndarray
 SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
 
@@ -62,6 +64,11 @@ def interaction(wi: Any, uv: Any) -> Any:
     si.n, si.p = mi.Normal3f(0, 0, 1), mi.Point3f(uv.x, uv.y, 0)
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
     si.sh_frame = mi.Frame3f(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+    return at_wavelengths(si)
+
+
+def at_wavelengths(si: Any) -> Any:
+    """Give an interaction wavelengths, where the variant has them."""
     if mi.is_spectral:
         si.wavelengths = type(si.wavelengths)(450, 500, 550, 600)
     return si
@@ -160,15 +167,7 @@ def as_mitsuba(kind: str, column: Array) -> Any:
 
     Dr.Jit compiles a kernel for every number of rows of a matrix, and for every alignment of memory.
     """
-    return getattr(mi, kind)(*(mi.Float(_aligned(row)) for row in np.atleast_2d(column.T)))
-
-
-def _aligned(row: Array) -> Array:
-    """Return a copy in float32 that begins at a multiple of 64 bytes."""
-    room = np.empty(len(row) + 16, np.float32)
-    start = -room.ctypes.data % 64 // 4
-    room[start : start + len(row)] = row
-    return room[start : start + len(row)]
+    return getattr(mi, kind)(*(aligned(row) for row in np.atleast_2d(column.T)))
 
 
 def _rows(value: Any, count: int) -> Array:

@@ -81,17 +81,17 @@ class Cells(Lanes):
         level = np.repeat(self.level + 1, 4)
         return Cells(_quarters(self.start, level.reshape(-1, 4)[:, :1]), level)
 
-    def points(self, side: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return side² random directions in each cell, one in each part [C, side², 3], and dω [C, side²]."""
+    def points(self, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Return random directions in each cell, one in each part [C, POINTS, 3], and dω [C, POINTS]."""
         r0, turn0 = (x[:, None] for x in _corner(self.start % HEMISPHERE))
         width = (0.5**self.level)[:, None]
-        i, j = np.divmod(np.arange(side * side), side)
-        shift = rng.random((2, len(self.start), side * side))
-        r, turn = r0 + width * (i + shift[0]) / side, turn0 + width * (j + shift[1]) / side
+        i, j = np.divmod(np.arange(POINTS), SIDE)
+        shift = rng.random((2, len(self.start), POINTS))
+        r, turn = r0 + width * (i + shift[0]) / SIDE, turn0 + width * (j + shift[1]) / SIDE
         z = np.where(self.start >= HEMISPHERE, -1, 1)[:, None] * (1 - r * r)
         sin, phi = r * np.sqrt(2 - r * r), 2 * np.pi * (turn - 0.5)
         wo = np.stack([sin * np.cos(phi), sin * np.sin(phi), z], axis=-1).astype(np.float32)
-        return wo, 4 * np.pi * r * (width / side) ** 2
+        return wo, 4 * np.pi * r * (width / SIDE) ** 2
 
     @property
     def solid_angle(self) -> Array:
@@ -165,7 +165,7 @@ def integrate(
 def _estimate(
     function: Callable[[Array], Array], cells: Cells, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    wo, omega = cells.points(SIDE, rng)
+    wo, omega = cells.points(rng)
     values = function(wo.reshape(-1, 3))
     values = np.where(np.isfinite(values), values, 0).reshape(*omega.shape, -1) * omega[..., None] * POINTS
     return values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
