@@ -6,11 +6,10 @@ import functools
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.records import dataclass
 
 # For every pixel: what is kept, by channel, and what Pillow needs to write a PNG
 BYTES_PER_CHANNEL = 4

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
 
 import numpy as np
-
-from mrt_mitsuba.records import dataclass
 
 # Up to this many lights the kernel holds the code of each; beyond, it loops over them
 UNROLLED_LIGHTS = 8

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
-
-from mrt_mitsuba.records import dataclass
 
 from .columns import Columns, column
 from .intersect import (

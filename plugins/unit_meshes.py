@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-
-from mrt_mitsuba.records import dataclass
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.command.logs import LEVELS
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import checked, choice, either, from_text, option, path, plain, switch
-from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.model import is_obj

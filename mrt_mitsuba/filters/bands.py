@@ -7,8 +7,7 @@ halo as for the whole picture.
 from __future__ import annotations
 
 from collections.abc import Iterator
-
-from mrt_mitsuba.records import dataclass
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -31,7 +32,6 @@ import numpy as np
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.filters.grid import Grid, finite
-from mrt_mitsuba.records import dataclass
 
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 GREY_WEIGHTS = (0.07, 0.72, 0.21)

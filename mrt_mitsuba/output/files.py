@@ -6,13 +6,13 @@ import contextlib
 import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, Any
 
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
 from mrt_mitsuba.output.layers import LAYERS
 from mrt_mitsuba.output.replacing import replacing_together
-from mrt_mitsuba.records import dataclass
 
 if TYPE_CHECKING:
     import numpy as np

@@ -6,9 +6,8 @@ A new layer takes one row. What its ``value`` is computed from along camera rays
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any
-
-from mrt_mitsuba.records import dataclass
 
 FIRST_HIT = "first hit"  # of the first ray of a pixel; a mean would name no point
 AVERAGED = "averaged"  # over the rays of a pixel, as the picture is
@@ -31,7 +30,6 @@ class Layer:
     free_with: tuple[str, ...] = ()  #: the passes that make it in any case
     counts: str = ""  #: the kind of rays that it counts
     internal: bool = False  #: cannot be asked for
-    calls: bool = False  #: do its values take calls to shapes or materials
 
     @property
     def channels(self) -> int:
@@ -44,11 +42,11 @@ _ROWS = (
         "depth", "Z", FIRST_HIT, "distance of the hit", lambda r: r.distance, free_with=("depth of field",)
     ),
     Layer("normal", "XYZ", FIRST_HIT, "geometric normal", lambda r: r.normal),
-    Layer("albedo", "RGB", FIRST_HIT, "diffuse reflectance", lambda r: r.albedo, calls=True),
+    Layer("albedo", "RGB", FIRST_HIT, "diffuse reflectance", lambda r: r.albedo),
     Layer("position", "XYZ", FIRST_HIT, "place of the hit", lambda r: r.position),
     Layer("uv", "UV", FIRST_HIT, "texture coordinates", lambda r: r.uv),
-    Layer("shape", "I", FIRST_HIT, "shape, from 1; 0 for none", lambda r: r.shape, calls=True),
-    Layer("material", "I", FIRST_HIT, "material, from 1; 0 for none", lambda r: r.material, calls=True),
+    Layer("shape", "I", FIRST_HIT, "shape, from 1; 0 for none", lambda r: r.shape),
+    Layer("material", "I", FIRST_HIT, "material, from 1; 0 for none", lambda r: r.material),
     Layer("edges", "Y", DERIVED, "what the edge detector measured", free_with=("edges",)),
     Layer("samples", "Y", DERIVED, "samples of the pixel", free_with=("edges", "rounds")),
     Layer("error", "Y", DERIVED, "standard error of the pixel", free_with=("rounds",)),

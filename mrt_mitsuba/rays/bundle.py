@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
-
-import numpy as np
 
 from mrt_mitsuba.rays.divisor import Divisor
 from mrt_mitsuba.rays.lattice import Lattice
 from mrt_mitsuba.rays.shutter import Number, Shutter
-from mrt_mitsuba.records import dataclass
-
-# Pixels of a bundle, beyond which tracing a few rays more takes longer than to record a kernel anew
-LARGEST_PADDED = 2**14
 
 
 @dataclass(frozen=True)
@@ -48,22 +42,8 @@ class Bundle:
         whole = start == 0 and stop == len(self.pixels)
         return self if whole else replace(self, pixels=self.pixels[start:stop])
 
-    def padded(self) -> Bundle:
-        """Return a small bundle with its last pixel repeated: so there are few sizes."""
-        count = len(self.pixels)
-        if isinstance(self.pixels, range) or count > LARGEST_PADDED:
-            return self
-        more = -count % (1 << max(count.bit_length() - 5, 0))
-        return replace(self, pixels=np.append(self.pixels, self.pixels[-1:].repeat(more)))
-
-    @property
-    def form(self) -> tuple[Any, ...]:
-        """Return what shapes the code of ``placed``; all else is data."""
-        phase = None if self.shutter is None else self.shutter.phase is None
-        return self.lattice, self.ray_count, self.rays_per_pixel, isinstance(self.pixels, range), phase
-
     def numbers(self, width: int, height: int) -> Numbers:
-        """Return the data of ``placed``: the size of the picture, and all that ``form`` leaves open."""
+        """Return the data of ``placed``: the size of the picture, and the pixels."""
         import mitsuba as mi
 
         first = self.pixels.start if isinstance(self.pixels, range) else 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -10,7 +11,6 @@ import numpy as np
 
 from mrt_mitsuba.rays.divisor import Divisor
 from mrt_mitsuba.rays.film import Film
-from mrt_mitsuba.records import dataclass
 
 MOST_LANES = 2**17  # of a kernel, each with as many sums
 MOST_SUMS = 128  # in a kernel: more take longer to compile, with fewer each ray is read more often

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.rays.bundle import Bundle
 from mrt_mitsuba.rays.lattice import CENTRE, Lattice
 from mrt_mitsuba.rays.shutter import Shutter
-from mrt_mitsuba.records import dataclass
 
 
 @dataclass(frozen=True)

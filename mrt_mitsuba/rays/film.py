@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba.rays.divisor import Divisor
-from mrt_mitsuba.records import dataclass
 
 STEPS = 32  # of a pixel, where integrals over a filter are summed
 
@@ -77,13 +76,6 @@ class Film:
         sampler = self.sensor.sampler().clone()
         sampler.set_sample_count(count)
         return int(sampler.sample_count())
-
-    @property
-    def form(self) -> Hashable | None:
-        """Return what shapes the code of ``rays``, all else being data; None where that is not known."""
-        if self.sensor.shutter_open_time() > 0 or self.bands:
-            return None
-        return self.sensor.shutter_open(), self.grey
 
     def numbers(self) -> Numbers:
         """Return the data of ``rays``."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.rays.divisor import Divisor
-from mrt_mitsuba.records import dataclass
 
 FILM = "film"
 LATTICES = ("report", "centered", FILM)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
-
-from mrt_mitsuba.records import dataclass
 
 Number = Callable[[Any, Any], Any]  # of a type and a value: a number as the kernel has it
 

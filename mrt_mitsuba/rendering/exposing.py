@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
@@ -16,7 +17,6 @@ from mrt_mitsuba.rays.divisor import Divisor
 from mrt_mitsuba.rays.film import Film, Numbers
 from mrt_mitsuba.rays.sampler import ray_sampler
 from mrt_mitsuba.rays.sequence import pixel_sequence
-from mrt_mitsuba.records import dataclass, leaves
 from mrt_mitsuba.rendering.shading import Shader, components
 from mrt_mitsuba.rendering.view import View
 from mrt_mitsuba.rendering.windows import dilated
@@ -228,21 +228,14 @@ class Exposer:
         import drjit as dr
 
         data = _Data.of(groups, start, self.film)
-        form = groups.size, len(groups), moments, self.film.form, *self.names
-
-        def trace() -> list[Any]:
-            place, channels, planes = self._trace(*self._lanes(groups, data, start), data)
-            if canvas is None:
-                planes = [*channels, *(c * c for c in channels[: 3 * moments]), *planes]
-                dr.eval(planes)  # block_reduce would evaluate each plane by itself, in a kernel of its own
-            else:
-                dr.eval(place, channels, planes)
-                canvas.put(place, channels, groups.pixels, groups.rays)
-            return [dr.block_reduce(dr.ReduceOp.Add, plane, groups.size) for plane in planes]
-
-        # numbered rays of a film without a canvas, which would be written to
-        known = canvas is None and self._independent and self.film.form is not None
-        sums = self.shader.replayed(self.view, form, self.layers, leaves(data), trace) if known else trace()
+        place, channels, planes = self._trace(*self._lanes(groups, data, start), data)
+        if canvas is None:
+            planes = [*channels, *(c * c for c in channels[: 3 * moments]), *planes]
+            dr.eval(planes)  # block_reduce would evaluate each plane by itself, in a kernel of its own
+        else:
+            dr.eval(place, channels, planes)
+            canvas.put(place, channels, groups.pixels, groups.rays)
+        sums = [dr.block_reduce(dr.ReduceOp.Add, plane, groups.size) for plane in planes]
         dr.eval(sums)
         return sums
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
 
@@ -13,7 +14,6 @@ from mrt_mitsuba.output.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rays.lattice import FILM, Lattice
 from mrt_mitsuba.rays.region import Region
-from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.rendering import kernel_text
 from mrt_mitsuba.rendering.detectors import DETECTORS
 from mrt_mitsuba.rendering.settings import NOISE, Focus, RenderSettings

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 from mrt_mitsuba.output import files
 from mrt_mitsuba.output.error import ErrorEstimate, Round
 from mrt_mitsuba.output.replacing import check_not_read
-from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.rendering.plan import Plan
 
 Image = NDArray[np.float32]

@@ -7,13 +7,13 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from mrt_mitsuba.errors import MrtWarning
 from mrt_mitsuba.output.error import ErrorEstimate, Round, RoundPicture
-from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.rendering.progress import Advance
 
 log = logging.getLogger(__name__)

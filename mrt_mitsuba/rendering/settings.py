@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -28,7 +29,6 @@ from mrt_mitsuba.options import (
 )
 from mrt_mitsuba.output.layers import LAYERS
 from mrt_mitsuba.rays.lattice import LATTICES
-from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.rendering.detectors import DETECTORS
 from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE
 

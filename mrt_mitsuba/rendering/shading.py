@@ -6,7 +6,7 @@ any other sampling integrator gives the picture, and Mitsuba the first hit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -192,17 +192,6 @@ class Shader:
         values = self.values(view, *view.rays(samples, sampler), sampler)
         return {name: TABLE[name].value(values) for name in names}
 
-    def replayed(
-        self, view: View, form: Hashable, names: Sequence[str], inputs: Any, trace: Callable[[], Any]
-    ) -> Any:
-        """Return what ``trace()`` does: arrays made of layers along rays that ``view`` sends out.
-
-        Where that is known to be safe, its kernels are launched again, if they are those of an earlier call
-        of the same ``form``: what in Python shapes the code. ``inputs``: the arrays that it reads besides
-        those of the integrator and the view.
-        """
-        return trace()
-
     @property
     def aovs(self) -> tuple[str, ...]:
         """Names of the integrator's own channels."""
@@ -236,15 +225,6 @@ class LayeredShader(Shader):
 
     def prepare(self, kernel: KernelPlan | None) -> None:
         self.integrator.prepare(self.scene, kernel)
-
-    def replayed(
-        self, view: View, form: Hashable, names: Sequence[str], inputs: Any, trace: Callable[[], Any]
-    ) -> Any:
-        seen = view.form
-        if seen is None or any(TABLE[name].calls for name in names):
-            return trace()
-        form = (seen, form, *names)
-        return self.integrator.replayed(self.scene, form, [view.arrays(), inputs], trace)
 
     def values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
         return LayeredValues(self.scene, view, ray, weight, self.integrator.trace(self.scene, sampler, ray))

@@ -18,7 +18,6 @@ from mrt_mitsuba.output.layers import AVERAGED, FIRST_HIT, TABLE
 from mrt_mitsuba.output.layers import channels as channel_count
 from mrt_mitsuba.rays.bundle import Bundle, Samples
 from mrt_mitsuba.rays.sampler import ray_sampler
-from mrt_mitsuba.records import leaves
 from mrt_mitsuba.rendering.shading import Shader, components
 from mrt_mitsuba.rendering.view import View
 
@@ -73,23 +72,16 @@ class Tracer:
         import drjit as dr
 
         sampler, pixels = self._sampler(), len(bundle.pixels)
-        if sampler is None:
-            bundle = bundle.padded()
         numbers = bundle.numbers(self.view.width, self.view.height)
 
-        def trace() -> dict[str, list[Any]]:
-            samples = bundle.placed(numbers)
-            if sampler is not None:
-                sampler.start_at(seed, samples.number)
-            values = self.shader.trace(names, self.view, samples, sampler)
-            if bundle.rays_per_pixel == 1:
-                return {name: components(value) for name, value in values.items()}
-            return _by_pixel(values, bundle, samples, numbers.share)
-
-        if sampler is None:
-            result = self.shader.replayed(self.view, bundle.form, names, leaves(numbers), trace)
+        samples = bundle.placed(numbers)
+        if sampler is not None:
+            sampler.start_at(seed, samples.number)
+        values = self.shader.trace(names, self.view, samples, sampler)
+        if bundle.rays_per_pixel == 1:
+            result = {name: components(value) for name, value in values.items()}
         else:
-            result = trace()
+            result = _by_pixel(values, bundle, samples, numbers.share)
         dr.eval(result)
         # LLVM's arrays are not copied
         return {

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba.rays.bundle import Samples
-from mrt_mitsuba.records import dataclass
 
 
 @dataclass(frozen=True)
@@ -20,17 +20,6 @@ class View:
     width: int
     height: int
     motion: tuple[float, float, float] | None = None
-
-    @property
-    def form(self) -> Hashable | None:
-        """Return what shapes the code of its rays, all but ``arrays``; None where that is not known."""
-        if self.sensor.class_name() != "PerspectiveCamera" or self.motion is not None:
-            return None
-        return self.sensor.near_clip(), self.sensor.far_clip()
-
-    def arrays(self) -> list[Any]:
-        """Return what its rays are made of, as a PyTree."""
-        return [self.sensor]
 
     def rays(self, samples: Samples, sampler: Any) -> tuple[Any, Any]:
         """Return the rays through some places on the film, and their weights."""

@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.options import choice, integer
-from mrt_mitsuba.records import dataclass
 
 if TYPE_CHECKING:
     import numpy as np

@@ -9,11 +9,11 @@ import subprocess
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
-from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps import worker
 

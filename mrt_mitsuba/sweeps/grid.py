@@ -10,10 +10,10 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.scene.model import Scene
 
 LONGEST_NAME = 200  # characters of a file's name without its ending; file systems take 255 bytes

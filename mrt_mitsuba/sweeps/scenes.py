@@ -10,10 +10,10 @@ import os
 import pickle
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, SupportsIndex, cast
 
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.sweeps.grid import Job
 
 

@@ -11,12 +11,11 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mrt_mitsuba.errors import OutputError, UsageError
 from mrt_mitsuba.rays.region import Region
-from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.sweeps.scenes import fingerprint
 from mrt_mitsuba.sweeps.worker import MADE_WITH, House, Task
 

@@ -10,11 +10,11 @@ import socket
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.cores import affinity, usable_cores
 from mrt_mitsuba.errors import MrtError, OutputError
-from mrt_mitsuba.records import dataclass
 from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps.scenes import Opener, SceneFile
 

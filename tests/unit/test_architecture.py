@@ -16,14 +16,14 @@ ROOT = Path(__file__).parents[2]
 FOLDERS = {"mrt_mitsuba": "mrt_mitsuba"} | {
     name: f"mrt_mitsuba.{name}" for name in ("plugins", "scenes_xml", "validation")
 }
-LINES, PARAMETERS, BRANCHES = 40, 8, 12
+LINES, PARAMETERS, BRANCHES = 60, 8, 12
 ALLOWED = {
     "mrt_mitsuba.plugins.whitted.MrtWhitted.trace",  # the camera ray and the bounces are one story
     "mrt_mitsuba.rendering.api.render",  # each option has a name that editors and ``inspect`` can show
     "mrt_mitsuba.sweeps.run.sweep",  # the same
 }
 
-FOUNDATION = {"errors", "interrupts", "loaders", "memory", "options", "records", "runtime"}
+FOUNDATION = {"errors", "interrupts", "loaders", "memory", "options", "runtime"}
 
 _BRANCH = ast.If | ast.IfExp | ast.For | ast.While | ast.ExceptHandler | ast.match_case | ast.comprehension
 
@@ -145,10 +145,10 @@ def test_imports_make_no_cycle() -> None:
 @pytest.mark.parametrize(
     ("room", "others"),
     [
-        ("plugins", {"plugins", "records"}),
-        ("rays", {"rays", "records"}),
-        ("output", {"output", "cores", "errors", "records"}),
-        ("filters", {"filters", "errors", "records", "runtime", "output"}),
+        ("plugins", {"plugins"}),
+        ("rays", {"rays"}),
+        ("output", {"output", "cores", "errors"}),
+        ("filters", {"filters", "errors", "runtime", "output"}),
         ("scene", {"scene", "plugins", "output", *FOUNDATION}),
         ("rendering", {"rendering", "plugins", "rays", "filters", "scene", "output", *FOUNDATION}),
     ],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 import sys
 from pathlib import Path
@@ -10,7 +9,6 @@ from pathlib import Path
 import pytest
 
 import mrt_mitsuba
-from mrt_mitsuba import records
 from mrt_mitsuba.command.words import read_toml
 
 ROOT = Path(__file__).parents[2]
@@ -100,74 +98,6 @@ print(mrt.render(), render())
 """
     done = run_python(code)
     assert done.stdout.split() == ["called"] * 3, done.stderr
-
-
-def kinds(dataclass):
-    """The same classes, made by a decorator."""
-
-    @dataclass(frozen=True)
-    class Base:
-        a: int
-        b: str = "b"
-
-        @property
-        def twice(self) -> int:
-            return 2 * self.a
-
-    @dataclass(frozen=True)
-    class Derived(Base):
-        c: list = dataclasses.field(default_factory=list, compare=False)
-        d: int = dataclasses.field(default=1, repr=False)
-
-    @dataclass(frozen=True, kw_only=True)
-    class Named:
-        a: int = 0
-
-        def __post_init__(self) -> None:
-            object.__setattr__(self, "a", self.a + 1)
-
-    @dataclass(frozen=True, eq=False)
-    class Single:
-        a: int
-
-    return Base, Derived, Named, Single
-
-
-USES = {
-    "places": lambda base, derived, named, single: derived(1, "x", [2], 3),
-    "defaults": lambda base, derived, named, single: (derived(1), named(), named(a=4).a, base(2).twice),
-    "equal": lambda base, derived, named, single: (
-        *(base(1) == other for other in (base(1), base(2), derived(1), 1)),
-        derived(1, c=[2]) == derived(1, c=[3]),
-        derived(1, d=2) == derived(1),
-        single(1) == single(1),
-    ),
-    "hash": lambda base, derived, named, single: (base(1) in {base(1)}, derived(1, c=[2]) in {derived(1)}),
-    "replace": lambda base, derived, named, single: dataclasses.replace(derived(1, c=[2]), a=5),
-    "apart": lambda base, derived, named, single: derived(1).c is derived(1).c,
-    "fields": lambda base, derived, named, single: [f.name for f in dataclasses.fields(derived)],
-    "match": lambda base, derived, named, single: (derived.__match_args__, named.__match_args__),
-    "too few": lambda base, derived, named, single: base(),
-    "too many": lambda base, derived, named, single: base(1, "x", 2),
-    "twice": lambda base, derived, named, single: base(1, a=1),
-    "unknown": lambda base, derived, named, single: base(1, z=1),
-    "by place": lambda base, derived, named, single: named(1),
-    "change": lambda base, derived, named, single: setattr(base(1), "a", 2),
-    "delete": lambda base, derived, named, single: delattr(base(1), "a"),
-}
-
-
-@pytest.mark.parametrize("use", USES.values(), ids=USES.keys())
-def test_records_are_dataclasses(use) -> None:
-    """They behave as those of the standard library, which are the reference."""
-
-    def outcome(dataclass) -> str:
-        try:
-            return repr(use(*kinds(dataclass)))
-        except (TypeError, AttributeError) as error:
-            return type(error).__name__
-
-    assert outcome(records.dataclass) == outcome(dataclasses.dataclass)
 
 
 def test_unknown_name() -> None:
