@@ -1,7 +1,7 @@
 """Mitsuba plugins in Dr.Jit, and the maths they share.
 
-``register()`` makes ``mrt_bsdf``, ``mrt_capsule``, ``mrt_cone``, ``mrt_cylinder``, ``mrt_group``,
-``mrt_light``, ``mrt_mesh``, ``mrt_plane``, ``mrt_texture`` and ``mrt_whitted`` known to Mitsuba;
+``register()`` makes ``mrt_bsdf``, ``mrt_cone``, ``mrt_cylinder``, ``mrt_group``, ``mrt_light``,
+``mrt_mesh``, ``mrt_plane``, ``mrt_texture`` and ``mrt_whitted`` known to Mitsuba;
 ``register_modules()`` does the same for plugins of other packages.
 """
 
@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from types import ModuleType
 
-MODULES = ("bsdf", "capsule", "cone", "cylinder", "group", "light", "mesh", "plane", "texture", "whitted")
+MODULES = ("bsdf", "cone", "cylinder", "group", "light", "mesh", "plane", "texture", "whitted")
 
 _packages: dict[str, tuple[str, ...]] = {}  # the plugin modules of each package
 _loaded: dict[tuple[str, str, str], ModuleType] = {}  # by variant, package and name

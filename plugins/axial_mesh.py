@@ -91,7 +91,7 @@ def _fill(mesh: Any, unit: UnitMesh, frame: Frame) -> None:
     """Write a new mesh: positions and normals as ``frame`` places them, texture coordinates, faces."""
     rows = np.array([list(frame.x), list(frame.y), list(frame.z)], np.float64)
     flipped = np.linalg.det(rows) < 0
-    positions = unit.placed(frame.extent) @ np.linalg.inv(rows).T + np.array(list(frame.origin))
+    positions = unit.points @ np.linalg.inv(rows).T + np.array(list(frame.origin))
     normals = unit.gradients @ rows
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     write_buffers(
@@ -110,8 +110,6 @@ def _refill(mesh: Any, unit: UnitMesh, frame: Frame) -> None:
     volume = dr.dot(rows[0], dr.cross(rows[1], rows[2]))
     columns = [dr.cross(rows[k - 2], rows[k - 1]) / volume for k in range(3)]
     position, normal = mi.Point3f(frame.origin), mi.Vector3f(0)
-    if np.any(unit.stretch):
-        position += columns[2] * (frame.extent * mi.Float(unit.stretch))
     for k in range(3):
         position += columns[k] * mi.Float(unit.points[:, k])
         normal += rows[k] * mi.Float(unit.gradients[:, k])
@@ -151,7 +149,7 @@ class Placement:
         origin = [
             sum(m * c for m, c in zip(self.linear[i], o, strict=True)) + self.offset[i] for i in range(3)
         ]
-        return Frame(type(o)(origin), row(frame.x), row(frame.y), row(frame.z), frame.extent)
+        return Frame(type(o)(origin), row(frame.x), row(frame.y), row(frame.z))
 
 
 def vector64(v: Any) -> Any:

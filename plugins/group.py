@@ -1,4 +1,4 @@
-"""``mrt_group``: thousands of spheres, cones, cylinders or capsules in one shape."""
+"""``mrt_group``: thousands of spheres, cones or cylinders in one shape."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CLOSED = tuple(name for name, kind in KINDS.items() if kind.closed)
 
 
 class MrtGroup(mi.Mesh):
-    r"""Many spheres, cones, cylinders or capsules as one shape, with per-object values for textures.
+    r"""Many spheres, cones or cylinders as one shape, with per-object values for textures.
 
     Mitsuba takes about 0.1 ms for a native shape, 1 ms for one in Python, and traces the methods of each BSDF
     that is written in Python; a group of 10⁵ objects costs as much as one shape and one BSDF. ``mrt_whitted``
@@ -28,9 +28,9 @@ class MrtGroup(mi.Mesh):
     =============== ========== ========== ==============================================================
     name            type       default    unit or range
     =============== ========== ========== ==============================================================
-    ``kind``        string     sphere     ``sphere``, ``cone``, ``cylinder`` (both closed) or ``capsule``
+    ``kind``        string     sphere     ``sphere``, ``cone`` or ``cylinder`` (closed)
     ``numbers``     ``Bitmap`` required   float32 [n, 4] for spheres: centre, radius; [n, 7] for cones: apex,
-                                          base centre, radius, and for the others: p0, p1, radius
+                                          base centre, radius; for cylinders: p0, p1, radius
     ``face_NAME``   ``Bitmap``            float32 [n, 1 or 3], values of the objects that a ``mesh_attribute``
                                           texture of this name looks up
     ``to_world``    transform  identity   any invertible affine transform of all objects
@@ -112,7 +112,7 @@ def _check(numbers: np.ndarray) -> None:
 def _stand_in(unit: UnitMesh, table: QuadricTable) -> dict[str, Any]:
     """Return the buffers of the mesh of all objects; the frames of some kinds are left-handed."""
     columns = np.linalg.inv(table.rows).transpose(0, 2, 1)
-    positions = unit.placed(table.extents[:, None]) @ columns + table.origins[:, None]
+    positions = unit.points @ columns + table.origins[:, None]
     normals = unit.gradients[None] @ table.rows
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
     faces = unit.faces if np.linalg.det(table.rows[0]) > 0 else unit.faces[:, ::-1]

@@ -54,9 +54,9 @@ def intersect_sphere(o, d, center, radius):
 # ------------------------------------ Quadrics of revolution ------------------------------------------
 #
 # A quadric is intersected in its unit frame, to which a ``Frame`` maps world space: a cone has its apex at 0
-# and its base disc of radius 1 at z = 1, a cylinder of radius 1 lies between z = 0 and z = 1, the axis of a
-# capsule of radius 1 between z = 0 and z = extent, a sphere of radius 1 around 0. The map is affine, so it
-# changes neither t nor what is hit, and sizes, aspect ratios and shears are gone before anything is squared.
+# and its base disc of radius 1 at z = 1, a cylinder of radius 1 lies between z = 0 and z = 1, a sphere of
+# radius 1 around 0. The map is affine, so it changes neither t nor what is hit, and sizes, aspect ratios and
+# shears are gone before anything is squared.
 #
 # The solid is convex: a line is inside it for one interval. It is cut out of the interval inside the infinite
 # quadric by the slab between the caps, so no ray slips through between two surfaces, at a rim or an apex.
@@ -76,7 +76,6 @@ class Frame:
     x: Any  # rows of the matrix, vectors
     y: Any
     z: Any
-    extent: Any = 1.0  # length of the axis in the unit frame
 
     def point(self, p: Any) -> Any:
         """Return a world-space point in the unit frame."""
@@ -126,20 +125,13 @@ def cylinder_frame(p0: Any, p1: Any, radius: Any) -> Frame:
     return _frame_along(p0, p1 - p0, radius)
 
 
-def capsule_frame(p0: Any, p1: Any, radius: Any) -> Frame:
-    """Return the unit frame of a capsule: all within ``radius`` of the segment from ``p0`` to ``p1``."""
-    frame = _frame_along(p0, p1 - p0, radius)
-    extent = dr.norm(p1 - p0) / radius
-    return Frame(frame.origin, frame.x, frame.y, frame.z * extent, extent)
-
-
 def sphere_frame(center: Any, radius: Any) -> Frame:
     """Return the unit frame of a sphere."""
     inverse = 1 / radius
     zero = 0 * inverse
     make = type(center)
     x, y, z = make([inverse, zero, zero]), make([zero, inverse, zero]), make([zero, zero, inverse])
-    return Frame(center, x, y, z, 0.0)
+    return Frame(center, x, y, z)
 
 
 def _frame_along(origin: Any, axis: Any, radius: Any) -> Frame:
@@ -287,58 +279,6 @@ def sphere_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
     return SurfacePoint(p - n * ((r - 1) * inverse), n, dr.select(azimuth < 0, azimuth + 1, azimuth), v)
 
 
-def intersect_capsule(o: Any, d: Any, frame: Frame) -> SurfaceHit:
-    """Return the first hit at t > 0 of a ray with a capsule.
-
-    A line's interval inside is that of the tube between the ends and of the two balls, taken together.
-    """
-    line, h = _line(o, d, frame), frame.extent
-    p, u = line.p, line.u
-    rho = dr.sqrt(dr.square(u.x) + dr.square(u.y))
-    r = dr.sqrt(dr.square(p.x) + dr.square(p.y))
-    moment = dr.abs(p.x * u.y - p.y * u.x)
-    meets = moment <= rho  # every ball is inside the endless tube, which meets all that is to be met
-    first, second = _roots(
-        dr.square(rho), p.x * u.x + p.y * u.y, (r - 1) * (r + 1), (rho - moment) * (rho + moment)
-    )
-    along, level = rho == 0, u.z == 0
-    to_start, to_end = -p.z / off_zero(u.z), (h - p.z) / off_zero(u.z)
-    enter = dr.select(level, -dr.inf, dr.minimum(to_start, to_end))
-    leave = dr.select(level, dr.inf, dr.maximum(to_start, to_end))
-    near = dr.maximum(dr.select(along, -dr.inf, first), enter)
-    far = dr.minimum(dr.select(along, dr.inf, second), leave)
-    in_tube = meets & dr.select(level, (p.z >= 0) & (p.z <= h), True) & dr.select(along, r <= 1, True)
-    in_tube = in_tube & (near <= far)
-    near, far = dr.select(in_tube, near, dr.inf), dr.select(in_tube, far, -dr.inf)
-    for z in (0 * h, h):
-        middle = z * u.z
-        offset = type(p)([p.x, p.y, p.z - z]) + u * middle
-        distance = dr.norm(offset)
-        half = dr.sqrt(dr.maximum((1 - distance) * (1 + distance), 0))
-        inside = distance <= 1
-        near = dr.select(inside, dr.minimum(near, middle - half), near)
-        far = dr.select(inside, dr.maximum(far, middle + half), far)
-    return _first_boundary(line, near <= far, near, LATERAL, far, LATERAL, True)
-
-
-def capsule_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
-    """Put a point near a capsule onto it, along the normal.
-
-    u = azimuth / 2π in [0, 1); v = 1 at the tip beyond p0, 3/4 and 1/4 at the rims of the tube, 0 at the
-    other tip, linear in the angle and along the tube.
-    """
-    q = frame.point(p)
-    along = dr.clip(q.z, 0, frame.extent)
-    z = q.z - along
-    r = dr.norm(type(q)([q.x, q.y, z]))
-    on_axis = r == 0
-    inverse = 1 / dr.select(on_axis, 1, r)
-    gradient = type(q)([dr.select(on_axis, 1, q.x * inverse), q.y * inverse, z * inverse])
-    surface = _surface_point(p, q, r - 1, gradient, True, frame)
-    v = 0.75 - 0.5 * along / frame.extent - dr.asin(dr.clip(gradient.z, -1, 1)) / (2 * dr.pi)
-    return SurfacePoint(surface.p, surface.n, surface.u, dr.clip(v, 0, 1))
-
-
 # ------------------------------ Derivatives of a surface point by u and v -------------------------------
 
 
@@ -369,19 +309,6 @@ def sphere_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
     x, y = _azimuth(q, r)
     around = type(q)([-2 * dr.pi * q.y, 2 * dr.pi * q.x, 0 * q.x])
     return around, type(q)([q.z * x, q.z * y, -r]) * dr.pi
-
-
-def capsule_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
-    """Return derivatives by u and v of a point of ``capsule_surface``; both are in the unit frame."""
-    r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
-    x, y = _azimuth(q, r)
-    z = q.z - dr.clip(q.z, 0, frame.extent)
-    around = type(q)([-2 * dr.pi * q.y, 2 * dr.pi * q.x, 0 * q.x])
-    ball = type(q)([z * x, z * y, -r]) * (2 * dr.pi)
-    by_v = [
-        dr.select(z == 0, a, b) for a, b in zip((0 * x, 0 * x, -2 * frame.extent + 0 * x), ball, strict=True)
-    ]
-    return around, type(q)(by_v)
 
 
 @dataclass

@@ -14,16 +14,12 @@ from .intersect import (
     Frame,
     SurfaceHit,
     SurfacePoint,
-    capsule_derivatives,
-    capsule_frame,
-    capsule_surface,
     cone_derivatives,
     cone_frame,
     cone_surface,
     cylinder_derivatives,
     cylinder_frame,
     cylinder_surface,
-    intersect_capsule,
     intersect_cone,
     intersect_cylinder,
     intersect_unit_sphere,
@@ -31,7 +27,7 @@ from .intersect import (
     sphere_frame,
     sphere_surface,
 )
-from .unit_meshes import UnitMesh, unit_capsule_mesh, unit_cone_mesh, unit_cylinder_mesh, unit_sphere_mesh
+from .unit_meshes import UnitMesh, unit_cone_mesh, unit_cylinder_mesh, unit_sphere_mesh
 
 POINT, DISC, BALL = (0, 0, 0), (1, 1, 0), (1, 1, 1)
 """What the ends of a quadric are, by the squared semi-axes of their unit frame that span them."""
@@ -45,7 +41,7 @@ class QuadricKind:
     frame: Callable[..., Frame]  #: its unit frame, of these points and the radius
     intersect: Callable[[Any, Any, Frame], SurfaceHit]
     surface: Callable[[Any, Any, Frame], SurfacePoint]  #: puts a point onto it
-    ends: tuple[tuple[int, int, int], tuple[int, int, int]]  #: at z = 0 and z = extent: point, disc or ball
+    ends: tuple[tuple[int, int, int], tuple[int, int, int]]  #: of its axis: point, disc or ball
     derivatives: Callable[[Any, Any, Frame], tuple[Any, Any]]  #: of a surface point, by u and v
     mesh: Callable[[int], UnitMesh]  #: what other integrators see, of so many sides
     open_twin: str | None = None  #: name of the kind without its discs
@@ -89,15 +85,6 @@ KINDS: dict[str, QuadricKind] = {
         mesh=partial(unit_cylinder_mesh, capped=False),
         closed=False,
     ),
-    "capsule": QuadricKind(
-        2,
-        capsule_frame,
-        intersect_capsule,
-        capsule_surface,
-        (BALL, BALL),
-        capsule_derivatives,
-        unit_capsule_mesh,
-    ),
 }
 
 
@@ -108,7 +95,6 @@ class QuadricTable:
     kind: str  # a key of KINDS
     origins: np.ndarray  # float64 [n, 3]
     rows: np.ndarray  # float64 [n, 3, 3]
-    extents: np.ndarray  # float64 [n]
     first_faces: np.ndarray  # int [n], of the stand-in of each, for textures that are looked up by face
     flipped: bool = False  # do the normals point inwards
 
@@ -116,8 +102,7 @@ class QuadricTable:
     def of_one(cls, kind: str, frame: Frame, *, flipped: bool = False) -> QuadricTable:
         """Return the table of a shape that is one object."""
         rows = np.array([[list(frame.x), list(frame.y), list(frame.z)]])
-        extents = np.array([frame.extent], float)
-        return cls(kind, np.array([list(frame.origin)]), rows, extents, np.zeros(1, int), flipped)
+        return cls(kind, np.array([list(frame.origin)]), rows, np.zeros(1, int), flipped)
 
     @classmethod
     def of_numbers(
@@ -130,13 +115,12 @@ class QuadricTable:
         points = [Columns.of(numbers[:, 3 * k : 3 * k + 3]) for k in range(KINDS[kind].points)]
         frame = place(KINDS[kind].frame(*points, column(numbers[:, -1])))
         rows = np.stack([row.array() for row in (frame.x, frame.y, frame.z)], axis=1)
-        extents = np.broadcast_to(np.array(frame.extent, float), len(numbers))
-        return cls(kind, frame.origin.array(), rows, extents, faces * np.arange(len(numbers)), flipped)
+        return cls(kind, frame.origin.array(), rows, faces * np.arange(len(numbers)), flipped)
 
     def hulls(self) -> np.ndarray:
         """Return the ellipsoids [n, 2, 3, 4] whose convex hull each is: three semi-axes, centre."""
         columns = np.linalg.inv(self.rows)
-        axis = columns[:, :, 2] * self.extents[:, None]
+        axis = columns[:, :, 2] * (KINDS[self.kind].points - 1)
         semi_axes = [columns * np.array(end) for end in KINDS[self.kind].ends]
         centers = np.stack([self.origins, self.origins + axis], axis=1)
         return np.concatenate([np.stack(semi_axes, axis=1), centers[..., None]], axis=3)

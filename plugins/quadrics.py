@@ -83,7 +83,7 @@ class Quadrics:
         x, y, z, more = (dr.gather(mi.Vector4f, self.table, 4 * leaf + k, active) for k in range(4))
         origin = mi.Point3f(x.w, y.w, z.w)
         x, y, z = (mi.Vector3f(r.x, r.y, r.z) for r in (x, y, z))
-        return Frame(origin, x, y, z, more.z), more.x, more.w
+        return Frame(origin, x, y, z), more.x, more.w
 
     def _meet(self, leaf: Any, ray: Any) -> SurfaceHit:
         frame, kind, _ = self._row(leaf)
@@ -141,14 +141,13 @@ class Quadrics:
 def _numbers(tables: list[QuadricTable], kinds: list[str], boxes: np.ndarray) -> np.ndarray:
     """Return what a kernel reads of each quadric, [n, 4, 4]: four numbers at a time.
 
-    A row and a coordinate of the origin, three times; kind, size of coordinates, extent, side of the normal.
+    A row and a coordinate of the origin, three times; kind, size of coordinates, nothing, side of the normal.
     """
     numbers = np.zeros((len(boxes), 4, 4))
     numbers[:, :3, :3] = np.concatenate([t.rows for t in tables])
     numbers[:, :3, 3] = np.concatenate([t.origins for t in tables])
     numbers[:, 3, 0] = np.concatenate([np.full(len(t.rows), kinds.index(t.kind)) for t in tables])
     numbers[:, 3, 1] = np.abs(boxes).max(axis=(1, 2))
-    numbers[:, 3, 2] = np.concatenate([t.extents for t in tables])
     numbers[:, 3, 3] = np.concatenate([np.full(len(t.rows), -1 if t.flipped else 1) for t in tables])
     return numbers
 
@@ -199,7 +198,7 @@ class _ScalarObject:
     def __init__(self, shape: Any, table: QuadricTable, k: int) -> None:
         self.shape, self.kind, self.first_face = shape, table.kind, int(table.first_faces[k])
         x, y, z = (mi.Vector3f(row.tolist()) for row in table.rows[k])
-        self.frame = Frame(mi.Point3f(table.origins[k].tolist()), x, y, z, float(table.extents[k]))
+        self.frame = Frame(mi.Point3f(table.origins[k].tolist()), x, y, z)
         self.side = -1 if table.flipped else 1
         self.scale = float(np.abs(table.boxes()[k]).max())
 
@@ -219,7 +218,6 @@ def _frame(frame: Frame) -> tuple:
     return (
         mi.Vector3f(frame.origin),
         *(mi.Vector3f(r) for r in (frame.x, frame.y, frame.z)),
-        mi.Float(frame.extent),
     )
 
 

@@ -69,7 +69,7 @@ def _on_quadrics(table: QuadricTable, boxes: np.ndarray, p: np.ndarray) -> bool:
     surface = KINDS[table.kind].surface
     for k in np.flatnonzero(near)[:MOST_LOOKED_AT]:
         origin, x, y, z = (Vector3(row.tolist()) for row in (table.origins[k], *table.rows[k]))
-        frame = Frame(origin, x, y, z, float(table.extents[k]))
+        frame = Frame(origin, x, y, z)
         feet = np.array([surface(Vector3(p.tolist()), part, frame).p for part in (LATERAL, BASE, TOP)])
         # A part goes on beyond the object, but not within its box, or nearly so
         there = [_holding(boxes[k : k + 1], foot)[0][0] for foot in feet]

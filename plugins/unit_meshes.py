@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,13 +16,6 @@ class UnitMesh:
     gradients: np.ndarray  # float64 [N, 3]
     uvs: np.ndarray  # float64 [N, 2]
     faces: np.ndarray  # uint32 [M, 3], counter-clockwise seen from outside in a right-handed frame
-    stretch: np.ndarray | float = 0.0  # [N], what z grows by for each unit of the frame's extent
-
-    def placed(self, extent: float | np.ndarray = 1.0) -> np.ndarray:
-        """Return the points [..., N, 3] in a frame of this extent, or in each of some [n, 1]."""
-        if not np.any(self.stretch):
-            return self.points
-        return self.points + np.multiply.outer(self.stretch * np.asarray(extent), [0.0, 0.0, 1.0])
 
 
 def unit_sphere_mesh(segments: int = 0) -> UnitMesh:
@@ -62,27 +55,8 @@ def unit_cylinder_mesh(segments: int, *, capped: bool = True) -> UnitMesh:
     return _join([side, _disc(segments, 0.0), _disc(segments, 1.0)]) if capped else side
 
 
-def unit_capsule_mesh(segments: int) -> UnitMesh:
-    """Return two half spheres of radius 1 around z = 0 and z = extent, and the tube between their rims."""
-    azimuth = 2 * np.pi * np.arange(segments + 1) / segments
-    angles = np.linspace(0, np.pi / 2, max(segments // 4, 2) + 1)
-    heights = np.concatenate([-np.cos(angles), np.cos(angles[::-1])])
-    radii = np.concatenate([np.sin(angles), np.sin(angles[::-1])])
-    v = np.concatenate([np.linspace(1, 0.75, len(angles)), np.linspace(0.25, 0, len(angles))])
-    rings = [_ring(azimuth, z, radius=r, slope=z, v=t) for z, r, t in zip(heights, radii, v, strict=True)]
-    i = np.arange(segments, dtype=np.uint32)
-    k = i + segments + 1
-    lower, upper = np.stack([i, i + 1, k], axis=1), np.stack([i + 1, k + 1, k], axis=1)
-    last = len(rings) - 2
-    # The triangles with two corners in a pole are left out
-    faces = [f + np.uint32(n * (segments + 1)) for n in range(last + 1)
-             for f, pole in ((lower, 0), (upper, last)) if n != pole]  # fmt: skip
-    stretch = np.repeat([0.0, 1.0], len(angles) * (segments + 1))
-    return replace(_join(rings, np.concatenate(faces)), stretch=stretch)
-
-
-def _ring(azimuth: np.ndarray, z: float, *, slope: float, v: float, radius: float = 1.0) -> UnitMesh:
-    x, y = radius * np.cos(azimuth), radius * np.sin(azimuth)
+def _ring(azimuth: np.ndarray, z: float, *, slope: float, v: float) -> UnitMesh:
+    x, y = np.cos(azimuth), np.sin(azimuth)
     points = np.stack([x, y, np.full_like(x, z)], axis=1)
     gradients = np.stack([x, y, np.full_like(x, slope)], axis=1)
     uvs = np.stack([azimuth / (2 * np.pi), np.full_like(x, v)], axis=1)

@@ -68,8 +68,7 @@ class MrtWhitted(mi.SamplingIntegrator):
     with r the mirror direction, and the sky where a ray meets nothing. Shading goes through ``si.bsdf()``:
     k_s F is the attribute ``mirror_reflectance`` of an ``mrt_bsdf``, and the delta reflection of any other
     BSDF. Lights are all emitters of the scene; those without a delta position take one random sample each.
-    ``mrt_plane``, ``mrt_cone``, ``mrt_cylinder``, ``mrt_capsule`` and ``mrt_group`` shapes are intersected
-    analytically.
+    ``mrt_plane``, ``mrt_cone``, ``mrt_cylinder`` and ``mrt_group`` shapes are intersected analytically.
 
     ==================== ======== ============ ===========================================================
     name                 type     default      unit or range

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from mrt_mitsuba.scene.model import (
     Camera,
-    Capsule,
     Cone,
     Cylinder,
     Light,
@@ -15,4 +14,4 @@ from mrt_mitsuba.scene.model import (
     Sphere,
 )
 
-__all__ = ["Camera", "Capsule", "Cone", "Cylinder", "Light", "Material", "Mesh", "Plane", "Scene", "Sphere"]
+__all__ = ["Camera", "Cone", "Cylinder", "Light", "Material", "Mesh", "Plane", "Scene", "Sphere"]

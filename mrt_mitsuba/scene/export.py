@@ -25,8 +25,8 @@ def scene_dict(
 
     ``flavor``: "mrt" for this project's plugins; "stock" for the nearest equivalents among Mitsuba's, which
     any Mitsuba program opens: ``roughplastic`` for the material, ``point`` lights as bright at the camera's
-    target, finite squares for planes, ``cylinder`` and two ``disk`` for a cylinder, two ``sphere`` for a
-    capsule, ``bitmap`` for a texture, and ``path`` with few bounces for the integrator. Cones and meshes
+    target, finite squares for planes, ``cylinder`` and two ``disk`` for a cylinder, ``bitmap``
+    for a texture, and ``path`` with few bounces for the integrator. Cones and meshes
     have none but in a file of their own, which ``write_xml`` writes.
 
     Raises ``UsageError`` for a scene, flavor, size or formula that there is not, ``SceneError`` for a stock
@@ -137,7 +137,7 @@ def _stock(scene_as_dict: dict[str, Any], scene: Scene) -> dict[str, Any]:
             raise SceneError(
                 f"{name} has no counterpart among Mitsuba's plugins: {kind} {_WITHOUT_STOCK[kind]}"
             )
-        if kind in _TUBES:
+        if kind == "mrt_cylinder":
             result |= {f"{name}_{part}": child for part, child in _stock_tube(node).items()}
         else:
             result[name] = _REPLACEMENTS[kind](node, scene) if kind in _REPLACEMENTS else node
@@ -185,7 +185,7 @@ def _stock_plane(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
 
 
 def _stock_tube(node: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return an open tube, and at each end a disc that faces away from the other, or a ball."""
+    """Return an open tube, and at each end a disc that faces away from the other."""
     p0, p1, radius = node["p0"], node["p1"], node["radius"]
 
     def disc(center: list[float], opposite: list[float]) -> dict[str, Any]:
@@ -193,9 +193,6 @@ def _stock_tube(node: dict[str, Any]) -> dict[str, dict[str, Any]]:
         return {"type": "disk", "to_world": _facing(center, away, radius), "bsdf": node["bsdf"]}
 
     tube = {"type": "cylinder", "p0": p0, "p1": p1, "radius": radius, "bsdf": node["bsdf"]}
-    if node["type"] == "mrt_capsule":
-        balls = ({"type": "sphere", "center": p, "radius": radius, "bsdf": node["bsdf"]} for p in (p0, p1))
-        return {"tube": tube, **dict(zip(("ball0", "ball1"), balls, strict=True))}
     return {"tube": tube, "disc0": disc(p0, p1), "disc1": disc(p1, p0)}
 
 
@@ -225,9 +222,8 @@ _REPLACEMENTS: dict[str, Callable[[dict[str, Any], Scene], dict[str, Any]]] = {
     "mrt_plane": _stock_plane,
 }
 
-_TUBES = ("mrt_cylinder", "mrt_capsule")
 # Solids that Mitsuba's own plugins show as meshes
-_AS_MESHES = {f"mrt_{kind}" for kind in OBJECTS} - {"mrt_sphere", *_TUBES}
+_AS_MESHES = {f"mrt_{kind}" for kind in OBJECTS} - {"mrt_sphere", "mrt_cylinder"}
 # Shapes that are written as files next to the XML
 _IN_FILES = {"mrt": {"mrt_mesh"}, "stock": {"mrt_mesh", *_AS_MESHES}}
 _WITHOUT_STOCK = {

@@ -104,16 +104,6 @@ class Cylinder:
     material: Material
 
 
-@dataclass(frozen=True)
-class Capsule:
-    """All points within the radius of the segment from p0 to p1."""
-
-    p0: Vector
-    p1: Vector
-    radius: float
-    material: Material
-
-
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangles of one material; a normal is on the side from which corners run counter-clockwise."""
@@ -137,7 +127,6 @@ class Scene:
     cones: tuple[Cone, ...] = ()
     cylinders: tuple[Cylinder, ...] = ()
     meshes: tuple[Mesh, ...] = ()
-    capsules: tuple[Capsule, ...] = ()
     texturing: str = "report"  # or "standard": bilinear, sRGB-aware
     focal_distance: float | None = None
     focal_range: float = FOCAL_RANGE
@@ -294,7 +283,7 @@ def _rgb(color: Color) -> dict[str, Any]:
 
 
 # What the plugins of the same names draw; the fields but for the material are their parameters
-OBJECTS: dict[str, type] = {"sphere": Sphere, "cone": Cone, "cylinder": Cylinder, "capsule": Capsule}
+OBJECTS: dict[str, type] = {"sphere": Sphere, "cone": Cone, "cylinder": Cylinder}
 
 
 def _parameters(thing: Any) -> dict[str, Any]:

@@ -74,7 +74,7 @@ def group(kind: str, *columns: np.ndarray) -> mi.Shape:
 
 
 @SCALES
-@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder", "capsule"])
+@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder"])
 def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: float) -> None:
     """Spheres: to the bit what Embree finds; quadrics: what the tree does. Lights are inside and far off.
 
@@ -104,7 +104,7 @@ def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: f
 
 
 @SCALES
-@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder", "capsule"])
+@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder"])
 def test_lists_for_the_eye_find_what_a_search_finds(kind: str, size: float, shift: float) -> None:
     """Also where the eye is within an object as large as all others together, and for rays from elsewhere."""
     starts, ends, radii, targets = crowd(size, shift)
@@ -139,7 +139,7 @@ def test_hulls_hold_their_objects() -> None:
         table = QuadricTable.of_numbers(kind, numbers, 1, place, flipped=False)
         axes, centers = table.hulls()[..., :3], table.hulls()[..., 3]  # [n, 2, 3, 3], [n, 2, 3]
         reach = (centers @ directions.T + np.linalg.norm(directions @ axes, axis=3)).max(axis=1)
-        local = KINDS[kind].mesh(64).placed(table.extents[:, None])
+        local = KINDS[kind].mesh(64).points
         world = local @ np.linalg.inv(table.rows).transpose(0, 2, 1) + table.origins[:, None]
         vertices = (world @ directions.T).max(axis=1)
         width = vertices + (world @ -directions.T).max(axis=1)

@@ -36,7 +36,6 @@ SHAPES: dict[str, tuple[dict[str, Any], set[str], set[str]]] = {
     "mrt_plane": ({"normal": [0, 1, 0]}, set(), OPEN | {"scale"}),
     "mrt_cone": (CONE, {"far"}, set()),
     "mrt_cylinder": ({"p0": [0, 1, 0], "p1": [0, 0, 0], "radius": 0.5, **MIRRORED}, {"far"}, set()),
-    "mrt_capsule": ({"p0": [0, 1, 0], "p1": [0, 0, 0], "radius": 0.5, **MIRRORED}, {"far"}, set()),
 }
 
 

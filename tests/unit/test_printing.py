@@ -21,7 +21,6 @@ def examples() -> dict[str, dict[str, Any]]:
     triangle = bitmap([(0, 0, 0), (1, 0, 0), (0, 1, 0)])
     return {
         "bsdf": {},
-        "capsule": {"p0": [0, 1, 0], "p1": [0, 0, 0], "radius": 1.0},
         "cone": {"apex": [0, 1, 0], "base_center": [0, 0, 0], "radius": 1.0},
         "cylinder": {"p0": [0, 1, 0], "p1": [0, 0, 0], "radius": 1.0},
         "group": {"numbers": mi.Bitmap(np.array([(0, 0, 0, 1), (2, 0, 0, 0.5)], dtype=np.float32))},

@@ -19,7 +19,7 @@ from mrt_mitsuba.plugins import intersect
 from mrt_mitsuba.plugins.intersect import BASE, LATERAL, TOP
 from mrt_mitsuba.plugins.quadrics import Quadrics
 from mrt_mitsuba.plugins.tree import Tree
-from mrt_mitsuba.scene.model import Camera, Capsule, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
+from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.validation.oracles import reference
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -40,8 +40,6 @@ def meet(shape: str, o: Any, d: Any) -> Any:
         return intersect.intersect_plane(o, d, V(0, 1, 0), 0.0)
     if shape == "sphere":
         return intersect.intersect_sphere(o, d, V(1, 2, 3), 0.5)
-    if shape == "capsule":
-        return intersect.intersect_capsule(o, d, intersect.capsule_frame(V(0, 0, 0), V(0, 0, 4), 2.0))
     kind = shape.removeprefix("open ")
     return KINDS[kind][1](o, d, UNIT[kind], capped=kind == shape)
 
@@ -88,16 +86,6 @@ INF = np.inf
         ("cylinder", (0, 0, 0.5), (1, 0, 0), 1, LATERAL),
         ("cylinder", (2, 0, -1), (-1, 0, 1), 1, LATERAL),  # onto the rim
         ("open cylinder", (0.2, 0, -5), (0, 0, 1), INF, None),
-        ("capsule", (0, 0, -5), (0, 0, 1), 3, None),  # onto a tip, along the axis
-        ("capsule", (0, 0, 1), (0, 0, 1), 5, None),  # from inside, out at the other tip
-        ("capsule", (1.2, 0, 9), (0, 0, -1), 3.4, None),  # parallel to the side, onto a ball
-        ("capsule", (2 + 1e-12, 0, 9), (0, 0, -1), INF, None),
-        ("capsule", (5, 0, 2), (-1, 0, 0), 3, None),  # onto the tube
-        ("capsule", (5, 0, 4), (-1, 0, 0), 3, None),  # at the rim of the tube
-        ("capsule", (5, 0, 5.2), (-1, 0, 0), 3.4, None),  # onto a ball
-        ("capsule", (5, 0, 6 + 1e-9), (-1, 0, 0), INF, None),
-        ("capsule", (0, 0, 2), (1, 0, 0), 2, None),  # from inside, through the side
-        ("capsule", (3, 0, 9), (-1, 0, -1), 3, None),  # aslant onto a ball
     ],
 )
 def test_single_rays(shape: str, o: tuple, d: tuple, t: float, part: int | None) -> None:
@@ -249,25 +237,6 @@ def test_search_against_float64(kind: str, count: int, scale: float, place: str)
         assert disagreements(lost, exact, thinner).mean() > 2e-4
 
 
-def test_capsule_is_a_tube_and_two_balls() -> None:
-    """Rays from outside meet the nearest of the three, over three decades of sizes."""
-    ends, radii, _, _ = crowd(30, "among", "cylinder")
-    numbers = np.concatenate([ends.reshape(-1, 6), radii[:, None]], axis=1).astype(np.float32)
-    d = np.random.default_rng(9).normal(size=(3, 50_000)).astype(np.float32)
-    o = -80 * d / np.linalg.norm(d, axis=0) + np.random.default_rng(10).uniform(-4, 4, d.shape)
-    ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d), dr.opaque(mi.Float, 2.0**127), 0, [])
-
-    def group(kind: str, rows: np.ndarray) -> Any:
-        return mi.load_dict({"type": "mrt_group", "kind": kind, "numbers": mi.Bitmap(rows)})
-
-    balls = [group("sphere", numbers[:, columns]) for columns in ([0, 1, 2, 6], [3, 4, 5, 6])]
-    parts = Quadrics([group("cylinder", numbers), *balls]).intersect(ray, mi.Bool(True))[0].numpy()
-    whole = Quadrics([group("capsule", numbers)]).intersect(ray, mi.Bool(True))[0].numpy()
-    assert 0.3 < (whole < 1e30).mean() < 0.99
-    # float32 at a distance of 80; a silhouette may go either way
-    assert np.isclose(whole, parts, rtol=1e-5).mean() > 0.9998
-
-
 def test_equal_objects_in_one_place_hide_nothing() -> None:
     """An open tube around a cone of the same length and radius: their boxes are one and the same."""
     tube = mi.load_dict({"type": "mrt_cylinder", "p0": [0, 0, 0], "p1": [0, 0, 1], "capped": False})
@@ -291,7 +260,6 @@ def everything(material: Material = GLOSSY) -> Scene:
         planes=(Plane((0, 1, 0), 0, material),),
         cones=(Cone((-0.5, 1.5, 0), (-0.4, 0, 0.1), 0.6, material), small),
         cylinders=(Cylinder((1, 0, -1), (0.7, 1.2, -1), 0.4, material),),
-        capsules=(Capsule((-1.2, 0.3, 1), (-0.4, 0.2, 1.6), 0.2, material),),
     )
 
 
@@ -310,7 +278,7 @@ def test_exact_shapes_look_like_fine_meshes() -> None:
     nodes = everything(MATTE).to_dict(width=160, height=120)
     nodes = {name: node for name, node in nodes.items() if name not in left_out}
     for node in nodes.values():
-        if isinstance(node, dict) and node["type"] in ("mrt_cone", "mrt_cylinder", "mrt_capsule"):
+        if isinstance(node, dict) and node["type"] in ("mrt_cone", "mrt_cylinder"):
             node["segments"] = 1024
     exact = mrt.render(nodes, aa=1, integrator={"type": "mrt_whitted", "clamp": False}).image
     mesh = mrt.render(nodes, aa=1, integrator="direct").image

@@ -12,7 +12,6 @@ from PIL import Image
 from mrt_mitsuba import SceneError
 from mrt_mitsuba.scene.model import (
     Camera,
-    Capsule,
     Cone,
     Cylinder,
     Light,
@@ -168,11 +167,6 @@ def test_triangles_show_the_nearest_texel(tmp_path: Path) -> None:
         np.testing.assert_allclose(found * np.pi, color, atol=1e-6)
     with pytest.raises(SceneError, match="textures on triangles only"):
         pixel(scene(Sphere((0, 0, 0), 1, matte)))
-
-
-def test_capsules_are_refused() -> None:
-    with pytest.raises(SceneError, match="no capsules"):
-        pixel(replace(scene(NEAR), capsules=(Capsule((0, 0, 0), (0, 1, 0), 0.5, WOOD),)))
 
 
 def test_picture_is_the_right_way_up_and_mirrored_as_in_the_original() -> None:

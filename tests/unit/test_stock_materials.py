@@ -78,7 +78,6 @@ PLACES = {
     "rectangle": SQUARE,
     "cone": {"type": "mrt_cone", "apex": [0, 1.2, 0], "base_center": [0, -1, 0], "segments": 1024},
     "cylinder": {"type": "mrt_cylinder", "p0": [0, 1, 0], "p1": [0.1, -1, 0.2], "segments": 1024},
-    "capsule": {"type": "mrt_capsule", "p0": [0, 0.7, 0], "p1": [0.1, -0.7, 0.2], "radius": 0.6},
     "plane": {"type": "mrt_plane", "normal": [0, 1, 0.2], "distance": 1.0},
     "group": {
         "type": "mrt_group",
@@ -117,7 +116,7 @@ def test_flipped_normals(name: str, flipped: bool) -> None:
         assert (ours.max() > 0.02) == (material["type"] == "twosided" or not flipped)
 
 
-@pytest.mark.parametrize("name", ["cone", "cylinder", "capsule", "group", "mesh"])
+@pytest.mark.parametrize("name", ["cone", "cylinder", "group", "mesh"])
 @pytest.mark.parametrize("scale", [[0.7, 0.5, 0.6], [-0.7, 0.5, 0.6]])
 def test_to_world(name: str, scale: list[float]) -> None:
     to_world = mi.ScalarTransform4f().translate([0.5, 0.3, 0]).rotate([0, 0, 1], 30).scale(scale)
@@ -142,7 +141,7 @@ def test_normals_of_corners_stay_across_the_surface() -> None:
     np.testing.assert_allclose(normals, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder", "capsule"])
+@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder"])
 def test_derivatives_by_uv_are_those_of_the_surface(kind: str) -> None:
     """dp/du and dp/dv of a hit by finite differences of the hits around it."""
     points = {"sphere": [0.1, 0.2, 0.3], "cone": [0, 1.2, 0, 0.2, -1, 0.1]}.get(

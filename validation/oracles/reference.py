@@ -73,8 +73,8 @@ class Settings:
 def reference_render(scene: Scene, *, width: int, height: int, **settings: Any) -> ReferenceResult:
     """Render a scene with one ray through each pixel, exactly but for the rounding of float64.
 
-    ``settings`` are those of ``Settings``. Raises ``SceneError`` for capsules, for a texture on
-    anything but triangles, and for one that is not looked up as in the report.
+    ``settings`` are those of ``Settings``. Raises ``SceneError`` for a texture on anything but
+    triangles, and for one that is not looked up as in the report.
     """
     chosen = Settings(**settings)
     pixel = np.arange(width * height)
@@ -286,8 +286,6 @@ class _Hits:
 
 class _Tracer:
     def __init__(self, scene: Scene, settings: Settings) -> None:
-        if scene.capsules:
-            raise SceneError("the float64 reference has no capsules; leave them out")
         self.scene, self.settings = scene, settings
         self.reach = ORIGINAL_REACH if settings.start == "original" else np.inf
         # Each with the numbers of its objects; all triangles of a mesh are one object
