@@ -60,6 +60,10 @@ def __getattr__(name: str) -> object:
     from importlib import import_module
 
     if name in _HOME:
+        if not _HOME[name].endswith(".errors"):
+            from mrt_mitsuba.runtime import check_start
+
+            check_start()
         value = getattr(import_module(_HOME[name]), name)
     elif name in _SUBMODULES:
         value = import_module(f"{__name__}.{name}")

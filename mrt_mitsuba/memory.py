@@ -46,11 +46,11 @@ LEAST_ROWS = 24
 
 @dataclass
 class Budget:
-    """Bytes that a render may use, of which its scene has taken some for pictures."""
+    """Bytes that a render may use, of which its scene has taken some for textures."""
 
     size: int
     taken: int = 0
-    pictures: set[str] = field(default_factory=set)  #: their paths, without symbolic links
+    inputs: set[str] = field(default_factory=set)  #: paths of the files that the scene is read from
 
     @classmethod
     def of(cls, memory: int | None) -> Budget:
@@ -75,7 +75,6 @@ class Budget:
                 f"memory, and {_text(self.size)} may be used: choose a smaller picture or a larger memory="
             )
         self.taken += stays
-        self.pictures.add(os.path.realpath(path))
 
 
 @functools.lru_cache(maxsize=2)

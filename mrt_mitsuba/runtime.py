@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import warnings
@@ -9,7 +10,7 @@ from functools import cache
 
 from mrt_mitsuba import llvm
 from mrt_mitsuba.cores import usable_cores
-from mrt_mitsuba.errors import MrtWarning, UnknownVariantError, VariantError
+from mrt_mitsuba.errors import MrtError, MrtWarning, UnknownVariantError, VariantError
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.loaders import mitsuba_first, one_by_one, rewriting_later
 from mrt_mitsuba.memory import check_addresses
@@ -42,7 +43,7 @@ def use(variant: str | None = None) -> str:
 def _use(variant: str | None) -> str:
     global _used
     llvm.prepare()
-    check_addresses()
+    check_start()
     with one_at_a_time, held(), rewriting_later():
         _used = _set(variant)
     return _used
@@ -66,6 +67,17 @@ def _set(variant: str | None) -> str:
         _keep_to_quota()
     _register_plugins()
     return variant
+
+
+def check_start() -> None:
+    """Raise ``MrtError`` where Mitsuba could not even be imported."""
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:
+        raise MrtError(
+            "the working folder has been deleted, and Mitsuba needs one: change to another"
+        ) from error
+    check_addresses()
 
 
 def register() -> None:

@@ -20,12 +20,12 @@ from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, is_obj
 
 def run(options: Options) -> int:
     """Render and write what the options say; return the exit code."""
-    from mrt_mitsuba.memory import check_addresses
-    from mrt_mitsuba.output.replacing import check_not_read, check_target
+    from mrt_mitsuba.output.replacing import check_target
+    from mrt_mitsuba.runtime import check_start
 
-    check_addresses()
+    check_start()
     for path in options.outputs():
-        check_target(path)
+        check_target(path, [] if options.scene is None else [options.scene])
     with _loading():
         with held():  # it imports Dr.Jit
             from mrt_mitsuba.rendering.api import render
@@ -48,7 +48,8 @@ def run(options: Options) -> int:
         from mrt_mitsuba.scene.placement import model_scene
 
         scene = model_scene(scene, **options.model())
-        check_not_read(options.outputs(), scene.pictures)  # at once, not after the render
+        for path in options.outputs():  # at once, not after the render
+            check_target(path, scene.pictures)
     result = render(scene, progress=progress, **options.render_arguments())
     seconds = time.perf_counter() - start
     result.save(*options.outputs(), tonemap=options.tonemap)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, Any
 
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
 from mrt_mitsuba.output.layers import LAYERS
-from mrt_mitsuba.output.replacing import replacing_together
+from mrt_mitsuba.output.replacing import replacing, replacing_together
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,6 +30,7 @@ PNG_RUNS = 3
 # a third of the bytes, or two where there is much sky: the last digits of colours are noise
 COMPRESSED = 2**20  # pixels
 
+TONEMAPS = ("report", "srgb")
 _PIXELS = 2**14  # converted to 8 bit at a time, so that intermediate arrays stay in the processor's cache
 
 
@@ -48,18 +50,23 @@ def save(
     layers: Mapping[str, Image] | None = None,
     header: Mapping[str, Any] | None = None,
     tonemap: str = "report",
+    inputs: Iterable[Path] = (),
 ) -> None:
-    """Write a picture [H, W, 3] in the formats that the endings of ``paths`` name, .png or .exr.
+    """Write a linear picture [H, W, 3] in the formats that the endings of ``paths`` name, .png or .exr.
 
-    All files are replaced, or none. Layers and header go into an EXR only, ``tonemap`` concerns a PNG only.
-    Raises ``OutputError``.
+    All files are replaced, or none. Layers and header go into an EXR only, ``tonemap`` (see ``to_8bit``)
+    concerns a PNG only. A layer is named by one channel ("depth.Z", [H, W]) or as a whole ("depth", [H, W];
+    "normal", [H, W, 3]), with the channels of ``LAYERS``, else R, G, B or Y. Header values are text or
+    numbers; anything else is written as JSON. ``inputs``: files that the picture is made from.
+
+    Raises ``OutputError`` for a file that cannot be written, or that is one of ``inputs``.
     """
     paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     endings = [os.path.splitext(os.fspath(path))[1].lower() for path in paths]
     for path, ending in zip(paths, endings, strict=True):
         if ending not in (".png", ".exr"):
             raise OutputError(f"cannot write {os.fspath(path)}: the name must end in .png or .exr")
-    with replacing_together(paths) as files:
+    with replacing_together(paths, inputs) as files:
         for file, ending in zip(files, endings, strict=True):
             if ending == ".png":
                 _write_png(file, image, tonemap)
@@ -67,9 +74,9 @@ def save(
                 _write_exr(file, image, layers or {}, header or {})
 
 
-def write_png(path: Path, image: Image, *, tonemap: str = "report") -> None:
-    """Write a linear picture [H, W, 3] as PNG; ``tonemap`` as in ``to_8bit``. Raises ``OutputError``."""
-    with replacing_together([path]) as (file,):
+def write_png(path: Path, image: Image, *, tonemap: str = "report", inputs: Iterable[Path] = ()) -> None:
+    """Write a linear picture [H, W, 3] as PNG, whatever the path's ending; see ``save``."""
+    with replacing(path, inputs) as file:
         _write_png(file, image, tonemap)
 
 
@@ -78,14 +85,11 @@ def write_exr(
     image: Image,
     layers: Mapping[str, Image] | None = None,
     header: Mapping[str, Any] | None = None,
+    *,
+    inputs: Iterable[Path] = (),
 ) -> None:
-    """Write a linear picture [H, W, 3] as float32 EXR, with layers and header attributes.
-
-    A layer is named by one channel ("depth.Z", [H, W]) or as a whole ("depth", [H, W]; "normal", [H, W, 3]),
-    with the channels of ``LAYERS``, else R, G, B or Y. Header values are text or numbers; anything else is
-    written as JSON. Raises ``OutputError``.
-    """
-    with replacing_together([path]) as (file,):
+    """Write a linear picture [H, W, 3] as float32 EXR, whatever the path's ending; see ``save``."""
+    with replacing(path, inputs) as file:
         _write_exr(file, image, layers or {}, header or {})
 
 
@@ -102,11 +106,15 @@ def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
 def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Mapping[str, Any]) -> None:
     import OpenEXR
 
-    attributes = {name: _attribute(value) for name, value in header.items()}
+    plain = {
+        name: value if isinstance(value, str | int | float) else json.dumps(value)
+        for name, value in header.items()
+    }
     kind = compression(image.shape[0] * image.shape[1])
-    attributes |= {"compression": kind, "type": OpenEXR.scanlineimage}
     # The library does not report a full disk when it opens the file itself, so the file is ours.
-    picture = OpenEXR.File(attributes, _channels(image, layers))
+    picture = OpenEXR.File(
+        {**plain, "compression": kind, "type": OpenEXR.scanlineimage}, _channels(image, layers)
+    )
     with contextlib.nullcontext() if kind == OpenEXR.NO_COMPRESSION else compressing():
         picture.write(_Stream(file))
 
@@ -196,32 +204,21 @@ def _blocks(image: Image, tonemap: str) -> Iterator[tuple[int, NDArray[np.uint8]
     """Yield the picture in 8 bit as ``to_8bit`` has it, some rows at a time with the number of the first."""
     import numpy as np
 
-    if tonemap not in _LEVELS:
-        raise UsageError(f"tonemap={tonemap!r}: must be {' or '.join(_LEVELS)}")
-    convert = _LEVELS[tonemap]
+    if tonemap not in TONEMAPS:
+        raise UsageError(f"tonemap={tonemap!r}: must be {' or '.join(TONEMAPS)}")
     rows, lost = max(1, _PIXELS // image.shape[1]), 0
     for row in range(0, len(image), rows):
         block = np.asarray(image[row : row + rows], np.float32)
         lost += int(np.isnan(block).any(axis=-1).sum())
-        yield row, convert(np.fmin(np.fmax(block, 0), 1))  # of NaN and a number, the number
+        values = np.fmin(np.fmax(block, 0), 1)  # of NaN and a number, the number
+        if tonemap == "report":
+            values *= np.float32(255)
+        else:
+            encoded = np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
+            values = encoded * 255 + 0.5
+        yield row, values.astype(np.uint8)
     if lost:
         warnings.warn(f"{lost} pixels are NaN; the PNG holds 0 there", MrtWarning, stacklevel=4)
-
-
-def _report_levels(values: Image) -> NDArray[np.uint8]:
-    import numpy as np
-
-    return (values * np.float32(255)).astype(np.uint8)
-
-
-def _srgb_levels(values: Image) -> NDArray[np.uint8]:
-    import numpy as np
-
-    encoded = np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
-    return (encoded * 255 + 0.5).astype(np.uint8)
-
-
-_LEVELS = {"report": _report_levels, "srgb": _srgb_levels}
 
 
 def _channels(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
@@ -246,9 +243,3 @@ def _channels(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
         for index, channel in enumerate(names):
             result[channel] = np.ascontiguousarray(array[:, :, index])
     return result
-
-
-def _attribute(value: Any) -> str | int | float:
-    import json
-
-    return value if isinstance(value, str | int | float) else json.dumps(value)

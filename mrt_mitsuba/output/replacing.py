@@ -1,4 +1,4 @@
-"""Putting files in the place of others: all of one result, or none.
+"""Putting files in the place of others: all of one result, or none, and never one that was read for it.
 
 New files are written next to the old ones under temporary names. Once all are complete and on the disk, they
 take the places of the old; if anything goes wrong before, they disappear. What a killed process left
@@ -14,110 +14,72 @@ import os
 import stat
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path as Folder
 from typing import IO
 
 from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.interrupts import held
 
 log = logging.getLogger(__name__)
 
 Path = str | os.PathLike[str]
 
-_PREFIX, _SUFFIX = ".mrt-", ".tmp"
+_TEMPORARY = ".mrt-{}.tmp"
 _OLD = 10.0  # seconds after which a file that nobody has locked has been left behind
 _unfinished: set[str] = set()  # temporary files of this process
 _tidied: set[str] = set()  # folders
 
 
-def check_target(path: Path) -> None:
-    """Raise ``OutputError`` if ``path`` cannot be written; to be asked before the work. Leaves no trace."""
-    with _explained(path):
-        temporary, file = _open_next_to(_target(path))
-        file.close()
-        _discard(temporary)
+def check_target(path: Path, inputs: Iterable[Path] = ()) -> None:
+    """Raise ``OutputError`` if ``path`` cannot be written; to be asked before the work. Leaves no trace.
 
-
-def check_not_read(paths: Sequence[Path], pictures: Iterable[Path]) -> None:
-    """Raise ``OutputError`` if one of the paths is one of the pictures that a scene is read from."""
-    read = set(map(os.path.realpath, pictures))
-    for path in paths:
-        if os.path.realpath(path) in read:
-            raise OutputError(
-                f"cannot write {os.fspath(path)}: the scene uses this picture; choose another name"
-            )
+    ``inputs``: files that the work reads; none of them is written, by whatever path or link.
+    """
+    with _explained(path), _temporary(os.path.dirname(_target(path, inputs))):
+        pass
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[IO[bytes]]:
+def replacing(path: Path, inputs: Iterable[Path] = ()) -> Iterator[IO[bytes]]:
     """Give a binary file to write to, which takes the place of ``path`` when all went well.
 
     A symbolic link stays and its target is replaced. Whatever is raised inside, the old file is left as it
-    was and no temporary file remains; an ``OSError`` becomes an ``OutputError``.
+    was and no temporary file remains; an ``OSError`` becomes an ``OutputError``. ``inputs`` as in
+    ``check_target``.
     """
-    with replacing_together([path]) as (file,):
+    with replacing_together([path], inputs) as (file,):
         yield file
 
 
 @contextlib.contextmanager
-def replacing_together(paths: Sequence[Path]) -> Iterator[list[IO[bytes]]]:
+def replacing_together(paths: Sequence[Path], inputs: Iterable[Path] = ()) -> Iterator[list[IO[bytes]]]:
     """Give a file for each of several paths, as ``replacing`` does; all are replaced, or none."""
-    written: list[tuple[str, str]] = []  # temporary file, target
     with contextlib.ExitStack() as stack:
-        try:
-            files = []
-            for path in paths:
-                with _explained(path):
-                    target = _target(path)
-                    temporary, file = _open_next_to(target)
-                    stack.callback(_close, file)
-                    written.append((temporary, target))
-                    files.append(file)
-            with _explained(*paths):
-                yield files
-            for path, file, (temporary, target) in zip(paths, files, written, strict=True):
-                with _explained(path):
-                    file.flush()
-                    os.fsync(file.fileno())
-                    if os.path.exists(target):
-                        os.chmod(temporary, stat.S_IMODE(os.stat(target).st_mode))
-            with _explained(*paths):
-                _rename(written)
-        finally:
-            for temporary, _ in written:
-                _discard(temporary)
-    for _, target in written:
+        files, targets = [], []
+        for path in paths:
+            with _explained(path):
+                targets.append(_target(path, inputs))
+                files.append(stack.enter_context(_temporary(os.path.dirname(targets[-1]))))
+        with _explained(*paths):
+            yield files
+        for path, file, target in zip(paths, files, targets, strict=True):
+            with _explained(path):
+                file.flush()
+                os.fsync(file.fileno())
+                if os.path.exists(target):
+                    os.fchmod(file.fileno(), stat.S_IMODE(os.stat(target).st_mode))
+        with held(), _explained(*paths):  # an interrupt in between is raised afterwards
+            for file, target in zip(files, targets, strict=True):
+                os.replace(file.name, target)
+    for target in targets:
         log.info("wrote %s", target)
-
-
-def _close(file: IO[bytes]) -> None:
-    with contextlib.suppress(OSError):  # of what a full disk has no room for; good files have been flushed
-        file.close()
-
-
-def _rename(files: Sequence[tuple[str, str]]) -> None:
-    """Put all files in their places; an interrupt in between is raised afterwards."""
-    waiting, interrupt = list(files), None
-    while waiting:
-        try:
-            while waiting:
-                if os.path.exists(waiting[0][0]):
-                    os.replace(*waiting[0])
-                del waiting[0]
-        except KeyboardInterrupt as error:
-            interrupt = error
-    if interrupt is not None:
-        raise interrupt
 
 
 def discard_unfinished() -> None:
     """Remove the temporary files of this process; for one about to end by force."""
     for temporary in tuple(_unfinished):
-        _discard(temporary)
-
-
-def _discard(temporary: str) -> None:
-    with contextlib.suppress(OSError):
-        os.unlink(temporary)
-    _unfinished.discard(temporary)
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
 
 
 @contextlib.contextmanager
@@ -129,7 +91,7 @@ def _explained(*paths: Path) -> Iterator[None]:
         raise OutputError(f"cannot write {names}: {error.strerror or error}") from error
 
 
-def _target(path: Path) -> str:
+def _target(path: Path, inputs: Iterable[Path]) -> str:
     """Return the real path to write; raise ``OutputError`` where replacing a file there would be wrong."""
     name = os.fspath(path)
     target = os.path.realpath(name)
@@ -139,7 +101,7 @@ def _target(path: Path) -> str:
     if not os.path.isdir(folder):
         raise OutputError(f"cannot write {name}: the folder {folder} does not exist; create it first")
     try:
-        found = os.lstat(target)
+        found, around = os.lstat(target), os.stat(folder)
     except FileNotFoundError:
         return target
     mode, problem = found.st_mode, ""
@@ -149,52 +111,47 @@ def _target(path: Path) -> str:
         problem = "it is a folder; choose another name"
     elif not stat.S_ISREG(mode):
         problem = "it is not a regular file"
+    elif any(os.path.exists(each) and os.path.samefile(target, each) for each in inputs):
+        problem = "what is written is made from this file; choose another name"
     # The superuser may write to any file; its owner's "read-only" is respected all the same.
     elif not mode & 0o222 or not os.access(target, os.W_OK):
         problem = "the file is read-only; remove it or choose another name"
-    elif _is_kept_by(found.st_uid, os.stat(folder)):
+    elif around.st_mode & stat.S_ISVTX and os.geteuid() not in (0, found.st_uid, around.st_uid):
         problem = "the file is another user's, and only its owner may replace it here; choose another name"
     if problem:
         raise OutputError(f"cannot write {name}: {problem}")
     return target
 
 
-def _is_kept_by(owner: int, folder: os.stat_result) -> bool:
-    """Return whether a folder such as /tmp (with a sticky bit) forbids this user to replace a file in it."""
-    return bool(folder.st_mode & stat.S_ISVTX) and os.geteuid() not in (0, owner, folder.st_uid)
-
-
-def _open_next_to(target: str) -> tuple[str, IO[bytes]]:
-    """Create and lock a new file in the folder of ``target``, with the rights the user's umask gives."""
-    folder = os.path.dirname(target)
-    _tidy(folder)
-    temporary = os.path.join(folder, f"{_PREFIX}{os.urandom(8).hex()}{_SUFFIX}")
-    _unfinished.add(temporary)
-    descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-    with contextlib.suppress(OSError):  # not every file system can
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    return temporary, os.fdopen(descriptor, "w+b")
+@contextlib.contextmanager
+def _temporary(folder: str) -> Iterator[IO[bytes]]:
+    """Give a new file in a folder, locked, with the rights of the user's umask; remove it at the end."""
+    if folder not in _tidied:
+        _tidied.add(folder)
+        _tidy(folder)
+    name = os.path.join(folder, _TEMPORARY.format(os.urandom(8).hex()))
+    _unfinished.add(name)
+    try:
+        file = open(name, "x+b")  # noqa: SIM115 - closing it may fail
+        try:
+            with contextlib.suppress(OSError):  # not every file system can
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield file
+        finally:
+            with contextlib.suppress(OSError):  # a full disk has no room for the rest
+                file.close()
+    finally:
+        with contextlib.suppress(OSError):
+            os.unlink(name)
+        _unfinished.discard(name)
 
 
 def _tidy(folder: str) -> None:
-    """Remove what killed processes left in a folder, once."""
-    if folder in _tidied:
-        return
-    _tidied.add(folder)
-    with contextlib.suppress(OSError), os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.name.startswith(_PREFIX) and entry.name.endswith(_SUFFIX):
-                with contextlib.suppress(OSError):
-                    _remove_if_left(entry)
-
-
-def _remove_if_left(entry: os.DirEntry[str]) -> None:
-    found = entry.stat(follow_symlinks=False)
-    if not stat.S_ISREG(found.st_mode) or time.time() - found.st_mtime < _OLD:
-        return
-    descriptor = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
-        os.unlink(entry.path)
-    finally:
-        os.close(descriptor)
+    """Remove what killed processes left in a folder."""
+    for path in Folder(folder).glob(_TEMPORARY.format("*")):
+        with contextlib.suppress(OSError):
+            found = path.lstat()
+            if stat.S_ISREG(found.st_mode) and time.time() - found.st_mtime > _OLD:
+                with path.open("rb") as file:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
+                    path.unlink()

@@ -6,6 +6,7 @@ scene → facts → plan → rays → integrator → filters → result: each st
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -220,7 +221,7 @@ def _render(
         _in_force(settings, plan, source),
         runtime.versions(),
         view.matrices(),
-        frozenset(budget.pictures),
+        frozenset(map(os.path.abspath, budget.inputs)),
         passes.error,
         tuple(passes.rounds),
     )

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from mrt_mitsuba.output import files
 from mrt_mitsuba.output.error import ErrorEstimate, Round
-from mrt_mitsuba.output.replacing import check_not_read
 from mrt_mitsuba.rendering.plan import Plan
 
 Image = NDArray[np.float32]
@@ -43,17 +42,18 @@ class Result:
     options: Mapping[str, Any]  #: the values in force
     versions: Mapping[str, str]  #: of what decides about pixels
     camera: Mapping[str, np.ndarray]  #: float64 [4, 4], see ``rendering.view``
-    inputs: frozenset[str] = frozenset()  #: paths of the pictures that the scene was read from
+    inputs: frozenset[str] = frozenset()  #: paths of the files that the scene was read from
     error: ErrorEstimate | None = None  #: to the converged picture; None where nothing was estimated
     rounds: tuple[Round, ...] = ()  #: what was known after each: the error over the time of this render
 
     def save(self, *paths: str | os.PathLike[str], tonemap: str = "report") -> None:
-        """Write .png and .exr files, all or none; raise ``OutputError``.
+        """Write .png and .exr files, all or none; raise ``OutputError``, also for a file that the scene was
+        read from.
 
         ``tonemap`` ("report" or "srgb") concerns a PNG only.
         """
-        check_not_read(paths, self.inputs)
-        files.save(paths, self.image, layers=self.layers, header=self.header(), tonemap=tonemap)
+        header = self.header()
+        files.save(paths, self.image, layers=self.layers, header=header, tonemap=tonemap, inputs=self.inputs)
 
     def header(self) -> dict[str, Any]:
         """Return the header attributes of an EXR: how the picture was made, and nothing such as seconds that

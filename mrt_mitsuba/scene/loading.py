@@ -61,6 +61,8 @@ def load_file(path: str, budget: Budget | None = None, **parameters: Any) -> tup
     require_file(path)
     if not path.lower().endswith(".xml"):
         raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
+    if budget is not None:
+        budget.inputs.add(path)
     given = {key: str(value) for key, value in parameters.items()}
     with _resolving(os.path.dirname(path) or "."):
         values = _check_xml(path, given)
@@ -91,6 +93,8 @@ def _make(parse: Callable[[Any], Any], name: str, budget: Budget | None, merge: 
             if isinstance(filename, str):
                 _check_data(filename)
                 size = picture_size(_resolved(filename)) if kind in _PICTURES else None
+                if budget is not None:
+                    budget.inputs.add(_resolved(filename))
                 if budget is not None and size is not None:
                     budget.take_texture(_resolved(filename), *size, around=kind == "envmap")
         mi.parser.transform_all(config, state)

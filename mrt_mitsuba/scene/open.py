@@ -74,8 +74,8 @@ def open_scene(
         focus = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
         chosen = _integrator(integrator, loaded)
         return Source(name, loaded, view, chosen, width, height, *focus, own=True)
-    if budget is not None:  # those that no face uses, too: a render must not overwrite them
-        budget.pictures.update(map(os.path.realpath, own.pictures))
+    if budget is not None:  # pictures that no face uses, too
+        budget.inputs.update(own.pictures, [os.fspath(scene)] if is_obj(scene) else [])
     width, height, fresnel = size[0] or SIZE[0], size[1] or SIZE[1], fresnel or "schlick"
     # its meshes have a material each: kept apart, they stay in order, and the same file has the same layers
     nodes = own.to_dict(width=width, height=height, fresnel=fresnel)

@@ -6,6 +6,8 @@ import fcntl
 import os
 import resource
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -219,18 +221,15 @@ def test_full_disk_leaves_the_old_files(tmp_path: Path, old, endings: list[str],
 
 
 @pytest.mark.parametrize("endings", ENDINGS)
-@pytest.mark.parametrize("step", ["fsync", "chmod", "replace"])
+@pytest.mark.parametrize("step", ["fsync", "fchmod", "replace"])
 def test_interrupt_leaves_all_files_old_or_makes_all_new(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image: np.ndarray, old, endings: list[str], step: str
 ) -> None:
-    paths = old(endings)
-    before, calls = getattr(os, step), []
+    paths, before = old(endings), getattr(os, step)
 
     def interrupted(*words: object) -> object:
-        calls.append(words)
         done = before(*words)
-        if len(calls) == 1:
-            raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
         return done
 
     monkeypatch.setattr(os, step, interrupted)
@@ -301,6 +300,42 @@ def test_a_forked_process_can_write_too(tmp_path: Path, image: np.ndarray) -> No
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
+def test_no_file_is_replaced_that_the_scene_was_read_from(tmp_path: Path) -> None:
+    """By whatever path or link: its own name, one through another folder, symbolic and hard links."""
+    (tmp_path / "folder").mkdir()
+    texture, xml = tmp_path / "texture.png", tmp_path / "scene.xml"
+    output.save(texture, grey(0, 1))
+    node = (
+        '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="{}"/>'
+    )
+    xml.write_text(
+        f'<scene version="3.0.0"><shape type="sphere">{node.format(texture.name)}</texture></bsdf></shape>'
+        '<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>'
+        '<integer name="height" value="4"/></film></sensor></scene>'
+    )
+    result = mrt.render(xml, integrator="path", spp=1)
+    before = {path: path.read_bytes() for path in (texture, xml)}
+    for name, source in (("a.png", texture), ("b.exr", texture), ("c.png", xml)):
+        (tmp_path / f"soft-{name}").symlink_to(source)
+        os.link(source, tmp_path / f"hard-{name}")
+    for name in ("texture.png", "folder/../texture.png", *(p.name for p in tmp_path.glob("*-*"))):
+        with pytest.raises(OutputError, match="made from this file; choose another name"):
+            result.save(tmp_path / "new.exr", tmp_path / name)
+    assert {path: path.read_bytes() for path in before} == before and not (tmp_path / "new.exr").exists()
+
+
+def test_a_deleted_working_folder_is_named(tmp_path: Path) -> None:
+    """Mitsuba itself ends in an ImportError there."""
+    code = (
+        f"import os, shutil; os.chdir({str(tmp_path)!r}); shutil.rmtree({str(tmp_path)!r})\n"
+        "import mrt_mitsuba as mrt\n"
+        "try: mrt.render(0)\n"
+        "except mrt.MrtError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "the working folder has been deleted" in done.stdout, done.stderr
 
 
 SENSORS = {
