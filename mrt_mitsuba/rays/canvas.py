@@ -30,13 +30,14 @@ class Canvas:
         """Take up values of so many channels of so many rays in each pixel, [pictures, pixels].
 
         Args:
-            moments: add up the colours of the rays of each pixel and their squares as well, unfiltered.
+            moments: add up the colours of the rays of each pixel and their squares as well, unfiltered, and
+                note the brightest.
         """
         self._film, self._pictures = film, len(rays)
         self._width, self._height = (n + 2 * film.reach for n in (film.width, film.height))
         self._shares = self._padded(np.float32(1 / np.maximum(rays, 1)))
         size = len(self._shares) - 1
-        self._sums, self._moments = np.zeros((channels + 1, size)), np.zeros((6 * moments, size))
+        self._sums, self._moments = np.zeros((channels + 1, size)), np.zeros((7 * moments, size))
 
     @property
     def sums(self) -> np.ndarray:
@@ -45,7 +46,8 @@ class Canvas:
 
     @property
     def moments(self) -> np.ndarray:
-        """The sums of colours and of squared colours, [pictures, H, W, 6]; empty where not asked for."""
+        """The sums of colours, those of squared colours, and the mean colour of the brightest ray of each pixel,
+        [pictures, H, W, 7]; empty where not asked for."""
         return np.moveaxis(self._seen(self._moments), 0, -1)
 
     def _padded(self, values: np.ndarray) -> np.ndarray:
@@ -86,8 +88,9 @@ class Canvas:
         runs = self._runs(start, first[start : stop + 1], self._shares[start : stop + 1])
         more = runs.moments(values[:3]) if len(self._moments) else []
         dr.eval(more)
-        for total, found in zip(self._moments, more, strict=True):
-            total[start:stop] += np.asarray(found)
+        for index, found in enumerate(more):
+            known = self._moments[index, start:stop]
+            (np.add if index < 6 else np.maximum)(known, np.asarray(found), out=known)
         rows = max(1, MOST_SUMS // ((2 * reach + 1) * len(self._sums)))
         for above in range(-reach, reach + 1, rows):
             down = range(above, min(above + rows, reach + 1))
@@ -154,15 +157,18 @@ class _Runs:
         return [total * self.share for total in self._summed(one, count)]
 
     def moments(self, values: Sequence[Any]) -> list[Any]:
-        """Return the sums of values, and those of their squares."""
+        """Return the sums of values, those of their squares, and the largest mean of a ray's values, or 0."""
         import drjit as dr
         import mitsuba as mi
 
-        def one(ray: Any) -> list[Any]:
+        def add(ray: Any, sums: list[Any], most: Any) -> tuple[Any, list[Any], Any]:
             found = [dr.gather(mi.Float, value, ray) for value in values]
-            return [*found, *(value * value for value in found)]
+            sums = [a + b for a, b in zip(sums, [*found, *(value * value for value in found)], strict=True)]
+            return ray + 1, sums, dr.maximum(most, sum(found) / len(found))
 
-        return self._summed(one, 2 * len(values))
+        state = self.first, [mi.Float(0)] * (2 * len(values)), mi.Float(0)
+        _, sums, most = dr.while_loop(state, lambda ray, *_: ray < self.last, add)
+        return [*sums, most]
 
     def _summed(self, one: Callable[[Any], list[Any]], count: int) -> list[Any]:
         """Return sums over each run of what ``one`` returns of a ray."""

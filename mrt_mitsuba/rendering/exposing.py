@@ -98,6 +98,7 @@ class Exposed:
     rays: np.ndarray  #: [pictures, pixels]: how many started there
     total: np.ndarray  #: [pictures, H, W, 3]: of the colours of those; empty where not asked for
     square: np.ndarray  #: [pictures, H, W, 3]: of their squares
+    peak: np.ndarray  #: [pictures, H, W, 1]: mean colour of the brightest, for progressive groups
 
 
 class Stack:
@@ -212,7 +213,7 @@ class Exposer:
             means = np.concatenate([total[:kept] / np.maximum(rays.ravel(), 1), rays.reshape(1, -1) > 0])
             found = np.concatenate([means, total[: 3 * moments], total[kept:]])
             sums, colors = np.split(channels_last(found.reshape(-1, pictures, *film.shape)), [kept + 1], -1)
-        return Exposed(sums[..., :-1], sums[..., -1], rays, colors[..., :3], colors[..., 3:])
+        return Exposed(sums[..., :-1], sums[..., -1], rays, colors[..., :3], colors[..., 3:6], colors[..., 6:])
 
     @property
     def _counted(self) -> dict[str, str]:
