@@ -60,13 +60,15 @@ def test_film_adds_up_what_rays_give_to_pixels_in_reach(kind: str, moments: bool
     place = (np.stack([column, row]) + rng.random((2, len(pixel)))).astype(np.float32)
     values = rng.normal(size=(4, len(pixel))).astype(np.float32)
 
-    expected, squares = np.zeros((2, height, width, 5)), np.zeros((2, height, width, 6))
+    expected, squares = np.zeros((2, height, width, 5)), np.zeros((2, height, width, 7))
     for n, (x, y) in enumerate(place.T.astype(np.float64)):
         shares = [FILTERS[kind](np.arange(count) + 0.5 - at) for count, at in ((height, y), (width, x))]
         value = np.append(values[:, n], 1) / rays.ravel()[pixel[n]]
         expected[picture[n]] += np.multiply.outer(*shares)[..., None] * value
         colors = values[:3, n].astype(np.float64)
-        squares[picture[n], row[n], column[n]] += [*colors, *colors**2]
+        found = squares[picture[n], row[n], column[n]]  # a view
+        found += [*colors, *colors**2, 0]
+        found[6] = max(found[6], colors.mean())  # the brightest, if it is not negative
 
     canvas = Canvas(Film.of(sensor), rays, 4, moments=moments)
     for part in np.array_split(pixels, 3):  # in three wavefronts
@@ -74,8 +76,8 @@ def test_film_adds_up_what_rays_give_to_pixels_in_reach(kind: str, moments: bool
         lanes = [mi.Float(value[own]) for value in values]
         canvas.put(mi.Point2f(place[:, own]), lanes, part, rays.ravel()[part])
     assert np.allclose(canvas.sums, expected, rtol=0, atol=1e-5)  # of values about 3
-    assert canvas.moments.shape[-1] == 6 * moments
-    assert np.allclose(canvas.moments, squares[..., : 6 * moments], rtol=1e-6, atol=1e-5)
+    assert canvas.moments.shape[-1] == 7 * moments
+    assert np.allclose(canvas.moments, squares[..., : 7 * moments], rtol=1e-6, atol=1e-5)
 
 
 @pytest.mark.parametrize("reach", [1, 2, 8])
