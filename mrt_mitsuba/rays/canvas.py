@@ -46,7 +46,7 @@ class Canvas:
 
     @property
     def moments(self) -> np.ndarray:
-        """The sums of colours, those of squared colours, and the mean colour of the brightest ray of each pixel,
+        """The sums of colours and of squared colours, and the mean colour of the brightest ray,
         [pictures, H, W, 7]; empty where not asked for."""
         return np.moveaxis(self._seen(self._moments), 0, -1)
 

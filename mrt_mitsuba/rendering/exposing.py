@@ -213,7 +213,8 @@ class Exposer:
             means = np.concatenate([total[:kept] / np.maximum(rays.ravel(), 1), rays.reshape(1, -1) > 0])
             found = np.concatenate([means, total[: 3 * moments], total[kept:]])
             sums, colors = np.split(channels_last(found.reshape(-1, pictures, *film.shape)), [kept + 1], -1)
-        return Exposed(sums[..., :-1], sums[..., -1], rays, colors[..., :3], colors[..., 3:6], colors[..., 6:])
+        found = np.split(colors, [3, 6], axis=-1)
+        return Exposed(sums[..., :-1], sums[..., -1], rays, *found)
 
     @property
     def _counted(self) -> dict[str, str]:
