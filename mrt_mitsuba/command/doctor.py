@@ -9,20 +9,13 @@ from importlib import metadata
 
 import mrt_mitsuba
 from mrt_mitsuba import llvm
-from mrt_mitsuba.command.listings import no_arguments
 from mrt_mitsuba.errors import MrtError
 
 PACKAGES = ("mitsuba", "drjit", "numpy", "OpenEXR", "pillow", llvm.WHEEL)
 
 
-def run(words: list[str]) -> int:
-    """Print the report; return 0 if the self-test passed, else 1."""
-    no_arguments("doctor", words)
-    return 0 if report() else 1
-
-
-def report() -> bool:
-    """Print the report line by line; return whether the self-test passed."""
+def run() -> int:
+    """Print the report line by line; return 0 if the self-test passed, else 1."""
     print(f"mrt-mitsuba {mrt_mitsuba.__version__}, Python {platform.python_version()}, {platform.platform()}")
     for package in PACKAGES:
         print(f"  {package:<20}{_version(package)}")
@@ -36,8 +29,8 @@ def report() -> bool:
         print(f"self-test: {self_test()}")
     except (ImportError, MrtError, RuntimeError) as error:
         print(f"self-test: FAILED: {error}")
-        return False
-    return True
+        return 1
+    return 0
 
 
 def _version(package: str) -> str:

@@ -1,27 +1,39 @@
-"""``mrt export``: a numbered scene as Mitsuba XML."""
+"""``mrt export``: a scene as Mitsuba XML."""
 
 from __future__ import annotations
 
 from mrt_mitsuba.command.options import parse
+from mrt_mitsuba.command.registry import COMMANDS
 from mrt_mitsuba.errors import UsageError
-
-FORM = "mrt export SCENE --xml PATH [--stock]"
+from mrt_mitsuba.scene.model import MODEL_OPTIONS, is_obj
 
 
 def run(words: list[str]) -> int:
     """Write a scene; return the exit code."""
-    flavor = "stock" if "--stock" in words else "mrt"
-    if flavor == "stock":
-        words.remove("--stock")
-    if len(words) != 3 or words[1] != "--xml":
-        raise UsageError(f"write {FORM}")
-    number, path = parse(["export", words[0]]).scene_number, words[2]
-    if not path:
-        raise UsageError(f"PATH is empty: write {FORM}")
+    usage = f"Usage: mrt export {COMMANDS['export'].form}"
+    rest = [word for word in words if word != "--stock"]
+    stock = len(words) - len(rest)
+    place = rest.index("--xml") if "--xml" in rest else len(rest)
+    path, rest = "".join(rest[place + 1 : place + 2]), rest[:place] + rest[place + 2 :]
+    if stock > 1 or not path or not rest:
+        raise UsageError(
+            f"{'--stock is given twice' if stock > 1 else 'give a scene and --xml PATH'}. {usage}"
+        )
+    options = parse(["export", *rest])
+    # what is left of a render in a file: the film's size and the materials' formula of scenes in our terms
+    numbered = options.scene is None or is_obj(options.scene)
+    taken = {"scene", *MODEL_OPTIONS, *(("width", "height", "fresnel") if numbered else ())}
+    names = [word.partition("=")[0] for word in rest if "=" in word]
+    strange = [name for name in names if name not in taken and name not in (options.params or ())]
+    if strange:
+        raise UsageError(f"{strange[0]} is of no use to mrt export of this scene. {usage}")
     from mrt_mitsuba.output.replacing import check_target
-
-    check_target(path)
     from mrt_mitsuba.scene.export import write_xml
 
-    print(f"Wrote {' and '.join(write_xml(number, path, flavor=flavor))}")
+    scene = options.scene_number if options.scene is None else options.scene
+    check_target(path, [] if options.scene is None else [options.scene])
+    given = {name: getattr(options, name) for name in ("width", "height", "fresnel", "params")}
+    model = options.model() if is_obj(scene) else {}
+    flavor = "stock" if stock else "mrt"
+    print(f"Wrote {' and '.join(write_xml(scene, path, flavor=flavor, **given, **model))}")
     return 0

@@ -7,7 +7,6 @@ import textwrap
 
 from mrt_mitsuba.command.options import TABLE
 from mrt_mitsuba.command.registry import COMMANDS
-from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
 WIDTH = 100  # characters of a line of help
@@ -40,31 +39,22 @@ def usage() -> str:
     return "\n".join(lines) + "\n"
 
 
-def show_help(words: list[str]) -> int:
+def show_help() -> int:
     """Print the help text."""
-    no_arguments("help", words)
     sys.stdout.write(usage())
     return 0
 
 
-def show_version(words: list[str]) -> int:
+def show_version() -> int:
     """Print the version of the package."""
-    no_arguments("--version", words)
     from mrt_mitsuba import __version__
 
     print(f"mrt-mitsuba {__version__}")
     return 0
 
 
-def show_scenes(words: list[str]) -> int:
+def show_scenes() -> int:
     """Print number and title of every scene."""
-    no_arguments("scenes", words)
     for number in NUMBERS:
         print(f"{number}  {report_scene(number).title}")
     return 0
-
-
-def no_arguments(command: str, words: list[str]) -> None:
-    """Raise ``UsageError`` if there are words after a command that takes none."""
-    if words:
-        raise UsageError(f"unexpected argument {words[0]!r} after mrt {command}")

@@ -92,7 +92,7 @@ def _dispatch(words: list[str]) -> int:
         return UsageError.exit_code
     command = registry.find(words[0])
     if command is not None:
-        return command.run(words[1:])
+        return command.run(words[0], words[1:])
     if words[0].isdecimal() and all("=" in word for word in words[1:]):
         number = words[0]
         raise UsageError(f"FILENAME is missing: write mrt FILENAME {number}, or mrt ./{number} for that name")

@@ -13,7 +13,7 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import checked, choice, either, from_text, option, path, plain, switch
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
-from mrt_mitsuba.scene.model import is_obj
+from mrt_mitsuba.scene.model import check_model_options, is_obj
 from mrt_mitsuba.scene.report import NUMBERS
 
 
@@ -69,9 +69,7 @@ def parse(arguments: Sequence[str]) -> Options:
     _check_together(values)
     _check_declared(params, values.get("scene"))
     options = Options(**values, params=params or None)
-    of_models = [name for name in options.model() if name != "convention"]
-    if of_models and not is_obj(options.scene):
-        raise UsageError(f"{of_models[0]} is of use only with an OBJ file: scene=PATH.obj")
+    check_model_options(options.scene, options.model())
     return options
 
 

@@ -3,24 +3,63 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Sequence
 from importlib import import_module
 from typing import NamedTuple
 
+from mrt_mitsuba.errors import UsageError
+
 
 class Command(NamedTuple):
-    """``form``: the words after the name, as the help shows them. ``home``: "module:function"; the function
-    takes those words as a list, raises ``MrtError`` and returns the exit code."""
+    """``form``: its words as the help shows them, which is where they are declared.
+
+    ``home``: "module:function"; the function takes plain words in turn and others by name, all as text, or
+    the whole list where a word of the form starts with ``--``. It raises ``MrtError`` and returns the exit
+    code.
+    """
 
     form: str
     help: str
     home: str
 
-    def run(self, words: list[str]) -> int:
+    def run(self, name: str, words: Sequence[str]) -> int:
         """Import the command and run it; return its exit code."""
+        plain, given = ([list(words)], {}) if "--" in self.form else self._read(f"mrt {name}", words)
         module, _, function = self.home.partition(":")
-        code: int = getattr(import_module(module), function)(words)
+        code: int = getattr(import_module(module), function)(*plain, **given)
         return code
+
+    def names(self) -> list[str]:
+        """Return the names that are written ``name=value``."""
+        return re.findall(r"\b([a-z_]+)(?=[a-z_|]*=)", self.form)
+
+    def _read(self, command: str, words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+        """Return plain words, and the others by name; raise ``UsageError`` where they are not of the form."""
+        usage = f"Usage: {command} {self.form}".strip()
+        plain: list[str] = []
+        given: dict[str, str] = {}
+        for word in words:
+            name, equals, value = word.partition("=")
+            if not equals:
+                plain.append(word)
+            elif name not in self.names():
+                close = difflib.get_close_matches(name, self.names(), n=1)
+                raise UsageError(f"unknown option {name!r}{f', meant {close[0]}?' if close else '.'} {usage}")
+            elif name in given:
+                raise UsageError(f"{name} is given twice. {usage}")
+            else:
+                given[name] = value
+        if "scene" in given:  # in place of SCENE
+            plain.append(given.pop("scene"))
+        wanted = [word for word in self.form.split() if word[0].isupper()]
+        if len(plain) > len(wanted):
+            raise UsageError(f"unexpected argument {plain[len(wanted)]!r} after {command}. {usage}")
+        needed = [word.partition("=")[0] for word in self.form.split() if word[0].islower()]
+        missing = wanted[len(plain) :] + [name for name in needed if name not in given]
+        if missing:
+            raise UsageError(f"{missing[0]} is missing. {usage}")
+        return plain, given
 
 
 COMMANDS = {
@@ -32,7 +71,7 @@ COMMANDS = {
     ),
     "scenes": Command("", "list the scenes", "mrt_mitsuba.command.listings:show_scenes"),
     "export": Command(
-        "SCENE --xml PATH [--stock]",
+        "SCENE|scene=PATH --xml PATH [--stock] [name=value ...]",
         "write a scene as Mitsuba XML; --stock: with stock plugins only",
         "mrt_mitsuba.command.export:run",
     ),
@@ -42,14 +81,14 @@ COMMANDS = {
         "mrt_mitsuba.command.sweep:run",
     ),
     "diff": Command(
-        "A.exr B.exr [layer=NAME] [rmse=LIMIT] [flip=LIMIT] [out=PATH]",
+        "A.exr B.exr [layer=NAME] [mae|rmse|rel_mse|psnr|largest|flip|p_value=LIMIT] [out=PATH]",
         "compare two pictures; exit code 1 beyond a limit, 2 if they do not compare",
         "mrt_mitsuba.validation.tools.commands:diff",
     ),
     "check": Command(
         "SCENE|scene=PATH [out=DIR] [quick=1]",
         "check the laws of every BSDF, shape and emitter, and find pixels that are not finite",
-        "mrt_mitsuba.validation.checks.scene:command",
+        "mrt_mitsuba.validation.tools.commands:check",
     ),
     "error-vs-time": Command(
         "SCENE|scene=PATH cases=FILE.toml [out=DIR]",

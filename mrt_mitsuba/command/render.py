@@ -49,7 +49,7 @@ def run(options: Options) -> int:
 
         scene = model_scene(scene, **options.model())
         for path in options.outputs():  # at once, not after the render
-            check_target(path, scene.pictures)
+            check_target(path, scene.files)
     result = render(scene, progress=progress, **options.render_arguments())
     seconds = time.perf_counter() - start
     result.save(*options.outputs(), tonemap=options.tonemap)

@@ -46,9 +46,9 @@ def load_dict(
     """
     import mitsuba as mi
 
-    with _resolving(None):
+    with _resolving(None), _explained(name):
         _check_dict(scene, name)
-        return _make(lambda config: mi.parser.parse_dict(config, scene), name, budget, merge)
+        return _instantiate(_parse(lambda config: mi.parser.parse_dict(config, scene), name, budget), merge)
 
 
 def load_file(path: str, budget: Budget | None = None, **parameters: Any) -> tuple[Any, Mapping[str, str]]:
@@ -56,49 +56,87 @@ def load_file(path: str, budget: Budget | None = None, **parameters: Any) -> tup
 
     Raises ``SceneError``, and ``UsageError`` for another kind of file or a texture too large for the budget.
     """
+    with _file(path, budget, parameters) as (state, values):
+        return _instantiate(state), values
+
+
+def rewrite_file(path: str, budget: Budget, **parameters: Any) -> tuple[str, Mapping[str, str]]:
+    """Return what ``load_file`` does as XML: includes and parameters filled in, files by their whole path."""
     import mitsuba as mi
 
-    require_file(path)
-    if not path.lower().endswith(".xml"):
-        raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
-    if budget is not None:
-        budget.inputs.add(path)
-    given = {key: str(value) for key, value in parameters.items()}
-    with _resolving(os.path.dirname(path) or "."):
-        values = _check_xml(path, given)
-        return _make(lambda config: mi.parser.parse_file(config, path, **given), path, budget), values
+    with _file(path, budget, parameters) as (state, values):
+        for node in state.nodes:
+            if isinstance(node.props.get("filename", None), str):
+                node.props["filename"] = os.path.abspath(_resolved(node.props["filename"]))
+        return mi.parser.write_string(state), values
 
 
 def declared(path: str) -> dict[str, str]:
     """Return the parameters that an XML file declares, with their defaults. Raises ``SceneError``."""
     require_file(path)
     with open(path, "rb") as stream:
-        tags = [tag for tag in _tags(stream.read()) if tag.startswith(b"<default")]
-    found = [{key: _text(value) for key, value in _ATTRIBUTE.findall(tag)} for tag in tags]
-    return {each.get(b"name", ""): each.get(b"value", "") for each in found}
+        found = [_attributes(tag) for tag in _tags(stream.read()) if tag.startswith(b"<default")]
+    return {each.get("name", ""): each.get("value", "") for each in found}
 
 
-def _make(parse: Callable[[Any], Any], name: str, budget: Budget | None, merge: bool = True) -> Any:
-    """Parse, check and instantiate."""
+# ---------------------------------------------- Mitsuba's parser ---------------------------------------
+
+
+@contextlib.contextmanager
+def _file(
+    path: str, budget: Budget | None, parameters: Mapping[str, Any]
+) -> Iterator[tuple[Any, Mapping[str, str]]]:
+    """Parse an XML file; its folder serves for data within the block."""
+    import mitsuba as mi
+
+    require_file(path)
+    if not path.lower().endswith(".xml"):
+        raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
+    given = {key: str(value) for key, value in parameters.items()}
+    with _resolving(os.path.dirname(path) or "."), _explained(path):
+        values, files = _check_xml(path, given)
+        if budget is not None:
+            budget.inputs.update(files)
+        yield _parse(lambda config: mi.parser.parse_file(config, path, **given), path, budget), values
+
+
+def _parse(parse: Callable[[Any], Any], name: str, budget: Budget | None) -> Any:
+    """Return Mitsuba's parser state once all that it would load has been looked at."""
+    import mitsuba as mi
+
+    state = parse(mi.parser.ParserConfig(mi.variant()))
+    mitsuba_first()  # a <path> of the file puts its folder before
+    for node in state.nodes:
+        kind, filename = node.props.plugin_name(), node.props.get("filename", None)
+        _check_plugin(kind, name)
+        samples = node.props.get("sample_count", 1)
+        if isinstance(samples, int) and samples < 1:  # some samplers divide by it
+            raise SceneError(f"cannot load {name}: {kind}: sample_count is {samples}; give 1 or more")
+        if isinstance(filename, str):
+            _check_data(filename)
+            found = _resolved(filename)
+            size = picture_size(found) if kind in _PICTURES else None
+            if budget is not None:
+                budget.inputs.add(found)
+                if size is not None:
+                    budget.take_texture(found, *size, around=kind == "envmap")
+    return state
+
+
+def _instantiate(state: Any, merge: bool = True) -> Any:
     import mitsuba as mi
 
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel, config.merge_meshes = False, merge
+    mi.parser.transform_all(config, state)
+    return mi.parser.instantiate(config, state)
+
+
+@contextlib.contextmanager
+def _explained(name: str) -> Iterator[None]:
+    """Turn what Mitsuba raises into a ``SceneError``."""
     try:
-        state = parse(config)
-        mitsuba_first()  # a <path> of the file puts its folder before
-        for node in state.nodes:
-            kind, filename = node.props.plugin_name(), node.props.get("filename", None)
-            _check_plugin(kind, name)
-            if isinstance(filename, str):
-                _check_data(filename)
-                size = picture_size(_resolved(filename)) if kind in _PICTURES else None
-                if budget is not None:
-                    budget.inputs.add(_resolved(filename))
-                if budget is not None and size is not None:
-                    budget.take_texture(_resolved(filename), *size, around=kind == "envmap")
-        mi.parser.transform_all(config, state)
-        return mi.parser.instantiate(config, state)
+        yield
     except RuntimeError as error:
         # Mitsuba quotes the traceback, too, where the plugin is written in Python
         text = _CODE_PLACE.sub("", _TRACEBACK.sub("", str(error)))
@@ -178,9 +216,12 @@ _TAG_MARK = re.compile(rb"""[>"']""")
 _NO_TAGS = ((b"<!--", b"-->"), (b"<![CDATA[", b"]]>"), (b"<?", b"?>"), (b"<!", b">"))
 
 
-def _check_xml(path: str, parameters: Mapping[str, str]) -> Mapping[str, str]:
-    """Look at an XML file and those that it includes before Mitsuba opens them; return its parameters."""
-    values, waiting, seen = dict(parameters), [path], set()
+def _check_xml(path: str, parameters: Mapping[str, str]) -> tuple[Mapping[str, str], set[str]]:
+    """Look at an XML file and those that it includes before Mitsuba opens them.
+
+    Return its parameters, and the paths of the files.
+    """
+    values, waiting, seen = dict(parameters), [path], set[str]()
     while waiting:
         file = waiting.pop()
         if file in seen:
@@ -196,16 +237,17 @@ def _check_xml(path: str, parameters: Mapping[str, str]) -> Mapping[str, str]:
             depth += -1 if tag.startswith(b"</") else not tag.endswith(b"/>")
             if depth > DEEPEST:
                 raise SceneError(f"cannot load {file}: it is nested more than {DEEPEST} levels deep")
-            if b"filename" in tag or tag.startswith(b"<default"):
-                attributes = {key.decode(): _text(value) for key, value in _ATTRIBUTE.findall(tag)}
-                if tag.startswith(b"<default"):
-                    values.setdefault(attributes.get("name", ""), attributes.get("value", ""))
-                elif "filename" in attributes:
-                    filename = _with_values(attributes["filename"], values)
-                    _check_data(filename)
-                    if tag.startswith(b"<include") and os.path.isfile(_resolved(filename)):
-                        waiting.append(_resolved(filename))
-    return values
+            if tag.startswith(b"<default"):
+                attributes = _attributes(tag)
+                values.setdefault(attributes.get("name", ""), attributes.get("value", ""))
+            elif b"filename" in tag and "filename" in (attributes := _attributes(tag)):
+                filename = attributes["filename"]
+                for name in sorted(values, key=len, reverse=True):  # the longest first, as Mitsuba does
+                    filename = filename.replace(f"${name}", values[name]) if name else filename
+                _check_data(filename)
+                if tag.startswith(b"<include") and os.path.isfile(_resolved(filename)):
+                    waiting.append(_resolved(filename))
+    return values, seen
 
 
 def _tags(data: bytes) -> Iterator[bytes]:
@@ -232,14 +274,11 @@ def _end_of_tag(data: bytes, position: int) -> int:
     return -1
 
 
-def _text(quoted: bytes) -> str:
+def _attributes(tag: bytes) -> dict[str, str]:
+    """Return the attributes of a tag."""
     import html
 
-    return html.unescape(quoted[1:-1].decode(errors="replace"))
-
-
-def _with_values(text: str, values: Mapping[str, str]) -> str:
-    """Put values in the place of ``$names``, the longest name first, as Mitsuba does."""
-    for name in sorted(values, key=len, reverse=True):
-        text = text.replace(f"${name}", values[name]) if name else text
-    return text
+    return {
+        name.decode(): html.unescape(quoted[1:-1].decode(errors="replace"))
+        for name, quoted in _ATTRIBUTE.findall(tag)
+    }

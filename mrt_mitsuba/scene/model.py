@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
-from mrt_mitsuba.errors import SceneError
+from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.options import choice, integer
 
 if TYPE_CHECKING:
@@ -32,9 +32,20 @@ LARGEST = 3.4e38  # number that Mitsuba's float32 can hold
 FOCAL_RANGE = 2.0  # half-width of the sharp zone
 
 
+# What is of use only with an OBJ file, but for the convention, which others may be given, too
+MODEL_OPTIONS = ("convention", "texturing", "camera", "target", "up", "fov", "light")
+
+
 def is_obj(scene: object) -> bool:
     """Return whether a scene is given as the path of an OBJ file."""
     return isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".obj")
+
+
+def check_model_options(scene: object, given: Iterable[str]) -> None:
+    """Raise ``UsageError`` for options of an OBJ file where the scene is none."""
+    useless = [name for name in given if name in MODEL_OPTIONS[1:]]
+    if useless and not is_obj(scene):
+        raise UsageError(f"{useless[0]} is of use only with an OBJ file: scene=PATH.obj")
 
 
 @dataclass(frozen=True)
@@ -131,14 +142,7 @@ class Scene:
     focal_distance: float | None = None
     focal_range: float = FOCAL_RANGE
     title: str = field(default="", compare=False)
-    named: frozenset[str] = field(default=frozenset(), compare=False)  #: pictures that its files name
-
-    @property
-    def pictures(self) -> frozenset[str]:
-        """Return the paths of the pictures that it shows, and of those that its files name, used or not."""
-        kinds = (*(f"{kind}s" for kind in OBJECTS), "planes", "meshes")
-        textures = {thing.material.texture for kind in kinds for thing in getattr(self, kind)}
-        return self.named | {texture for texture in textures if texture is not None}
+    files: frozenset[str] = field(default=frozenset(), compare=False)  #: that it was read from
 
     def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> dict[str, Any]:
         """Return the scene as a Mitsuba dict of this project's plugins, materials shared by reference.

@@ -75,13 +75,13 @@ def read_obj(path: str | os.PathLike[str], *, convention: str = "report") -> tup
 def read_model(
     path: str | os.PathLike[str], *, convention: str = "report"
 ) -> tuple[tuple[Mesh, ...], frozenset[str]]:
-    """Return what ``read_obj`` does, and the pictures that the material libraries name, used or not."""
+    """Return what ``read_obj`` does, and the paths of all files that belong to the model, used or not."""
     if convention not in CONVENTIONS:
         raise UsageError(f"convention={convention!r}: must be {' or '.join(CONVENTIONS)}")
     reader = _Reader(Path(path), convention)
     reader.read()
-    textures = {material.texture for material in reader.materials.values()}
-    return reader.meshes(), frozenset(texture for texture in textures if texture is not None)
+    textures = {material.texture for material in reader.materials.values() if material.texture is not None}
+    return reader.meshes(), frozenset({os.fspath(path), *reader.libraries, *textures})
 
 
 @dataclass
@@ -109,6 +109,7 @@ class _Reader:
         self.line = 1
         self.unknown_materials: set[str] = set()
         self.findings = Findings()
+        self.libraries: set[str] = set()
 
     def fail(self, text: str, line: int | None = None) -> None:
         raise SceneError(f"{self.path}:{self.line if line is None else line}: {text}")
@@ -230,6 +231,7 @@ class _Reader:
                 text = f"{self.path}:{self.line}: the material library {name} {MISSING} {folder}"
                 self.findings.add("libraries", f"{text}; its materials get the default")
             else:
+                self.libraries.add(str(found))
                 self.materials |= read_mtl(found, convention=self.convention, folder=folder)
 
     # ------------------------------------------ Result -------------------------------------------------

@@ -13,9 +13,11 @@ from typing import Any
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.scene.loading import load_dict, load_file
-from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, is_obj
+from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, check_model_options, is_obj
 from mrt_mitsuba.scene.parameters import set_parameters
 from mrt_mitsuba.scene.report import report_scene
+
+WIDEST_FILTER = 1024  # pixels: the largest radius of a film's filter
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,7 @@ def open_scene(
     ``size``: width and height; ``budget``: memory from which its textures take theirs; ``model``: options of
     ``model_scene``.
     """
-    if model and not is_obj(scene) and model.keys() != {"convention"}:
-        raise UsageError(f"{next(k for k in model if k != 'convention')} is of use only with an OBJ file")
+    check_model_options(scene, model or {})
     name, own = _model(scene, model or {})
     # a key of mi.traverse has a dot, the name of a parameter of an XML file has none
     keys = {key: value for key, value in (params or {}).items() if "." in key}
@@ -74,8 +75,8 @@ def open_scene(
         focus = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
         chosen = _integrator(integrator, loaded)
         return Source(name, loaded, view, chosen, width, height, *focus, own=True)
-    if budget is not None:  # pictures that no face uses, too
-        budget.inputs.update(own.pictures, [os.fspath(scene)] if is_obj(scene) else [])
+    if budget is not None:
+        budget.inputs.update(own.files)
     width, height, fresnel = size[0] or SIZE[0], size[1] or SIZE[1], fresnel or "schlick"
     # its meshes have a material each: kept apart, they stay in order, and the same file has the same layers
     nodes = own.to_dict(width=width, height=height, fresnel=fresnel)
@@ -98,7 +99,7 @@ def reopen_scene(
 ) -> Source:
     """Open a scene as ``open_scene`` does, for callers who leave it as it is; numbered ones may be kept."""
     numbered = hasattr(scene, "__index__") and not params and not model.keys() - {"convention"}
-    if not numbered or report_scene(operator.index(scene)).pictures:
+    if not numbered or report_scene(operator.index(scene)).meshes:
         how: dict[str, Any] = {"size": size, "fresnel": fresnel, "integrator": integrator, "sensor": sensor}
         return open_scene(scene, **how, params=params, model=model, budget=budget)
     import mitsuba as mi
@@ -170,7 +171,20 @@ def _own(
         return os.path.basename(path), *load_file(path, budget, **declared)
     if isinstance(scene, mi.Scene):
         return "a Mitsuba scene", scene, {}
+    _check_variant("scene", scene)
     raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")
+
+
+def _check_variant(name: str, thing: Any) -> None:
+    """Raise ``UsageError`` for an object of Mitsuba that was loaded in another variant."""
+    import mitsuba as mi
+
+    variant = thing.variant_name() if hasattr(thing, "variant_name") else mi.variant()
+    if variant != mi.variant():
+        raise UsageError(
+            f"the {name} was loaded in the variant {variant}, and {mi.variant()} is in use: load it again, "
+            f"or write variant={variant}"
+        )
 
 
 def _number(values: Mapping[str, str], name: str, default: Any) -> Any:
@@ -191,7 +205,15 @@ def _sensor(name: str, scene: Any, number: int) -> Any:
         raise SceneError(f"{name} has no sensor: add one, so that there is something to look through")
     if number >= len(sensors):
         raise UsageError(f"sensor={number}: {name} has {len(sensors)}, counted from 0")
-    return sensors[number]
+    sensor = sensors[number]
+    parts = [sensor] if sensor.class_name() != "BatchSensor" else mi.traverse(sensor).hierarchy
+    for part in parts:
+        if part.class_name() == "IrradianceMeter" and part.get_shape() is None:  # Mitsuba would crash
+            raise SceneError(f"{name} has an irradiancemeter outside of a shape: put it into one")
+    reach = sensor.film().rfilter().radius()
+    if not 0 <= reach <= WIDEST_FILTER:
+        raise SceneError(f"{name} has a filter of radius {reach:g}: give at most {WIDEST_FILTER} pixels")
+    return sensor
 
 
 def _film_size(name: str, sensor: Any, width: int | None, height: int | None) -> tuple[int, int]:
@@ -217,6 +239,7 @@ def _integrator(integrator: Any, scene: Any) -> Any:
             f"the integrator {type(integrator).__name__} computes derivatives, by mi.render(scene, params): "
             "choose another for a picture, such as path or direct"
         )
+    _check_variant("integrator", integrator)
     if not isinstance(integrator, mi.SamplingIntegrator):
         raise UsageError(
             f"the integrator is {' '.join(repr(integrator).split())}: "

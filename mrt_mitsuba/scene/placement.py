@@ -29,7 +29,7 @@ def obj_scene(
     on each side, the right one brighter. ``texturing`` follows ``convention`` unless given. Raises as
     ``read_obj`` does.
     """
-    meshes, pictures = read_model(path, convention=convention)
+    meshes, files = read_model(path, convention=convention)
     low = np.min([m.vertices.min(axis=0) for m in meshes], axis=0).astype(float)
     high = np.max([m.vertices.max(axis=0) for m in meshes], axis=0).astype(float)
     center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
@@ -50,7 +50,7 @@ def obj_scene(
         else (Light(place(4, 5, 4), (2.5, 2.5, 2.5)), Light(place(-4, 3, 5), (1.0, 1.0, 1.2))),
         meshes=meshes,
         texturing=texturing or convention,
-        named=pictures,
+        files=files,
     )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.command.words import read_toml
+from mrt_mitsuba.command.toml import read_toml
 
 ROOT = Path(__file__).parents[2]
 

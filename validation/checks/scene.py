@@ -14,9 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.command.words import words
-from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
+from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.validation.checks import emitter
 from mrt_mitsuba.validation.checks.bsdf import check_bsdf
@@ -293,30 +291,3 @@ def _bsdf_on(shape: Any) -> str:
 
 def _name(plugin: Any) -> str:
     return f"{class_name(plugin)} {plugin.id()!r}"
-
-
-# ------------------------------------------------ The command ---------------------------------------------
-
-FORM = "mrt check SCENE|scene=PATH [out=DIR] [quick=1]"
-
-
-def command(arguments: list[str]) -> int:
-    """Run ``mrt check``: return 0 where every law holds, 1 where one does not. Raises ``UsageError``."""
-    scenes, given = words(arguments, ("scene", "out", "quick"), FORM)
-    scenes += [given["scene"]] if "scene" in given else []
-    if len(scenes) != 1:
-        raise UsageError(f"give one scene. Usage: {FORM}")
-    if given.get("quick", "0") not in ("0", "1"):
-        raise UsageError(f"quick={given['quick']}: must be 0 or 1")
-    scene: Any = int(scenes[0]) if scenes[0].isdigit() else scenes[0]
-    if "out" in given:
-        report.prepare(Path(given["out"]), "summary.json", "index.html")
-    try:
-        found = check_scene(scene, quick=given.get("quick") == "1", progress=TerminalProgress(unit="plugin"))
-    except SceneError as error:  # nothing was checked
-        raise UsageError(str(error)) from error
-    print(found)
-    if "out" in given:
-        found.save(given["out"])
-        print(f"Report: {Path(given['out']) / 'index.html'}")
-    return 0 if found.passed else 1
