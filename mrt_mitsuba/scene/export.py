@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.options import check
-from mrt_mitsuba.scene.model import FRESNEL, OBJECTS, SIDE, Scene
+from mrt_mitsuba.scene.model import FRESNEL, OBJECTS, SIDE, SIZE, Scene, check_model_options, is_obj
 from mrt_mitsuba.scene.report import report_scene
 
 FLAVORS = ("mrt", "stock")
@@ -43,73 +43,96 @@ def scene_dict(
 
 
 def write_xml(
-    scene: int | Scene, path: str | os.PathLike[str], *, flavor: str = "mrt", fresnel: str = "schlick"
+    scene: int | Scene | str | os.PathLike[str],
+    path: str | os.PathLike[str],
+    *,
+    flavor: str = "mrt",
+    fresnel: str | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    params: Mapping[str, Any] | None = None,
+    **model: Any,
 ) -> list[str]:
     """Write a scene as XML through Mitsuba's own writer; return the paths of what was written.
 
-    XML cannot hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file next to it,
-    named after the XML file and the shape; all files are replaced, or none. Raises ``OutputError`` if a file
-    cannot be written, ``SceneError`` for groups of objects (``mrt_group``), which have neither an XML form
-    nor a stock counterpart.
+    ``scene`` and what follows ``flavor`` are those of ``render``, a scene being a number, a ``Scene``, or the
+    path of an OBJ or XML file; an XML file is written with its includes and parameters filled in. XML cannot
+    hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file next to it, named after
+    the XML file and the shape; all files are replaced, or none.
+
+    Raises ``OutputError`` if a file cannot be written, or is one that the scene is read from; ``SceneError``
+    for groups of objects (``mrt_group``), which have neither an XML form nor a stock counterpart; and what
+    ``render`` raises for a scene or an option.
     """
+    from mrt_mitsuba.memory import Budget
     from mrt_mitsuba.output.replacing import replacing_together
+    from mrt_mitsuba.scene.loading import rewrite_file
+    from mrt_mitsuba.scene.placement import model_scene
 
-    mine = scene_dict(scene, fresnel=fresnel)
-    models = {
-        name: node
-        for name, node in mine.items()
-        if isinstance(node, dict) and node["type"] in _IN_FILES[flavor]
-    }
-    files = {name: f"{os.path.splitext(os.fspath(path))[0]}_{name}.ply" for name in models}
-    for name, node in models.items():
-        mine[name] = _ply_node(node, os.path.basename(files[name]))
-    text = _text_of(mine, scene, flavor)
-    with replacing_together([*files.values(), path]) as opened:
-        for file, node in zip(opened, models.values(), strict=False):
+    check_model_options(scene, model)
+    files: dict[str, Any] = {}  # shapes by the paths of the files that hold them
+    inputs: Iterable[str] = ()
+    if isinstance(scene, str | os.PathLike) and not is_obj(scene):
+        given = {"fresnel": fresnel, "width": width, "height": height, "flavor=stock": flavor != "mrt"}
+        useless = [name for name, value in given.items() if value]
+        if useless:
+            raise UsageError(f"{useless[0]} is of no use with an XML file, which is written as it is")
+        runtime.use()
+        budget = Budget.of(None)
+        text, values = rewrite_file(os.fspath(scene), budget, **params or {})
+        focus = {name: values[name] for name in ("focaldist", "focalrange") if name in values}
+        inputs = budget.inputs
+    else:
+        if params:
+            raise UsageError(f"params: only an XML file declares names, such as {next(iter(params))}")
+        if not isinstance(scene, Scene):
+            scene = model_scene(scene, **model) if is_obj(scene) else report_scene(scene)  # type: ignore[arg-type]
+        size = {"width": width or SIZE[0], "height": height or SIZE[1]}
+        mine = scene_dict(scene, fresnel=fresnel or "schlick", **size)
+        for name, node in mine.items():
+            if isinstance(node, dict) and node["type"] in _IN_FILES[flavor]:
+                file = f"{os.path.splitext(os.fspath(path))[0]}_{name}.ply"
+                files[file] = node
+                mine[name] = _ply_node(node, os.path.basename(file))
+        text = _text_of(mine, scene, flavor)
+        has_focus = scene.focal_distance is not None
+        focus = {"focaldist": scene.focal_distance, "focalrange": scene.focal_range} if has_focus else {}
+        inputs = scene.files
+    with replacing_together([*files, path], inputs) as opened:
+        for file, node in zip(opened, files.values(), strict=False):
             file.write(_ply(node))
-        opened[-1].write(text.encode())
-    return [*files.values(), os.fspath(path)]
+        opened[-1].write((_with_focus(text, focus) + "\n").encode())
+    return [*files, os.fspath(path)]
 
 
-def _text_of(mine: dict[str, Any], scene: int | Scene, flavor: str) -> str:
+def _text_of(mine: dict[str, Any], model: Scene, flavor: str) -> str:
     """Return the XML of a dict of this project's plugins."""
     import mitsuba as mi
 
     for name, node in mine.items():
-        kind = node["type"] if isinstance(node, dict) else ""
-        if kind == "mrt_group":
+        if isinstance(node, dict) and node["type"] == "mrt_group":
             raise SceneError(
-                f"{name} cannot be written as XML: {kind} is made of arrays; render it from Python, or "
+                f"{name} cannot be written as XML: mrt_group is made of arrays; render it from Python, or "
                 "write at most 1000 spheres or 100 objects of another kind"
             )
-    mine = {name: _with_whole_path(node) for name, node in mine.items()}
-    model = scene if isinstance(scene, Scene) else report_scene(scene)
+        picture = node.get("diffuse_reflectance", {}) if isinstance(node, dict) else {}
+        if "filename" in picture:  # found from wherever the XML lies
+            whole = {**picture, "filename": os.path.abspath(picture["filename"])}
+            mine[name] = {**node, "diffuse_reflectance": whole}
     if flavor == "stock":
         mine = _stock(mine, model)
     variant = runtime.use()
     # The writer looks plugins up in scalar_rgb, whatever the current variant
     runtime.use("scalar_rgb")
     runtime.use(variant)
-    state = mi.parser.parse_dict(mi.parser.ParserConfig(variant), mine)
-    return _with_focus(mi.parser.write_string(state), model) + "\n"
+    return str(mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(variant), mine)))
 
 
-def _with_focus(text: str, scene: Scene) -> str:
+def _with_focus(text: str, focus: Mapping[str, Any]) -> str:
     """Add what Mitsuba's cameras have no parameters for, and ``render`` reads."""
-    if scene.focal_distance is None:
-        return text
     start = text.index(">", text.index("<scene")) + 1
-    focus = {"focaldist": scene.focal_distance, "focalrange": scene.focal_range}
-    lines = [f'\n    <default name="{name}" value="{value!r}"/>' for name, value in focus.items()]
+    lines = [f'\n    <default name="{name}" value="{value}"/>' for name, value in focus.items()]
     return text[:start] + "".join(lines) + text[start:]
-
-
-def _with_whole_path(node: Any) -> Any:
-    """Return a material whose picture is found from wherever the XML lies."""
-    picture = node.get("diffuse_reflectance", {}) if isinstance(node, dict) else {}
-    if "filename" not in picture:
-        return node
-    return {**node, "diffuse_reflectance": {**picture, "filename": os.path.abspath(picture["filename"])}}
 
 
 def _ply_node(node: dict[str, Any], filename: str) -> dict[str, Any]:

@@ -101,7 +101,7 @@ def files(tmp_path: Path) -> dict[str, str]:
         (("nan", "b"), 2, "is NaN in 1 pixels, the first at row 3, column 5"),
         (("a", "text"), 2, "not a whole EXR"),
         (("a", "none"), 2, "No such file"),
-        (("a",), 2, "give two EXR files"),
+        (("a",), 2, "B.exr is missing. Usage: mrt diff A.exr B.exr"),
         (("a", "b", "rsme=1"), 2, "unknown option 'rsme', meant rmse?"),
         (("a", "b", "rmse=much"), 2, "must be a number"),
         (("a", "b", "rmse=1", "rmse=2"), 2, "given twice"),
