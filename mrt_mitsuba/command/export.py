@@ -12,21 +12,17 @@ def run(words: list[str]) -> int:
     """Write a scene; return the exit code."""
     usage = f"Usage: mrt export {COMMANDS['export'].form}"
     rest = [word for word in words if word != "--stock"]
-    stock = len(words) - len(rest)
+    if len(words) - len(rest) > 1:
+        raise UsageError(f"--stock is given twice. {usage}")
     place = rest.index("--xml") if "--xml" in rest else len(rest)
     path, rest = "".join(rest[place + 1 : place + 2]), rest[:place] + rest[place + 2 :]
-    if stock > 1 or not path or not rest:
-        raise UsageError(
-            f"{'--stock is given twice' if stock > 1 else 'give a scene and --xml PATH'}. {usage}"
-        )
+    if not path or not rest:
+        raise UsageError(f"give a scene and --xml PATH. {usage}")
     options = parse(["export", *rest])
-    # what is left of a render in a file: the film's size and the materials' formula of scenes in our terms
-    numbered = options.scene is None or is_obj(options.scene)
-    taken = {"scene", *MODEL_OPTIONS, *(("width", "height", "fresnel") if numbered else ())}
-    names = [word.partition("=")[0] for word in rest if "=" in word]
-    strange = [name for name in names if name not in taken and name not in (options.params or ())]
-    if strange:
-        raise UsageError(f"{strange[0]} is of no use to mrt export of this scene. {usage}")
+    taken = {"scene", "width", "height", "fresnel", *MODEL_OPTIONS, *(options.params or ())}
+    strange = {word.partition("=")[0] for word in rest if "=" in word} - taken
+    if strange:  # what is said of the render, which is not in the file
+        raise UsageError(f"{min(strange)} is of no use to mrt export. {usage}")
     from mrt_mitsuba.output.replacing import check_target
     from mrt_mitsuba.scene.export import write_xml
 
@@ -34,6 +30,6 @@ def run(words: list[str]) -> int:
     check_target(path, [] if options.scene is None else [options.scene])
     given = {name: getattr(options, name) for name in ("width", "height", "fresnel", "params")}
     model = options.model() if is_obj(scene) else {}
-    flavor = "stock" if stock else "mrt"
+    flavor = "stock" if "--stock" in words else "mrt"
     print(f"Wrote {' and '.join(write_xml(scene, path, flavor=flavor, **given, **model))}")
     return 0

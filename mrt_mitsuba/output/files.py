@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import stat
+import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -156,34 +158,61 @@ def read_exr(path: Path) -> Picture:
     """Read an EXR with the channels R, G, B; raise ``OutputError`` if there is none or it is broken."""
     import numpy as np
 
-    planes, header = _read(path)
+    planes, headers = read_channels(path)
     missing = [channel for channel in "RGB" if channel not in planes]
     if missing:
         raise OutputError(f"cannot read {os.fspath(path)}: it has no channel {missing[0]!r}")
     image = np.stack([planes.pop(channel) for channel in "RGB"], axis=-1)  # [H, W, 3]
-    return Picture(image, planes, header)
+    return Picture(image, planes, headers["R"])
 
 
-def read_channels(path: Path) -> dict[str, Image]:
-    """Read every channel of an EXR, [H, W] float32 by name; raise ``OutputError`` if it is none or broken."""
-    return _read(path)[0]
+def read_channels(path: Path) -> tuple[dict[str, Image], dict[str, dict[str, Any]]]:
+    """Return every channel of an EXR, [H, W] float32 by name, and the header of each.
 
-
-def _read(path: Path) -> tuple[dict[str, Image], dict[str, Any]]:
+    Where a file has several parts, their names come before those of their channels. Raises ``OutputError``
+    for what is none, or broken.
+    """
     import numpy as np
     import OpenEXR
 
     name = os.fspath(path)
     try:
-        with open(name, "rb") as file:  # reports a missing or unreadable file better than the library
+        if not stat.S_ISREG(os.stat(name).st_mode):  # a pipe has no end to wait for
+            raise OutputError(f"cannot read {name}: it is not a regular file")
+        with open(name, "rb") as file:  # reports an unreadable file better than the library
             file.read(1)
-        part = OpenEXR.File(name, separate_channels=True)
-        planes = {key: np.asarray(value.pixels, np.float32) for key, value in part.channels().items()}
-        return planes, dict(part.header())
+        with _silenced():
+            parts = OpenEXR.File(name, header_only=True).parts
+            deep = any("deep" in str(part.type()) for part in parts)
+            parts = [] if deep else OpenEXR.File(name, separate_channels=True).parts
     except OSError as error:
         raise OutputError(f"cannot read {name}: {error.strerror or error}") from error
     except (RuntimeError, ValueError, TypeError) as error:
         raise OutputError(f"cannot read {name}: not a whole EXR ({error})") from error
+    if not parts:
+        problem = "a deep EXR holds many values in a pixel; flatten it first" if deep else "not a whole EXR"
+        raise OutputError(f"cannot read {name}: {problem}")
+    planes: dict[str, Image] = {}
+    headers: dict[str, dict[str, Any]] = {}
+    for part in parts:
+        for channel, values in part.channels.items():
+            key = channel if len(parts) == 1 else f"{part.name()}.{channel}"
+            planes[key], headers[key] = np.asarray(values.pixels, np.float32), dict(part.header)
+    return planes, headers
+
+
+@contextlib.contextmanager
+def _silenced() -> Iterator[None]:
+    """Keep the EXR library from printing about broken files, in Python and in its own code."""
+    sys.stderr.flush()
+    before = os.dup(2)
+    try:
+        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+            os.dup2(nowhere.fileno(), 2)
+            yield
+    finally:
+        os.dup2(before, 2)
+        os.close(before)
 
 
 def to_8bit(image: Image, tonemap: str = "report") -> NDArray[np.uint8]:

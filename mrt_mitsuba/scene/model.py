@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ LARGEST = 3.4e38  # number that Mitsuba's float32 can hold
 FOCAL_RANGE = 2.0  # half-width of the sharp zone
 
 
-# What is of use only with an OBJ file, but for the convention, which others may be given, too
+# What is of use only with an OBJ file
 MODEL_OPTIONS = ("convention", "texturing", "camera", "target", "up", "fov", "light")
 
 
@@ -41,9 +41,9 @@ def is_obj(scene: object) -> bool:
     return isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".obj")
 
 
-def check_model_options(scene: object, given: Iterable[str]) -> None:
+def check_model_options(scene: object, given: Mapping[str, Any]) -> None:
     """Raise ``UsageError`` for options of an OBJ file where the scene is none."""
-    useless = [name for name in given if name in MODEL_OPTIONS[1:]]
+    useless = [name for name, value in given.items() if (name, value) != ("convention", "report")]
     if useless and not is_obj(scene):
         raise UsageError(f"{useless[0]} is of use only with an OBJ file: scene=PATH.obj")
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 
 import mrt_mitsuba as mrt
@@ -82,6 +84,19 @@ def files(tmp_path: Path) -> dict[str, str]:
     write_exr(tmp_path / "small.exr", GREY[:5])
     write_exr(tmp_path / "nan.exr", np.where(spotted() > 0.55, np.nan, GREY))
     (tmp_path / "text.exr").write_text("no picture")
+    os.mkfifo(tmp_path / "pipe.exr")
+    kind = {"type": OpenEXR.scanlineimage}
+    shifted = {"dataWindow": ((100, 200), (115, 211)), "displayWindow": ((0, 0), (639, 479))}
+    OpenEXR.File(kind | shifted, {"RGB": GREY}).write(str(tmp_path / "shifted.exr"))
+    parts = [OpenEXR.Part(kind | {"name": n}, {"RGB": p}) for n, p in (("left", GREY), ("right", spotted()))]
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
+    tiled = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
+    OpenEXR.File(tiled, {"RGB": GREY}).write(str(tmp_path / "tiled.exr"))
+    deep = np.empty((12, 16), object)
+    deep[...] = [[np.ones(2, np.float32)] * 16] * 12
+    header = {"type": OpenEXR.deepscanline, "compression": OpenEXR.ZIPS_COMPRESSION}
+    OpenEXR.File(header, {"R": deep}).write(str(tmp_path / "deep.exr"))
+    (tmp_path / "cut.exr").write_bytes((tmp_path / "b.exr").read_bytes()[:-100])
     return {path.stem: str(path) for path in tmp_path.iterdir()} | {"none": str(tmp_path / "none.exr")}
 
 
@@ -101,16 +116,24 @@ def files(tmp_path: Path) -> dict[str, str]:
         (("nan", "b"), 2, "is NaN in 1 pixels, the first at row 3, column 5"),
         (("a", "text"), 2, "not a whole EXR"),
         (("a", "none"), 2, "No such file"),
+        (("a", "cut"), 2, "not a whole EXR"),
+        (("a", "pipe"), 2, "pipe.exr: it is not a regular file"),
+        (("a", "shifted"), 2, "the data windows (0, 0, 15, 11) and (100, 200, 115, 211)"),
+        (("tiled", "b", "largest=0"), 0, "ok     largest"),
+        (("parts", "parts", "layer=right", "largest=0"), 0, "ok     largest"),
+        (("a", "parts"), 2, "has no layer 'R, G, B'; it has left, right"),
+        (("a", "deep"), 2, "many values in a pixel; flatten it first"),
         (("a",), 2, "B.exr is missing. Usage: mrt diff A.exr B.exr"),
         (("a", "b", "rsme=1"), 2, "unknown option 'rsme', meant rmse?"),
         (("a", "b", "rmse=much"), 2, "must be a number"),
         (("a", "b", "rmse=1", "rmse=2"), 2, "given twice"),
     ],
 )
-def test_command(words, code: int, said: str, files, capsys) -> None:
+def test_command(words, code: int, said: str, files, capfd) -> None:
     assert main(["diff", *(files.get(word, word) for word in words)]) == code
-    out, err = capsys.readouterr()
+    out, err = capfd.readouterr()
     assert said in (err if code == 2 else out)
+    assert err.count("\n") == (code == 2)
 
 
 def test_difference_is_written(files, tmp_path: Path, capsys) -> None:
@@ -123,3 +146,8 @@ def test_difference_is_written(files, tmp_path: Path, capsys) -> None:
     shown = np.asarray(Image.open(tmp_path / "d.png")).astype(int).sum(axis=-1)
     assert np.unravel_index(shown.argmax(), shown.shape) == (3, 5) and (shown < 20).sum() == shown.size - 1
     assert main(["diff", files["a"], files["b"], f"out={tmp_path}/no/such/place"]) == 2
+    before = (tmp_path / "a.exr").read_bytes()
+    (tmp_path / "link.png").symlink_to("a.exr")
+    for out in ("a", "a.exr", "a.png", "b", "../" + tmp_path.name + "/a", "link"):
+        assert main(["diff", files["a"], files["b"], f"out={tmp_path}/{out}"]) == 2
+    assert (tmp_path / "a.exr").read_bytes() == before and not (tmp_path / "a.png").exists()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from mrt_mitsuba.errors import OutputError, UsageError
 from mrt_mitsuba.output.files import read_channels, write_exr, write_png
+from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.result import Result
 from mrt_mitsuba.validation.tools import image_tests
 
@@ -41,6 +42,7 @@ class Difference:
     p_value: float | None  #: of as much difference by noise alone; None where no noise is known
     difference: np.ndarray  #: a − b, float32 [H, W, C]
     pictures: tuple[np.ndarray, np.ndarray] = field(repr=False)
+    inputs: tuple[str, ...] = ()  #: paths of the files that were compared
 
     @cached_property
     def flip(self) -> float | None:
@@ -57,11 +59,13 @@ class Difference:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the signed difference as .exr, and its size in false colours as .png, black for none.
 
-        The ending of ``path`` does not matter. Raises ``OutputError``.
+        The ending of ``path`` does not matter. Raises ``OutputError``, also for a file that was compared.
         """
         from matplotlib import colormaps
 
         stem = Path(path).with_suffix("") if Path(path).suffix in (".exr", ".png") else Path(path)
+        for ending in ("exr", "png"):
+            check_target(f"{stem}.{ending}", self.inputs)
         values = self.difference
         shown = values if values.shape[2] == 3 else np.repeat(values[..., :1], 3, axis=2)
         write_exr(f"{stem}.exr", shown, header={k: str(v) for k, v in self.measures().items()})
@@ -95,13 +99,20 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
     ``render(target=...)`` and ``aamode="noise"`` write it, and pixels that are independent: a box filter.
     It is too small where a few very bright rays rule the noise.
 
-    Raises ``UsageError`` for what cannot be compared: another size, no such layer, NaN.
+    An EXR of several parts has each as a layer, by its name. Raises ``UsageError`` for what cannot be
+    compared: another size or data window, no such layer, NaN.
     """
     sides = [Layer.read(side, layer, name) for side, name in ((a, "a"), (b, "b"))]
     first, second = (side.values for side in sides)
     if first.shape != second.shape:
         sizes = " and ".join(f"{s.shape[1]}x{s.shape[0]} with {s.shape[2]} channels" for s in (first, second))
         raise UsageError(f"cannot compare pictures of {sizes}: their sizes must be the same")
+    windows = [side.window for side in sides if side.window is not None]
+    if len(windows) == 2 and windows[0] != windows[1]:
+        raise UsageError(
+            f"cannot compare the data windows {windows[0]} and {windows[1]}, of first column and row to last "
+            "column and row: the pictures show other places"
+        )
     with np.errstate(invalid="ignore", over="ignore"):
         difference = np.where(first == second, 0, first.astype(np.float64) - second)  # inf where both are
         square = difference**2
@@ -119,6 +130,7 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
         p_value=_p_value(sides),
         difference=difference.astype(np.float32),
         pictures=(first, second),
+        inputs=tuple(os.fspath(side) for side in (a, b) if isinstance(side, str | os.PathLike)),
     )
 
 
@@ -134,12 +146,19 @@ class Layer:
     values: np.ndarray
     variance: np.ndarray | None = None
     samples: np.ndarray | float = np.inf
+    window: tuple[int, ...] | None = None  #: of an EXR: first column and row, last column and row
 
     @classmethod
     def read(cls, source: Any, layer: str = "", name: str = "the picture") -> Layer:
         """Return the picture, or a layer of it, of whatever ``compare`` takes. Raises ``UsageError``."""
         if isinstance(source, str | os.PathLike):
-            return cls.of(_read(source), layer, os.fspath(source))
+            try:
+                channels, headers = read_channels(source)
+            except OutputError as error:
+                raise UsageError(f"{error}; only EXR files can be compared") from error
+            found = cls.of(channels, layer, os.fspath(source))
+            header = headers[_channels_of(channels, layer)[0]]
+            return replace(found, window=tuple(int(n) for corner in header["dataWindow"] for n in corner))
         if isinstance(source, Result):
             channels = {letter: source.image[..., i] for i, letter in enumerate("RGB")}
             return cls.of({**channels, **source.layers}, layer, f"result {name}")
@@ -175,13 +194,6 @@ class Layer:
                 f"{name} is NaN in {bad.sum()} pixels, the first at row {row}, column {column}: mend it first"
             )
         return cls(values)
-
-
-def _read(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    try:
-        return read_channels(path)
-    except OutputError as error:
-        raise UsageError(f"{error}; only EXR files can be compared") from error
 
 
 def _channels_of(channels: Mapping[str, np.ndarray], layer: str) -> list[str]:
