@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -13,15 +12,17 @@ import numpy as np
 from .emission import largest
 from .fresnel import f0_from_ior
 from .kernel_plan import MaterialRows, Mirror, Reason
-from .lobes import ALPHA_MAX, ALPHA_MIN, Lobes, Pair
+from .lobes import LOBES, Lobes, Pair
 from .parameters import ParameterError, choice, flag, number, spectrum
 from .protocols import MergeableBSDF
 from .variants import first, is_jit, updatable, varies, varies_by_face
 
 FRESNEL_FORMS = ("schlick", "dielectric", "unity")
 
-# Names of the parameters under ``mi.traverse``
-NUMBERS, COLORS = ("alpha", "int_ior", "ext_ior"), ("diffuse_reflectance", "specular_reflectance")
+# Numbers, or textures of one channel, with their defaults and limits
+NUMBERS: dict[str, tuple[float, dict[str, float]]] = {
+    "alpha": (0.1, {}), "int_ior": (1.5, {"above": 0}), "ext_ior": (1.0, {"above": 0}),
+}  # fmt: skip
 
 
 class MrtBSDF(mi.BSDF):
@@ -69,81 +70,77 @@ class MrtBSDF(mi.BSDF):
     the side of the normal only. The attribute ``mirror_reflectance`` (``eval_attribute``) is k_s F(θi), the
     weight that ``mrt_whitted`` gives to the mirror ray, and ``int_ior`` (``eval_attribute_1``) drives its
     bounce budget.
-    In polarised variants the reflected light is depolarised.
+    In polarised variants the reflected light is depolarised. Samples and their density are constants in
+    derivatives: ``sample`` returns the value, which follows the parameters, over the density, which does not.
     """
 
     def __init__(self, props: mi.Properties) -> None:
         mi.BSDF.__init__(self, props)
         self.fresnel = choice(props, "fresnel", FRESNEL_FORMS)
-        self.int_ior = self._number_or_texture(props, "int_ior", 1.5, above=0)
-        self.ext_ior = self._number_or_texture(props, "ext_ior", 1.0, above=0)
-        self.alpha = self._number_or_texture(props, "alpha", 0.1)
-        self.diffuse_reflectance = spectrum(props, "diffuse_reflectance", 0.5)
-        self.specular_reflectance = spectrum(props, "specular_reflectance", 1.0)
-        self.f0 = self._read_f0(props)
         self.sample_visible = flag(props, "sample_visible", True)
-        self._update()
-
-    @staticmethod
-    def _number_or_texture(props: mi.Properties, name: str, default: float, **limits: float) -> Any:
-        if name in props and props.type(name) == mi.Properties.Type.Object:
-            return spectrum(props, name)
-        return updatable(number(props, name, default, **limits))
-
-    def _read_f0(self, props: mi.Properties) -> mi.Texture | None:
-        if "f0" not in props:
-            return None
-        if self.fresnel != "schlick":
-            raise ParameterError(
-                f'mrt_bsdf: "f0" has no meaning with fresnel="{self.fresnel}"; leave one of them out'
+        self.parameters: dict[str, Any] = {}
+        for name, (default, limits) in NUMBERS.items():
+            textured = name in props and props.type(name) == mi.Properties.Type.Object
+            self.parameters[name] = (
+                spectrum(props, name) if textured else updatable(number(props, name, default, **limits))
             )
-        return spectrum(props, "f0")
+        for lobe in LOBES:
+            self.parameters[lobe.reflectance] = spectrum(props, lobe.reflectance, lobe.default)
+        if "f0" in props:
+            if self.fresnel != "schlick":
+                raise ParameterError(
+                    f'mrt_bsdf: "f0" has no meaning with fresnel="{self.fresnel}"; leave one of them out'
+                )
+            self.parameters["f0"] = spectrum(props, "f0")
+        self._update()
 
     def _update(self) -> None:
         # Opaque numbers travel as data: instances share one compiled function, new values need no new kernel
-        dr.make_opaque(
-            *(p for p in (self.alpha, self.int_ior, self.ext_ior) if not isinstance(p, mi.Texture))
-        )
-        diffuse = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
-        glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
-        if self._varies(self.diffuse_reflectance):
-            diffuse |= mi.BSDFFlags.SpatiallyVarying
-        if self._varies(self.specular_reflectance, self.alpha, self.int_ior, self.ext_ior, self.f0):
-            glossy |= mi.BSDFFlags.SpatiallyVarying
-        self.m_components = [diffuse, glossy]
-        self.m_flags = diffuse | glossy
+        dr.make_opaque(*(p for p in self.parameters.values() if not isinstance(p, mi.Texture)))
+        self.m_components, self.m_flags = [], 0
+        for lobe in LOBES:
+            flags = getattr(mi.BSDFFlags, lobe.flag) | mi.BSDFFlags.FrontSide
+            if any(self._varies(name) for name in (lobe.reflectance, *lobe.numbers)):
+                flags |= mi.BSDFFlags.SpatiallyVarying
+            self.m_components = [*self.m_components, flags]
+            self.m_flags |= flags
 
-    @staticmethod
-    def _varies(*parameters: Any) -> bool:
-        return any(isinstance(p, mi.Texture) and varies(p) for p in parameters)
+    def _varies(self, name: str) -> bool:
+        parameter = self.parameters.get(name)
+        return isinstance(parameter, mi.Texture) and varies(parameter)
 
     def traverse(self, callback: Any) -> None:
-        flags = mi.ParamFlags.Differentiable
-        for name in (*NUMBERS, *COLORS):
-            callback.put(name, getattr(self, name), flags)
-        if self.f0 is not None:
-            callback.put("f0", self.f0, flags)
+        for name, parameter in self.parameters.items():
+            callback.put(name, parameter, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Any = ()) -> None:
         self._update()
 
+    def _read(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Any:
+        """Return a parameter at a surface point."""
+        parameter = self.parameters[name]
+        if isinstance(parameter, mi.Texture):
+            return parameter.eval_1(si, active) if name in NUMBERS else parameter.eval(si, active)
+        return parameter if is_jit() else first(parameter)
+
     def lobes(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Lobes:
         """Return the lobes at a surface point."""
-        return Lobes(self.fresnel, _PointParameters(self, si, active), si.wi, visible=self.sample_visible)
+        given = {name: self._read(name, si, active) for name in self.parameters}
+        return Lobes(self.fresnel, given, si.wi, visible=self.sample_visible)
 
     def rows(self, points: mi.SurfaceInteraction3f | None = None) -> MaterialRows | Reason:
         """Return the parameters as plain numbers, or why they are none.
 
         ``points``: one surface point on each object of a shape, for textures that vary from face to face.
         """
-        varying = [p for p in (getattr(self, name) for name in (*NUMBERS, *COLORS)) if self._varies(p)]
-        if self.f0 is not None or not all(points is not None and varies_by_face(p) for p in varying):
+        varying = [self.parameters[name] for name in self.parameters if self._varies(name)]
+        if "f0" in self.parameters or not all(points is not None and varies_by_face(p) for p in varying):
             return Reason.VARYING
         count = 1 if points is None else dr.width(points)
-        point = _PointParameters(self, dr.zeros(mi.SurfaceInteraction3f) if points is None else points, True)
-        values = [point.alpha, point.int_ior, point.ext_ior], point.diffuse, point.specular
-        if dr.grad_enabled(values):
+        given = self.lobes(dr.zeros(mi.SurfaceInteraction3f) if points is None else points, True).given
+        if dr.grad_enabled(given):
             return Reason.GRADIENTS
+        values = [given[name] for name in NUMBERS], *(given[lobe.reflectance] for lobe in LOBES)
         rows = (np.stack([np.broadcast_to(x, count) for x in value], axis=1) for value in values)
         return MaterialRows(*rows)
 
@@ -174,21 +171,22 @@ class MrtBSDF(mi.BSDF):
         active: mi.Bool = True,
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         lobes = self.lobes(si, active)
-        wo, pair, specular = lobes.sample(ctx, sample1, sample2, active)
+        wo, pair, component = lobes.sample(ctx, sample1, sample2, active)
         pdf = lobes.density(ctx, pair)
         drawn = pdf > 0
-        weight = dr.select(drawn, lobes.value(ctx, pair) / dr.select(drawn, pdf, 1), 0)
+        weight = dr.select(drawn, lobes.value(ctx, pair) / dr.select(drawn, dr.detach(pdf), 1), 0)
         bs = mi.BSDFSample3f()
         bs.wo, bs.pdf, bs.eta = wo, pdf, mi.Float(1)
-        bs.sampled_component = dr.select(specular, mi.UInt32(1), mi.UInt32(0))
-        glossy, diffuse = mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DiffuseReflection
-        bs.sampled_type = dr.select(specular, mi.UInt32(+glossy), mi.UInt32(+diffuse))
+        bs.sampled_component, bs.sampled_type = component, mi.UInt32(0)
+        for k, lobe in enumerate(LOBES):
+            kind = mi.UInt32(+getattr(mi.BSDFFlags, lobe.flag))
+            bs.sampled_type = dr.select(component == k, kind, bs.sampled_type)
         return bs, mi.depolarizer(weight)
 
     # ------------------------------------------ Attributes ---------------------------------------------
 
     def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
-        return mi.Spectrum(self.diffuse_reflectance.eval(si, active))
+        return mi.Spectrum(self._read("diffuse_reflectance", si, active))
 
     def has_attribute(self, name: str, active: mi.Bool = True) -> mi.Bool:
         return name in ("mirror_reflectance", "int_ior")
@@ -202,71 +200,37 @@ class MrtBSDF(mi.BSDF):
 
     def eval_attribute_1(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Float:
         if name == "int_ior":
-            return _PointParameters(self, si, active).int_ior
+            return self._read("int_ior", si, active)
         raise ParameterError(f'mrt_bsdf: no scalar attribute "{name}"; there is "int_ior"')
 
     def mirror_bound(self) -> Mirror:
         """Return upper bounds of ``mirror_reflectance``, and ``int_ior``; inf for what varies."""
-        reflectance, f0 = largest(self.specular_reflectance), self._f0_bound()
-        int_ior = float("inf") if isinstance(self.int_ior, mi.Texture) else first(self.int_ior)
-        return Mirror(reflectance * max(1, f0), int_ior, reflectance * f0)
+        reflectance, f0 = largest(self.parameters["specular_reflectance"]), self._f0_bound()
+        int_ior = self.parameters["int_ior"]
+        index = math.inf if isinstance(int_ior, mi.Texture) else first(int_ior)
+        return Mirror(reflectance * max(1, f0), index, reflectance * f0)
 
     def value_bound(self) -> float:
-        """Return an upper bound of f cos θ; inf where a parameter varies.
-
-        D is largest at tan²θ = 2 α² - 1, else at 0. G₁ / cos θ is 1 / cos θ up to α tan θ = 1/1.6 and at most
-        3.535 / (α sin θ) beyond. A negative α has |G₁| < 3 in place of 1, twice.
-        """
-        if isinstance(self.alpha, mi.Texture):
-            return float("inf")
-        alpha = min(max(abs(first(self.alpha)), ALPHA_MIN), ALPHA_MAX)
-        peak = max(1, 4 * alpha**4 * math.exp(1 / alpha**2 - 2)) if 2 * alpha**2 > 1 else 1
-        shadowed = 5.66 * math.sqrt(1 + 0.4 / alpha**2) * (9 if first(self.alpha) < 0 else 1)
-        lobe = 0.25 * peak / (math.pi * alpha**2) * shadowed
-        fresnel = max(1, self._f0_bound())
-        specular = largest(self.specular_reflectance)
-        return largest(self.diffuse_reflectance) / math.pi + (specular * fresnel * lobe if specular else 0)
+        """Return an upper bound of f cos θ; inf where a parameter varies."""
+        alpha, f0 = self.parameters["alpha"], self._f0_bound()
+        if isinstance(alpha, mi.Texture):
+            return math.inf
+        bounds = ((largest(self.parameters[lobe.reflectance]), lobe) for lobe in LOBES)
+        return sum(share * lobe.bound(first(alpha), f0) for share, lobe in bounds if share)
 
     def _f0_bound(self) -> float:
         """Return an upper bound of the reflectance at normal incidence."""
-        if self.f0 is not None:
-            return largest(self.f0)
-        varying = isinstance(self.int_ior, mi.Texture) or isinstance(self.ext_ior, mi.Texture)
-        if self.fresnel == "unity" or varying:
+        if "f0" in self.parameters:
+            return largest(self.parameters["f0"])
+        indices = self.parameters["ext_ior"], self.parameters["int_ior"]
+        if self.fresnel == "unity" or any(isinstance(index, mi.Texture) for index in indices):
             return 1.0
-        return f0_from_ior(first(self.ext_ior), first(self.int_ior))
+        return f0_from_ior(*map(first, indices))
 
     def to_string(self) -> str:
-        names = (*NUMBERS, *COLORS, "f0")
-        return f"MrtBSDF[fresnel={self.fresnel}, " + ", ".join(f"{n}={getattr(self, n)}" for n in names) + "]"
-
-
-def _number(name: str) -> Any:
-    def read(point: _PointParameters) -> mi.Float:
-        parameter = getattr(point.bsdf, name)
-        if isinstance(parameter, mi.Texture):
-            return parameter.eval_1(point.si, point.active)
-        return parameter if is_jit() else first(parameter)
-
-    return cached_property(read)
-
-
-def _color(name: str) -> Any:
-    def read(point: _PointParameters) -> mi.UnpolarizedSpectrum | None:
-        texture = getattr(point.bsdf, name)
-        return None if texture is None else texture.eval(point.si, point.active)
-
-    return cached_property(read)
-
-
-class _PointParameters:
-    """The parameters at a surface point; each is read when it is first asked for, and once."""
-
-    alpha, int_ior, ext_ior = map(_number, NUMBERS)
-    diffuse, specular, f0 = map(_color, (*COLORS, "f0"))
-
-    def __init__(self, bsdf: MrtBSDF, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
-        self.bsdf, self.si, self.active = bsdf, si, active
+        parameters = self.parameters | {"f0": self.parameters.get("f0")}
+        text = ", ".join(f"{name}={parameter}" for name, parameter in parameters.items())
+        return f"MrtBSDF[fresnel={self.fresnel}, {text}]"
 
 
 MergeableBSDF.register(MrtBSDF)

@@ -1,10 +1,11 @@
-"""The two lobes of ``mrt_bsdf`` at a surface point, wherever its parameters come from."""
+"""The lobes of ``mrt_bsdf``: a table of them, and what they make together at a surface point."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -31,28 +32,6 @@ COS_MIN = 1e-12
 IOR_MIN, IOR_MAX = 1e-9, 1e9
 
 
-class Parameters(Protocol):
-    """The parameters of an ``mrt_bsdf`` at a surface point; without f0, that of the indices of refraction."""
-
-    @property
-    def alpha(self) -> mi.Float: ...
-
-    @property
-    def int_ior(self) -> mi.Float: ...
-
-    @property
-    def ext_ior(self) -> mi.Float: ...
-
-    @property
-    def diffuse(self) -> mi.UnpolarizedSpectrum: ...
-
-    @property
-    def specular(self) -> mi.UnpolarizedSpectrum: ...
-
-    @property
-    def f0(self) -> mi.UnpolarizedSpectrum | None: ...
-
-
 @dataclass
 class Pair:
     """Two directions, above the surface where ``active``, and tan² of their half vector's angle to z."""
@@ -72,32 +51,118 @@ class Pair:
         # on wi alone is computed once for all wo
         up = mi.Vector3f(0, 0, 1)
         wi, wo, active = dr.select(above_i, wi, up), dr.select(above_o, wo, up), above_i & above_o
-        return cls(wi, wo, tan2_theta(wi + wo) if tan2_theta_h is None else tan2_theta_h, active)
+        tan2 = tan2_theta(wi + wo)
+        if tan2_theta_h is not None:
+            tan2 = dr.replace_grad(tan2_theta_h, tan2) if dr.grad_enabled(tan2) else tan2_theta_h
+        return cls(wi, wo, tan2, active)
+
+
+class Diffuse:
+    """Lambert's lobe."""
+
+    reflectance, default = "diffuse_reflectance", 0.5
+    flag = "DiffuseReflection"
+    numbers: tuple[str, ...] = ()
+
+    def value(self, at: Lobes, pair: Pair) -> mi.UnpolarizedSpectrum:
+        return at.given[self.reflectance] * (dr.inv_pi * pair.wo.z)
+
+    def density(self, at: Lobes, pair: Pair) -> mi.Float:
+        return dr.inv_pi * pair.wo.z
+
+    def sample(self, at: Lobes, wi: mi.Vector3f, sample2: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
+        wo = mi.warp.square_to_cosine_hemisphere(sample2)
+        return wo, tan2_theta(wi + wo)
+
+    def albedo(self, at: Lobes) -> mi.UnpolarizedSpectrum:
+        return at.given[self.reflectance]
+
+    def bound(self, alpha: float, f0: float) -> float:
+        return 1 / math.pi
+
+
+class Specular:
+    """Beckmann's microfacets, each a mirror of Fresnel's reflectance."""
+
+    reflectance, default = "specular_reflectance", 1.0
+    flag = "GlossyReflection"
+    numbers = ("alpha", "int_ior", "ext_ior", "f0")
+
+    def value(self, at: Lobes, pair: Pair) -> mi.UnpolarizedSpectrum:
+        fresnel = at.fresnel(*half_vector_angles(pair.wi, pair.wo))
+        lobe = microfacet_specular(pair.wi, pair.wo, pair.tan2_theta_h, at.alpha)
+        return at.given[self.reflectance] * fresnel * lobe
+
+    def density(self, at: Lobes, pair: Pair) -> mi.Float:
+        """Return that of the microfacet normal over 4 ωo·h."""
+        d = beckmann_d(pair.tan2_theta_h, at.alpha)
+        if at.visible:
+            return 0.25 * d * visible_over_cos(pair.wi, at.alpha)
+        # D cos θh / (4 ωo·h), where h = ωi + ωo is not normalised: cos θh = h.z / |h|, ωo·h = |h|² / 2, and
+        # |h|² = h.z² (1 + tan²θh). The product ωo·h itself would feel the rounding of ωo's length: by 2 % at
+        # cos θ = 1e-3 in float32
+        return 0.5 * d / ((pair.wi.z + pair.wo.z) * (1 + pair.tan2_theta_h))
+
+    def sample(self, at: Lobes, wi: mi.Vector3f, sample2: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
+        if at.visible:
+            unit = mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, 1.0)
+            m = sample_beckmann_visible(wi, at.alpha, sample2, unit.sample_visible_11, mi.Vector3f)
+        else:
+            m = sample_beckmann(at.alpha, sample2.x, sample2.y, mi.Vector3f)
+        # The drawn normal *is* the half vector: of a narrow lobe, wi + wo has lost what sets it apart from n
+        return mi.reflect(wi, m), tan2_theta(m)
+
+    def albedo(self, at: Lobes) -> mi.UnpolarizedSpectrum:
+        return at.mirror_reflectance
+
+    def bound(self, alpha: float, f0: float) -> float:
+        """D is largest at tan²θ = 2 α² - 1, else at 0. G₁ / cos θ is 1 / cos θ up to α tan θ = 1/1.6 and at
+        most 3.535 / (α sin θ) beyond. A negative α has |G₁| < 3 in place of 1, twice.
+        """
+        size = min(max(abs(alpha), ALPHA_MIN), ALPHA_MAX)
+        peak = max(1, 4 * size**4 * math.exp(1 / size**2 - 2)) if 2 * size**2 > 1 else 1
+        shadowed = 5.66 * math.sqrt(1 + 0.4 / size**2) * (9 if alpha < 0 else 1)
+        return max(1, f0) * 0.25 * peak / (math.pi * size**2) * shadowed
+
+
+# In the order of the components of the BSDF. A lobe has the name of the parameter that scales it, what flags
+# say of it, the other parameters that it depends on, its value f cos θo, the density of its samples, samples
+# (with tan² of the half vector), the reflectance by which it is chosen, and a bound of the value without the
+# reflectance
+LOBES = (Diffuse(), Specular())
 
 
 class Lobes:
-    """Value, density and samples of the lobes, seen from the local direction ``wi``."""
+    """Value, density and samples of the lobes, seen from the local direction ``wi``.
 
-    def __init__(self, form: str, parameters: Parameters, wi: mi.Vector3f, *, visible: bool = True) -> None:
-        self.form, self.parameters, self.wi, self.visible = form, parameters, wi, visible
+    ``given``: the parameters of the BSDF there, by name. Samples and their density are constants in
+    derivatives (detached sampling): only the value, divided by the density, follows the parameters.
+    """
+
+    def __init__(self, form: str, given: dict[str, Any], wi: mi.Vector3f, *, visible: bool = True) -> None:
+        self.form, self.given, self.wi, self.visible = form, given, wi, visible
+
+    @cached_property
+    def constant(self) -> Lobes:
+        """The same without derivatives by the parameters."""
+        return Lobes(self.form, dr.detach(self.given), self.wi, visible=self.visible)
 
     @cached_property
     def alpha(self) -> mi.Float:
         """The roughness within what float32 resolves."""
-        alpha = self.parameters.alpha
+        alpha = self.given["alpha"]
         size = _within(dr.abs(alpha), ALPHA_MIN, ALPHA_MAX)
         return dr.select(alpha < 0, -size, size)
 
     def fresnel(self, cos_theta: mi.Float, sin2_theta: mi.Float) -> Any:
         """Return F at a microfacet: a float, or a spectrum where ``f0`` was given."""
-        given = self.parameters
         if self.form == "unity":
             return mi.Float(1)
-        ext_ior, int_ior = (_within(ior, IOR_MIN, IOR_MAX) for ior in (given.ext_ior, given.int_ior))
+        ext_ior, int_ior = (_within(self.given[name], IOR_MIN, IOR_MAX) for name in ("ext_ior", "int_ior"))
         if self.form == "dielectric":
             return fresnel_dielectric(cos_theta, ext_ior, int_ior, sin2_theta)
-        f0 = f0_from_ior(ext_ior, int_ior) if given.f0 is None else given.f0
-        return fresnel_schlick(cos_theta, f0, sin2_theta)
+        f0 = self.given.get("f0")
+        return fresnel_schlick(cos_theta, f0_from_ior(ext_ior, int_ior) if f0 is None else f0, sin2_theta)
 
     @cached_property
     def mirror_reflectance(self) -> mi.UnpolarizedSpectrum:
@@ -105,77 +170,57 @@ class Lobes:
         above = self.wi.z > COS_MIN
         sin2_theta = dr.square(self.wi.x) + dr.square(self.wi.y)
         fresnel = self.fresnel(dr.select(above, self.wi.z, 1), dr.select(above, sin2_theta, 0))
-        return dr.select(above, self.parameters.specular * fresnel, 0)
+        return dr.select(above, self.given["specular_reflectance"] * fresnel, 0)
 
     def value(self, ctx: mi.BSDFContext, pair: Pair) -> mi.UnpolarizedSpectrum:
         """Return f cos θo of the enabled lobes."""
-        diffuse, specular = _enabled(ctx)
         value = mi.UnpolarizedSpectrum(0)
-        if specular:
-            fresnel = self.fresnel(*half_vector_angles(pair.wi, pair.wo))
-            lobe = microfacet_specular(pair.wi, pair.wo, pair.tan2_theta_h, self.alpha)
-            value += self.parameters.specular * fresnel * lobe
-        if diffuse:
-            value += self.parameters.diffuse * (dr.inv_pi * pair.wo.z)
+        for _, lobe in _enabled(ctx):
+            value += lobe.value(self, pair)
         # The report's G₁ of a negative roughness can be negative; light cannot
         return dr.select(pair.active, dr.maximum(value, 0), 0)
 
     def density(self, ctx: mi.BSDFContext, pair: Pair) -> mi.Float:
         """Return the density per solid angle with which ``sample`` draws ``pair.wo``."""
-        diffuse, specular = _enabled(ctx)
-        density, probability = mi.Float(0), self._specular_probability(ctx)
-        if specular:
-            density += probability * self._specular_density(pair)
-        if diffuse:
-            density += (1 - probability) * (dr.inv_pi * pair.wo.z)
+        at, density = self.constant, mi.Float(0)
+        for _, lobe, probability in at._chances(ctx):
+            density += probability * lobe.density(at, pair)
         return dr.select(pair.active, density, 0)
 
     def sample(
         self, ctx: mi.BSDFContext, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
-    ) -> tuple[mi.Vector3f, Pair, mi.Bool]:
-        """Draw a direction; return it, its pair with ``wi``, and whether the specular lobe was drawn from."""
-        above = active & (self.wi.z > COS_MIN)
-        wi = dr.select(above, self.wi, mi.Vector3f(0, 0, 1))
-        specular = sample1 < self._specular_probability(ctx)
-        m = self._sample_normal(wi, sample2)
-        lambertian = mi.warp.square_to_cosine_hemisphere(sample2)
-        wo = dr.select(specular, mi.reflect(wi, m), lambertian)
-        # The drawn normal *is* the half vector: of a narrow lobe, wi + wo has lost what sets it apart from n
-        tan2_theta_h = dr.select(specular, tan2_theta(m), tan2_theta(wi + lambertian))
-        return wo, Pair.above(wi, wo, above, tan2_theta_h), specular
+    ) -> tuple[mi.Vector3f, Pair, mi.UInt32]:
+        """Draw a direction; return it, its pair with ``wi``, and which of ``LOBES`` it was drawn from."""
+        at, above = self.constant, active & (self.wi.z > COS_MIN)
+        up = mi.Vector3f(0, 0, 1)
+        wi = dr.select(above, dr.detach(self.wi), up)
+        wo, tan2_theta_h, component = up, mi.Float(0), mi.UInt32(0)
+        taken = mi.Float(0)
+        for place, (number, lobe, probability) in enumerate(at._chances(ctx)):
+            drawn = lobe.sample(at, wi, sample2)
+            # The first lobe takes what the others leave
+            own = mi.Bool(True) if place == 0 else (sample1 >= taken) & (sample1 < taken + probability)
+            taken += 0 if place == 0 else probability
+            wo, tan2_theta_h = dr.select(own, drawn[0], wo), dr.select(own, drawn[1], tan2_theta_h)
+            component = dr.select(own, mi.UInt32(number), component)
+        wo, tan2_theta_h = dr.detach(wo), dr.detach(tan2_theta_h)
+        return wo, Pair.above(dr.select(above, self.wi, up), wo, above, tan2_theta_h), component
 
-    def _sample_normal(self, wi: mi.Vector3f, sample2: mi.Point2f) -> mi.Vector3f:
-        if not self.visible:
-            return sample_beckmann(self.alpha, sample2.x, sample2.y, mi.Vector3f)
-        unit = mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, 1.0)
-        return sample_beckmann_visible(wi, self.alpha, sample2, unit.sample_visible_11, mi.Vector3f)
-
-    def _specular_density(self, pair: Pair) -> mi.Float:
-        """Return that of the microfacet normal over 4 ωo·h."""
-        d = beckmann_d(pair.tan2_theta_h, self.alpha)
-        if self.visible:
-            return 0.25 * d * visible_over_cos(pair.wi, self.alpha)
-        # D cos θh / (4 ωo·h), where h = ωi + ωo is not normalised: cos θh = h.z / |h|, ωo·h = |h|² / 2, and
-        # |h|² = h.z² (1 + tan²θh). The product ωo·h itself would feel the rounding of ωo's length: by 2 % at
-        # cos θ = 1e-3 in float32
-        return 0.5 * d / ((pair.wi.z + pair.wo.z) * (1 + pair.tan2_theta_h))
-
-    def _specular_probability(self, ctx: mi.BSDFContext) -> mi.Float:
-        """Return the probability of the specular lobe, after the lobes' reflectances towards ``wi``."""
-        diffuse, specular = _enabled(ctx)
-        if not (diffuse and specular):
-            return mi.Float(1 if specular else 0)
-        weight = dr.abs(dr.mean(self.mirror_reflectance))
-        total = weight + dr.abs(dr.mean(self.parameters.diffuse))
-        return dr.select(total > 0, weight / dr.select(total > 0, total, 1), 0.5)
+    def _chances(self, ctx: mi.BSDFContext) -> list[tuple[int, Any, mi.Float]]:
+        """Return the enabled lobes, and how likely each is drawn from: after their reflectances."""
+        lobes = _enabled(ctx)
+        if len(lobes) < 2:
+            return [(k, lobe, mi.Float(1)) for k, lobe in lobes]
+        weights = [dr.abs(dr.mean(lobe.albedo(self))) for _, lobe in lobes]
+        total = sum(weights)
+        known = total > 0
+        shares = [dr.select(known, w / dr.select(known, total, 1), 1 / len(lobes)) for w in weights[1:]]
+        return [(k, lobe, p) for (k, lobe), p in zip(lobes, [1 - sum(shares), *shares], strict=True)]
 
 
-def _enabled(ctx: mi.BSDFContext) -> tuple[bool, bool]:
-    """Return whether the diffuse and the specular lobe take part."""
-    return (
-        ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0),
-        ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1),
-    )
+def _enabled(ctx: mi.BSDFContext) -> list[tuple[int, Any]]:
+    """Return the lobes that take part, with their places in ``LOBES``."""
+    return [(k, x) for k, x in enumerate(LOBES) if ctx.is_enabled(getattr(mi.BSDFFlags, x.flag), k)]
 
 
 def _within(x: Any, least: float, most: float) -> Any:

@@ -9,7 +9,6 @@ Dr.Jit would record its calls in the kernels of every scene, and only Python cal
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -17,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from .kernel_plan import MaterialRows, Reason
-from .lobes import Lobes, Pair
+from .lobes import LOBES, Lobes, Pair
 from .lookup import ByShape, aligned
 from .protocols import MergeableBSDF, QuadricShape
 from .variants import is_jit
@@ -102,13 +101,18 @@ class MergedBSDF:
         """Return the lobes at a surface point."""
         return Lobes(self.fresnel, self._row(si), si.wi)
 
-    def _row(self, si: mi.SurfaceInteraction3f) -> _Row:
+    def _row(self, si: mi.SurfaceInteraction3f) -> dict[str, Any]:
         # One mask for all lights, or they would be looked up for each
         everywhere = mi.Bool(True)
-        (alpha, int_ior, ext_ior, _), *colors = (self.table(si, everywhere, part) for part in range(3))
+        numbers, *colors = (self.table(si, everywhere, part) for part in range(1 + len(LOBES)))
         channels = dr.size_v(mi.UnpolarizedSpectrum)
-        diffuse, specular = (mi.UnpolarizedSpectrum(list(color)[:channels]) for color in colors)
-        return _Row(alpha, int_ior, ext_ior, diffuse, specular)
+        return {
+            **dict(zip(("alpha", "int_ior", "ext_ior"), numbers, strict=False)),
+            **{
+                x.reflectance: mi.UnpolarizedSpectrum(list(c)[:channels])
+                for x, c in zip(LOBES, colors, strict=True)
+            },
+        }
 
     def eval(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
@@ -126,19 +130,7 @@ class MergedBSDF:
 
     def eval_attribute_1(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
         """Return ``int_ior``."""
-        return self._row(si).int_ior
-
-
-@dataclass
-class _Row:
-    """The parameters of the shape at a surface point."""
-
-    alpha: mi.Float
-    int_ior: mi.Float
-    ext_ior: mi.Float
-    diffuse: mi.UnpolarizedSpectrum
-    specular: mi.UnpolarizedSpectrum
-    f0: None = None
+        return self._row(si)["int_ior"]
 
 
 class _ByObject:
