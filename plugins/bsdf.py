@@ -11,7 +11,7 @@ import numpy as np
 
 from .emission import largest
 from .fresnel import f0_from_ior
-from .kernel_plan import MaterialRows, Mirror, Reason
+from .kernel_plan import GRADIENTS, VARYING, MaterialRows, Mirror
 from .lobes import LOBES, Lobes, Pair
 from .parameters import ParameterError, choice, flag, number, spectrum
 from .protocols import MergeableBSDF
@@ -128,18 +128,18 @@ class MrtBSDF(mi.BSDF):
         given = {name: self._read(name, si, active) for name in self.parameters}
         return Lobes(self.fresnel, given, si.wi, visible=self.sample_visible)
 
-    def rows(self, points: mi.SurfaceInteraction3f | None = None) -> MaterialRows | Reason:
+    def rows(self, points: mi.SurfaceInteraction3f | None = None) -> MaterialRows | str:
         """Return the parameters as plain numbers, or why they are none.
 
         ``points``: one surface point on each object of a shape, for textures that vary from face to face.
         """
         varying = [self.parameters[name] for name in self.parameters if self._varies(name)]
         if "f0" in self.parameters or not all(points is not None and varies_by_face(p) for p in varying):
-            return Reason.VARYING
+            return VARYING
         count = 1 if points is None else dr.width(points)
         given = self.lobes(dr.zeros(mi.SurfaceInteraction3f) if points is None else points, True).given
         if dr.grad_enabled(given):
-            return Reason.GRADIENTS
+            return GRADIENTS
         values = [given[name] for name in NUMBERS], *(given[lobe.reflectance] for lobe in LOBES)
         rows = (np.stack([np.broadcast_to(x, count) for x in value], axis=1) for value in values)
         return MaterialRows(*rows)

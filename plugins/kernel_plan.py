@@ -1,16 +1,15 @@
 """Facts about a scene, and the plan of the kernels that ``mrt_whitted`` makes for them.
 
-Plain data and one pure function, ``make_plan``: nothing here knows Mitsuba. The integrator reads the facts,
-the plan decides, the integrator obeys. A plan may be edited (``dataclasses.replace``) before it is obeyed.
+Plain data and one table, ``RULES``: nothing here knows Mitsuba. The integrator reads the facts, the rules
+decide, the integrator obeys. A plan may be edited (``dataclasses.replace``) before it is obeyed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from enum import Enum
-from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -20,50 +19,13 @@ UNROLLED_LIGHTS = 8
 # With fewer objects, looking up what is in the way of a light takes as long as searching for it; with more
 # pairs of an object and a light, the lists are too long for a processor's caches
 LEAST_BUFFERED, MOST_PAIRS = 64, 2**17
-# Beyond, lists of what the eye sees take longer to make than they save
-MOST_SEEN = 2**14
 
 BUDGETS = ("report", "plain")
 
-
-class Reason(str, Enum):
-    """Why something is not in the kernel."""
-
-    NO_NATIVE_SHAPES = "no-native-shapes"  # every shape is traced by the integrator itself
-    NO_MESHES = "no-meshes"
-    NO_SPHERES = "no-spheres"
-    NO_QUADRICS = "no-quadrics"
-    NO_PLANES = "no-planes"
-    NO_LIGHTS = "no-lights"
-    NO_SURFACE_EMITTERS = "no-surface-emitters"
-    NO_SKY = "no-sky"
-    DELTA_LIGHTS = "delta-lights"  # every light is a point or a direction
-    MAX_DEPTH = "max-depth"  # the bounce budget admits no mirror ray
-    NO_MIRRORS = "no-mirrors"  # no material reflects visibly
-    UNIFORM = "uniform"  # no material varies over its surface
-    ONE_SIDED = "one-sided"  # no material is lit from behind
-    SCALAR_VARIANT = "scalar-variant"
-    SPECTRAL_VARIANT = "spectral-variant"
-    TANGENTS = "tangents"  # materials need derivatives of the surface, which the table does not have
-    ISOTROPIC = "isotropic"  # no material asks how the surface is turned
-    NATIVE_SHAPES = "native-shapes"  # shapes other than plain spheres
-    INSTANCES = "instances"
-    OTHER_LIGHTS = "other-lights"  # a light other than mrt_light, or not known by its numbers
-    FEW_OBJECTS = "few-objects"
-    MANY_OBJECTS = "many-objects"
-    MANY_PAIRS = "many-pairs"  # of an object and a light
-    OTHER_CAMERA = "other-camera"  # the first is no pinhole, or there is none
-    OTHER_BSDF = "other-bsdf"  # a BSDF other than mrt_bsdf
-    MIXED_FRESNEL = "mixed-fresnel"
-    VARYING = "varying"  # a parameter varies over the surface, or has no place in the table
-    APART = "apart"  # no point light is on a surface
-    ALONE = "alone"  # a ray that leaves the only object, which is convex, meets nothing
-    BLACK = "black"  # no material reflects
-    NO_DIFFUSE = "no-diffuse"
-    NO_SPECULAR = "no-specular"
-    UNBOUNDED = "unbounded"  # no bound of what may still arrive is known
-    BOUNDED = "bounded"  # a path's throughput stays within float32
-    GRADIENTS = "gradients"  # derivatives are wanted
+# Why materials have no place in one table
+SCALAR_VARIANT = "a scalar variant compiles no kernel"
+VARYING = "a material varies over its surface"
+GRADIENTS = "derivatives are wanted"
 
 
 @dataclass(frozen=True)
@@ -90,7 +52,7 @@ class SceneFacts:
 
     vectorised: bool  #: is the variant one that compiles kernels
     native_shapes: int  #: shapes that only Mitsuba can trace
-    meshes: int  #: of the native ones
+    meshes: int  #: of the native ones, and of those in groups
     spheres: int  #: of the native ones
     plain_spheres: int  #: of the spheres, those that face outwards and do not emit
     planes: int  #: shapes that are infinite planes
@@ -111,9 +73,8 @@ class SceneFacts:
     oriented: bool  #: does a material depend on tangents: anisotropy, bump and normal maps
     textured: bool  #: does a material vary over its surface
     two_sided: bool  #: is a material lit from behind
-    unmergeable: Reason | None  #: why the materials cannot be looked up in one table
+    unmergeable: str  #: why the materials cannot be looked up in one table; "" where they can
     tabled: bool  #: can the lights be
-    pinhole: bool  #: do all rays of the first camera come from one point
 
 
 @dataclass(frozen=True)
@@ -145,189 +106,295 @@ class CutOff:
 class KernelPlan:
     """Every decision that changes a kernel. ``reason(name)`` says why one left something out."""
 
+    spheres: str  #: "none", "corrected": hits moved onto them, "table": and no call to the shape
+    lights: str  #: "none", "unrolled", "loop" that calls each, or "table": a loop over their numbers
+    mirrors: bool  #: mirror reflections
+    lobes: tuple[str, ...]  #: of the materials: "diffuse", "specular"
+    cut_off: CutOff  #: what is too little to be traced
     bvh: bool  #: Mitsuba's ray queries
     coherent: bool  #: Embree's treatment of packets of like rays
-    spheres: str  #: "none", "corrected": hits moved onto them, "table": and no call to the shape
     quadrics: tuple[str, ...]  #: kinds of exact quadrics; others are traced as meshes
     planes: bool  #: analytic planes, else they are traced as meshes
-    lights: str  #: "none", "unrolled", "loop" that calls each, or "table": a loop over their numbers
     buffers: bool  #: lists of what may be in the way of a light, in place of a search
-    eye: bool  #: lists of the quadrics that are seen from the camera, in place of a search for its rays
     touching: bool  #: shadow rays that end short of lights on surfaces
     random: bool  #: random numbers
     emission: bool  #: surfaces that emit
     sky: str  #: "none", "parameter" or "environment"
-    mirrors: bool  #: mirror reflections
     mirror_rays: bool  #: the loop that traces them; else they see the sky
-    cut_off: CutOff  #: what is too little to be traced
     guarded: bool  #: throughputs kept within float32
-    lobes: tuple[str, ...]  #: of the materials: "diffuse", "specular"
     textures: bool  #: texture coordinates
     shading_frames: bool  #: interpolated normals
     tangents: bool  #: derivatives of the surface by uv, and frames along them
     merged: bool  #: one BSDF with a table of materials, in place of a call to each
     two_sided: bool  #: light from behind a surface
-    reasons: tuple[tuple[str, Reason], ...] = ()  #: of what was left out
+    reasons: tuple[tuple[str, str], ...] = ()  #: what was left out, and why, in words
 
-    def reason(self, name: str) -> Reason | None:
+    def reason(self, name: str) -> str | None:
         """Return why ``name`` was left out; None where it was not."""
         return dict(self.reasons).get(name)
 
 
-def _arriving(facts: SceneFacts, settings: Settings) -> float:
-    """Return a bound of the radiance from anywhere, but for what mirrors add: inf where there is none.
+@dataclass(frozen=True)
+class Case:
+    """What a rule goes by."""
 
-    Each light counts for one where its share is clamped to that, and the sky for one at least.
-    """
-    lights = facts.lights if settings.clamp or facts.lights == 0 else facts.arriving * facts.value
-    sky = facts.sky if settings.own_sky is None else settings.own_sky
-    return lights + max(1, sky) + facts.emission
+    facts: SceneFacts
+    settings: Settings
+    made: Mapping[str, Any]  #: the decisions of the rules before it
+
+    @property
+    def affordable(self) -> Sequence[Mirror]:
+        """The mirrors that the bounce budget admits."""
+        return [m for m in self.facts.mirrors if self.settings.cost(m.int_ior) < self.settings.max_depth]
+
+    @property
+    def arriving(self) -> float:
+        """A bound of the radiance from anywhere, but for what mirrors add: inf where there is none.
+
+        Each light counts for one where its share is clamped to that, and the sky for one at least.
+        """
+        facts = self.facts
+        clamped = self.settings.clamp or facts.lights == 0
+        lights = facts.lights if clamped else facts.arriving * facts.value
+        sky = facts.sky if self.settings.own_sky is None else self.settings.own_sky
+        return lights + max(1, sky) + facts.emission
+
+    @property
+    def hits(self) -> float:
+        """The number of hits of a path, weighted by its throughput at normal incidence.
+
+        It is one where materials reflect less than a half there: what is left out at further hits adds less
+        than as much again. Where mirrors face each other, it adds up.
+        """
+        mirrors = self.affordable if self.made["mirrors"] else []
+        reflectance = max((m.at_normal for m in mirrors if m.at_normal < math.inf), default=0.0)
+        if reflectance <= 0.5:
+            return 1.0
+        cost = min(self.settings.cost(m.int_ior) for m in mirrors)
+        bounces = (self.settings.max_depth - 2) // cost + 1
+        return sum(min(reflectance, 1.0) ** k for k in range(max(bounces, 0) + 1))
+
+    @property
+    def cut_off(self) -> CutOff:
+        """What is too little to be traced."""
+        return CutOff(
+            self.arriving * self.hits if self.made["mirrors"] else 0.0, self.facts.lights * self.hits
+        )
+
+    @property
+    def bounded(self) -> bool:
+        """Do throughputs stay below 1e30."""
+        growth = max((m.reflectance for m in self.affordable), default=0.0)
+        return growth <= 1 or (self.settings.max_depth - 1) * math.log10(growth) < 30
+
+    @property
+    def visible(self) -> bool:
+        """Does a mirror reflect so much that it can be seen."""
+        bounds = [m.reflectance * self.arriving for m in self.affordable]
+        return any(bound > self.settings.min_contribution for bound in bounds)
+
+    @property
+    def sky(self) -> str:
+        """Where the sky comes from."""
+        given = self.settings.own_sky is not None
+        return "parameter" if given else "environment" if self.facts.environment else "none"
+
+    @property
+    def lobes(self) -> tuple[str, ...]:
+        """The lobes that materials have."""
+        return tuple(name for name in ("diffuse", "specular") if getattr(self.facts, name))
+
+    @property
+    def objects(self) -> int:
+        """The number of objects that may be in the way of a light."""
+        return self.facts.native_shapes + sum(count for _, count in self.facts.quadrics)
 
 
-def _hits(mirrors: Sequence[Mirror], settings: Settings) -> float:
-    """Return the number of hits of a path, weighted by its throughput at normal incidence.
+@dataclass(frozen=True)
+class Rule:
+    """One decision about the kernels."""
 
-    It is one where materials reflect less than a half there: what is left out at further hits adds less than
-    as much again. Where mirrors face each other, it adds up.
-    """
-    reflectance = max((m.at_normal for m in mirrors if m.at_normal < math.inf), default=0.0)
-    bounces = (settings.max_depth - 2) // min((settings.cost(m.int_ior) for m in mirrors), default=1) + 1
-    return 1.0 if reflectance <= 0.5 else sum(min(reflectance, 1.0) ** k for k in range(max(bounces, 0) + 1))
+    name: str  #: of the field of the plan
+    what: str  #: that is decided about, in words
+    held: Callable[[SceneFacts, KernelPlan], str]  #: what the kernels hold then; "" for nothing to be told
+    against: Callable[
+        [Case], Mapping[str, bool]
+    ]  #: reasons, and whether they hold: the first that does is it
+    value: Callable[[Case, bool], Any] = lambda case, free: free  #: by whether there is none
 
 
-Unless = Callable[..., bool]
+_SPHERES = {"table": "spheres from a table of centres and radii", "corrected": "hits moved onto spheres"}
+_LIGHTS = {"unrolled": "unrolled", "loop": "in a loop of calls", "table": "in a loop over a table"}
+_SKY = {"parameter": "the integrator's sky", "environment": "the scene's sky"}
+_OTHERS = "other shapes, or spheres that emit or face inwards"
+_ALONE = "a ray that leaves the only object meets nothing"
 
 
-@lru_cache(maxsize=16)  # asked twice in each render
+def _lights(case: Case, free: bool) -> str:
+    facts = case.facts
+    unrolled = facts.lights <= UNROLLED_LIGHTS or not facts.vectorised
+    return "none" if not free else "unrolled" if unrolled else "table" if facts.tabled else "loop"
+
+
+# In the order in which they are taken: later ones may ask for earlier decisions
+RULES = (
+    Rule(
+        "spheres", "table of spheres",
+        lambda facts, plan: _SPHERES[plan.spheres],
+        lambda case: {
+            "no sphere in the scene": case.facts.spheres == 0,
+            SCALAR_VARIANT: not case.facts.vectorised,
+            VARYING: case.facts.textured,
+            "a material needs the frame along texture coordinates": case.facts.oriented,
+            _OTHERS: case.facts.plain_spheres < case.facts.native_shapes,
+        },
+        lambda case, free: "table" if free else "corrected" if case.facts.spheres else "none",
+    ),
+    Rule(
+        "lights", "shadow rays",
+        lambda facts, plan: f"{facts.lights} lights, {_LIGHTS[plan.lights]}",
+        lambda case: {"no light": case.facts.lights == 0, "every material is black": not case.lobes},
+        _lights,
+    ),
+    Rule(
+        "mirrors", "bounce loop",
+        lambda facts, plan: "mirror bounces" if plan.mirror_rays else "mirror images of the sky",
+        lambda case: {
+            "max_depth admits no mirror ray": bool(case.facts.mirrors) and not case.affordable,
+            "no material reflects visibly": not case.visible,
+            _ALONE: case.facts.alone and case.sky == "none",
+        },
+    ),
+    Rule(
+        "lobes", "one of the lobes",
+        lambda facts, plan: f"lobes: {', '.join(plan.lobes)}",
+        lambda case: {
+            "every material is black": not case.lobes,
+            "no material has the specular one": not case.facts.specular,
+            "no material has the diffuse one": not case.facts.diffuse,
+        },
+        lambda case, free: case.lobes,
+    ),
+    Rule(
+        "cut_off", "cut-off",
+        lambda facts, plan: "an end of paths too dim to be seen" if 0 < plan.cut_off.paths < math.inf else "",
+        lambda case: {
+            "what may still arrive has no known bound": case.made["mirrors"] and case.arriving == math.inf
+        },
+        lambda case, free: case.cut_off,
+    ),
+    Rule(
+        "bvh", "BVH",
+        lambda facts, plan: f"{facts.native_shapes} shapes in Mitsuba's BVH",
+        lambda case: {"no shapes but analytic ones": case.facts.native_shapes == 0},
+    ),
+    Rule(  # it pays where there are thousands of triangles to meet
+        "coherent", "coherent packets",
+        lambda facts, plan: "coherent packets of rays",
+        lambda case: {"no mesh in the scene": case.facts.meshes == 0},
+    ),
+    Rule(
+        "quadrics", "cones and cylinders",
+        lambda facts, plan: f"{sum(n for kind, n in facts.quadrics if kind in plan.quadrics)} exact objects "
+        f"in a tree: {', '.join(plan.quadrics)}",
+        lambda case: {"none in the scene": not case.facts.quadrics},
+        lambda case, free: tuple(kind for kind, _ in case.facts.quadrics),
+    ),
+    Rule(
+        "planes", "planes",
+        lambda facts, plan: f"{facts.planes} analytic planes",
+        lambda case: {"none in the scene": case.facts.planes == 0},
+    ),
+    Rule(
+        "buffers", "light buffers",
+        lambda facts, plan: "light buffers: what may be in the way of each light",
+        lambda case: {
+            "no light": case.made["lights"] == "none",
+            SCALAR_VARIANT: not case.facts.vectorised,
+            "a light other than mrt_light, or one with derivatives": not case.facts.tabled,
+            _OTHERS: case.facts.native_shapes > 0 and case.made["spheres"] != "table",
+            "few objects": case.objects < LEAST_BUFFERED,
+            "too many lights and objects": case.objects * case.facts.lights > MOST_PAIRS,
+        },
+    ),
+    Rule(
+        "touching", "lights on surfaces",
+        lambda facts, plan: "shadow rays that end short of lights on surfaces",
+        lambda case: {"no point light is on a surface": not case.facts.touching},
+    ),
+    Rule(
+        "random", "random numbers",
+        lambda facts, plan: "random numbers",
+        lambda case: {"every light is a point or a direction": case.facts.random_lights == 0},
+    ),
+    Rule(
+        "emission", "emission",
+        lambda facts, plan: "emission of surfaces",
+        lambda case: {"no surface emits": case.facts.surface_emitters == 0},
+    ),
+    Rule(
+        "sky", "sky",
+        lambda facts, plan: _SKY[plan.sky],
+        lambda case: {"no sky in the scene": case.sky == "none"},
+        lambda case, free: case.sky,
+    ),
+    Rule(
+        "mirror_rays", "mirror rays",
+        lambda facts, plan: "",  # told with the mirrors
+        lambda case: {_ALONE: case.made["mirrors"] and case.facts.alone},
+        lambda case, free: case.made["mirrors"] and free,
+    ),
+    Rule(
+        "guarded", "guard against overflow",
+        lambda facts, plan: "throughputs kept within float32",
+        lambda case: {"no path gets that bright": case.made["mirrors"] and case.bounded},
+        lambda case, free: case.made["mirrors"] and free,
+    ),
+    Rule(
+        "textures", "textures",
+        lambda facts, plan: "textures and their coordinates",
+        lambda case: {"every material is uniform": not case.facts.textured},
+    ),
+    Rule(
+        "shading_frames", "shading normals",
+        lambda facts, plan: "shading normals of meshes",
+        lambda case: {"no mesh in the scene": case.facts.meshes == 0},
+    ),
+    Rule(
+        "tangents", "tangents",
+        lambda facts, plan: "tangents along texture coordinates",
+        lambda case: {
+            "no material depends on the direction of texture coordinates": not case.facts.oriented
+        },
+    ),
+    Rule(
+        "merged", "merged materials",
+        lambda facts, plan: "all materials as one, from a table",
+        lambda case: {case.facts.unmergeable: bool(case.facts.unmergeable)},
+    ),
+    Rule(
+        "two_sided", "light from behind",
+        lambda facts, plan: "light from behind surfaces",
+        lambda case: {"no material is lit from behind": not case.facts.two_sided},
+    ),
+)  # fmt: skip
+
+#: What a decision is about, by its name
+WHAT = {rule.name: rule.what for rule in RULES}
+
+
 def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
     """Decide what the kernels for a scene hold."""
-    reasons: list[tuple[str, Reason]] = []
-
-    def unless(name: str, *obstacles: tuple[bool, Reason]) -> bool:
-        """Note the first reason that holds against ``name``; return whether there is none."""
-        found = [reason for holds, reason in obstacles if holds]
-        reasons.extend((name, reason) for reason in found[:1])
-        return not found
-
-    spheres, lights = _spheres(facts, unless), _lights(facts, unless)
-    affordable = [m for m in facts.mirrors if settings.cost(m.int_ior) < settings.max_depth]
-    mirrors = _mirrors(facts, settings, affordable, unless)
-    lobes = _lobes(facts, unless)
-    return KernelPlan(
-        spheres=spheres,
-        lights=lights,
-        mirrors=mirrors,
-        lobes=lobes,
-        cut_off=_cut_off(facts, settings, affordable if mirrors else None, unless),
-        bvh=unless("bvh", (facts.native_shapes == 0, Reason.NO_NATIVE_SHAPES)),
-        # It pays where there are thousands of triangles to meet
-        coherent=unless("coherent", (facts.meshes == 0, Reason.NO_MESHES)),
-        quadrics=_quadrics(facts, unless),
-        planes=unless("planes", (facts.planes == 0, Reason.NO_PLANES)),
-        buffers=_buffers(facts, spheres, lights, unless),
-        eye=_eye(facts, unless),
-        touching=unless("touching", (not facts.touching, Reason.APART)),
-        random=unless("random", (facts.random_lights == 0, Reason.DELTA_LIGHTS)),
-        emission=unless("emission", (facts.surface_emitters == 0, Reason.NO_SURFACE_EMITTERS)),
-        sky=_sky(facts, settings, unless),
-        mirror_rays=mirrors and unless("mirror_rays", (facts.alone, Reason.ALONE)),
-        guarded=mirrors and unless("guarded", (_bounded(affordable, settings), Reason.BOUNDED)),
-        textures=unless("textures", (not facts.textured, Reason.UNIFORM)),
-        shading_frames=unless("shading_frames", (facts.meshes == 0, Reason.NO_MESHES)),
-        tangents=unless("tangents", (not facts.oriented, Reason.ISOTROPIC)),
-        merged=unless("merged", (facts.unmergeable is not None, facts.unmergeable or Reason.VARYING)),
-        two_sided=unless("two_sided", (not facts.two_sided, Reason.ONE_SIDED)),
-        reasons=tuple(reasons),
-    )
+    made, reasons = dict[str, Any](), list[tuple[str, str]]()
+    case = Case(facts, settings, made)
+    for rule in RULES:
+        found = [why for why, holds in rule.against(case).items() if holds]
+        reasons += [(rule.name, why) for why in found[:1]]
+        made[rule.name] = rule.value(case, not found)
+    return KernelPlan(**made, reasons=tuple(reasons))
 
 
-def _spheres(facts: SceneFacts, unless: Unless) -> str:
-    table = unless(
-        "spheres",
-        (facts.spheres == 0, Reason.NO_SPHERES),
-        (not facts.vectorised, Reason.SCALAR_VARIANT),
-        (facts.textured, Reason.VARYING),
-        (facts.oriented, Reason.TANGENTS),
-        (facts.plain_spheres < facts.native_shapes, Reason.NATIVE_SHAPES),
-    )
-    return "table" if table else "corrected" if facts.spheres else "none"
-
-
-def _lights(facts: SceneFacts, unless: Unless) -> str:
-    black = not (facts.diffuse or facts.specular)
-    lit = unless("lights", (facts.lights == 0, Reason.NO_LIGHTS), (black, Reason.BLACK))
-    unrolled = facts.lights <= UNROLLED_LIGHTS or not facts.vectorised
-    return ("unrolled" if unrolled else "table" if facts.tabled else "loop") if lit else "none"
-
-
-def _buffers(facts: SceneFacts, spheres: str, lights: str, unless: Unless) -> bool:
-    objects = facts.native_shapes + sum(count for _, count in facts.quadrics)
-    return unless(
-        "buffers",
-        (lights == "none", Reason.NO_LIGHTS),
-        (not facts.vectorised, Reason.SCALAR_VARIANT),
-        (not facts.tabled, Reason.OTHER_LIGHTS),
-        (facts.native_shapes > 0 and spheres != "table", Reason.NATIVE_SHAPES),
-        (objects < LEAST_BUFFERED, Reason.FEW_OBJECTS),
-        (objects * facts.lights > MOST_PAIRS, Reason.MANY_PAIRS),
-    )
-
-
-def _eye(facts: SceneFacts, unless: Unless) -> bool:
-    quadrics = sum(count for _, count in facts.quadrics)
-    return unless(
-        "eye",
-        (not facts.vectorised, Reason.SCALAR_VARIANT),
-        (quadrics < LEAST_BUFFERED, Reason.FEW_OBJECTS),
-        (quadrics > MOST_SEEN, Reason.MANY_OBJECTS),
-        (not facts.pinhole, Reason.OTHER_CAMERA),
-    )
-
-
-def _mirrors(facts: SceneFacts, settings: Settings, affordable: Sequence[Mirror], unless: Unless) -> bool:
-    arriving, has_sky = _arriving(facts, settings), settings.own_sky is not None or facts.environment
-    bright = [m for m in affordable if m.reflectance * arriving > settings.min_contribution]
-    return unless(
-        "mirrors",
-        (bool(facts.mirrors) and not affordable, Reason.MAX_DEPTH),
-        (not bright, Reason.NO_MIRRORS),
-        (facts.alone and not has_sky, Reason.ALONE),
-    )
-
-
-def _lobes(facts: SceneFacts, unless: Unless) -> tuple[str, ...]:
-    lobes = tuple(name for name in ("diffuse", "specular") if getattr(facts, name))
-    unless(
-        "lobes",
-        (not lobes, Reason.BLACK),
-        (not facts.specular, Reason.NO_SPECULAR),
-        (not facts.diffuse, Reason.NO_DIFFUSE),
-    )
-    return lobes
-
-
-def _cut_off(
-    facts: SceneFacts, settings: Settings, mirrors: Sequence[Mirror] | None, unless: Unless
-) -> CutOff:
-    """Return the limits for paths off these mirrors; None where nothing is reflected."""
-    arriving, hits = _arriving(facts, settings), 1.0 if mirrors is None else _hits(mirrors, settings)
-    bounded = unless("cut_off", (mirrors is not None and arriving == math.inf, Reason.UNBOUNDED))
-    paths = 0.0 if mirrors is None else arriving * hits if bounded else math.inf
-    return CutOff(paths, facts.lights * hits)
-
-
-def _bounded(mirrors: Sequence[Mirror], settings: Settings) -> bool:
-    """Return whether throughputs stay below 1e30."""
-    growth = max((m.reflectance for m in mirrors), default=0.0)
-    return growth <= 1 or (settings.max_depth - 1) * math.log10(growth) < 30
-
-
-def _quadrics(facts: SceneFacts, unless: Unless) -> tuple[str, ...]:
-    unless("quadrics", (not facts.quadrics, Reason.NO_QUADRICS))
-    return tuple(kind for kind, _ in facts.quadrics)
-
-
-def _sky(facts: SceneFacts, settings: Settings, unless: Unless) -> str:
-    given = settings.own_sky is not None
-    found = unless("sky", (not given and not facts.environment, Reason.NO_SKY))
-    return ("parameter" if given else "environment") if found else "none"
+def held(plan: KernelPlan, facts: SceneFacts) -> list[str]:
+    """Return a line for each thing that the kernels hold."""
+    there = [rule for rule in RULES if getattr(plan, rule.name) not in (False, "none", ())]
+    return [line for line in (rule.held(facts, plan) for rule in there) if line]

@@ -8,14 +8,14 @@ Dr.Jit would record its calls in the kernels of every scene, and only Python cal
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .kernel_plan import MaterialRows, Reason
+from .kernel_plan import SCALAR_VARIANT, VARYING, MaterialRows
 from .lobes import LOBES, Lobes, Pair
 from .lookup import ByShape, aligned
 from .protocols import MergeableBSDF, QuadricShape
@@ -25,36 +25,29 @@ from .variants import is_jit
 MOST_FACES = 2**20
 
 
-def material_rows(
-    shapes: Sequence[mi.Shape], read: Callable[[Callable, Any], Any]
-) -> list[MaterialRows] | Reason:
-    """Return the materials of the shapes, or why they have no place in one table.
-
-    ``read(function, thing)``: what the function returns of a BSDF or a shape, see ``watch.Notes``.
-    """
-    obstacle = _obstacle(shapes)
-    rows: list[MaterialRows] = []
-    for shape in shapes if obstacle is None else ():
-        found = read(_of_objects, shape) if varies_by_object(shape) else read(_of_bsdf, shape.bsdf())
-        if isinstance(found, Reason):
+def material_rows(shapes: Sequence[mi.Shape]) -> list[MaterialRows] | str:
+    """Return the materials of the shapes, or why they have no place in one table."""
+    bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
+    mergeable = bool(bsdfs) and all(isinstance(b, MergeableBSDF) for b in bsdfs.values())
+    obstacles = {
+        SCALAR_VARIANT: not is_jit(),
+        "a spectral variant": mi.is_spectral,
+        # Inside an instance, shapes are not the scene's own
+        "instances in the scene": any(s.class_name() == "Instance" for s in shapes),
+        "a material other than mrt_bsdf": not mergeable,
+        "materials of different Fresnel formulas": mergeable and len({b.fresnel for b in bsdfs.values()}) > 1,
+    }
+    if any(obstacles.values()):
+        return next(why for why, holds in obstacles.items() if holds)
+    rows, known = list[MaterialRows](), dict[int, MaterialRows | str]()
+    for shape in shapes:
+        found = _of_objects(shape) if varies_by_object(shape) else known.get(id(shape.bsdf()))
+        if found is None:
+            found = known[id(shape.bsdf())] = shape.bsdf().rows()
+        if isinstance(found, str):
             return found
         rows.append(found)
-    return obstacle or rows
-
-
-def _obstacle(shapes: Sequence[mi.Shape]) -> Reason | None:
-    """Return what keeps materials out of a table, whatever their parameters."""
-    bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
-    if not is_jit():
-        return Reason.SCALAR_VARIANT
-    if mi.is_spectral:
-        return Reason.SPECTRAL_VARIANT
-    # Inside an instance, shapes are not the scene's own
-    if any(s.class_name() == "Instance" for s in shapes):
-        return Reason.INSTANCES
-    if not bsdfs or not all(isinstance(b, MergeableBSDF) for b in bsdfs.values()):
-        return Reason.OTHER_BSDF
-    return Reason.MIXED_FRESNEL if len({b.fresnel for b in bsdfs.values()}) != 1 else None
+    return rows
 
 
 def varies_by_object(shape: Any) -> bool:
@@ -63,14 +56,10 @@ def varies_by_object(shape: Any) -> bool:
     return exact and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.SpatiallyVarying)
 
 
-def _of_bsdf(bsdf: MergeableBSDF) -> MaterialRows | Reason:
-    return bsdf.rows()
-
-
-def _of_objects(shape: Any) -> MaterialRows | Reason:
+def _of_objects(shape: Any) -> MaterialRows | str:
     faces = shape.quadrics().first_faces
     if faces[-1] >= MOST_FACES:
-        return Reason.VARYING
+        return VARYING
     points = dr.zeros(mi.SurfaceInteraction3f, len(faces))
     points.shape, points.prim_index = mi.ShapePtr(shape), mi.UInt32(faces.astype(np.uint32))
     return shape.bsdf().rows(points)

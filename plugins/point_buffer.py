@@ -1,6 +1,6 @@
-"""Which objects are seen from a point, a light or the eye: lists of them for the cells of a cube around it.
+"""Which objects are seen from a light: lists of them for the cells of a cube around it.
 
-A ray to or from the point looks up the cell that it comes through and tests the objects listed there, one or
+A ray to the light looks up the cell that it comes through and tests the objects listed there, one or
 two of hundreds, in place of a walk down a tree. Each list begins with the object nearest to the point, and a
 ray leaves it where all others are beyond its end, or behind its hit. The lists are conservative: objects are
 taken for wider by what float32 loses; what a ray meets is for the test of each to say.
@@ -68,25 +68,6 @@ class PointBuffer:
             first, lambda near, blocked: active & (near < end) & ~blocked,
             lambda thing, blocked: test(thing), mi.Bool(False),
         )  # fmt: skip
-
-    def starts_ray(self, point: Any, ray: Any) -> Any:
-        """Return whether a ray comes from a point, up to rounding; its origin may be further on."""
-        place = dr.gather(mi.Vector4f, self.places, point)
-        o = ray.o - mi.Point3f(place.x, place.y, place.z)
-        off = dr.squared_norm(dr.cross(o, ray.d)) <= dr.square(place.w) * dr.squared_norm(ray.d)
-        return off & (dr.dot(o, ray.d) >= 0)
-
-    def nearest(
-        self, point: Any, ray: Any, active: Any, visit: Callable[[Any, tuple], tuple], state: tuple
-    ) -> tuple:
-        """Return what ``visit(object, state)`` makes of a state at the objects listed for a ray that comes
-        from a point; the first of it is the reach of the ray, or the distance of the nearest hit so far."""
-        first, depth = self._look(point, ray.d)
-        place = dr.gather(mi.Vector4f, self.places, point)
-        start, slope = depth(ray.o - mi.Point3f(place.x, place.y, place.z)), depth(ray.d)
-        return self._walk(
-            first, lambda near, state: active & (near < dr.fma(state[0], slope, start)), visit, state
-        )
 
     def _look(self, point: Any, d: Any) -> tuple[Any, Callable[[Any], Any]]:
         """Return where the list for a direction from a point begins, and what gives the depth of vectors:

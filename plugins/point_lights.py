@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,19 +46,12 @@ def direction_to(position: mi.Point3f, it: mi.Interaction3f) -> mi.DirectionSamp
     return ds
 
 
-def numbers_of(lights: list[Any], read: Callable[[Callable, Any], Any]) -> list[Numbers] | None:
-    """Return lights as numbers; None where not all of them are.
-
-    ``read(function, light)``: what the function returns of the light, see ``watch.Notes``.
-    """
+def numbers_of(lights: list[Any]) -> list[Numbers] | None:
+    """Return lights as numbers; None where not all of them are."""
     if not is_jit() or mi.is_spectral or not all(isinstance(light, TabledLight) for light in lights):
         return None
-    found = [read(_numbers, light) for light in lights]
+    found = [light.numbers() for light in lights]
     return None if None in found else found
-
-
-def _numbers(light: TabledLight) -> Numbers | None:
-    return light.numbers()
 
 
 class Lights:
@@ -76,7 +68,6 @@ class Lights:
             # three numbers of a colour, whatever the variant's colours have
             columns = zip(*numbers, strict=True)
             self.columns = [Table(mi.Vector3f, [(3 * v)[:3] for v in column]) for column in columns]
-        self.known = form == "none" or numbers is not None  #: is all that they are in these arrays
 
     def at(self, index: mi.UInt32, active: mi.Bool) -> Any:
         """Return a light by its number, for a loop over all."""

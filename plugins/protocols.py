@@ -7,14 +7,13 @@ Mitsuba's classes take no mix-in; a class joins a protocol by registration: afte
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np
 
     from .intersect import Frame
-    from .kernel_plan import KernelPlan, MaterialRows, Mirror, Reason, SceneFacts
+    from .kernel_plan import KernelPlan, MaterialRows, Mirror, SceneFacts
     from .quadric_kinds import QuadricTable
 
 
@@ -28,28 +27,21 @@ class LayeredIntegrator(ABC):
         """Return the names of the layers that ``trace`` knows."""
 
     @abstractmethod
-    def scene_facts(self, scene: Any) -> SceneFacts:
-        """Return what the kernels depend on."""
+    def read(self, scene: Any) -> Any:
+        """Read a scene as it is; ``facts`` of what is returned are what the kernels depend on."""
 
     @abstractmethod
     def kernel_plan(self, facts: SceneFacts) -> KernelPlan:
         """Return what the kernels for such a scene hold."""
 
     @abstractmethod
-    def prepare(self, scene: Any, plan: KernelPlan | None = None) -> Any:
-        """Get ready to trace the scene by a plan; by default, by that of ``kernel_plan``."""
+    def prepare(self, scene: Any, plan: KernelPlan | None = None, reading: Any = None) -> Any:
+        """Return what ``trace`` needs, by a plan of the kernels for what was read; by default, of both new
+        ones."""
 
     @abstractmethod
-    def trace(self, scene: Any, sampler: Any, ray: Any, active: Any = True) -> Any:
-        """Return the radiance along rays, and what the layers are made of."""
-
-    @abstractmethod
-    def replayed(self, scene: Any, form: Hashable, inputs: Any, run: Callable[[], Any]) -> Any:
-        """Return what ``run()`` does, by launching kernels recorded before where that is known to be safe.
-
-        ``run`` calls ``trace`` on the scene it was prepared for, without a sampler. ``form`` names what in
-        Python shapes the rest of its code, ``inputs`` are the arrays that the rest reads.
-        """
+    def trace(self, scene: Any, sampler: Any, ray: Any, active: Any = True, data: Any = None) -> Any:
+        """Return the radiance along rays, and what the layers are made of. ``data``: from ``prepare``."""
 
 
 class PlaneShape(ABC):
@@ -106,7 +98,7 @@ class MergeableBSDF(MirrorBSDF):
     fresnel: str  # one of the forms of mrt_bsdf
 
     @abstractmethod
-    def rows(self, points: Any = None) -> MaterialRows | Reason:
+    def rows(self, points: Any = None) -> MaterialRows | str:
         """Return the parameters as plain numbers, or why they are none.
 
         ``points``: one surface point on each object of a shape, for textures that vary from face to face.

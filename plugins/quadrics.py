@@ -10,10 +10,9 @@ import numpy as np
 
 from .intersect import LATERAL, Frame, SurfaceHit, SurfacePoint
 from .lookup import aligned, shape_ids
-from .point_buffer import PointBuffer
 from .quadric_kinds import KINDS, QuadricTable
 from .tree import Tree
-from .variants import but_not, is_jit
+from .variants import is_jit
 
 
 class Quadrics:
@@ -43,12 +42,9 @@ class Quadrics:
         frames = [s.moving_frame() for s in shapes]
         self.moving = [(k, f) for k, f in zip(leaves, frames, strict=True) if f is not None]
 
-    def intersect(self, ray: Any, active: Any, eye: PointBuffer | None = None) -> tuple[Any, Any, Any]:
-        """Return distance, place in the tables and part of the nearest quadric; ``ray.maxt`` for none.
-
-        ``eye``: lists for a point from which most rays come.
-        """
-        return self._walk(ray, active, any_hit=False, eye=eye)
+    def intersect(self, ray: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Return distance, place in the tables and part of the nearest quadric; ``ray.maxt`` for none."""
+        return self._walk(ray, active, any_hit=False)
 
     def occluded(self, ray: Any, active: Any) -> Any:
         """Return whether there is a quadric before ``ray.maxt``."""
@@ -62,9 +58,7 @@ class Quadrics:
         """Return whether a quadric is before ``ray.maxt``."""
         return self._meet(leaf, ray).t < ray.maxt
 
-    def _walk(
-        self, ray: Any, active: Any, *, any_hit: bool, eye: PointBuffer | None = None
-    ) -> tuple[Any, Any, Any]:
+    def _walk(self, ray: Any, active: Any, *, any_hit: bool) -> tuple[Any, Any, Any]:
         def visit(leaf: Any, state: tuple) -> tuple:
             hit = self._meet(leaf, ray)
             closer = hit.t < state[0]
@@ -72,10 +66,6 @@ class Quadrics:
                     dr.select(closer, hit.part, state[2]))  # fmt: skip
 
         state = mi.Float(ray.maxt), mi.UInt32(0), mi.Int32(LATERAL)
-        if eye is not None:
-            from_eye = eye.starts_ray(mi.UInt32(0), ray)
-            state = eye.nearest(mi.UInt32(0), ray, active & from_eye, visit, state)
-            active = but_not(active, from_eye)
         return self.tree.walk(ray, active, visit, state, any_hit=any_hit)
 
     def _row(self, leaf: Any, active: Any = True) -> tuple[Frame, Any, Any]:
@@ -162,7 +152,7 @@ class ScalarQuadrics:
         self.kinds = sorted({o.kind for o in self.objects})
         self.count = len(self.objects)
 
-    def intersect(self, ray: Any, active: bool, eye: None = None) -> tuple[float, int, int]:
+    def intersect(self, ray: Any, active: bool) -> tuple[float, int, int]:
         best = (ray.maxt, 0, LATERAL)
         for k, thing in enumerate(self.objects if active else ()):
             hit = KINDS[thing.kind].intersect(ray.o, ray.d, thing.frame)

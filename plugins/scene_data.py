@@ -1,11 +1,9 @@
-"""Reading a scene for ``mrt_whitted``: first the facts, then, by a plan, the data of its kernels."""
+"""The data of the kernels of ``mrt_whitted`` for a scene, and its ray queries."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -13,38 +11,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .emission import MOST_EMITTERS, arriving, brightness, place
+from .facts import Reading, has_mirror
 from .hit_errors import CURVED, HitErrors
-from .kernel_plan import CutOff, KernelPlan, Mirror, Reason, SceneFacts
-from .merged_bsdf import MergedBSDF, material_rows, varies_by_object
-from .mesh_api import ray_arrays, ray_flags, surface_interaction, vertex_version
-from .parameters import ParameterError
+from .kernel_plan import KernelPlan
+from .merged_bsdf import MergedBSDF
 from .planes import Planes
 from .point_buffer import PointBuffer, point_buffer
-from .point_lights import Lights, numbers_of
-from .protocols import MirrorBSDF, PlaneShape, QuadricShape
-from .quadric_kinds import KINDS
+from .point_lights import Lights
 from .quadrics import quadrics_of
-from .replay import held
-from .spheres import SphereBlockers, Spheres, is_plain_sphere, is_sphere
-from .touching import any_touching
-from .variants import but_not, is_jit, varies
-from .watch import Notes
-
-# Beyond these sizes, Embree's products of three lengths leave float32
-SMALLEST_MESH, LARGEST_MESH = 1e-8, 1e10
+from .snapshot import Kept
+from .spheres import SphereBlockers, Spheres
+from .variants import but_not, is_jit
 
 # Where a light lies on a surface, shadow rays end by this share of their way short of it: it shines to both
 # sides
 TOUCHING = 2.0**-10
-
-# What ``SceneData`` makes of the shapes, and the decisions that shape it
-OF_SHAPES = ("bvh", "ray_arrays", "planes", "quadrics", "errors", "spheres", "shape_arrays")
-
-
-def _of_shapes(plan: KernelPlan) -> tuple[Any, ...]:
-    return plan.bvh, plan.planes, plan.quadrics, plan.spheres
-
 
 # Reach of a mirror ray: any number that float32 holds
 FARTHEST = 2.0**127
@@ -59,241 +40,66 @@ class Hit:
     error: mi.Float  # how far the point may be off the surface
 
 
-class SceneReading:
-    """The objects of a scene, sorted by who traces them, and the facts about them."""
+@dataclass
+class Traced:
+    """The shapes, sorted by who traces them."""
 
-    facts: SceneFacts
-
-    def __init__(self, scene: mi.Scene, before: SceneReading | None = None) -> None:
-        """Read a scene; what has not changed since ``before`` is taken from there."""
-        # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed
-        self.objects = _objects(scene)
-        self.shapes = scene.shapes()
-        self.environment, self.emitters = scene.environment(), scene.emitters()
-        self.bsdfs = _once(s.bsdf() for s in self.shapes)
-        known = before is not None and before.objects == self.objects and before.bsdfs == self.bsdfs
-        self.notes: Notes = before.notes if before and known else self._new_notes()
-        self.forms = [_shape_state(s) for s in self.shapes]
-        self.planes = [s for s in self.shapes if isinstance(s, PlaneShape)]
-        self.quadrics = [s for s in self.shapes if isinstance(s, QuadricShape)]
-        self.native = [s for s in self.shapes if not isinstance(s, (PlaneShape, QuadricShape))]
-        self.moving = self._moving()
-        if not (before and self.same_shapes(before)):
-            _check_sizes(self.native)
-        self._tables = [s.quadrics() for s in self.quadrics]
-        read = self.notes.read
-        self.brightness = [read(brightness, e) for e in self.emitters]
-        self.lights = self._lights()
-        self.numbers = numbers_of(self.lights, read)
-        self.eye = _eye(scene)
-        materials = material_rows(self.shapes, read)
-        self.unmergeable = materials if isinstance(materials, Reason) else None
-        self.materials = [] if isinstance(materials, Reason) else materials
-        self.facts = self._read_facts(self._touching(before))
-
-    def _new_notes(self) -> Notes:
-        groups = [s for s in self.shapes if varies_by_object(s)]
-        return Notes(_once([*self.bsdfs, *self.emitters, *groups]))
-
-    def is_of(self, scene: mi.Scene) -> bool:
-        """Return whether this scene was read.
-
-        The id of a scene may have passed to another one, those of objects held here cannot.
-        """
-        return _objects(scene) == self.objects
-
-    def is_stale(self, scene: mi.Scene) -> bool:
-        """Return whether it is another scene, or was changed since."""
-        if not self.is_of(scene) or self.notes.refresh() or self._moving() != self.moving:
-            return True
-        if [_shape_state(s) for s in self.shapes] != self.forms or _eye(scene) != self.eye:
-            return True
-        return self.bsdfs != _once(s.bsdf() for s in self.shapes)
-
-    def same_shapes(self, other: SceneReading) -> bool:
-        """Return whether no shape was moved or edited between two readings."""
-        return (self.objects, self.forms, self.moving) == (other.objects, other.forms, other.moving)
-
-    def _moving(self) -> list[bool]:
-        return [s.moving_frame() is not None for s in self.quadrics]
-
-    def _touching(self, before: SceneReading | None) -> bool:
-        """Return whether a point light is on a surface."""
-        self.places = list(filter(None, map(partial(self.notes.read, place), self.lights[:MOST_EMITTERS])))
-        if before and self.same_shapes(before) and self.places == before.places:
-            return before.facts.touching
-        return any_touching(self.shapes, self.places)
-
-    def _lights(self) -> list[Any]:
-        pairs = zip(self.emitters, self.brightness, strict=True)
-        return [e for e, value in pairs if not e.is_environment() and value != 0]
-
-    def _read_of_bsdfs(self, function: Callable[[Any], Any]) -> list[Any]:
-        return [self.notes.read(function, b) for b in self.bsdfs]
-
-    def _read_facts(self, touching: bool) -> SceneFacts:
-        quadrics: Counter[str] = Counter()
-        for table in self._tables:
-            quadrics[table.kind] += len(table.rows)
-        delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
-        read, largest = self.notes.read, dict(zip(map(id, self.emitters), self.brightness, strict=True))
-        surfaces = [largest[id(e)] for e in self.lights if mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
-        return SceneFacts(
-            vectorised=is_jit(),
-            native_shapes=len(self.native),
-            meshes=sum(s.is_mesh() for s in self.native),
-            spheres=sum(map(is_sphere, self.native)),
-            plain_spheres=sum(map(is_plain_sphere, self.native)),
-            planes=len(self.planes),
-            quadrics=tuple(sorted(quadrics.items())),
-            lights=len(self.lights),
-            random_lights=sum(not mi.has_flag(e.flags(), delta) for e in self.lights),
-            surface_emitters=len(surfaces),
-            environment=self.environment is not None,
-            sky=0.0 if self.environment is None else largest[id(self.environment)],
-            arriving=sum(arriving(e, largest[id(e)]) for e in self.lights),
-            emission=max(surfaces, default=0.0),
-            alone=self._alone(),
-            touching=touching,
-            value=max(self._read_of_bsdfs(_value_bound), default=0.0),
-            diffuse=self._has_lobe("diffuse"),
-            specular=self._has_lobe("specular"),
-            mirrors=tuple(read(_mirror, b) for b in self.bsdfs if has_mirror(b)),
-            oriented=any(self._read_of_bsdfs(is_oriented)),
-            textured=self.unmergeable is not None and any(self._read_of_bsdfs(is_textured)),
-            two_sided=any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in self.bsdfs),
-            unmergeable=self.unmergeable,
-            tabled=self.numbers is not None,
-            pinhole=self.eye is not None,
-        )
-
-    def _has_lobe(self, name: str) -> bool:
-        """Return whether a material may have such a lobe; those outside the table may."""
-        return self.unmergeable is not None or any(getattr(m, name).any() for m in self.materials)
-
-    def _alone(self) -> bool:
-        """Return whether there is one object only, convex, which reflects on its outside."""
-        plain = [s for s in self.native if is_plain_sphere(s)]
-        convex = [t for t in self._tables if KINDS[t.kind].closed and len(t.rows) == 1 and not t.flipped]
-        one_sided = all(isinstance(b, MirrorBSDF) for b in self.bsdfs)
-        return len(self.shapes) == 1 and len(plain) + len(convex) + len(self.planes) == 1 and one_sided
+    bvh: mi.Scene | None  # those that only Mitsuba can trace; None: the scene itself
+    planes: Planes
+    quadrics: Any
+    errors: HitErrors
+    spheres: Spheres | None
 
 
 class SceneData:
     """The data of the kernels for a scene, as a plan wants them, and its ray queries.
 
-    What depends on the shapes alone is taken from ``before`` where they are the same.
+    ``kept`` spares making what depends on parts of the scene that have not changed.
     """
 
-    bvh: mi.Scene | None  # of the shapes that only Mitsuba can trace; None: the scene itself
-    ray_arrays: list[Any] | None  # what is read of it; None: not known yet
-    planes: Planes
-    quadrics: Any
-    errors: HitErrors
-    spheres: Spheres | None
-    shape_arrays: list[Any]  # what is in these
-    lights: Lights
-    buffers: list[tuple[PointBuffer, Any]]  # what may be in the way of the lights, with what tests it
-    eye: PointBuffer | None  # what of the quadrics the camera may see
-
-    def __init__(self, reading: SceneReading, plan: KernelPlan, before: SceneData | None = None) -> None:
-        self.reading, self.facts = reading, reading.facts
-        self.limit(plan)
-        if before and reading.same_shapes(before.reading) and _of_shapes(plan) == _of_shapes(before.plan):
-            for name in OF_SHAPES:
-                setattr(self, name, getattr(before, name))
-        else:
-            self._trace_shapes(plan)
-        self.lights = (
-            before.lights
-            if before and self._same_lights(before)
-            else Lights(reading.lights, reading.numbers, plan.lights)
+    def __init__(self, reading: Reading, plan: KernelPlan, kept: Kept) -> None:
+        self.plan, self.facts, self.environment = plan, reading.facts, reading.snapshot.environment
+        now = reading.snapshot
+        form = plan.bvh, plan.planes, plan.quadrics, plan.spheres
+        traced = kept("traced", (now.shape_part, *form), lambda: _trace(reading, plan))
+        self.bvh, self.planes, self.quadrics = traced.bvh, traced.planes, traced.quadrics
+        self.errors, self.spheres = traced.errors, traced.spheres
+        self.lights = kept(
+            "lights",
+            (now.light_part, plan.lights),
+            lambda: Lights(reading.lights, reading.numbers, plan.lights),
         )
-        self.buffers = before.buffers if before and self._same_places(before) else self._light_buffers()
-        self.eye = before.eye if before and self._same_view(before) else self._eye_buffer()
-        self.environment = reading.environment
-        self.merged = MergedBSDF(reading.shapes, reading.materials) if plan.merged else None
-        self._arrays = held([self.lights, self.merged, self.buffers, self.eye, self.environment])
-        self.ray_flags = ray_flags(
-            textures=plan.textures, shading_frames=plan.shading_frames, tangents=plan.tangents
+        self.buffers = kept(
+            "buffers",
+            (now.shape_part, now.light_part, plan.buffers, *form),
+            lambda: self._light_buffers(reading) if plan.buffers else [],
         )
+        self.merged = kept(
+            "merged",
+            (now.shape_part, now.material_part, plan.merged),
+            lambda: MergedBSDF(now.shapes, reading.materials) if plan.merged else None,
+        )
+        self.path_limit: Any = plan.cut_off.paths
+        if is_jit() and self.path_limit not in (0, math.inf, self.facts.lights + 1):
+            self.path_limit = dr.opaque(mi.Float, self.path_limit)  # a brighter sky needs no new kernel
+        self.ray_flags = +mi.RayFlags.dPdUV if plan.tangents else +mi.RayFlags.Minimal
+        self.ray_flags |= +mi.RayFlags.UV if plan.textures else 0
+        self.ray_flags |= +mi.RayFlags.ShadingFrame if plan.shading_frames else 0
 
-    def _same_lights(self, before: SceneData) -> bool:
-        now, then = self.reading, before.reading
-        same = (now.lights, now.numbers, self.plan.lights) == (then.lights, then.numbers, before.plan.lights)
-        return same and now.numbers is not None
-
-    def _same_places(self, before: SceneData) -> bool:
-        same_shapes = self.spheres is before.spheres and self.quadrics is before.quadrics
-        return same_shapes and self._places() == before._places() and self.plan.buffers == before.plan.buffers
-
-    def _places(self) -> list[list[float]]:
-        return [position for position, _ in self.reading.numbers or ()]
-
-    def _light_buffers(self) -> list[tuple[PointBuffer, Any]]:
+    def _light_buffers(self, reading: Reading) -> list[tuple[PointBuffer, Any]]:
         """Return lists of what may be in the way of the lights, with what tests it; empty for none."""
-        if not self.plan.buffers:
-            return []
         things = [] if self.quadrics is None else [self.quadrics]
         if self.plan.bvh:
-            things.append(SphereBlockers(self.reading.native))
-        pairs = [(point_buffer(np.array(self._places()), *t.hulls()), t) for t in things]
+            things.append(SphereBlockers(reading.native))
+        places = np.array([position for position, _ in reading.numbers or ()])
+        pairs = [(point_buffer(places, *thing.hulls()), thing) for thing in things]
         buffers = [(buffer, thing) for buffer, thing in pairs if buffer is not None]
         return buffers if len(buffers) == len(pairs) else []
 
-    def _same_view(self, before: SceneData) -> bool:
-        same_eye = self.reading.eye == before.reading.eye and self.plan.eye == before.plan.eye
-        return same_eye and self.quadrics is before.quadrics
-
-    def _eye_buffer(self) -> PointBuffer | None:
-        if not self.plan.eye or self.quadrics is None:
-            return None
-        return point_buffer(np.array([self.reading.eye]), *self.quadrics.hulls())
-
-    def _trace_shapes(self, plan: KernelPlan) -> None:
-        reading = self.reading
-        exact = [s for s in reading.quadrics if s.quadrics().kind in plan.quadrics]
-        planes = reading.planes if plan.planes else []
-        own = {id(s) for s in (*exact, *planes)}
-        others = [s for s in reading.shapes if id(s) not in own]
-        if others and not plan.bvh:
-            raise ValueError(f"the plan leaves {len(others)} shapes untraced: set its bvh to True")
-        # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the others only
-        self.bvh, self.ray_arrays = _scene_of(others) if own else None, None
-        self.planes = Planes(planes)
-        self.quadrics = quadrics_of(exact)
-        self.errors = HitErrors(others)
-        self.spheres = Spheres(others) if plan.spheres != "none" else None
-        self.shape_arrays = held([self.planes, self.quadrics, self.errors, self.spheres])
-
-    def limit(self, plan: KernelPlan) -> None:
-        """Take over a plan that differs in its cut-off alone."""
-        self.plan, self.path_limit = plan, plan.cut_off.paths
-        # What shapes the code of the kernels, ``arrays`` being their data
-        self.form: Hashable = replace(plan, cut_off=CutOff(0.0, plan.cut_off.lights))
-        if is_jit() and self.path_limit not in (0, math.inf, self.facts.lights + 1):
-            self.path_limit = dr.opaque(mi.Float, self.path_limit)  # a brighter sky needs no new kernel
-
-    # ------------------------------------------- Replay ------------------------------------------------
-
-    def arrays(self, scene: mi.Scene) -> list[Any] | None:
-        """Return all that the kernels read; None where they call plugins, which may read anything."""
-        plan = self.plan
-        tabled = plan.merged and self.lights.known and (plan.spheres == "table" or not plan.bvh)
-        plain = self.environment is None or self.environment.class_name() == "ConstantBackgroundEmitter"
-        if not (tabled and plain):
-            return None
-        if self.ray_arrays is None:
-            self.ray_arrays = ray_arrays(self.bvh or scene) if plan.bvh else []
-        return [*self._arrays, self.path_limit, *self.shape_arrays, *self.ray_arrays]
-
     # ----------------------------------------- Ray queries ---------------------------------------------
 
-    def intersect(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, *, from_eye: bool = False) -> Hit:
-        """Return the nearest hit among Mitsuba's shapes, the quadrics and the analytic planes.
-
-        ``from_eye``: most rays come from the camera.
-        """
+    def intersect(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> Hit:
+        """Return the nearest hit among Mitsuba's shapes, the quadrics and the analytic planes."""
         t, plane, on_plane = self.planes.intersect(ray, active)
         # What lies behind a plane need not be looked for
         ray = mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths)
@@ -302,7 +108,7 @@ class SceneData:
         if self.quadrics is not None:
             reach = dr.select(found, si.t, ray.maxt)
             nearer = mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths)
-            quadric = self.quadrics.intersect(nearer, active, self.eye if from_eye else None)
+            quadric = self.quadrics.intersect(nearer, active)
             closer = active & (quadric[0] < reach)
             self.quadrics.put_into(si, ray, quadric, closer, tangents=self.plan.tangents)
             scale = dr.select(closer, self.quadrics.scale(quadric[1], closer), scale)
@@ -333,7 +139,7 @@ class SceneData:
         if self.spheres is not None and self.plan.spheres == "table" and not differentiable:
             si, scale = self.spheres.interaction(pi, ray, found)
             return si, found, scale
-        si = surface_interaction(self.bvh or scene, pi, ray, self.ray_flags, found)
+        si = pi.compute_surface_interaction(ray, self.ray_flags, found)
         if self.spheres is not None:
             self.spheres.put_back(si, found)
         return si, found, self.errors.size(si, found)
@@ -406,44 +212,25 @@ class SceneData:
         )
 
 
-def _check_sizes(shapes: list[mi.Shape]) -> None:
-    """Refuse meshes that float32 cannot trace."""
-    for shape in shapes:
-        if shape.is_mesh():
-            _check_size(shape)
-
-
-def _check_size(mesh: mi.Shape) -> None:
-    low, high = (np.array(corner, float).ravel() for corner in (mesh.bbox().min, mesh.bbox().max))
-    extent, farthest = (high - low).max(), np.abs([low, high]).max()
-    if np.isfinite(farthest) and extent > 0 and not (extent >= SMALLEST_MESH and farthest <= LARGEST_MESH):
-        raise ParameterError(
-            f'mrt_whitted: the mesh "{mesh.id()}" is {extent:.3g} across and reaches to {farthest:.3g}; '
-            f"rays meet meshes from {SMALLEST_MESH:g} to {LARGEST_MESH:g}: scale the scene"
-        )
-
-
-def has_mirror(bsdf: Any) -> bool:
-    """Return whether a BSDF reflects like a mirror."""
-    return bsdf.has_attribute("mirror_reflectance") or mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
-
-
-def is_textured(bsdf: Any) -> bool:
-    """Return whether a BSDF varies over its surface; the flags of Mitsuba's own do not say so."""
-    flags = bsdf.flags()
-    if isinstance(bsdf, MirrorBSDF):
-        return mi.has_flag(flags, mi.BSDFFlags.SpatiallyVarying)
-    return any(isinstance(node, mi.Texture) and varies(node) for node in mi.traverse(bsdf).hierarchy)
-
-
-def is_oriented(bsdf: Any) -> bool:
-    """Return whether a BSDF depends on how the surface is turned about its normal."""
-    if isinstance(bsdf, MirrorBSDF):
-        return False
-    names = {node.class_name() for node in mi.traverse(bsdf).hierarchy}
-    if names & {"BumpMap", "NormalMap"} or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Anisotropic):
-        return True
-    return not type(bsdf).__module__.startswith("mitsuba")  # somebody else's, which may ask for anything
+def _trace(reading: Reading, plan: KernelPlan) -> Traced:
+    """Sort the shapes by who traces them."""
+    exact = [s for s in reading.quadrics if s.quadrics().kind in plan.quadrics]
+    planes = reading.planes if plan.planes else []
+    own = {id(s) for s in (*exact, *planes)}
+    others = [s for s in reading.snapshot.shapes if id(s) not in own]
+    if others and not plan.bvh:
+        raise ValueError(f"the plan leaves {len(others)} shapes untraced: set its bvh to True")
+    bvh = None
+    if own and others:
+        # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the others only.
+        # Mitsuba names an object after its key, and these belong to another scene: they keep their names
+        things = [*others, *reading.snapshot.groups]
+        names = [s.id() or f"shape_{i}" for i, s in enumerate(things)]
+        if len(set(names)) < len(names):
+            names = [f"shape_{i}" for i in range(len(things))]
+        bvh = mi.load_dict({"type": "scene", **dict(zip(names, things, strict=True))})
+    spheres = Spheres(others) if plan.spheres != "none" else None
+    return Traced(bvh, Planes(planes), quadrics_of(exact), HitErrors(others), spheres)
 
 
 def _frame_along(si: mi.SurfaceInteraction3f) -> mi.Frame3f:
@@ -455,14 +242,6 @@ def _frame_along(si: mi.SurfaceInteraction3f) -> mi.Frame3f:
     s = s / dr.select(known, length, 1)
     any_frame = mi.Frame3f(n)
     return mi.Frame3f(dr.select(known, s, any_frame.s), dr.select(known, dr.cross(n, s), any_frame.t), n)
-
-
-def _value_bound(bsdf: Any) -> float:
-    return bsdf.value_bound() if isinstance(bsdf, MirrorBSDF) else math.inf
-
-
-def _mirror(bsdf: Any) -> Mirror:
-    return bsdf.mirror_bound() if isinstance(bsdf, MirrorBSDF) else Mirror(1.0, 1.0)
 
 
 def _eval_bsdf(
@@ -490,36 +269,3 @@ def _eval_bsdf(
         context.type_mask = +mi.BSDFFlags.DeltaReflection
         reflectance = mi.unpolarized_spectrum(bsdf.sample(context, si, mi.Float(0), mi.Point2f(0), active)[1])
     return values, reflectance, int_ior
-
-
-def _scene_of(shapes: list[mi.Shape]) -> mi.Scene | None:
-    if not shapes:
-        return None
-    # Mitsuba names an object after its key, and these belong to another scene: they keep their names
-    names = [s.id() or f"shape_{i}" for i, s in enumerate(shapes)]
-    if len(set(names)) < len(names):
-        names = [f"shape_{i}" for i in range(len(shapes))]
-    return mi.load_dict({"type": "scene", **dict(zip(names, shapes, strict=True))})
-
-
-def _once(things: Iterable[Any]) -> list[Any]:
-    """Return each object once."""
-    return list({id(thing): thing for thing in things}.values())
-
-
-def _eye(scene: mi.Scene) -> list[float] | None:
-    """Return where all rays of the first camera come from; None where that is no point."""
-    sensor = next(iter(scene.sensors()), None)
-    if sensor is None or sensor.class_name() != "PerspectiveCamera":
-        return None
-    place = np.array(sensor.world_transform().translation(), float).ravel()
-    return place.tolist() if place.shape == (3,) and np.isfinite(place).all() else None
-
-
-def _objects(scene: mi.Scene) -> list[Any]:
-    return [*scene.shapes(), *scene.emitters()]
-
-
-def _shape_state(shape: Any) -> tuple:
-    bbox = shape.bbox()
-    return (vertex_version(shape), *bbox.min, *bbox.max)

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from .emission import largest
+from .facts import Reading
 from .kernel_plan import BUDGETS, KernelPlan, SceneFacts, Settings, make_plan
 from .parameters import LARGEST, choice, flag, integer, number, spectrum
 from .protocols import LayeredIntegrator
-from .replay import Replay
-from .scene_data import Hit, SceneData, SceneReading
+from .scene_data import Hit, SceneData
+from .snapshot import Kept, Snapshot
 from .variants import but_not
 
 # A sixteenth of a step of an 8-bit picture: what many cut paths add up to stays below half a step, and on
@@ -68,7 +68,8 @@ class MrtWhitted(mi.SamplingIntegrator):
     with r the mirror direction, and the sky where a ray meets nothing. Shading goes through ``si.bsdf()``:
     k_s F is the attribute ``mirror_reflectance`` of an ``mrt_bsdf``, and the delta reflection of any other
     BSDF. Lights are all emitters of the scene; those without a delta position take one random sample each.
-    ``mrt_plane``, ``mrt_cone``, ``mrt_cylinder`` and ``mrt_group`` shapes are intersected analytically.
+    ``mrt_plane``, ``mrt_cone``, ``mrt_cylinder`` and ``mrt_group`` shapes are intersected
+    analytically.
 
     ==================== ======== ============ ===========================================================
     name                 type     default      unit or range
@@ -108,10 +109,9 @@ class MrtWhitted(mi.SamplingIntegrator):
         self.clamp = flag(props, "clamp", True)
         self.min_contribution = number(props, "min_contribution", MIN_CONTRIBUTION, least=0)
         self.bounce_budget = choice(props, "bounce_budget", BUDGETS)
-        self._reading: SceneReading | None = None
-        self._data: SceneData | None = None
-        self._given_plan: KernelPlan | None = None  # it holds until the scene changes
-        self._replay = Replay()
+        self._snapshot: Snapshot | None = None  # of the scene that was looked at last
+        self._made = Kept()
+        self._rendering: SceneData | None = None  # what ``sample`` traces while ``render`` runs
 
     # ------------------------------------- Mitsuba's interface ----------------------------------------
 
@@ -124,8 +124,11 @@ class MrtWhitted(mi.SamplingIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> mi.TensorXf:
-        self.prepare(scene)
-        return mi.SamplingIntegrator.render(self, scene, sensor, seed, spp, develop, evaluate)
+        before, self._rendering = self._rendering, self.prepare(scene)
+        try:
+            return mi.SamplingIntegrator.render(self, scene, sensor, seed, spp, develop, evaluate)
+        finally:
+            self._rendering = before
 
     def sample(
         self,
@@ -135,7 +138,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         medium: mi.Medium | None = None,
         active: mi.Bool = True,
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-        trace = self.trace(scene, sampler, mi.Ray3f(ray), active)
+        trace = self.trace(scene, sampler, mi.Ray3f(ray), active, self._rendering)
         return mi.depolarizer(trace.radiance), trace.hit.found, []
 
     def aov_names(self) -> list[str]:
@@ -153,66 +156,51 @@ class MrtWhitted(mi.SamplingIntegrator):
         """Return the names of the layers that ``trace`` knows."""
         return LAYERS
 
+    def read(self, scene: mi.Scene) -> Reading:
+        """Read a scene as it is now; cheap where nothing has changed since the last call."""
+        self._snapshot = Snapshot(scene, self._snapshot)
+        return Reading(self._snapshot, self._made)
+
     def scene_facts(self, scene: mi.Scene) -> SceneFacts:
-        """Read what the kernels depend on; cheap where nothing has changed since the last call."""
-        return self._read(scene).facts
+        """Return what the kernels depend on."""
+        return self.read(scene).facts
 
     def kernel_plan(self, facts: SceneFacts) -> KernelPlan:
         """Decide what the kernels for such a scene hold."""
-        return make_plan(facts, self._settings)
-
-    def prepare(self, scene: mi.Scene, plan: KernelPlan | None = None) -> SceneData:
-        """Make the data of the kernels; cheap where nothing has changed since the last call.
-
-        A ``plan`` of one's own is made for the facts that were read last, and holds until the scene changes;
-        without one, that of ``kernel_plan`` does.
-        """
-        reading = self._reading
-        if plan is None or reading is None or not reading.is_of(scene):
-            reading = self._read(scene)
-        self._given_plan = self._given_plan if plan is None else plan
-        plan = self._given_plan or self.kernel_plan(reading.facts)
-        data = self._data
-        if data is not None and data.reading is reading:
-            if data.plan is plan:
-                return data
-            if replace(data.plan, cut_off=plan.cut_off) == plan:
-                data.limit(plan)
-                return data
-        self._data = SceneData(reading, plan, data)
-        return self._data
-
-    def _read(self, scene: mi.Scene) -> SceneReading:
-        if self._reading is None or self._reading.is_stale(scene):
-            self._reading, self._given_plan = SceneReading(scene, self._reading), None
-        return self._reading
-
-    @property
-    def _settings(self) -> Settings:
         own_sky = None if self.sky is None else largest(self.sky)
-        return Settings(self.max_depth, self.min_contribution, self.bounce_budget, self.clamp, own_sky)
+        settings = Settings(self.max_depth, self.min_contribution, self.bounce_budget, self.clamp, own_sky)
+        return make_plan(facts, settings)
 
-    def replayed(self, scene: mi.Scene, form: Hashable, inputs: Any, run: Callable[[], Any]) -> Any:
-        """Return what ``run()`` does, launching recorded kernels where all that they read is known."""
-        data = self._data
-        arrays = data.arrays(scene) if data is not None and data.reading.is_of(scene) else None
-        if data is None or arrays is None or dr.grad_enabled(arrays, inputs) or scene.shapes_grad_enabled():
-            return run()
-        return self._replay((form, data.form, self._settings), [arrays, self.sky, inputs], run)
+    def prepare(
+        self, scene: mi.Scene, plan: KernelPlan | None = None, reading: Reading | None = None
+    ) -> SceneData:
+        """Make the data of the kernels for ``trace``; cheap where nothing has changed since the last call.
+
+        Without a ``plan`` of one's own, that of ``kernel_plan``. ``reading``: what ``read(scene)`` has just
+        returned.
+        """
+        reading = self.read(scene) if reading is None else reading
+        return SceneData(reading, plan or self.kernel_plan(reading.facts), self._made)
 
     # ------------------------------------------- Tracing -----------------------------------------------
 
     def trace(
-        self, scene: mi.Scene, sampler: mi.Sampler | None, ray: mi.Ray3f, active: mi.Bool = True
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler | None,
+        ray: mi.Ray3f,
+        active: mi.Bool = True,
+        data: SceneData | None = None,
     ) -> Trace:
-        """Return the radiance along ``ray`` and its by-products; what is not read from it is not computed."""
-        data = self._data
-        if data is None or not data.reading.is_of(scene):
-            data = self.prepare(scene)
+        """Return the radiance along ``ray`` and its by-products; what is not read from it is not computed.
+
+        ``data``: what ``prepare`` returned for the scene as it is; without, it is called.
+        """
+        data = self.prepare(scene) if data is None else data
 
         # ------------------------------ The camera ray, first of a peeled loop ------------------------------
         active = mi.Bool(active)
-        hit = data.intersect(scene, ray, active, from_eye=True)
+        hit = data.intersect(scene, ray, active)
         shading = self._shade(data, scene, sampler, ray, hit, mi.UnpolarizedSpectrum(1), active)
         if not data.plan.mirrors:
             return Trace(shading.radiance, shading.radiance, hit, mi.UInt32(0), shading.shadow_rays)

@@ -11,10 +11,10 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.output import layers
 from mrt_mitsuba.output.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
+from mrt_mitsuba.plugins import kernel_plan
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rays.lattice import FILM, Lattice
 from mrt_mitsuba.rays.region import Region
-from mrt_mitsuba.rendering import kernel_text
 from mrt_mitsuba.rendering.detectors import DETECTORS
 from mrt_mitsuba.rendering.settings import NOISE, Focus, RenderSettings
 
@@ -79,12 +79,12 @@ class Omission:
     @property
     def what(self) -> str:
         """Return in words what is left out."""
-        return "edge pass" if self.name == EDGES else kernel_text.WHAT.get(self.name, self.name)
+        return "edge pass" if self.name == EDGES else kernel_plan.WHAT.get(self.name, self.name)
 
     @property
     def why(self) -> str:
         """Why, in words."""
-        return _WHY.get(self.reason) or kernel_text.why(self.reason)
+        return _WHY.get(self.reason, self.reason)
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class Plan(RenderFacts):
         if self.kernel is None or self.parts is None:
             lines += [f"  kernel  {self.integrator}.sample"]
         else:
-            lines += [f"  kernel  {text}" for text in kernel_text.held(self.kernel, self.parts)]
+            lines += [f"  kernel  {text}" for text in kernel_plan.held(self.kernel, self.parts)]
         for why, group in groupby(self.left_out, lambda omission: omission.why):
             lines += [f"  without {', '.join(omission.what for omission in group)}: {why}"]
         return "\n".join(lines)
@@ -311,7 +311,7 @@ def _goal(settings: RenderSettings) -> str:
 def _left_out(
     traced: frozenset[str], facts: RenderFacts, made: set[str], settings: RenderSettings
 ) -> list[Omission]:
-    left_out = [Omission(name, reason.value) for name, reason in facts.kernel.reasons] if facts.kernel else []
+    left_out = [Omission(name, why) for name, why in facts.kernel.reasons] if facts.kernel else []
     if EDGES not in made:
         reasons = {"none": "all-samples", NOISE: "noise"}
         left_out.append(Omission(EDGES, reasons.get(str(settings.aamode), "one-sample")))

@@ -212,9 +212,10 @@ class LayeredShader(Shader):
     def __init__(self, scene: Any, integrator: Any) -> None:
         super().__init__(scene, integrator)
         try:
-            self.facts = integrator.scene_facts(scene)
+            self._reading = integrator.read(scene)
         except ParameterError as error:
             raise SceneError(str(error)) from None
+        self.facts, self._data = self._reading.facts, None
         self.kernel = integrator.kernel_plan(self.facts)
         self.random = self.kernel.random
         self.name = integrator.plugin_name
@@ -224,10 +225,11 @@ class LayeredShader(Shader):
         return super().layers | self.integrator.provided_layers()
 
     def prepare(self, kernel: KernelPlan | None) -> None:
-        self.integrator.prepare(self.scene, kernel)
+        self._data = self.integrator.prepare(self.scene, kernel, self._reading)
 
     def values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
-        return LayeredValues(self.scene, view, ray, weight, self.integrator.trace(self.scene, sampler, ray))
+        trace = self.integrator.trace(self.scene, sampler, ray, True, self._data)
+        return LayeredValues(self.scene, view, ray, weight, trace)
 
 
 def shader_for(scene: Any, integrator: Any) -> Shader:

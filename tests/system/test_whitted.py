@@ -32,7 +32,6 @@ def trace(nodes: dict[str, Any], o: Any, d: Any, **integrator: Any) -> Traced:
     """Trace rays [N, 3] through a scene."""
     scene = mi.load_dict({"type": "scene", **nodes})
     tracer = mi.load_dict({**WHITTED, **integrator})
-    tracer.prepare(scene)
     rays = mi.Ray3f(mi.Point3f(np.atleast_2d(o).T), mi.Vector3f(np.atleast_2d(d).T))
     found = tracer.trace(scene, None, rays)
     si = found.hit.si
@@ -122,5 +121,4 @@ def test_a_bounce_costs_what_the_index_leaves_of_ten(ior: float, bounces: int) -
     scene = mi.load_dict({"type": "scene", **walls})
     tracer = mi.load_dict({**WHITTED, "bounce_budget": "report", "sky": 1.0})
     ray = mi.Ray3f(mi.Point3f(0, 0, 0.5), mi.Vector3f(0, 0, -1))
-    tracer.prepare(scene)
     assert np.array(tracer.trace(scene, None, ray).bounces).item() == bounces

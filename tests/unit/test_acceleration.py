@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -103,29 +102,6 @@ def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: f
         np.testing.assert_array_equal(found, expected)
 
 
-@SCALES
-@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder"])
-def test_lists_for_the_eye_find_what_a_search_finds(kind: str, size: float, shift: float) -> None:
-    """Also where the eye is within an object as large as all others together, and for rays from elsewhere."""
-    starts, ends, radii, targets = crowd(size, shift)
-    ends[0], radii[0] = starts[0] + size * 0.7, size * 0.8
-    quadrics = Quadrics(
-        [group(kind, starts, radii) if kind == "sphere" else group(kind, starts, ends, radii)]
-    )
-    for place in size * (np.array(PLACES[:5]) + shift):
-        eye = point_buffer(place[None], *quadrics.hulls())
-        ray = lit(targets, place)
-        ray.o, ray.d, ray.maxt = mi.Point3f(place.tolist()) - ray.d * 0.01, -ray.d, dr.inf
-        assert dr.all(eye.starts_ray(mi.UInt32(0), ray))
-        other = mi.Ray3f(ray.o, mi.Vector3f(ray.d.z, ray.d.x, ray.d.y))  # and some the other way
-        assert np.mean(eye.starts_ray(mi.UInt32(0), other).numpy()) < 0.01
-        for rays in (ray, other):
-            found = [part.numpy() for part in quadrics.intersect(rays, mi.Bool(True), eye)]
-            expected = [part.numpy() for part in quadrics.intersect(rays, mi.Bool(True))]
-            assert np.isfinite(expected[0]).mean() > 0.02
-            np.testing.assert_array_equal(found, expected)
-
-
 def test_hulls_hold_their_objects() -> None:
     """In any direction, a hull reaches a little further than the stand-in of its quadric, of any shear."""
     rng = np.random.default_rng(4)
@@ -158,35 +134,3 @@ def test_no_lists_where_they_would_be_long(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(lists_module, "MOST_LISTED", 6 * 2**2 * 3 * 50 - 1)
     assert lists(3, 5, 50) is not None
     assert lists(3, 0, 50) is None  # the points are in all of them, which are in all cells
-
-
-def test_lists_for_the_eye_leave_pictures_as_they_are() -> None:
-    """Of any camera: the first, for which they are, another, one with a lens, and one that is moved."""
-    starts, ends, radii, _ = crowd(1, 0)
-    look = mi.ScalarTransform4f().look_at([0.4, 0.3, 3], [0, 0, 0], [0, 1, 0])
-    aside = mi.ScalarTransform4f().look_at([3, 0.3, 1], [0, 0, 0], [0, 1, 0])
-    # Other filters add up in any order
-    film = {"type": "hdrfilm", "width": 40, "height": 30, "filter": {"type": "box"}}
-    camera = {"type": "perspective", "fov": 50, "film": film, "to_world": look}
-    scene = mi.load_dict({
-        "type": "scene", "integrator": {"type": "mrt_whitted"}, "cones": group("cone", starts, ends, radii),
-        "sensor_0": camera, "sensor_1": {**camera, "to_world": aside},
-        "sensor_2": {**camera, "type": "thinlens", "aperture_radius": 0.1, "focus_distance": 3.0},
-        "light": {"type": "mrt_light", "position": [3, 5, 4]}, "sky": {"type": "constant", "radiance": 0.2},
-    })  # fmt: skip
-    integrator = scene.integrator()
-
-    def pictures() -> list[np.ndarray]:
-        return [np.array(mi.render(scene, sensor=k, spp=4)) for k in range(3)]
-
-    plan = integrator.prepare(scene).plan
-    assert plan.eye
-    found = pictures()
-    assert min(picture.std() for picture in found) > 0.01
-    integrator.prepare(scene, replace(plan, eye=False))
-    np.testing.assert_array_equal(found, pictures())
-    parameters = mi.traverse(scene)
-    parameters["sensor_0.to_world"] = aside
-    parameters.update()
-    np.testing.assert_array_equal(pictures()[0], found[1])
-    assert integrator.prepare(scene).plan.eye

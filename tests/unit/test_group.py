@@ -102,8 +102,6 @@ def test_reflections_are_not_left_out() -> None:
             camera=content.camera, sky=content.sky, lights=content.lights, spheres=content.spheres
         ).to_dict()
     )
-    integrator = loaded.integrator()
-    integrator.prepare(loaded)
     deep = np.array(mi.render(loaded, spp=1, seed=0))
     shallow = np.array(
         mi.render(loaded, spp=1, seed=0, integrator=mi.load_dict({"type": "mrt_whitted", "max_depth": 1}))

@@ -293,7 +293,6 @@ def test_kernel_does_not_grow_with_the_number_of_cones() -> None:
         cones = tuple(Cone((i, 1, 0), (i, 0, 0), 0.4, MATTE) for i in range(count))
         scene = Scene(Camera((5, 5, 5), (0, 0, 0)), (0, 0, 0), (Light((0, 10, 0), (1, 1, 1)),), cones=cones)
         loaded = mi.load_dict(scene.to_dict(width=8, height=8))
-        loaded.integrator().prepare(loaded)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             dr.eval(mi.render(loaded, spp=1))

@@ -110,8 +110,6 @@ def test_textured_square(picture, integrator: str) -> None:
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, 3)
     tracer = mi.load_dict({"type": integrator})
-    if integrator == "mrt_whitted":
-        tracer.prepare(scene)
     got = tracer.sample(scene, sampler, ray)[0].numpy().T
     np.testing.assert_allclose(got, wanted, rtol=1e-4)  # the light is at 10⁴, not at infinity
 

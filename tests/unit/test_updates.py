@@ -52,25 +52,6 @@ def test_reflections_come_and_go_with_the_material(variant: str) -> None:
     assert drawn(scene) == pytest.approx(0.35, rel=1e-4)
 
 
-def test_a_later_scene_is_not_taken_for_an_earlier_one() -> None:
-    """Python gives the id of a scene that is gone to the next; an integrator may have read the first."""
-    integrator = mi.load_dict({"type": "mrt_whitted", "max_depth": 1})
-    ray = mi.Ray3f(mi.Point3f(0, 0, 5), mi.Vector3f(0, 0, -1))
-    ids, again = set[int](), 0
-    for k in range(400):  # whether and when an id is given again depends on what else was allocated
-        reflectance = 0.1 + 0.02 * (k % 7)
-        scene = mirror(specular_reflectance=0.0, diffuse_reflectance=reflectance)
-        again += id(scene) in ids
-        ids.add(id(scene))
-        light = integrator.trace(scene, None, ray).radiance[0]
-        # A light of 1 at (0, 3, 4) over a white-grey plane: ρ/π cos θ
-        assert float(light[0]) == pytest.approx(reflectance / np.pi * 0.8, rel=1e-4)
-        del scene
-        if again == 3:
-            return
-    pytest.fail("no id was given again")
-
-
 def test_light_buffers_follow_the_light_and_the_spheres() -> None:
     """A floor under a ball, and so many others that there are lists of what is in the way of the light."""
     look = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])

@@ -86,10 +86,11 @@ def record(scene: Any, **options: Any) -> Recorder:
     from mrt_mitsuba.plugins.whitted import MrtWhitted
 
     class Recording(MrtWhitted):
-        def prepare(self, scene: Any, plan: Any = None) -> Any:
-            data = super().prepare(scene, plan)
-            if not isinstance(data.bvh, Recorder):
-                data.bvh = Recorder(data.bvh or scene)
+        recorder: Recorder
+
+        def prepare(self, scene: Any, plan: Any = None, reading: Any = None) -> Any:
+            data = super().prepare(scene, plan, reading)
+            data.bvh = self.recorder = Recorder(data.bvh or scene)
             return data
 
     integrator = Recording(mi.Properties())
@@ -99,9 +100,8 @@ def record(scene: Any, **options: Any) -> Recorder:
         dr.scoped_set_flag(dr.JitFlag.SymbolicConditionals, False),
     ):
         mrt.render(scene, integrator=integrator, **options)
-    recorder: Recorder = integrator.prepare(scene).bvh
-    recorder.finish()
-    return recorder
+    integrator.recorder.finish()
+    return integrator.recorder
 
 
 @dataclass(frozen=True)

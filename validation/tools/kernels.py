@@ -56,9 +56,6 @@ def forget() -> None:
     """Make the next render compile its kernels, or, without a cache of our own, read them from the cache."""
     import drjit as dr
 
-    from mrt_mitsuba.plugins.replay import forget_recordings
-
-    forget_recordings()
     dr.flush_kernel_cache()
     if has_own_cache():
         for file in Path(os.environ[CACHE]).iterdir():

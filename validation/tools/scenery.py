@@ -48,7 +48,6 @@ def rays(o: np.ndarray, d: np.ndarray) -> Any:
 def traced(scene: Any, ray: Any, **parameters: Any) -> Any:
     """Return what ``mrt_whitted`` with these parameters finds along rays."""
     integrator = mi.load_dict({"type": "mrt_whitted", **parameters})
-    integrator.prepare(scene)
     return integrator.trace(scene, None, ray)
 
 

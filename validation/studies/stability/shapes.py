@@ -368,8 +368,8 @@ def _trace(solid: Solid, size: float, o: np.ndarray, d: np.ndarray) -> _Traced:
     integrator = mi.load_dict({"type": "mrt_whitted", "min_contribution": 0.0, "bounce_budget": "plain"})
     # Its mirror rays meet nothing and would be left out; here they are to show that they do not meet it
     facts = replace(integrator.scene_facts(scene), alone=False)
-    integrator.prepare(scene, integrator.kernel_plan(facts))
-    found = integrator.trace(scene, None, rays(o, d))
+    data = integrator.prepare(scene, integrator.kernel_plan(facts))
+    found = integrator.trace(scene, None, rays(o, d), True, data)
     si, hit = found.hit.si, np.array(found.hit.found)
     t = np.where(hit, np.array(si.t, np.float64), np.inf)
     return _Traced(hit, t, np.array(si.n, np.float64).T, np.array(found.direct[0]), np.array(found.bounces))

@@ -1,0 +1,155 @@
+"""What a scene is at one moment: the only module that decides whether something has changed.
+
+All that ``mrt_whitted`` makes of a scene depends on three parts of its snapshot: the shapes, their materials
+and the lights. A part lists objects, references between them, their plain properties and the Dr.Jit index of
+each of their arrays. It holds the arrays, so that Dr.Jit cannot give their indices to others, and the
+objects, so that Python cannot give away their ids: parts with equal lists are the same, and no array is read
+to tell.
+
+What is made of a part is kept with that part as its key (``Kept``). A part that has not changed since the
+last snapshot is the same object as then; one with derivatives never is, as what was made of it has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable
+from functools import cache
+from typing import Any, TypeVar
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .variants import is_jit
+
+Value = TypeVar("Value")
+PLAIN = (bool, int, float, str, bytes, type(None))
+
+
+class Part:
+    """Some objects with their textures and the like, as they are; equal to itself only."""
+
+    def __init__(self) -> None:
+        self.state: list[Any] = []  # what is compared
+        self.steady = True  # no derivatives are wanted
+        self._held: dict[int, Any] = {}  # objects, by id
+        self._arrays: list[Any] = []
+
+    def add(self, thing: Any, elsewhere: tuple[type, ...], *facts: Any) -> None:
+        """Add an object and what it holds, but for objects of the classes that belong ``elsewhere``."""
+        self.state += [id(thing), *facts]
+        if thing is None or id(thing) in self._held:
+            return
+        self._held[id(thing)] = thing
+        seen = _collector(mi.variant())()
+        thing.traverse(seen)
+        own = getattr(thing, "__dict__", None) or {}  # of a class in Python
+        for name, value, kind in [*seen.entries, *((name, value, None) for name, value in own.items())]:
+            if isinstance(value, mi.Object):
+                if isinstance(value, elsewhere):
+                    continue
+                self.state.append(name)
+                self.add(value, elsewhere)
+                continue
+            value = value if kind is None else mi.get_property(value, kind, thing)
+            if isinstance(value, PLAIN):
+                self.state += name, value
+            elif dr.is_jit_v(value) or (is_jit() and hasattr(value, "matrix")):
+                self.state.append(name)
+                self._arrays.append(value)
+            elif dr.is_array_v(value) or hasattr(value, "matrix"):
+                self.state += name, np.array(getattr(value, "matrix", value)).tobytes()
+            elif kind is not None:  # made for this look at it
+                self.state += name, str(value)
+            else:
+                self.state += name, id(value)
+                self._held[id(value)] = value
+
+    def close(self, before: Part | None) -> Part:
+        """Return the part from ``before`` if nothing has changed since, else this one."""
+        self.steady = not dr.grad_enabled(self._arrays)
+        self.state += dr.detail.collect_indices(self._arrays)
+        if before is not None and self.steady and before.steady and self.state == before.state:
+            return before
+        # An object shows its arrays themselves; copies share the numbers, and stay as they are
+        self._arrays = [type(a)(a) for a in self._arrays] if self.steady else []
+        return self
+
+
+class Snapshot:
+    """The objects of a scene, and the parts that tell whether they have changed."""
+
+    def __init__(self, scene: mi.Scene, before: Snapshot | None = None) -> None:
+        """Look at a scene; parts that have not changed since ``before`` are taken from there."""
+        # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed
+        self.shapes, self.emitters, self.environment = scene.shapes(), scene.emitters(), scene.environment()
+        seen = _collector(mi.variant())()
+        scene.traverse(seen)
+        # Groups are traced through their instances, which don't say of which group they are
+        self.groups = [v for _, v, _ in seen.entries if isinstance(v, mi.Shape) and _is_group(v)]
+        self.inner: list[Any] = []  #: the shapes of the groups
+        for group in self.groups:
+            inside = _collector(mi.variant())()
+            group.traverse(inside)
+            self.inner += [v for _, v, _ in inside.entries if isinstance(v, mi.Shape)]
+        shapes, materials, lights = Part(), Part(), Part()
+        for shape in [*self.shapes, *self.groups, *self.inner]:
+            shapes.add(
+                shape, (mi.Shape, mi.BSDF, mi.Emitter, mi.Sensor, mi.Medium),
+                shape.has_flipped_normals(), shape.is_emitter(),
+            )  # fmt: skip
+        for shape in [*self.shapes, *self.inner]:
+            bsdf = shape.bsdf()
+            materials.add(bsdf, (mi.Shape, mi.Emitter, mi.Medium), None if bsdf is None else bsdf.flags())
+        for emitter in self.emitters:
+            lights.add(emitter, (mi.Shape, mi.Medium), emitter.flags())
+        lights.add(self.environment, (mi.Shape, mi.Medium))
+        self.shape_part = shapes.close(before and before.shape_part)
+        self.material_part = materials.close(before and before.material_part)
+        self.light_part = lights.close(before and before.light_part)
+
+    @property
+    def bsdfs(self) -> list[Any]:
+        """Each material once."""
+        return once(shape.bsdf() for shape in [*self.shapes, *self.inner])
+
+
+class Kept:
+    """What was made last of something, under a key that names all that it depends on."""
+
+    def __init__(self) -> None:
+        self._values: dict[str, tuple[Hashable, Any]] = {}
+
+    def __call__(self, name: str, key: Hashable, make: Callable[[], Value]) -> Value:
+        """Return what ``make()`` returns, or returned last if the key is the same."""
+        known = self._values.get(name)
+        if known is None or known[0] != key:
+            # Key and value come together or, where ``make`` is interrupted, not at all
+            known = self._values[name] = key, make()
+        return known[1]  # type: ignore[no-any-return]
+
+
+def once(things: Iterable[Any]) -> list[Any]:
+    """Return each object once, in order."""
+    return list({id(thing): thing for thing in things if thing is not None}.values())
+
+
+def _is_group(shape: Any) -> bool:
+    return shape.class_name().startswith("ShapeGroup")
+
+
+@cache
+def _collector(variant: str) -> type:
+    """Return the class of what collects parameters, for a variant: there is none before one is chosen."""
+
+    class Collector(mi.TraversalCallback):
+        """The parameters of one object: name, value, and how to read it."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.entries: list[tuple[str, Any, Any]] = []
+
+        def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
+            self.entries.append((name, value, cpptype))
+
+    return Collector
