@@ -1,77 +1,77 @@
-"""The benchmark: its file, its schema, its comparison."""
+"""The benchmark: its file, its comparison, and the renders that it measures."""
 
 from __future__ import annotations
 
 import copy
 import json
+import sys
+from pathlib import Path
 
 import pytest
 
 from mrt_mitsuba.validation import bench
-from mrt_mitsuba.validation.studies import rivals
-
-KINDS = {"number": (int, float), "integer": int, "string": str}
-
-
-def _fits(value, schema) -> bool:
-    """Return whether a value has as much of a JSON schema as the benchmark uses."""
-    if "const" in schema:
-        return value == schema["const"]
-    if schema["type"] == "array":
-        return isinstance(value, list) and all(_fits(item, schema["items"]) for item in value)
-    if schema["type"] != "object":
-        return isinstance(value, KINDS[schema["type"]])
-    known, others = schema.get("properties", {}), schema.get("additionalProperties")
-    return set(known) <= value.keys() and all(
-        _fits(item, known.get(key) or others) for key, item in value.items() if key in known or others
-    )
+from mrt_mitsuba.validation.studies import speed
+from mrt_mitsuba.validation.tools import renders
 
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
+    """A quick run of two renders in turns with this same version, and of the scene's pairs."""
     path = tmp_path_factory.mktemp("bench") / "new" / "bench.json"
-    assert bench.main(["--quick", "--out", str(path)]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(speed, "QUICK", speed.Extent((40, 30), 1, (0,), 1, 4))
+        patch.setattr(bench, "_cases", lambda given, turns: iter([("small, loaded", {"seconds": 0.5})]))
+        assert bench.main(["--quick", "--out", str(path)]) == 0
     return path
 
 
-def test_file_follows_the_schema_and_a_broken_one_does_not(found):
-    run = json.loads(found.read_text())
-    assert _fits(run, bench.SCHEMA)
-    for where, name in (
-        (lambda run: run["scenes"]["3"], "floor"),
-        (lambda run: run["scenes"]["3"]["each_kernel"][0], "launches"),
-        (lambda run: next(iter(run["rivals"].values())), "median"),
-    ):
-        broken = copy.deepcopy(run)
-        del where(broken)[name]
-        assert not _fits(broken, bench.SCHEMA)
-    assert set(run["scenes"]) == {"3"}
-    assert run["scenes"]["3"]["rays"]["camera"] == 80 * 60 * 4
-    assert all(run["scenes"]["3"][name] > 0 for name in bench.COMPARED)
-    tracing = [k for k in run["scenes"]["3"]["each_kernel"] if k["kind"] == "traces rays"]
-    assert [k["size"] for k in tracing] == [80 * 60 * 4] and tracing[0]["seconds"] > 0
-    assert len(run["rivals"]) == rivals.PAIRS
-
-
-def test_comparison_prints_ratios(found):
-    before = bench.read(found)
-    now = copy.deepcopy(before)
-    now["scenes"]["3"]["render"] *= 2
-    name = next(iter(now["rivals"]))
-    now["rivals"][name] |= {"median": 3 * before["rivals"][name]["median"], "goal": 0.0}  # out of reach
-    lines = bench.table(now, before).splitlines()
-    line = lines[lines.index("") - 1]
-    assert line.startswith("3") and "(2.00x)" in line and line.count("(1.00x)") == 4
-    (line,) = (line for line in lines if line.startswith(name))
-    assert "(3.00x)" in line and line.endswith("0 slower")
-    assert "x)" not in bench.table(now)
-    now["rivals"][name] |= {"low": 0.9, "high": 1.1, "goal": 1.0}
-    assert "1 open" in bench.table(now)
+def test_file_has_a_row_for_each_figure(found):
+    run = bench.read(found)
+    assert run["schema"] == bench.SCHEMA and {"mitsuba", "llvm", "python"} <= run["versions"].keys()
+    assert len(run["rows"]) == 2 + 4
+    start, *_ = run["rows"].values()
+    assert start["goal"] == bench.START_GOAL and start["low"] <= start["ratio"] <= start["high"]
 
 
 @pytest.mark.parametrize(
-    "text", ["{}", "[1]", "no json", '{"schema": 1, "scenes": {}}', '{"schema": 2, "scenes": {}}']
+    "name", ["200 lights", "aamode=noise", "small, prepared", "small, with an update, filters"]
 )
+def test_renders_are_those_of_their_names(name, monkeypatch, variant):
+    make, count = renders.CASES[name]
+    render = make()
+    monkeypatch.setitem(renders.CASES, name, (lambda: render, 1))
+    assert renders.seconds(name) > 0 and count >= 1
+    if name == "200 lights":
+        assert len(render.args[0].emitters()) > 200
+
+
+def test_both_sides_take_turns(monkeypatch, tmp_path):
+    """The other Python measures the same cases."""
+    monkeypatch.setattr(renders, "CASES", {"small": (lambda: None, 1)})
+    script = tmp_path / "renders.py"
+    script.write_text("import sys; print('{\"%s\": %s}' % (sys.argv[1], sys.argv[0].count('/')))")
+    monkeypatch.setattr(renders, "__file__", str(script))
+    arguments = ["--small", "--turns", "2", "--before", sys.executable, "--out", str(tmp_path / "b.json")]
+    monkeypatch.setattr(bench, "_start", lambda turns: {"seconds": float(turns)})
+    assert bench.main(arguments) == 0
+    rows = json.loads((tmp_path / "b.json").read_text())["rows"]
+    assert rows["small"]["ratio"] == 1 and rows["small"]["other_seconds"] == rows["small"]["seconds"] > 0
+
+
+def test_comparison_prints_ratios(found):
+    before = bench.read(found)["rows"]
+    now = copy.deepcopy(before)
+    name = list(now)[-1]
+    now["small, loaded"]["seconds"] *= 2
+    now[name] |= {"ratio": 3 * before[name]["ratio"], "goal": 0.0}  # out of reach
+    assert "(2.00x)" in bench.line("small, loaded", now["small, loaded"], before["small, loaded"])
+    text = bench.line(name, now[name], before[name])
+    assert "(3.00x)" in text and text.endswith("0 slower")
+    assert "x)" not in bench.line(name, now[name])
+    assert bench.line(name, now[name] | {"low": 0.9, "high": 1.1, "goal": 1.0}).endswith("1 open")
+
+
+@pytest.mark.parametrize("text", ["{}", "[1]", "no json", '{"schema": 2, "rows": {}}', '{"schema": 3}'])
 def test_a_file_of_another_kind_is_refused(text, tmp_path, capsys):
     (tmp_path / "other.json").write_text(text)
     with pytest.raises(SystemExit):
@@ -88,14 +88,13 @@ def test_a_place_that_cannot_be_written_is_found_before_measuring(tmp_path, caps
         assert text == "" and errors.startswith("make bench: ") and reason in errors
 
 
-def test_schema_is_printed(capsys):
-    assert bench.main(["--schema"]) == 0
-    assert json.loads(capsys.readouterr().out) == bench.SCHEMA
-
-
 def test_the_place_of_kernels_can_be_chosen_in_time(run_python):
     """Dr.Jit reads it once, when it is imported."""
-    modules = (
-        "from mrt_mitsuba.validation import bench, cli; from mrt_mitsuba.validation.tools import commands"
-    )
+    modules = "from mrt_mitsuba.validation import cli; from mrt_mitsuba.validation.tools import commands"
     assert run_python(f"import sys; {modules}; print('drjit' in sys.modules)").stdout == "False\n"
+
+
+def test_renders_know_public_names_only():
+    """So that an earlier version can be measured."""
+    lines = Path(renders.__file__).read_text().splitlines()
+    assert not [line for line in lines if "from mrt_mitsuba" in line or "import mrt_mitsuba." in line]

@@ -13,7 +13,7 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.tools import device_bench
+from mrt_mitsuba.validation.studies import speed
 
 SIZE = {"width": 16, "height": 12}
 # Float32 in another order of operations; at edges and in narrow highlights a rounding can turn a pixel
@@ -83,8 +83,8 @@ def test_make_test_gpu_runs_its_selection_where_it_is_told_to(tmp_path: Path) ->
 
 
 def test_bench_of_a_device_measures_all_pairs() -> None:
-    rows = list(device_bench.measure("llvm_ad_rgb", device_bench.QUICK))
-    assert {(row.scene, row.other) for row in rows} == {
-        (scene, other) for scene in ("0", "1000 triangles") for other in ("direct", "path")
-    }
-    assert all(row.time.seconds > 0 and row.time.other_seconds > 0 for row in rows)
+    pairs = list(speed.on_device("llvm_ad_rgb", [(80, 60)], 1000))
+    assert len(pairs) == 2 * 6 and len({pair.name for pair in pairs}) == 12
+    for pair in (pairs[0], pairs[-1]):
+        time, _ = speed.compare(pair, 1)
+        assert time.seconds > 0 and time.other_seconds > 0

@@ -55,7 +55,7 @@ def validate(
             module = types.ModuleType(f"mrt_mitsuba.validation.studies.{name}")
             module.TITLE, module.run = TITLE, function  # type: ignore[attr-defined]
             monkeypatch.setitem(sys.modules, module.__name__, module)
-        monkeypatch.setattr(cli, "STUDIES", {name: cli.Entry(name, "") for name in studies})
+        monkeypatch.setattr(cli, "STUDIES", {name: (name, "", 1, 2) for name in studies})
         code = cli.main(["all", "--out", str(tmp_path), *options])
         if code == cli.INTERRUPTED:
             return code, {}, Page("")
@@ -131,13 +131,6 @@ def test_page_is_self_contained_with_answers_first_and_tables_last(validate, tmp
     assert [text for text in shown if text not in page.text] == []
 
 
-def test_names_stand_for_studies() -> None:
-    speed = list(cli.SPEED)
-    assert cli.named(["error-vs-time"]) == speed and cli.named(["growth"]) == ["growth"]
-    assert cli.named(["error-vs-time", "laws", "growth"]) == ["laws", *speed]
-    assert cli.named(["laws", "all"]) == list(cli.STUDIES)
-
-
 def test_list_has_a_line_on_each_study(capsys) -> None:
     from importlib import import_module
 
@@ -145,10 +138,10 @@ def test_list_has_a_line_on_each_study(capsys) -> None:
         with pytest.raises(SystemExit) as ended:
             cli.main([option])
         text = capsys.readouterr().out
-        assert ended.value.code == 0 and all(e.about in text and e.about for e in cli.STUDIES.values())
-    for entry in cli.STUDIES.values():
-        module = import_module(f"mrt_mitsuba.validation.studies.{entry.module}")
-        assert module.TITLE and callable(module.run) and 0 < entry.quick < entry.full
+        assert ended.value.code == 0 and all(about and about in text for _, about, *_ in cli.STUDIES.values())
+    for name, _, quick, full in cli.STUDIES.values():
+        module = import_module(f"mrt_mitsuba.validation.studies.{name}")
+        assert module.TITLE and callable(module.run) and 0 < quick < full
 
 
 @pytest.mark.parametrize(("bad", "verdict"), [(missed, "missed"), (broken, "failed"), (empty, "empty")])
@@ -163,7 +156,7 @@ def test_what_does_not_pass_is_shown_and_the_others_go_on(validate, capsys, bad,
 
 
 def test_a_study_that_cannot_be_imported_is_a_failure(monkeypatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(cli, "STUDIES", {"gone": cli.Entry("no_such_module", "")})
+    monkeypatch.setattr(cli, "STUDIES", {"gone": ("no_such_module", "", 1, 2)})
     assert cli.main(["gone", "--out", str(tmp_path / "new")]) == 1
     assert "ModuleNotFoundError" in (tmp_path / "new" / "summary.json").read_text()
 

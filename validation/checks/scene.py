@@ -71,11 +71,8 @@ class SceneCheck:
 
     def save(self, folder: str | Path) -> None:
         """Write the page (``index.html``), ``summary.json`` and CSV files. Raises ``OutputError``."""
-        report.prepare(Path(folder), "summary.json", "index.html")
-        outcomes = [
-            report.Outcome(check.study(), check.seconds) for check in (*self.checks.values(), self._pixels())
-        ]
-        report.write(Path(folder), outcomes, report.header(quick=False), title=f"{TITLE}: {self.name}")
+        studies = [check.study() for check in (*self.checks.values(), self._pixels())]
+        report.save(folder, *studies, title=f"{TITLE}: {self.name}")
 
     def _pixels(self) -> Check:
         law = Law("pixels", notes=[str(self.fault)] if self.fault else [])

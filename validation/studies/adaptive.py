@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.tools.own_scenes import LOCAL, SCENES, SPP, load
 from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.timing import timed
 
 TITLE = "Scenes of one's own, and rendering to an error"
 
@@ -36,16 +37,21 @@ class Extent:
 
 FULL = Extent(tuple(SCENES), (64, 48), 2**13, 4, 5, 32, (192, 144))
 QUICK = Extent(("gloss", "stratified", "texture_and_sky"), (32, 24), 2**12, 2, 3, 12, (48, 36))
+Truths = dict[str, tuple[Any, np.ndarray]]  # scenes and their pictures by name
 
 
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
     extent = QUICK if quick else FULL
-    loaded = {name: load(name, *extent.size) for name in extent.scenes}
-    truths = {name: _mean(scene, extent.truth) for name, scene in loaded.items()}
-    _uniform(study, extent, loaded, truths)
-    _calibration(study, extent, loaded, truths)
-    _bias(study, extent, loaded, truths)
+    once = min(extent.truth, 2**12)
+    truths: Truths = {}
+    for name in extent.scenes:
+        scene, seeds = load(name, *extent.size), range(10_000, 10_000 + extent.truth // once)
+        pictures = [np.array(mi.render(scene, spp=once, seed=seed), np.float64) for seed in seeds]
+        truths[name] = scene, np.mean(pictures, axis=0)
+    _uniform(study, extent, truths)
+    _calibration(study, extent, truths)
+    _bias(study, extent, truths)
     _equal_error(study, extent)
 
 
@@ -54,7 +60,7 @@ def rmse(picture: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(picture - truth, dtype=np.float64))))
 
 
-def shift(picture: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+def shift(picture: np.ndarray, truth: np.ndarray) -> float:
     """Return how far a picture is shifted, in pixels: the step that explains most of what is different.
 
     Least squares of the difference against the truth's slopes, which is the top of the cross-correlation
@@ -63,41 +69,19 @@ def shift(picture: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     rows, columns = np.gradient(truth.astype(np.float64), axis=(0, 1))
     slopes = np.stack([columns.ravel(), rows.ravel()], axis=1)
     step, *_ = np.linalg.lstsq(-slopes, (picture - truth).ravel().astype(np.float64), rcond=None)
-    return float(step[0]), float(step[1])
+    return math.hypot(*step)
 
 
-def _mean(scene: Any, spp: int) -> np.ndarray:
-    """Return the mean of Mitsuba's pictures with so many rays in all."""
-    import mitsuba as mi
-
-    once = min(spp, 2**12)
-    pictures = (np.array(mi.render(scene, spp=once, seed=10_000 + k), np.float64) for k in range(spp // once))
-    return np.asarray(sum(pictures) / (spp // once))
-
-
-def _seconds(render: Callable[[], Any]) -> tuple[Any, float]:
-    start = time.perf_counter()
-    result = render()
-    return result, time.perf_counter() - start
-
-
-# ------------------------------------------- Uniform samples -------------------------------------------
-
-
-def _uniform(study: Study, extent: Extent, loaded: dict[str, Any], truths: dict[str, np.ndarray]) -> None:
-    import mitsuba as mi
-
+def _uniform(study: Study, extent: Extent, truths: Truths) -> None:
+    """Compare uniform samples with Mitsuba's, in error and place."""
     rows: list[tuple[Any, ...]] = []
-    plain: dict[str, Any] = {"aa": 1, "aamode": "none", "spp": SPP}
-    with study.stage("Uniform samples", len(loaded)) as advance:
-        for name, scene in loaded.items():
-            seeds = range(extent.repeats)
-            ours = [mrt.render(scene, **plain, seed=seed).image for seed in seeds]
-            theirs = [np.array(mi.render(scene, spp=SPP, seed=seed)) for seed in seeds]
-            errors = [np.sqrt(np.mean([rmse(p, truths[name]) ** 2 for p in ps])) for ps in (ours, theirs)]
-            step = shift(np.mean(ours, axis=0), np.mean(theirs, axis=0))
-            rows.append((name, *errors, errors[0] / errors[1], math.hypot(*step)))
-            advance(1)
+    for name, (scene, truth) in study.each("Uniform samples", truths.items()):
+        seeds = range(extent.repeats)
+        ours = [mrt.render(scene, aa=1, aamode="none", spp=SPP, seed=seed).image for seed in seeds]
+        theirs = [np.array(mi.render(scene, spp=SPP, seed=seed)) for seed in seeds]
+        errors = [np.sqrt(np.mean([rmse(p, truth) ** 2 for p in ps])) for ps in (ours, theirs)]
+        step = shift(np.mean(ours, axis=0), np.mean(theirs, axis=0))
+        rows.append((name, *errors, errors[0] / errors[1], step))
     study.table(
         "uniform",
         f"RMSE of {SPP} rays a pixel, ours and mi.render's, {extent.size[0]}x{extent.size[1]}",
@@ -105,37 +89,30 @@ def _uniform(study: Study, extent: Extent, loaded: dict[str, Any], truths: dict[
         rows,
         "With the same seeds, the rays are the same.",
     )
-    why = "the same rays; least fault: a tenth of the samples left out"
-    study.at_most(
-        "uniform: largest distance of the ratio from 1", max(abs(r[3] - 1) for r in rows), 0.05, why
+    worst, why = (
+        max(abs(r[3] - 1) for r in rows),
+        "the same rays; least fault: a tenth of them left out",
     )
+    study.at_most("uniform: largest distance of the ratio from 1", worst, 0.05, why)
     why = "a lattice off by half a sample shifts by 0.06, one by half a pixel by 0.5"
     study.at_most("uniform: largest shift, pixels", max(r[4] for r in rows), 0.02, why)
 
 
-# --------------------------------------------- To an error ---------------------------------------------
-
-
-def _calibration(study: Study, extent: Extent, loaded: dict[str, Any], truths: dict[str, np.ndarray]) -> None:
-    import mitsuba as mi
-
+def _calibration(study: Study, extent: Extent, truths: Truths) -> None:
+    """Render to errors, and compare the stated with the true ones."""
     rows, held, count = [], 0, 0
-    with study.stage("Stated errors", len(loaded) * len(TARGETS) * extent.seeds) as advance:
-        for name, scene in loaded.items():
-            uniform = rmse(np.array(mi.render(scene, spp=SPP, seed=1)), truths[name])
-            found = []
-            for target in TARGETS:
-                for seed in range(extent.seeds):
-                    result = mrt.render(scene, target=target * uniform, seed=seed)
-                    true, error = rmse(result.image, truths[name]), result.error
-                    assert error is not None  # there was a target
-                    found.append(
-                        (true / error.rmse, error.low <= true <= error.high, error.high / error.rmse)
-                    )
-                    advance(1)
-            ratios, inside, widths = zip(*found, strict=True)
-            held, count = held + sum(inside), count + len(inside)
-            rows.append((name, len(found), sum(inside), np.mean(ratios), np.std(ratios), np.mean(widths)))
+    for name, (scene, truth) in study.each("Stated errors", truths.items()):
+        uniform = rmse(np.array(mi.render(scene, spp=SPP, seed=1)), truth)
+        found = []
+        for target in TARGETS:
+            for seed in range(extent.seeds):
+                result = mrt.render(scene, target=target * uniform, seed=seed)
+                true, error = rmse(result.image, truth), result.error
+                assert error is not None  # there was a target
+                found.append((true / error.rmse, error.low <= true <= error.high, error.high / error.rmse))
+        ratios, inside, widths = zip(*found, strict=True)
+        held, count = held + sum(inside), count + len(inside)
+        rows.append((name, len(found), sum(inside), np.mean(ratios), np.std(ratios), np.mean(widths)))
     study.table(
         "calibration",
         f"True error against the stated one, with its interval of {LEVEL:.0%}",
@@ -147,24 +124,20 @@ def _calibration(study: Study, extent: Extent, loaded: dict[str, Any], truths: d
     study.at_least("stated errors that hold", held / count, ENOUGH, why)
 
 
-def _bias(study: Study, extent: Extent, loaded: dict[str, Any], truths: dict[str, np.ndarray]) -> None:
+def _bias(study: Study, extent: Extent, truths: Truths) -> None:
+    """Compare the mean of many adaptive pictures with the truth."""
     rows: list[tuple[str, float, float, float]] = []
-    with study.stage("Bias", len(loaded) * extent.pictures) as advance:
-        for name, scene in loaded.items():
-            means, total, square = [], np.zeros_like(truths[name]), np.zeros_like(truths[name])
-            for seed in range(extent.pictures):
-                image = mrt.render(scene, aamode="noise", spp=32, seed=seed).image.astype(np.float64)
-                means.append(image.mean())
-                total, square = total + image, square + image**2
-                advance(1)
-            mean, n = total / extent.pictures, extent.pictures
-            spread = (square / n - mean**2) * n / (n - 1)  # variance of one picture
-            off = np.mean((mean - truths[name]) ** 2 - spread / n)  # what noise does not explain
-            whole = float(np.mean(means) - truths[name].mean()) / float(np.std(means, ddof=1))
-            rows.append((name, math.sqrt(max(off, 0) / np.mean(spread)), whole, 1.96 / math.sqrt(n)))
+    n = extent.pictures
+    for name, (scene, truth) in study.each("Bias", truths.items()):
+        pictures = [mrt.render(scene, aamode="noise", spp=32, seed=seed).image for seed in range(n)]
+        stack = np.array(pictures, np.float64)
+        spread, means = stack.var(axis=0, ddof=1), stack.mean(axis=(1, 2, 3))
+        off = np.mean((stack.mean(axis=0) - truth) ** 2 - spread / n)  # what noise does not explain
+        whole = float(np.mean(means) - truth.mean()) / float(np.std(means, ddof=1))
+        rows.append((name, math.sqrt(max(off, 0) / np.mean(spread)), whole, 1.96 / math.sqrt(n)))
     study.table(
         "bias",
-        f"Bias of {extent.pictures} pictures of a mean of 32 rays, in standard errors of one",
+        f"Bias of {n} pictures of a mean of 32 rays, in standard errors of one",
         ("scene", "of a pixel", "of the picture's mean", "± of that"),
         rows,
         "The truth's own error counts as bias.",
@@ -178,24 +151,22 @@ def _bias(study: Study, extent: Extent, loaded: dict[str, Any], truths: dict[str
 def _equal_error(study: Study, extent: Extent) -> None:
     """Compare costs at equal error, given that uniform rays cost in proportion and err by their root."""
     rows, columns = [], ("rays", "seconds", "from", "to")
-    with study.stage("Equal error", len(extent.scenes)) as advance:
-        for name in extent.scenes:
-            uniform, noise, target = _in_turns(load(name, *extent.timed), extent.repeats)
-            limit, why = 1.1, "noise is even: estimating it may cost a tenth"
-            if name in LOCAL:
-                limit, why = 0.6, "noise is local: rays elsewhere are saved"
-            row: list[Any] = [name]
-            for door, ours in (("aamode=noise", noise), ("target", target)):
-                worth = np.array(ours.squares) / uniform.squares
-                rays = float(np.median(worth * ours.rays)) / SPP
-                seconds = worth * ours.seconds / uniform.seconds
-                low, middle, high = np.quantile(seconds, (0.1, 0.5, 0.9))
-                row += [rays, float(middle), float(low), float(high)]
-                what = f"to the same error / mi.render's: {name}, {door}"
-                study.goal(f"time {what}", middle, limit, why, interval=(low, high))
-                study.at_most(f"rays {what}", rays, limit, why)
-            rows.append(tuple(row))
-            advance(1)
+    for name in study.each("Equal error", extent.scenes):
+        uniform, noise, target = _in_turns(load(name, *extent.timed), extent.repeats)
+        limit, why = 1.1, "noise is even: estimating it may cost a tenth"
+        if name in LOCAL:
+            limit, why = 0.6, "noise is local: rays elsewhere are saved"
+        row: list[Any] = [name]
+        for door, ours in (("aamode=noise", noise), ("target", target)):
+            worth = ours["squares"] / uniform["squares"]
+            rays = float(np.median(worth * ours["rays"])) / SPP
+            seconds = worth * ours["seconds"] / uniform["seconds"]
+            low, middle, high = np.quantile(seconds, (0.1, 0.5, 0.9))
+            row += [rays, float(middle), float(low), float(high)]
+            what = f"to the same error / mi.render's: {name}, {door}"
+            study.goal(f"time {what}", middle, limit, why, interval=(low, high))
+            study.at_most(f"rays {what}", rays, limit, why)
+        rows.append(tuple(row))
     study.table(
         "equal-error",
         f"Cost of the error that mi.render has with {SPP} rays a pixel, {extent.timed[0]}x{extent.timed[1]}",
@@ -206,25 +177,12 @@ def _equal_error(study: Study, extent: Extent) -> None:
     )
 
 
-@dataclass
-class _Spent:
-    """Pictures of one kind, and what each took."""
+def _in_turns(scene: Any, repeats: int) -> list[dict[str, np.ndarray]]:
+    """Render a scene by ``mi.render``, with ``aamode="noise"``, and to the error of the first, in turns.
 
-    render: Callable[[int], tuple[np.ndarray, float]]  #: by seed; the picture and its rays a pixel
-    pictures: list[np.ndarray] = field(default_factory=list)
-    rays: list[float] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-
-    @property
-    def squares(self) -> list[float]:
-        """Squared error of each picture, by its distance from the mean of all: no truth is needed."""
-        n, mean = len(self.pictures), np.asarray(np.mean(self.pictures, axis=0, dtype=np.float64))
-        return [rmse(picture, mean) ** 2 * n / (n - 1) for picture in self.pictures]
-
-
-def _in_turns(scene: Any, repeats: int) -> list[_Spent]:
-    """Render a scene by ``mi.render``, with ``aamode="noise"``, and to the error of the first, in turns."""
-    import mitsuba as mi
+    Return "rays", "seconds" and "squares" of each kind, by picture: the squared error by its distance
+    from the mean of all, for which no truth is needed.
+    """
 
     def uniform(seed: int) -> tuple[np.ndarray, float]:
         return np.array(mi.render(scene, spp=SPP, seed=seed)), SPP
@@ -234,17 +192,22 @@ def _in_turns(scene: Any, repeats: int) -> list[_Spent]:
         return result.image, result.rounds[-1].spp
 
     error = rmse(uniform(1000)[0], uniform(1001)[0]) / math.sqrt(2)
-    kinds = [
-        _Spent(uniform),
-        _Spent(lambda seed: ours(seed, aamode="noise", spp=SPP)),
-        _Spent(lambda seed: ours(seed, target=error)),
+    kinds: list[Callable[[int], tuple[np.ndarray, float]]] = [
+        uniform,
+        lambda seed: ours(seed, aamode="noise", spp=SPP),
+        lambda seed: ours(seed, target=error),
     ]
     for kind in kinds:
-        kind.render(1000)  # compiles
+        kind(1000)  # compiles
+    spent: list[list[tuple[np.ndarray, float, float]]] = [[] for _ in kinds]
     for seed in range(repeats):
-        for kind in kinds:
-            (picture, rays), seconds = _seconds(lambda: kind.render(seed))  # noqa: B023
-            kind.pictures.append(picture)
-            kind.rays.append(rays)
-            kind.seconds.append(seconds)
-    return kinds
+        for kind, kept in zip(kinds, spent, strict=True):
+            (picture, rays), seconds = timed(lambda: kind(seed))  # noqa: B023
+            kept.append((picture, rays, seconds))
+    found = []
+    for kept in spent:
+        mean = np.mean([picture for picture, _, _ in kept], axis=0, dtype=np.float64)
+        squares = [rmse(picture, mean) ** 2 * repeats / (repeats - 1) for picture, _, _ in kept]
+        rays, seconds = (np.array([one[i] for one in kept]) for i in (1, 2))
+        found.append({"squares": np.array(squares), "rays": rays, "seconds": seconds})
+    return found

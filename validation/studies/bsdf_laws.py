@@ -12,7 +12,6 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.scene.report import SCENE_4_MATERIALS
 from mrt_mitsuba.validation.checks.bsdf import check_bsdf
-from mrt_mitsuba.validation.studies import inverse_rendering
 from mrt_mitsuba.validation.tools.bsdf_probe import (
     albedo,
     at_angle,
@@ -79,7 +78,7 @@ def run(study: Study, *, quick: bool) -> None:
         "follow the stated density and carry value over density, light can be followed either way, no more "
         "comes out than goes in, and derivatives are those of the values."
     )
-    laws = (general, furnace, dielectric_terms, published, never_negative, inverse_rendering.run)
+    laws = (general, furnace, dielectric_terms, published, never_negative)
     for law in study.each("laws", laws):
         law(study, quick=quick)
 

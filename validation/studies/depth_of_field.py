@@ -18,7 +18,6 @@ picture's pixels.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,79 +31,69 @@ from mrt_mitsuba.validation.tools.study import Study
 
 TITLE = "Depth of field: the filters against a lens"
 
-SCENES = (3, 4)
 MODES = ("report", "corrected")
 REACH = filters.dof.MAX_AMOUNT  # pixels that a blurred one takes from in the report
-
-
-@dataclass(frozen=True)
-class Extent:
-    """How much to measure."""
-
-    size: tuple[int, int]
-    aa: int
-    spp: int  # rays through the lens for each sample
-
-
-FULL = Extent((400, 300), 4, 32)
-QUICK = Extent((128, 96), 3, 12)
-
-
-@dataclass(frozen=True)
-class Lens:
-    """A thin lens: radius of the aperture and distance in focus, scene units."""
-
-    radius: float
-    focus: float
-
-    def through(self, nodes: dict[str, Any]) -> dict[str, Any]:
-        """Return a scene's dict with its camera behind the lens."""
-        lens = {"type": "thinlens", "aperture_radius": self.radius, "focus_distance": self.focus}
-        return {**nodes, "sensor": {**nodes["sensor"], **lens}}
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Pictures [H, W, 3] of one scene by name: sharp, report, corrected, thinlens; and regions [H, W]."""
-
-    pictures: dict[str, np.ndarray]
-    regions: dict[str, np.ndarray]
-    lens: Lens
-    noise: float  # RMSE of the picture through the lens
-
-    def error(self, name: str, region: str = "all") -> float:
-        """Return the RMSE to the lens."""
-        difference = self.pictures[name] - self.pictures["thinlens"]
-        return float(np.sqrt(np.mean(np.square(difference[self.regions[region]]))))
+Lens = dict[str, Any]  # of a camera: a thin lens, by the radius of its aperture and its distance in focus
 
 
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
-    extent = QUICK if quick else FULL
-    rows = []
-    for number in study.each("Depth of field", SCENES):
-        found = compare(report_scene(number), extent)
-        rows += _rows(number, found)
-        _hold(study, number, found)
-        _show(study, number, found)
+    size, aa, spp = ((128, 96), 3, 12) if quick else ((400, 300), 4, 32)
+    rows: list[dict[str, Any]] = []
+    for number in study.each("Depth of field", (3, 4)):
+        rows += compare(study, number, size=size, aa=aa, spp=spp)
     note = "Near depth steps: within 8 pixels of an outline. At the border: within 8 pixels of it."
     study.records("errors", "RMSE to a lens", rows, note)
 
 
-def compare(scene: Scene, extent: Extent) -> Comparison:
-    """Blur a sharp render with each filter, and render it through the fitted lens."""
-    width, height = extent.size
-    options: dict[str, Any] = {"aa": extent.aa, "aamode": "none", "lattice": "centered", "focaldist": 0}
+def compare(study: Study, number: int, *, size: tuple[int, int], aa: int, spp: int) -> list[dict[str, Any]]:
+    """Blur a sharp render with each filter, and hold both to renders through the fitted lens."""
+    scene, name = report_scene(number), f"scene {number}"
+    width, height = size
+    options: dict[str, Any] = {"aa": aa, "aamode": "none", "lattice": "centered", "focaldist": 0}
     sharp = mrt.render(scene, width=width, height=height, layers=["depth", "normal"], **options)
     depth = sharp.layers["depth.Z"]
     focus: dict[str, Any] = {"focal_distance": scene.focal_distance, "focal_range": scene.focal_range}
     pictures = {"sharp": sharp.image}
     pictures |= {mode: filters.gaussian_dof(sharp.image, depth, **focus, mode=mode) for mode in MODES}
     lens = fit_lens(scene, depth)
-    one, other = (_through(lens, scene, extent, seed) for seed in (1, 100_001))
-    pictures["thinlens"] = (one + other) / 2
+    nodes = scene.to_dict(width=width, height=height)
+    nodes["sensor"] |= lens
+    one, other = (mrt.render(nodes, **options, spp=spp, seed=seed).image for seed in (1, 100_001))
+    truth = pictures["thinlens"] = (one + other) / 2
+    regions = _regions(sharp)
+    squares = {mode: np.square(pictures[mode] - truth) for mode in ("sharp", *MODES)}
+    errors = {
+        (mode, region): float(np.sqrt(square[mask].mean()))
+        for mode, square in squares.items()
+        for region, mask in regions.items()
+        if mask.any()
+    }
+    corrected, why = errors["corrected", "all"], "a correction that is worse is none"
+    study.at_most(f"{name}: RMSE of corrected / report", corrected / errors["report", "all"], 1, why)
+    study.at_most(f"{name}: RMSE of corrected / no blur at all", corrected / errors["sharp", "all"], 1, why)
     noise = float(np.sqrt(np.mean(np.square(one - other)))) / 2
-    return Comparison(pictures, _regions(sharp), lens, noise)
+    why = "else the comparison would be one of noise"
+    study.at_most(f"{name}: noise of the lens / RMSE of corrected", noise / corrected, 0.5, why)
+    study.record(f"{name}: aperture radius", lens["aperture_radius"])
+    study.record(f"{name}: focus distance", lens["focus_distance"])
+    sheet = np.concatenate(list(pictures.values()), axis=1)
+    caption = f"Left to right: {', '.join(pictures)}."
+    study.picture(f"pictures-{number}", f"Scene {number}", sheet, caption, exr=True)
+    sheet = np.concatenate([np.abs(pictures[mode] - truth) for mode in MODES], axis=1)
+    title = f"Scene {number}: difference from the lens, five times"
+    study.picture(f"errors-{number}", title, 5 * sheet, f"Left to right: {', '.join(MODES)}.")
+    return [
+        {
+            "scene": number,
+            "filter": mode,
+            "region": region,
+            "pixels": int(regions[region].sum()),
+            "RMSE": error,
+            "RMSE / without": error / errors["sharp", region],
+        }
+        for (mode, region), error in errors.items()
+    ]
 
 
 def fit_lens(scene: Scene, depth: np.ndarray) -> Lens:
@@ -115,7 +104,7 @@ def fit_lens(scene: Scene, depth: np.ndarray) -> Lens:
     signed = np.where(depth < scene.focal_distance, -radius, radius)[hit]
     (a, b), *_ = np.linalg.lstsq(np.stack([np.ones(hit.sum()), -1 / depth[hit]], axis=1), signed, rcond=None)
     pixels = depth.shape[1] / (2 * math.tan(math.radians(scene.camera.hfov) / 2))
-    return Lens(radius=float(b / pixels), focus=float(b / a))
+    return {"type": "thinlens", "aperture_radius": float(b / pixels), "focus_distance": float(b / a)}
 
 
 def disc_radius(amount: np.ndarray) -> np.ndarray:
@@ -127,13 +116,6 @@ def disc_radius(amount: np.ndarray) -> np.ndarray:
     return np.where(amount < 1, amount, np.sqrt(np.maximum(2 * amount - 1, 0)))
 
 
-def _through(lens: Lens, scene: Scene, extent: Extent, seed: int) -> np.ndarray:
-    width, height = extent.size
-    nodes = lens.through(scene.to_dict(width=width, height=height))
-    options: dict[str, Any] = {"aa": extent.aa, "aamode": "none", "lattice": "centered"}
-    return mrt.render(nodes, **options, spp=extent.spp, seed=seed).image
-
-
 def _regions(sharp: Any) -> dict[str, np.ndarray]:
     depth = sharp.layers["depth.Z"]
     normal = np.stack([sharp.layers[f"normal.{axis}"] for axis in "XYZ"], axis=-1)
@@ -141,60 +123,5 @@ def _regions(sharp: Any) -> dict[str, np.ndarray]:
     border[REACH:-REACH, REACH:-REACH] = False
     outlines = np.asarray(filters.geometry_edges(normal, depth, crease_angle=180).mask)
     steps = binary_dilation(outlines, iterations=REACH) & ~border
-    return {
-        "all": np.ones(depth.shape, bool),
-        "near depth steps": steps,
-        "at the border": border,
-        "elsewhere": ~(steps | border),
-    }
-
-
-def _rows(number: int, found: Comparison) -> list[dict[str, Any]]:
-    return [
-        {
-            "scene": number,
-            "filter": name,
-            "region": region,
-            "pixels": int(mask.sum()),
-            "RMSE": found.error(name, region),
-            "RMSE / without": found.error(name, region) / found.error("sharp", region),
-        }
-        for name in ("sharp", *MODES)
-        for region, mask in found.regions.items()
-        if mask.any()
-    ]
-
-
-def _hold(study: Study, number: int, found: Comparison) -> None:
-    name = f"scene {number}"
-    corrected, why = found.error("corrected"), "a correction that is worse is none"
-    study.at_most(f"{name}: RMSE of corrected / report", corrected / found.error("report"), 1, why)
-    study.at_most(f"{name}: RMSE of corrected / no blur at all", corrected / found.error("sharp"), 1, why)
-    why = "else the comparison would be one of noise"
-    study.at_most(f"{name}: noise of the lens / RMSE of corrected", found.noise / corrected, 0.5, why)
-    study.record(f"{name}: aperture radius", found.lens.radius)
-    study.record(f"{name}: focus distance", found.lens.focus)
-    by_region = {
-        region: found.error("corrected", region) / found.error("report", region)
-        for region, mask in found.regions.items()
-        if mask.any()
-    }
-    best = min(by_region, key=by_region.__getitem__)
-    study.text(
-        f"Scene {number}: the lens nearest to the report's blur has an aperture of radius "
-        f"{found.lens.radius:.3g} and is focused at {found.lens.focus:.3g}. The corrected filter has "
-        f"{by_region['all']:.0%} of the report's error, and gains most {best} ({by_region[best]:.0%}). Both "
-        "keep what no filter over one picture can know: what blurred things hide, and that the report's "
-        "amounts do not follow a lens."
-    )
-
-
-def _show(study: Study, number: int, found: Comparison) -> None:
-    order = ("sharp", *MODES, "thinlens")
-    sheet = np.concatenate([found.pictures[name] for name in order], axis=1)
-    study.picture(
-        f"pictures-{number}", f"Scene {number}", sheet, f"Left to right: {', '.join(order)}.", exr=True
-    )
-    errors = np.concatenate([np.abs(found.pictures[m] - found.pictures["thinlens"]) for m in MODES], axis=1)
-    title = f"Scene {number}: difference from the lens, five times"
-    study.picture(f"errors-{number}", title, 5 * errors, f"Left to right: {', '.join(MODES)}.")
+    every = np.ones(depth.shape, bool)
+    return {"all": every, "near depth steps": steps, "at the border": border, "elsewhere": ~(steps | border)}

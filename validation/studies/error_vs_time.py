@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from mrt_mitsuba.validation.tools import knobs
-from mrt_mitsuba.validation.tools.precision import Findings, Point
+import mrt_mitsuba as mrt
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.studies.depth_of_field import fit_lens
+from mrt_mitsuba.validation.tools.precision import Point
 from mrt_mitsuba.validation.tools.precision_page import describe
+from mrt_mitsuba.validation.tools.renders import load
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.work_precision import error_vs_time
 
@@ -15,139 +19,217 @@ TITLE = "Error against run time"
 
 ANSWERS = (0.03, 0.01, 0.003, 0.001)  # RMSE that the page finds settings for
 INVISIBLE = 0.5 / 255  # half a step of an 8-bit picture
-# Scenes whose highlights are broad: elsewhere rare, very bright paths rule the mean square of every picture
-TAME = (0, 7, 9)
-PICTURES = ("path", "lens")  # trades whose cases look different in the same time
+MODES = ("none", "luma", "sobel", "geometry")
+CUT_OFFS = (0.0, 1 / 16 / 255, 1 / 255, 4 / 255, 16 / 255)
+DEPTHS = (1, 2, 3, 5, 10)
+
+Options = dict[str, Any]
+Points = Mapping[str, Point]
 
 
 @dataclass(frozen=True)
 class Extent:
-    """How much to measure: scenes by the trade of ``knobs.TRADES``."""
+    """How much to measure: how far the settings go, and scenes by trade."""
 
-    settings: knobs.Extent
+    size: tuple[int, int]
+    amounts: Sequence[int]  # aa
+    reference_aa: int  # an even multiple of each: at an odd one, lattices share samples and with them errors
+    spp: Sequence[int]
+    reference_spp: int
     scenes: Mapping[str, Sequence[int]]
     repeats: int
 
+    def scene(self, number: int, **options: Any) -> Options:
+        """Return a scene of the report as a dict, of the extent's size."""
+        return mrt.scene_dict(number, width=self.size[0], height=self.size[1], **options)
 
-SCENES = (0, 1, 2, 3, 4, 7, 9)
-FULL = Extent(
-    knobs.Extent((240, 180), (1, 2, 4, 8), 48, (1, 4, 16, 64), 2048),
-    {"sampling": SCENES, "whitted": SCENES, "path": TAME, "lens": (3, 4)},
-    5,
-)
-QUICK = Extent(
-    knobs.Extent((64, 48), (1, 4), 24, (1, 16), 512),
-    {"sampling": (0,), "whitted": (0,), "path": (0,), "lens": (3,)},
-    1,
-)
+
+ALL = (0, 1, 2, 3, 4, 7, 9)
+# Under path, scenes of broad highlights: elsewhere rare, very bright paths rule every mean square
+OF_TRADES = {"sampling": ALL, "whitted": ALL, "path": (0, 7, 9), "lens": (3, 4)}
+FULL = Extent((240, 180), (1, 2, 4, 8), 48, (1, 4, 16, 64), 2048, OF_TRADES, 5)
+QUICK_TRADES = {"sampling": (0,), "whitted": (0,), "path": (0,), "lens": (3,)}
+QUICK = Extent((64, 48), (1, 4), 24, (1, 16), 512, QUICK_TRADES, 1)
+
+
+@dataclass(frozen=True)
+class Trade:
+    """Settings of one kind on one scene, and the picture they strive for: arguments of ``error_vs_time``."""
+
+    scene: Any
+    title: str
+    truth: str  # what the reference is
+    cases: Mapping[str, Options]
+    reference: Any
+    shared: Options
+    hold: Callable[[Study, str, Points], float | None]  # states bounds; returns the least error to be judged
+    strips: bool = False  # whether cases look different in the same time
 
 
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
     extent = QUICK if quick else FULL
     jobs = [(name, number) for name, numbers in extent.scenes.items() for number in numbers]
-    samplings: dict[int, Findings] = {}
+    samplings: dict[Any, Points] = {}
     for name, number in study.each("Error against time", jobs):
-        trade = knobs.TRADES[name](number, extent.settings)
-        found = error_vs_time(
-            trade.scene,
-            trade.cases,
-            reference=trade.reference,
-            repeats=extent.repeats,
-            shared=trade.shared,
-            strips=name in PICTURES and not quick,
-        )
+        trade = TRADES[name](number, extent)
+        strips = trade.strips and not quick
+        options: Options = {"reference": trade.reference, "shared": trade.shared, "strips": strips}
+        found = error_vs_time(trade.scene, trade.cases, repeats=extent.repeats, **options)
         where = f"scene {number}, {name}"
         describe(study, found, where, f"Scene {number}: {trade.title}", trade.truth)
-        if not found.failed:
-            HOLD[name](study, where, found)
+        least = None if found.failed else trade.hold(study, where, found.points)
+        if least is not None:
+            what = f"{where}: error of the reference / least error it judges"
+            why = "then it changes no error by more than an eighth, and the judge is better than the judged"
+            study.at_most(what, found.reference_error / least, 0.5, why)
         if name == "sampling":
-            samplings[number] = found
+            samplings[number] = found.points
         del trade, found  # the scenes with them
     if extent.repeats > 1:  # else a disturbance would decide
-        _answer(study, samplings)
+        rows = [[number, *(best([points], e) for e in ANSWERS)] for number, points in samplings.items()]
+        if len(samplings) > 1:
+            rows.append(["all of these", *(best([*samplings.values()], e) for e in ANSWERS)])
+        columns = ["scene", *(f"RMSE at most {error:g}" for error in ANSWERS)]
+        note = "The fastest of all modes of anti-aliasing, amounts and lattices: aamode, aa, lattice."
+        study.table("choose", "Which settings for an error of x?", columns, rows, note, first=True)
 
 
-def fastest(points: Iterable[Point], error: float) -> Point | None:
-    """Return the fastest case with an RMSE of at most so much."""
-    return min((p for p in points if p.rmse <= error), key=lambda p: p.seconds, default=None)
-
-
-def for_all(samplings: Sequence[Mapping[str, Point]], error: float) -> str:
+def best(scenes: Sequence[Points], error: float) -> str:
     """Return the case that stays within an error in every scene in the least time of all together."""
-    good = [name for name in samplings[0] if all(points[name].rmse <= error for points in samplings)]
-    seconds = {name: sum(points[name].seconds for points in samplings) for name in good}
-    best = min(seconds, key=seconds.__getitem__, default=None)
-    return f"{best}: {1000 * seconds[best]:.3g} ms" if best else "none of these"
+    good = [name for name in scenes[0] if all(points[name].rmse <= error for points in scenes)]
+    seconds = {name: sum(points[name].seconds for points in scenes) for name in good}
+    fastest = min(seconds, key=seconds.__getitem__, default=None)
+    return f"{fastest}: {1000 * seconds[fastest]:.3g} ms" if fastest else "none of these"
 
 
-def _answer(study: Study, samplings: Mapping[int, Findings]) -> None:
-    """Add which settings to take for which error: in each scene, and one that does for all of them."""
-    rows = []
-    for number, found in samplings.items():
-        best = [fastest(found.points.values(), error) for error in ANSWERS]
-        shown = (f"{p.name}: {1000 * p.seconds:.3g} ms" if p else "none of these" for p in best)
-        rows.append([number, *shown])
-    if len(samplings) > 1:
-        every = [found.points for found in samplings.values()]
-        rows.append(["all of these", *(for_all(every, error) for error in ANSWERS)])
-    columns = ["scene", *(f"RMSE at most {error:g}" for error in ANSWERS)]
-    note = "The fastest of all modes of anti-aliasing, amounts and lattices: aamode, aa, lattice."
-    study.table("choose", "Which settings for an error of x?", columns, rows, note, first=True)
-
-
-# ------------------- What must hold: facts that no load on the machine changes -------------------
-
-
-def _rmse(found: Findings, name: str) -> float:
-    return found.points[name].rmse
-
-
-def _of_number(names: Iterable[str], pattern: str) -> list[str]:
-    """Return the cases of a name with a number in it, "none aa={} centered", by that number."""
+def _ends(names: Iterable[str], pattern: str) -> tuple[str, str, float]:
+    """Return the cases of least and most of a number, "none aa={} centered", and how much less that is."""
     before, after = pattern.split("{}")
-    words = [n for n in names if n.startswith(before) and n.endswith(after)]
-    return sorted(words, key=lambda n: float(n[len(before) : len(n) - len(after)]))
+    numbers = {float(n[len(before) : len(n) - len(after)]): n for n in names
+               if n.startswith(before) and n.endswith(after)}  # fmt: skip
+    few, many = min(numbers), max(numbers)
+    return numbers[few], numbers[many], few / many
 
 
-def _hold_reference(study: Study, where: str, found: Findings, least: float) -> None:
-    what = f"{where}: error of the reference / least error it judges"
-    why = "then it changes no error by more than an eighth, and the judge is better than the judged"
-    study.at_most(what, found.reference_error / least, 0.5, why)
+def sampling(number: int, extent: Extent) -> Trade:
+    """Return which pixels get how many samples, and where in the pixel."""
+    most = extent.reference_aa
+
+    def hold(study: Study, where: str, points: Points) -> float:
+        few, many, share = _ends(points, "none aa={} centered")
+        what, ratio = f"{where}: RMSE of {many} / {few}", points[many].rmse / points[few].rmse
+        why = "an edge of the lattice is known to 1 / aa; twice that: samples that do not help leave 1"
+        study.at_most(what, ratio, 2 * share, why)
+        return points[many].rmse
+
+    return Trade(
+        extent.scene(number),
+        "anti-aliasing mode, aa and lattice",
+        f"{most}x{most} centered samples in every pixel; its error: what three quarters of {most} change",
+        {
+            f"{mode} aa={aa} {lattice}": {"aa": aa, "aamode": mode, "lattice": lattice}
+            for lattice in ("report", "centered")
+            for mode in MODES
+            for aa in extent.amounts
+            if aa > 1 or mode == "none"
+        },
+        [{"aa": aa, "aamode": "none", "lattice": "centered"} for aa in (most, most * 3 // 4)],
+        {},
+        hold,
+    )
 
 
-def _hold_sampling(study: Study, where: str, found: Findings) -> None:
-    few, *_, many = _of_number(found.points, "none aa={} centered")
-    amounts = [float(name.split()[1][3:]) for name in (few, many)]
-    what = f"{where}: RMSE of {many} / {few}"
-    why = "an edge of the lattice is known to 1 / aa; twice that: samples that do not help leave 1"
-    study.at_most(what, _rmse(found, many) / _rmse(found, few), 2 * amounts[0] / amounts[1], why)
-    _hold_reference(study, where, found, _rmse(found, many))
+def whitted(number: int, extent: Extent) -> Trade:
+    """Return cut-off, bounce limit and form of the Fresnel factor, at the same samples."""
+
+    def integrator(**parameters: Any) -> Options:
+        return {"integrator": {"type": "mrt_whitted", **parameters}}
+
+    def hold(study: Study, where: str, points: Points) -> None:
+        cut_off = points[f"min_contribution={255 * CUT_OFFS[1]:g}/255"]
+        why = "half a step of 8 bits, as promised; a cut-off that is 16 times too large leaves more"
+        what = f"{where}: largest error of the default cut-off"
+        study.at_most(what, cut_off.difference.largest, INVISIBLE, why)
+        first, last = (f"max_depth={depth}" for depth in (DEPTHS[0], DEPTHS[-1]))
+        what = f"{where}: RMSE of {first} - that of {DEPTHS[-1]}"
+        why = "seen is 6e-4 (scene 9) and above; a limit that has no effect leaves 0"
+        study.at_least(what, points[first].rmse - points[last].rmse, 3e-4, why)
+
+    cases = {f"min_contribution={255 * c:g}/255": integrator(min_contribution=c) for c in CUT_OFFS}
+    cases |= {f"max_depth={depth}": integrator(max_depth=depth) for depth in DEPTHS}
+    return Trade(
+        extent.scene(number, fresnel="dielectric"),
+        "cut-off, bounce limit, Fresnel form",
+        "no cut-off, max_depth=10, exact Fresnel, the same rays",
+        {**cases, "fresnel=schlick": {"scene": extent.scene(number)}},
+        integrator(min_contribution=0.0),
+        {"aa": 2, "aamode": "none", "lattice": "report"},
+        hold,
+    )
 
 
-def _hold_whitted(study: Study, where: str, found: Findings) -> None:
-    cut_off = f"min_contribution={255 * knobs.CUT_OFFS[1]:g}/255"
-    what = f"{where}: largest error of the default cut-off"
-    why = "half a step of 8 bits, as promised; a cut-off that is 16 times too large leaves more"
-    study.at_most(what, found.points[cut_off].difference.largest, INVISIBLE, why)
-    first, *_, last = knobs.DEPTHS
-    what = f"{where}: RMSE of max_depth={first} - that of {last}"
-    why = "seen is 6e-4 (scene 9) and above; a limit that has no effect leaves 0"
-    study.at_least(what, _rmse(found, f"max_depth={first}") - _rmse(found, f"max_depth={last}"), 3e-4, why)
+def path(number: int, extent: Extent) -> Trade:
+    """Return Mitsuba's path and direct at rising spp, and mrt_whitted, against converged path."""
+
+    def hold(study: Study, where: str, points: Points) -> float:
+        few, many, share = _ends(points, "path spp={}")
+        ratio = points[many].rmse / points[few].rmse / share**0.5
+        why = "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15"
+        study.at_most(f"{where}: |RMSE of {many} / {few} / theory - 1|", abs(ratio - 1), 0.15, why)
+        return points[many].rmse
+
+    cases: dict[str, Options] = {
+        f"{kind} spp={spp}": {"integrator": kind, "spp": spp}
+        for kind in ("path", "direct")
+        for spp in extent.spp
+    }
+    cases["mrt_whitted"] = {}
+    cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
+    return Trade(
+        extent.scene(number),
+        "Whitted, direct and path at rising spp",
+        f"path with spp={extent.reference_spp}",
+        cases,
+        {"integrator": "path", "spp": extent.reference_spp},
+        {"aa": 1, "aamode": "none"},
+        hold,
+        strips=True,
+    )
 
 
-def _hold_path(study: Study, where: str, found: Findings) -> None:
-    few, *_, many = _of_number(found.points, "path spp={}")
-    spp = [float(name.split("=")[1]) for name in (few, many)]
-    what = f"{where}: |RMSE of {many} / {few} / theory - 1|"
-    why = "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15"
-    study.at_most(what, abs(_rmse(found, many) / _rmse(found, few) / (spp[0] / spp[1]) ** 0.5 - 1), 0.15, why)
-    _hold_reference(study, where, found, _rmse(found, many))
+def lens(number: int, extent: Extent) -> Trade:
+    """Return both depth-of-field filters, and a thin lens at rising spp."""
+
+    def hold(study: Study, where: str, points: Points) -> None:
+        ratio = points["filter corrected"].rmse / points["filter report"].rmse
+        what, why = f"{where}: RMSE of corrected / report", "the corrected filter is no worse"
+        study.at_most(what, ratio, 1, why)
+
+    width, height = extent.size
+    shared: Options = {"aa": 2, "aamode": "none", "lattice": "centered"}
+    scene = extent.scene(number)
+    sharp = mrt.render(load(scene), **shared, layers=["depth"])
+    scene["sensor"] |= fit_lens(report_scene(number), sharp.layers["depth.Z"])
+    cases: dict[str, Options] = {
+        f"filter {dof}": {"scene": number, "width": width, "height": height, "dof": dof}
+        for dof in ("report", "corrected")
+    }
+    return Trade(
+        scene,
+        "depth of field as a filter and through a lens",
+        f"a lens fitted to the report's blur, {extent.reference_spp} rays a pixel",
+        cases | {f"thinlens spp={4 * spp}": {"spp": spp} for spp in extent.spp},
+        {"spp": extent.reference_spp // 4},  # of four samples
+        shared,
+        hold,
+        strips=True,
+    )
 
 
-def _hold_lens(study: Study, where: str, found: Findings) -> None:
-    ratio = _rmse(found, "filter corrected") / _rmse(found, "filter report")
-    study.at_most(f"{where}: RMSE of corrected / report", ratio, 1, "the corrected filter is no worse")
-
-
-HOLD = {"sampling": _hold_sampling, "whitted": _hold_whitted, "path": _hold_path, "lens": _hold_lens}
+TRADES: dict[str, Callable[[int, Extent], Trade]] = {
+    "sampling": sampling,
+    "whitted": whitted,
+    "path": path,
+    "lens": lens,
+}

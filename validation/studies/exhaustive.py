@@ -8,7 +8,6 @@ that at cosines drawn at random, and judge the worst.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -33,67 +32,31 @@ F0, IOR = np.float32(0.04), np.float32(1.5)
 # Some dozen roundings, of which squares double some
 BOUND = 16.0
 
-
-@dataclass(frozen=True)
-class Formula:
-    """A function of the cosine, in any precision and in 50 digits."""
-
-    name: str
-    evaluate: Callable[[Any], Any]
-    truth: Callable[[Any], Any]
+Function = Callable[[Any], Any]
 
 
-def _g1(alpha: float) -> Formula:
+def _g1(alpha: float) -> tuple[Function, Function]:
     rough = float(np.float32(alpha))
-
-    def evaluate(c: Any) -> Any:
-        return smith_g1(Vector3((dr.sqrt((1 - c) * (1 + c)), c * 0, c)), rough)
 
     def truth(c: Any) -> Any:
         x = exact.number(c)
         return exact.smith_g1((exact.mp.sqrt(1 - x * x), 0, x), rough)
 
-    return Formula(f"Smith's G1, alpha = {alpha}", evaluate, truth)
+    return lambda c: smith_g1(Vector3((dr.sqrt((1 - c) * (1 + c)), c * 0, c)), rough), truth
 
 
-FORMULAS = (
-    Formula(
-        "Schlick, F0 = 0.04", lambda c: fresnel_schlick(c, float(F0)), lambda c: exact.fresnel_schlick(c, F0)
+# Functions of the cosine by name, in any precision and in 50 digits
+FORMULAS: dict[str, tuple[Function, Function]] = {
+    "Schlick, F0 = 0.04": (
+        lambda c: fresnel_schlick(c, float(F0)),
+        lambda c: exact.fresnel_schlick(c, F0),
     ),
-    Formula(
-        "exact Fresnel, into n = 1.5",
+    "exact Fresnel, into n = 1.5": (
         lambda c: fresnel_dielectric(c, 1.0, float(IOR)),
         lambda c: exact.fresnel_dielectric(c, 1, IOR),
     ),
-    *map(_g1, (0.05, 0.2, 1.0)),
-)
-
-
-@dataclass
-class Found:
-    """Errors of one formula, in units in the last place of the float32 result."""
-
-    count: int = 0
-    above: Any = None  # how many exceed each of STEPS
-    worst: float = -1.0
-    cosine: float = 0.0
-    flushed: int = 0  # to 0, as LLVM kernels do with what is below the least number with all its digits
-    brightest: float = 0.0  # cosine of these
-
-    def __post_init__(self) -> None:
-        self.above = np.zeros(len(STEPS), np.int64)
-
-    def add(self, cosines: Any, error: Any, flushed: Any) -> None:
-        """Take in one chunk."""
-        self.count += dr.width(error)
-        self.above += [int(dr.count(error > step)[0]) for step in STEPS]
-        if dr.any(flushed):
-            self.flushed += int(dr.count(flushed)[0])
-            self.brightest = max(self.brightest, float(dr.max(dr.select(flushed, cosines, 0))[0]))
-        largest = float(dr.max(error)[0])
-        if largest > self.worst:
-            at = dr.compress(error == largest)
-            self.worst, self.cosine = largest, float(dr.gather(type(cosines), cosines, at)[0])
+    **{f"Smith's G1, alpha = {alpha}": _g1(alpha) for alpha in (0.05, 0.2, 1.0)},
+}
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -101,19 +64,13 @@ def run(study: Study, *, quick: bool) -> None:
     if runtime.obstacle(runtime.FAST):
         raise VariantError(f"every cosine needs llvm arrays: {runtime.obstacle(runtime.FAST)}")
     stride = QUICK if quick else 1
-    total = ONE + 1
     rows, confirmed = [], 0.0
-    with study.stage(TITLE, len(FORMULAS) * -(-total // (CHUNK * stride))) as advance:
-        for formula in FORMULAS:
-            found = Found()
-            for cosines in _chunks(stride):
-                found.add(cosines, *_errors(formula, cosines))
-                advance(1)
-            confirmed = max(confirmed, _reference_error(formula, found.cosine))
-            rows.append(_row(formula, found))
-            study.at_most(
-                f"{formula.name}: largest error, ulp", found.worst, BOUND, "a rounding for each step"
-            )
+    for name, (formula, truth) in study.each(TITLE, FORMULAS.items()):
+        row = _errors(formula, truth, stride)
+        rows.append({"formula": name, **row})
+        confirmed = max(confirmed, _reference_error(formula, truth, float.fromhex(row["at the cosine"])))
+        worst = row["largest error, ulp"]
+        study.at_most(f"{name}: largest error, ulp", worst, BOUND, "a rounding for each step")
     note = f"Every {stride}th float32 cosine." if quick else "Every float32 cosine in [0, 1]."
     note += " 1 ulp: the step between float32 numbers."
     study.records("exhaustive", "Largest errors", rows, note)
@@ -131,44 +88,50 @@ def _chunks(stride: int) -> Iterator[Any]:
         yield dr.reinterpret_array(Float, dr.select(bits < LEAST, 0, bits))
 
 
-def _errors(formula: Formula, cosines: Any) -> tuple[Any, Any]:
-    """Return |float32 − float64| over the step of float32 there, and where float32 gives 0 instead."""
+def _errors(formula: Function, truth: Function, stride: int) -> dict[str, Any]:
+    """Return the row of a formula: |float32 − float64| over the step of float32 there.
+
+    Where float32 gives 0 instead, as LLVM kernels do with what is below the least number with all its digits,
+    cosines are counted as flushed.
+    """
     from drjit.llvm import Float, Float64, UInt32
 
-    found, truth = formula.evaluate(cosines), formula.evaluate(Float64(cosines))
-    exponent = dr.reinterpret_array(UInt32, Float(truth)) & 0x7F800000
-    step = Float64(dr.reinterpret_array(Float, dr.maximum(exponent, LEAST))) * 2.0**-23
-    flushed = (found == 0) & (truth > 0)
-    error = dr.select(flushed, 0, dr.abs(Float64(found) - truth) / step)
-    dr.eval(cosines, error, flushed)
-    return error, flushed
+    count, flushed, brightest = 0, 0, 0.0
+    above, worst, cosine = np.zeros(len(STEPS), np.int64), -1.0, 0.0
+    for cosines in _chunks(stride):
+        found, wide = formula(cosines), formula(Float64(cosines))
+        exponent = dr.reinterpret_array(UInt32, Float(wide)) & 0x7F800000
+        step = Float64(dr.reinterpret_array(Float, dr.maximum(exponent, LEAST))) * 2.0**-23
+        to_zero = (found == 0) & (wide > 0)
+        error = dr.select(to_zero, 0, dr.abs(Float64(found) - wide) / step)
+        dr.eval(cosines, error, to_zero)
+        count += dr.width(error)
+        above += [int(dr.count(error > edge)[0]) for edge in STEPS]
+        flushed += int(dr.count(to_zero)[0])
+        brightest = max(brightest, float(dr.max(dr.select(to_zero, cosines, 0))[0]))
+        largest = float(dr.max(error)[0])
+        if largest > worst:
+            worst = largest
+            cosine = float(dr.gather(Float, cosines, dr.compress(error == largest))[0])
+    value, right = float(formula(dr.opaque(Float, cosine))[0]), truth(cosine)
+    return {
+        "cosines": count,
+        "largest error, ulp": worst,
+        "at the cosine": cosine.hex(),
+        "by 50 digits, ulp": float(abs(exact.number(value) - right) / float(np.spacing(np.float32(right)))),
+        **{f"share above {s:g} ulp": float(n / count) for s, n in zip(STEPS, above, strict=True)},
+        "flushed to 0": flushed,
+        "all at cosines up to": brightest,
+    }
 
 
-def _reference_error(formula: Formula, worst: float) -> float:
+def _reference_error(formula: Function, truth: Function, worst: float) -> float:
     """Return the largest error of the float64 values against 50 digits, at random cosines and the worst."""
     from drjit.llvm import Float64
 
     rng = np.random.default_rng(6)
     bits = rng.integers(LEAST, ONE, CONFIRMED).astype(np.uint32)
     cosines = np.append(bits.view(np.float32), np.array([worst, 1], np.float32))
-    truth = np.array([float(formula.truth(c)) for c in cosines])
-    found = np.array(formula.evaluate(Float64(cosines.astype(np.float64))))
-    return float((np.abs(found - truth) / np.spacing(truth.astype(np.float32)).astype(np.float64)).max())
-
-
-def _row(formula: Formula, found: Found) -> dict[str, Any]:
-    from drjit.llvm import Float
-
-    value = float(formula.evaluate(dr.opaque(Float, found.cosine))[0])
-    truth = formula.truth(found.cosine)
-    judged = float(abs(exact.number(value) - truth) / float(np.spacing(np.float32(truth))))
-    return {
-        "formula": formula.name,
-        "cosines": found.count,
-        "largest error, ulp": found.worst,
-        "at the cosine": float(found.cosine).hex(),
-        "by 50 digits, ulp": judged,
-        **{f"share above {s:g} ulp": float(n / found.count) for s, n in zip(STEPS, found.above, strict=True)},
-        "flushed to 0": found.flushed,
-        "all at cosines up to": found.brightest,
-    }
+    right = np.array([float(truth(c)) for c in cosines])
+    found = np.array(formula(Float64(cosines.astype(np.float64))))
+    return float((np.abs(found - right) / np.spacing(right.astype(np.float32)).astype(np.float64)).max())

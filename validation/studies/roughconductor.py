@@ -6,6 +6,7 @@ import os
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -18,14 +19,20 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.output.files import write_exr
 from mrt_mitsuba.validation.checks.probe import is_scalar
 from mrt_mitsuba.validation.oracles import exact
-from mrt_mitsuba.validation.studies import metals
 from mrt_mitsuba.validation.tools import image_tests
-from mrt_mitsuba.validation.tools.bsdf_probe import Array, evaluate, largest, lobe_pairs, relative_error
-from mrt_mitsuba.validation.tools.gallery import panels
+from mrt_mitsuba.validation.tools.bsdf_probe import (
+    Array,
+    evaluate,
+    interaction,
+    largest,
+    lobe_pairs,
+    relative_error,
+    rgb,
+)
 from mrt_mitsuba.validation.tools.image_tests import Comparison
 from mrt_mitsuba.validation.tools.scenery import ball_scene, side_by_side
 from mrt_mitsuba.validation.tools.study import Study
-from mrt_mitsuba.validation.tools.warm import in_turns, timed
+from mrt_mitsuba.validation.tools.timing import in_turns, timed
 
 TITLE = "The BSDF against Mitsuba's roughconductor"
 
@@ -34,6 +41,7 @@ POINTWISE = 2e-5  # exp of up to 16, of arguments that are right to a few roundi
 SCALAR_PAIRS = 60  # scalar variants take milliseconds for each
 SHORT = 0.02  # of |ωi + ωo|²: above, Mitsuba's density is right to 3e-6
 JUDGED = 10  # densities for each variant and roughness
+NAMES = ("value", "density of visible normals", "density of plain D sampling")
 LEVEL = 1e-3  # probability with which a test of pictures rejects equal ones
 POWER_ALPHA = 0.3  # of the pictures in which small errors must be seen; a highlight is then some pixels wide
 MUTATIONS: Mapping[str, Mapping[str, Any]] = {
@@ -51,7 +59,7 @@ def run(study: Study, *, quick: bool) -> None:
     )
     pointwise(study, quick=quick)
     rendered(study, quick=quick)
-    metals.run(study, quick=quick)
+    metals(study, quick=quick)
     efficiency(study, quick=quick)
 
 
@@ -70,40 +78,28 @@ def theirs(alpha: float, *, visible: bool = True) -> dict[str, Any]:
     return {**form, "alpha": alpha, "sample_visible": visible}
 
 
-@dataclass(frozen=True)
-class Pointwise:
-    """Largest relative differences; of plain D sampling's density where the half vector is well known."""
-
-    value: float
-    pdf_visible: float
-    pdf_plain: float
-    judged: tuple[tuple[float, float], ...]  # elsewhere, where those densities differ most: our error, theirs
-
-
-def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> Pointwise:
+def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> tuple[dict[str, float], Array]:
     """Compare values and densities of ``count`` random pairs of directions, in the current variant.
 
-    Mitsuba's density of plain D sampling divides by ωo·h and so feels the rounding of the length of ωo, by
-    6e-8 / |ωi + ωo|². Where |ωi + ωo|² < ``SHORT`` and the densities differ, 50 digits judge both.
+    Return the largest relative differences by name; of plain D sampling's density where the half vector is
+    well known. Mitsuba's divides by ωo·h and so feels the rounding of the length of ωo, by 6e-8 / |ωi + ωo|².
+    Where |ωi + ωo|² < ``SHORT`` and the densities differ, 50 digits judge both: our error and theirs, [n, 2].
     """
     wi, wo = lobe_pairs(count, alpha, seed=seed)
     found = {}
     for visible in (True, False):
         pair = (mi.load_dict(bsdf(alpha, visible=visible)) for bsdf in (ours, theirs))
         found[visible] = [evaluate(bsdf, wi, wo) for bsdf in pair]
-    values = [relative_error(one[0], other[0]).max() for one, other in found.values()]
+    value = largest(relative_error(one[0], other[0]).max() for one, other in found.values())
     visible_error = relative_error(found[True][0][1], renormalised(found[True][1][1], wi, alpha))
     plain = found[False][0][1], found[False][1][1]
     plain_error = relative_error(*plain)
     short = ((wi.astype(float) + wo) ** 2).sum(axis=-1) < SHORT
     apart = np.flatnonzero(short & (plain_error > POINTWISE))
     worst = apart[np.argsort(-plain_error[apart])[:JUDGED]]
-    return Pointwise(
-        largest(values),
-        float(visible_error.max()),
-        float(plain_error[~short].max()),
-        tuple(_judge(wi[i], wo[i], alpha, plain[0][i], plain[1][i]) for i in worst),
-    )
+    judged = [_judge(wi[i], wo[i], alpha, plain[0][i], plain[1][i]) for i in worst]
+    figures = (value, float(visible_error.max()), float(plain_error[~short].max()))
+    return dict(zip(NAMES, figures, strict=True)), np.array(judged).reshape(-1, 2)
 
 
 def renormalised(density: Array, wi: Array, alpha: float) -> Array:
@@ -136,38 +132,27 @@ def pointwise(study: Study, *, quick: bool) -> None:
     variants = runtime.usable_variants()
     if quick:  # every colour mode once, and one scalar variant
         variants = [name for name in variants if not name.startswith("scalar") or name == runtime.SLOW]
-    found = _measure_pointwise(study, variants, 5_000 if quick else 200_000)
-    rows: list[list[Any]] = [
-        [*where, p.value, p.pdf_visible, p.pdf_plain, len(p.judged)] for where, p in found
-    ]
-    columns = ["variant", "alpha", "pairs", "value", "density, visible", "density, D", "judged"]
-    note = "Judged: pairs at grazing angles whose densities of plain D sampling differ by more, up to 10."
-    study.table("pointwise", "Largest relative differences from roughconductor", columns, rows, note)
-    names = ("value", "density of visible normals", "density of plain D sampling")
-    for column, name in enumerate(names, start=3):
-        what = f"{name}, relative, {len(variants)} variants"
-        why = "exp of up to 16, of arguments right to a few roundings"
-        study.at_most(what, largest(row[column] for row in rows), POINTWISE, why)
-    _hold_judged(study, [judged for _, p in found for judged in p.judged])
-
-
-def _measure_pointwise(
-    study: Study, variants: Sequence[str], count: int
-) -> list[tuple[tuple[str, float, int], Pointwise]]:
-    """Return variant, roughness and number of pairs of each comparison, and what it found."""
-    before, found = runtime.use(), []
+    count, before = 5_000 if quick else 200_000, runtime.use()
+    rows: list[list[Any]] = []
+    judged = []
     for variant in study.each("points", variants):
         runtime.use(variant)
         pairs = SCALAR_PAIRS if is_scalar() else count
-        found += [((variant, alpha, pairs), compare_pointwise(alpha, count=pairs)) for alpha in ALPHAS]
+        for alpha in ALPHAS:
+            found, apart = compare_pointwise(alpha, count=pairs)
+            rows.append([variant, alpha, pairs, *found.values(), len(apart)])
+            judged.append(apart)
     runtime.use(before)
-    return found
-
-
-def _hold_judged(study: Study, judged: Sequence[tuple[float, float]]) -> None:
-    study.record("densities of plain D sampling at grazing angles judged by 50 digits", len(judged))
-    if judged:
-        errors = np.array(judged)
+    columns = ["variant", "alpha", "pairs", *NAMES, "judged"]
+    note = "Judged: pairs at grazing angles whose densities of plain D sampling differ by more, up to 10."
+    study.table("pointwise", "Largest relative differences from roughconductor", columns, rows, note)
+    for column, name in enumerate(NAMES, start=3):
+        what = f"{name}, relative, {len(variants)} variants"
+        why = "exp of up to 16, of arguments right to a few roundings"
+        study.at_most(what, largest(row[column] for row in rows), POINTWISE, why)
+    errors = np.concatenate(judged)
+    study.record("densities of plain D sampling at grazing angles judged by 50 digits", len(errors))
+    if len(errors):
         study.record("their largest error among these", errors[:, 1].max())
         what = "our largest error where the densities differ, against 50 digits"
         study.at_most(what, errors[:, 0].max(), POINTWISE, "the same, of D alone")
@@ -190,8 +175,7 @@ class RoughconductorComparison:
     @property
     def equal(self) -> bool:
         """Return whether neither single points nor the pictures distinguish them."""
-        named = ("value", "density of visible normals", "density of plain D sampling")
-        return not self.test.rejects and all(self.errors[name] <= POINTWISE for name in named)
+        return not self.test.rejects and all(self.errors[name] <= POINTWISE for name in NAMES)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an EXR: ours as R, G, B, and the layers "theirs" and "difference". Raises ``OutputError``."""
@@ -233,15 +217,13 @@ def compare_roughconductor(
     if not 0 < alpha <= 1:
         raise UsageError(f"alpha={alpha!r}: roughconductor is compared for a roughness in (0, 1]")
     runtime.use(runtime.FAST)
-    points = compare_pointwise(alpha, count=pairs)
+    points, _ = compare_pointwise(alpha, count=pairs)
     pair = [bsdf(alpha, visible=sample_visible) for bsdf in (ours, theirs)]
     stacks, seconds = _render_both(pair, size=size, spp=spp, renders=renders, seed=seed)
     first, second = (stack.mean(axis=0) for stack in stacks)
     test = image_tests.compare(*map(image_tests.estimate, stacks), level=LEVEL)
     errors = {
-        "value": points.value,
-        "density of visible normals": points.pdf_visible,
-        "density of plain D sampling": points.pdf_plain,
+        **points,
         "relRMSE of the pictures": test.rel_rmse,
         "probability of so much between equal pictures": test.p,
         "pixels that differ, with the same random numbers": same_numbers(alpha, size=size),
@@ -319,51 +301,24 @@ def _hold_pictures(study: Study, found: RoughconductorComparison) -> None:
 # ------------------------------------------ Noise and time ------------------------------------------
 
 
-@dataclass(frozen=True)
-class Efficiency:
-    """Noise of one sampler: geometric mean of the variances of pixels, and seconds of a render."""
-
-    variance: float
-    seconds: float
-
-    @property
-    def equal_time_error(self) -> float:
-        """Typical error of a pixel after a second."""
-        return float(np.sqrt(self.variance * self.seconds))
-
-
-def measure_efficiency(
-    alpha: float, *, size: int, spp: int, renders: int
-) -> dict[tuple[str, bool], Efficiency]:
-    """Return noise and time of both plugins and samplings, by ("ours" or "theirs", visible); in turn."""
-    keys = [(name, visible) for visible in (True, False) for name in ("ours", "theirs")]
-    bsdfs = [(ours if name == "ours" else theirs)(alpha, visible=visible) for name, visible in keys]
-    stacks, seconds = _render_both(bsdfs, size=size, spp=spp, renders=renders, seed=500, studio=True)
-    spreads = [stack.var(axis=0, ddof=1) for stack in stacks]
-    noisy = np.min(spreads, axis=0) > 0  # the ball, not the sky around it
-    # the geometric mean: a few bright pixels would turn the mean into chance
-    variances = [float(np.exp(np.log(spread[noisy]).mean())) for spread in spreads]
-    return {key: Efficiency(v, s) for key, v, s in zip(keys, variances, seconds, strict=True)}
-
-
 def efficiency(study: Study, *, quick: bool) -> None:
     """Compare noise at equal sample counts, which is held, and at equal time, which is recorded."""
     settings = {"size": 64, "spp": 16, "renders": 12} if quick else {"size": 96, "spp": 16, "renders": 32}
-    alphas = (0.1, 0.5) if quick else (0.02, 0.1, 0.3, 0.6)
     rows: list[dict[str, Any]] = []
-    for alpha in study.each("noise", alphas):
-        found = measure_efficiency(alpha, **settings)
-        for visible in (True, False):
-            one, other = found["ours", visible], found["theirs", visible]
-            ratios = {
-                "variance": one.variance / other.variance,
-                "time": one.seconds / other.seconds,
-                "equal-time error": one.equal_time_error / other.equal_time_error,
-            }
-            rows.append({"alpha": alpha, "sampling": "visible" if visible else "D", **ratios})
+    for alpha in study.each("noise", (0.1, 0.5) if quick else (0.02, 0.1, 0.3, 0.6)):
+        kinds = [(bsdf, visible) for visible in (True, False) for bsdf in (ours, theirs)]
+        bsdfs = [bsdf(alpha, visible=visible) for bsdf, visible in kinds]
+        stacks, seconds = _render_both(bsdfs, **settings, seed=500, studio=True)
+        spreads = [stack.var(axis=0, ddof=1) for stack in stacks]
+        noisy = np.min(spreads, axis=0) > 0  # the ball, not the sky around it
+        # the geometric mean: a few bright pixels would turn the mean into chance
+        variances = [float(np.exp(np.log(spread[noisy]).mean())) for spread in spreads]
+        for sampling, first in (("visible", 0), ("D", 2)):
+            variance = variances[first] / variances[first + 1]
+            time = seconds[first] / seconds[first + 1]
+            ratios = {"variance": variance, "time": time, "equal-time error": (variance * time) ** 0.5}
+            rows.append({"alpha": alpha, "sampling": sampling, **ratios})
     study.records("efficiency", "Ours over Mitsuba's", rows, "Times: medians of renders taken in turn.")
-    title = "Error at equal time, ours over Mitsuba's"
-    study.plot("efficiency", title, _bars(rows), "Below 1 ours is the better.")
     why = "the same sampling; the variances of a thousand pixels are known to a few percent"
     most = largest(row["variance"] for row in rows)
     study.at_most("variance at equal sample count, ours over theirs", most, 1.1, why)
@@ -371,10 +326,60 @@ def efficiency(study: Study, *, quick: bool) -> None:
     study.record("equal-time error, ours over theirs, median", median)
 
 
-def _bars(rows: Sequence[Mapping[str, Any]]) -> Any:
-    figure, axes = panels(6, 3.5)
-    names = [f"α {row['alpha']:g}\n{row['sampling']}" for row in rows]
-    axes.bar(names, [row["equal-time error"] for row in rows])
-    axes.axhline(1, color="black", linewidth=0.8)
-    axes.set(ylabel="error at equal time, ratio")
-    return figure
+# ---------------------------------------------- Metals ----------------------------------------------
+
+
+def metals(study: Study, *, quick: bool) -> None:
+    """Hold Schlick's term with the F₀ of every metal that Mitsuba brings to the exact Fresnel term."""
+    angles = np.arange(0.0, 90.0)
+    theta = np.radians(angles)
+    wi = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], axis=-1)
+    rows = []
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)  # of spectra without a colour in RGB Mitsuba takes the nearest
+    for path in sorted((Path(mi.__file__).parent / "data" / "ior").glob("*.eta.spd")):
+        name = path.name.removesuffix(".eta.spd")
+        parameters = mi.traverse(mi.load_dict({"type": "roughconductor", "material": name}))
+        eta, k = (np.ravel(parameters[f"{key}.value"]).astype(float) for key in ("eta", "k"))
+        f0 = ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)  # from air
+        bsdf = mi.load_dict({"type": "mrt_bsdf", "f0": rgb(f0.tolist())})
+        schlick = np.array(bsdf.eval_attribute("mirror_reflectance", interaction(wi))).T
+        exact = exact_conductor(wi[:, 2], eta, k)
+        error = np.abs(schlick - exact)
+        weight = np.sin(2 * theta)[:, None] / np.sin(2 * theta).sum()  # cos θ dω / π: even light
+        even = np.abs(((schlick - exact) * weight).sum(axis=0)).max()
+        worst = error.max(axis=1)
+        normal = (error[0] / exact[0]).max()
+        rows.append([name, *f0.tolist(), worst.max(), angles[worst.argmax()], even, normal])
+    mi.set_log_level(level)
+    what = f"F₀ of {len(rows)} metals against the exact value, relative"
+    why = "the same number by two formulas, a few roundings"
+    study.at_most(what, largest(row[-1] for row in rows), 1e-5, why)
+    why = "what its missing dip towards grazing angles costs, there where least light comes from"
+    most = largest(row[-2] for row in rows)
+    study.at_most("Schlick against exact under even light, worst metal", most, 0.05, why)
+    study.record("Schlick against exact, worst metal and angle", largest(row[4] for row in rows))
+    title, note = "Schlick against exact, by material", "Differences of reflectance, of the worst channel."
+    columns = [
+        "material",
+        "F₀ red",
+        "F₀ green",
+        "F₀ blue",
+        "largest error",
+        "at °",
+        "under even light",
+        "at 0°",
+    ]
+    study.table("metals", title, columns, sorted(rows, key=lambda row: -row[4]), note)
+
+
+def exact_conductor(cos_theta: Array, eta: Array, k: Array) -> Array:
+    """Return Mitsuba's Fresnel term of conductors, [angles, channels]."""
+    cosine = mi.Float(cos_theta)
+    found = [
+        np.array(mi.fresnel_conductor(cosine, mi.Complex2f(float(n), float(x))))
+        for n, x in zip(eta, k, strict=True)
+    ]
+    # In RGB, some channels of two compounds have neither index nor extinction: 0/0 along the normal, else 1
+    undefined = (eta == 0) & (k == 0) & (cos_theta == 1)[:, None]
+    return np.where(undefined, 1.0, np.stack(found, axis=-1))

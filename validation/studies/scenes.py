@@ -107,27 +107,7 @@ CASES = {
 }
 
 
-@dataclass(frozen=True)
-class Judgement:
-    """A picture against the truth.
-
-    ``error`` [H, W]: the largest difference in a channel. ``reason`` [H, W]: an index in ``REASONS`` where it
-    exceeds a step of an 8-bit picture, else -1.
-    """
-
-    image: np.ndarray
-    truth: np.ndarray
-    error: np.ndarray
-    reason: np.ndarray
-
-    @property
-    def share(self) -> float:
-        """Share of pixels off by more than a step."""
-        return float(np.mean(self.error > STEP))
-
-    def count(self, reason: str) -> int:
-        """Return the number of pixels that are off for a reason."""
-        return int(np.sum(self.reason == REASONS.index(reason)))
+Judgement = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def judge(
@@ -135,20 +115,22 @@ def judge(
 ) -> Judgement:
     """Judge a linear picture [H, W, 3], one sample a pixel; ``settings``: those of ``reference_render``.
 
-    A pixel that is off by more than a step is on a silhouette or a shadow's edge if a ray moved by
-    ``displacement`` pixels meets other things or other lights, on steep shading if that changes its colour by
-    as much, or unexplained.
+    Return it and the truth; the error [H, W], the largest difference in a channel; and the reason [H, W], an
+    index in ``REASONS`` where the error exceeds a step of an 8-bit picture, else -1. A pixel
+    that is off by more than a step is on a silhouette or a shadow's edge if a ray moved by ``displacement``
+    pixels meets other things or other lights, on steep shading if that changes its colour by as much, or
+    unexplained.
     """
     height, width, _ = image.shape
     truth = reference_render(scene, width=width, height=height, **settings).image
     error = np.abs(image - truth).max(axis=-1)
     off = ~(error <= STEP)
     if not off.any():
-        return Judgement(image, truth, error, np.full(off.shape, -1))
+        return image, truth, error, np.full(off.shape, -1)
     found = sensitivity(scene, width=width, height=height, displacement=displacement, **settings)
     steep = off & (error <= found.spread)
     reason = np.select([~off, found.silhouette, found.shadow, steep], [-1, 0, 1, 2], 3)
-    return Judgement(image, truth, error, reason)
+    return image, truth, error, reason
 
 
 def draw(
@@ -167,22 +149,16 @@ def draw(
 
 def hold(study: Study, name: str, judgement: Judgement, cut: float) -> None:
     """Hold a scene to its bounds; ``cut``: the largest difference that the cut-off of dim paths makes."""
-    error, most = judgement.error, CASES[name].most
+    (_, _, error, reason), most = judgement, CASES[name].most
     why = f"least fault: 1 % of the pixels off by {most:g}, or half of them by 1e-7"
     study.at_most(f"scene {name}: median difference", np.median(error), MEDIAN, why)
     study.at_most(f"scene {name}: difference of 99 %", np.quantile(error, 0.99), most, why)
     why = "rounding sends single pixels to the other side of an edge: measured up to two in ten thousand"
-    study.at_most(f"scene {name}: share of pixels off by > 1/255", judgement.share, SHARE, why)
+    study.at_most(f"scene {name}: share of pixels off by > 1/255", np.mean(error > STEP), SHARE, why)
     why = "silhouettes, edges of shadows and steep shading are reasons, found by moved rays"
-    study.at_most(f"scene {name}: pixels off without a reason", judgement.count("unexplained"), 0, why)
+    left = np.sum(reason == REASONS.index("unexplained"))
+    study.at_most(f"scene {name}: pixels off without a reason", left, 0, why)
     study.at_most(f"scene {name}: change by cutting dim paths", cut, CUT, "the promise, of every pixel")
-
-
-def original_renders() -> Path | None:
-    """Return the folder of the original's renders, if at hand: MRT_REFERENCE, or next to the checkout."""
-    sibling = Path(__file__).resolve().parents[3] / "shared" / "reference"
-    folder = Path(os.environ.get("MRT_REFERENCE", sibling)) / "renders"
-    return folder if folder.is_dir() else None
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -192,10 +168,12 @@ def run(study: Study, *, quick: bool) -> None:
         size = case.quick if quick else case.size
         form: dict[str, Any] = {"fresnel": case.fresnel}
         found = judged[name] = judge(draw(case.scene, size, **form), case.scene, **form)
-        cut = np.abs(draw(case.scene, size, **form, cut=True) - found.image)
+        image, _, error, reason = found
+        cut = np.abs(draw(case.scene, size, **form, cut=True) - image)
         hold(study, name, found, float(cut.max()))
-        shown = [np.median(found.error), np.quantile(found.error, 0.99), found.error.max(), cut.max()]
-        rows.append([name, "{}x{}".format(*size), *map(float, shown), *map(found.count, REASONS)])
+        shown = [np.median(error), np.quantile(error, 0.99), error.max(), cut.max()]
+        counts = [int(np.sum(reason == i)) for i in range(len(REASONS))]
+        rows.append([name, "{}x{}".format(*size), *map(float, shown), *counts])
     columns = ["scene", "size", "median", "99 %", "largest", "cut-off", *REASONS]
     note = (
         "One sample per pixel, no path cut; then how much cutting dim paths changes. Fresnel is exact, and "
@@ -225,12 +203,12 @@ def _pictures(study: Study, judged: dict[str, Judgement]) -> None:
     from matplotlib.colors import LogNorm
 
     figure, axes = panels(8, 2.6 * len(judged), len(judged), 2)
-    for (left, right), (name, judgement) in zip(axes, judged.items(), strict=True):
-        left.imshow(np.clip(judgement.image, 0, 1))
+    for (left, right), (name, (image, _, error, reasons)) in zip(axes, judged.items(), strict=True):
+        left.imshow(np.clip(image, 0, 1))
         left.set_ylabel(f"scene {name}")
-        shown = right.imshow(np.maximum(judgement.error, 1e-8), norm=LogNorm(1e-8, 1), cmap="magma")
+        shown = right.imshow(np.maximum(error, 1e-8), norm=LogNorm(1e-8, 1), cmap="magma")
         for index, (reason, color) in enumerate(zip(REASONS, ("cyan", "yellow", "lime", "red"), strict=True)):
-            y, x = np.nonzero(judgement.reason == index)
+            y, x = np.nonzero(reasons == index)
             right.scatter(x, y, s=40, facecolors="none", edgecolors=color, label=reason)
         figure.colorbar(shown, ax=right, label="difference")
         for axis in (left, right):
@@ -244,8 +222,9 @@ def _pictures(study: Study, judged: dict[str, Judgement]) -> None:
 
 
 def _original(study: Study, quick: bool) -> None:
-    folder = original_renders()
-    if folder is None:
+    sibling = Path(__file__).resolve().parents[3] / "shared" / "reference"
+    folder = Path(os.environ.get("MRT_REFERENCE", sibling)) / "renders"  # or next to the checkout
+    if not folder.is_dir():
         study.text("The original's renders are not at hand (MRT_REFERENCE names their folder): not judged.")
         return
     rows = []

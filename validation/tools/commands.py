@@ -62,7 +62,7 @@ def check(scene: str, *, out: str | None = None, quick: str = "0") -> int:
 
 def error_vs_time(scene: str, *, cases: str, out: str = "error-vs-time") -> int:
     """Measure the cases of a TOML file; return 0, or 1 where one of them failed."""
-    from mrt_mitsuba.validation.tools.kernels import own_cache
+    from mrt_mitsuba.validation.tools.timing import own_cache
 
     settings = read_cases(cases)
     with own_cache():  # cold times are then those of the compiler; before Dr.Jit starts

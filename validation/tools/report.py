@@ -7,91 +7,64 @@ import csv
 import html
 import io
 import json
+import numbers
 import os
+import platform
 import re
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.output.files import to_8bit, write_exr
 from mrt_mitsuba.output.replacing import check_target, replacing
-from mrt_mitsuba.validation.tools import machine
-from mrt_mitsuba.validation.tools.study import Picture, Plot, Study, Table
+from mrt_mitsuba.validation.tools.study import Image, Study, Table
 
 LONG_TABLE = 12  # rows from which on a table of the page is folded
 LONG_LIST = 30  # bounds from which on they are folded if all hold
 DOTS_PER_INCH = 110
 COLUMN = 6.5  # inches from which on a plot has a row of the page to itself, too
-VALIDATION = "Validation of mrt-mitsuba"
 BROAD = 2  # width over height from which on a picture has a row of the page to itself
+VALIDATION = "Validation of mrt-mitsuba"
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """A study after its run; ``failure`` is the traceback where it broke off."""
-
-    study: Study
-    seconds: float
-    failure: str = ""
-
-    @property
-    def passed(self) -> bool:
-        return not self.failure and self.study.passed
-
-    @property
-    def verdict(self) -> str:
-        """Return one word: passed, missed (a bound), failed (broke off) or empty (nothing was held)."""
-        if self.failure:
-            return "failed"
-        if not self.study.bounds:
-            return "empty"
-        return "passed" if self.study.passed else "missed"
+def machine() -> dict[str, Any]:
+    """Return the number of cores and the system, without the name of the machine."""
+    return {"cores": usable_cores(), "system": f"{platform.system()} {platform.machine()}"}
 
 
-def header(*, quick: bool) -> dict[str, Any]:
-    """Return what the figures were made with."""
-    found = machine.versions()
+def versions() -> dict[str, str]:
+    """Return the versions of everything that bears on speed or accuracy, by name."""
+    import drjit as dr
+    import mitsuba as mi
+
+    import mrt_mitsuba
+
+    usable = dr.has_backend(dr.JitBackend.LLVM)
     return {
-        "version": found.pop("mrt-mitsuba"),
-        **found,
-        **machine.machine(),
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "quick": quick,
+        "version": mrt_mitsuba.__version__,
+        "mitsuba": mi.MI_VERSION,
+        "drjit": dr.__version__,
+        "llvm": ".".join(map(str, dr.detail.llvm_version())) if usable else "none",
+        "python": platform.python_version(),
     }
 
 
-def summary(outcomes: Sequence[Outcome], about: Mapping[str, Any]) -> dict[str, Any]:
-    """Return everything that was found, as JSON-ready values."""
-    studies = {
-        outcome.study.name: {
-            **outcome.study.summary(),
-            "passed": outcome.passed,
-            "verdict": outcome.verdict,
-            "failure": outcome.failure,
-            "seconds": round(outcome.seconds, 2),
-        }
-        for outcome in outcomes
-    }
-    return {**about, "passed": all(outcome.passed for outcome in outcomes), "studies": studies}
-
-
-def terminal_table(outcomes: Sequence[Outcome]) -> str:
+def terminal_table(studies: Sequence[Study]) -> str:
     """Return the bounds of all studies, one per line, under the verdict on each study."""
     lines = []
-    for outcome in outcomes:
-        study = outcome.study
-        lines += ["", f"{study.name}: {study.title} - {outcome.verdict.upper()} in {outcome.seconds:.1f} s"]
+    for study in studies:
+        lines += ["", f"{study.name}: {study.title} - {study.verdict.upper()} in {study.seconds:.1f} s"]
         shown = [*study.bounds, *study.goals]
         width = max((len(bound.name) for bound in shown), default=0)
         lines += [
             f"  {b.verdict:<6} {b.name:<{width}}  {b.measured:>10.4g} {b.sign} {b.limit:.4g}" for b in shown
         ]
-        lines += [f"  FAILED {outcome.failure.splitlines()[-1]}"] if outcome.failure else []
+        lines += [f"  FAILED {study.failure.splitlines()[-1]}"] if study.failure else []
     return "\n".join(lines[1:])
 
 
@@ -103,31 +76,32 @@ def prepare(folder: Path, *names: str) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(
-            f"cannot make the folder {folder}: {error.strerror}; choose another --out"
-        ) from error
+        problem = f"cannot make the folder {folder}: {error.strerror}; choose another --out"
+        raise OutputError(problem) from error
     for name in names:
         check_target(folder / name)
 
 
-def write(
-    folder: Path, outcomes: Sequence[Outcome], about: Mapping[str, Any], *, title: str = VALIDATION
+def save(
+    folder: str | os.PathLike[str], *studies: Study, title: str = VALIDATION, quick: bool = False
 ) -> None:
-    """Write every file of the report into an existing folder; ``title`` heads the page.
+    """Write every file of the report into a folder, made if need be; ``title`` heads the page.
 
     A figure is drawn once: the file and the page hold the same bytes. Raises ``OutputError``.
     """
-    sections = [_section(folder, outcome) for outcome in outcomes]
-    result = summary(outcomes, about)
-    _write(folder / "summary.json", json.dumps(result, indent=2, allow_nan=False).encode() + b"\n")
-    _write(folder / "index.html", _page(sections, result, title).encode())
-
-
-def save(folder: str | os.PathLike[str], study: Study, *, title: str, quick: bool = False) -> None:
-    """Write the report of a tool's study into a folder, made if need be. Raises ``OutputError``."""
     place = Path(folder)
     prepare(place, "summary.json", "index.html")
-    write(place, [Outcome(study, study.seconds)], header(quick=quick), title=title)
+    sections = [_section(place, study) for study in studies]
+    result = {
+        **versions(),
+        **machine(),
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "quick": quick,
+        "passed": all(study.passed for study in studies),
+        "studies": {study.name: study.summary() for study in studies},
+    }
+    _write(place / "summary.json", json.dumps(result, indent=2, allow_nan=False).encode() + b"\n")
+    _write(place / "index.html", _page(sections, result, title).encode())
 
 
 def notebook(study: Study, *, title: str) -> str:
@@ -138,41 +112,47 @@ def notebook(study: Study, *, title: str) -> str:
     return f'<iframe srcdoc="{html.escape(page)}" style="width: 100%; height: 40rem; border: 0"></iframe>'
 
 
-def _section(folder: Path, outcome: Outcome) -> dict[str, Any]:
+def _section(folder: Path, study: Study) -> dict[str, Any]:
     """Write the files of one study and return what the page shows of it."""
-    study = outcome.study
-    section: dict[str, Any] = {"outcome": outcome, "study": study, "texts": [], "images": [], "tables": []}
+    section: dict[str, Any] = {"study": study, "texts": [], "images": [], "tables": []}
     for part in study.parts:
         if isinstance(part, str):
             section["texts"].append(part)
             continue
         stem = f"{_slug(study.name)}-{_slug(part.name)}"
         if isinstance(part, Table):
-            _write(folder / f"{stem}.csv", _csv(part))
-            section["tables"].append(
-                {"part": part, "numeric": _numeric(part), "folded": len(part.rows) >= LONG_TABLE}
-            )
+            text = io.StringIO()
+            csv.writer(text, lineterminator="\n").writerows([part.columns, *part.rows])
+            _write(folder / f"{stem}.csv", text.getvalue().encode())
+            columns = zip(*part.rows, strict=True) if part.rows else [[]] * len(part.columns)
+            numeric = [all(isinstance(value, numbers.Number) for value in column) for column in columns]
+            folded = len(part.rows) >= LONG_TABLE
+            section["tables"].append({"part": part, "numeric": numeric, "folded": folded})
             continue
-        png = _plot_png(part) if isinstance(part, Plot) else _picture_png(part)
+        png = _png(part)
         _write(folder / f"{stem}.png", png)
-        if isinstance(part, Picture) and part.exr:
-            write_exr(folder / f"{stem}.exr", part.image)
-        section["images"].append(
-            {
-                "part": part,
-                "data": base64.b64encode(png).decode(),
-                "kind": type(part).__name__.lower(),
-                "broad": _is_broad(part),
-            }
-        )
+        if part.exr:
+            write_exr(folder / f"{stem}.exr", part.content)
+        if part.is_plot:
+            kind, broad = "plot", part.content.get_figwidth() > COLUMN
+        else:
+            kind, broad = "picture", part.content.shape[1] > BROAD * part.content.shape[0]
+        data = base64.b64encode(png).decode()
+        section["images"].append({"part": part, "data": data, "kind": kind, "broad": bool(broad)})
     return section
 
 
-def _is_broad(part: Plot | Picture) -> bool:
-    """Return whether an image needs the whole width of the page to be read."""
-    if isinstance(part, Picture):
-        return part.image.shape[1] > BROAD * part.image.shape[0]
-    return bool(part.figure.get_figwidth() > COLUMN)
+def _png(image: Image) -> bytes:
+    import PIL.Image
+
+    buffer = io.BytesIO()
+    if not image.is_plot:
+        PIL.Image.fromarray(to_8bit(image.content, "srgb")).save(buffer, format="PNG")
+        return buffer.getvalue()
+    image.content.savefig(buffer, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight", facecolor="white")
+    if "matplotlib.pyplot" in sys.modules:  # which keeps every figure that it made
+        sys.modules["matplotlib.pyplot"].close(image.content)
+    return buffer.getvalue()
 
 
 def _page(sections: Sequence[Mapping[str, Any]], result: Mapping[str, Any], title: str) -> str:
@@ -193,45 +173,12 @@ def cell(value: Any) -> str:
     """Return a value as people read it: floats to four digits, the rest as it is."""
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, int):
+    if isinstance(value, (int, str)):
         return str(value)
     try:
-        return value if isinstance(value, str) else f"{float(value):.4g}"
+        return f"{float(value):.4g}"
     except (TypeError, ValueError):
         return str(value)
-
-
-def _numeric(table: Table) -> list[bool]:
-    """Return which columns hold numbers only, and are set flush right."""
-    import numbers
-
-    columns = zip(*table.rows, strict=True) if table.rows else [[]] * len(table.columns)
-    return [all(isinstance(value, numbers.Number) for value in column) for column in columns]
-
-
-def _csv(table: Table) -> bytes:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(table.columns)
-    writer.writerows(table.rows)
-    return text.getvalue().encode()
-
-
-def _plot_png(plot: Plot) -> bytes:
-    buffer = io.BytesIO()
-    plot.figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight", facecolor="white")
-    pyplot = sys.modules.get("matplotlib.pyplot")
-    if pyplot is not None:  # which keeps every figure that it made
-        pyplot.close(plot.figure)
-    return buffer.getvalue()
-
-
-def _picture_png(picture: Picture) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(to_8bit(picture.image, "srgb")).save(buffer, format="PNG")
-    return buffer.getvalue()
 
 
 def _write(path: Path, data: bytes) -> None:

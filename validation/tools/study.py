@@ -1,4 +1,4 @@
-"""The product of a validation study: bounds, tables, plots and pictures, collected while it runs.
+"""The findings of a validation study: bounds, tables, plots and pictures, collected while it runs.
 
 A study is a module with ``TITLE`` and ``run(study, *, quick)``. It states its findings through the ``Study``
 it is given; ``report`` turns the result into a table on the terminal, ``summary.json``, CSV files and a page.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import gc
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -48,14 +47,8 @@ class Bound:
 
     def as_dict(self) -> dict[str, Any]:
         """Return JSON-ready values."""
-        return {
-            "name": self.name,
-            "measured": _plain(self.measured),
-            "limit": _plain(self.limit),
-            "sense": self.sign,
-            "holds": self.holds,
-            "note": self.note,
-        }
+        figures = {"measured": _plain(self.measured), "limit": _plain(self.limit)}
+        return {"name": self.name, **figures, "sense": self.sign, "holds": self.holds, "note": self.note}
 
 
 @dataclass(frozen=True)
@@ -84,24 +77,18 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Plot:
-    """A matplotlib figure with a caption that says what it shows."""
+class Image:
+    """A matplotlib figure, or a linear picture [H, W, 3], with a caption that says what it shows."""
 
     name: str
     title: str
-    figure: Any
+    content: Any
     caption: str = ""
+    exr: bool = False  # whether a picture, which is shown in sRGB, is written as EXR as well
 
-
-@dataclass(frozen=True)
-class Picture:
-    """A linear picture [H, W, 3] with a caption; shown in sRGB, and written as EXR where ``exr`` is set."""
-
-    name: str
-    title: str
-    image: np.ndarray
-    caption: str = ""
-    exr: bool = False
+    @property
+    def is_plot(self) -> bool:
+        return not isinstance(self.content, np.ndarray)
 
 
 @dataclass
@@ -111,15 +98,23 @@ class Study:
     name: str
     title: str
     progress: Progress = field(default_factory=Progress)
-    parts: list[Table | Plot | Picture | str] = field(default_factory=list)
+    parts: list[Table | Image | str] = field(default_factory=list)
     bounds: list[Bound] = field(default_factory=list)
     goals: list[Goal] = field(default_factory=list)  # of speed: shown, but the verdict does not hang on them
     figures: dict[str, float] = field(default_factory=dict)  # single numbers worth keeping, without a bound
-    seconds: float = 0.0  # that it took, where a tool made it
+    seconds: float = 0.0  # that it took
+    failure: str = ""  # the traceback where it broke off
 
     @property
     def passed(self) -> bool:
-        return bool(self.bounds) and not self.missed
+        return self.verdict == "passed"
+
+    @property
+    def verdict(self) -> str:
+        """Return one word: passed, missed (a bound), failed (broke off) or empty (nothing was held)."""
+        if self.failure:
+            return "failed"
+        return "empty" if not self.bounds else "missed" if self.missed else "passed"
 
     @property
     def missed(self) -> set[str]:
@@ -133,17 +128,15 @@ class Study:
     @property
     def plots(self) -> dict[str, Any]:
         """Return the figures."""
-        return {part.name: part.figure for part in self.parts if isinstance(part, Plot)}
+        return {part.name: part.content for part in self.parts if isinstance(part, Image) and part.is_plot}
 
-    def at_most(self, name: str, measured: float, limit: float, note: str) -> Bound:
+    def at_most(self, name: str, measured: float, limit: float, note: str) -> None:
         """Hold a figure to an upper bound; ``note``: why it is this one."""
         self.bounds.append(Bound(name, float(measured), float(limit), True, note))
-        return self.bounds[-1]
 
-    def at_least(self, name: str, measured: float, limit: float, note: str) -> Bound:
+    def at_least(self, name: str, measured: float, limit: float, note: str) -> None:
         """Hold a figure to a lower bound; ``note``: why it is this one."""
         self.bounds.append(Bound(name, float(measured), float(limit), False, note))
-        return self.bounds[-1]
 
     def goal(
         self, name: str, measured: float, limit: float, note: str, *, interval: tuple[float, float]
@@ -179,27 +172,21 @@ class Study:
 
     def plot(self, name: str, title: str, figure: Any, caption: str = "") -> None:
         """Add a matplotlib figure."""
-        self.parts.append(Plot(name, title, figure, caption))
+        self.parts.append(Image(name, title, figure, caption))
 
     def picture(
         self, name: str, title: str, image: np.ndarray, caption: str = "", *, exr: bool = False
     ) -> None:
         """Add a linear picture [H, W, 3]."""
-        self.parts.append(Picture(name, title, np.asarray(image, np.float32), caption, exr))
+        self.parts.append(Image(name, title, np.asarray(image, np.float32), caption, exr))
 
     def text(self, paragraph: str) -> None:
         """Add a paragraph."""
         self.parts.append(paragraph)
 
-    @contextmanager
-    def stage(self, title: str, total: int) -> Iterator[Any]:
-        """Show progress; the value is called with the number of steps just done."""
-        with self.progress.stage(title, total) as advance:
-            yield advance
-
     def each(self, title: str, items: Collection[Item]) -> Iterator[Item]:
         """Yield items and show progress; frees scenes, which would slow down the kernels of later ones."""
-        with self.stage(title, len(items)) as advance:
+        with self.progress.stage(title, len(items)) as advance:
             for item in items:
                 yield item
                 gc.collect()
@@ -207,20 +194,24 @@ class Study:
 
     def summary(self) -> Mapping[str, Any]:
         """Return the study as JSON-ready values; numbers that JSON cannot hold become text."""
+        tables = {
+            name: {
+                "title": table.title,
+                "columns": list(table.columns),
+                "rows": [[_plain(value) for value in row] for row in table.rows],
+            }
+            for name, table in self.tables.items()
+        }
         return {
             "title": self.title,
-            "passed": self.passed,
             "bounds": [bound.as_dict() for bound in self.bounds],
             "goals": [goal.as_dict() | {"verdict": goal.verdict} for goal in self.goals],
             "figures": {name: _plain(value) for name, value in self.figures.items()},
-            "tables": {
-                name: {
-                    "title": table.title,
-                    "columns": list(table.columns),
-                    "rows": [[_plain(value) for value in row] for row in table.rows],
-                }
-                for name, table in self.tables.items()
-            },
+            "tables": tables,
+            "passed": self.passed,
+            "verdict": self.verdict,
+            "failure": self.failure,
+            "seconds": round(self.seconds, 2),
         }
 
 

@@ -19,7 +19,7 @@ from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.rendering.result import Result
 from mrt_mitsuba.scene.open import open_scene
-from mrt_mitsuba.validation.tools import compare, kernels, precision_page, report
+from mrt_mitsuba.validation.tools import compare, precision_page, report, timing
 from mrt_mitsuba.validation.tools.precision import RESOLVED, Findings, Options, Panel, Point, Strip
 
 REFERENCE_SEEDS = (2**20 + 1, 2**20 + 2)  # far from those of the repeats
@@ -177,7 +177,7 @@ def _measure(
                 if name not in failed:
                     try:
                         if turn == -2:
-                            kernels.forget()
+                            timing.forget()
                         result = runner(cases[name], max(turn, 0))
                         _check_size(_picture(result), truth)
                     except Exception as error:

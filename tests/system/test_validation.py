@@ -1,0 +1,490 @@
+"""The studies of ``mrt-validate``: each passes in quick mode, and notices faults that are planted."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba import filters, plugins
+from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.scene.model import Material, Scene
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation import cli
+from mrt_mitsuba.validation.oracles import filters as loops
+from mrt_mitsuba.validation.oracles.reference import reference_render
+from mrt_mitsuba.validation.studies import (
+    antialiasing,
+    depth_of_field,
+    error_vs_time,
+    roughconductor,
+    scenes,
+    speed,
+    stock,
+)
+from mrt_mitsuba.validation.tools.precision import Point
+from mrt_mitsuba.validation.tools.scenery import with_materials
+from mrt_mitsuba.validation.tools.study import Study, findings
+from mrt_mitsuba.validation.tools.timing import in_turns, ratio
+
+for needed in cli.EXTRAS:
+    pytest.importorskip(needed)
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+Patch = pytest.MonkeyPatch
+Fault = Callable[[Patch], None]
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch: Patch, variant: str, tmp_path: Path) -> None:
+    """Let studies measure as little as shows whether their bounds hold."""
+    monkeypatch.setattr(
+        antialiasing,
+        "QUICK",
+        antialiasing.Extent((0,), (2, 4), 8, (80, 60), (64, 48, 1024), (60, 45), 8, (4, 16)),
+    )
+    trades = {"sampling": (0,), "whitted": (0,), "path": (0,)}
+    tiny = error_vs_time.Extent((40, 30), (1, 4), 24, (1, 16), 256, trades, 1)
+    monkeypatch.setattr(error_vs_time, "QUICK", tiny)
+    monkeypatch.setattr(error_vs_time, "FULL", dataclasses.replace(tiny, repeats=2))
+    monkeypatch.setattr(speed, "QUICK", speed.Extent((48, 36), 16, (0,), 1, 16))
+    monkeypatch.setattr(roughconductor.runtime, "usable_variants", lambda: ["llvm_ad_rgb"])
+    monkeypatch.setenv("MRT_REFERENCE", str(tmp_path))  # none of the original's renders
+
+
+def quick(name: str) -> Study:
+    """What a study, or a part of it as "study:part", finds."""
+    module, _, part = name.partition(":")
+    study = import_module(f"mrt_mitsuba.validation.studies.{module}")
+    return findings(getattr(study, part or "run"), quick=True)
+
+
+# Laws, stability and adaptive have tests of their own
+@pytest.mark.parametrize(
+    "name",
+    [
+        "roughconductor",
+        "stock",
+        "scenes",
+        "antialiasing",
+        "depth_of_field",
+        "exhaustive",
+        "error_vs_time",
+        "speed",
+    ],
+)
+def test_study_passes(name: str) -> None:
+    study = quick(name)
+    assert study.passed, study.missed
+    assert study.tables and not [goal for goal in study.goals if name == "speed"]  # so small, it says nothing
+
+
+# ------------------------------------------------ Faults ------------------------------------------------
+
+
+def wrapped(module: Any, name: str, change: Callable[..., Any]) -> Fault:
+    """Put ``change(original, *arguments, **options)`` in the place of a function."""
+
+    def plant(patch: Patch) -> None:
+        patch.setattr(module, name, partial(change, getattr(module, name)))
+
+    return plant
+
+
+def of_bsdf(**parameters: Callable[[Any], Any]) -> Fault:
+    """Change parameters of every ``mrt_bsdf`` that is loaded: functions of what was given."""
+
+    def inner(node: Any) -> Any:
+        if not isinstance(node, dict):
+            return node
+        if node.get("type") == "mrt_bsdf":
+            node = node | {name: change(node.get(name)) for name, change in parameters.items()}
+        return {key: inner(value) for key, value in node.items()}
+
+    def load_dict(load: Any, nodes: Any, *more: Any, **options: Any) -> Any:
+        return load(inner(nodes), *more, **options)
+
+    return wrapped(mi, "load_dict", load_dict)
+
+
+def in_bsdf(change: Callable[..., Any]) -> Fault:
+    """Put ``change(method, self, ctx, si, wo, active)`` in the place of eval, pdf and eval_pdf."""
+
+    def plant(patch: Patch) -> None:
+        kind = plugins.plugin("bsdf").MrtBSDF
+        for name in ("eval", "pdf", "eval_pdf"):
+            method = getattr(kind, name)
+
+            def other(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True, method: Any = method) -> Any:
+                return change(method, self, ctx, si, wo, active)
+
+            patch.setattr(kind, name, other)
+
+    return plant
+
+
+def turned(method: Any, self: Any, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+    """The normal points to the other side."""
+    other = type(si)(si)
+    other.wi = -si.wi
+    return method(self, ctx, other, -wo, active)
+
+
+def below_zero(method: Any, self: Any, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+    found = method(self, ctx, si, wo, active)
+    return (found[0] - 1e-3, found[1]) if isinstance(found, tuple) else found - 1e-3
+
+
+BRIGHT = of_bsdf(specular_reflectance=lambda _: 1.02)
+ROUGH = of_bsdf(alpha=lambda alpha: 1.05 * alpha if isinstance(alpha, float) else alpha)
+SCHLICK = of_bsdf(fresnel=lambda form: "schlick" if form == "dielectric" else form or "schlick")
+FLIPPED = in_bsdf(turned)
+
+
+def one_ray_too_many(render: Any, scene: Any, **options: Any) -> Any:
+    result = render(scene, **options)
+    more = {**result.rays, "primary": result.rays["primary"] + (options["aamode"] == "luma")}
+    return dataclasses.replace(result, rays=more)
+
+
+def no_refinement(render: Any, scene: Any, **options: Any) -> Any:
+    result = render(scene, **options)
+    if options["aamode"] != "sobel" or options.get("spp"):
+        return result
+    one = render(scene, **options | {"aa": 1, "aamode": "none"}).image
+    return dataclasses.replace(result, image=one)
+
+
+def moved_blur(blur: Any, image: Any, depth: Any, *, mode: str, **focus: Any) -> Any:
+    blurred = blur(image, depth, mode=mode, **focus)
+    return np.roll(blurred, 1, axis=1) if mode == "corrected" else blurred
+
+
+def wrong_cases(trade: str, wrong: Callable[[dict[str, Any]], dict[str, Any]]) -> Fault:
+    """Change the options of the cases of a trade, and of its reference."""
+
+    def plant(patch: Patch) -> None:
+        make = error_vs_time.TRADES[trade]
+
+        def broken(number: int, extent: Any) -> Any:
+            made = make(number, extent)
+            cases = {name: wrong(options) for name, options in made.cases.items()}
+            reference = wrong(made.reference) if isinstance(made.reference, dict) else made.reference
+            return dataclasses.replace(made, cases=cases, reference=reference)
+
+        patch.setitem(error_vs_time.TRADES, trade, broken)
+
+    return plant
+
+
+def wrong_cone(**changes: Any) -> Fault:
+    def plant(patch: Patch) -> None:
+        load = mi.load_dict
+
+        def changed(nodes: Any) -> Any:
+            return load(nodes | {"cone": nodes["cone"] | changes} if "cone" in nodes else nodes)
+
+        patch.setattr(mi, "load_dict", changed)
+
+    return plant
+
+
+def growing_code(patch: Patch) -> None:
+    """Planes are code of their own, each: take more of them for more lights."""
+
+    def planes(count: int, **size: int) -> Any:
+        nodes = mrt.scene_dict(0, **size)
+        return nodes | {f"plane_{i}": nodes["plane_0"] for i in range(count // 8)}
+
+    patch.setattr(speed.renders, "with_lights", planes)
+    patch.setattr(speed, "against_mitsuba", lambda extent: [])
+    patch.setattr(speed, "other_ways", lambda extent: [])
+
+
+def lamp_left_out(patch: Patch) -> None:
+    """What a plan leaves out is seen."""
+    make = speed._left_out
+    lamp = {"lamp": {"type": "mrt_light", "position": [0, 9, 0], "intensity": 1.0}}
+    patch.setattr(speed, "_left_out", lambda scene, change, more: make(scene, lamp, more))
+    patch.setattr(speed, "against_mitsuba", lambda extent: [])
+    patch.setattr(speed, "growth", lambda extent: [])
+
+
+def other_conductor(patch: Patch) -> None:
+    ours = roughconductor.ours
+    patch.setattr(roughconductor, "ours", lambda alpha: ours(alpha) | {"fresnel": "schlick"})
+    patch.setattr(speed, "other_ways", lambda extent: [])
+    patch.setattr(speed, "growth", lambda extent: [])
+
+
+FAULTS: list[tuple[str, Fault, str]] = [
+    ("antialiasing", wrapped(mrt, "render", one_ray_too_many), "camera rays"),
+    ("antialiasing", wrapped(mrt, "render", no_refinement), "error of sobel"),
+    (
+        "antialiasing",
+        wrapped(filters, "sobel_edges", lambda sobel, image, variance=None: sobel(image)),
+        "noise: share of",
+    ),
+    ("depth_of_field", wrapped(filters, "gaussian_dof", moved_blur), "corrected / report"),
+    (
+        "error_vs_time",
+        wrong_cases("sampling", lambda o: o | {"aa": 1} if o["aa"] == 4 else o),
+        "RMSE of none aa=4",
+    ),
+    ("error_vs_time", wrong_cases("path", lambda o: o | {"spp": 8} if o.get("spp") == 16 else o), "theory"),
+    (
+        "error_vs_time",
+        wrong_cases("path", lambda o: o | {"spp": 32} if o.get("spp") == 256 else o),
+        "error of the reference",
+    ),
+    ("speed", growing_code, "times the lights"),
+    ("speed", lamp_left_out, "without cone code"),
+    ("speed", other_conductor, "roughconductor"),
+    ("stock:mesh_cones", wrong_cone(radius=1.001 * stock.CONE.radius), "slope"),
+    ("stock:mesh_cones", wrong_cone(segments=128), "mean error"),
+    ("stock:mesh_cones", wrong_cone(capped=False), "another part"),
+    ("stock:direct", wrapped(stock, "_beyond_stand_in", lambda f, *a: f(*a) & False), "without a reason"),
+    ("stock:whole_scenes", SCHLICK, "scene 0"),
+    ("roughconductor:pointwise", BRIGHT, "value"),
+    ("roughconductor:pointwise", ROUGH, "value"),
+    ("roughconductor:pointwise", FLIPPED, "value"),
+    ("roughconductor:metals", of_bsdf(f0=lambda _: 0.5), "F₀ of"),
+    ("bsdf_laws:dielectric_terms", SCHLICK, "F against Mitsuba's"),
+    ("bsdf_laws:published", SCHLICK, "published albedos"),
+    ("bsdf_laws:published", BRIGHT, "published albedos"),
+    ("bsdf_laws:never_negative", in_bsdf(below_zero), "least value"),
+]
+
+
+@pytest.mark.parametrize(("name", "fault", "bound"), FAULTS, ids=[f"{n}-{b}" for n, _, b in FAULTS])
+def test_a_planted_fault_is_noticed(name: str, fault: Fault, bound: str, monkeypatch: Patch) -> None:
+    fault(monkeypatch)
+    with np.errstate(all="ignore"):  # what divides by a density of zero is the fault's doing
+        missed = quick(name).missed
+    assert [what for what in missed if bound in what], missed
+
+
+# --------------------------------- Scenes: the least mistakes, every mode ---------------------------------
+
+SIZE = (80, 60)
+PLACES = {"width": 80, "height": 60}
+
+
+def altered(scene: Scene, **changes: Any) -> Scene:
+    """A scene with every material changed; a value is a function of the old one."""
+
+    def change(m: Material) -> Material:
+        return dataclasses.replace(m, **{name: value(getattr(m, name)) for name, value in changes.items()})
+
+    return with_materials(scene, change)
+
+
+def brighter(scene: Scene) -> Scene:
+    lights = [dataclasses.replace(x, color=tuple(1.00001 * c for c in x.color)) for x in scene.lights]
+    return dataclasses.replace(scene, lights=tuple(lights))
+
+
+def moved(scene: Scene) -> Scene:
+    """One sphere by a tenth of a pixel or less."""
+    x, y, z = scene.spheres[1].center
+    sphere = dataclasses.replace(scene.spheres[1], center=(x, y + 1e-3, z))
+    return dataclasses.replace(scene, spheres=(scene.spheres[0], sphere, *scene.spheres[2:]))
+
+
+MISTAKES: dict[str, Callable[[Scene], Scene]] = {
+    "lights x 1.00001": brighter,
+    "sky x 1.001": lambda scene: dataclasses.replace(scene, sky=tuple(1.001 * c for c in scene.sky)),
+    "alpha x 1.0001": lambda scene: altered(scene, alpha=lambda a: 1.0001 * a),
+    "index + 0.00003": lambda scene: altered(scene, ior=lambda n: n + 3e-5),
+    "Ks x 0.9999": lambda scene: altered(scene, specular=lambda c: tuple(0.9999 * x for x in c)),
+    "a light less": lambda scene: dataclasses.replace(scene, lights=scene.lights[:-1]),
+    "a sphere moved": moved,
+}
+
+
+def verdict(number: int, scene: Scene | None = None, **integrator: Any) -> Study:
+    """Judge a scene, changed or drawn otherwise, by the truth of the unchanged one."""
+    right = report_scene(number)
+    image = scenes.draw(scene or right, SIZE, **integrator)
+    return findings(scenes.hold, name=str(number), judgement=scenes.judge(image, right), cut=0.0)
+
+
+@pytest.mark.parametrize("number", [0, 1, 2, 3])
+def test_small_mistakes_in_scenes_are_seen(number: int) -> None:
+    assert verdict(number).passed
+    for name, mistake in MISTAKES.items():
+        assert not verdict(number, mistake(report_scene(number))).passed, name
+
+
+@pytest.mark.parametrize("integrator", [{"clamp": False}, {"bounce_budget": "plain", "max_depth": 1}])
+def test_a_wrong_integrator_is_seen(integrator: dict[str, Any]) -> None:
+    """Scene 1 has every roughness, and lights that need the clamp."""
+    assert not verdict(1, **integrator).passed
+
+
+def test_every_pixel_that_is_off_has_one_reason() -> None:
+    """A picture shifted by half a displacement is off at silhouettes and shadows only, and judged so."""
+    scene = report_scene(1)
+    shifted = reference_render(scene, displacement=(2e-2, 0), **PLACES).image
+    error, reason = scenes.judge(shifted, scene, displacement=2e-2)[2:]
+    counts = {name: int(np.sum(reason == i)) for i, name in enumerate(scenes.REASONS)}
+    assert sum(counts.values()) == np.sum(error > scenes.STEP) > 5
+    assert counts["silhouette"] > 0 and counts["unexplained"] == 0
+
+
+@pytest.mark.parametrize(
+    ("number", "aamodes"), [(0, "none luma"), (1, "none sobel"), (2, "none"), (3, "none luma sobel")]
+)
+def test_modes_are_those_of_the_tracer(number: int, aamodes: str) -> None:
+    """The detector of the truth, too, looks at the picture in float64."""
+    every = np.stack(
+        [
+            reference_render(report_scene(number), displacement=p, **PLACES).image
+            for p in product((0, 0.5), repeat=2)
+        ]
+    )
+    for aamode in aamodes.split():
+        result = mrt.render(number, **PLACES, focaldist=0, fresnel="dielectric", aa=2, aamode=aamode)
+        edges = np.ones(every.shape[1:3], bool)
+        if aamode != "none":
+            edges = getattr(loops, f"{aamode}_edges")(every[0]).mask
+            assert 0.01 < edges.mean() < 0.95
+        # grey levels are truncated: a picture off by one rounding may refine a few pixels more or less
+        same = antialiasing.refined_pixels(result) == edges
+        assert np.mean(~same) <= 0.002
+        truth = np.where(edges[..., None], every.mean(axis=0), every[0])
+        error = np.abs(result.image - truth).max(axis=-1)[same]
+        assert np.quantile(error, 0.99) <= scenes.CASES[str(number)].most + scenes.CUT
+        assert np.mean(error > scenes.STEP) <= 4 * scenes.SHARE  # four samples
+
+
+# -------------------------------------- What studies are made of --------------------------------------
+
+
+def test_beyond_its_stand_in_a_plane_is_not_compared() -> None:
+    """Scene 0 looks along its floor: a row below the horizon is farther than 50 away."""
+    found = stock.compare_direct(report_scene(0), 0, width=64, height=48)
+    assert 1 <= len(np.flatnonzero(found["beyond"].any(axis=1))) <= 3
+    assert not found["theirs"][found["beyond"]].any()
+
+
+def test_disc_has_the_variance_of_the_pascal_line() -> None:
+    for k in range(1, 9):
+        line = np.array([math.comb(2 * k - 1, j) for j in range(2 * k)], float)
+        mean = np.average(np.arange(2 * k), weights=line)
+        variance = np.average((np.arange(2 * k) - mean) ** 2, weights=line)
+        assert depth_of_field.disc_radius(np.array(float(k))) ** 2 / 4 == pytest.approx(variance)
+    assert depth_of_field.disc_radius(np.array(0.0)) == 0
+
+
+def test_fit_finds_a_lens_that_is_there(monkeypatch: Patch) -> None:
+    """Discs of a known lens, in place of the report's blur: the fit must give that lens back."""
+    scene, radius, focus = report_scene(3), 0.1, 3.0
+    depth = np.linspace(1, 9, 200 * 150, dtype=np.float32).reshape(150, 200)
+    scale = radius * 200 / (2 * math.tan(math.radians(scene.camera.hfov) / 2))
+    discs = np.abs(scale * (1 / focus - 1 / depth.astype(float)))
+    monkeypatch.setattr(depth_of_field, "disc_radius", lambda amount: discs)
+    lens = depth_of_field.fit_lens(dataclasses.replace(scene, focal_distance=focus), depth)
+    assert (lens["aperture_radius"], lens["focus_distance"]) == pytest.approx((radius, focus), rel=1e-6)
+
+
+def test_advice_is_the_fastest_that_is_good_enough() -> None:
+    grey = np.full((2, 2, 3), 0.5, np.float32)
+    same = mrt.compare(grey, grey)
+
+    def points(**figures: tuple[float, float]) -> dict[str, Point]:
+        return {
+            name: Point(name, {}, np.array([seconds]), np.array([[rmse**2]]), 0, 0, {}, grey, same, 0)
+            for name, (seconds, rmse) in figures.items()
+        }
+
+    one = points(rough=(1, 0.02), good=(3, 0.002), slow=(9, 0.001))
+    other = points(rough=(1, 0.001), good=(2, 0.02), slow=(5, 0.001))
+    found = [error_vs_time.best([one], error).split(":")[0] for error in (*error_vs_time.ANSWERS, 1e-4)]
+    assert found == ["rough", "good", "good", "slow", "none of these"]
+    answers = [error_vs_time.best([one, other], error) for error in (0.02, 0.01, 1e-4)]
+    assert answers == ["rough: 2e+03 ms", "slow: 1.4e+04 ms", "none of these"]
+
+
+def test_repeats_give_advice_and_strips() -> None:
+    study = findings(error_vs_time.run, quick=False)
+    assert study.tables["choose"].first and study.tables["choose"].rows[0][0] == 0
+    assert any("strip" in name for name in study.plots)
+
+
+def test_runs_are_timed_in_turns() -> None:
+    order: list[str] = []
+    runs = {name: (lambda name=name: order.append(name)) for name in "ab"}
+    assert ratio(runs["a"], runs["b"], repeats=3).median > 0
+    assert order == list("ab" + "ab" + "ba" + "ab")
+    assert in_turns([lambda turn: turn, lambda turn: -turn], 3) == [[0, 1, 2], [0, -1, -2]]
+
+
+# ---------------------------------------- compare_roughconductor ----------------------------------------
+
+SMALL: dict[str, Any] = {"size": 32, "spp": 8, "renders": 32, "pairs": 2000}
+
+
+def test_comparison_finds_them_equal(tmp_path: Path) -> None:
+    found = mrt.compare_roughconductor(alpha=0.2, **SMALL)
+    assert found.equal and not found.test.rejects
+    assert 0 < found.errors["value"] < 2e-5
+    assert found.errors["pixels that differ, with the same random numbers"] < 5e-3
+    assert found.timings["ratio"] == pytest.approx(found.timings["ours"] / found.timings["theirs"])
+    assert {image.shape for image in found.images.values()} == {(24, 32, 3)}
+    found.save(tmp_path / "both.exr")
+    exr = read_exr(tmp_path / "both.exr")
+    np.testing.assert_array_equal(exr.image, found.images["ours"])
+    difference = exr.image - np.stack([exr.layers[f"theirs.{c}"] for c in "RGB"], axis=-1)
+    # the difference was taken in float64
+    np.testing.assert_allclose(difference, found.images["difference"], atol=1e-6 * exr.image.max())
+    assert "alpha = 0.2: equal" in str(found) and "alpha = 0.2: equal" in found._repr_html_()
+
+
+@pytest.mark.parametrize("mistake", [BRIGHT, ROUGH])
+def test_comparison_sees_a_broken_bsdf(mistake: Fault, monkeypatch: Patch) -> None:
+    mistake(monkeypatch)
+    found = mrt.compare_roughconductor(alpha=0.3, **SMALL)
+    assert not found.equal and found.errors["value"] > 0.01
+    # the ball is a third of the picture
+    assert found.errors["pixels that differ, with the same random numbers"] > 0.1
+
+
+def test_roughness_out_of_range_is_refused() -> None:
+    for alpha in (0, -0.1, 1.5, float("nan")):
+        with pytest.raises(mrt.UsageError, match="alpha="):
+            mrt.compare_roughconductor(alpha)
+
+
+def test_fifty_digits_judge_where_densities_differ() -> None:
+    """Mitsuba's density of plain D sampling is off at grazing angles; ours is not."""
+    ours, theirs = roughconductor.compare_pointwise(0.001, count=20_000)[1].T
+    assert len(ours) == roughconductor.JUDGED
+    assert ours.max() < 5e-6 < 2e-5 < theirs.max()
+
+
+def test_exact_reflectance_of_metals() -> None:
+    """Against the textbook's form with complex indices, in float64."""
+    cos, eta, k = (
+        np.cos(np.radians(np.arange(0.0, 90.0))),
+        np.array([0.14, 0.37, 1.44]),
+        np.array([4, 2.4, 1.6]),
+    )
+    index, c = eta - 1j * k, cos[:, None]
+    inside = np.sqrt(1 - (1 - c**2) / index**2)  # cosine of the refracted wave
+    s, p = (c - index * inside) / (c + index * inside), (index * c - inside) / (index * c + inside)
+    found = roughconductor.exact_conductor(cos, eta, k)
+    np.testing.assert_allclose(found, (abs(s) ** 2 + abs(p) ** 2) / 2, rtol=1e-5)  # float32
+    none = np.zeros(1)
+    np.testing.assert_allclose(roughconductor.exact_conductor(cos, none, none), 1)  # the limit, also at 0°

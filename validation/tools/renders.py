@@ -1,0 +1,196 @@
+"""Seconds of renders, printed as JSON: ``python renders.py CASE ...``.
+
+A script that knows nothing but the public names, so that it also measures an earlier version of the project:
+the bench runs it by the Python of either, in turns.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+import mrt_mitsuba as mrt
+
+SMALL: dict[str, Any] = {"width": 64, "height": 48}
+ONE_RAY: dict[str, Any] = {"aamode": "none", "aa": 1, "lattice": "report", "focaldist": 0}
+SUPERSAMPLED: dict[str, Any] = ONE_RAY | {"aa": 4}
+FILTERS: dict[str, Any] = {"lattice": "report", "focaldist": 2.0}  # those of scene 3 by its number
+
+Nodes = dict[str, Any]
+Render = Callable[..., Any]
+
+
+# ----------------------------------------- Scenes of many things -----------------------------------------
+
+
+def load(nodes: Nodes) -> Any:
+    """Return a Mitsuba scene of a dict with our plugins."""
+    import mitsuba as mi
+
+    mrt.register()
+    return mi.load_dict(nodes)
+
+
+def _without(nodes: Nodes, *kinds: str) -> Nodes:
+    return {name: node for name, node in nodes.items() if not name.startswith(kinds)}
+
+
+def with_lights(count: int, **size: int) -> Nodes:
+    """Return scene 4 with its light from points above, each of its own brightness."""
+    nodes = _without(mrt.scene_dict(4, **size), "light_")
+    for i in range(count):
+        a, b, c = i * 0.754877666 % 1, i * 0.569840296 % 1, i * 0.362378 % 1  # evenly in the room
+        value = (6 / count) * (0.5 + a)
+        nodes[f"light_{i}"] = {
+            "type": "mrt_light",
+            "position": [10 * a, 4 + 16 * b, 10 * c],
+            "intensity": {"type": "rgb", "value": [value, value, value]},
+        }
+    return nodes
+
+
+def with_triangles(count: int, **size: int) -> Nodes:
+    """Return hills under the camera and the lights of scene 0."""
+    import mitsuba as mi
+
+    cells = max(1, round((count / 2) ** 0.5))
+    z, x = np.mgrid[-3 : 3 : (cells + 1) * 1j, -3 : 3 : (cells + 1) * 1j]
+    positions = np.stack([x, 0.2 * np.sin(5 * x) * np.cos(7 * z), z], axis=-1).reshape(1, -1, 3)
+    corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    first = np.stack([corner, corner + cells + 1, corner + 1], axis=1)
+    second = np.stack([corner + 1, corner + cells + 1, corner + cells + 2], axis=1)
+    faces = np.concatenate([first, second])[None].astype(np.uint32)
+    hills = {
+        "type": "mrt_mesh",
+        "positions": mi.Bitmap(np.ascontiguousarray(positions, np.float32)),
+        "faces": mi.Bitmap(np.ascontiguousarray(faces)),
+        "bsdf": {"type": "ref", "id": "material_4"},
+    }
+    return _without(mrt.scene_dict(0, **size), "plane_") | {"hills": hills}
+
+
+def crowd(count: int, kind: str, **size: int) -> Nodes:
+    """Return the room of scene 4 with so many spheres, or cones as high and wide, in any direction.
+
+    Of the kind "group", the spheres are one shape.
+    """
+    import mitsuba as mi
+
+    nodes = _without(mrt.scene_dict(4, **size), "sphere_", "spheres")
+    material = next(name for name in nodes if name.startswith("material_"))
+    rng = np.random.default_rng(5)
+    centers, radii = rng.uniform((1, 0, 1), (7.5, 6.5, 7.5), (count, 3)), rng.uniform(0.05, 0.25, count)
+    if kind == "group":
+        numbers = np.column_stack([centers, radii]).astype(np.float32)
+        bsdf = {"type": "ref", "id": material}
+        group = {"type": "mrt_group", "kind": "sphere", "numbers": mi.Bitmap(numbers), "bsdf": bsdf}
+        return nodes | {"crowd": group}
+    half = rng.normal(size=(count, 3))
+    half *= (radii / np.linalg.norm(half, axis=1))[:, None]
+    for i, (center, radius, up) in enumerate(zip(centers, radii.tolist(), half, strict=True)):
+        place: Nodes = {"type": "sphere", "center": center.tolist()}
+        if kind == "cone":
+            ends = {"apex": (center + up).tolist(), "base_center": (center - up).tolist()}
+            place = {"type": "mrt_cone", **ends}
+        nodes[f"{kind}_{i}"] = {**place, "radius": radius, "bsdf": {"type": "ref", "id": material}}
+    return nodes
+
+
+# ------------------------------------------------- Cases -------------------------------------------------
+
+
+def of_scene(nodes: Callable[..., Nodes], size: tuple[int, int], options: dict[str, Any]) -> Render:
+    """Return a render of a scene that is loaded once."""
+    return partial(mrt.render, load(nodes(width=size[0], height=size[1])), **options)
+
+
+def _small(**options: Any) -> Render:
+    return partial(mrt.render, load(mrt.scene_dict(3, **SMALL)), **options)
+
+
+def _with_update(**options: Any) -> Render:
+    """Return a render of a loaded scene of which a colour changes before."""
+    import mitsuba as mi
+
+    scene = load(mrt.scene_dict(3, **SMALL))
+    parameters = mi.traverse(scene)
+    key = next(name for name in list(parameters.keys()) if name.endswith("diffuse_reflectance.value"))
+    turn = iter(range(10**9))
+
+    def render() -> Any:
+        parameters[key] = mi.Color3f(0.3 + 0.001 * (next(turn) % 100), 0.2, 0.1)
+        parameters.update()
+        return mrt.render(scene, **options)
+
+    return render
+
+
+def _prepared() -> Render:
+    """Return a prepared render; of versions that have none, the nearest thing: a render of a loaded scene."""
+    scene = load(mrt.scene_dict(3, **SMALL))
+    if hasattr(mrt, "prepare"):
+        prepared: Render = mrt.prepare(scene, **ONE_RAY)
+        return prepared
+    return partial(mrt.render, scene, **ONE_RAY)
+
+
+def _by_mitsuba() -> Render:
+    """Return Mitsuba's own way to a picture by the scene's integrator, ``mrt_whitted``."""
+    import mitsuba as mi
+
+    scene = load(mrt.scene_dict(3, **SMALL))
+    return lambda: np.array(mi.render(scene, spp=1))
+
+
+def _box(**options: Any) -> Render:
+    import mitsuba as mi
+
+    box = mi.cornell_box()
+    box["sensor"]["film"] |= {"width": 96, "height": 96, "rfilter": {"type": "box"}}
+    return partial(mrt.render, load(box), integrator="path", **options)
+
+
+LARGE, MIDDLE = (800, 600), (400, 300)
+CASES: dict[str, tuple[Callable[[], Render], int]] = {  # what makes the render, and how many count as one
+    **{
+        f"scene {n}": (partial(of_scene, partial(mrt.scene_dict, n), LARGE, SUPERSAMPLED), 1)
+        for n in range(5)
+    },
+    "a million triangles": (partial(of_scene, partial(with_triangles, 10**6), MIDDLE, SUPERSAMPLED), 2),
+    "200 lights": (partial(of_scene, partial(with_lights, 200), (160, 120), ONE_RAY), 2),
+    "a thousand cones": (partial(of_scene, partial(crowd, 1000, "cone"), MIDDLE, SUPERSAMPLED), 2),
+    "to an error": (partial(_box, target=0.02), 1),
+    "aamode=noise": (partial(_box, aamode="noise", spp=64), 1),
+    "small, prepared": (_prepared, 100),
+    "small, loaded": (partial(_small, **ONE_RAY), 100),
+    "small, with an update": (partial(_with_update, **ONE_RAY), 100),
+    "small, from its number": (lambda: partial(mrt.render, 3, **SMALL, **ONE_RAY), 100),
+    "small, film": (partial(_small, aamode="none", aa=1), 100),
+    "small, filters": (partial(_small, **FILTERS), 50),
+    "small, with an update, filters": (partial(_with_update, **FILTERS), 50),
+    "small, from its number, filters": (lambda: partial(mrt.render, 3, **SMALL), 50),
+    "small, mi.render": (_by_mitsuba, 100),
+}
+
+
+def seconds(name: str) -> float:
+    """Return the mean seconds of warm renders of a case."""
+    make, count = CASES[name]
+    render = make()
+    for _ in range(1 if count < 10 else 3):
+        render()
+    start = time.perf_counter()
+    for _ in range(count):
+        render()
+    return (time.perf_counter() - start) / count
+
+
+if __name__ == "__main__":
+    mrt.register()
+    print(json.dumps({name: seconds(name) for name in sys.argv[1:] or CASES}))
