@@ -56,9 +56,9 @@ def test_errors_fall_as_theory_says_and_a_bias_is_found(scene):
     assert few.seconds_interval[0] <= few.seconds <= few.seconds_interval[1]
     assert few.rmse_interval[0] < few.rmse < few.rmse_interval[1] and few.efficiency > 0
     assert few.cold > 0 and few.rays["primary"] == 4 * SIZE[0] * SIZE[1]
-    (strip,) = found.strips[:1]
-    assert [panel.name.split(",")[0].split()[0] for panel in strip.panels] == ["path", "blind"]
-    assert all(np.isfinite(panel.image).all() and panel.seconds > 0 for panel in strip.panels)
+    _, panels = found.strips[0]
+    assert [name.split(",")[0].split()[0] for name, _, _ in panels] == ["path", "blind"]
+    assert all(np.isfinite(image).all() and seconds > 0 for _, seconds, image in panels)
 
 
 def test_nothing_is_claimed_below_the_reference(scene):

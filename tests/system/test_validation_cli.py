@@ -80,8 +80,7 @@ def good(study: Study, *, quick: bool) -> None:
     study.table("answer", "What to do", ["setting"], [["aa=2"]], first=True)
     study.plot("curve", "A curve", figure, "rises")
     study.picture("ball", "A ball", np.full((4, 5, 3), 0.25), exr=True)
-    with study.stage("work", 2) as advance:
-        advance(2)
+    assert list(study.each("work", [1, 2])) == [1, 2]
 
 
 def missed(study: Study, *, quick: bool) -> None:

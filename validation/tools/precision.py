@@ -24,6 +24,8 @@ NOTHING = 1e-15  # an RMSE of 0, as logarithms have it
 
 Options = Mapping[str, Any]
 Interval = tuple[float, float]
+Panel = tuple[str, float, np.ndarray]  # name, seconds and picture of what a curve reaches in some time
+Strip = tuple[float, Sequence[Panel]]  # that time, and a panel of each curve
 
 
 @dataclass(frozen=True)
@@ -111,23 +113,6 @@ class Point:
     def resolved(self) -> bool:
         """Return whether the error can be distinguished from the reference's own."""
         return self.rmse > RESOLVED * self.reference_error
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A picture of an equal-time strip."""
-
-    name: str
-    seconds: float
-    image: np.ndarray
-
-
-@dataclass(frozen=True)
-class Strip:
-    """The error that each curve reaches in about the same time."""
-
-    seconds: float
-    panels: Sequence[Panel]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from mrt_mitsuba.validation.tools.gallery import gallery, panels
 from mrt_mitsuba.validation.tools.intervals import Estimate
-from mrt_mitsuba.validation.tools.precision import Findings, Interval, Point, Strip
+from mrt_mitsuba.validation.tools.precision import Findings, Interval, Panel, Point
 from mrt_mitsuba.validation.tools.study import Study
 
 TITLE = "Error against time"
@@ -40,13 +40,10 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
         return
     caption = " ".join([_caption(found), _reference(found, truth), *found.verdicts])
     study.plot(f"{prefix}diagram", f"{title}: work and precision", diagram(found), caption)
-    for number, strip in enumerate(found.strips, 1):
-        study.plot(
-            f"{prefix}strip-{number}",
-            f"{title}: what {strip.seconds:.2g} s buy",
-            strip_figure(found, strip),
-            "In sRGB; where a picture is cut, it is where the cases differ most.",
-        )
+    for number, (seconds, shown) in enumerate(found.strips, 1):
+        caption = "In sRGB; where a picture is cut, it is where the cases differ most."
+        figure = strip_figure(found, shown)
+        study.plot(f"{prefix}strip-{number}", f"{title}: what {seconds:.2g} s buy", figure, caption)
     if found.errors:
         study.table(
             f"{prefix}times",
@@ -187,13 +184,13 @@ def _label_between_decades(axis: Any) -> None:
         axis.set_tick_params(which="minor", labelsize=8)
 
 
-def strip_figure(found: Findings, strip: Strip) -> Any:
+def strip_figure(found: Findings, panels: Sequence[Panel]) -> Any:
     """Return the pictures of a strip side by side, the reference last, each with its seconds and error."""
-    cut = _most_different(np.stack([panel.image for panel in strip.panels]), found.reference)
+    cut = _most_different(np.stack([image for _, _, image in panels]), found.reference)
     pictures = {}
-    for p in strip.panels:
-        rmse = np.sqrt(np.mean((p.image - found.reference) ** 2))
-        pictures[f"{p.name}\n{p.seconds:.3g} s, RMSE {rmse:.2g}"] = p.image
+    for name, seconds, image in panels:
+        rmse = np.sqrt(np.mean((image - found.reference) ** 2))
+        pictures[f"{name}\n{seconds:.3g} s, RMSE {rmse:.2g}"] = image
     pictures["reference"] = found.reference
     cuts = {title: np.asarray(picture[cut], np.float32) for title, picture in pictures.items()}
     return gallery(cuts, columns=min(4, len(cuts)), width=10, title=0.6)

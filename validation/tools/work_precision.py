@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -75,22 +75,26 @@ def error_vs_time(
     taken = [name for name, options in {"shared": shared or {}, **cases}.items() if "seed" in options]
     if taken:
         raise UsageError(f"{taken[0]} sets a seed: repeats have seeds of their own; leave it out")
-    progress = progress or Progress()
     runner = _Runner(scene, dict(shared or {}))
-    truth = _Truth.of(reference, runner)
-    measured = _measure(runner, cases, truth, repeats, progress)
-    points = {name: m for name, m in measured.items() if isinstance(m, Point)}
+    halves, own_error = _reference(reference, runner)
+    low = [e for e in errors or () if not e > RESOLVED * own_error]
+    if low:
+        raise UsageError(
+            f"no claim can be made about an RMSE of {low[0]:g}: the reference's own error is "
+            f"{own_error:.2g}, and only errors above twice that stand out; take a better reference"
+        )
+    points, failed = _measure(runner, cases, halves, own_error, repeats, progress or Progress())
     found = WorkPrecision(
         scene=runner.name,
         points=points,
-        failed={name: m for name, m in measured.items() if isinstance(m, str)},
-        reference=truth.image,
-        reference_error=truth.error,
+        failed=failed,
+        reference=(halves[0] + halves[1]) / 2,
+        reference_error=own_error,
         repeats=repeats,
-        errors=_round_errors(points.values(), truth.error) if errors is None else _claimed(errors, truth),
+        errors=_round_errors(points.values(), own_error) if errors is None else list(errors),
     )
     shown = _strips(found, runner) if strips else []
-    return WorkPrecision(**{**vars(found), "strips": shown, "took": time.perf_counter() - start})
+    return replace(found, strips=shown, took=time.perf_counter() - start)
 
 
 class _Runner:
@@ -99,54 +103,39 @@ class _Runner:
     def __init__(self, scene: Any, shared: Options) -> None:
         self.scene, self.shared = scene, shared
         self.variant = runtime.use(shared.get("variant"))
-        self._loaded: dict[int, tuple[Any, Any]] = {}
+        self._loaded: dict[int, tuple[Any, Any]] = {}  # by the id of a scene, which is kept with it
         self.name = ""
 
     def __call__(self, options: Options, seed: int) -> Result:
         given = {"scene": self.scene, "variant": self.variant, **self.shared, **options, "seed": seed}
-        if given["variant"] == self.variant and "params" not in given:
-            given["scene"] = self._load(given["scene"])
-        result = render(given.pop("scene"), **given)
+        scene = given.pop("scene")
+        can_be_loaded = isinstance(scene, dict) or str(scene).lower().endswith(".xml")
+        if can_be_loaded and given["variant"] == self.variant and "params" not in given:
+            if id(scene) not in self._loaded:
+                self._loaded[id(scene)] = (scene, open_scene(scene).scene)
+            scene = self._loaded[id(scene)][1]
+        result = render(scene, **given)
         self.name = self.name or result.plan.scene
         return result
 
-    def _load(self, scene: Any) -> Any:
-        """Return a scene that is loaded once, of a dict or an XML file; the same of others."""
-        if not isinstance(scene, dict) and not str(scene).lower().endswith(".xml"):
-            return scene
-        if id(scene) not in self._loaded:
-            self._loaded[id(scene)] = (scene, open_scene(scene).scene)
-        return self._loaded[id(scene)][1]
 
-
-@dataclass(frozen=True)
-class _Truth:
-    """The reference: two independent halves, or twice the same picture; and its own error."""
-
-    halves: tuple[np.ndarray, np.ndarray]
-    error: float
-
-    @property
-    def image(self) -> np.ndarray:
-        return (self.halves[0] + self.halves[1]) / 2
-
-    @classmethod
-    def of(cls, reference: Any, runner: _Runner) -> _Truth:
-        if isinstance(reference, Mapping):
-            spp = {"spp": int(reference["spp"]) // 2} if reference.get("spp", 1) > 1 else {}
-            results = [runner({**reference, **spp}, seed) for seed in REFERENCE_SEEDS]
-            first, second = map(_picture, results)
-            if (first == second).all() and (aa := results[0].plan.lattice.aa) > 1:
-                coarser = _picture(runner({**reference, "aa": aa - 1}, REFERENCE_SEEDS[0]))
-                return cls((first, first), _rms(first - coarser))
-            return cls((first, second), _rms(first - second) / 2)
-        if isinstance(reference, Sequence) and not isinstance(reference, str):
-            first, second = (_picture(runner(r, s)) for r, s in zip(reference, REFERENCE_SEEDS, strict=True))
-            return cls((first, first), _rms(first - second))
-        picture = compare.Layer.read(reference)
-        known = 0.0 if picture.variance is None else float(picture.variance.mean()) ** 0.5
-        values = picture.values.astype(np.float64)
-        return cls((values, values), known)
+def _reference(reference: Any, runner: _Runner) -> tuple[tuple[np.ndarray, np.ndarray], float]:
+    """Return two independent halves of the reference, or twice the same picture; and its own error."""
+    if isinstance(reference, Mapping):
+        spp = {"spp": int(reference["spp"]) // 2} if reference.get("spp", 1) > 1 else {}
+        results = [runner({**reference, **spp}, seed) for seed in REFERENCE_SEEDS]
+        first, second = map(_picture, results)
+        if (first == second).all() and (aa := results[0].plan.lattice.aa) > 1:
+            coarser = _picture(runner({**reference, "aa": aa - 1}, REFERENCE_SEEDS[0]))
+            return (first, first), _rms(first - coarser)
+        return (first, second), _rms(first - second) / 2
+    if isinstance(reference, Sequence) and not isinstance(reference, str):
+        first, second = (_picture(runner(r, s)) for r, s in zip(reference, REFERENCE_SEEDS, strict=True))
+        return (first, first), _rms(first - second)
+    picture = compare.Layer.read(reference)
+    known = 0.0 if picture.variance is None else float(picture.variance.mean()) ** 0.5
+    values = picture.values.astype(np.float64)
+    return (values, values), known
 
 
 def _picture(result: Result) -> np.ndarray:
@@ -161,12 +150,22 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _measure(
-    runner: _Runner, cases: Mapping[str, Options], truth: _Truth, repeats: int, progress: Progress
-) -> dict[str, Point | str]:
-    """Return the point of every case, or why it failed.
+def _seconds(result: Result) -> float:
+    """Return seconds of a render but for loading its scene."""
+    return result.timings.total - result.timings.load
 
-    It runs cold, warm, and ``repeats`` times in turn, so that a load on the machine meets all alike.
+
+def _measure(
+    runner: _Runner,
+    cases: Mapping[str, Options],
+    halves: tuple[np.ndarray, np.ndarray],
+    own_error: float,
+    repeats: int,
+    progress: Progress,
+) -> tuple[dict[str, Point], dict[str, str]]:
+    """Return the points of cases, and why others failed.
+
+    Each runs cold, warm, and ``repeats`` times in turn, so that a load on the machine meets all alike.
     """
     cold: dict[str, Result] = {}
     failed: dict[str, str] = {}
@@ -174,50 +173,39 @@ def _measure(
     with progress.stage("Error against time", len(cases) * (repeats + 2)) as advance:
         for turn in range(-2, repeats):  # cold, warm, and those that count
             for name in cases:
-                if name not in failed:
-                    try:
-                        if turn == -2:
-                            timing.forget()
-                        result = runner(cases[name], max(turn, 0))
-                        _check_size(_picture(result), truth)
-                    except Exception as error:
-                        failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())}"
-                    else:
-                        cold.setdefault(name, result)
-                        runs[name] += [result] if turn >= 0 else []
                 advance(1)
-    return {
-        name: failed[name] if name in failed else _point(name, cases[name], cold[name], runs[name], truth)
-        for name in cases
-    }
-
-
-def _check_size(image: np.ndarray, truth: _Truth) -> None:
-    if image.shape != truth.image.shape:
-        sizes = " and the reference ".join(f"{i.shape[1]}x{i.shape[0]}" for i in (image, truth.image))
-        raise UsageError(f"it has {sizes} pixels: their sizes must be the same")
-
-
-def _seconds(result: Result) -> float:
-    """Return seconds of a render but for loading its scene."""
-    return result.timings.total - result.timings.load
-
-
-def _point(name: str, options: Options, cold: Result, runs: Sequence[Result], truth: _Truth) -> Point:
-    errors = [np.stack([r.image.ravel() - half.ravel() for r in runs]) for half in truth.halves]
-    gram = errors[0] @ errors[1].T / errors[0].shape[1]
-    return Point(
-        name=name,
-        options=options,
-        times=np.array([_seconds(r) for r in runs]),
-        gram=(gram + gram.T) / 2,
-        cold=_seconds(cold),
-        compile=cold.timings.compile,
-        rays=dict(runs[0].rays),
-        image=runs[0].image,
-        difference=compare.compare(runs[0].image, truth.image),
-        reference_error=truth.error,
-    )
+                if name in failed:
+                    continue
+                try:
+                    if turn == -2:
+                        timing.forget()
+                    result = runner(cases[name], max(turn, 0))
+                    if (image := _picture(result)).shape != halves[0].shape:
+                        both = (f"{i.shape[1]}x{i.shape[0]}" for i in (image, halves[0]))
+                        sizes = " and the reference ".join(both)
+                        raise UsageError(f"it has {sizes} pixels: their sizes must be the same")
+                except Exception as error:
+                    failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+                    continue
+                cold.setdefault(name, result)
+                runs[name] += [result] if turn >= 0 else []
+    points = {}
+    for name in [name for name in cases if name not in failed]:
+        errors = [np.stack([r.image.ravel() - half.ravel() for r in runs[name]]) for half in halves]
+        gram = errors[0] @ errors[1].T / errors[0].shape[1]
+        points[name] = Point(
+            name=name,
+            options=cases[name],
+            times=np.array([_seconds(r) for r in runs[name]]),
+            gram=(gram + gram.T) / 2,
+            cold=_seconds(cold[name]),
+            compile=cold[name].timings.compile,
+            rays=dict(runs[name][0].rays),
+            image=runs[name][0].image,
+            difference=compare.compare(runs[name][0].image, (halves[0] + halves[1]) / 2),
+            reference_error=own_error,
+        )
+    return points, {name: failed[name] for name in cases if name in failed}
 
 
 def _round_errors(points: Any, floor: float) -> list[float]:
@@ -231,16 +219,6 @@ def _round_errors(points: Any, floor: float) -> list[float]:
     return inside[::-1][:MOST_ERRORS] or [float(f"{np.sqrt(min(found) * max(found)):.1e}")]
 
 
-def _claimed(errors: Sequence[float], truth: _Truth) -> list[float]:
-    low = [e for e in errors if not e > RESOLVED * truth.error]
-    if low:
-        raise UsageError(
-            f"no claim can be made about an RMSE of {low[0]:g}: the reference's own error is "
-            f"{truth.error:.2g}, and only errors above twice that stand out; take a better reference"
-        )
-    return list(errors)
-
-
 def _strips(found: WorkPrecision, runner: _Runner) -> list[Strip]:
     """Render what each curve of several cases reaches in times that all of them have."""
     curves = {name: points for name, points in found.families.items() if len(points) > 1}
@@ -249,7 +227,7 @@ def _strips(found: WorkPrecision, runner: _Runner) -> list[Strip]:
     low = max(points[0].seconds for points in curves.values())
     high = min(points[-1].seconds for points in curves.values())
     budgets = [low, high] if high > 3 * low else [np.sqrt(low * high)]
-    return [Strip(t, [_panel(p, t, runner, found.repeats) for p in curves.values()]) for t in budgets]
+    return [(t, [_panel(p, t, runner, found.repeats) for p in curves.values()]) for t in budgets]
 
 
 def _panel(points: Sequence[Point], seconds: float, runner: _Runner, seed: int) -> Panel:
@@ -258,9 +236,9 @@ def _panel(points: Sequence[Point], seconds: float, runner: _Runner, seed: int) 
     spp = near.options.get("spp")
     wanted = max(1, round(spp * seconds / near.seconds)) if isinstance(spp, int) else spp
     if wanted == spp:
-        return Panel(near.name, near.seconds, near.image)
+        return near.name, near.seconds, near.image
     try:
         result = runner({**near.options, "spp": wanted}, seed)
     except Exception:  # so many samples may not fit
-        return Panel(near.name, near.seconds, near.image)
-    return Panel(f"{near.family}, {wanted} spp", _seconds(result), result.image)
+        return near.name, near.seconds, near.image
+    return f"{near.family}, {wanted} spp", _seconds(result), result.image
