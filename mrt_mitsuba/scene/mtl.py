@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+import re
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.scene.files import MISSING, Findings, decode, find, numbers, read_text
@@ -27,35 +29,10 @@ _WITHOUT_EFFECT |= {
     for name, values in (("Ke", _NOTHING), ("Tf", _OPAQUE))
 }
 
-# Options of a map_Kd statement, with the number of values that follow each
-_MAP_OPTIONS = {
-    "-blendu": (1, 1),
-    "-blendv": (1, 1),
-    "-cc": (1, 1),
-    "-clamp": (1, 1),
-    "-boost": (1, 1),
-    "-imfchan": (1, 1),
-    "-texres": (1, 1),
-    "-bm": (1, 1),
-    "-mm": (2, 2),
-    "-o": (1, 3),
-    "-s": (1, 3),
-    "-t": (1, 3),
-}
-
-
-@dataclass
-class _Entry:
-    """The statements of one newmtl block; None for those it does not have."""
-
-    line: int
-    kd: Color | None = None
-    ks: Color | None = None
-    ka: Color | None = None
-    ni: float | None = None
-    ns: float | None = None
-    map_kd: tuple[int, str] | None = None  # line, rest of the statement
-    unknown: set[str] = field(default_factory=set)
+_REAL = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
+# Options of a map_Kd statement, with the least and the largest number of values that follow each
+_MAP_OPTIONS = {f"-{name}": (1, 1) for name in ("blendu", "blendv", "cc", "clamp", "boost", "texres", "bm")}
+_MAP_OPTIONS |= {"-imfchan": (1, 1), "-mm": (2, 2), "-o": (1, 3), "-s": (1, 3), "-t": (1, 3)}
 
 
 def read_mtl(
@@ -79,132 +56,84 @@ def read_mtl(
     """
     path = Path(path)
     findings = Findings()
-    # the report's reading defines itself; from the standard's, statements may be missing
-    unused = findings if convention == "standard" else None
-    entries = _parse(path, decode(read_text(path)).split("\n"), unused)
-    make = {"report": _report_material, "standard": _standard_material}[convention]
-    materials = {}
-    for name, entry in entries.items():
-        material = make(entry)
-        if entry.map_kd is not None:
-            line, rest = entry.map_kd
-            material = replace(material, texture=_texture(path, line, rest, folder, findings))
-        materials[name] = material
-    findings.warn()
-    return materials
-
-
-def _parse(path: Path, lines: list[str], findings: Findings | None) -> dict[str, _Entry]:
-    entries: dict[str, _Entry] = {}
-    current: _Entry | None = None
-    for number, line in enumerate(lines, 1):
-        statement, _, rest = line.split("#", 1)[0].strip().partition(" ")
-        statement, _, tabbed = statement.partition("\t")
-        rest = f"{tabbed} {rest}".strip()
-        where = f"{path}:{number}"
+    blocks: dict[str, dict[str, Any]] = {}
+    block: dict[str, Any] | None = None
+    for number, line in enumerate(decode(read_text(path)).split("\n"), 1):
+        statement, *rest = line.split("#", 1)[0].strip().split(maxsplit=1)[:2] or [""]
+        text, where = "".join(rest), f"{path}:{number}"
         if statement == "newmtl":
-            if not rest:
+            if not text:
                 raise SceneError(f"{where}: newmtl has no name; write newmtl NAME")
-            current = entries[rest] = _Entry(number)
-        elif statement in _STATEMENTS:
-            if current is None:
+            block = blocks[text] = {}
+        elif statement in ("Kd", "Ks", "Ka", "Ni", "Ns", "map_Kd"):
+            if block is None:
                 raise SceneError(f"{where}: {statement} comes before any newmtl; write newmtl NAME before it")
-            _STATEMENTS[statement](current, where, number, rest)
-        elif findings is not None and rest not in _WITHOUT_EFFECT.get(statement, ()) and statement:
-            findings.add("statements", f"{where}: {statement} {rest[:40]} is not used")
-    return entries
+            block[statement] = _value(statement, text, where, folder or path.parent, path.parent, findings)
+        # the report's reading defines itself; from the standard's, statements may be missing
+        elif statement and convention == "standard" and text not in _WITHOUT_EFFECT.get(statement, ()):
+            findings.add("statements", f"{where}: {statement} {text[:40]} is not used")
+    findings.warn()
+    make = {"report": _report_material, "standard": _standard_material}[convention]
+    return {name: replace(make(block), texture=block.get("map_Kd")) for name, block in blocks.items()}
 
 
-def _color(name: str) -> Callable[[_Entry, str, int, str], None]:
-    def read(entry: _Entry, where: str, line: int, rest: str) -> None:
-        words = rest.split()
-        if words and words[0] in ("spectral", "xyz"):
-            raise SceneError(f"{where}: {name} {words[0]} is not supported; give red, green and blue")
-        values = numbers(where, name, words, 1, 3)
-        if min(values) < 0:
-            raise SceneError(f"{where}: {name} is {rest}, but a colour must not be negative")
-        if len(values) == 2:
-            raise SceneError(f"{where}: {name} has 2 numbers, but must have 1 or 3")
-        setattr(entry, name.lower(), tuple(values * (3 if len(values) == 1 else 1)))
+def _value(
+    statement: str, text: str, where: str, folder: Path, library: Path, findings: Findings
+) -> Color | float | str | None:
+    """Return a colour, a number, or the path of a picture; None, with a warning, for one that is missing.
 
-    return read
-
-
-def _number(name: str) -> Callable[[_Entry, str, int, str], None]:
-    def read(entry: _Entry, where: str, line: int, rest: str) -> None:
-        (value,) = numbers(where, name, rest.split(), 1, 1)
-        if value < 0:
-            raise SceneError(f"{where}: {name} is {rest}, but must not be negative")
-        setattr(entry, name.lower(), value)
-
-    return read
-
-
-def _map(entry: _Entry, where: str, line: int, rest: str) -> None:
-    if not rest:
-        raise SceneError(f"{where}: map_Kd names no file")
-    entry.map_kd = line, rest
-
-
-_STATEMENTS: dict[str, Callable[[_Entry, str, int, str], None]] = {
-    "Kd": _color("Kd"),
-    "Ks": _color("Ks"),
-    "Ka": _color("Ka"),
-    "Ni": _number("Ni"),
-    "Ns": _number("Ns"),
-    "map_Kd": _map,
-}
+    Raises ``SceneError`` for anything else.
+    """
+    words = text.split()
+    if statement == "map_Kd":
+        if not text:
+            raise SceneError(f"{where}: map_Kd names no file")
+        name = _without_options(words)
+        found = find(text, [folder, library]) or (find(name, [folder, library]) if name else None)
+        if found is None:
+            missing = f"{where}: the texture {name or text} {MISSING} {folder}; Kd is used in its place"
+            findings.add("textures", missing)
+        return found and str(found)
+    colored = statement.startswith("K")
+    if colored and words and words[0] in ("spectral", "xyz"):
+        raise SceneError(f"{where}: {statement} {words[0]} is not supported; give red, green and blue")
+    values = numbers(where, statement, words, 1, 3 if colored else 1)
+    if min(values) < 0:
+        what = "a colour must not" if colored else "must not"
+        raise SceneError(f"{where}: {statement} is {text}, but {what} be negative")
+    if len(values) == 2:
+        raise SceneError(f"{where}: {statement} has 2 numbers, but must have 1 or 3")
+    return (
+        values[0] if not colored else (values[0], values[-1] if len(values) == 1 else values[1], values[-1])
+    )
 
 
-def _report_material(entry: _Entry) -> Material:
+def _report_material(block: Mapping[str, Any]) -> Material:
     default = DEFAULT_MATERIAL
     return Material(
-        ior=default.ior if entry.ka is None else entry.ka[0],
-        alpha=default.alpha if entry.ni is None else entry.ni,
-        specular=default.specular if entry.ks is None else entry.ks,
-        diffuse=default.diffuse if entry.kd is None else entry.kd,
+        ior=block.get("Ka", (default.ior,))[0],
+        alpha=block.get("Ni", default.alpha),
+        specular=block.get("Ks", default.specular),
+        diffuse=block.get("Kd", default.diffuse),
     )
 
 
-def _standard_material(entry: _Entry) -> Material:
+def _standard_material(block: Mapping[str, Any]) -> Material:
     return Material(
-        ior=1.0 if entry.ni is None else entry.ni,
-        alpha=math.sqrt(2 / ((entry.ns or 0.0) + 2)),
-        specular=entry.ks or (0.0, 0.0, 0.0),
-        diffuse=entry.kd or (0.8, 0.8, 0.8),
+        ior=block.get("Ni", 1.0),
+        alpha=math.sqrt(2 / (block.get("Ns", 0.0) + 2)),
+        specular=block.get("Ks", (0.0, 0.0, 0.0)),
+        diffuse=block.get("Kd", (0.8, 0.8, 0.8)),
     )
 
 
-def _texture(path: Path, line: int, rest: str, folder: Path | None, findings: Findings) -> str | None:
-    """Return the picture that a map_Kd statement names, or None, with a warning, where there is none."""
-    folders = [path.parent] if folder is None else [folder, path.parent]
-    name = rest
-    found = find(name, folders)
-    if found is None:
-        name = _without_options(rest)
-        found = find(name, folders) if name else None
-    if found is None:
-        text = f"{path}:{line}: the texture {name or rest} {MISSING} {folders[0]}; Kd is used in its place"
-        findings.add("textures", text)
-        return None
-    return str(found)
-
-
-def _without_options(rest: str) -> str:
+def _without_options(words: list[str]) -> str:
     """Return the file name of a map statement, which follows its options."""
-    words = rest.split()
     while words and words[0] in _MAP_OPTIONS:
-        least, most = _MAP_OPTIONS[words.pop(0)]
+        least, most = _MAP_OPTIONS[words[0]]
+        words = words[1:]
         for taken in range(most):
-            if taken >= least and not _is_number(words[0] if words else ""):
+            if taken >= least and not re.fullmatch(_REAL, words[0] if words else ""):
                 break
             words = words[1:]
     return " ".join(words)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -53,11 +53,11 @@ def open_scene(
     ``model_scene``.
     """
     check_model_options(scene, model or {})
-    name, own = _model(scene, model or {})
+    own = _in_our_terms(scene, model or {})
     # a key of mi.traverse has a dot, the name of a parameter of an XML file has none
     keys = {key: value for key, value in (params or {}).items() if "." in key}
     declared = {key: value for key, value in (params or {}).items() if "." not in key}
-    if declared and not _is_xml(scene):
+    if declared and not str(scene).lower().endswith(".xml"):
         raise UsageError(
             f"params: {next(iter(declared))} is not a key of mi.traverse, and only an XML file declares names"
         )
@@ -66,20 +66,21 @@ def open_scene(
             raise UsageError(
                 "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
             )
-        name, loaded, values = _own(scene, budget, declared)
+        name, loaded, values = _loaded(scene, budget, declared)
         if keys and loaded is scene:
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
         set_parameters(loaded, keys)
         view = _sensor(name, loaded, sensor)
-        width, height = _film_size(name, view, *size)
-        focus = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
-        chosen = _integrator(integrator, loaded)
-        return Source(name, loaded, view, chosen, width, height, *focus, own=True)
+        width, height = (a or int(b) for a, b in zip(size, view.film().crop_size(), strict=True))
+        distance, reach = (_number(values.get(key)) for key in ("focaldist", "focalrange"))  # of write_xml
+        chosen, reach = _integrator(integrator, loaded), FOCAL_RANGE if reach is None else reach
+        return Source(name, loaded, view, chosen, width, height, distance, reach, own=True)
     if budget is not None:
         budget.inputs.update(own.files)
     width, height, fresnel = size[0] or SIZE[0], size[1] or SIZE[1], fresnel or "schlick"
     # its meshes have a material each: kept apart, they stay in order, and the same file has the same layers
     nodes = own.to_dict(width=width, height=height, fresnel=fresnel)
+    name = str(operator.index(scene)) if hasattr(scene, "__index__") else own.title or "a scene"
     loaded = load_dict(nodes, name, budget, merge=False)
     set_parameters(loaded, keys)
     view, integrator = _sensor(name, loaded, sensor), _integrator(integrator, loaded)
@@ -127,38 +128,24 @@ def sized(source: Source) -> Iterator[None]:
     names = ("film.size", "film.crop_size", "film.crop_offset")
     before = [list(parameters[name]) for name in names]
     try:
-        _set(parameters, zip(names, (size, size, [0, 0]), strict=True))
+        parameters.update(dict(zip(names, (size, size, [0, 0]), strict=True)))
         yield
     finally:
-        _set(parameters, zip(names, before, strict=True))
+        parameters.update(dict(zip(names, before, strict=True)))
 
 
-def _set(parameters: Any, values: Iterable[tuple[str, Any]]) -> None:
-    for name, value in values:
-        parameters[name] = value
-    parameters.update()
-
-
-def _is_xml(scene: Any) -> bool:
-    return isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".xml")
-
-
-def _model(scene: Any, options: Mapping[str, Any]) -> tuple[str, Scene | None]:
-    """Return the name and the model of a scene in the report's terms; no model of any other."""
-    if isinstance(scene, Scene):
-        return scene.title or "a scene", scene
+def _in_our_terms(scene: Any, options: Mapping[str, Any]) -> Scene | None:
+    """Return a scene in the report's terms, or None for any other."""
     if hasattr(scene, "__index__"):
-        number = operator.index(scene)
-        return str(number), report_scene(number)
+        return report_scene(operator.index(scene))
     if is_obj(scene):
         from mrt_mitsuba.scene.placement import model_scene
 
-        model = model_scene(scene, **options)
-        return model.title, model
-    return "", None
+        return model_scene(scene, **options)
+    return scene if isinstance(scene, Scene) else None
 
 
-def _own(
+def _loaded(
     scene: Any, budget: Budget | None, declared: Mapping[str, Any]
 ) -> tuple[str, Any, Mapping[str, str]]:
     """Return the name of someone's own scene, the Mitsuba scene, and the parameters of its file."""
@@ -187,12 +174,11 @@ def _check_variant(name: str, thing: Any) -> None:
         )
 
 
-def _number(values: Mapping[str, str], name: str, default: Any) -> Any:
-    """Return a parameter of a file that ``write_xml`` gives a focus."""
+def _number(text: str | None) -> float | None:
     try:
-        return max(0.0, float(values[name]))
-    except (KeyError, ValueError):
-        return default
+        return None if text is None else max(0.0, float(text))
+    except ValueError:
+        return None
 
 
 def _sensor(name: str, scene: Any, number: int) -> Any:
@@ -210,17 +196,14 @@ def _sensor(name: str, scene: Any, number: int) -> Any:
     for part in parts:
         if part.class_name() == "IrradianceMeter" and part.get_shape() is None:  # Mitsuba would crash
             raise SceneError(f"{name} has an irradiancemeter outside of a shape: put it into one")
-    reach = sensor.film().rfilter().radius()
-    if not 0 <= reach <= WIDEST_FILTER:
-        raise SceneError(f"{name} has a filter of radius {reach:g}: give at most {WIDEST_FILTER} pixels")
+    film = sensor.film()
+    width, height = film.crop_size()
+    if width < 1 or height < 1:
+        raise SceneError(f"{name} brings a film of {width}x{height}: give it one pixel at least")
+    if not 0 <= film.rfilter().radius() <= WIDEST_FILTER:
+        radius = film.rfilter().radius()
+        raise SceneError(f"{name} has a filter of radius {radius:g}: give at most {WIDEST_FILTER} pixels")
     return sensor
-
-
-def _film_size(name: str, sensor: Any, width: int | None, height: int | None) -> tuple[int, int]:
-    own_width, own_height = (int(n) for n in sensor.film().crop_size())
-    if own_width < 1 or own_height < 1:
-        raise SceneError(f"{name} brings a film of {own_width}x{own_height}: give it one pixel at least")
-    return width or own_width, height or own_height
 
 
 def _integrator(integrator: Any, scene: Any) -> Any:
