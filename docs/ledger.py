@@ -149,15 +149,16 @@ def cylinder() -> str:
     """Distances of random rays to a cylinder, in float32 against float64."""
     import mitsuba as mi
 
-    from mrt_mitsuba.plugins.intersect import cylinder_frame, intersect_cylinder
+    from mrt_mitsuba.plugins.quadric_kinds import KINDS
 
     rng = np.random.default_rng(1)
     d = rng.normal(size=(3, 100_000)).astype(np.float32)
     o = (0.5 * rng.normal(size=d.shape) - 4 * d / np.linalg.norm(d, axis=0)).astype(np.float32)
 
     def distances(point, vector):
-        frame = cylinder_frame(point(0, -0.5, 0), point(0.25, 0.5, 0), 0.5)
-        return np.array(intersect_cylinder(point(o), vector(d), frame).t, np.float64)
+        kind = KINDS["cylinder"]
+        frame = kind.frame(point(0, -0.5, 0), point(0.25, 0.5, 0), 0.5)
+        return np.array(kind.intersect(point(o), vector(d), frame).t, np.float64)
 
     t, exact = distances(mi.Point3f, mi.Vector3f), distances(mi.Point3d, mi.Vector3d)
     both = np.isfinite(t) & np.isfinite(exact)

@@ -13,8 +13,7 @@ from .intersect import Frame
 from .mesh_api import construct, keep_apart, write_buffers
 from .parameters import ParameterError, flag, integer, number, vector
 from .protocols import QuadricShape
-from .quadric_kinds import KINDS, QuadricTable
-from .unit_meshes import UnitMesh
+from .quadric_kinds import KINDS, QuadricTable, UnitMesh
 from .variants import first, is_jit, updatable
 
 # From some thousand sides on the triangles are slivers, between which rays slip through; more would not help
@@ -24,8 +23,7 @@ MOST_SEGMENTS = 65536
 def axial_mesh(kind: str, end0: str, end1: str) -> type[mi.Mesh]:
     """Return the base class of ``mrt_KIND``, for the current variant (Mitsuba's classes take no mix-in).
 
-    Its parameters are the two points by these names, ``radius``, ``segments``, ``to_world``, and ``capped``
-    where the kind has an open twin.
+    Its parameters are the two points by these names, ``radius``, ``segments``, ``capped`` and ``to_world``.
     """
     plugin, names = f"mrt_{kind}", (end0, end1, "radius")
 
@@ -34,9 +32,8 @@ def axial_mesh(kind: str, end0: str, end1: str) -> type[mi.Mesh]:
             ends = vector(props, end0), vector(props, end1)
             radius = number(props, "radius", 1.0, above=0)
             _check_axis(plugin, end0, ends[0], end1, ends[1])
-            open_twin = KINDS[kind].open_twin
-            self.capped = open_twin is None or flag(props, "capped", True)
-            self.kind = kind if self.capped or open_twin is None else open_twin
+            self.capped = flag(props, "capped", True)
+            self.kind = kind if self.capped else f"open {kind}"
             self.placement = Placement(props)
             self.unit = KINDS[self.kind].mesh(side_count(props, 256))
             self.exact_frame = self._frame_of(vector64(ends[0]), vector64(ends[1]), radius)

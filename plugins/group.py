@@ -11,8 +11,7 @@ from .axial_mesh import Placement, side_count
 from .mesh_api import construct, keep_apart, write_buffers
 from .parameters import ParameterError, choice
 from .protocols import QuadricShape
-from .quadric_kinds import KINDS, QuadricTable
-from .unit_meshes import UnitMesh
+from .quadric_kinds import KINDS, QuadricTable, UnitMesh
 
 # Kinds that a group may hold
 CLOSED = tuple(name for name, kind in KINDS.items() if kind.closed)

@@ -105,57 +105,8 @@ class SurfaceHit:
     part: Any
 
 
-@dataclass
-class SurfacePoint:
-    """A point ``p`` put onto a surface, the outward unit normal ``n``, and texture coordinates ``u, v``."""
-
-    p: Any
-    n: Any
-    u: Any
-    v: Any
-
-
-def cone_frame(apex: Any, base_center: Any, radius: Any) -> Frame:
-    """Return the unit frame of a right circular cone."""
-    return _frame_along(apex, base_center - apex, radius)
-
-
-def cylinder_frame(p0: Any, p1: Any, radius: Any) -> Frame:
-    """Return the unit frame of a right circular cylinder from ``p0`` (z = 0) to ``p1`` (z = 1)."""
-    return _frame_along(p0, p1 - p0, radius)
-
-
-def sphere_frame(center: Any, radius: Any) -> Frame:
-    """Return the unit frame of a sphere."""
-    inverse = 1 / radius
-    zero = 0 * inverse
-    make = type(center)
-    x, y, z = make([inverse, zero, zero]), make([zero, inverse, zero]), make([zero, zero, inverse])
-    return Frame(center, x, y, z)
-
-
-def _frame_along(origin: Any, axis: Any, radius: Any) -> Frame:
-    """Return the frame whose z runs along ``axis``; seen against it, u grows counter-clockwise."""
-    length2 = dr.squared_norm(axis)
-    n = axis / -dr.sqrt(length2)
-    s, t = tangents(n)
-    return Frame(origin, s / radius, t / radius, axis / length2)
-
-
 def _cross(a: Any, b: Any) -> Any:
     return type(a)([a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x])
-
-
-def tangents(n: Any) -> tuple[Any, Any]:
-    """Return two unit vectors that make a right-handed frame with the unit vector ``n``.
-
-    Source: Duff et al., "Building an Orthonormal Basis, Revisited", 2017.
-    """
-    sign = dr.select(n.z >= 0, 1, -1)
-    a = -1 / (sign + n.z)
-    b = n.x * n.y * a
-    make = type(n)
-    return make([1 + sign * n.x * n.x * a, sign * b, -sign * n.x]), make([b, sign + n.y * n.y * a, -n.y])
 
 
 def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> SurfaceHit:
@@ -225,92 +176,6 @@ def intersect_cylinder(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> 
     )
 
 
-def cone_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
-    """Put a point near a cone onto the given part of it, along the normal.
-
-    Side: u = azimuth / 2π in [0, 1), v = 0 at the base and 1 at the apex. Base: the unit square around the
-    disc. At the apex the normal is that of one of the generatrices.
-    """
-    q = frame.point(p)
-    r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
-    on_side = part == LATERAL
-    x, y = _azimuth(q, r)
-    gradient = type(q)([dr.select(on_side, x, 0), dr.select(on_side, y, 0), dr.select(on_side, -1, 1)])
-    return _surface_point(p, q, dr.select(on_side, r - q.z, q.z - 1), gradient, on_side, frame)
-
-
-def cylinder_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
-    """Put a point near a cylinder onto the given part of it, along the normal.
-
-    Side: u = azimuth / 2π in [0, 1), v = 0 at the disc ``BASE``, 1 at ``TOP``. Discs: the unit square around
-    each.
-    """
-    q = frame.point(p)
-    r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
-    on_side, on_base = part == LATERAL, part == BASE
-    x, y = _azimuth(q, r)
-    off_disc = dr.select(on_base, q.z - 1, -q.z)
-    z = dr.select(on_side, 0, dr.select(on_base, 1, -1))
-    gradient = type(q)([dr.select(on_side, x, 0), dr.select(on_side, y, 0), z])
-    return _surface_point(p, q, dr.select(on_side, r - 1, off_disc), gradient, on_side, frame)
-
-
-def intersect_unit_sphere(o: Any, d: Any, frame: Frame) -> SurfaceHit:
-    """Return the first hit at t > 0 of a ray with the sphere of radius 1 around the origin of ``frame``."""
-    o = frame.point(o)
-    t = intersect_sphere(o, frame.vector(d), type(o)([0.0, 0.0, 0.0]), 1.0)
-    return SurfaceHit(t, LATERAL)
-
-
-def sphere_surface(p: Any, part: Any, frame: Frame) -> SurfacePoint:
-    """Put a point near the sphere of ``frame`` onto it, along the normal.
-
-    u = azimuth / 2π in [0, 1), v = angle to +z over π, as in Mitsuba's ``sphere``.
-    """
-    q = frame.point(p)
-    r = dr.norm(q)
-    at_center = r == 0
-    gradient = q * (1 / dr.select(at_center, 1, r))
-    g = frame.gradient(gradient)
-    inverse = 1 / dr.select(at_center, 1, dr.norm(g))
-    n = g * inverse
-    azimuth = dr.atan2(q.y, q.x) / (2 * dr.pi)
-    v = dr.acos(dr.clip(gradient.z, -1, 1)) / dr.pi
-    return SurfacePoint(p - n * ((r - 1) * inverse), n, dr.select(azimuth < 0, azimuth + 1, azimuth), v)
-
-
-# ------------------------------ Derivatives of a surface point by u and v -------------------------------
-
-
-def cone_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
-    """Return derivatives by u and v of a point of ``cone_surface``; both are in the unit frame."""
-    x, y = _azimuth(q, dr.sqrt(dr.square(q.x) + dr.square(q.y)))
-    return _axial_derivatives(q, part, type(q)([-x, -y, -1 + 0 * x]))
-
-
-def cylinder_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
-    """Return derivatives by u and v of a point of ``cylinder_surface``; both are in the unit frame."""
-    return _axial_derivatives(q, part, type(q)([0 * q.x, 0 * q.x, -1 + 0 * q.x]))
-
-
-def _axial_derivatives(q: Any, part: Any, along: Any) -> tuple[Any, Any]:
-    """Return the derivatives of the side, ``along`` by v, or of a disc in the unit square."""
-    side, zero = part == LATERAL, 0 * q.x
-    two = 2 + zero
-    around = type(q)([-2 * dr.pi * q.y, 2 * dr.pi * q.x, zero])
-    by_u = [dr.select(side, a, b) for a, b in zip(around, (two, zero, zero), strict=True)]
-    by_v = [dr.select(side, a, b) for a, b in zip(along, (zero, two, zero), strict=True)]
-    return type(q)(by_u), type(q)(by_v)
-
-
-def sphere_derivatives(q: Any, part: Any, frame: Frame) -> tuple[Any, Any]:
-    """Return derivatives by u and v of a point of ``sphere_surface``; both are in the unit frame."""
-    r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
-    x, y = _azimuth(q, r)
-    around = type(q)([-2 * dr.pi * q.y, 2 * dr.pi * q.x, 0 * q.x])
-    return around, type(q)([q.z * x, q.z * y, -r]) * dr.pi
-
-
 @dataclass
 class _Line:
     """A ray's line in the unit frame: s ↦ p + s u with |u| = 1, p · u = 0, and s = t length − start."""
@@ -360,21 +225,3 @@ def _first_boundary(
     t = dr.select(from_outside, near_t, far_t)
     part = dr.select(from_outside, near_part, far_part)
     return SurfaceHit(dr.select(inside & (t > 0), t, dr.inf), part)
-
-
-def _azimuth(q: Any, r: Any) -> tuple[Any, Any]:
-    """Return cosine and sine of the azimuth of ``q`` at distance r from the axis; on the axis, those of 0."""
-    on_axis = r == 0
-    inverse = 1 / dr.select(on_axis, 1, r)
-    return dr.select(on_axis, 1, q.x * inverse), q.y * inverse
-
-
-def _surface_point(p: Any, q: Any, distance: Any, gradient: Any, on_side: Any, frame: Frame) -> SurfacePoint:
-    """Move ``p`` (``q`` in the unit frame) by a Newton step; ``distance`` is linear along ``gradient``."""
-    g = frame.gradient(gradient)
-    inverse = 1 / dr.norm(g)
-    n = g * inverse
-    azimuth = dr.atan2(q.y, q.x) / (2 * dr.pi)
-    u = dr.select(on_side, dr.select(azimuth < 0, azimuth + 1, azimuth), 0.5 + 0.5 * q.x)
-    v = dr.select(on_side, 1 - q.z, 0.5 + 0.5 * q.y)
-    return SurfacePoint(p - n * (distance * inverse), n, u, dr.clip(v, 0, 1))

@@ -1,91 +1,252 @@
-"""The one table of the quadrics that ``mrt_whitted`` traces exactly, in float32 and by numpy alike."""
+"""The kinds of quadrics that ``mrt_whitted`` traces exactly, a class of pure functions each, and their table.
+
+Everything works in float32 and float64, on scalars, Dr.Jit arrays and lists of columns alike (see
+``intersect``). ``points`` place a quadric, followed by a radius: ``width`` numbers. ``parts`` are of its
+surface, ``ends`` what is at both ends of its axis.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from .columns import Columns, column
 from .intersect import (
+    BASE,
+    LATERAL,
+    TOP,
     Frame,
     SurfaceHit,
-    SurfacePoint,
-    cone_derivatives,
-    cone_frame,
-    cone_surface,
-    cylinder_derivatives,
-    cylinder_frame,
-    cylinder_surface,
     intersect_cone,
     intersect_cylinder,
-    intersect_unit_sphere,
-    sphere_derivatives,
-    sphere_frame,
-    sphere_surface,
+    intersect_sphere,
 )
-from .unit_meshes import UnitMesh, unit_cone_mesh, unit_cylinder_mesh, unit_sphere_mesh
 
 POINT, DISC, BALL = (0, 0, 0), (1, 1, 0), (1, 1, 1)
 """What the ends of a quadric are, by the squared semi-axes of their unit frame that span them."""
 
 
+@dataclass
+class SurfacePoint:
+    """A point ``p`` put onto a surface, the outward unit normal ``n``, and texture coordinates ``u, v``."""
+
+    p: Any
+    n: Any
+    u: Any
+    v: Any
+
+
 @dataclass(frozen=True)
-class QuadricKind:
-    """A kind of quadric: the convex hull, or its curved side, of what is at the two ends of an axis."""
+class UnitMesh:
+    """Vertices in the unit frame, with the gradient that becomes the normal of each."""
 
-    points: int  #: that place it; a radius follows
-    frame: Callable[..., Frame]  #: its unit frame, of these points and the radius
-    intersect: Callable[[Any, Any, Frame], SurfaceHit]
-    surface: Callable[[Any, Any, Frame], SurfacePoint]  #: puts a point onto it
-    ends: tuple[tuple[int, int, int], tuple[int, int, int]]  #: of its axis: point, disc or ball
-    derivatives: Callable[[Any, Any, Frame], tuple[Any, Any]]  #: of a surface point, by u and v
-    mesh: Callable[[int], UnitMesh]  #: what other integrators see, of so many sides
-    open_twin: str | None = None  #: name of the kind without its discs
-    closed: bool = True
-
-    @property
-    def width(self) -> int:
-        """Return how many numbers an object is made of."""
-        return 3 * self.points + 1
+    points: np.ndarray  # float64 [N, 3]
+    gradients: np.ndarray  # float64 [N, 3]
+    uvs: np.ndarray  # float64 [N, 2]
+    faces: np.ndarray  # uint32 [M, 3], counter-clockwise seen from outside in a right-handed frame
 
 
-_CONE = partial(
-    QuadricKind, 2, cone_frame, surface=cone_surface, ends=(POINT, DISC), derivatives=cone_derivatives
-)
-_CYLINDER = partial(
-    QuadricKind,
-    2,
-    cylinder_frame,
-    surface=cylinder_surface,
-    ends=(DISC, DISC),
-    derivatives=cylinder_derivatives,
-)
+class Sphere:
+    """A sphere of radius 1 around 0."""
 
-KINDS: dict[str, QuadricKind] = {
-    "sphere": QuadricKind(
-        1,
-        sphere_frame,
-        intersect_unit_sphere,
-        sphere_surface,
-        (BALL, BALL),
-        sphere_derivatives,
-        unit_sphere_mesh,
-    ),
-    "cone": _CONE(intersect_cone, mesh=unit_cone_mesh, open_twin="open cone"),
-    "open cone": _CONE(
-        partial(intersect_cone, capped=False), mesh=partial(unit_cone_mesh, capped=False), closed=False
-    ),
-    "cylinder": _CYLINDER(intersect_cylinder, mesh=unit_cylinder_mesh, open_twin="open cylinder"),
-    "open cylinder": _CYLINDER(
-        partial(intersect_cylinder, capped=False),
-        mesh=partial(unit_cylinder_mesh, capped=False),
-        closed=False,
-    ),
+    points, width = 1, 4
+    parts, ends, closed = (LATERAL,), (BALL, BALL), True
+
+    def frame(self, center: Any, radius: Any) -> Frame:
+        """Return the unit frame of a sphere."""
+        inverse = 1 / radius
+        zero, make = 0 * inverse, type(center)
+        return Frame(
+            center, make([inverse, zero, zero]), make([zero, inverse, zero]), make([zero, zero, inverse])
+        )
+
+    def intersect(self, o: Any, d: Any, frame: Frame) -> SurfaceHit:
+        """Return the first hit at t > 0."""
+        o = frame.point(o)
+        return SurfaceHit(intersect_sphere(o, frame.vector(d), type(o)([0.0, 0.0, 0.0]), 1.0), LATERAL)
+
+    def surface(self, p: Any, part: Any, frame: Frame) -> SurfacePoint:
+        """Put a point near the sphere onto it, along the normal.
+
+        u = azimuth / 2π in [0, 1), v = angle to +z over π, as in Mitsuba's ``sphere``.
+        """
+        q = frame.point(p)
+        r = dr.norm(q)
+        at_center = r == 0
+        gradient = q * (1 / dr.select(at_center, 1, r))
+        g = frame.gradient(gradient)
+        inverse = 1 / dr.select(at_center, 1, dr.norm(g))
+        n = g * inverse
+        v = dr.acos(dr.clip(gradient.z, -1, 1)) / dr.pi
+        return SurfacePoint(p - n * ((r - 1) * inverse), n, _turn(q), v)
+
+    def derivatives(self, q: Any, part: Any) -> tuple[Any, Any]:
+        """Return derivatives by u and v of a surface point ``q``, both in the unit frame."""
+        r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
+        x, y = _azimuth(q, r)
+        around = type(q)([-2 * dr.pi * q.y, 2 * dr.pi * q.x, 0 * q.x])
+        return around, type(q)([q.z * x, q.z * y, -r]) * dr.pi
+
+    def mesh(self, segments: int = 0) -> UnitMesh:
+        """Return an octahedron, whatever ``segments``."""
+        points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+        octants = [(x, y, z) for x in (0, 1) for y in (2, 3) for z in (4, 5)]
+        turned = [(sum(octant) % 2) == 1 for octant in octants]  # an odd number of mirrored axes
+        faces = [octant[::-1] if turn else octant for octant, turn in zip(octants, turned, strict=True)]
+        return UnitMesh(points, points, np.zeros((6, 2)), np.array(faces, np.uint32))
+
+
+class Axial:
+    """A solid of revolution along z from 0 to 1: a side, and a disc of radius 1 at each end that is one.
+
+    ``slope``: what the radius of the side grows by from one end to the other. Without ``capped`` it is open.
+    Texture coordinates: u = azimuth / 2π in [0, 1), v = 1 - z on the side, the unit square around a disc.
+    """
+
+    points, width, slope = 2, 7, 0
+    parts: tuple[int, ...] = (LATERAL, BASE)
+    ends = (DISC, DISC)
+
+    def __init__(self, *, capped: bool = True) -> None:
+        self.closed = capped
+
+    def frame(self, p0: Any, p1: Any, radius: Any) -> Frame:
+        """Return the frame whose z runs from p0 to p1; seen against it, u grows counter-clockwise.
+
+        Source of the tangents: Duff et al., "Building an Orthonormal Basis, Revisited", 2017.
+        """
+        axis = p1 - p0
+        length2 = dr.squared_norm(axis)
+        n = axis / -dr.sqrt(length2)
+        make = type(n)
+        sign = dr.select(n.z >= 0, 1, -1)
+        a = -1 / (sign + n.z)
+        b = n.x * n.y * a
+        s, t = make([1 + sign * n.x * n.x * a, sign * b, -sign * n.x]), make([b, sign + n.y * n.y * a, -n.y])
+        return Frame(p0, s / radius, t / radius, axis / length2)
+
+    def surface(self, p: Any, part: Any, frame: Frame) -> SurfacePoint:
+        """Put a point near the given part onto it by a Newton step along the normal.
+
+        At an apex the normal is that of one of the generatrices.
+        """
+        q = frame.point(p)
+        r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
+        x, y = _azimuth(q, r)
+        side = part == LATERAL
+        on_base = True if TOP not in self.parts else part == BASE
+        # The distance to the part, linear along its gradient
+        off_disc = q.z - 1 if on_base is True else dr.select(on_base, q.z - 1, -q.z)
+        off_side = r - q.z if self.slope else r - 1
+        up = dr.select(side, -self.slope, dr.select(on_base, 1, -1))
+        g = frame.gradient(type(q)([dr.select(side, x, 0), dr.select(side, y, 0), up]))
+        inverse = 1 / dr.norm(g)
+        n = g * inverse
+        u = dr.select(side, _turn(q), 0.5 + 0.5 * q.x)
+        v = dr.clip(dr.select(side, 1 - q.z, 0.5 + 0.5 * q.y), 0, 1)
+        return SurfacePoint(p - n * (dr.select(side, off_side, off_disc) * inverse), n, u, v)
+
+    def derivatives(self, q: Any, part: Any) -> tuple[Any, Any]:
+        """Return derivatives by u and v of a surface point ``q``, both in the unit frame."""
+        side, zero = part == LATERAL, 0 * q.x
+        x, y = _azimuth(q, dr.sqrt(dr.square(q.x) + dr.square(q.y)))
+        around = -2 * dr.pi * q.y, 2 * dr.pi * q.x, zero
+        along = -self.slope * x, -self.slope * y, -1 + zero
+        by_u = [dr.select(side, a, b) for a, b in zip(around, (2 + zero, zero, zero), strict=True)]
+        by_v = [dr.select(side, a, b) for a, b in zip(along, (zero, 2 + zero, zero), strict=True)]
+        return type(q)(by_u), type(q)(by_v)
+
+
+class Cone(Axial):
+    """The apex at 0, the base disc at z = 1."""
+
+    slope, ends = 1, (POINT, DISC)
+
+    def intersect(self, o: Any, d: Any, frame: Frame) -> SurfaceHit:
+        """Return the first hit at t > 0."""
+        return intersect_cone(o, d, frame, capped=self.closed)
+
+    def mesh(self, segments: int) -> UnitMesh:
+        """Return a fan from the apex, with a vertex and a normal there for each triangle, and the base."""
+        azimuth = 2 * np.pi * np.arange(segments + 1) / segments
+        middle = 0.5 * (azimuth[1:] + azimuth[:-1])
+        fan = _ring(middle, 0.0, slope=-1.0, v=1.0)
+        apex = UnitMesh(0 * fan.points, fan.gradients, fan.uvs, fan.faces)
+        i = np.arange(segments, dtype=np.uint32)
+        faces = np.stack([i, i + segments + 1, i + 1], axis=1)
+        side = _join([_ring(azimuth, 1.0, slope=-1.0, v=0.0), apex], faces)
+        return _join([side, _disc(segments, 1.0)]) if self.closed else side
+
+
+class Cylinder(Axial):
+    """Radius 1 from z = 0 to z = 1."""
+
+    parts = (LATERAL, BASE, TOP)
+
+    def intersect(self, o: Any, d: Any, frame: Frame) -> SurfaceHit:
+        """Return the first hit at t > 0."""
+        return intersect_cylinder(o, d, frame, capped=self.closed)
+
+    def mesh(self, segments: int) -> UnitMesh:
+        """Return a strip of quads split in two, and two discs."""
+        azimuth = 2 * np.pi * np.arange(segments + 1) / segments
+        rings = [_ring(azimuth, z, slope=0.0, v=1.0 - z) for z in (0.0, 1.0)]
+        i = np.arange(segments, dtype=np.uint32)
+        k = i + segments + 1
+        side = _join(rings, np.concatenate([np.stack([i, i + 1, k], 1), np.stack([i + 1, k + 1, k], 1)]))
+        return _join([side, _disc(segments, 0.0), _disc(segments, 1.0)]) if self.closed else side
+
+
+KINDS: dict[str, Any] = {
+    "sphere": Sphere(),
+    "cone": Cone(),
+    "open cone": Cone(capped=False),
+    "cylinder": Cylinder(),
+    "open cylinder": Cylinder(capped=False),
 }
+
+
+def _azimuth(q: Any, r: Any) -> tuple[Any, Any]:
+    """Return cosine and sine of the azimuth of ``q`` at distance r from the axis; on the axis, those of 0."""
+    on_axis = r == 0
+    inverse = 1 / dr.select(on_axis, 1, r)
+    return dr.select(on_axis, 1, q.x * inverse), q.y * inverse
+
+
+def _turn(q: Any) -> Any:
+    """Return the azimuth of ``q`` over 2π, in [0, 1)."""
+    azimuth = dr.atan2(q.y, q.x) / (2 * dr.pi)
+    return dr.select(azimuth < 0, azimuth + 1, azimuth)
+
+
+def _ring(azimuth: np.ndarray, z: float, *, slope: float, v: float) -> UnitMesh:
+    x, y = np.cos(azimuth), np.sin(azimuth)
+    points, gradients = (np.stack([x, y, np.full_like(x, c)], axis=1) for c in (z, slope))
+    uvs = np.stack([azimuth / (2 * np.pi), np.full_like(x, v)], axis=1)
+    return UnitMesh(points, gradients, uvs, np.empty((0, 3), np.uint32))
+
+
+def _disc(segments: int, z: float) -> UnitMesh:
+    """Return a fan around the centre, facing away from z = 1/2."""
+    rim = _ring(2 * np.pi * np.arange(segments) / segments, z, slope=0, v=0)
+    points = np.concatenate([rim.points, [[0, 0, z]]])
+    i = np.arange(segments, dtype=np.uint32)
+    faces = np.stack([i, (i + 1) % segments, np.full_like(i, segments)], axis=1)
+    gradients = np.tile([0, 0, 1.0 if z > 0.5 else -1.0], (segments + 1, 1))
+    return UnitMesh(points, gradients, 0.5 + 0.5 * points[:, :2], faces if z > 0.5 else faces[:, ::-1])
+
+
+def _join(parts: Sequence[UnitMesh], more_faces: np.ndarray | None = None) -> UnitMesh:
+    """Return one mesh of several; ``more_faces`` index the joined vertices."""
+    first = np.cumsum([0] + [len(p.points) for p in parts])
+    faces = [p.faces + np.uint32(start) for p, start in zip(parts, first, strict=False)]
+    faces += [] if more_faces is None else [more_faces]
+    columns = (np.concatenate([getattr(p, name) for p in parts]) for name in ("points", "gradients", "uvs"))
+    return UnitMesh(*columns, np.concatenate(faces).astype(np.uint32))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from .merged_bsdf import MergedBSDF
 from .planes import Planes
 from .point_buffer import PointBuffer, point_buffer
 from .point_lights import Lights
-from .quadrics import quadrics_of
+from .quadrics import Quadrics
 from .snapshot import Kept
 from .spheres import SphereBlockers, Spheres
 from .variants import but_not, is_jit
@@ -230,7 +230,8 @@ def _trace(reading: Reading, plan: KernelPlan) -> Traced:
             names = [f"shape_{i}" for i in range(len(things))]
         bvh = mi.load_dict({"type": "scene", **dict(zip(names, things, strict=True))})
     spheres = Spheres(others) if plan.spheres != "none" else None
-    return Traced(bvh, Planes(planes), quadrics_of(exact), HitErrors(others), spheres)
+    quadrics = Quadrics(exact) if exact else None
+    return Traced(bvh, Planes(planes), quadrics, HitErrors(others), spheres)
 
 
 def _frame_along(si: mi.SurfaceInteraction3f) -> mi.Frame3f:

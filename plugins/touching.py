@@ -13,7 +13,7 @@ import numpy as np
 
 from .columns import Vector3
 from .hit_errors import CURVED, flat_triangles
-from .intersect import BASE, LATERAL, TOP, Frame
+from .intersect import Frame
 from .protocols import PlaneShape, QuadricShape
 from .quadric_kinds import KINDS, QuadricTable
 from .spheres import center_and_radius, is_sphere
@@ -66,11 +66,11 @@ def _holding(boxes: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _on_quadrics(table: QuadricTable, boxes: np.ndarray, p: np.ndarray) -> bool:
     near, slack = _holding(boxes, p)
-    surface = KINDS[table.kind].surface
+    kind = KINDS[table.kind]
     for k in np.flatnonzero(near)[:MOST_LOOKED_AT]:
         origin, x, y, z = (Vector3(row.tolist()) for row in (table.origins[k], *table.rows[k]))
         frame = Frame(origin, x, y, z)
-        feet = np.array([surface(Vector3(p.tolist()), part, frame).p for part in (LATERAL, BASE, TOP)])
+        feet = np.array([kind.surface(Vector3(p.tolist()), part, frame).p for part in kind.parts])
         # A part goes on beyond the object, but not within its box, or nearly so
         there = [_holding(boxes[k : k + 1], foot)[0][0] for foot in feet]
         if (there & (np.linalg.norm(feet - p, axis=1) <= slack[k])).any():

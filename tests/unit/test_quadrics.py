@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 import mrt_mitsuba as mrt
 from mrt_mitsuba.plugins import intersect
 from mrt_mitsuba.plugins.intersect import BASE, LATERAL, TOP
+from mrt_mitsuba.plugins.quadric_kinds import KINDS
 from mrt_mitsuba.plugins.quadrics import Quadrics
 from mrt_mitsuba.plugins.tree import Tree
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
@@ -27,12 +28,8 @@ pytestmark = pytest.mark.usefixtures("variant")
 V = dr.scalar.Array3f64
 MATTE = Material(0.5, 0.5, (0, 0, 0), (0.8, 0.8, 0.8))
 GLOSSY = Material(1.5, 0.2, (0.5, 0.5, 0.5), (0.3, 0.4, 0.5))
-KINDS = {
-    "cone": (intersect.cone_frame, intersect.intersect_cone, intersect.cone_surface),
-    "cylinder": (intersect.cylinder_frame, intersect.intersect_cylinder, intersect.cylinder_surface),
-}
 # Apex or upper end at (0, 0, 1), base disc of radius 1 in the plane z = 0
-UNIT = {kind: make(V(0, 0, 1), V(0, 0, 0), 1.0) for kind, (make, _, _) in KINDS.items()}
+UNIT = {kind: KINDS[kind].frame(V(0, 0, 1), V(0, 0, 0), 1.0) for kind in ("cone", "cylinder")}
 
 
 def meet(shape: str, o: Any, d: Any) -> Any:
@@ -40,8 +37,7 @@ def meet(shape: str, o: Any, d: Any) -> Any:
         return intersect.intersect_plane(o, d, V(0, 1, 0), 0.0)
     if shape == "sphere":
         return intersect.intersect_sphere(o, d, V(1, 2, 3), 0.5)
-    kind = shape.removeprefix("open ")
-    return KINDS[kind][1](o, d, UNIT[kind], capped=kind == shape)
+    return KINDS[shape].intersect(o, d, UNIT[shape.removeprefix("open ")])
 
 
 INF = np.inf
@@ -94,23 +90,24 @@ def test_single_rays(shape: str, o: tuple, d: tuple, t: float, part: int | None)
     assert part is None or hit.part == part
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", UNIT)
 def test_surface_points_have_their_normal_and_uv(kind: str) -> None:
     """Points near each part end up on it, with the normal outwards; uv goes around the axis."""
     import drjit.llvm.ad as arrays
 
-    make, _, surface_of = KINDS[kind]
     rng = np.random.default_rng(2)
     end0, end1 = np.array([0.3, 1.5, -0.2]), np.array([0.1, 0.4, 0.3])
-    frame = make(*(arrays.Array3f64(*map(arrays.Float64, end)) for end in (end0, end1)), arrays.Float64(0.7))
+    frame = KINDS[kind].frame(
+        *(arrays.Array3f64(*map(arrays.Float64, end)) for end in (end0, end1)), arrays.Float64(0.7)
+    )
     p = arrays.Array3f64(((end0 + end1) / 2 + rng.normal(size=(1000, 3)) * 0.4).T)
     levels = {
         LATERAL: lambda q: dr.sqrt(q.x**2 + q.y**2) - (q.z if kind == "cone" else 1),
         BASE: lambda q: q.z - 1,
         TOP: lambda q: -q.z,
     }
-    for part in (LATERAL, BASE) + ((TOP,) if kind == "cylinder" else ()):
-        surface = surface_of(p, part, frame)
+    for part in KINDS[kind].parts:
+        surface = KINDS[kind].surface(p, part, frame)
         q, back = frame.point(surface.p), frame.point(surface.p - surface.n * 1e-6)
         other = ~(q.z > 0.05)  # above its apex a cone has another half
         assert dr.all(other | (dr.abs(levels[part](q)) < 1e-12))
@@ -126,16 +123,15 @@ def test_surface_points_have_their_normal_and_uv(kind: str) -> None:
 points = st.tuples(*[st.floats(-1e3, 1e3)] * 3)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", UNIT)
 @given(o=points, d=points, end0=points, end1=points, radius=st.floats(1e-3, 1e3))
 def test_any_ray_gives_a_point_on_the_shape(kind: str, o, d, end0, end1, radius: float) -> None:
     """Whatever the ray: no error, no NaN, and a hit is on the surface, on its bounded part."""
-    make, cut, _ = KINDS[kind]
     length = np.linalg.norm(np.subtract(end1, end0))
     if np.linalg.norm(d) < 1e-6 or not 1e-3 < length / radius < 1e3:
         return
-    frame = make(V(*end0), V(*end1), radius)
-    hit = cut(V(*o), V(*d), frame)
+    frame = KINDS[kind].frame(V(*end0), V(*end1), radius)
+    hit = KINDS[kind].intersect(V(*o), V(*d), frame)
     assert hit.t > 0
     if hit.t == INF:
         return
@@ -208,7 +204,7 @@ def crowd(count: int, place: str, kind: str, rays: int = 8_000) -> tuple[np.ndar
     return ends, radii, o, d
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", UNIT)
 @pytest.mark.parametrize(
     ("count", "scale", "place"),
     [

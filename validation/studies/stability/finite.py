@@ -11,16 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.plugins.intersect import (
-    cone_frame,
-    cone_surface,
-    cylinder_frame,
-    cylinder_surface,
-    intersect_cone,
-    intersect_cylinder,
-    intersect_plane,
-    intersect_sphere,
-)
+from mrt_mitsuba.plugins.intersect import intersect_plane, intersect_sphere
+from mrt_mitsuba.plugins.quadric_kinds import KINDS
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.validation.checks.probe import not_finite
@@ -170,20 +162,20 @@ def _sphere(draw: _Draw) -> Any:
     return ~(intersect_sphere(o, d, center, draw.log(1e-6, 1e6, (1e-7, 0.5, 1, 1e7))) > 0)
 
 
-def _quadric(to_frame: Any, intersect: Any, surface: Any) -> Callable[[_Draw], Any]:
+def _quadric(kind: Any) -> Callable[[_Draw], Any]:
     """Return a check of distance and normal of a random shape in each lane; some rays start at its end."""
 
     def evaluate(draw: _Draw) -> Any:
         end, axis = draw.vector(mi.Point3f), draw.unit()
-        frame = to_frame(
+        frame = kind.frame(
             end, end + axis * draw.log(1e-2, 1e2, (1e-3, 1, 1e3)), draw.log(1e-2, 1e2, (1e-3, 1, 1e3))
         )
         straight = dr.isfinite(dr.norm(frame.z))  # the ends are not one point after rounding
         o = dr.select(draw.uniform() < 0.2, end, draw.vector(mi.Point3f))
         d = draw.unit()
-        hit = intersect(o, d, frame)
+        hit = kind.intersect(o, d, frame)
         found = hit.t < 1e10
-        point = surface(dr.select(found, o + d * hit.t, end), hit.part, frame)
+        point = kind.surface(dr.select(found, o + d * hit.t, end), hit.part, frame)
         return straight & (~(hit.t > 0) | (found & (_not_unit(point.n) | ~dr.isfinite(point.u + point.v))))
 
     return evaluate
@@ -231,9 +223,9 @@ BULK: Sequence[tuple[str, str, Callable[[_Draw], Any]]] = (
     (
         "mrt_cone",
         "distances, normals and texture coordinates",
-        _quadric(cone_frame, intersect_cone, cone_surface),
+        _quadric(KINDS["cone"]),
     ),
-    ("mrt_cylinder", "the same", _quadric(cylinder_frame, intersect_cylinder, cylinder_surface)),
+    ("mrt_cylinder", "the same", _quadric(KINDS["cylinder"])),
     ("mrt_whitted", "radiance, distances and normals", _whitted),
 )
 
