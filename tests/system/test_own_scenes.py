@@ -12,7 +12,7 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba.memory import Workspace
 from mrt_mitsuba.validation.studies import adaptive
-from mrt_mitsuba.validation.tools.own_scenes import SCENES, SPP, load, sensor
+from mrt_mitsuba.validation.tools.own_scenes import SCENES, SPP, load, own_scene, sensor
 from mrt_mitsuba.validation.tools.study import findings
 
 WIDTH, HEIGHT = 32, 24
@@ -26,7 +26,7 @@ def _load(name: str, **more: Any) -> Any:
 
 
 def _sensor_of(name: str) -> dict[str, Any]:
-    found = SCENES[name](mi.ScalarTransform4f())["sensor"]
+    found = own_scene(name)["sensor"]
     return found | {"film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT} | found["film"]}
 
 
@@ -155,7 +155,7 @@ def test_size_sensor_and_parameters(tmp_path):
     before = list(scene.sensors()[0].film().crop_size())
     assert mrt.render(scene, width=20, height=10, spp=4).image.shape == (10, 20, 3)
     assert list(scene.sensors()[0].film().crop_size()) == before
-    above = sensor(mi.ScalarTransform4f(), [0, 9, 0.1], [0, 0, 0])
+    above = sensor([0, 9, 0.1], [0, 0, 0])
     two = _load("spot", other=above | {"film": above["film"] | {"width": WIDTH, "height": HEIGHT}})
     first, second = (mrt.render(two, integrator="direct", sensor=k, spp=4).image for k in (0, 1))
     assert _rmse(first, second) > 0.01

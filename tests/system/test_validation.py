@@ -229,10 +229,10 @@ def other_conductor(patch: Patch) -> None:
 
 
 FAULTS: list[tuple[str, Fault, str]] = [
-    ("antialiasing", wrapped(mrt, "render", one_ray_too_many), "camera rays"),
-    ("antialiasing", wrapped(mrt, "render", no_refinement), "error of sobel"),
+    ("antialiasing:modes", wrapped(mrt, "render", one_ray_too_many), "camera rays"),
+    ("antialiasing:modes", wrapped(mrt, "render", no_refinement), "error of sobel"),
     (
-        "antialiasing",
+        "antialiasing:noise",
         wrapped(filters, "sobel_edges", lambda sobel, image, variance=None: sobel(image)),
         "noise: share of",
     ),

@@ -43,18 +43,13 @@ QUICK = Extent((0, 3), (2, 4), 16, (120, 90), (96, 72, 1024), (80, 60), 16, (4, 
 
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
-    extent = QUICK if quick else FULL
-    _compare_modes(study, extent)
-    _compare_with_mitsuba(study, *extent.box)
-    _chase_noise(study, extent)
-    for lattice in ("report", "film"):
-        error = variance_error("sobel", spp=2, lattice=lattice)
-        why = "of 2 rays: a variance by n in place of n - 1 is half as large, and changes nearly all"
-        study.at_most(f"noise: share of pixels of another variance, lattice={lattice}", error, 0.02, why)
+    for part in (modes, box_filter, noise):
+        part(study, quick=quick)
 
 
-def _compare_modes(study: Study, extent: Extent) -> None:
+def modes(study: Study, *, quick: bool) -> None:
     """Compare every mode and amount in the report's scenes with full supersampling of the same lattice."""
+    extent = QUICK if quick else FULL
     width, height = extent.size
     rows = []
     for number in study.each("Anti-aliasing", extent.scenes):
@@ -98,8 +93,9 @@ def refined_pixels(result: Any) -> np.ndarray:
     return np.asarray(result.layers.get("samples.Y", every) > 1)
 
 
-def _compare_with_mitsuba(study: Study, width: int, height: int, spp: int) -> None:
+def box_filter(study: Study, *, quick: bool) -> None:
     """Compare lattices with random samples that Mitsuba places and filters itself, on scene 3."""
+    width, height, spp = (QUICK if quick else FULL).box
     scene = load(mrt.scene_dict(3, width=width, height=height, fresnel="dielectric"))
     whitted = {"type": "mrt_whitted", "min_contribution": 0.0}
     runs = [mi.render(scene, integrator=mi.load_dict(whitted), spp=spp // 4, seed=k) for k in range(4)]
@@ -151,8 +147,13 @@ def variance_error(detector: str, *, spp: int, lattice: str) -> float:
     return float(off.mean()) if np.max(expected) > 0 else 1.0
 
 
-def _chase_noise(study: Study, extent: Extent) -> None:
+def noise(study: Study, *, quick: bool) -> None:
     """Count refined pixels where the converged picture is flat, and where it has an edge."""
+    extent = QUICK if quick else FULL
+    for lattice in ("report", "film"):
+        error = variance_error("sobel", spp=2, lattice=lattice)
+        why = "of 2 rays: a variance by n in place of n - 1 is half as large, and changes nearly all"
+        study.at_most(f"noise: share of pixels of another variance, lattice={lattice}", error, 0.02, why)
     scene = load(lit_by_a_sphere(*extent.light_size))
     # where the detectors look
     truth = mrt.render(scene, **AT_CENTRES, spp=16 * extent.light_spp, seed=78).image

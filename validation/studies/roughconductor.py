@@ -97,7 +97,13 @@ def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> tuple[dict[
     short = ((wi.astype(float) + wo) ** 2).sum(axis=-1) < SHORT
     apart = np.flatnonzero(short & (plain_error > POINTWISE))
     worst = apart[np.argsort(-plain_error[apart])[:JUDGED]]
-    judged = [_judge(wi[i], wo[i], alpha, plain[0][i], plain[1][i]) for i in worst]
+    judged = []
+    for i in worst:  # D cos θh / (4 ωo·h), h of the directions as they are given, ωo·h of those of length 1
+        given = exact.unit([float(a) + float(b) for a, b in zip(wi[i], wo[i], strict=True)])
+        pairs = zip(exact.unit(list(wo[i])), exact.half_vector(wi[i], wo[i]), strict=True)
+        density = exact.beckmann_d(given[2], alpha if is_scalar() else np.float32(alpha))
+        true = density * given[2] / (4 * sum(a * b for a, b in pairs))
+        judged.append([abs(float(side[i] / true) - 1) for side in plain])
     figures = (value, float(visible_error.max()), float(plain_error[~short].max()))
     return dict(zip(NAMES, figures, strict=True)), np.array(judged).reshape(-1, 2)
 
@@ -112,19 +118,6 @@ def renormalised(density: Array, wi: Array, alpha: float) -> Array:
     smith = (erf(b) - 1) / 2 + np.exp(-(np.minimum(b, 30) ** 2)) / (2 * np.sqrt(np.pi) * b)
     fit = np.where(b < 1.6, b * (3.535 + 2.181 * b) / (1 + b * (2.276 + 2.577 * b)), 1)
     return density / ((1 + smith) * fit)
-
-
-def _judge(wi: Array, wo: Array, alpha: float, one: float, other: float) -> tuple[float, float]:
-    """Return relative errors of two densities of plain D sampling, D cos θh / (4 ωo·h), against 50 digits.
-
-    h is the half vector of the directions as they are given, on which D depends; ωo·h is that of directions
-    of length 1.
-    """
-    given = exact.unit([float(a) + float(b) for a, b in zip(wi, wo, strict=True)])
-    cos_d = sum(a * b for a, b in zip(exact.unit(list(wo)), exact.half_vector(wi, wo), strict=True))
-    alpha_used = alpha if is_scalar() else np.float32(alpha)
-    true = exact.beckmann_d(given[2], alpha_used) * given[2] / (4 * cos_d)
-    return abs(float(one / true) - 1), abs(float(other / true) - 1)
 
 
 def pointwise(study: Study, *, quick: bool) -> None:
@@ -271,31 +264,24 @@ def rendered(study: Study, *, quick: bool) -> None:
     )
     alphas = (POWER_ALPHA,) if quick else (0.03, 0.1, POWER_ALPHA)
     for alpha in study.each("pictures", alphas):
-        _hold_pictures(study, compare_roughconductor(alpha, **settings))
+        found, at = compare_roughconductor(alpha, **settings), f"alpha {alpha:g}"
+        what = f"share of pixels that differ with the same random numbers, {at}"
+        why = "paths that rounding sends past an edge; the ball covers a third of the picture"
+        study.at_most(what, found.errors["pixels that differ, with the same random numbers"], 5e-3, why)
+        what, why = f"p of the difference with independent numbers, {at}", "pixels, tiles and the picture"
+        study.at_least(what, found.test.p, LEVEL, why)
+        study.record(f"relRMSE of the averages, {at}", found.test.rel_rmse)
+        study.record(f"time, ours over theirs, {at}", found.timings["ratio"])
+        sheet = side_by_side(found.images["ours"], found.images["theirs"], gain=20)
+        caption = f"{found.samples} samples per pixel each, independent: the difference is noise."
+        title = f"Ours, Mitsuba's, |difference| × 20; {at}"
+        study.picture(f"pictures-{alpha:g}", title, sheet, caption, exr=True)
     for name, change in study.each("mistakes", MUTATIONS.items()):
         broken = {**ours(POWER_ALPHA), **change}
         stacks, _ = _render_both([broken, theirs(POWER_ALPHA)], seed=100, **settings)
         test = image_tests.compare(*map(image_tests.estimate, stacks), level=LEVEL)
         why = "the test of pictures must see this error"
         study.at_most(f"p of the difference with {name}", test.p, LEVEL, why)
-
-
-def _hold_pictures(study: Study, found: RoughconductorComparison) -> None:
-    at = f"alpha {found.alpha:g}"
-    what = f"share of pixels that differ with the same random numbers, {at}"
-    why = "paths that rounding sends past an edge; the ball covers a third of the picture"
-    study.at_most(what, found.errors["pixels that differ, with the same random numbers"], 5e-3, why)
-    what = f"p of the difference with independent numbers, {at}"
-    study.at_least(what, found.test.p, LEVEL, "pixels, tiles and the picture, with Šidák's correction")
-    study.record(f"relRMSE of the averages, {at}", found.test.rel_rmse)
-    study.record(f"time, ours over theirs, {at}", found.timings["ratio"])
-    study.picture(
-        f"pictures-{found.alpha:g}",
-        f"Ours, Mitsuba's, |difference| × 20; {at}",
-        side_by_side(found.images["ours"], found.images["theirs"], gain=20),
-        f"{found.samples} samples per pixel each, independent: the difference is noise.",
-        exr=True,
-    )
 
 
 # ------------------------------------------ Noise and time ------------------------------------------

@@ -365,7 +365,7 @@ def whole_scenes(study: Study, *, quick: bool) -> None:
             study.at_least(f"p of equality, {what}", found.p, LEVEL, why)
         else:
             study.at_most(f"p of equality with {what}", found.p, LEVEL, "it must be seen")
-        each = [v.p for v in (found.pixel, found.tile, found.image)]
+        each = found.p_values.values()
         rows.append([what, ", ".join(found.detected_by) or "-", *each, found.rel_rmse])
 
     for number in study.each("Whole scenes", (0, 1, 3) if quick else (0, 1, 2, 3, 4)):

@@ -48,7 +48,7 @@ class Difference:
     def flip(self) -> float | None:
         """Mean of FLIP, the difference that a viewer sees, from 0 to 1; None where it is not defined."""
         try:
-            return image_tests.flip(*reversed(self.pictures)).mean
+            return image_tests.flip(*reversed(self.pictures))[0]
         except (UsageError, ImportError):
             return None
 

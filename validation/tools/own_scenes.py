@@ -2,62 +2,76 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 Node = dict[str, Any]
 SPP = 64  # of their samplers
+SCENES = ("envmap", "instances", "thin_lens", "gloss", "rough_glass",
+          "area_light", "spot", "crop", "texture_and_sky", "stratified")  # fmt: skip
+# Where most of the noise is in a part of the picture
+LOCAL = ("thin_lens", "gloss", "texture_and_sky", "rough_glass")
 
 
 def load(name: str, width: int, height: int, *, film: Node | None = None, **more: Any) -> Any:
     """Return a scene by name, at a size; ``film`` and further nodes replace its own."""
-    import mitsuba as mi
-
-    nodes = SCENES[name](mi.ScalarTransform4f())
-    sensor = nodes["sensor"]
+    nodes = own_scene(name)
     size: Node = {"width": width, "height": height}
     if name == "crop":
         window = {"crop_offset_x": width // 4, "crop_offset_y": height // 4}
         size = {"width": 3 * width // 2, "height": 3 * height // 2, "crop_width": width} | window
         size["crop_height"] = height
-    nodes["sensor"] = sensor | {"film": size | sensor["film"] | (film or {})}
+    nodes["sensor"] |= {"film": size | nodes["sensor"]["film"] | (film or {})}
     path = {"type": "path", "max_depth": 4}
     return mi.load_dict({"type": "scene", "integrator": path, **nodes} | more)
 
 
-def sensor(to: Any, origin: list[float], target: list[float], rfilter: str = "gaussian", **more: Any) -> Node:
-    """Return a camera with a film; ``to``: the identity as a transform."""
+def sensor(origin: list[float], target: list[float], rfilter: str = "gaussian", **more: Any) -> Node:
+    """Return a camera with a film."""
     film = {"type": "hdrfilm", "rfilter": {"type": rfilter}, "component_format": "float32"}
     return {
         "type": "perspective",
         "fov": 40,
-        "to_world": to.look_at(origin, target, [0, 1, 0]),
+        "to_world": mi.ScalarTransform4f().look_at(origin, target, [0, 1, 0]),
         "film": film | more.pop("film", {}),
         "sampler": {"type": more.pop("sampler", "independent"), "sample_count": SPP},
     } | more
+
+
+def own_scene(name: str) -> Node:
+    """Return the nodes of a scene, its sensor among them."""
+    return (_under_skies() | _indoors())[name]
+
+
+def _to() -> Any:
+    return mi.ScalarTransform4f()
 
 
 def _rgb(*values: float) -> Node:
     return {"type": "rgb", "value": list(values) if len(values) == 3 else values[0]}
 
 
-def _checks(to: Any, count: int) -> Node:
+def _checks(count: int) -> Node:
     colors = {"color0": _rgb(0.1), "color1": _rgb(0.9)}
-    return {"type": "checkerboard", "to_uv": to.scale([count, count, 1]), **colors}
+    return {"type": "checkerboard", "to_uv": _to().scale([count, count, 1]), **colors}
 
 
 def _diffuse(reflectance: Any) -> Node:
     return {"type": "diffuse", "reflectance": reflectance}
 
 
-def _floor(to: Any, bsdf: Node) -> Node:
-    return {"type": "rectangle", "to_world": to.rotate([1, 0, 0], -90).scale(10), "bsdf": bsdf}
+def _floor(bsdf: Node) -> Node:
+    return {"type": "rectangle", "to_world": _to().rotate([1, 0, 0], -90).scale(10), "bsdf": bsdf}
 
 
 def _ball(center: list[float], radius: float, bsdf: Node) -> Node:
     return {"type": "sphere", "center": center, "radius": radius, "bsdf": bsdf}
+
+
+def _box() -> Node:
+    return {"type": "cube", "to_world": _to().translate([0, 0.5, 0]).rotate([0, 1, 0], 30).scale(0.5)}
 
 
 def _lamp(center: list[float], radius: float, radiance: float) -> Node:
@@ -69,126 +83,91 @@ def _sky(*color: float) -> Node:
     return {"type": "constant", "radiance": _rgb(*color)}
 
 
-def _envmap(to: Any) -> Node:
-    import mitsuba as mi
-
+def _under_skies() -> dict[str, Node]:
+    """Return scenes with a sky or an environment all around."""
     pixels = np.full((16, 32, 3), 0.4, np.float32)
     pixels[3:5, 10:12] = 30
-    return {
-        "sensor": sensor(to, [0, 2, 6], [0, 0.5, 0]),
-        "around": {"type": "envmap", "bitmap": mi.Bitmap(pixels)},
-        "floor": _floor(to, _diffuse(_rgb(0.6))),
-        "ball": _ball([0, 1, 0], 1, {"type": "roughconductor", "alpha": 0.2}),
-    }
-
-
-def _instances(to: Any) -> Node:
-    places = {f"at{i}": to.translate([i % 3 - 1, 0.4, i // 3 - 1]) for i in range(9)}
-    group = {"type": "ref", "id": "group"}
-    return {
-        "sensor": sensor(to, [0, 3, 6], [0, 0.5, 0], "box"),
-        "group": {"type": "shapegroup", "a": _ball([0, 0, 0], 0.4, _diffuse(_rgb(0.7)))},
-        **{name: {"type": "instance", "to_world": place, "g": group} for name, place in places.items()},
-        "floor": _floor(to, _diffuse(_checks(to, 8))),
-        "sky": _sky(0.3, 0.4, 0.5),
-        "lamp": _lamp([3, 5, 3], 0.7, 20),
-    }
-
-
-def _thin_lens(to: Any) -> Node:
+    places = [_to().translate([i % 3 - 1, 0.4, i // 3 - 1]) for i in range(9)]
+    member = {"type": "instance", "g": {"type": "ref", "id": "group"}}
     lens: Node = {"type": "thinlens", "aperture_radius": 0.2, "focus_distance": 6.0}
     return {
-        "sensor": sensor(to, [0, 1.5, 6], [0, 0.6, 0], **lens),
-        "floor": _floor(to, _diffuse(_checks(to, 20))),
-        "near": _ball([-1, 0.5, 3], 0.5, _diffuse(_rgb(0.7, 0.2, 0.2))),
-        "far": _ball([1, 0.5, -2], 0.5, _diffuse(_rgb(0.2, 0.2, 0.7))),
-        "sky": _sky(0.6, 0.7, 0.9),
+        "envmap": {
+            "sensor": sensor([0, 2, 6], [0, 0.5, 0]),
+            "around": {"type": "envmap", "bitmap": mi.Bitmap(pixels)},
+            "floor": _floor(_diffuse(_rgb(0.6))),
+            "ball": _ball([0, 1, 0], 1, {"type": "roughconductor", "alpha": 0.2}),
+        },
+        "instances": {
+            "sensor": sensor([0, 3, 6], [0, 0.5, 0], "box"),
+            "group": {"type": "shapegroup", "a": _ball([0, 0, 0], 0.4, _diffuse(_rgb(0.7)))},
+            **{f"at{i}": member | {"to_world": place} for i, place in enumerate(places)},
+            "floor": _floor(_diffuse(_checks(8))),
+            "sky": _sky(0.3, 0.4, 0.5),
+            "lamp": _lamp([3, 5, 3], 0.7, 20),
+        },
+        "thin_lens": {
+            "sensor": sensor([0, 1.5, 6], [0, 0.6, 0], **lens),
+            "floor": _floor(_diffuse(_checks(20))),
+            "near": _ball([-1, 0.5, 3], 0.5, _diffuse(_rgb(0.7, 0.2, 0.2))),
+            "far": _ball([1, 0.5, -2], 0.5, _diffuse(_rgb(0.2, 0.2, 0.7))),
+            "sky": _sky(0.6, 0.7, 0.9),
+        },
+        "texture_and_sky": {
+            "sensor": sensor([0, 1.5, 6], [0, 2.5, 0], fov=60),
+            "floor": _floor(_diffuse(_checks(30))),
+            "ball": _ball([-1, 0.6, 1], 0.6, _diffuse(_checks(12))),
+            "sky": _sky(0.5, 0.7, 1.0),
+        },
+        "gloss": {
+            "sensor": sensor([0, 1.5, 5], [0, 0.7, 0], "box"),
+            "floor": _floor({"type": "roughconductor", "alpha": 0.1}),
+            "ball": _ball([0, 0.7, 0], 0.7, {"type": "roughplastic", "alpha": 0.1}),
+            "sky": _sky(0.2),
+            "lamp": _lamp([1.2, 3, -1], 0.1, 200),
+        },
     }
 
 
-def _gloss(to: Any) -> Node:
+def _indoors() -> dict[str, Node]:
+    """Return scenes that lamps light."""
+    back = _to().translate([0, 2, -2]).scale(4)
+    above = _to().translate([0, 4, 0]).rotate([1, 0, 0], 90)
+    spot = {"type": "spot", "intensity": _rgb(40, 36, 30), "cutoff_angle": 25}
     return {
-        "sensor": sensor(to, [0, 1.5, 5], [0, 0.7, 0], "box"),
-        "floor": _floor(to, {"type": "roughconductor", "alpha": 0.1}),
-        "ball": _ball([0, 0.7, 0], 0.7, {"type": "roughplastic", "alpha": 0.1}),
-        "sky": _sky(0.2),
-        "lamp": _lamp([1.2, 3, -1], 0.1, 200),
+        "rough_glass": {
+            "sensor": sensor([0, 1.2, 5], [0, 0.8, 0]),
+            "floor": _floor(_diffuse(_checks(8))),
+            "ball": _ball([0, 0.9, 0], 0.8, {"type": "roughdielectric", "alpha": 0.3}),
+            "lamp": _lamp([0, 4, 0], 1.0, 6),
+            "sky": _sky(0.2),
+        },
+        "area_light": {
+            "sensor": sensor([0, 1.5, 6], [0, 1, 0], "mitchell"),
+            "floor": _floor(_diffuse(_rgb(0.8, 0.4, 0.3))),
+            "wall": {"type": "rectangle", "to_world": back, "bsdf": _diffuse(_rgb(0.5))},
+            "box": _box(),
+            "light": {
+                "type": "rectangle",
+                "to_world": above,
+                "emitter": {"type": "area", "radiance": _rgb(6)},
+            },
+        },
+        "spot": {
+            "sensor": sensor([0, 3, 6], [0, 0.5, 0], "tent"),
+            "floor": _floor(_diffuse(_rgb(0.7))),
+            "box": {"type": "cube", "to_world": _to().translate([0, 0.5, 0]).scale(0.5)},
+            "light": spot | {"to_world": _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])},
+        },
+        "crop": {
+            "sensor": sensor([0, 2, 6], [0, 0.5, 0], film={"sample_border": True}),
+            "floor": _floor(_diffuse(_checks(8))),
+            "ball": _ball([0, 1, 0], 1, {"type": "plastic"}),
+            "lamp": _lamp([2, 4, 2], 0.5, 15),
+        },
+        "stratified": {
+            "sensor": sensor([0, 2, 6], [0, 0.5, 0], "box", sampler="stratified"),
+            "floor": _floor(_diffuse(_checks(8))),
+            "box": _box(),
+            "lamp": _lamp([0, 4, 1], 1.0, 5),
+        },
     }
-
-
-def _rough_glass(to: Any) -> Node:
-    return {
-        "sensor": sensor(to, [0, 1.2, 5], [0, 0.8, 0]),
-        "floor": _floor(to, _diffuse(_checks(to, 8))),
-        "ball": _ball([0, 0.9, 0], 0.8, {"type": "roughdielectric", "alpha": 0.3}),
-        "lamp": _lamp([0, 4, 0], 1.0, 6),
-        "sky": _sky(0.2),
-    }
-
-
-def _area_light(to: Any) -> Node:
-    back = to.translate([0, 2, -2]).scale(4)
-    above = to.translate([0, 4, 0]).rotate([1, 0, 0], 90)
-    return {
-        "sensor": sensor(to, [0, 1.5, 6], [0, 1, 0], "mitchell"),
-        "floor": _floor(to, _diffuse(_rgb(0.8, 0.4, 0.3))),
-        "wall": {"type": "rectangle", "to_world": back, "bsdf": _diffuse(_rgb(0.5))},
-        "box": {"type": "cube", "to_world": to.translate([0, 0.5, 0]).rotate([0, 1, 0], 30).scale(0.5)},
-        "light": {"type": "rectangle", "to_world": above, "emitter": {"type": "area", "radiance": _rgb(6)}},
-    }
-
-
-def _spot(to: Any) -> Node:
-    light = {"type": "spot", "intensity": _rgb(40, 36, 30), "cutoff_angle": 25}
-    return {
-        "sensor": sensor(to, [0, 3, 6], [0, 0.5, 0], "tent"),
-        "floor": _floor(to, _diffuse(_rgb(0.7))),
-        "box": {"type": "cube", "to_world": to.translate([0, 0.5, 0]).scale(0.5)},
-        "light": light | {"to_world": to.look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])},
-    }
-
-
-def _crop(to: Any) -> Node:
-    return {
-        "sensor": sensor(to, [0, 2, 6], [0, 0.5, 0], film={"sample_border": True}),
-        "floor": _floor(to, _diffuse(_checks(to, 8))),
-        "ball": _ball([0, 1, 0], 1, {"type": "plastic"}),
-        "lamp": _lamp([2, 4, 2], 0.5, 15),
-    }
-
-
-def _texture_and_sky(to: Any) -> Node:
-    return {
-        "sensor": sensor(to, [0, 1.5, 6], [0, 2.5, 0], fov=60),
-        "floor": _floor(to, _diffuse(_checks(to, 30))),
-        "ball": _ball([-1, 0.6, 1], 0.6, _diffuse(_checks(to, 12))),
-        "sky": _sky(0.5, 0.7, 1.0),
-    }
-
-
-def _stratified(to: Any) -> Node:
-    return {
-        "sensor": sensor(to, [0, 2, 6], [0, 0.5, 0], "box", sampler="stratified"),
-        "floor": _floor(to, _diffuse(_checks(to, 8))),
-        "box": {"type": "cube", "to_world": to.translate([0, 0.5, 0]).rotate([0, 1, 0], 30).scale(0.5)},
-        "lamp": _lamp([0, 4, 1], 1.0, 5),
-    }
-
-
-SCENES: dict[str, Callable[[Any], Node]] = {
-    make.__name__.strip("_"): make
-    for make in (
-        _envmap,
-        _instances,
-        _thin_lens,
-        _gloss,
-        _rough_glass,
-        _area_light,
-        _spot,
-        _crop,
-        _texture_and_sky,
-        _stratified,
-    )
-}
-# Where most of the noise is in a part of the picture
-LOCAL = ("thin_lens", "gloss", "texture_and_sky", "rough_glass")
