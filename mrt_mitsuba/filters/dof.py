@@ -52,7 +52,7 @@ def blur_amount(depth: Any, *, focal_distance: float | None, focal_range: float 
         UsageError: for a wrong shape, or a distance or range that is NaN.
     """
     grid = Grid(depth)
-    distance = grid.plane(depth, "depth")
+    distance = grid.flat(depth, (), "depth")
     focus = _focus(focal_distance, focal_range)
     if focus == 0:
         return grid.output([dr.zeros(grid.Float, grid.count)])
@@ -84,7 +84,7 @@ def gaussian_dof(
         return image
     grid = Grid(image)
     planes = grid.planes(image, "image")
-    distance = grid.plane(depth, "depth")
+    distance = grid.flat(depth, (), "depth")
     arrays = isinstance(image, np.ndarray) and isinstance(depth, np.ndarray)
     if arrays and _all_sharp(depth, focus, focal_range, mode):
         return np.array(image, np.float32)
@@ -141,16 +141,10 @@ def _report(grid: Grid, planes: Sequence[Any], amount: Any) -> list[Any]:
     blurred, wide = [grid.Float(plane) for plane in planes], k > 0
     dr.eval(sources, k, blurred, wide)
     pixels = grid.Int(dr.compress(wide))
-    if dr.width(pixels) > 0:
-        sums = _pascal_passes(grid, sources, pixels, dr.gather(grid.Int, k, pixels))
-        for target, total in zip(blurred, sums[:3], strict=True):
-            dr.scatter(target, total / sums[3], pixels)  # not zero: the pixel itself gives
-        dr.eval(blurred)
-    return blurred
+    if dr.width(pixels) == 0:
+        return blurred
 
-
-def _pascal_passes(grid: Grid, sources: Sequence[Any], pixels: Any, k: Any) -> list[Any]:
-    """Return the weighted sums over the windows of ``pixels``, one per source plane."""
+    k = dr.gather(grid.Int, k, pixels)
     column, row = grid.coordinates(pixels)
     start, count = _cut(grid.height - 1 - row, k, grid.height)
     bottom = (grid.height - 1 - start) * grid.width + column
@@ -165,7 +159,12 @@ def _pascal_passes(grid: Grid, sources: Sequence[Any], pixels: Any, k: Any) -> l
     place = dr.empty(grid.Int, MAX_AMOUNT * grid.count)  # read below only where written here
     dr.scatter(place, dr.arange(grid.Int, dr.width(needed)), needed)
     dr.eval(along_rows, place)
-    return vertical.sums(along_rows, place)
+
+    sums = vertical.sums(along_rows, place)
+    for target, total in zip(blurred, sums[:3], strict=True):
+        dr.scatter(target, total / sums[3], pixels)  # not zero: the pixel itself gives
+    dr.eval(blurred)
+    return blurred
 
 
 def _cut(centre: Any, k: Any, size: Any) -> tuple[Any, Any]:
@@ -179,18 +178,15 @@ class _Taps:
 
     def __init__(self, grid: Grid, first: Any, stride: Any, count: Any, k: Any) -> None:
         self._grid, self._first, self._stride, self._count = grid, first, stride, count
-        self._weights, self._line = grid.table(_PASCAL), (k - 1) * _MOST
+        self._weights, self._line = grid.Float(_PASCAL), (k - 1) * _MOST
 
     def sums(self, planes: Sequence[Any], place: Any = None) -> list[Any]:
         """Return the weighted sum of each plane's values; ``place``: where in the planes they are."""
         grid = self._grid
 
         def add(j: Any, totals: Sequence[Any]) -> list[Any]:
-            weight, index, active = (
-                dr.gather(grid.Float, self._weights, self._line + j),
-                self._index(j),
-                j < self._count,
-            )
+            weight = dr.gather(grid.Float, self._weights, self._line + j)
+            index, active = self._first + j * self._stride, j < self._count
             if place is not None:
                 index = dr.gather(grid.Int, place, index, active=active)
             return [
@@ -201,15 +197,12 @@ class _Taps:
         zero = dr.zeros(grid.Float, dr.width(self._first))
         return list(grid.accumulate(self._count, [zero] * len(planes), add))
 
-    def _index(self, j: Any) -> Any:
-        return self._first + j * self._stride
-
     def touched(self, size: int) -> Any:
         """Return the indices of all values in any of the lines, of ``size``, in ascending order."""
         grid, touched = self._grid, dr.zeros(self._grid.Bool, size)
 
         def mark(j: Any, none: Sequence[Any]) -> Sequence[Any]:
-            dr.scatter(touched, grid.Bool(True), self._index(j), active=j < self._count)
+            dr.scatter(touched, grid.Bool(True), self._first + j * self._stride, active=j < self._count)
             return none
 
         grid.accumulate(self._count, [], mark)

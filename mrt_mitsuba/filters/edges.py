@@ -37,8 +37,6 @@ LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 GREY_WEIGHTS = (0.07, 0.72, 0.21)
 REACH = 1  # rows and columns of neighbours that a pixel depends on, either way
 
-_OFFSETS = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
-
 
 @dataclass(frozen=True)
 class EdgeMap:
@@ -132,14 +130,17 @@ def sobel_edges(
     grid = Grid(image)
     grey = 255 * _weighted(grid.planes(image, "image"), GREY_WEIGHTS)
     near = _Neighbourhood(grid, grey if variance is not None else dr.trunc(grey))
-    value = near.sobel()
+    w = near.window  # both sides of a difference are summed alike, so equal sides give 0
+    gx = (w[2] + 2 * w[5] + w[8]) - (w[0] + 2 * w[3] + w[6])
+    gy = (w[6] + 2 * w[7] + w[8]) - (w[0] + 2 * w[1] + w[2])
+    value = dr.abs(gx) + dr.abs(gy)
     if variance is not None:
         grey_variance = dr.square(255 * _deviation(grid, variance, GREY_WEIGHTS))
         squares = [2, 4, 2, 4, 0, 4, 2, 4, 2]  # of Gx's and Gy's weights, summed
         noise = dr.sqrt(near.weighted_sum(grey_variance, squares))
         excess = value - _sigmas(grid, noise_sigmas) * noise
         value = dr.select(excess > 0, dr.trunc(excess), 0)
-    value = dr.select(near.finite(), value, math.inf)
+    value = dr.select(finite(near.window), value, math.inf)
     return near.edge_map(value > grid.opaque(threshold), value)
 
 
@@ -173,15 +174,26 @@ def geometry_edges(
         raise UsageError(f"depth_step={depth_step} is out of range; give a relative step above 0")
     grid = Grid(normal)
     normals = grid.planes(normal, "normal")
-    distance = grid.plane(depth, "depth")
+    distance = grid.flat(depth, (), "depth")
     hit = (distance > 0) & (distance < math.inf)
     bad = dr.isnan(distance) | (hit & ~finite(normals))
     inverse = dr.select(bad, math.inf, dr.select(hit, 1 / distance, 0))
     dr.eval(inverse, normals)  # in one kernel
     near = _Neighbourhood(grid, inverse)
-    step = _depth_measure(near.window) / grid.opaque(depth_step)
-    crease = _crease_measure(near, normals) / grid.opaque(1 - math.cos(math.radians(crease_angle)))
-    value = dr.select(near.finite(), dr.maximum(step, crease), math.inf)
+    windows = [near.of(plane) for plane in normals]
+    step, crease, centre = 0, 0, near.window[4]
+    for k in range(4):  # pairs of opposite neighbours
+        one, other = near.window[k], near.window[8 - k]
+        largest = dr.maximum(dr.maximum(one, other), centre)
+        difference = dr.abs((one - centre) + (other - centre))
+        step = dr.maximum(step, dr.select(largest > 0, difference / largest, 0))
+    for k in (0, 1, 2, 3, 5, 6, 7, 8):
+        dot = sum(window[4] * window[k] for window in windows)
+        both = (centre > 0) & (near.window[k] > 0)
+        crease = dr.maximum(crease, dr.select(both, 1 - dot, 0))
+    step /= grid.opaque(depth_step)
+    crease /= grid.opaque(1 - math.cos(math.radians(crease_angle)))
+    value = dr.select(finite(near.window), dr.maximum(step, crease), math.inf)
     return near.edge_map(value > 1, value)
 
 
@@ -199,30 +211,16 @@ class _Neighbourhood:
         self._inner = (column > 0) & (row > 0) & (column < grid.width - 1) & (row < grid.height - 1)
         self.window = self.of(plane)
 
-    def at(self, plane: Any, dx: int, dy: int) -> Any:
-        """Return the plane's value at the neighbour ``dx`` columns to the right and ``dy`` rows down."""
-        index = self._grid.index + dx + dy * self._grid.width
-        return dr.gather(self._grid.Float, plane, index, active=self._inner)
-
     def of(self, plane: Any) -> list[Any]:
         """Return the nine values of another plane."""
         dr.eval(plane)  # computed once for each pixel, not once for each of the nine that read it
-        return [self.at(plane, dx, dy) for dx, dy in _OFFSETS]
+        grid, active = self._grid, self._inner
+        indices = [grid.index + dx + dy * grid.width for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+        return [dr.gather(grid.Float, plane, index, active=active) for index in indices]
 
     def weighted_sum(self, plane: Any, weights: Sequence[float]) -> Any:
         """Return the sum of nine weights times another plane's values."""
         return sum(weight * value for weight, value in zip(weights, self.of(plane), strict=True) if weight)
-
-    def finite(self) -> Any:
-        """Return where all nine values are finite numbers."""
-        return finite(self.window)
-
-    def sobel(self) -> Any:
-        """Return |Gx| + |Gy|; both sides of a difference are summed alike, so equal sides give 0."""
-        w = self.window
-        gx = (w[2] + 2 * w[5] + w[8]) - (w[0] + 2 * w[3] + w[6])
-        gy = (w[6] + 2 * w[7] + w[8]) - (w[0] + 2 * w[1] + w[2])
-        return dr.abs(gx) + dr.abs(gy)
 
     def edge_map(self, mask: Any, value: Any) -> EdgeMap:
         """Return the result, with the border left out."""
@@ -244,28 +242,6 @@ def _sigmas(grid: Grid, noise_sigmas: float) -> Any:
     if not 0 <= noise_sigmas < math.inf:
         raise UsageError(f"noise_sigmas={noise_sigmas} is out of range; give a number from 0 on")
     return grid.opaque(noise_sigmas)
-
-
-def _depth_measure(inverse: Sequence[Any]) -> Any:
-    """Return the largest relative second difference over the four pairs of opposite neighbours."""
-    centre, result = inverse[4], 0
-    for first in range(4):
-        one, other = inverse[first], inverse[8 - first]
-        largest = dr.maximum(dr.maximum(one, other), centre)
-        difference = dr.abs((one - centre) + (other - centre))
-        result = dr.maximum(result, dr.select(largest > 0, difference / largest, 0))
-    return result
-
-
-def _crease_measure(near: _Neighbourhood, normals: Sequence[Any]) -> Any:
-    """Return the largest ``1 − n·n'`` over the neighbours, where both pixels hit something."""
-    windows = [near.of(plane) for plane in normals]
-    result = 0
-    for k in (0, 1, 2, 3, 5, 6, 7, 8):
-        dot = sum(window[4] * window[k] for window in windows)
-        both = (near.window[4] > 0) & (near.window[k] > 0)
-        result = dr.maximum(result, dr.select(both, 1 - dot, 0))
-    return result
 
 
 def _check_numbers(**options: float) -> None:

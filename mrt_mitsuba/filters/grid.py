@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -55,14 +55,11 @@ class Grid:
         """
         wanted = (self.rows, self.columns, *channels)
         if _shape(array) != wanted or self.count == 0:
-            raise UsageError(f"{name} has shape {_shape(array)}; expected {_wanted(wanted)}")
+            expected = "at least one pixel" if 0 in wanted else f"[{', '.join(map(str, wanted))}]"
+            raise UsageError(f"{name} has shape {_shape(array)}; expected {expected}")
         if dr.is_tensor_v(array):
             return self._tensor(dr.detach(array, preserve_type=False)).array
         return self.Float(np.ascontiguousarray(array, dtype=np.float32).ravel())
-
-    def plane(self, array: Any, name: str) -> Any:
-        """Return an array [rows, columns] as one flat plane."""
-        return self.flat(array, (), name)
 
     def planes(self, array: Any, name: str) -> list[Any]:
         """Return an array [rows, columns, 3] as three flat planes."""
@@ -77,10 +74,6 @@ class Grid:
         """Return column and row of pixels given by their index."""
         row = index // self.width
         return index - row * self.width, row
-
-    def table(self, values: Iterable[float]) -> Any:
-        """Return numbers to be looked up in a loop."""
-        return self.Float(list(values))
 
     def accumulate(
         self, count: Any, totals: Sequence[Any], add: Callable[[Any, Sequence[Any]], Sequence[Any]]
@@ -129,12 +122,6 @@ def finite(planes: Sequence[Any]) -> Any:
 
 def _shape(array: Any) -> tuple[int, ...]:
     return tuple(array.shape) if hasattr(array, "shape") else np.shape(array)
-
-
-def _wanted(shape: tuple[int, ...]) -> str:
-    if 0 in shape:
-        return "at least one pixel"
-    return f"[{', '.join(map(str, shape))}]"
 
 
 def _backend_module(image: Any) -> ModuleType:

@@ -37,38 +37,41 @@ def gather_discs(grid: Grid, planes: Sequence[Any], radius: Any, *, max_radius: 
         planes: red, green and blue.
         radius: a plane of signed radii in pixels, at most ``max_radius`` either way.
     """
-    offsets = _offsets(max_radius)
+    reach = math.ceil(max_radius + 1) - 1
+    steps = range(-reach, reach + 1)
+    # the neighbours that a disc of the largest radius covers at least in part
+    offsets = [(dx, dy) for dy in steps for dx in steps if math.hypot(dx, dy) < max_radius + 1]
+    distances = sorted(Counter(math.hypot(dx, dy) for dx, dy in offsets).items())
+    spread = sum(number * _coverage(dr.abs(radius), distance) for distance, number in distances)
     good = finite(planes)
-    # what a covered pixel gets of a disc's light
-    share = dr.select(good, 1 / _spread(dr.abs(radius), offsets), 0)
+    share = dr.select(good, 1 / spread, 0)  # what a covered pixel gets of a disc's light
     colours = [dr.select(good, plane, 0) for plane in planes]
     wide = dr.abs(radius) > 0
     blurred = [grid.Float(plane) for plane in planes]
     dr.eval(radius, share, colours, wide, blurred)
     pixels = grid.Int(dr.compress(good & _near_any(grid, wide, max(dx for dx, _ in offsets))))
-    if dr.width(pixels) > 0:
-        front, same, behind = _gather_layers(grid, colours, radius, share, pixels, offsets)
-        for target, value in zip(blurred, _composite(front, same, behind), strict=True):
-            dr.scatter(target, value, pixels)
-        dr.eval(blurred)
+    if dr.width(pixels) == 0:
+        return blurred
+
+    totals = _gather_layers(grid, colours, radius, share, pixels, offsets)
+    front, same, behind = totals[:4], totals[4:8], totals[8:]
+    # the layers laid over each other; the same layer holds the pixel itself, so its weight is not zero
+    covered, solid = dr.minimum(front[3], 1), dr.minimum(same[3], 1)
+    gap = dr.minimum(1 - solid, behind[3])
+    per_front = dr.select(front[3] > 0, covered / front[3], 0)
+    per_same = solid / same[3] / (solid + gap)
+    per_behind = dr.select(behind[3] > 0, gap / behind[3], 0) / (solid + gap)
+    values = [
+        per_front * front[c] + (1 - covered) * (per_same * same[c] + per_behind * behind[c]) for c in range(3)
+    ]
+    for target, value in zip(blurred, values, strict=True):
+        dr.scatter(target, value, pixels)
+    dr.eval(blurred)
     return blurred
-
-
-def _offsets(max_radius: float) -> list[tuple[int, int]]:
-    """Return the neighbours that a disc of the largest radius covers at least in part."""
-    reach = math.ceil(max_radius + 1) - 1
-    steps = range(-reach, reach + 1)
-    return [(dx, dy) for dy in steps for dx in steps if math.hypot(dx, dy) < max_radius + 1]
 
 
 def _coverage(radius: Any, distance: Any) -> Any:
     return dr.clip(radius + (1 - distance), 0, 1)
-
-
-def _spread(radius: Any, offsets: Sequence[tuple[int, int]]) -> Any:
-    """Return the sum of a disc's coverages over all pixels."""
-    distances = Counter(math.hypot(dx, dy) for dx, dy in offsets)
-    return sum(number * _coverage(radius, distance) for distance, number in sorted(distances.items()))
 
 
 def _clamped(grid: Grid, column: Any, row: Any, dx: Any, dy: Any) -> Any:
@@ -99,14 +102,13 @@ def _gather_layers(
     share: Any,
     pixels: Any,
     offsets: Sequence[tuple[int, int]],
-) -> tuple[Sequence[Any], Sequence[Any], Sequence[Any]]:
+) -> Sequence[Any]:
     """Return the weighted sums of red, green, blue and 1: in front, in the same layer, behind."""
     column, row = grid.coordinates(pixels)
     own_radius = dr.gather(grid.Float, radius, pixels)
     own_share = dr.gather(grid.Float, share, pixels)
-    steps = [
-        grid.table(step) for step in zip(*((dx, dy, math.hypot(dx, dy)) for dx, dy in offsets), strict=True)
-    ]
+    triples = [(dx, dy, math.hypot(dx, dy)) for dx, dy in offsets]
+    steps = [grid.Float(list(step)) for step in zip(*triples, strict=True)]
 
     def add(j: Any, totals: Sequence[Any]) -> list[Any]:
         dx, dy, distance = (dr.gather(grid.Float, table, j) for table in steps)
@@ -126,21 +128,4 @@ def _gather_layers(
         terms = [weight * value for weight in weights for value in values]
         return [total + term for total, term in zip(totals, terms, strict=True)]
 
-    totals = grid.accumulate(len(offsets), [dr.zeros(grid.Float, dr.width(pixels))] * 12, add)
-    return totals[:4], totals[4:8], totals[8:]
-
-
-def _composite(front: Sequence[Any], same: Sequence[Any], behind: Sequence[Any]) -> list[Any]:
-    """Return the colours of the layers laid over each other.
-
-    The same layer holds the pixel itself, so its weight is not zero.
-    """
-    covered = dr.minimum(front[3], 1)
-    solid = dr.minimum(same[3], 1)
-    gap = dr.minimum(1 - solid, behind[3])
-    per_front = dr.select(front[3] > 0, covered / front[3], 0)
-    per_same = solid / same[3] / (solid + gap)
-    per_behind = dr.select(behind[3] > 0, gap / behind[3], 0) / (solid + gap)
-    return [
-        per_front * front[c] + (1 - covered) * (per_same * same[c] + per_behind * behind[c]) for c in range(3)
-    ]
+    return grid.accumulate(len(offsets), [dr.zeros(grid.Float, dr.width(pixels))] * 12, add)

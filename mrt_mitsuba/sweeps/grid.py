@@ -23,15 +23,22 @@ NOT_SWEPT = frozenset({"scene", "progress", "on_round", "region", "params"})
 
 @dataclass(frozen=True)
 class Job:
-    """One picture. ``parameters``: its values of the grid, by key; ``name``: of its file, without ending."""
+    """One picture."""
 
-    name: str
+    name: str  #: of its file, without ending
     scene: Any
-    parameters: Mapping[str, Any]
     arguments: Mapping[str, Any]  #: of ``render``, without the scene
+    parameters: Mapping[str, Any]  #: its values of the grid, by key
+    identity: str = ""  #: fingerprint of the scene
+    made_with: str = ""  #: fingerprint of scene, settings and versions
+
+    @property
+    def file(self) -> str:
+        """The name of its picture in the folder."""
+        return f"{self.name}.exr"
 
 
-def jobs(scene: Any, grid: Mapping[str, Any], zipped: bool, fixed: Mapping[str, Any]) -> list[Job]:
+def jobs(scene: Any, grid: Any, zipped: bool, fixed: Mapping[str, Any]) -> list[Job]:
     """Return the jobs of a grid, in the order of its axes, the last of which varies fastest.
 
     ``zipped``: the axes are columns of one list, whose rows are the jobs; ``fixed``: arguments of ``render``
@@ -49,23 +56,33 @@ def jobs(scene: Any, grid: Mapping[str, Any], zipped: bool, fixed: Mapping[str, 
         raise UsageError(f"zipped axes must be of one length, and are {lengths}")
     rows = list(zip(*axes.values(), strict=True) if zipped else itertools.product(*axes.values()))
     points = [dict(zip(axes, row, strict=True)) for row in rows]
-    names = _frames(len(points)) if zipped else [_name(point) for point in points]
-    _refuse_same(names)
-    return [_job(name, scene, point, shared) for name, point in zip(names, points, strict=True)]
+    digits = max(4, len(str(len(points) - 1)))  # as programs that make films expect them
+    names = [f"frame_{n:0{digits}}" if zipped else _name(point) for n, point in enumerate(points)]
+    counts = Counter(name.casefold() for name in names)  # some file systems ignore case
+    for name in names:
+        if counts[name.casefold()] > 1:
+            raise UsageError(
+                f"{counts[name.casefold()]} jobs would write the same file {name}: take out values given "
+                "twice, or use zipped=True, which numbers the files"
+            )
+    found = []
+    for name, point in zip(names, points, strict=True):
+        dotted = {key: value for key, value in point.items() if "." in key}
+        arguments = shared | {key: value for key, value in point.items() if key not in dotted}
+        params = {**shared.get("params", {}), **point.get("params", {}), **dotted}
+        if params:
+            arguments["params"] = params
+        found.append(Job(name, arguments.pop("scene", scene), arguments, point))
+    return found
 
 
-def _job(name: str, scene: Any, point: dict[str, Any], shared: Mapping[str, Any]) -> Job:
-    dotted = {key: value for key, value in point.items() if "." in key}
-    arguments = dict(shared) | {key: value for key, value in point.items() if key not in dotted}
-    params = {**shared.get("params", {}), **point.get("params", {}), **dotted}
-    if params:
-        arguments["params"] = params
-    return Job(name, arguments.pop("scene", scene), point, arguments)
-
-
-def _axes(grid: Mapping[str, Any], fixed: Mapping[str, Any]) -> dict[str, list[Any]]:
+def _axes(grid: Any, fixed: Mapping[str, Any]) -> dict[str, list[Any]]:
+    if not isinstance(grid, Mapping):
+        raise UsageError(f'grid={grid!r}: give a dict of lists, such as {{"aa": [1, 2]}}')
     axes = {}
     for key, values in grid.items():
+        if not (isinstance(key, str) and key.isprintable()):
+            raise UsageError(f"grid: the key {key!r} is no name of an option or a parameter")
         if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
             raise UsageError(f"grid: {key} is {values!r}; give a list of values, such as [{values!r}]")
         axes[key] = [_check(key, plain(value)) for value in values]
@@ -106,12 +123,6 @@ def _finite(value: Any) -> bool:
     return not isinstance(value, list | tuple) or all(map(_finite, value))
 
 
-def _frames(count: int) -> list[str]:
-    """Return names as programs that make films expect them, numbered from 0."""
-    digits = max(4, len(str(count - 1)))
-    return [f"frame_{number:0{digits}}" for number in range(count)]
-
-
 def _name(point: Mapping[str, Any]) -> str:
     name = ",".join(f"{word(key)}={word(value)}" for key, value in point.items()) or "picture"
     if len(name.encode()) > LONGEST_NAME:
@@ -134,13 +145,3 @@ def word(value: Any) -> str:
     elif isinstance(value, Scene):
         value = value.title or "scene"
     return re.sub(r"[^\w.+-]+", "-", str(value))
-
-
-def _refuse_same(names: Sequence[str]) -> None:
-    counts = Counter(name.casefold() for name in names)  # some file systems ignore case
-    same = next((name for name in names if counts[name.casefold()] > 1), None)
-    if same is not None:
-        raise UsageError(
-            f"{counts[same.casefold()]} jobs would write the same file {same}: take out values given twice, "
-            "or use zipped=True, which numbers the files"
-        )

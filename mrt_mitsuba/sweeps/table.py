@@ -7,15 +7,13 @@ import io
 import json
 import os
 import time
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from typing import Any
 
 from mrt_mitsuba.errors import OutputError
-from mrt_mitsuba.sweeps.grid import word
+from mrt_mitsuba.output.replacing import check_target, replacing
+from mrt_mitsuba.sweeps.grid import Job, word
 
-FILE = "table.csv"
 FACTS = {
     "file": str,
     "error": str,
@@ -29,15 +27,23 @@ FACTS = {
 PAUSE = 1.0  # seconds from one writing to the next, so that short jobs do not rewrite it all the time
 
 
-@dataclass(repr=False)
 class Table:
-    """The outcome of each job of a sweep."""
+    """The outcome of each job of a sweep.
 
-    folder: str
-    keys: tuple[str, ...]  #: of the grid
-    jobs: Mapping[str, Mapping[str, Any]]  #: the parameters of every job, by its name
-    _ended: dict[str, dict[str, Any]] = field(default_factory=dict)
-    _written: float = 0.0
+    ``folder``: of the pictures, whose ``table.csv`` it is; ``keys``: of the grid; ``earlier``: the facts that
+    the file held before, by the name of the picture.
+
+    Raises ``OutputError`` for a ``table.csv`` that no sweep made, or that cannot be written.
+    """
+
+    def __init__(self, folder: str, keys: tuple[str, ...], jobs: list[Job]) -> None:
+        self.folder, self.keys = folder, keys
+        self._parameters = {job.name: job.parameters for job in jobs}
+        self._ended: dict[str, dict[str, Any]] = {}
+        self._path = os.path.join(folder, "table.csv")
+        self._written = 0.0
+        check_target(self._path)
+        self.earlier = _read(self._path)
 
     @property
     def rows(self) -> list[dict[str, Any]]:
@@ -47,84 +53,60 @@ class Table:
         "seconds", "rays", "rmse", "attempts", "worker" and "versions". None stands for the
         unknown: what an earlier sweep did not record, an error that the render did not estimate.
         """
-        return [self._ended[name] for name in self.jobs if name in self._ended]
+        return [self._ended[name] for name in self._parameters if name in self._ended]
 
     @property
     def failed(self) -> list[dict[str, Any]]:
         """The rows of jobs that left no picture."""
         return [row for row in self.rows if row["error"]]
 
-    def __contains__(self, name: object) -> bool:
-        return name in self._ended
-
     def __len__(self) -> int:
         return len(self._ended)
 
     def __str__(self) -> str:
-        return f"{len(self) - len(self.failed)} of {len(self.jobs)} pictures in {self.folder}"
+        return f"{len(self) - len(self.failed)} of {len(self._parameters)} pictures in {self.folder}"
 
     def add(self, name: str, facts: Mapping[str, Any]) -> None:
         """Add the row of a job that ended; the file follows once in a while."""
         row = dict.fromkeys(FACTS) | {"file": "", "error": ""} | dict(facts)
-        self._ended[name] = {**self.jobs[name], **row}
+        self._ended[name] = {**self._parameters[name], **row}
         if time.monotonic() > self._written + PAUSE:
-            self.write()
-
-    def keep(self, names: Collection[str], versions: str) -> None:
-        """Add the rows of jobs whose pictures an earlier sweep made, as far as its table knows them."""
-        known = _read(self.path)
-        for name in names:
-            file = f"{name}.exr"
-            self.add(name, known.get(file, {}) | {"file": file, "error": "", "versions": versions})
-        if names:
-            self.write()
-
-    @property
-    def path(self) -> str:
-        """Where the table is written."""
-        return os.path.join(self.folder, FILE)
-
-    @contextmanager
-    def writing(self) -> Iterator[None]:
-        """Write the file at the end, whatever is raised inside."""
-        try:
-            yield
-        finally:
             self.write()
 
     def write(self) -> None:
         """Write the file, which replaces the one before when it is complete."""
-        from mrt_mitsuba.output.replacing import replacing
-
         text = io.StringIO()
         writer = csv.DictWriter(text, (*self.keys, *FACTS), lineterminator="\n")
         writer.writeheader()
         writer.writerows({key: _cell(value) for key, value in row.items()} for row in self.rows)
-        with replacing(self.path) as file:
+        with replacing(self._path) as file:
             file.write(text.getvalue().encode())
         self._written = time.monotonic()
 
 
 def _read(path: str) -> dict[str, dict[str, Any]]:
-    """Return the facts of an earlier table by the name of the file; nothing where it is missing or broken."""
+    """Return the facts of an earlier table by the name of the file."""
+    rows: list[Mapping[str, str]] = []
+    columns: list[str] = list(FACTS)
     try:
         with open(path, encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
+            reader = csv.DictReader(file)
+            rows, columns = list(reader), list(reader.fieldnames or [])
     except FileNotFoundError:
         return {}
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise OutputError(f"cannot read {path}: {error}; remove it, and the pictures stay") from error
-    return {row["file"]: _facts(row) for row in rows if row.get("file")}
-
-
-def _facts(row: Mapping[str, str]) -> dict[str, Any]:
-    facts: dict[str, Any] = {}
-    for name, kind in FACTS.items():
-        try:
-            facts[name] = kind(row[name])
-        except (KeyError, ValueError, TypeError):
-            facts[name] = None
-    return facts
+    except (OSError, UnicodeDecodeError, csv.Error):
+        columns = []
+    if columns[-len(FACTS) :] != list(FACTS):
+        raise OutputError(f"{path} is not the table of a sweep: move it away, or choose another folder")
+    found: dict[str, dict[str, Any]] = {}
+    for row in rows:
+        facts = found.setdefault(row["file"], {})
+        for name, kind in FACTS.items():
+            try:
+                facts[name] = kind(row[name])
+            except (ValueError, TypeError):
+                facts[name] = None
+    return found
 
 
 def _cell(value: Any) -> Any:

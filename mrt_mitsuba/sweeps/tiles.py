@@ -9,173 +9,122 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-from mrt_mitsuba.errors import OutputError, UsageError
-from mrt_mitsuba.rays.region import Region
-from mrt_mitsuba.sweeps.scenes import fingerprint
-from mrt_mitsuba.sweeps.worker import MADE_WITH, House, Task
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.sweeps.grid import Job
+from mrt_mitsuba.sweeps.scenes import fingerprint, receive
+from mrt_mitsuba.sweeps.worker import MADE_WITH, Setting, strips
 
-ROWS = 64  # copied at a time; a multiple of the 16 that are compressed together
 # Memory for a tile, unless the caller says: what is kept of a pixel is 84 bytes at most
 BYTES_PER_PIXEL = 128
 LEAST_MEMORY = 2**27
 
 
-@dataclass(frozen=True)
-class Mosaic:
-    """A picture and its tiles, row by row."""
-
-    picture: Task
-    width: int
-    height: int
-    rows: int
-    columns: int
-
-    @classmethod
-    def of(cls, task: Task, tiles: tuple[int, int]) -> Mosaic:
-        """Cut a picture into so many rows and columns of tiles; raise ``UsageError`` if it is too small."""
-        width, height = _size(task)
-        rows, columns = tiles
-        if rows > height or columns > width:
-            raise UsageError(f"tiles={tiles}: a picture of {width}x{height} pixels has fewer rows or columns")
-        return cls(task, width, height, rows, columns)
-
-    @property
-    def regions(self) -> list[Region]:
-        """The tiles' places, whose sizes differ by a pixel at most."""
-        return [
-            Region(left, top, right - left, bottom - top)
-            for top, bottom in itertools.pairwise(_cuts(self.height, self.rows))
-            for left, right in itertools.pairwise(_cuts(self.width, self.columns))
-        ]
-
-    @property
-    def tiles(self) -> list[Task]:
-        """Return the tasks: each tile goes into a file in a folder named after the picture."""
-        task, tasks = self.picture, []
-        for number, region in enumerate(self.regions):
-            place = (region.x, region.y, region.width, region.height)
-            memory = max(LEAST_MEMORY, BYTES_PER_PIXEL * region.width * region.height)
-            arguments = {"memory": memory, **task.arguments, "region": place}
-            name = f"{self.folder}/{number // self.columns},{number % self.columns}"
-            made_with = fingerprint(task.made_with, place)
-            tasks.append(replace(task, name=name, arguments=arguments, made_with=made_with))
-        return tasks
-
-    @property
-    def folder(self) -> str:
-        """The name of the tiles' folder."""
-        return f"{self.picture.name}.tiles"
+def check_tiles(tiles: Any, png: bool, jobs: Sequence[Job]) -> None:
+    """Raise ``UsageError`` for numbers of rows and columns, or for jobs, that cannot be cut into tiles."""
+    pair = isinstance(tiles, list | tuple) and [type(number) for number in tiles] == [int, int]
+    if not (pair and min(tiles) > 0):
+        raise UsageError(f"tiles={tiles!r}: give rows and columns, such as (4, 4)")
+    if png:
+        raise UsageError("tiles: pictures in tiles are written as EXR only; leave out png")
+    if any(job.arguments.get("target") or job.arguments.get("aamode") == "noise" for job in jobs):
+        raise UsageError("tiles: target and aamode=noise share the rays out over the whole picture")
 
 
-def _cuts(size: int, parts: int) -> list[int]:
-    return [size * number // parts for number in range(parts + 1)]
+def cut(job: Job, tiles: tuple[int, int]) -> list[Job]:
+    """Return the jobs of a picture's tiles, row by row, each with a file in a folder named after the picture.
+
+    Raises ``UsageError`` if the picture has too few pixels.
+    """
+    width, height = job.arguments.get("width"), job.arguments.get("height")
+    if not (width and height):  # only the scene knows
+        from mrt_mitsuba import runtime
+        from mrt_mitsuba.scene.open import open_scene
+
+        runtime.use()
+        source = open_scene(receive(job.scene), size=(width, height))
+        width, height = source.width, source.height
+    rows, columns = tiles
+    if rows > height or columns > width:
+        raise UsageError(f"tiles={tiles}: a picture of {width}x{height} pixels has fewer rows or columns")
+    found = []
+    for row, (top, bottom) in enumerate(_spans(height, rows)):
+        for column, (left, right) in enumerate(_spans(width, columns)):
+            region = (left, top, right - left, bottom - top)
+            memory = max(LEAST_MEMORY, BYTES_PER_PIXEL * region[2] * region[3])
+            arguments = {"memory": memory, **job.arguments, "region": region}
+            name, made = f"{job.name}.tiles/{row},{column}", fingerprint(job.made_with, region)
+            found.append(replace(job, name=name, arguments=arguments, made_with=made))
+    return found
 
 
-def _size(task: Task) -> tuple[int, int]:
-    """Return width and height of a picture; loads its scene where only that knows."""
-    from mrt_mitsuba import runtime
-    from mrt_mitsuba.scene.open import open_scene
-    from mrt_mitsuba.sweeps.scenes import SceneFile
-
-    width, height = task.arguments.get("width"), task.arguments.get("height")
-    if width and height:
-        return width, height
-    runtime.use()
-    scene = task.scene.load() if isinstance(task.scene, SceneFile) else task.scene
-    source = open_scene(scene, size=(width, height))
-    return source.width, source.height
+def _spans(size: int, parts: int) -> Sequence[tuple[int, int]]:
+    """Return start and end of each part, whose sizes differ by one at most."""
+    return list(itertools.pairwise(size * number // parts for number in range(parts + 1)))
 
 
-def assemble_task(mosaic: Mosaic, found: Sequence[Mapping[str, Any] | None], house: House) -> dict[str, Any]:
-    """Put the tiles of a picture together, given the facts of those just made; return the picture's."""
+def assemble(
+    job: Job, tiles: Sequence[Job], found: Sequence[Mapping[str, Any] | None], setting: Setting
+) -> dict[str, Any]:
+    """Write a picture from its tiles, and remove these; return its facts, given those of new tiles."""
     from distributed import get_worker
 
     facts: dict[str, Any] = {"worker": get_worker().address}
-    errors = [tile["error"] for tile in found if tile and "error" in tile]
-    if errors:
-        return facts | {"error": errors[0]}
-    task = mosaic.picture
+    for tile in found:
+        if tile and "error" in tile:
+            return facts | {"error": tile["error"]}
+    paths = [os.path.join(setting.folder, tile.file) for tile in tiles]
+    scratch = os.path.join(setting.scratch, job.file)
     try:
-        assemble(mosaic)
-    except (OSError, RuntimeError, OutputError) as error:
-        return facts | {"error": f"cannot put {task.name} together: {error}"}
-    for name in ("seconds", "rays"):
-        # tiles that an earlier sweep made have none
+        _join(job, tiles, paths, scratch)
+        os.replace(scratch, os.path.join(setting.folder, job.file))
+        for path in paths:
+            os.unlink(path)
+        os.rmdir(os.path.dirname(paths[0]))
+    except (OSError, RuntimeError) as error:
+        return facts | {"error": f"cannot put {job.name} together: {error}"}
+    for name in ("seconds", "rays"):  # unknown of tiles that an earlier sweep made
         facts[name] = sum(tile[name] for tile in found if tile) if all(found) else None
-    return facts | {"file": task.files[-1]}
+    return facts | {"file": job.file}
 
 
-def assemble(mosaic: Mosaic) -> None:
-    """Write a picture from its tiles, and remove these."""
-    import OpenEXR
-
-    from mrt_mitsuba.output.files import compressing
-
-    task = mosaic.picture
-    paths = [os.path.join(task.folder, tile.files[-1]) for tile in mosaic.tiles]
-    path = os.path.join(task.scratch, task.files[-1])
-    header = _header(mosaic, OpenEXR.InputFile(paths[0]).header())
-    with compressing():
-        picture = OpenEXR.OutputFile(path, header)
-        try:
-            for rows, planes in _rows(mosaic, paths, list(header["channels"])):
-                picture.writePixels(planes, rows)
-        finally:
-            picture.close()
-    _check_complete(path, mosaic.height)
-    os.replace(path, os.path.join(task.folder, task.files[-1]))
-    shutil.rmtree(os.path.join(task.folder, mosaic.folder))
-
-
-def _header(mosaic: Mosaic, tile: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the header that the picture would have in one piece, given that of a tile."""
-    import OpenEXR
-
-    from mrt_mitsuba.output.files import compression
-
-    header: dict[str, Any] = OpenEXR.Header(mosaic.width, mosaic.height)
-    kind = compression(mosaic.width * mosaic.height)
-    header["compression"] = type(header["compression"])(int(kind))  # an older type of the library
-    header |= {name: value for name, value in tile.items() if name not in header and name != "type"}
-    options = json.loads(tile["mrt:options"])
-    options.pop("region", None)
-    header["channels"] = tile["channels"]
-    header["mrt:options"] = json.dumps(options).encode()
-    header[MADE_WITH] = mosaic.picture.made_with.encode()
-    return header
-
-
-def _rows(
-    mosaic: Mosaic, paths: Sequence[str], channels: Sequence[str]
-) -> Iterator[tuple[int, dict[str, bytes]]]:
-    """Yield some rows of the picture at a time: their number, and the bytes of each channel."""
+def _join(job: Job, tiles: Sequence[Job], paths: Sequence[str], path: str) -> None:
     import numpy as np
     import OpenEXR
 
-    regions = mosaic.regions
-    for first in range(0, len(regions), mosaic.columns):
-        tiles = [OpenEXR.InputFile(path) for path in paths[first : first + mosaic.columns]]
-        for top in range(0, regions[first].height, ROWS):
-            bottom = min(top + ROWS, regions[first].height)
-            planes = {}
-            for channel in channels:
-                parts = [
-                    np.frombuffer(tile.channel(channel, scanLine1=top, scanLine2=bottom - 1), np.float32)
-                    for tile in tiles
-                ]
-                planes[channel] = np.hstack([part.reshape(bottom - top, -1) for part in parts]).tobytes()
-            yield bottom - top, planes
+    from mrt_mitsuba.output.files import compressing, compression
 
-
-def _check_complete(path: str, height: int) -> None:
-    """Read the last row and let the file reach the disk: the library does not report a full one."""
-    import OpenEXR
-
-    OpenEXR.InputFile(path).channel("R", scanLine1=height - 1, scanLine2=height - 1)
+    files = [OpenEXR.InputFile(each) for each in paths]
+    own = files[0].header()
+    left, top, wide, high = tiles[-1].arguments["region"]
+    header: dict[str, Any] = OpenEXR.Header(left + wide, top + high)
+    kind = compression((left + wide) * (top + high))
+    header["compression"] = type(header["compression"])(int(kind))  # an older type of the library
+    header |= {name: value for name, value in own.items() if name not in header and name != "type"}
+    options = {name: value for name, value in json.loads(own["mrt:options"]).items() if name != "region"}
+    header["channels"] = own["channels"]
+    header["mrt:options"] = json.dumps(options).encode()
+    header[MADE_WITH] = job.made_with.encode()
+    channels = list(own["channels"])
+    columns = [tile.arguments["region"][1] for tile in tiles].count(0)  # those in the first row
+    with compressing():
+        picture = OpenEXR.OutputFile(path, header)
+        try:
+            for first in range(0, len(files), columns):
+                row = [strips(file, channels) for file in files[first : first + columns]]
+                for parts in zip(*row, strict=True):
+                    planes, rows = {}, 0
+                    for name in channels:
+                        blocks = [np.frombuffer(part[name], np.float32) for part in parts]
+                        rows = len(blocks[0]) // tiles[first].arguments["region"][2]
+                        planes[name] = np.hstack([block.reshape(rows, -1) for block in blocks]).tobytes()
+                    picture.writePixels(planes, rows)
+        finally:
+            picture.close()
+    # The library does not report a full disk: read the last row, and let the file reach the disk
+    OpenEXR.InputFile(path).channel("R", scanLine1=top + high - 1, scanLine2=top + high - 1)
     with open(path, "rb") as file:
         os.fsync(file.fileno())

@@ -1,79 +1,49 @@
-"""The code that runs on a worker: one job at a time; variant, scene, render, file."""
+"""The code that runs on a worker: variant, scene, render, file."""
 
 from __future__ import annotations
 
-import functools
-import json
-import logging
 import os
 import socket
-import threading
+import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from mrt_mitsuba import runtime
 from mrt_mitsuba.cores import affinity, usable_cores
-from mrt_mitsuba.errors import MrtError, OutputError
-from mrt_mitsuba.runtime import versions
-from mrt_mitsuba.sweeps.scenes import Opener, SceneFile
+from mrt_mitsuba.errors import MrtError
+from mrt_mitsuba.memory import free_memory
+from mrt_mitsuba.options import SMALLEST_MEMORY
+from mrt_mitsuba.sweeps.grid import Job
+from mrt_mitsuba.sweeps.scenes import identify, receive
 
-# Of the scheduler's events, by which a client learns what has begun, and the facts about what has ended: to
-# fetch a result takes it and the worker much longer
-TOPIC = "mrt-sweep"
-ENDED = "mrt-sweep-ended"
 MADE_WITH = "mrt:sweep"  # header attribute: fingerprint of scene, settings and versions
-THUMBNAIL = 160  # pixels, the longer side
-ENOUGH = 0.2  # seconds of a batch, after which it ends
-PAUSE = 0.5  # seconds before a worker ends, in which the client fetches the facts about its last job
-
-_one_at_a_time = threading.Lock()  # Dr.Jit is not safe with several Python threads
-_open = Opener()
-_cores = functools.cache(usable_cores)
-_done = 0  # jobs since this process began
-_ending = threading.Event()  # it is about to be replaced
+ROWS = 64  # of a picture, read at a time; a multiple of the 16 that are compressed together
 
 
 @dataclass(frozen=True)
-class Task:
-    """A picture to render: ``scratch`` holds its file until it is complete and moves to ``folder``."""
+class Setting:
+    """What all jobs of a sweep share."""
 
-    name: str
     folder: str
-    scratch: str
-    scene: Any
-    arguments: Mapping[str, Any]  #: of ``render``
-    made_with: str
-    png: bool = False
-
-    @property
-    def key(self) -> str:
-        """Names the task among those of all clients of a scheduler."""
-        return f"{os.path.basename(self.scratch)}/{self.name}"
-
-    @property
-    def thumbnail(self) -> str:
-        """The path of the picture for the contact sheet, as an array."""
-        return os.path.join(self.scratch, f"{self.name}.npy")
-
-    @property
-    def files(self) -> list[str]:
-        """The names of the pictures to write, the EXR last."""
-        return [f"{self.name}.{ending}" for ending in ("png", "exr") if self.png or ending == "exr"]
+    scratch: str  #: holds the file of each picture until it is complete and moves to ``folder``
+    png: bool
+    software: Mapping[str, str]  #: that all workers must have
+    local: bool  #: do workers share this machine's home, and so its cache of kernels
+    sharing: Mapping[str, int]  #: how many workers share cores, by ``cores``
 
 
-@dataclass(frozen=True)
-class House:
-    """The rules that all jobs of a worker share.
+def software(worker: Any = None) -> dict[str, str]:
+    """Return the versions of what decides about pixels, and Python's.
 
-    ``sharing``: how many workers share cores, by ``cores_of``; ``renew``: jobs after which a worker gets a
-    new process; ``local``: do workers share this machine's home, and so its cache of kernels.
+    With a ``worker`` of a cluster, Dr.Jit, which is imported here first, keeps its kernels near it: the homes
+    of clusters are often far away.
     """
-
-    sharing: Mapping[str, int]
-    renew: int
-    local: bool
-    versions: Mapping[str, str]
+    if worker is not None:
+        near = os.path.join(os.path.dirname(worker.local_directory), "drjit")
+        os.environ.setdefault("DRJIT_CACHE_DIR", near)
+    return {**runtime.versions(), "python": f"{sys.version_info[0]}.{sys.version_info[1]}"}
 
 
 def named(versions: Mapping[str, str]) -> str:
@@ -81,164 +51,114 @@ def named(versions: Mapping[str, str]) -> str:
     return ", ".join(f"{name} {version}" for name, version in versions.items())
 
 
-def cores_of() -> str:
+def cores() -> str:
     """Return a name for the cores of this process: workers that share them have the same."""
     return f"{socket.gethostname()} {affinity()}"
 
 
-def facts(path: str) -> dict[str, Any]:
+def describe(path: str, local: bool, dask_worker: Any = None) -> dict[str, Any]:
     """Return what a client asks of each worker before it begins, such as whether it sees a file."""
-    return {
-        "versions": versions(),
-        "cores": cores_of(),
-        "sees": os.path.exists(path) and os.access(os.path.dirname(path), os.W_OK),
-    }
+    sees = os.path.exists(path) and os.access(os.path.dirname(path), os.W_OK)
+    return {"software": software(None if local else dask_worker), "cores": cores(), "sees": sees}
 
 
-def is_fresh(task: Task) -> bool:
-    """Return whether the pictures are there and were made with the same scene, settings and versions."""
-    import OpenEXR
-
-    paths = [os.path.join(task.folder, file) for file in task.files]
-    if not all(map(os.path.isfile, paths)):
-        return False
+def attempts(name: str, setting: Setting) -> int:
+    """Return how often a worker has begun a job, 1 at least."""
     try:
-        header = OpenEXR.File(paths[-1], header_only=True).header()
-    except (OSError, RuntimeError, ValueError, TypeError):
-        return False
-    return header.get(MADE_WITH) == task.made_with
+        return max(1, os.path.getsize(os.path.join(setting.scratch, f"{name}.begun")))
+    except FileNotFoundError:
+        return 1
 
 
-def render_batch(tasks: Sequence[Task], house: House) -> dict[str, Any]:
-    """Render pictures one after the other, as many as take little time; return the facts of the last.
+def render_job(job: Job, setting: Setting) -> dict[str, Any]:
+    """Render a picture and write it; return its facts for the table, or the reason why there is none.
 
     Errors that are not this project's are raised: a repetition may help, where memory or a device ran out.
     """
-    start = time.monotonic()
-    for task in tasks:
-        found = _render_task(task, house)
-        if time.monotonic() > start + ENOUGH:
-            break
-    return found
+    from distributed import get_worker
 
-
-def _render_task(task: Task, house: House) -> dict[str, Any]:
-    """Render a picture and write it; return its facts for the table, or the reason why there is none."""
-    from distributed import Reschedule, get_worker
-
-    global _done
-    worker, note = get_worker(), os.path.join(task.scratch, f"{task.name}.json")
-    with _one_at_a_time:
-        if found := _read_note(note):  # done, but the worker was gone before it could report
-            worker.log_event(ENDED, (task.key, found))
-            return found
-        if _done >= house.renew and (worker.nanny or house.local):
-            _renew(worker)
-            raise Reschedule  # to another worker, or to this one's next process
-        worker.log_event(TOPIC, task.key)
-        try:
-            _prepare(worker, house)
-            found = _render(task, worker) | {"worker": worker.address}
-            with open(note, "w") as file:
-                json.dump(found, file)
-        except MrtError as error:
-            found = {"error": " ".join(str(error).split()), "worker": worker.address}
-        _done += 1
-        worker.log_event(ENDED, (task.key, found))
-    return found
-
-
-def _read_note(path: str) -> dict[str, Any]:
-    """Return what a worker wrote about a job that it has done; nothing where it did not come so far."""
+    worker, scratch = get_worker(), os.path.join(setting.scratch, job.name)
+    os.makedirs(os.path.dirname(scratch), exist_ok=True)  # tiles have a folder of their own
+    with open(f"{scratch}.begun", "ab") as file:
+        file.write(b"+")
     try:
-        with open(path) as file:
-            return dict(json.load(file))
-    except (FileNotFoundError, json.JSONDecodeError):
-        return {}
+        with runtime.one_at_a_time:
+            found = _render(job, setting, scratch, worker)
+    except MrtError as error:
+        found = {"error": " ".join(str(error).split())}
+    return found | {"worker": worker.address}
 
 
-def _renew(worker: Any) -> None:
-    """Let this process be replaced by a new one."""
-    time.sleep(PAUSE)
-    if not _ending.is_set():
-        _ending.set()
-        logging.getLogger("tornado.application").setLevel(logging.CRITICAL)  # or the end is a traceback
-        worker.loop.add_callback(worker.close_gracefully, restart=True, reason="mrt-sweep: renewed")
-
-
-def _prepare(worker: Any, house: House) -> None:
-    """Choose Dr.Jit's cache, before it is imported, and its share of the cores; check the versions."""
-    if versions() != house.versions:
-        raise MrtError(f"the worker has {named(versions())}; the sweep began with {named(house.versions)}")
-    if not house.local:  # homes of clusters are often far away
-        near = os.path.join(os.path.dirname(worker.local_directory), "drjit")
-        os.environ.setdefault("DRJIT_CACHE_DIR", near)
+def _render(job: Job, setting: Setting, scratch: str, worker: Any) -> dict[str, Any]:
+    start = time.perf_counter()
+    here = software(None if setting.local else worker)
+    if here != setting.software:
+        raise MrtError(f"the worker has {named(here)}; the sweep began with {named(setting.software)}")
     import drjit as dr
 
-    threads = max(1, _cores() // house.sharing.get(cores_of(), 1))
+    from mrt_mitsuba.output.files import save
+    from mrt_mitsuba.rendering.api import render
+    from mrt_mitsuba.rendering.progress import Progress
+
+    threads = max(1, usable_cores() // setting.sharing.get(cores(), 1))
     if dr.thread_count() != threads:
         dr.set_thread_count(threads)
-
-
-def _render(task: Task, worker: Any) -> dict[str, Any]:
-    import numpy as np
-
-    from mrt_mitsuba import runtime
-    from mrt_mitsuba.output.files import save
-    from mrt_mitsuba.rendering.api import render_with
-    from mrt_mitsuba.rendering.progress import Progress
-    from mrt_mitsuba.rendering.settings import RenderSettings
-
-    start = time.perf_counter()
-    settings = RenderSettings.of(**{"memory": _memory(worker), **task.arguments})
-    scene = task.scene
-    if isinstance(scene, SceneFile):
-        runtime.use(settings.variant)
-        scene = scene.load()
-    result = render_with(scene, settings, Progress(), opener=_open)
-    header = result.header() | {MADE_WITH: task.made_with}
-    for file in task.files:
-        path, target = os.path.join(task.scratch, file), os.path.join(task.folder, file)
-        for place in (path, target):  # tiles have a folder of their own
-            os.makedirs(os.path.dirname(place), exist_ok=True)
-        save(path, result.image, layers=result.layers, header=header)
-        os.replace(path, target)
-    if "region" not in task.arguments:
-        np.save(task.thumbnail, shrunk(result.image))
+    arguments = dict(job.arguments)
+    limit = worker.memory_manager.memory_limit
+    if limit:  # other workers need theirs
+        arguments.setdefault("memory", max(min(free_memory(), limit) // 2, SMALLEST_MEMORY))
+    runtime.use(arguments.get("variant"))
+    result = render(receive(job.scene), progress=Progress(), **arguments)
+    if identify(job.scene) != job.identity:
+        raise MrtError(f"{job.scene} has changed since the sweep began: run it again")
+    header = result.header() | {MADE_WITH: job.made_with}
+    for ending in ("exr", "png") if setting.png else ("exr",):
+        target = os.path.join(setting.folder, f"{job.name}.{ending}")
+        os.makedirs(os.path.dirname(target), exist_ok=True)
+        save(f"{scratch}.{ending}", result.image, layers=result.layers, header=header)
+        os.replace(f"{scratch}.{ending}", target)
     return {
-        "file": task.files[-1],
+        "file": job.file,
         "seconds": time.perf_counter() - start,
         "rays": sum(result.rays.values()),
         "rmse": result.error.rmse if result.error else None,
     }
 
 
-def _memory(worker: Any) -> int | None:
-    """Return half of what is free or, if that is less, of what the worker may take; others need theirs."""
-    from mrt_mitsuba.memory import Budget
-    from mrt_mitsuba.options import SMALLEST_MEMORY
-
-    limit = worker.memory_manager.memory_limit
-    return max(min(Budget.of(None).size, limit // 2), SMALLEST_MEMORY) if limit else None
-
-
-def thumbnail(path: str) -> Any:
-    """Return a picture as ``shrunk`` does; None where it cannot be read."""
-    from mrt_mitsuba.output.files import read_exr
-
-    try:
-        return shrunk(read_exr(path).image)
-    except OutputError:
-        return None
-
-
-def shrunk(image: Any) -> Any:
-    """Return a picture [H, W, 3] in sRGB, 8 bit, no larger than ``THUMBNAIL``."""
-    import numpy as np
+def is_fresh(job: Job, folder: str, png: bool) -> bool:
+    """Return whether a picture is there, whole, and made with the same scene, settings and versions."""
+    import OpenEXR
     from PIL import Image
 
-    from mrt_mitsuba.output.files import to_8bit
+    path = os.path.join(folder, job.name)
+    if made_with(f"{path}.exr") != job.made_with:
+        return False
+    try:
+        file = OpenEXR.InputFile(f"{path}.exr")
+        for _ in strips(file, list(file.header()["channels"])):
+            pass
+        if png:
+            with Image.open(f"{path}.png") as picture:
+                picture.load()
+    except (OSError, RuntimeError, ValueError, TypeError, SyntaxError):
+        return False
+    return True
 
-    picture = Image.fromarray(to_8bit(np.nan_to_num(image), "srgb"))
-    picture.thumbnail((THUMBNAIL, THUMBNAIL))
-    return np.asarray(picture)
+
+def made_with(path: str) -> str | None:
+    """Return the fingerprint in the header of a picture that a sweep made; None for any other file."""
+    import OpenEXR
+
+    try:
+        found = OpenEXR.File(path, header_only=True).header().get(MADE_WITH) if os.path.isfile(path) else None
+    except (OSError, RuntimeError, ValueError, TypeError):
+        return None
+    return str(found) if found is not None else None
+
+
+def strips(file: Any, channels: list[str]) -> Iterator[dict[str, bytes]]:
+    """Yield the channels of an EXR, ``ROWS`` rows at a time."""
+    height = file.header()["dataWindow"].max.y + 1
+    for top in range(0, height, ROWS):
+        bottom = min(top + ROWS, height) - 1
+        yield dict(zip(channels, file.channels(channels, scanLine1=top, scanLine2=bottom), strict=True))

@@ -6,6 +6,7 @@ import contextlib
 import csv
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -41,24 +42,31 @@ def wait_for(condition: Callable[[], Any], what: str) -> Any:
 
 
 class Cluster:
-    """A scheduler and two workers, started by hand."""
+    """A scheduler and two workers, started by hand; ``preload``: Python code that each worker runs first."""
 
-    def __init__(self, folder: Path) -> None:
-        file = folder / "scheduler.json"
+    def __init__(self, folder: Path, preload: str = "") -> None:
+        file, code = folder / "scheduler.json", folder / "preload.py"
+        code.write_text(preload)
         common = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
         self.scheduler = self._start(folder, "scheduler", "--port", "0", *common)
         wait_for(lambda: file.exists() and file.read_text().endswith("}"), "a scheduler")
         self.address = json.loads(file.read_text())["address"]
-        self.workers = [
-            self._start(folder, "worker", "--nthreads", "1", "--local-directory", str(folder), *common)
-            for _ in range(2)
-        ]
+        own = ["--nthreads", "1", "--local-directory", str(folder), "--preload", str(code)]
+        self.workers = [self._start(folder, "worker", *own, *common) for _ in range(2)]
 
     @staticmethod
     def _start(folder: Path, *words: str) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "dask", *words]
+        own = {"ALLOWED_FAILURES": "1", "WORKER_SATURATION": "1.0"}
+        environ = os.environ | {f"DASK_DISTRIBUTED__SCHEDULER__{name}": own[name] for name in own}
         with open(folder / "log", "ab") as log:
-            return subprocess.Popen(command, cwd=folder, stdout=log, stderr=log, start_new_session=True)
+            return subprocess.Popen(
+                [sys.executable, "-m", "dask", *words],
+                cwd=folder,
+                env=environ,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
 
     def stop(self) -> None:
         """End all processes, also those that the workers have started."""
@@ -77,14 +85,14 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.fixture
-def mortal(tmp_path: Path) -> Iterator[Callable[[], Cluster]]:
+def mortal(tmp_path: Path) -> Iterator[Callable[..., Cluster]]:
     """Starts clusters for tests that break them."""
     started: list[Cluster] = []
 
-    def start() -> Cluster:
+    def start(preload: str = "") -> Cluster:
         folder = tmp_path / f"cluster{len(started)}"
         folder.mkdir()
-        started.append(Cluster(folder))
+        started.append(Cluster(folder, preload))
         return started[-1]
 
     yield start
@@ -145,11 +153,9 @@ def test_pictures_are_those_of_render_alone(address: str, tmp_path: Path) -> Non
         assert row["attempts"] == 1 and row["seconds"] > 0 and row["rays"] == sum(alone.rays.values())
     assert [row["file"] for row in table.rows][:2] == ["scene=3,aa=1,seed=0.exr", "scene=3,aa=1,seed=1.exr"]
     assert [row["file"] for row in written(tmp_path / "out")] == [row["file"] for row in table.rows]
-    assert (tmp_path / "out" / "contact.png").stat().st_size > 2000
 
 
 def test_parameters_of_the_scene(address: str, tmp_path: Path) -> None:
-    """Jobs that follow each other in a worker set them in a scene that it has loaded once."""
     places = [[[0.5, 0, 0, x], [0, 0.5, 0, 1], [0, 0, 0.5, 1], [0, 0, 0, 1]] for x in (1.0, 2.0)]
     grid = {"material_0.alpha": [0.1, 0.6], "light_0.intensity.value": [[1, 0, 0], [0, 1, 0]]}
     for more in ({}, {"sphere_0.to_world": places}):
@@ -178,20 +184,78 @@ def test_a_second_run_renders_only_what_is_missing_or_was_made_otherwise(
     address: str, tmp_path: Path
 ) -> None:
     def run(**options: Any) -> dict[str, int]:
-        table = mrt.sweep(3, tmp_path, grid={"seed": [1, 2, 3]}, cluster=address, **SMALL | options)
-        assert len(table.rows) == 3 and not table.failed
+        table = mrt.sweep(3, tmp_path, grid={"seed": [1, 2]}, cluster=address, png=True, **SMALL | options)
+        assert len(table.rows) == 2 and not table.failed
         assert all(row["seconds"] > 0 and row["attempts"] == 1 for row in table.rows)
-        return {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.exr")}
+        return {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("seed*")}
 
     first = run()
-    assert run() == first
-    (tmp_path / "seed=2.exr").unlink()
-    (tmp_path / "seed=3.exr").write_bytes((tmp_path / "seed=3.exr").read_bytes()[:100])
-    second = run(memory="1G")  # does not decide about pixels
-    assert {name for name in first if first[name] != second[name]} == {"seed=2.exr", "seed=3.exr"}
+    assert run(memory="1G") == first  # memory does not decide about pixels
+    (tmp_path / "seed=1.exr").unlink()
+    second = run()
+    assert {name for name in first if first[name] != second[name]} == {"seed=1.exr", "seed=1.png"}
     third = run(fresnel="dielectric")
     assert not set(second.values()) & set(third.values())
     assert not set(third.values()) & set(run(fresnel="dielectric", resume=False).values())
+
+
+def test_a_picture_that_was_cut_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At every kilobyte: the sweep comes so far as to look for workers."""
+    options: dict[str, Any] = {"grid": {"seed": [1]}, "png": True, **SMALL}
+    mrt.sweep(3, tmp_path, workers=1, **options)
+    monkeypatch.setattr("mrt_mitsuba.sweeps.cluster.CONNECTING", 0.2)
+    nowhere = {"cluster": "tcp://127.0.0.1:9"}
+    assert not mrt.sweep(3, tmp_path, **nowhere, **options).failed  # whole, and none is needed
+    for file in (tmp_path / "seed=1.exr", tmp_path / "seed=1.png"):
+        whole = file.read_bytes()
+        for length in range(0, len(whole), 1024):
+            file.write_bytes(whole[:length])
+            with pytest.raises(MrtError, match="no scheduler answers"):
+                mrt.sweep(3, tmp_path, **nowhere, **options)
+        file.write_bytes(whole)
+
+
+@pytest.mark.parametrize("name", ["table.csv", "seed=1.exr", "seed=1.png", "link", "picture.tiles/0,0.exr"])
+def test_a_file_of_the_users_own_is_refused_by_name(tmp_path: Path, name: str) -> None:
+    mine = tmp_path / ("seed=1.exr" if name == "link" else name)
+    mine.parent.mkdir(exist_ok=True)
+    options: dict[str, Any] = {"tiles": (1, 2)} if "tiles" in name else {"grid": {"seed": [1]}, "png": True}
+    if name == "link":
+        mine.symlink_to(tmp_path / "nothing")
+    elif name.endswith("exr"):
+        mrt.render(0, width=8, height=8, aa=1).save(mine)
+    else:
+        mine.write_text("file,error\nmine,\n")
+    before = sorted(tmp_path.rglob("*")), None if name == "link" else mine.read_bytes()
+    with pytest.raises(
+        OutputError, match=f"{mine.name}.*(not made by|not the table of) a sweep.*another folder"
+    ):
+        mrt.sweep(3, tmp_path, resume=False, **options, **SMALL)
+    assert (sorted(tmp_path.rglob("*")), None if name == "link" else mine.read_bytes()) == before
+
+
+def test_a_scene_file_counts_by_its_contents(address: str, tmp_path: Path) -> None:
+    """Two versions in one folder after each other, two at a time, and a change while it is rendered."""
+    scene, out = tmp_path / "mine.xml", tmp_path / "out"
+    assert cli.main(["export", "0", "--xml", str(scene)]) == 0
+    options: dict[str, Any] = {"cluster": address, **SMALL}
+    first = mrt.sweep(scene, out, **options).rows[0]
+    text = scene.read_text()
+    changed = text.replace('value="60"', 'value="50"')
+    assert changed != text
+    scene.write_text(changed)
+    pixels = read_exr(out / "picture.exr").image.tobytes()
+    second = mrt.sweep(scene, out, **options).rows[0]
+    assert second != first and read_exr(out / "picture.exr").header["mrt:sweep"]
+    assert read_exr(out / "picture.exr").image.tobytes() == mrt.render(scene, **SMALL).image.tobytes()
+    assert pixels
+    with pytest.raises(UsageError, match="2 jobs would write the same file scene=mine"):
+        mrt.sweep(None, out, grid={"scene": [str(scene), str(tmp_path / "other" / "mine.xml")]}, **options)
+    sweep = Background(scene, tmp_path / "late", cluster=address, grid={"seed": range(3)}, **SLOW)
+    wait_for(lambda: (tmp_path / "late").exists() and pictures(tmp_path / "late"), "a picture")
+    scene.write_text(text)
+    errors = [row["error"] for row in sweep.end().rows]
+    assert "mine.xml has changed since the sweep began" in errors[-1]
 
 
 def test_a_job_that_fails_ends_no_other(address: str, tmp_path: Path) -> None:
@@ -224,6 +288,9 @@ def test_frames_are_numbered_for_films(address: str, tmp_path: Path) -> None:
     [
         ({"aaa": [1]}, {}, "aaa is not an option of render: did you mean aa?"),
         ({"aa": []}, {}, "aa is an empty list"),
+        ([1], {}, r'grid=\[1\]: give a dict of lists, such as {"aa": \[1, 2\]}'),
+        ({1: [1]}, {}, "grid: the key 1 is no name"),
+        ({"a\nb": [1]}, {}, r"grid: the key 'a\\nb' is no name"),
         ({"aa": 3}, {}, r"aa is 3; give a list of values, such as \[3\]"),
         ({"aamode": "luma"}, {}, "aamode is 'luma'; give a list"),
         ({"aa": [0]}, {}, "aa=0: must be a whole number"),
@@ -251,7 +318,7 @@ def test_frames_are_numbered_for_films(address: str, tmp_path: Path) -> None:
     ],
 )
 def test_a_broken_grid_is_refused_before_anything_is_rendered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: dict, options: dict, message: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: Any, options: dict, message: str
 ) -> None:
     monkeypatch.setattr("mrt_mitsuba.sweeps.cluster.CONNECTING", 0.5)
     with pytest.raises(MrtError, match=message):
@@ -277,94 +344,80 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
 
 # -------------------------------------------- What is survived --------------------------------------------
 
+SLOW = {"width": 400, "height": 300, "aa": 8, "aamode": "none"}  # a second or so each
 
-def slow(count: int) -> dict[str, Any]:
-    """A grid whose jobs take a second or so each."""
-    return {"grid": {"seed": range(count)}, "width": 400, "height": 300, "aa": 8, "aamode": "none"}
-
-
-def begun(client: Any) -> set[str]:
-    """The jobs that workers have begun, by the events of the scheduler."""
-    return {job for _, job in client.get_events("mrt-sweep")}
-
-
-def test_a_worker_killed_in_mid_job_costs_one_retry(mortal, tmp_path: Path) -> None:
-    from distributed import Client
-
-    cluster, out = mortal(), tmp_path / "out"
-    with Client(cluster.address, set_as_default=False) as client:
-        client.wait_for_workers(2, timeout=PATIENCE)
-        numbers = client.run(os.getpid)
-        sweep = Background(3, out, cluster=client, **slow(6))
-        wait_for(lambda: out.exists() and pictures(out), "a picture")
-        before = begun(client)
-        job = wait_for(lambda: begun(client) - before, "another job").pop()
-        busy = next(worker for worker, jobs in client.processing().items() if job in jobs)
-        os.kill(numbers[busy], signal.SIGKILL)
-        table = sweep.end()
-    assert [row["error"] for row in table.rows] == [""] * 6
-    assert sorted(row["attempts"] for row in table.rows) == [1, 1, 1, 1, 1, 2]
-    assert pictures(out) == [f"seed={n}.exr" for n in range(6)] and not left_over(out)
+# What each worker runs first: seed 1 fails, 2 costs the first worker that takes it, and 3 every worker
+SPOILED = """
+import os, pathlib
+from mrt_mitsuba.rendering import api
+def render(*scene, seed=0, alone=api.render, **options):
+    if seed == 1:
+        raise RuntimeError("out of luck")
+    first = pathlib.Path("died")
+    if seed == 3 or seed == 2 and not first.exists():
+        first.touch()
+        os._exit(1)
+    return alone(*scene, seed=seed, **options)
+api.render = render
+"""
 
 
-@pytest.mark.parametrize("what", ["fails", "dies"])
-def test_a_batch_of_small_jobs_suffers_from_none_of_them(mortal, tmp_path: Path, what: str) -> None:
-    from distributed import Client
+def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    table = mrt.sweep(3, out, grid={"seed": range(40)}, cluster=mortal(SPOILED).address, **SMALL)
+    errors = {row["seed"]: row["error"] for row in table.failed}
+    assert errors.keys() == {1, 3} and errors[1] == "RuntimeError: out of luck"
+    assert "every worker that rendered it died" in errors[3]
+    assert [row["attempts"] for row in table.rows if row["seed"] in (1, 2)] == [3, 2]
+    assert len(pictures(out)) == 38 and not left_over(out)
 
-    def spoil() -> None:
-        from mrt_mitsuba.sweeps import worker
 
-        def render(task: Any, own: Any) -> Any:
-            if task.arguments["seed"] == 42 and what == "dies":
-                time.sleep(0.1)  # in which the scheduler learns that it has begun
-                os._exit(1)
-            if task.arguments["seed"] == 42:
-                raise RuntimeError("out of luck")
-            return alone(task, own)
-
-        alone, worker._render = worker._render, render
-
-    with Client(mortal().address, set_as_default=False) as client:
-        client.wait_for_workers(2, timeout=PATIENCE)
-        client.run(spoil)
-        sweep = Background(3, tmp_path / "out", grid={"seed": range(200)}, cluster=client, **SMALL)
-        table = sweep.end()
-        tasks = {key for _, key in client.get_events("mrt-sweep")}
-    attempts = [row["attempts"] for row in table.rows]
-    assert len(tasks) == len(attempts) == 200 and attempts[:42] + attempts[43:] == [1] * 199
-    if what == "fails":
-        assert attempts[42] == 3 and [row["error"] for row in table.failed] == ["RuntimeError: out of luck"]
-    else:  # with what spoils it
-        assert 2 <= attempts[42] <= 3 and not table.failed
+@pytest.mark.parametrize(
+    ("preload", "message"),
+    [
+        ("import mrt_mitsuba; mrt_mitsuba.__version__ = '0.0.1'", "mrt-mitsuba 0.0.1,"),
+        ("import mrt_mitsuba, mitsuba; mitsuba.__version__ = '3.8.0'", "mitsuba 3.8.0,"),
+        (
+            "import sys\nfrom mrt_mitsuba.sweeps import worker\n"
+            "worker.sys = type('other', (), {'version_info': (3, 9)})",
+            "python 3.9",
+        ),
+        ("import sys; sys.modules['mrt_mitsuba.sweeps.worker'] = None", "cannot run this mrt-mitsuba"),
+    ],
+    ids=["another version", "another Mitsuba", "another Python", "none"],
+)
+def test_workers_with_other_software_are_refused(mortal, tmp_path: Path, preload: str, message: str) -> None:
+    with pytest.raises(MrtError, match=f"(?s){message}.*install") as caught:
+        mrt.sweep(3, tmp_path / "out", cluster=mortal(preload).address, **SMALL)
+    assert "\n" not in str(caught.value) and not pictures(tmp_path / "out")
 
 
 def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(tmp_path: Path) -> None:
     import psutil
 
     def workers() -> list[psutil.Process]:
-        return [p for p in psutil.Process().children() if "dask_spec" in " ".join(p.cmdline())]
+        started = psutil.Process().children(recursive=True)
+        return [p for p in started if "spawn_main" in " ".join(p.cmdline())]
 
     others = workers()
-    sweep = Background(3, tmp_path, workers=1, **slow(3))
+    sweep = Background(3, tmp_path, workers=1, grid={"seed": range(3)}, **SLOW)
     wait_for(lambda: pictures(tmp_path), "a picture")
     (worker,) = set(workers()) - set(others)
     worker.kill()
-    table = sweep.end()
-    assert [row["error"] for row in table.rows] == [""] * 3 and workers() == others
+    assert [row["error"] for row in sweep.end().rows] == [""] * 3 and workers() == others
 
 
 def test_a_scheduler_killed_ends_the_sweep_and_a_second_run_finishes_it(mortal, tmp_path: Path) -> None:
     cluster, out = mortal(), tmp_path / "out"
-    sweep = Background(3, out, cluster=cluster.address, **slow(6))
+    sweep = Background(3, out, cluster=cluster.address, grid={"seed": range(6)}, **SLOW)
     wait_for(lambda: out.exists() and pictures(out), "a picture")
     cluster.scheduler.kill()
     outcome = sweep.end()
     assert isinstance(outcome, MrtError) and "the scheduler is gone" in str(outcome)
-    assert "\n" not in str(outcome)
     first = {path.name: path.stat().st_mtime_ns for path in out.glob("*.exr")}
     assert 0 < len(first) < 6 and {row["file"] for row in written(out)} <= first.keys()
     cluster.stop()
-    table = mrt.sweep(3, out, cluster=mortal().address, **slow(6))
+    table = mrt.sweep(3, out, cluster=mortal().address, grid={"seed": range(6)}, **SLOW)
     assert len(table.rows) == 6 and not table.failed and not left_over(out)
     assert {name: (out / name).stat().st_mtime_ns for name in first} == first
 
@@ -398,15 +451,11 @@ def test_interrupted_from_the_keyboard(start, tmp_path: Path) -> None:
         assert read_exr(out / name).image.shape == (300, 400, 3)
 
 
-def test_the_command_and_workers_that_are_renewed(tmp_path: Path, capsys) -> None:
-    text = SWEEP.replace("aa = 8", "aa = 1\nrenew = 2").replace("3, 4, 5", "3")
-    (tmp_path / "sweep.toml").write_text(text)
+def test_the_command(tmp_path: Path, capsys) -> None:
+    (tmp_path / "sweep.toml").write_text(SWEEP.replace("aa = 8", "aa = 1"))
     assert cli.main(["sweep", str(tmp_path / "out"), str(tmp_path / "sweep.toml"), "workers=1"]) == 0
-    assert capsys.readouterr().out.endswith(f"4 of 4 pictures in {tmp_path / 'out'}\n")
-    rows = written(tmp_path / "out")
-    workers = [row["worker"] for row in rows]
-    assert [workers.count(worker) for worker in dict.fromkeys(workers)] == [2, 2]
-    assert {row["attempts"] for row in rows} == {"1"}
+    assert capsys.readouterr().out.endswith(f"6 of 6 pictures in {tmp_path / 'out'}\n")
+    assert {row["attempts"] for row in written(tmp_path / "out")} == {"1"}
 
 
 @pytest.mark.parametrize(
@@ -431,12 +480,12 @@ def test_a_broken_command(tmp_path: Path, capsys, words: list[str], text: str, m
 
 def test_a_gpu_is_pinned_to_each_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether there are some or not: what the driver will go by is in each worker's environment."""
-    from mrt_mitsuba.sweeps.cluster import Engine
+    from mrt_mitsuba.sweeps.cluster import connected
 
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,GPU-7")
-    engine = Engine(None, None, 2, 1000, None, "cuda_ad_rgb")
-    with engine.connected(str(tmp_path), 9) as (client, ready):
-        ready()
+    options: dict[str, Any] = {"workers": None, "retries": 0, "dashboard": None, "variant": "cuda_ad_rgb"}
+    with connected(None, 9, **options) as (client, count):
+        client.wait_for_workers(count, timeout=PATIENCE)
         found = client.run(os.getenv, "CUDA_VISIBLE_DEVICES")
     assert sorted(found.values()) == ["5", "GPU-7"]
 
@@ -455,6 +504,13 @@ def test_threads_are_shared_out(address: str, tmp_path: Path) -> None:
     with Client(address, set_as_default=False) as client:
         mrt.sweep(3, tmp_path, grid={"seed": range(4)}, cluster=client, **SMALL)
         assert set(client.run(threads).values()) <= {max(1, usable_cores() // 2)}
+
+
+def test_results_can_be_pickled() -> None:
+    result = mrt.render(3, layers=["depth"], **SMALL)
+    again = pickle.loads(pickle.dumps(result))
+    assert again.image.tobytes() == result.image.tobytes() and again.header() == result.header()
+    assert again.plan == result.plan and again.layers.keys() == result.layers.keys()
 
 
 # ------------------------------------------------- Tiles -------------------------------------------------
@@ -484,22 +540,36 @@ def test_tiles_make_the_same_picture(address: str, tmp_path: Path, options: dict
     assert all(str(tiled.header[key]) == str(whole.header[key]) for key in whole.header.keys() - own)
 
 
-def test_tiles_of_an_earlier_sweep_are_kept(address: str, tmp_path: Path) -> None:
-    (tmp_path / "picture.exr").mkdir()  # in the way of the picture, when its tiles are there
-    options = {"tiles": (2, 2), "cluster": address, **SMALL}
-    first = mrt.sweep(3, tmp_path, **options)
-    assert "cannot put picture together" in first.failed[0]["error"]
-    assert sorted(path.name for path in (tmp_path / "picture.tiles").iterdir()) == [
-        f"{row},{column}.exr" for row in (0, 1) for column in (0, 1)
-    ]
-    (tmp_path / "picture.exr").rmdir()
-    (tmp_path / "picture.tiles" / "1,0.exr").unlink()
-    second = mrt.sweep(3, tmp_path, **options)
-    assert (
-        not second.failed and second.rows[0]["rays"] is None
-    )  # those of the tiles that were there are unknown
-    assert read_exr(tmp_path / "picture.exr").image.tobytes() == mrt.render(3, **SMALL).image.tobytes()
-    assert not (tmp_path / "picture.tiles").exists()
+# What each worker runs first: it notes the tiles that it renders, and fails below the first row until allowed
+BROKEN = """
+import pathlib
+from mrt_mitsuba.rendering import api
+def render(*scene, region, alone=api.render, **options):
+    if region[1] > 0 and not pathlib.Path("allowed").exists():
+        raise RuntimeError("out of luck")
+    with open("rendered", "a") as file:
+        print(region, file=file)
+    return alone(*scene, region=region, **options)
+if api.render.__module__ == api.__name__:  # it is read more than once
+    api.render = render
+"""
+
+
+def test_tiles_of_an_earlier_sweep_are_kept(mortal, tmp_path: Path) -> None:
+    """Those that are whole: of two that are there, one was cut in the meantime."""
+    address, out = mortal(BROKEN).address, tmp_path / "out"
+    first = mrt.sweep(3, out, tiles=(2, 2), retries=0, cluster=address, **SMALL)
+    assert "out of luck" in first.failed[0]["error"]
+    tile, cut = (out / "picture.tiles" / f"0,{column}.exr" for column in (0, 1))
+    assert tile.exists()
+    cut.write_bytes(cut.read_bytes()[:9000])
+    (tmp_path / "cluster0" / "allowed").touch()
+    second = mrt.sweep(3, out, tiles=(2, 2), cluster=address, **SMALL)
+    assert not second.failed and second.rows[0]["rays"] is None  # unknown of the tile that was there
+    rendered = (tmp_path / "cluster0" / "rendered").read_text().splitlines()
+    assert sorted(map(rendered.count, rendered)) == [1, 1, 1, 2, 2]
+    assert read_exr(out / "picture.exr").image.tobytes() == mrt.render(3, **SMALL).image.tobytes()
+    assert not (out / "picture.tiles").exists()
 
 
 def test_a_tile_that_fails_fails_its_picture(address: str, tmp_path: Path) -> None:
