@@ -8,14 +8,19 @@ LONGEST = 800  # characters of a message
 def printable(text: str) -> str:
     """Return a text for people: what a file put into it can neither steer a terminal nor flood it.
 
-    Characters that do not print are escaped, but for line ends; of a long text, start and end stay.
+    Characters that do not print are escaped, line ends too; of a long text, start and end stay.
     """
     if len(text) > LONGEST:
         left_out = len(text) - LONGEST
         text = f"{text[: LONGEST * 3 // 4]} [... {left_out} characters ...] {text[-LONGEST // 4 :]}"
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def one_line(text: str) -> str:
+    """Return a text of others for people, its lines joined."""
+    return printable(" ".join(text.split()))
 
 
 class MrtError(Exception):

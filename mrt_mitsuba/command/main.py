@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from mrt_mitsuba.command import registry
 from mrt_mitsuba.command.interrupt import Terminated, ending_soon, leave_now
 from mrt_mitsuba.command.options import parse
-from mrt_mitsuba.errors import MrtError, UsageError, printable
+from mrt_mitsuba.errors import MrtError, UsageError, one_line
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
@@ -109,7 +109,7 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"mrt: {' '.join(printable(message).split())}", file=sys.stderr)
+    print(f"mrt: {one_line(message)}", file=sys.stderr)
     return code
 
 
@@ -122,7 +122,7 @@ def _end_by_force() -> None:
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
-    print(f"mrt: warning: {' '.join(printable(str(message)).split())}", file=sys.stderr)
+    print(f"mrt: warning: {one_line(str(message))}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from mrt_mitsuba.command.options import Options
-from mrt_mitsuba.errors import MrtWarning
+from mrt_mitsuba.errors import MrtWarning, printable
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.rendering.settings import NOISE
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, is_obj
@@ -56,7 +56,7 @@ def run(options: Options) -> int:
     if not options.quiet:
         if result.error is not None:
             print(f"Error: {result.error}, {result.rounds[-1].spp:.1f} rays a pixel")
-        print(f"Wrote {' and '.join(options.outputs())}")
+        print(f"Wrote {printable(' and '.join(options.outputs()))}")
         print(f"Render time: {seconds:.6f}s")
     return 0
 
@@ -89,7 +89,7 @@ def banner(options: Options) -> str:
     width, height = ("from the file", "from the file") if own_film else SIZE
     aamode = options.aamode or (NOISE if options.rmse else None)
     lines = {
-        "Scene": options.scene if options.scene is not None else options.scene_number,
+        "Scene": options.scene_number if options.scene is None else printable(options.scene),
         "Width": options.width or width,
         "Height": options.height or height,
         "AA": options.aa or ("as noise needs" if aamode == NOISE else "from the file" if own_film else 4),

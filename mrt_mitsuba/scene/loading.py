@@ -140,7 +140,7 @@ def _explained(name: str) -> Iterator[None]:
     except RuntimeError as error:
         # Mitsuba quotes the traceback, too, where the plugin is written in Python
         text = _CODE_PLACE.sub("", _TRACEBACK.sub("", str(error)))
-        raise SceneError(f"cannot load {name}: {text}") from error
+        raise SceneError(f"cannot load {name}: {' '.join(text.split())}") from error
 
 
 # ---------------------------------------------- Folders ------------------------------------------------

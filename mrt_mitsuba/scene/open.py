@@ -228,4 +228,6 @@ def _integrator(integrator: Any, scene: Any) -> Any:
             f"the integrator is {' '.join(repr(integrator).split())}: "
             "it must be a sampling integrator, such as path or direct"
         )
+    if "StokesIntegrator" in repr(integrator):  # also inside another; Mitsuba would crash
+        raise UsageError("the integrator stokes works by mi.render alone: choose another, such as path")
     return integrator
