@@ -83,7 +83,7 @@ def test_model_is_seen_from_where_the_camera_is_put(mrt_command, tmp_path: Path)
     [("out scene=a.obj", 1, "a.obj:2: v has 2 numbers"), ("out scene=a.obj fov=0", 2, "fov must be degrees")],
 )
 def test_bad_input(mrt_command, tmp_path: Path, arguments: str, code: int, text: str) -> None:
-    """The installed command refuses as ``test_bad_input.py`` shows, where the table of cases is."""
+    """The installed command refuses as ``test_refusals.py`` shows, where the table of cases is."""
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0\n")
     done = mrt_command(*arguments.split(), "quiet=1")
     assert (done.returncode, done.stdout) == (code, "")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import sys
 import time
@@ -119,27 +118,6 @@ def test_scenes(capsys) -> None:
     assert all(len(line) > 10 for line in lines)
 
 
-WRONG = """
-out width=0; out aamode=fancy; out colour=1; out 17; out aa=nan; out focaldist=nan; out aa=2 aa=3
-out camera=0,0,1; out scene=a.obj fov=nan; out.png; --colour; 3; 3 aa=2; doctr; doctor now; scenes all
-exprot --xml a.xml; export; export 3; export 3 --xml; export 17 --xml a.xml; export 3 --obj a.xml
-export 3 --xml a.xml b.xml
-"""
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [*map(str.split, re.split("[;\n]", WRONG.strip())), ["export", "3", "--xml", ""]],
-    ids=" ".join,
-)
-def test_wrong_usage(renderer: Recorder, tmp_path: Path, monkeypatch, capsys, arguments: list[str]) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(arguments) == 2
-    text, errors = capsys.readouterr()
-    assert text == "" and errors.startswith("mrt: ") and errors.count("\n") == 1
-    assert renderer.calls == [] and list(tmp_path.iterdir()) == []
-
-
 def test_unwritable_target_is_found_before_rendering(renderer: Recorder, tmp_path: Path, capsys) -> None:
     (tmp_path / "out.exr").mkdir()
     assert cli.main([str(tmp_path / "out")]) == 1
@@ -177,7 +155,7 @@ def test_unexpected_errors_show_where_on_request(renderer: Recorder, tmp_path: P
         cli.main([str(tmp_path / "out")])
 
 
-@pytest.mark.parametrize(("quiet", "text"), [("0", "mrt: warning: slow here\n"), ("1", "")])
+@pytest.mark.parametrize(("quiet", "text"), [("0", "mrt: warning: slow\\nhere\n"), ("1", "")])
 def test_warnings_are_one_line(
     renderer: Recorder, tmp_path: Path, monkeypatch, capsys, quiet: str, text: str
 ) -> None:

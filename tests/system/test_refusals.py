@@ -1,0 +1,486 @@
+"""What is refused, by the command, from Python, in files and by plugins: an error of one line that names the
+thing and the way out, and no file left behind."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import math
+import os
+import re
+import resource
+import shutil
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.command import main as cli
+from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Cone, Cylinder, Material, Mesh, Scene, Sphere
+
+# ------------------------------------------------ The command -----------------------------------------
+
+PIPE = object()
+Content = str | bytes | Path | object | None  # None: a folder; a Path: a symbolic link to it
+
+SENSOR = "<sensor type='perspective'><film type='hdrfilm'>{}</film></sensor>"
+SMALL = SENSOR.format("<integer name='width' value='4'/><integer name='height' value='3'/>")
+LARGE = SENSOR.format("<integer name='width' value='99999'/><integer name='height' value='99999'/>")
+FILTER = "<rfilter type='gaussian'><float name='stddev' value='1e9'/></rfilter>"
+SAMPLER = """<sensor type='perspective'><sampler type='multijitter'><integer name='sample_count' value='0'/>
+</sampler></sensor>"""
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
+MODEL = "mtllib a.mtl\n" + TRIANGLE
+PICTURE = "newmtl m\nKd 1 1 1\nmap_Kd p.png\n"
+WHITE = base64.b64decode(  # one pixel
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4//8/AAX+Av4N70a4AAAAAElFTkSuQmCC"
+)
+
+
+def xml(inside: str, sensor: str = SMALL) -> dict[str, Content]:
+    return {"a.xml": f"<scene version='3.0.0'>{sensor}{inside}</scene>"}
+
+
+def ball(material: str) -> dict[str, Content]:
+    return xml(f"<shape type='sphere'><bsdf type='mrt_bsdf'>{material}</bsdf></shape>")
+
+
+PAPERED = """<texture name='diffuse_reflectance' type='mrt_texture'><string name='filename' value='no.png'/>
+</texture>"""
+ENDS = "<point name='p0' value='1 0 0'/><point name='p1' value='{} 0 0'/><float name='radius' value='{}'/>"
+
+
+def shape(kind: str, parameters: str) -> dict[str, Content]:
+    return xml(f"<shape type='mrt_{kind}'>{parameters}</shape>")
+
+
+def textured(picture: Content) -> dict[str, Content]:
+    return {"a.obj": MODEL, "a.mtl": PICTURE, "p.png": picture}
+
+
+# Files, arguments, the exit code and what the one line must hold
+Case = tuple[dict[str, Content], str, int, str]
+
+WRONG = """
+out width=0 -> width must be a whole number; out aamode=fancy -> aamode must be none
+out 17 -> SCENE 17: must be; out colour=1 -> unknown option 'colour'; out aa=nan -> aa must be
+out focaldist=nan -> focaldist must be; out aa=2 aa=3 -> aa is given twice
+out camera=0,0,1 -> only with an OBJ file; out fov=0 -> fov must be degrees
+out convention=standard -> only with an OBJ file; out.png -> write out format=png
+--colour -> unknown option; 3 -> FILENAME is missing; 3 aa=2 -> FILENAME is missing
+doctr -> did you mean mrt doctor; exprot --xml a.xml -> mrt export
+doctor now -> unexpected argument 'now' after mrt doctor; scenes all -> unexpected argument
+help me -> unexpected; export -> give a scene; export 3 -> --xml PATH; export 3 --xml -> --xml PATH
+export --xml a.xml -> give a scene; export 17 --xml a.xml -> SCENE 17; export 3 --obj a.xml -> --xml PATH
+export 3 --xml a.xml b.xml -> unexpected argument
+export 0 --xml a.xml --stock --stock -> --stock is given twice; export 3 --xml a.xml aa=2 -> aa is of no use
+export 3 --xml a.xml fov=30 -> only with an OBJ file; export 3 scene=a.xml --xml b.xml -> give one of them
+check -> SCENE|scene=PATH is missing; check 0 1 -> unexpected argument '1'
+check 0 quick=2 -> must be 0 or 1; check 0 scene=1 -> unexpected argument
+error-vs-time 0 -> cases is missing; diff a.exr -> B.exr is missing; diff a.exr b.exr rsme=1 -> meant rmse?
+sweep out -> FILE.toml is missing; sweep out no.toml -> cannot read no.toml
+sweep out no.toml worker=2 -> meant workers?; check 0 out=a out=b -> out is given twice
+error-vs-time 0 cases=no.toml -> cannot read no.toml: there is no such file
+"""
+
+OUTPUTS: list[Case] = [
+    *(({}, words, 2, text) for words, text in re.findall(r"(\S.*?) -> (.*?)(?:; |\n)", WRONG)),
+    ({"out.png": None}, "out", 1, "out.png: it is a folder; choose another name"),
+    ({"file": ""}, "file/out", 1, "is a file, not a folder; choose another place"),
+    ({}, "none/out", 1, "does not exist; create it first"),
+    ({"out.exr": Path("b.exr"), "b.exr": Path("out.exr")}, "out", 1, "links lead in a circle"),
+    ({"out.png": PIPE}, "out", 1, "out.png: it is not a regular file"),
+    ({"out_mesh_0.ply": None}, "export 8 --xml out.xml", 1, "out_mesh_0.ply: it is a folder"),
+    ({}, "export 0 --xml none/a.xml", 1, "does not exist; create it first"),
+    ({"a.xml": None}, "export 0 --xml a.xml", 1, "a.xml: it is a folder"),
+    (textured(WHITE), "p scene=a.obj aa=1", 1, "cannot write p.png: what is written is made from"),
+    (textured(WHITE) | {"a.obj": MODEL.replace("/1", "")}, "p scene=a.obj aa=1", 1, "cannot write p.png"),
+    (xml("") | {"out.exr": Path("a.xml")}, "out scene=a.xml", 1, "out.exr: what is written is made from"),
+    (textured(WHITE) | {"out.exr": Path("a.mtl")}, "out scene=a.obj", 1, "out.exr: what is written is made"),
+    (xml("") | {"l.xml": Path("a.xml")}, "export scene=l.xml --xml ./a.xml", 1, "a.xml: what is written is"),
+    (textured(WHITE), "export scene=a.obj --xml a.mtl", 1, "a.mtl: what is written is made from this file"),
+    ({}, "export scene=no.xml --xml b.xml", 1, "cannot read no.xml: there is no such file"),
+    (xml(""), "export scene=a.xml --xml b.xml --stock", 2, "flavor=stock is of no use with an XML file"),
+    (xml(""), "export scene=a.xml --xml b.xml width=3", 2, "width is of no use with an XML file"),
+]
+
+SIZES: list[Case] = [
+    ({}, "out width=16384 height=16384 aa=1 memory=512M", 2, "needs 4.1 GiB of memory, and 512 MiB"),
+    ({}, "out width=65536 height=65536 aa=1 memory=16G", 2, "choose a smaller width and height"),
+    (xml("", LARGE), "out scene=a.xml memory=512M", 2, "a picture of 99999x99999 pixels needs"),
+]
+
+FILES: list[Case] = [
+    ({}, "out scene=a.obj", 1, "cannot read a.obj: there is no such file in"),
+    ({}, "out scene=a.xml", 1, "cannot read a.xml: there is no such file in"),
+    ({"d.xml": None}, "out scene=d.xml", 1, "cannot read d.xml: it is a folder; name a file in it"),
+    ({"a.xml": PIPE}, "out scene=a.xml", 1, "it is not a regular file; copy its content into one"),
+    ({"a.obj": Path("a.obj")}, "out scene=a.obj", 1, "its symbolic links lead in a circle"),
+    ({"a\nb.obj": None}, "out scene=a\nb.obj", 1, "cannot read a\\nb.obj: it is a folder; name a file"),
+    ({"a.ply": ""}, "out scene=a.ply", 2, "a scene file ends in .xml or .obj"),
+]
+
+SCENES: list[Case] = [
+    ({"a.xml": ""}, "out scene=a.xml", 1, "cannot load a.xml"),
+    ({"a.xml": b"\xff\xfe\0"}, "out scene=a.xml", 1, "cannot load a.xml"),
+    ({"a.xml": f"<scene>{SMALL}</scene>"}, "out scene=a.xml", 1, "missing version attribute"),
+    (xml("<shape type='sphere'/>", ""), "out scene=a.xml", 1, "a.xml has no sensor: add one"),
+    (xml("<shape type='potato'/>"), "out scene=a.xml", 1, 'Plugin "potato" not found'),
+    (xml("<include filename='a.xml'/>"), "out scene=a.xml", 1, "recursion depth"),
+    (xml("<integrator type='ptracer'/>"), "out scene=a.xml", 2, "it must be a sampling integrator"),
+    (xml("", SENSOR.format("<integer name='height' value='0'/>")), "out scene=a.xml", 1, "768x0: give it"),
+    (xml("", "<sensor type='irradiancemeter'/>"), "out scene=a.xml", 1, "irradiancemeter outside of a shape"),
+    (xml("", SENSOR.format(FILTER)), "out scene=a.xml", 1, "a.xml has a filter of radius"),
+    (xml("", SAMPLER), "out scene=a.xml", 1, "multijitter: sample_count is 0; give 1 or more"),
+    (xml(""), "out scene=a.xml fresnel=schlick", 2, "it is a parameter of mrt_bsdf"),
+]
+
+PLUGINS: list[Case] = [
+    (ball("<float name='alpha' value='nan'/>"), "out scene=a.xml", 1, '"alpha" is nan, but must be a finite'),
+    (ball("<float name='aplha' value='1'/>"), "out scene=a.xml", 1, '- float "aplha"'),
+    (shape("cone", ""), "out scene=a.xml", 1, '"mrt_cone": mrt_cone: "apex" is missing; give three numbers'),
+    (shape("cylinder", ENDS.format(1, 1)), "out scene=a.xml", 1, "but must be two points"),
+    (ball(PAPERED), "out scene=a.xml", 1, "no.png', which cannot be read"),
+]
+
+MODELS: list[Case] = [
+    (textured("no picture"), "out scene=a.obj", 1, "p.png', which cannot be read"),
+    (textured(b"\x89PNG\r\n\x1a\n\0\0"), "out scene=a.obj", 1, "p.png', which cannot be read"),
+    ({"a.obj": TRIANGLE}, "out scene=a.obj camera=0,9,0 target=0,0,0", 2, "choose another up"),
+]
+
+CASES = OUTPUTS + SIZES + FILES + SCENES + PLUGINS + MODELS
+
+
+def put(path: Path, content: Content) -> None:
+    if content is None:
+        path.mkdir()
+    elif content is PIPE:
+        os.mkfifo(path)
+    elif isinstance(content, Path):
+        path.symlink_to(content)
+    else:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def refusal(capture: pytest.CaptureFixture[str], words: list[str]) -> tuple[int, str]:
+    """Exit code and the one line of a run that must fail."""
+    render = words[0] not in ("export", "help", "doctor", "scenes", "check", "diff", "sweep", "error-vs-time")
+    code = cli.main([*words, "quiet=1"] if render and len(words) > 1 else words)
+    text, errors = capture.readouterr()
+    text = text if render and len(words) == 1 else text.strip()
+    assert errors.startswith("mrt: ") and errors.count("\n") == 1, errors
+    assert "Traceback" not in errors and "MRT_TRACEBACK" not in errors, errors
+    return code, errors
+
+
+@pytest.mark.parametrize(("files", "words", "code", "text"), CASES, ids=range(len(CASES)))
+def test_command_refuses(
+    tmp_path: Path, monkeypatch, capfd, files: dict[str, Content], words: str, code: int, text: str
+) -> None:
+    for name, content in files.items():
+        put(tmp_path / name, content)
+    monkeypatch.chdir(tmp_path)
+    found, message = refusal(capfd, words.split(" "))
+    assert text in message
+    assert found == code
+    assert {path.name for path in tmp_path.iterdir()} == files.keys(), "files were left behind"
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "text"),
+    [
+        ("scalar_rbg", 2, "Did you mean scalar_rgb?"),
+        ("cuda_ad_rgb", 1, "Use llvm_ad_rgb or scalar_rgb"),
+        ("fast", 2, "This Mitsuba has scalar_rgb"),
+    ],
+)
+def test_variant_that_cannot_be_had(tmp_path, monkeypatch, capfd, name: str, code: int, text: str) -> None:
+    """Names that this Mitsuba does not have, and one that this machine cannot run."""
+    from mrt_mitsuba import runtime
+
+    if name == "cuda_ad_rgb" and runtime.obstacle(name) is None:
+        pytest.skip("there is a GPU here")
+    monkeypatch.chdir(tmp_path)
+    found, message = refusal(capfd, ["out", f"variant={name}"])
+    assert found == code and text in message
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read anything")
+@pytest.mark.parametrize("name", ["a.obj", "a.xml"])
+def test_file_that_may_not_be_read(tmp_path: Path, monkeypatch, capfd, name: str) -> None:
+    (tmp_path / name).touch(mode=0o200)
+    monkeypatch.chdir(tmp_path)
+    code, message = refusal(capfd, ["out", f"scene={name}"])
+    assert code == 1 and f"try chmod +r {name}" in message
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "out 0 format=png width=64 height=48 aa=1",
+        " ".join(["out", "0", "format=exr", "width=64", "height=48"]),
+        "export 0 --xml out.xml",
+    ],
+)
+def test_disk_that_is_full(tmp_path: Path, monkeypatch, capsys, arguments: str) -> None:
+    """A limit on the size of files is to a program what a full disk is: the old file stays, nothing else."""
+    old = [tmp_path / f"out.{ending}" for ending in ("png", "exr", "xml")]
+    for path in old:
+        path.write_text("old")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "before").mkdir()
+    cli.main(
+        ["before/" + arguments.split()[0], "0", "quiet=1", "width=64", "height=48"]
+    )  # now the kernels are in the cache
+    shutil.rmtree("before")
+    capsys.readouterr()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))  # bytes; any picture has more
+    try:
+        code, message = refusal(capsys, arguments.split())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert code == 1 and "cannot write out." in message and "File too large" in message
+    assert sorted(tmp_path.iterdir()) == sorted(old)
+    assert [path.read_text() for path in old] == ["old"] * 3
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGBA", "I;16"])
+def test_pictures_of_every_kind_are_read(tmp_path: Path, monkeypatch, capfd, mode: str) -> None:
+    """Black and white, grey, palette, alpha, 16 bits."""
+    levels = np.arange(12).reshape(3, 4) * 20
+    image = Image.fromarray(levels.astype(np.uint16 if mode == "I;16" else np.uint8))
+    image = image if mode == "I;16" else image.convert(mode)
+    for name, content in textured("").items():
+        put(tmp_path / name, content)
+    image.save(tmp_path / "p.png")
+    monkeypatch.chdir(tmp_path)
+    arguments = ["out", "scene=a.obj", "width=8", "height=6", "aa=1", "format=png", "quiet=1"]
+    assert (cli.main(arguments), *capfd.readouterr()) == (0, "", "")
+    assert (tmp_path / "out.png").exists()
+
+
+# ------------------------------------------------- Models --------------------------------------------
+
+SQUARE, UVS, NORMAL = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n", "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n", "vn 0 0 1\n"
+FACE = "f 1 2 3\n"
+# The text, the line that is named, and what is said of it
+BROKEN_OBJ: list[tuple[str, int | None, str]] = [
+    ("", None, "has no faces; export the model with its geometry"),
+    ("f 1 2 3\n", 1, "v index 1, but the file has 0"),
+    (SQUARE + "f 1 2 9\n", 5, "v index 9, but the file has 4"),
+    (SQUARE + "f 1 2 3\n" * 5000 + "f 1 2 5\n", 5005, "v index 5"),
+    (SQUARE + "f 0 1 2\n", 5, "v index 0: indices count from 1"),
+    (SQUARE + UVS + "f 1/1 2/2 3/5\n", 9, "vt index 5, but the file has 4"),
+    (SQUARE + "f 1/-1 2/-1 3/-1\n", 5, "vt index -1: only 0 came before"),
+    (SQUARE + NORMAL + "f 1//1 2//1 3//2\n", 6, "vn index 2, but the file has 1"),
+    (SQUARE + "f 1 2\n", 5, "2 corners"),
+    (SQUARE + UVS + "f 1/1 2 3/3\n", 9, "different forms"),
+    (SQUARE + UVS + "f /1 2/2 3/3\n", 9, "'/1'"),
+    (SQUARE + "f 1.5 2 3\n", 5, "'1.5'"),
+    (SQUARE + "f a b c\n", 5, "'a'"),
+    (SQUARE + "f 1 2 99999999999999999999\n", 5, "9999"),
+    ("v nan 0 0\n" + SQUARE + "f 1 2 3\n", 1, "'nan'"),
+    ("v 0 0 0\nv 0 1e39 0\n" + SQUARE + "f 1 2 3\n", 2, "too large"),
+    (SQUARE + "v 0 0 0\nv 0 1e999 0\n" + FACE, 6, "too large"),
+    ("v 0 0\n" + SQUARE + "f 1 2 3\n", 1, "v has 2 numbers"),
+    ("v 0 0 0 0 0 0 0 0\n" + SQUARE + "f 1 2 3\n", 1, "v has 8 numbers"),
+    ("v 0 zero 0\n" + SQUARE + "f 1 2 3\n", 1, "'zero'"),
+    ("v 0,5 0 0\n" + SQUARE + "f 1 2 3\n", 1, "'0,5'"),
+    (SQUARE + "vt 0 nan\n" + FACE, 5, "'nan'"),
+    (SQUARE + "vt\n" + FACE, 5, "vt has 0 numbers"),
+    (SQUARE + "vn 0 1\n" + FACE, 5, "vn has 2 numbers"),
+    (SQUARE + "vertex 1 2 3\n" + FACE, 5, "unknown statement 'vertex'"),
+    ("v 0 0 0\n\0\1\2", None, "zero byte"),
+    (SQUARE + "usemtl\n" + FACE, 5, "usemtl has no name"),
+    ("mtllib\n" + SQUARE + "f 1 2 3\n", 1, "mtllib has no name"),
+]
+BROKEN_MTL: list[tuple[str, int | None, str]] = [
+    ("Kd 1 1 1\n", 1, "before any newmtl"),
+    ("newmtl\n", 1, "newmtl has no name"),
+    ("newmtl a\nKs 0 -1 0\n", 2, "must not be negative"),
+    ("newmtl a\nKd 1 1\n", 2, "2 numbers"),
+    ("newmtl a\nNi\n", 2, "0 numbers"),
+    ("newmtl a\nNi glass\n", 2, "'glass'"),
+    ("newmtl a\nKd spectral file.rfl\n", 2, "not supported"),
+    ("newmtl a\nmap_Kd\n", 2, "names no file"),
+    ("newmtl a\n\0", None, "zero byte"),
+]
+LIBRARY = "mtllib a.mtl\n" + SQUARE + FACE
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line", "words"),
+    [("a.obj", *row) for row in BROKEN_OBJ] + [("a.mtl", *row) for row in BROKEN_MTL],
+    ids=range(len(BROKEN_OBJ) + len(BROKEN_MTL)),
+)
+def test_models_name_file_and_line(
+    tmp_path: Path, name: str, text: str, line: int | None, words: str
+) -> None:
+    (tmp_path / "a.obj").write_text(LIBRARY)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(mrt.SceneError) as caught:
+        mrt.render(tmp_path / "a.obj")
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+    assert (f"{name}:{line}: " if line else f"{name}: ") in str(caught.value)
+
+
+# ---------------------------------------------- From Python -------------------------------------------
+
+TINY: dict[str, Any] = {"width": 8, "height": 6, "aa": 1}
+MATTE = Material(1.5, 0.1, (0, 0, 0), (0.5, 0.5, 0.5))
+EMPTY = Scene(Camera((0, 0, 5), (0, 0, 0)), BLUE_SKY, ())
+NAN, INFINITE = math.nan, math.inf
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"scene": 99}, "there is no scene 99: choose one of 0, 1"),
+        ({"scene": 1.5}, "scene is 1.5: give a number, a Scene, a dict, a Mitsuba scene or a path"),
+        ({"scene": None}, "scene is None: give a number"),
+        ({"width": 0}, "width=0: must be a whole number from 1 to 65536"),
+        ({"width": 8.0}, "width=8.0: must be a whole number"),
+        ({"aa": 0}, "aa=0: must be a whole number from 1 to 64"),
+        ({"layers": None}, "layers=None: must be a comma list"),
+        ({"layers": ["depth", "depth"]}, "each once"),
+        ({"motion": (1, 2)}, "motion=(1, 2): must be three finite numbers"),
+        ({"aamode": "none", "layers": ["edges"]}, "edges"),
+        ({"integrator": 3}, "the integrator is 3: it must be a sampling integrator"),
+        ({"integrator": {"type": "ptracer"}}, "it must be a sampling integrator"),
+        ({"integrator": "prb"}, "the integrator PRBIntegrator computes derivatives"),
+        ({"integrator": "volprim_rf_basic"}, "computes derivatives"),
+    ],
+)
+def test_render_refuses(arguments: dict[str, Any], text: str) -> None:
+    with pytest.raises(mrt.UsageError, match=re.escape(text)) as caught:
+        mrt.render(**{**TINY, **arguments})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("scene", "text"),
+    [
+        ("", "cannot read '': there is no such file"),
+        ("a\nb.xml", "cannot read a\\nb.xml: there is no such file"),
+        ("a\0b.xml", "its name holds a zero byte"),
+        ({"type": "scene"}, "a dict has no sensor: add one"),
+        ({"type": "potato"}, 'Plugin "potato" not found'),
+        ({"type": "sphere"}, "a dict is a Shape, not a scene: put it into one"),
+        ({"type": 3}, "type is 3; give the name of a plugin"),
+        ({"type": "scene", "ball": {"type": "sphere", "center": None}}, "ball.center is None; give it a"),
+        ({"type": "mrt_bsdf", "alpha": "big"}, "mrt_bsdf: \"alpha\" is 'big', but must be a number"),
+        (dataclasses.replace(EMPTY, sky=(0, NAN, 0)), "sky is (0, nan, 0), but must be three finite"),
+        (dataclasses.replace(EMPTY, texturing="nice"), "texturing is 'nice', but must be report or standard"),
+        (dataclasses.replace(EMPTY, camera=Camera((1, 1, 1), (1, 1, 1))), "are the same point"),
+        (dataclasses.replace(EMPTY, camera=Camera((0, NAN, 0), (0, 0, 0))), "position is (0, nan, 0)"),
+        (dataclasses.replace(EMPTY, camera=Camera((0, 0, 5), (0, 0, 0), hfov=180)), "less than 180 degrees"),
+        (dataclasses.replace(EMPTY, spheres=(Sphere((0, 0, 0), 0, MATTE),)), "spheres[0] is Sphere("),
+        (dataclasses.replace(EMPTY, cones=(Cone((0, 0, INFINITE), (0, 0, 0), 1, MATTE),)), "cones[0] is"),
+        (dataclasses.replace(EMPTY, cylinders=(Cylinder((0, 0, 0), (0, 0, 0), 1, MATTE),)), "two points"),
+        (
+            dataclasses.replace(EMPTY, meshes=(Mesh(np.zeros((3, 3)), np.array([[0, 1, 7]]), MATTE),)),
+            '"faces" holds 7, but there are 3 positions',
+        ),
+    ],
+    ids=str,
+)
+def test_scenes_that_cannot_be_drawn(scene: Any, text: str) -> None:
+    size = TINY if isinstance(scene, Scene) else {"aa": 1}
+    with pytest.raises(mrt.SceneError, match=re.escape(text)) as caught:
+        mrt.render(scene, **size)
+    assert "Traceback" not in str(caught.value) and ".cpp:" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"width": 0}, "width=0"),
+        ({"fresnel": "exact"}, "fresnel='exact': must be schlick or dielectric"),
+        ({"flavor": "vanilla"}, "flavor='vanilla': must be mrt or stock"),
+    ],
+)
+def test_scene_dict_refuses(arguments: dict[str, Any], text: str) -> None:
+    with pytest.raises(mrt.UsageError, match=re.escape(text)):
+        mrt.scene_dict(0, **arguments)
+
+
+def test_results_are_not_saved_by_another_tone_map(tmp_path: Path) -> None:
+    with pytest.raises(mrt.UsageError, match="tonemap='neon': must be report or srgb"):
+        mrt.render(0, **TINY).save(tmp_path / "a.png", tonemap="neon")
+    assert list(tmp_path.iterdir()) == []
+
+
+CORNERS = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
+
+
+def _mesh(**arrays: np.ndarray) -> dict[str, Any]:
+    arrays = {"positions": CORNERS, "faces": np.array([[[0, 1, 2]]], np.uint32), **arrays}
+    return {"type": "mrt_mesh", **{name: mi.Bitmap(array) for name, array in arrays.items()}}
+
+
+UP = {"type": "mrt_plane", "normal": [0, 1, 0]}
+PLUGINS: list[tuple[dict[str, Any], str]] = [
+    ({"type": "mrt_bsdf", "alpha": NAN}, '"alpha" is nan, but must be a finite number'),
+    ({"type": "mrt_bsdf", "alpha": 1e39}, '"alpha" is 1e+39, but must be a finite number'),
+    ({"type": "mrt_bsdf", "alpha": "rough"}, "\"alpha\" is 'rough', but must be a number"),
+    ({"type": "mrt_bsdf", "alpha": True}, '"alpha" is True, but must be a number'),
+    ({"type": "mrt_bsdf", "int_ior": 0.0}, '"int_ior" is 0.0, but must be a finite number > 0'),
+    ({"type": "mrt_bsdf", "int_ior": 1e-39}, '"int_ior" is 1e-39, but must be a finite number > 0'),
+    ({"type": "mrt_bsdf", "diffuse_reflectance": NAN}, '"diffuse_reflectance" is nan, but must be finite'),
+    ({"type": "mrt_bsdf", "diffuse_reflectance": "red"}, "is 'red', but must be a number, a colour"),
+    ({"type": "mrt_bsdf", "specular_reflectance": {"type": "rgb", "value": [1, -1, 1]}}, "not negative"),
+    ({"type": "mrt_bsdf", "fresnel": {"type": "rgb", "value": 1}}, "one of schlick, dielectric, unity"),
+    ({"type": "mrt_bsdf", "fresnel": "exact"}, "\"fresnel\" is 'exact', but must be one of schlick,"),
+    ({"type": "mrt_bsdf", "f0": 0.1, "fresnel": "unity"}, '"f0" has no meaning with fresnel="unity"'),
+    ({"type": "mrt_bsdf", "sample_visible": 1}, '"sample_visible" is 1, but must be true or false'),
+    ({"type": "mrt_bsdf", "aplha": 0.1}, '"aplha"'),
+    ({"type": "mrt_light", "intensity": INFINITE}, '"intensity" is inf, but must be finite'),
+    ({"type": "mrt_light", "position": [0, 1e39, 0]}, "three finite numbers"),
+    ({"type": "mrt_light", "position": [0, NAN, 0]}, '"position" is'),
+    ({"type": "mrt_light", "position": [0, INFINITE, 0]}, '"position" is'),
+    ({"type": "mrt_light", "position": 3.0}, '"position" is 3.0, but must be three finite numbers'),
+    ({"type": "mrt_light", "to_world": 1.0}, '"to_world"'),
+    ({"type": "mrt_light", "falloff": True}, '"falloff"'),
+    ({"type": "mrt_plane"}, '"normal" is missing; give three numbers'),
+    (UP | {"normal": [0, 0, 0]}, '"normal" is [0, 0, 0], but must be a vector of non-zero length'),
+    (UP | {"normal": [0, NAN, 0]}, '"normal" is'),
+    (UP | {"distance": INFINITE}, '"distance" is inf, but must be a finite number'),
+    (UP | {"extent": 0.0}, '"extent" is 0.0, but must be a finite number > 0'),
+    (UP | {"to_world": 2.0}, 'mrt_plane: "to_world" is not accepted'),
+    ({"type": "mrt_whitted", "sky": -1.0}, '"sky" is -1.0, but must be finite and not negative'),
+    ({"type": "mrt_whitted", "max_depth": 1.5}, '"max_depth" is 1.5, but must be an integer from 1 to'),
+    ({"type": "mrt_whitted", "max_depth": 2**32}, "but must be an integer from 1 to 4294967295"),
+    ({"type": "mrt_texture"}, "give one of"),
+    ({"type": "mrt_texture", "filename": "nothing.png"}, "nothing.png"),
+    ({"type": "mrt_texture", "bitmap": 3}, '"bitmap" is 3, but must be a mi.Bitmap'),
+]
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
+@pytest.mark.parametrize(("plugin", "text"), PLUGINS, ids=range(len(PLUGINS)))
+def test_plugins_name_the_parameter(variant: str, plugin: dict[str, Any], text: str) -> None:
+    with pytest.raises(RuntimeError, match=re.escape(text)) as caught:
+        mi.load_dict(plugin)
+    assert plugin["type"] in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "text"),
+    [
+        ({"positions": CORNERS * np.float32(np.nan)}, '"positions" holds a number that is not finite'),
+        ({"positions": CORNERS[:, :, :2]}, "must have [1, N, 3]"),
+        ({"texcoords": CORNERS[:, :2]}, '"texcoords" has 2 entries for 3 positions'),
+        ({"faces": np.array([[[0, 1, -2]]], np.float32)}, '"faces" holds -2'),
+        ({"faces": np.array([[[0, 1, 0.5]]], np.float32)}, '"faces" holds a number that is not whole'),
+    ],
+)
+def test_meshes_name_the_array(variant: str, arrays: dict[str, np.ndarray], text: str) -> None:
+    with pytest.raises(RuntimeError, match=re.escape(text)):
+        mi.load_dict(_mesh(**arrays))
