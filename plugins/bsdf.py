@@ -11,8 +11,8 @@ import numpy as np
 
 from .emission import largest
 from .fresnel import f0_from_ior
-from .kernel_plan import GRADIENTS, VARYING, MaterialRows, Mirror
-from .lobes import LOBES, Lobes, Pair
+from .kernel_plan import GRADIENTS, VARYING, Mirror
+from .lobes import LOBES, TABLED, Lobes, Pair
 from .parameters import ParameterError, choice, flag, number, spectrum
 from .protocols import MergeableBSDF
 from .variants import first, is_jit, updatable, varies, varies_by_face
@@ -128,8 +128,9 @@ class MrtBSDF(mi.BSDF):
         given = {name: self._read(name, si, active) for name in self.parameters}
         return Lobes(self.fresnel, given, si.wi, visible=self.sample_visible)
 
-    def rows(self, points: mi.SurfaceInteraction3f | None = None) -> MaterialRows | str:
-        """Return the parameters as plain numbers, or why they are none.
+    def rows(self, points: mi.SurfaceInteraction3f | None = None) -> np.ndarray | str:
+        """Return the parameters as plain numbers [n, 1 + lobes, 4], or why they are none: numbers, and a
+        reflectance for each lobe.
 
         ``points``: one surface point on each object of a shape, for textures that vary from face to face.
         """
@@ -140,9 +141,12 @@ class MrtBSDF(mi.BSDF):
         given = self.lobes(dr.zeros(mi.SurfaceInteraction3f) if points is None else points, True).given
         if dr.grad_enabled(given):
             return GRADIENTS
-        values = [given[name] for name in NUMBERS], *(given[lobe.reflectance] for lobe in LOBES)
-        rows = (np.stack([np.broadcast_to(x, count) for x in value], axis=1) for value in values)
-        return MaterialRows(*rows)
+        rows = np.zeros((count, 1 + len(LOBES), 4))
+        parts = [given[name] for name in TABLED], *(given[lobe.reflectance] for lobe in LOBES)
+        for k, part in enumerate(parts):
+            for channel, value in enumerate(part):
+                rows[:, k, channel] = value
+        return rows
 
     # -------------------------------------- Value and density ------------------------------------------
 

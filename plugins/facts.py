@@ -11,7 +11,7 @@ import numpy as np
 
 from .emission import MOST_EMITTERS, arriving, brightness, place
 from .kernel_plan import Mirror, SceneFacts
-from .merged_bsdf import material_rows
+from .materials import lobes_in, material_rows
 from .parameters import ParameterError
 from .point_lights import numbers_of
 from .protocols import MirrorBSDF, PlaneShape, QuadricShape
@@ -112,8 +112,7 @@ def _read_materials(snapshot: Snapshot) -> tuple[list[Any], dict[str, Any]]:
     return rows, {
         "value": max(values, default=0.0),
         # Those outside the table may have any lobe
-        "diffuse": bool(unmergeable) or any(row.diffuse.any() for row in rows),
-        "specular": bool(unmergeable) or any(row.specular.any() for row in rows),
+        "lobes": tuple((name, bool(unmergeable) or there) for name, there in lobes_in(rows)),
         "mirrors": tuple(
             b.mirror_bound() if isinstance(b, MirrorBSDF) else Mirror(1.0, 1.0) for b in reflecting
         ),

@@ -38,15 +38,6 @@ class Mirror:
 
 
 @dataclass(frozen=True)
-class MaterialRows:
-    """Parameters of an ``mrt_bsdf`` as plain numbers: one row, or one for each object of a group."""
-
-    numbers: np.ndarray  # [n, 3]: alpha, int_ior, ext_ior
-    diffuse: np.ndarray  # [n, channels]
-    specular: np.ndarray
-
-
-@dataclass(frozen=True)
 class SceneFacts:
     """The content of a scene, as far as a kernel depends on it."""
 
@@ -67,8 +58,7 @@ class SceneFacts:
     arriving: float  #: the most that arrives from all lights; inf where there is no bound
     emission: float  #: the largest radiance of a surface; inf where that is not known
     value: float  #: the largest value of a BSDF times the cosine; inf where that is not known
-    diffuse: bool  #: has a material a diffuse lobe
-    specular: bool  #: has a material a specular lobe
+    lobes: tuple[tuple[str, bool], ...]  #: all that mrt_bsdf has, and whether a material has them
     mirrors: tuple[Mirror, ...]  #: of the materials that reflect like a mirror
     oriented: bool  #: does a material depend on tangents: anisotropy, bump and normal maps
     textured: bool  #: does a material vary over its surface
@@ -202,7 +192,7 @@ class Case:
     @property
     def lobes(self) -> tuple[str, ...]:
         """The lobes that materials have."""
-        return tuple(name for name in ("diffuse", "specular") if getattr(self.facts, name))
+        return tuple(name for name, there in self.facts.lobes if there)
 
     @property
     def objects(self) -> int:
@@ -270,8 +260,7 @@ RULES = (
         lambda facts, plan: f"lobes: {', '.join(plan.lobes)}",
         lambda case: {
             "every material is black": not case.lobes,
-            "no material has the specular one": not case.facts.specular,
-            "no material has the diffuse one": not case.facts.diffuse,
+            **{f"no material has the {name} one": not there for name, there in reversed(case.facts.lobes)},
         },
         lambda case, free: case.lobes,
     ),

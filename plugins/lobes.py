@@ -60,7 +60,7 @@ class Pair:
 class Diffuse:
     """Lambert's lobe."""
 
-    reflectance, default = "diffuse_reflectance", 0.5
+    name, reflectance, default = "diffuse", "diffuse_reflectance", 0.5
     flag = "DiffuseReflection"
     numbers: tuple[str, ...] = ()
 
@@ -84,7 +84,7 @@ class Diffuse:
 class Specular:
     """Beckmann's microfacets, each a mirror of Fresnel's reflectance."""
 
-    reflectance, default = "specular_reflectance", 1.0
+    name, reflectance, default = "specular", "specular_reflectance", 1.0
     flag = "GlossyReflection"
     numbers = ("alpha", "int_ior", "ext_ior", "f0")
 
@@ -125,11 +125,14 @@ class Specular:
         return max(1, f0) * 0.25 * peak / (math.pi * size**2) * shadowed
 
 
-# In the order of the components of the BSDF. A lobe has the name of the parameter that scales it, what flags
-# say of it, the other parameters that it depends on, its value f cos θo, the density of its samples, samples
-# (with tan² of the half vector), the reflectance by which it is chosen, and a bound of the value without the
-# reflectance
+# In the order of the components of the BSDF. A lobe has a name, the name and default of the parameter that
+# scales it, the flag of its component, and the other parameters that it depends on; its value f cos θo, the
+# density of samples, samples (with tan² of the half vector), the reflectance by which it is chosen, and a
+# bound of the value for a reflectance of 1
 LOBES = (Diffuse(), Specular())
+
+# Numbers, of which a table of materials has up to four
+TABLED = ("alpha", "int_ior", "ext_ior")
 
 
 class Lobes:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from .intersect import Frame
-    from .kernel_plan import KernelPlan, MaterialRows, Mirror, SceneFacts
+    from .kernel_plan import KernelPlan, Mirror, SceneFacts
     from .quadric_kinds import QuadricTable
 
 
@@ -98,8 +98,8 @@ class MergeableBSDF(MirrorBSDF):
     fresnel: str  # one of the forms of mrt_bsdf
 
     @abstractmethod
-    def rows(self, points: Any = None) -> MaterialRows | str:
-        """Return the parameters as plain numbers, or why they are none.
+    def rows(self, points: Any = None) -> np.ndarray | str:
+        """Return the parameters as plain numbers [n, 1 + lobes, 4], or why they are none.
 
         ``points``: one surface point on each object of a shape, for textures that vary from face to face.
         """

@@ -14,7 +14,8 @@ import numpy as np
 from .facts import Reading, has_mirror
 from .hit_errors import CURVED, HitErrors
 from .kernel_plan import KernelPlan
-from .merged_bsdf import MergedBSDF
+from .lobes import LOBES, Pair
+from .materials import MaterialTable
 from .planes import Planes
 from .point_buffer import PointBuffer, point_buffer
 from .point_lights import Lights
@@ -77,7 +78,7 @@ class SceneData:
         self.merged = kept(
             "merged",
             (now.shape_part, now.material_part, plan.merged),
-            lambda: MergedBSDF(now.shapes, reading.materials) if plan.merged else None,
+            lambda: MaterialTable(now.shapes, reading.materials) if plan.merged else None,
         )
         self.path_limit: Any = plan.cut_off.paths
         if is_jit() and self.path_limit not in (0, math.inf, self.facts.lights + 1):
@@ -187,10 +188,9 @@ class SceneData:
     def context(self) -> mi.BSDFContext:
         """Return what of the materials is evaluated."""
         context = mi.BSDFContext()
-        if self.plan.lobes == ("diffuse",):
-            context.type_mask = +mi.BSDFFlags.Diffuse
-        elif self.plan.lobes == ("specular",):
-            context.type_mask = +mi.BSDFFlags.Glossy
+        if 0 < len(self.plan.lobes) < len(LOBES):
+            flags = [getattr(mi.BSDFFlags, lobe.flag) for lobe in LOBES if lobe.name in self.plan.lobes]
+            context.type_mask = sum(map(int, flags))
         return context
 
     def eval_bsdf(
@@ -257,6 +257,13 @@ def _eval_bsdf(
     values = [mi.UnpolarizedSpectrum(0) for _ in wos]
     reflectance, int_ior = mi.UnpolarizedSpectrum(0), mi.Float(1)
     if bsdf is None:
+        return values, reflectance, int_ior
+    if isinstance(bsdf, MaterialTable):
+        lobes = bsdf.lobes(si)
+        pairs = (Pair.above(si.wi, wo, seen) for wo, seen in zip(wos, facing, strict=True))
+        values = [lobes.value(context, pair) for pair in pairs]
+        if mirror:
+            reflectance, int_ior = lobes.mirror_reflectance, lobes.given["int_ior"]
         return values, reflectance, int_ior
     values = [
         mi.unpolarized_spectrum(bsdf.eval(context, si, wo, seen))
