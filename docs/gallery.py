@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shlex
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,64 +27,60 @@ class Entry:
         return "sh" if self.code.startswith("mrt ") else "python"
 
 
-@dataclass(frozen=True)
-class Section:
-    title: str
-    text: str
-    entries: tuple[Entry, ...]
+Section = tuple[str, str, tuple[Entry, ...]]  # title, text, entries
 
 
 def sections() -> list[Section]:
     """Return all that the gallery shows."""
     return [
-        Section(
+        (
             "The report's scenes",
             "As the original has them, numbers included. The PNG holds the values of light, without "
             "the curve that screens expect, as in the original.",
             tuple(_scene(n) for n in NUMBERS if n not in (5, 6, 7, 8)),
         ),
-        Section(
+        (
             "Further scenes",
             "The original's scenes 5 to 8 use models that are not free; these are the project's own, in "
             "their place.",
             tuple(_scene(n) for n in (5, 6, 7, 8)),
         ),
-        Section(
+        (
             "Contours",
             "What a detector finds gets more samples, the rest keeps one a pixel. Here are the three "
             "detectors in scene 3, and two of them side by side in scene 7, as the report compares them.",
             (CONTOURS, SIDE_BY_SIDE),
         ),
-        Section(
+        (
             "Anti-aliasing, enlarged",
             "Five times as large: a sphere and its shadows in scene 3.",
             (ANTIALIASING,),
         ),
-        Section(
+        (
             "Depth of field",
             "The height map is the amount of blur, from 0 (black) to 8. With the report's filter, what is "
             "blurred in front ends at a hard rim where it meets something sharp; corrected, it spreads over "
             "it, as behind a lens.",
             (HEIGHT_MAP, *BLUR, BLUR_ENLARGED),
         ),
-        Section(
+        (
             "Motion blur",
             "The camera moves while the shutter is open. Eight averaged renders show as eight copies; the "
             "same number of moments spread over the rays of neighbouring pixels does not.",
             MOTION,
         ),
-        Section(
+        (
             "Textures",
             "A detail of scene 8: the nearest texel as stored, as in the report, and Mitsuba's way, between "
             "texels and decoded from sRGB.",
             (TEXTURES,),
         ),
-        Section(
+        (
             "Layers",
             "What an EXR can hold next to the picture. Direct light and reflection add up to the picture.",
             (LAYERS,),
         ),
-        Section(
+        (
             "Any Mitsuba scene",
             "Adaptive sampling over Mitsuba's Cornell box with its path tracer.",
             (CORNELL_BOX,),
@@ -271,38 +265,32 @@ result.save("cornell_box.png", tonemap="srgb")
 def build(folder: Path) -> None:
     """Make all pictures in a folder, and a page to include."""
     page = []
-    for section in sections():
-        page += [f"## {section.title}", section.text, ":::::{container} pictures"]
-        for entry in section.entries:
+    for title, text, entries in sections():
+        page += [f"## {title}", text, ":::::{container} pictures"]
+        for entry in entries:
             make(entry, folder)
             page += [_figure(name, caption, entry) for name, caption in entry.pictures.items()]
         page.append(":::::")
-        page += [f"```python\n{e.code.strip()}\n```" for e in section.entries if e.language == "python"]
+        page += [f"```python\n{e.code.strip()}\n```" for e in entries if e.language == "python"]
     (folder / "gallery.inc.md").write_text("\n\n".join(page) + "\n")
 
 
 def make(entry: Entry, folder: Path) -> None:
     """Run the code of an entry in a folder."""
-    with _in(folder):
+    before = os.getcwd()
+    os.chdir(folder)
+    try:
         if entry.language == "python":
             exec(compile(entry.code, next(iter(entry.pictures)), "exec"), {})
         else:
             renderer.run(replace(command(entry), format="png", quiet=True))
+    finally:
+        os.chdir(before)
 
 
 def command(entry: Entry) -> options.Options:
     """The options of an entry's command."""
     return options.parse(shlex.split(entry.code)[1:])
-
-
-@contextlib.contextmanager
-def _in(folder: Path) -> Iterator[None]:
-    before = os.getcwd()
-    os.chdir(folder)
-    try:
-        yield
-    finally:
-        os.chdir(before)
 
 
 def _figure(name: str, caption: str, entry: Entry) -> str:

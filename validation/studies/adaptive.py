@@ -49,10 +49,8 @@ def run(study: Study, *, quick: bool) -> None:
         scene, seeds = load(name, *extent.size), range(10_000, 10_000 + extent.truth // once)
         pictures = [np.array(mi.render(scene, spp=once, seed=seed), np.float64) for seed in seeds]
         truths[name] = scene, np.mean(pictures, axis=0)
-    _uniform(study, extent, truths)
-    _calibration(study, extent, truths)
-    _bias(study, extent, truths)
-    _equal_error(study, extent)
+    for part in (uniform_samples, calibration, bias, equal_error):
+        part(study, extent, truths)
 
 
 def rmse(picture: np.ndarray, truth: np.ndarray) -> float:
@@ -72,7 +70,7 @@ def shift(picture: np.ndarray, truth: np.ndarray) -> float:
     return math.hypot(*step)
 
 
-def _uniform(study: Study, extent: Extent, truths: Truths) -> None:
+def uniform_samples(study: Study, extent: Extent, truths: Truths) -> None:
     """Compare uniform samples with Mitsuba's, in error and place."""
     rows: list[tuple[Any, ...]] = []
     for name, (scene, truth) in study.each("Uniform samples", truths.items()):
@@ -98,7 +96,7 @@ def _uniform(study: Study, extent: Extent, truths: Truths) -> None:
     study.at_most("uniform: largest shift, pixels", max(r[4] for r in rows), 0.02, why)
 
 
-def _calibration(study: Study, extent: Extent, truths: Truths) -> None:
+def calibration(study: Study, extent: Extent, truths: Truths) -> None:
     """Render to errors, and compare the stated with the true ones."""
     rows, held, count = [], 0, 0
     for name, (scene, truth) in study.each("Stated errors", truths.items()):
@@ -124,7 +122,7 @@ def _calibration(study: Study, extent: Extent, truths: Truths) -> None:
     study.at_least("stated errors that hold", held / count, ENOUGH, why)
 
 
-def _bias(study: Study, extent: Extent, truths: Truths) -> None:
+def bias(study: Study, extent: Extent, truths: Truths) -> None:
     """Compare the mean of many adaptive pictures with the truth."""
     rows: list[tuple[str, float, float, float]] = []
     n = extent.pictures
@@ -148,10 +146,10 @@ def _bias(study: Study, extent: Extent, truths: Truths) -> None:
     study.at_most("bias of means beyond their uncertainty, in standard errors", worst, 0.25, why)
 
 
-def _equal_error(study: Study, extent: Extent) -> None:
+def equal_error(study: Study, extent: Extent, truths: Truths) -> None:
     """Compare costs at equal error, given that uniform rays cost in proportion and err by their root."""
     rows, columns = [], ("rays", "seconds", "from", "to")
-    for name in study.each("Equal error", extent.scenes):
+    for name in study.each("Equal error", truths):
         uniform, noise, target = _in_turns(load(name, *extent.timed), extent.repeats)
         limit, why = 1.1, "noise is even: estimating it may cost a tenth"
         if name in LOCAL:
