@@ -258,12 +258,12 @@ def test_command_writes_a_page(tmp_path, capsys, variant):
 @pytest.mark.parametrize(
     ("words", "text", "said"),
     [
-        (["3"], None, "give one scene and a file of cases"),
-        (["3", "4"], GOOD, "give one scene"),
+        (["3"], None, "cases is missing"),
+        (["3", "4"], GOOD, "unexpected argument '4'"),
         (["3"], "cases = {", "cannot read"),
         (["3"], "cases = {}", "no entry 'reference'"),
         (["3"], GOOD.replace("repeats", "repeat"), "unknown entry 'repeat'"),
-        (["3", "cases=none.toml"], None, "No such file"),
+        (["3", "cases=none.toml"], None, "no such file"),
         (["scene=none.xml"], GOOD, "no such file"),
     ],
 )
