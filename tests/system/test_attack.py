@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import shutil
@@ -219,6 +220,59 @@ def test_pipes_are_refused(variant: str, tmp_path: Path, inside: str) -> None:
     (tmp_path / "a.xml").write_text(scene_xml(inside))
     with pytest.raises(SceneError, match="pipe: it is not a regular file"):
         mrt.render(str(tmp_path / "a.xml"), aa=1)
+
+
+# --------------------------------------- Every plugin in every place -----------------------------------
+
+KINDS = {
+    "sensor": "perspective thinlens orthographic radiancemeter irradiancemeter distant batch",
+    "film": "hdrfilm specfilm",
+    "sampler": "independent stratified multijitter orthogonal ldsampler",
+    "rfilter": "box tent gaussian mitchell catmullrom lanczos",
+    "integrator": "path direct volpath volpathmis ptracer prb prb_basic prb_projective prbvolpath aov depth "
+    "moment direct_projective volprim_rf_basic stokes mrt_whitted",
+    "emitter": "area constant directional directionalarea envmap point projector spot sunsky mrt_light",
+}
+AROUND = """sensor:perspective sensor:batch film:hdrfilm shape:sphere bsdf:diffuse integrator:stokes
+integrator:moment"""
+NUMBERS_IN = {"sampler": "sample_count", "rfilter": "stddev radius lobes", "film": "width crop_width"}
+LIMITS = ("width=8", "height=6"), ("target=0.5", "maxspp=64", "maxseconds=3"), ("aamode=noise", "spp=16")
+VARIANTS = ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral_polarized", "llvm_ad_mono_polarized")
+
+
+def odd_scenes() -> list[str]:
+    """Return what stands beside a ball and a sky: each plugin alone, in others, and with odd numbers."""
+    node = "<{0} type='{1}'>{{}}</{0}>"
+    found = [node.format(kind, name) for kind, names in KINDS.items() for name in names.split()]
+    outer = ["{}"] + [node.format(*each.split(":")) for each in AROUND.split()]
+    placed = [around.format(each.format("")) for each in found for around in outer]
+    for kind, names in NUMBERS_IN.items():
+        for name, value in itertools.product(names.split(), ("0", "-1", "1e9", "nan", "2147483648")):
+            number = f"<{'float' if kind == 'rfilter' else 'integer'} name='{name}' value='{value}'/>"
+            inside = [each.format(number) for each in found if each.startswith(f"<{kind}")]
+            film = "<film type='hdrfilm'>{}</film>" if kind == "rfilter" else "{}"
+            placed += [f"<sensor type='perspective'>{film.format(each)}</sensor>" for each in inside]
+    return placed
+
+
+ODD = list(itertools.product(odd_scenes(), LIMITS, VARIANTS))
+random.Random(1).shuffle(ODD)
+
+
+@pytest.mark.parametrize("place", range(min(12 * ROUNDS, len(ODD))))
+def test_every_plugin_in_every_place(mrt_command, tmp_path: Path, place: int) -> None:
+    """A picture, or one line that says why not; no crash, and no hang."""
+    inside, words, variant = ODD[place]
+    ball = "<shape type='sphere'/><emitter type='constant'/>"
+    (tmp_path / "a.xml").write_text(f"<scene version='3.0.0'>{inside}{ball}</scene>")
+    done = mrt_command(
+        "out", "scene=a.xml", f"variant={variant}", "quiet=1", "memory=1G", "log=error", *words
+    )
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert done.returncode in (0, 1, 2), (inside, done.stderr)
+    assert "MRT_TRACEBACK" not in done.stderr, (inside, done.stderr)
+    assert left == (["a.xml", "out.exr", "out.png"] if done.returncode == 0 else ["a.xml"]), inside
+    assert done.stderr.count("\n") == (done.returncode != 0), (inside, done.stderr)
 
 
 # -------------------------------------- 9, 12: files that lie -----------------------------------------
