@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Iterator
 from importlib import metadata
 
 import mrt_mitsuba
@@ -18,39 +17,29 @@ def run() -> int:
     """Print the report line by line; return 0 if the self-test passed, else 1."""
     print(f"mrt-mitsuba {mrt_mitsuba.__version__}, Python {platform.python_version()}, {platform.platform()}")
     for package in PACKAGES:
-        print(f"  {package:<20}{_version(package)}")
+        try:
+            print(f"  {package:<20}{metadata.version(package)}")
+        except metadata.PackageNotFoundError:
+            print(f"  {package:<20}not installed")
     choice = llvm.prepare()
     print(choice.describe())
     for line in choice.rejected:
         print(f"  passed over: {line}")
     try:
-        for line in _variants():
-            print(line)
+        import mitsuba as mi
+
+        from mrt_mitsuba import runtime
+
+        print(f"variants: {', '.join(runtime.usable_variants())}")
+        reasons = {runtime.obstacle(variant): variant.split("_")[0] for variant in mi.variants()}
+        for reason, family in reasons.items():
+            if reason:
+                print(f"  not {family}_*: {reason}")
         print(f"self-test: {self_test()}")
     except (ImportError, MrtError, RuntimeError) as error:
         print(f"self-test: FAILED: {error}")
         return 1
     return 0
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "not installed"
-
-
-def _variants() -> Iterator[str]:
-    import mitsuba as mi
-
-    from mrt_mitsuba import runtime
-
-    usable = runtime.usable_variants()
-    yield f"variants: {', '.join(usable)}"
-    reasons = {runtime.obstacle(variant): variant.split("_")[0] for variant in mi.variants()}
-    for reason, family in reasons.items():
-        if reason:
-            yield f"  not {family}_*: {reason}"
 
 
 def self_test() -> str:

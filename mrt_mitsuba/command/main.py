@@ -50,11 +50,11 @@ def _open_closed_streams() -> None:
             setattr(sys, name, stream)
 
 
-def _guarded(arguments: list[str]) -> int:
+def _guarded(words: list[str]) -> int:
     """Run the command; whatever goes wrong becomes one line and an exit code."""
     try:
         with ending_soon(_end_by_force):
-            code = _dispatch(arguments)
+            code = _dispatch(words)
             sys.stdout.flush()
         return code
     except MrtError as error:
@@ -67,21 +67,15 @@ def _guarded(arguments: list[str]) -> int:
         # whoever read the output has gone; keep Python from complaining about it once more at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except OSError as error:
-        if error.errno not in FULL or error.filename is not None:
-            return _unexpected(error)
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - or Python complains once more at exit
-        return _fail(f"cannot print: {error.strerror}; send the output elsewhere", 1)
     except MemoryError:
         return _fail("out of memory: choose a smaller width, height or aa", 1)
     except Exception as error:
-        return _unexpected(error)
-
-
-def _unexpected(error: Exception) -> int:
-    if os.environ.get(TRACEBACK):
-        raise error
-    return _fail(f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)", 1)
+        if isinstance(error, OSError) and error.errno in FULL and error.filename is None:
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - or Python complains once more at exit
+            return _fail(f"cannot print: {error.strerror}; send the output elsewhere", 1)
+        if os.environ.get(TRACEBACK):
+            raise
+        return _fail(f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)", 1)
 
 
 def _dispatch(words: list[str]) -> int:
@@ -90,17 +84,17 @@ def _dispatch(words: list[str]) -> int:
 
         sys.stderr.write(usage())
         return UsageError.exit_code
-    command = registry.find(words[0])
+    name = words[0]
+    command = registry.find(name)
     if command is not None:
-        return command.run(words[0], words[1:])
-    if words[0].isdecimal() and all("=" in word for word in words[1:]):
-        number = words[0]
-        raise UsageError(f"FILENAME is missing: write mrt FILENAME {number}, or mrt ./{number} for that name")
+        return command.run(name, words[1:])
+    if name.isdecimal() and all("=" in word for word in words[1:]):
+        raise UsageError(f"FILENAME is missing: write mrt FILENAME {name}, or mrt ./{name} for that name")
     meant = registry.near_miss(words)
     if meant:
         raise UsageError(
-            f"there is no command {words[0]!r}: did you mean mrt {meant}? For a picture of that "
-            f"name, write mrt ./{words[0]}"
+            f"there is no command {name!r}: did you mean mrt {meant}? For a picture of that name, write "
+            f"mrt ./{name}"
         )
     options = parse(words)
     from mrt_mitsuba.command import render

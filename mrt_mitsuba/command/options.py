@@ -10,7 +10,7 @@ from typing import Any
 
 from mrt_mitsuba.command.logs import LEVELS
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.options import checked, choice, either, from_text, option, path, plain, switch
+from mrt_mitsuba.options import choice, either, from_text, option, path, switch
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.model import check_model_options, is_obj
@@ -66,39 +66,30 @@ def parse(arguments: Sequence[str]) -> Options:
             values[name] = from_text(TABLE[name], text)
         else:
             params[name] = text
-    _check_together(values)
-    _check_declared(params, values.get("scene"))
-    options = Options(**values, params=params or None)
-    check_model_options(options.scene, options.model())
-    return options
-
-
-def _check_declared(params: dict[str, str], scene: str | None) -> None:
-    """Raise ``UsageError`` for names that are neither options nor parameters of an XML file."""
-    from mrt_mitsuba.scene.loading import declared
-
-    if not params:
-        return
-    known = declared(scene) if scene and scene.lower().endswith(".xml") else {}
-    strange = next((name for name in params if name not in known), None)
-    if strange is not None:
-        raise UsageError(_unknown(strange, known))
-
-
-def _check_together(values: dict[str, Any]) -> None:
-    """Raise ``UsageError`` for options that exclude each other, or need one that is missing."""
     if "scene" in values and "scene_number" in values:
         raise UsageError(f"both SCENE {values['scene_number']} and scene={values['scene']}: give one of them")
     for name in ("motionsamples", "motionmode"):
         if name in values and "motion" not in values:
             raise UsageError(f"{name} is of use only with motion=dx,dy,dz")
+    if params:
+        _check_declared(params, values.get("scene", ""))
+    options = Options(**values, params=params or None)
+    check_model_options(options.scene, options.model())
+    return options
 
 
-def check(name: str, value: Any) -> Any:
-    """Return a value from Python as the option ``name`` holds it; raise ``UsageError`` if it must not."""
-    if name not in TABLE:
-        raise UsageError(_unknown(name))
-    return checked(TABLE[name], value)
+def _check_declared(params: Iterable[str], scene: str) -> None:
+    """Raise ``UsageError`` for names that are neither options nor parameters of an XML file."""
+    from difflib import get_close_matches
+
+    from mrt_mitsuba.scene.loading import declared
+
+    known = declared(scene) if scene.lower().endswith(".xml") else {}
+    strange = next((name for name in params if name not in known), None)
+    if strange is not None:
+        close = get_close_matches(strange.lstrip("-").lower(), [*TABLE, *known], n=1)
+        hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
+        raise UsageError(f"unknown option {strange!r}.{hint}")
 
 
 def _filename(text: str) -> str:
@@ -115,23 +106,9 @@ def _filename(text: str) -> str:
 
 
 def _scene_number(text: str) -> int:
-    try:
-        number = int(plain(text))
-    except ValueError:
-        hint = f" For a file of your own, write scene={text}" if "." in text or os.path.exists(text) else ""
-        raise UsageError(f"SCENE {text!r}: must be {_scenes()}.{hint}") from None
-    if number not in NUMBERS:
-        raise UsageError(f"SCENE {number}: must be {_scenes()}")
-    return number
-
-
-def _scenes() -> str:
-    return f"{either([str(number) for number in NUMBERS])} ('mrt scenes' lists them)"
-
-
-def _unknown(name: str, params: Iterable[str] = ()) -> str:
-    import difflib
-
-    close = difflib.get_close_matches(name.lstrip("-").lower(), [*TABLE, *params], n=1)
-    hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
-    return f"unknown option {name!r}.{hint}"
+    if text not in map(str, NUMBERS):
+        file = "." in text or os.path.exists(text)
+        hint = f" For a file of your own, write scene={text}" if file else ""
+        known = either([str(number) for number in NUMBERS])
+        raise UsageError(f"SCENE {text}: must be {known} ('mrt scenes' lists them).{hint}")
+    return int(text)
