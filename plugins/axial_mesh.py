@@ -13,7 +13,7 @@ from .intersect import Frame
 from .mesh_api import construct, keep_apart, write_buffers
 from .parameters import ParameterError, flag, integer, number, vector
 from .protocols import QuadricShape
-from .quadric_kinds import KINDS, QuadricTable, UnitMesh
+from .quadric_kinds import KINDS, QuadricTable
 from .variants import first, is_jit, updatable
 
 # From some thousand sides on the triangles are slivers, between which rays slip through; more would not help
@@ -39,7 +39,8 @@ def axial_mesh(kind: str, end0: str, end1: str) -> type[mi.Mesh]:
             self.exact_frame = self._frame_of(vector64(ends[0]), vector64(ends[1]), radius)
             sizes = len(self.unit.points), len(self.unit.faces)
             construct(self, plugin, sizes, props, normals=True, texcoords=True)
-            _fill(self, self.unit, self.exact_frame)
+            uvs = self.unit.uvs.astype(np.float32).ravel()
+            write_buffers(self, vertex_texcoords=uvs, **self.quadrics().stand_in(self.unit))
             self.parameters = dict(zip(names, (*map(mi.Point3f, ends), updatable(radius)), strict=True))
             keep_apart(self, plugin, sizes[1])
 
@@ -70,10 +71,20 @@ def axial_mesh(kind: str, end0: str, end1: str) -> type[mi.Mesh]:
                 p0, p1, radius = (self.parameters[name] for name in names)
                 self.exact_frame = self._frame_of(vector64(p0), vector64(p1), first(radius))
                 if is_jit():
-                    _refill(self, self.unit, self._frame_of(p0, p1, radius))
+                    self._follow(self._frame_of(p0, p1, radius))
                 else:
-                    _fill(self, self.unit, self.exact_frame)
+                    write_buffers(self, **self.quadrics().stand_in(self.unit))
             mi.Mesh.parameters_changed(self, keys)
+
+        def _follow(self, frame: Frame) -> None:
+            """Write positions and normals anew, differentiably with respect to what ``frame`` is made of."""
+            frame = Frame(*map(mi.Vector3f, vars(frame).values()))
+            points, gradients = (mi.Vector3f(x.T) for x in (self.unit.points, self.unit.gradients))
+            positions, normals = (
+                frame.origin + frame.to_world(points),
+                dr.normalize(frame.gradient(gradients)),
+            )
+            write_buffers(self, vertex_positions=dr.ravel(positions), vertex_normals=dr.ravel(normals))
 
         def to_string(self) -> str:
             points = ", ".join(f"{name}={list(vector64(self.parameters[name]))}" for name in names[:2])
@@ -82,35 +93,6 @@ def axial_mesh(kind: str, end0: str, end1: str) -> type[mi.Mesh]:
 
     QuadricShape.register(AxialMesh)
     return AxialMesh
-
-
-def _fill(mesh: Any, unit: UnitMesh, frame: Frame) -> None:
-    """Write a new mesh: positions and normals as ``frame`` places them, texture coordinates, faces."""
-    rows = np.array([list(frame.x), list(frame.y), list(frame.z)], np.float64)
-    flipped = np.linalg.det(rows) < 0
-    positions = unit.points @ np.linalg.inv(rows).T + np.array(list(frame.origin))
-    normals = unit.gradients @ rows
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    write_buffers(
-        mesh,
-        faces=(unit.faces[:, ::-1] if flipped else unit.faces).ravel(),
-        vertex_texcoords=unit.uvs.astype(np.float32).ravel(),
-        vertex_positions=positions.astype(np.float32).ravel(),
-        vertex_normals=normals.astype(np.float32).ravel(),
-    )
-
-
-def _refill(mesh: Any, unit: UnitMesh, frame: Frame) -> None:
-    """Write positions and normals anew, differentiably with respect to what ``frame`` was made of."""
-    rows = [mi.Vector3f(r) for r in (frame.x, frame.y, frame.z)]
-    # The columns of the inverse matrix are cross products of its rows
-    volume = dr.dot(rows[0], dr.cross(rows[1], rows[2]))
-    columns = [dr.cross(rows[k - 2], rows[k - 1]) / volume for k in range(3)]
-    position, normal = mi.Point3f(frame.origin), mi.Vector3f(0)
-    for k in range(3):
-        position += columns[k] * mi.Float(unit.points[:, k])
-        normal += rows[k] * mi.Float(unit.gradients[:, k])
-    write_buffers(mesh, vertex_positions=dr.ravel(position), vertex_normals=dr.ravel(dr.normalize(normal)))
 
 
 def side_count(props: mi.Properties, default: int) -> int:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 import numpy as np
 
@@ -11,7 +9,7 @@ from .axial_mesh import Placement, side_count
 from .mesh_api import construct, keep_apart, write_buffers
 from .parameters import ParameterError, choice
 from .protocols import QuadricShape
-from .quadric_kinds import KINDS, QuadricTable, UnitMesh
+from .quadric_kinds import KINDS, QuadricTable
 
 # Kinds that a group may hold
 CLOSED = tuple(name for name, kind in KINDS.items() if kind.closed)
@@ -60,7 +58,7 @@ class MrtGroup(mi.Mesh):
         )
         sizes = len(numbers) * len(unit.points), len(numbers) * faces
         construct(self, "mrt_group", sizes, props, normals=True)
-        write_buffers(self, **_stand_in(unit, self.table))
+        write_buffers(self, **self.table.stand_in(unit))
         for name, values in attributes.items():
             if len(values) != len(numbers):
                 raise ParameterError(f'mrt_group: "{name}" has {len(values)} rows for {len(numbers)} objects')
@@ -106,21 +104,6 @@ def _check(numbers: np.ndarray) -> None:
         if not right.all():
             row = int(np.argmin(right))
             raise ParameterError(f'mrt_group: row {row} of "numbers" is {fault}: {numbers[row].tolist()}')
-
-
-def _stand_in(unit: UnitMesh, table: QuadricTable) -> dict[str, Any]:
-    """Return the buffers of the mesh of all objects; the frames of some kinds are left-handed."""
-    columns = np.linalg.inv(table.rows).transpose(0, 2, 1)
-    positions = unit.points @ columns + table.origins[:, None]
-    normals = unit.gradients[None] @ table.rows
-    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    faces = unit.faces if np.linalg.det(table.rows[0]) > 0 else unit.faces[:, ::-1]
-    first = len(unit.points) * np.arange(len(table.rows), dtype=np.uint32)
-    return {
-        "faces": (faces[None] + first[:, None, None]).astype(np.uint32).ravel(),
-        "vertex_positions": positions.astype(np.float32).ravel(),
-        "vertex_normals": normals.astype(np.float32).ravel(),
-    }
 
 
 QuadricShape.register(MrtGroup)

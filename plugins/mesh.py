@@ -9,6 +9,9 @@ from .axial_mesh import Placement
 from .mesh_api import construct, write_buffers
 from .parameters import ParameterError
 
+# What vertices may have, and numbers for each in the bitmap
+_EXTRAS = {"texcoords": (2, 3), "normals": (3,)}
+
 
 class MrtMesh(mi.Mesh):
     r"""Triangles given as arrays, which a dict carries as bitmaps of one row.
@@ -51,27 +54,18 @@ class MrtMesh(mi.Mesh):
             extras |= {name: extras[name] @ placement.inverse for name in ("normals",) if name in extras}
         sizes = len(positions), len(faces)
         construct(self, "mrt_mesh", sizes, props, **{name: name in extras for name in _EXTRAS})
-        buffers = {"positions": positions} | {name: _BUFFERS[name](array) for name, array in extras.items()}
+        buffers = {"positions": positions, **extras}
+        if "texcoords" in extras:
+            buffers["texcoords"] = extras["texcoords"][:, :2]
+        if "normals" in extras:
+            lengths = np.linalg.norm(extras["normals"], axis=1, keepdims=True)
+            buffers["normals"] = extras["normals"] / np.where(lengths == 0, 1, lengths)
         flat = {f"vertex_{name}": array.astype(np.float32).ravel() for name, array in buffers.items()}
         write_buffers(self, **flat, faces=faces.astype(np.uint32).ravel())
         self.content = f"positions={len(positions)}, faces={len(faces)}"
 
     def to_string(self) -> str:
         return f"MrtMesh[{self.content}]"
-
-
-def _two(array: np.ndarray) -> np.ndarray:
-    return array[:, :2]
-
-
-def _unit(array: np.ndarray) -> np.ndarray:
-    lengths = np.linalg.norm(array, axis=1, keepdims=True)
-    return np.asarray(array / np.where(lengths == 0, 1, lengths))
-
-
-# What vertices may have: numbers in the bitmap, and what of them Mitsuba takes
-_EXTRAS = {"texcoords": (2, 3), "normals": (3,)}
-_BUFFERS = {"texcoords": _two, "normals": _unit}
 
 
 def _array(props: mi.Properties, name: str, *widths: int) -> np.ndarray:

@@ -291,3 +291,17 @@ class QuadricTable:
         hulls = self.hulls()
         half, centers = np.sqrt((hulls[..., :3] ** 2).sum(axis=3)), hulls[..., 3]
         return np.stack([(centers - half).min(axis=1), (centers + half).max(axis=1)], axis=1)
+
+    def stand_in(self, unit: UnitMesh) -> dict[str, np.ndarray]:
+        """Return the buffers of a mesh of all objects, each of them ``unit``; frames may be left-handed."""
+        columns = np.linalg.inv(self.rows).transpose(0, 2, 1)
+        positions = unit.points @ columns + self.origins[:, None]
+        normals = unit.gradients[None] @ self.rows
+        normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+        faces = unit.faces if np.linalg.det(self.rows[0]) > 0 else unit.faces[:, ::-1]
+        first = len(unit.points) * np.arange(len(self.rows), dtype=np.uint32)
+        return {
+            "faces": (faces[None] + first[:, None, None]).astype(np.uint32).ravel(),
+            "vertex_positions": positions.astype(np.float32).ravel(),
+            "vertex_normals": normals.astype(np.float32).ravel(),
+        }
