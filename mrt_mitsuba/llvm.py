@@ -123,11 +123,18 @@ def wheel_library(search_path: Iterable[str]) -> tuple[str | None, str | None]:
     prefix = WHEEL.replace("-", "_") + "-"
     for folder in search_path:
         for name in _list(folder):
-            if name.startswith(prefix) and name.endswith(".dist-info"):
-                info = os.path.join(folder, name)
-                library = _library_in_record(folder, os.path.join(info, "RECORD"))
-                if library:
-                    return library, _wheel_problem(library, info)
+            if not (name.startswith(prefix) and name.endswith(".dist-info")):
+                continue
+            info = os.path.join(folder, name)
+            try:
+                with open(os.path.join(info, "RECORD"), encoding="utf-8") as lines:
+                    files = [line.split(",", 1)[0] for line in lines if "/libLLVM.so." in line]
+            except (OSError, UnicodeDecodeError):
+                continue
+            paths = (os.path.normpath(os.path.join(folder, file)) for file in files)
+            library = next(filter(os.path.isfile, paths), None)
+            if library:
+                return library, _wheel_problem(library, info)
     return None, None
 
 
@@ -142,19 +149,6 @@ def _wheel_problem(library: str, info: str) -> str | None:
             f"the installation of {WHEEL} is unfinished: whoever may write to {info} has to start Python "
             f"once ({sys.executable} -c '')"
         )
-    return None
-
-
-def _library_in_record(folder: str, record: str) -> str | None:
-    try:
-        with open(record, encoding="utf-8") as lines:
-            files = [line.split(",", 1)[0] for line in lines if "/libLLVM.so." in line]
-    except (OSError, UnicodeDecodeError):
-        return None
-    for file in files:
-        path = os.path.normpath(os.path.join(folder, file))
-        if os.path.isfile(path):
-            return path
     return None
 
 
@@ -207,7 +201,6 @@ def version_of(library: str) -> Version | None:
     Where neither the name nor the target of a symbolic link holds it, the library is asked, in a process of
     its own.
     """
-    path = library
     if os.path.dirname(library):
         path = os.path.realpath(library)
         if not os.path.isfile(path):
@@ -215,22 +208,6 @@ def version_of(library: str) -> Version | None:
         version = version_in_name(path)
         if version:
             return version
-    return _ask(library)
-
-
-_ASK = """
-import ctypes, sys
-numbers = [ctypes.c_uint(0) for _ in range(3)]
-library = ctypes.CDLL(sys.argv[1])
-library.LLVMContextCreate
-if hasattr(library, "LLVMGetVersion"):
-    library.LLVMGetVersion(*map(ctypes.byref, numbers))
-print(*(number.value for number in numbers))
-"""
-
-
-def _ask(library: str) -> Version | None:
-    """Load a library in a child process and ask for its version; (0, 0, 0) if it is older than LLVM 16."""
     import subprocess
 
     try:
@@ -246,6 +223,18 @@ def _ask(library: str) -> Version | None:
         return None
 
 
+# Prints (0, 0, 0) for what is older than LLVM 16
+_ASK = """
+import ctypes, sys
+numbers = [ctypes.c_uint(0) for _ in range(3)]
+library = ctypes.CDLL(sys.argv[1])
+library.LLVMContextCreate
+if hasattr(library, "LLVMGetVersion"):
+    library.LLVMGetVersion(*map(ctypes.byref, numbers))
+print(*(number.value for number in numbers))
+"""
+
+
 _prepared: Choice | None = None
 _drjit_came_first = False
 
@@ -259,7 +248,12 @@ def prepare() -> Choice:
     if _prepared is None:
         _prepared = choose()
         _drjit_came_first = "drjit" in sys.modules
-        _set(_prepared)
+        if _prepared.path:
+            os.environ[VARIABLE] = _prepared.path
+        elif _prepared.source == "none":
+            os.environ[VARIABLE] = BLOCKED
+        elif _prepared.rejected:
+            os.environ.pop(VARIABLE, None)
         if not _drjit_came_first and _prepared.rejected and _prepared.rejected[0].startswith(VARIABLE):
             _warn(
                 f"{_prepared.rejected[0]}, which Dr.Jit cannot use; it needs {OLDEST} or newer. "
@@ -269,15 +263,6 @@ def prepare() -> Choice:
         if problem:
             _warn(problem)
     return _prepared
-
-
-def _set(choice: Choice) -> None:
-    if choice.path:
-        os.environ[VARIABLE] = choice.path
-    elif choice.source == "none":
-        os.environ[VARIABLE] = BLOCKED
-    elif choice.rejected:
-        os.environ.pop(VARIABLE, None)
 
 
 def too_early() -> str | None:

@@ -59,19 +59,18 @@ def one_by_one() -> None:
     """
     import mitsuba as mi
 
+    def in_turn(loader: Callable[..., Any], mentions: Callable[[Any], bool]) -> Callable[..., Any]:
+        @functools.wraps(loader)
+        def load(source: Any, parallel: bool | None = None, optimize: bool = True, **parameters: Any) -> Any:
+            parallel = not mentions(source) if parallel is None else parallel
+            return loader(source, parallel, optimize, **parameters)
+
+        return load
+
     for name, mentions in _MENTIONS.items():
         loader = getattr(mi, name)
         if not hasattr(loader, "__wrapped__"):
-            setattr(mi, name, _in_turn(loader, mentions))
-
-
-def _in_turn(loader: Callable[..., Any], mentions: Callable[[Any], bool]) -> Callable[..., Any]:
-    @functools.wraps(loader)
-    def load(source: Any, parallel: bool | None = None, optimize: bool = True, **parameters: Any) -> Any:
-        parallel = not mentions(source) if parallel is None else parallel
-        return loader(source, parallel, optimize, **parameters)
-
-    return load
+            setattr(mi, name, in_turn(loader, mentions))
 
 
 def _is_mentioned(scene: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import sys
 import threading
@@ -34,38 +35,40 @@ def use(variant: str | None = None) -> str:
     Raises ``UnknownVariantError`` for a name that this Mitsuba does not know, and ``VariantError`` for one
     that cannot run here.
     """
+    global _used
     mitsuba = sys.modules.get("mitsuba")
     if mitsuba is not None and variant in (None, _used) and mitsuba.variant() == _used is not None:
         return _used
-    return _use(variant)
-
-
-def _use(variant: str | None) -> str:
-    global _used
     llvm.prepare()
     check_start()
     with one_at_a_time, held(), rewriting_later():
-        _used = _set(variant)
-    return _used
+        import mitsuba as mi
 
+        if variant is None:
+            variant = mi.variant() or default_variant()
+        elif variant not in mi.variants():
+            close = difflib.get_close_matches(variant, mi.variants(), n=1)
+            hint = f" Did you mean {close[0]}?" if close else ""
+            known = ", ".join(mi.variants())
+            raise UnknownVariantError(f"unknown variant {variant!r}.{hint} This Mitsuba has {known}.")
+        problem = obstacle(variant)
+        if problem:
+            raise VariantError(f"the variant {variant} cannot be used: {problem}")
+        if mi.variant() != variant:
+            try:
+                mi.set_variant(variant)
+            except ImportError as error:
+                raise VariantError(f"the variant {variant} cannot be used: {error}") from error
+            import drjit as dr
 
-def _set(variant: str | None) -> str:
-    import mitsuba as mi
+            if dr.thread_count() > usable_cores():  # Dr.Jit does not look at quotas of control groups
+                dr.set_thread_count(usable_cores())
+        from mrt_mitsuba import plugins
 
-    if variant is None:
-        variant = mi.variant() or default_variant()
-    elif variant not in mi.variants():
-        raise UnknownVariantError(_unknown(variant, mi.variants()))
-    problem = obstacle(variant)
-    if problem:
-        raise VariantError(f"the variant {variant} cannot be used: {problem}")
-    if mi.variant() != variant:
-        try:
-            mi.set_variant(variant)
-        except ImportError as error:
-            raise VariantError(f"the variant {variant} cannot be used: {error}") from error
-        _keep_to_quota()
-    _register_plugins()
+        mitsuba_first()
+        one_by_one()
+        plugins.register()
+        _used = variant
     return variant
 
 
@@ -85,7 +88,9 @@ def register() -> None:
 
     They follow every later switch of the variant. Where no variant is set yet, the default one is.
     """
-    _use(None)
+    global _used
+    _used = None  # also where a caller has taken them out since
+    use()
 
 
 def default_variant() -> str:
@@ -101,10 +106,28 @@ def default_variant() -> str:
 
 def obstacle(variant: str) -> str | None:
     """Return why a known variant cannot run here, with the fix, or None if nothing speaks against it."""
-    if variant.startswith("llvm"):
-        return _llvm_obstacle()
+    if not variant.startswith(("llvm", "cuda")):
+        return None
+    choice = llvm.prepare()
+    import drjit as dr
+
     if variant.startswith("cuda"):
-        return _cuda_obstacle()
+        found = dr.has_backend(dr.JitBackend.CUDA)
+        return (
+            None
+            if found
+            else f"it needs an NVIDIA GPU with its driver, and none was found. Use {FAST} or {SLOW}."
+        )
+    early = llvm.too_early()
+    if early:
+        return early
+    if not choice.usable:
+        return choice.describe()
+    loaded = dr.detail.llvm_version()
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        return f"Dr.Jit could not load {choice.path or 'any LLVM'}. {llvm.HELP}"
+    if loaded[0] < llvm.OLDEST:
+        return f"Dr.Jit loaded LLVM {llvm.version_text(loaded)}, with which it would abort. {llvm.HELP}"
     return None
 
 
@@ -142,52 +165,3 @@ def versions() -> dict[str, str]:
         "drjit": dr.__version__,
         "llvm": llvm_version,
     }
-
-
-def _llvm_obstacle() -> str | None:
-    choice = llvm.prepare()
-    import drjit as dr
-
-    early = llvm.too_early()
-    if early:
-        return early
-    if not choice.usable:
-        return choice.describe()
-    loaded = dr.detail.llvm_version()
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        return f"Dr.Jit could not load {choice.path or 'any LLVM'}. {llvm.HELP}"
-    if loaded[0] < llvm.OLDEST:
-        return f"Dr.Jit loaded LLVM {llvm.version_text(loaded)}, with which it would abort. {llvm.HELP}"
-    return None
-
-
-def _cuda_obstacle() -> str | None:
-    import drjit as dr
-
-    if dr.has_backend(dr.JitBackend.CUDA):
-        return None
-    return f"it needs an NVIDIA GPU with its driver, and none was found. Use {FAST} or {SLOW}."
-
-
-def _keep_to_quota() -> None:
-    """Let Dr.Jit have no more threads than cores: by itself it does not look at quotas of control groups."""
-    import drjit as dr
-
-    if dr.thread_count() > usable_cores():
-        dr.set_thread_count(usable_cores())
-
-
-def _unknown(variant: str, known: list[str]) -> str:
-    import difflib
-
-    close = difflib.get_close_matches(variant, known, n=1)
-    hint = f" Did you mean {close[0]}?" if close else ""
-    return f"unknown variant {variant!r}.{hint} This Mitsuba has {', '.join(known)}."
-
-
-def _register_plugins() -> None:
-    from mrt_mitsuba import plugins
-
-    mitsuba_first()
-    one_by_one()
-    plugins.register()
