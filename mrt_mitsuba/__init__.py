@@ -61,9 +61,7 @@ def __getattr__(name: str) -> object:
 
     if name in _HOME:
         if not _HOME[name].endswith(".errors"):
-            from mrt_mitsuba.runtime import check_start
-
-            check_start()
+            import_module(f"{__name__}.runtime").check_start()
         value = getattr(import_module(_HOME[name]), name)
     elif name in _SUBMODULES:
         value = import_module(f"{__name__}.{name}")

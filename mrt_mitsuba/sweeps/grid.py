@@ -56,17 +56,8 @@ def jobs(scene: Any, grid: Any, zipped: bool, fixed: Mapping[str, Any]) -> list[
         raise UsageError(f"zipped axes must be of one length, and are {lengths}")
     rows = list(zip(*axes.values(), strict=True) if zipped else itertools.product(*axes.values()))
     points = [dict(zip(axes, row, strict=True)) for row in rows]
-    digits = max(4, len(str(len(points) - 1)))  # as programs that make films expect them
-    names = [f"frame_{n:0{digits}}" if zipped else _name(point) for n, point in enumerate(points)]
-    counts = Counter(name.casefold() for name in names)  # some file systems ignore case
-    for name in names:
-        if counts[name.casefold()] > 1:
-            raise UsageError(
-                f"{counts[name.casefold()]} jobs would write the same file {name}: take out values given "
-                "twice, or use zipped=True, which numbers the files"
-            )
     found = []
-    for name, point in zip(names, points, strict=True):
+    for name, point in zip(_names(points, zipped), points, strict=True):
         dotted = {key: value for key, value in point.items() if "." in key}
         arguments = shared | {key: value for key, value in point.items() if key not in dotted}
         params = {**shared.get("params", {}), **point.get("params", {}), **dotted}
@@ -123,14 +114,27 @@ def _finite(value: Any) -> bool:
     return not isinstance(value, list | tuple) or all(map(_finite, value))
 
 
-def _name(point: Mapping[str, Any]) -> str:
-    name = ",".join(f"{word(key)}={word(value)}" for key, value in point.items()) or "picture"
-    if len(name.encode()) > LONGEST_NAME:
-        raise UsageError(
-            f"the file {name[:60]}... would have a name of {len(name)} characters: use zipped=True, "
-            "which numbers the files"
-        )
-    return name
+def _names(points: Sequence[Mapping[str, Any]], zipped: bool) -> list[str]:
+    if zipped:
+        digits = max(4, len(str(len(points) - 1)))  # as programs that make films expect them
+        return [f"frame_{number:0{digits}}" for number in range(len(points))]
+    names = [
+        ",".join(f"{word(key)}={word(value)}" for key, value in point.items()) or "picture"
+        for point in points
+    ]
+    counts = Counter(name.casefold() for name in names)  # some file systems ignore case
+    for name in names:
+        if counts[name.casefold()] > 1:
+            raise UsageError(
+                f"{counts[name.casefold()]} jobs would write the same file {name}: take out values given "
+                "twice, or use zipped=True, which numbers the files"
+            )
+        if len(name.encode()) > LONGEST_NAME:
+            raise UsageError(
+                f"the file {name[:60]}... would have a name of {len(name)} characters: use zipped=True, "
+                "which numbers the files"
+            )
+    return names
 
 
 def word(value: Any) -> str:

@@ -80,7 +80,7 @@ def sweep(
     table = Table(folder, tuple(grid or {}), planned)
     shown = TerminalProgress(unit=" pictures") if progress is None else progress
     with TemporaryDirectory(prefix=".mrt-", dir=folder, ignore_cleanup_errors=True) as scratch:
-        pictures = [_sent(job, scratch) for job in planned]
+        pictures = _sent(planned, scratch)
         for job in pictures:
             _refuse_to_replace(folder, job.name, job.file in table.earlier, png)
         fresh = {job.name for job in pictures if resume and is_fresh(job, folder, png)}
@@ -120,13 +120,18 @@ def sweep(
     return table
 
 
-def _sent(job: Job, scratch: str) -> Job:
-    """Return a job as a worker takes it, with its fingerprints; it needs no values of the grid."""
-    scene = send(job.scene, scratch)
-    identity = identify(scene)
-    pixels = sorted((key, value) for key, value in job.arguments.items() if key != "memory")
-    made = fingerprint(identity, pixels, versions())
-    return replace(job, scene=scene, parameters={}, identity=identity, made_with=made)
+def _sent(jobs: Sequence[Job], scratch: str) -> list[Job]:
+    """Return jobs as workers take them, with their fingerprints; they need no values of the grid."""
+    sent = {key: send(scene, scratch) for key, scene in {id(job.scene): job.scene for job in jobs}.items()}
+    identities = {key: identify(scene) for key, scene in sent.items()}
+    found = []
+    for job in jobs:
+        identity = identities[id(job.scene)]
+        pixels = sorted((key, value) for key, value in job.arguments.items() if key != "memory")
+        made = fingerprint(identity, pixels, versions())
+        scene = sent[id(job.scene)]
+        found.append(replace(job, scene=scene, parameters={}, identity=identity, made_with=made))
+    return found
 
 
 def _refuse_to_replace(folder: str, name: str, listed: bool, png: bool) -> None:
@@ -153,7 +158,8 @@ def _submit(
     resume: bool,
 ) -> dict[Future, Job]:
     """Hand over the pictures or their tiles, but for those tiles that are there; return what is to end."""
-    prefix, given = os.path.basename(setting.scratch), {"retries": retries, "pure": False}
+    prefix = os.path.basename(setting.scratch)
+    given: dict[str, Any] = {"retries": retries, "pure": False}
     wanted = [
         each
         for job in rest

@@ -38,9 +38,14 @@ def send(scene: Any, folder: str) -> Any:
     return path
 
 
+def is_copy(sent: Any) -> bool:
+    """Return whether a scene was sent in a file of the sweep's own."""
+    return isinstance(sent, str) and sent.endswith(SENT)
+
+
 def receive(scene: Any) -> Any:
     """Return the scene that was sent; needs a variant, as it may hold Mitsuba's types."""
-    if isinstance(scene, str) and scene.endswith(SENT):
+    if is_copy(scene):
         with open(scene, "rb") as file:
             return pickle.load(file)
     return scene

@@ -16,7 +16,7 @@ from mrt_mitsuba.errors import MrtError
 from mrt_mitsuba.memory import free_memory
 from mrt_mitsuba.options import SMALLEST_MEMORY
 from mrt_mitsuba.sweeps.grid import Job
-from mrt_mitsuba.sweeps.scenes import identify, receive
+from mrt_mitsuba.sweeps.scenes import identify, is_copy, receive
 
 MADE_WITH = "mrt:sweep"  # header attribute: fingerprint of scene, settings and versions
 ROWS = 64  # of a picture, read at a time; a multiple of the 16 that are compressed together
@@ -109,7 +109,7 @@ def _render(job: Job, setting: Setting, scratch: str, worker: Any) -> dict[str, 
         arguments.setdefault("memory", max(min(free_memory(), limit) // 2, SMALLEST_MEMORY))
     runtime.use(arguments.get("variant"))
     result = render(receive(job.scene), progress=Progress(), **arguments)
-    if identify(job.scene) != job.identity:
+    if not is_copy(job.scene) and identify(job.scene) != job.identity:
         raise MrtError(f"{job.scene} has changed since the sweep began: run it again")
     header = result.header() | {MADE_WITH: job.made_with}
     for ending in ("exr", "png") if setting.png else ("exr",):

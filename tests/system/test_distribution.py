@@ -112,15 +112,3 @@ def test_installed_command_renders(installed: Path, tmp_path: Path) -> None:
     run(installed / "mrt", "demo", "7", "width=32", "height=24", "aa=1", cwd=tmp_path)
     run(installed / "mrt", "export", "0", "--xml", "a.xml", cwd=tmp_path)
     run(installed / "mrt", "mine", "scene=a.xml", "aa=1", cwd=tmp_path)
-
-
-def test_installed_entry_points_are_found(installed: Path, tmp_path: Path) -> None:
-    code = """
-import importlib.metadata, mrt_mitsuba
-import mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-(found,) = [point for point in importlib.metadata.entry_points(group="mitsuba") if point.name == "mrt"]
-found.load()
-print(mi.load_dict({"type": "mrt_bsdf", "alpha": 0.25}))
-"""
-    assert "0.25" in run(installed / "python", "-c", code, cwd=tmp_path)

@@ -147,7 +147,7 @@ def test_imports_make_no_cycle() -> None:
     [
         ("plugins", {"plugins"}),
         ("rays", {"rays"}),
-        ("output", {"output", "cores", "errors"}),
+        ("output", {"output", "cores", "errors", "interrupts"}),
         ("filters", {"filters", "errors", "runtime", "output"}),
         ("scene", {"scene", "plugins", "output", *FOUNDATION}),
         ("rendering", {"rendering", "plugins", "rays", "filters", "scene", "output", *FOUNDATION}),

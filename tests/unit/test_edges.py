@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import subprocess
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -171,15 +170,6 @@ def test_noise_of_unknown_size_leaves_its_neighbourhood_alone(detector: Any) -> 
     assert np.isfinite(edges.value).all()
 
 
-@pytest.mark.parametrize("detector", DETECTORS)
-@pytest.mark.parametrize("value", [0.0, 0.1, 0.9])
-def test_without_noise_a_flat_picture_has_no_edges_once_variance_is_given(
-    detector: Any, value: float
-) -> None:
-    image = np.full((6, 7, 3), value)
-    assert not detector(image, variance=np.zeros_like(image)).mask.any()
-
-
 # ---- geometry ----
 
 
@@ -250,12 +240,6 @@ def test_geometry_decides_by_angle_step_and_miss(change: dict, options: dict, is
     assert np.isfinite(edges.value).all()
 
 
-def test_geometry_measures_a_crease_by_its_cosine() -> None:
-    value = geometry_edges(*face(slice(4, None), tilted(15))).value[2, 3]
-    # 1 − cos in float32 has an error of 1e-7 against 0.03
-    assert value == pytest.approx((1 - np.cos(np.radians(15))) / (1 - np.cos(np.radians(20))), rel=1e-5)
-
-
 def test_geometry_sees_a_step_in_every_direction() -> None:
     normal, depth = face()
     depth[2, 4] = 2.9
@@ -284,31 +268,6 @@ def test_arrays_give_arrays_of_their_kind(backend: str) -> None:
     assert type(found.mask) is module.TensorXb and type(found.value) is module.TensorXf
     np.testing.assert_array_equal(listed.mask, plain.mask)
     np.testing.assert_array_equal(np.array(found.mask), plain.mask)
-
-
-@pytest.mark.parametrize(
-    ("variant", "backend"), [("scalar_rgb", "scalar"), pytest.param("llvm_ad_rgb", "llvm", marks=needs_llvm)]
-)
-def test_numpy_is_computed_in_the_backend_of_the_variant(
-    run_python: Callable[..., subprocess.CompletedProcess[str]], variant: str, backend: str
-) -> None:
-    code = """
-import sys
-import mrt_mitsuba
-import mitsuba as mi
-import numpy as np
-from mrt_mitsuba import filters
-from mrt_mitsuba.filters.grid import Grid
-
-mi.set_variant(sys.argv[1])
-image = np.random.default_rng(0).random((6, 7, 3)).astype(np.float32)
-plain, tensor = filters.luma_edges(image), filters.luma_edges(mi.TensorXf(image))
-assert isinstance(plain.mask, np.ndarray) and isinstance(tensor.value, mi.TensorXf)
-assert (plain.mask == np.array(tensor.mask)).all() and plain.mask.any()
-print(Grid(image).Float.__module__)
-"""
-    done = run_python(code, variant)
-    assert done.stdout.split() == [f"drjit.{backend}"], done.stderr
 
 
 @pytest.mark.parametrize("ending", ["png", "exr"])

@@ -74,14 +74,6 @@ def test_newest_system_library(tmp_path: Path) -> None:
 
 
 @linux
-def test_link_is_judged_by_its_target(tmp_path: Path) -> None:
-    old = library(tmp_path, "libLLVM-15.so.1")
-    link = tmp_path / "libLLVM-19.so"
-    link.symlink_to(old)
-    assert llvm.choose({llvm.VARIABLE: str(link)}, [], [str(tmp_path)]).source == "none"
-
-
-@linux
 @pytest.mark.parametrize("name", ["libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1"])
 def test_older_than_17_is_never_chosen(tmp_path: Path, name: str) -> None:
     old = library(tmp_path / "system", name)
@@ -212,17 +204,3 @@ except mrt_mitsuba.VariantError as error:
     assert done.returncode == 0, done.stderr
     assert "Import mrt_mitsuba before mitsuba and drjit" in done.stdout
     assert "Import mrt_mitsuba before mitsuba and drjit" in done.stderr
-
-
-def test_kernel_that_old_llvm_cannot_compile(run_python) -> None:
-    """``dr.minimum`` aborts the process under LLVM 14 to 16."""
-    code = """
-import mrt_mitsuba, mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-import drjit as dr
-print(dr.detail.llvm_version()[0], dr.minimum(mi.Float(1, 5), 3))
-"""
-    done = run_python(code)
-    assert done.returncode == 0, done.stderr
-    version, values = done.stdout.split(" ", 1)
-    assert int(version) >= llvm.OLDEST and values.strip() == "[1, 3]"
