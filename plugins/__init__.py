@@ -41,23 +41,25 @@ def register_modules(package: str, names: Sequence[str]) -> None:
         )
     watching = bool(_packages)
     _packages[package] = tuple(dict.fromkeys((*_packages.get(package, ()), *names)))
-    _load_all(mi.variant())
+    _load_all()
     if not watching:
-        mi.detail.add_variant_callback(lambda old, new: _load_all(new))
+        mi.detail.add_variant_callback(lambda old, new: _load_all())
 
 
 def plugin(name: str, package: str = __name__) -> ModuleType:
-    """Return the plugin module ``name`` (e.g. "whitted") as loaded for the current variant."""
+    """Return the module ``name`` (e.g. "whitted") for the current variant, to which its classes belong."""
     import mitsuba as mi
 
-    return _loaded[mi.variant(), package, name]
+    key = mi.variant(), package, name
+    if key not in _loaded:
+        _loaded[key] = _load(*key)
+    return _loaded[key]
 
 
-def _load_all(variant: str) -> None:
+def _load_all() -> None:
     for package, names in _packages.items():
         for name in names:
-            if (variant, package, name) not in _loaded:
-                _loaded[variant, package, name] = _load(variant, package, name)
+            plugin(name, package)
 
 
 def _load(variant: str, package: str, name: str) -> ModuleType:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from .axial_mesh import axial_mesh
+from . import plugin
 
 
-class MrtCone(axial_mesh("cone", "apex", "base_center")):  # type: ignore[misc]
+class MrtCone(plugin("axial_mesh").AxialMesh):  # type: ignore[misc]
     r"""A full right circular cone: lateral surface and base disc.
 
     ``mrt_whitted`` intersects the quadric and the disc themselves. To every other integrator the shape is a
@@ -45,6 +45,8 @@ class MrtCone(axial_mesh("cone", "apex", "base_center")):  # type: ignore[misc]
 
     Nearest stock plugin: ``linearcurve``, whose segments of varying radius have round ends.
     """
+
+    kind, ends = "cone", ("apex", "base_center")
 
 
 mi.register_shape("mrt_cone", MrtCone)

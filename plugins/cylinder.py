@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from .axial_mesh import axial_mesh
+from . import plugin
 
 
-class MrtCylinder(axial_mesh("cylinder", "p0", "p1")):  # type: ignore[misc]
+class MrtCylinder(plugin("axial_mesh").AxialMesh):  # type: ignore[misc]
     r"""A right circular cylinder with its two discs.
 
     ``mrt_whitted`` intersects the quadric and the discs themselves. To every other integrator the shape is a
@@ -41,6 +41,8 @@ class MrtCylinder(axial_mesh("cylinder", "p0", "p1")):  # type: ignore[misc]
 
     Nearest stock plugin: ``cylinder``, which is open.
     """
+
+    kind, ends = "cylinder", ("p0", "p1")
 
 
 mi.register_shape("mrt_cylinder", MrtCylinder)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .axial_mesh import Placement, side_count
 from .mesh_api import construct, keep_apart, write_buffers
-from .parameters import ParameterError, choice
+from .parameters import ParameterError, choice, segments
+from .placement import Placement
 from .protocols import QuadricShape
 from .quadric_kinds import KINDS, QuadricTable
 
@@ -51,7 +51,7 @@ class MrtGroup(mi.Mesh):
         _check(numbers)
         attributes = {name: _table(props, name) for name in props if name.startswith("face_")}
         self.content = f"kind={kind}, objects={len(numbers)}"
-        unit = KINDS[kind].mesh(side_count(props, 8))
+        unit = KINDS[kind].mesh(segments(props, 8))
         faces = len(unit.faces)
         self.table = QuadricTable.of_numbers(
             kind, numbers, faces, Placement(props), flipped=props.get("flip_normals", False)

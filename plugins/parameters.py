@@ -11,6 +11,9 @@ import drjit as dr
 # Mitsuba computes in float32; what is larger would become infinite there, and what is smaller zero
 LARGEST, SMALLEST = 3.4e38, 1.2e-38
 
+# From some thousand sides on triangles are slivers, between which rays slip through; more would not help
+MOST_SEGMENTS = 65536
+
 
 class ParameterError(ValueError):
     """A plugin parameter has a wrong value. The text names plugin, key, value and what is allowed."""
@@ -47,6 +50,11 @@ def integer(props: Any, name: str, default: int, *, least: int, most: int | None
     if not right or value < least or (most is not None and value > most):
         _fail(props, name, value, f"an integer {limits}")
     return value
+
+
+def segments(props: Any, default: int) -> int:
+    """Return the parameter ``segments``: sides of a mesh."""
+    return integer(props, "segments", default, least=3, most=MOST_SEGMENTS)
 
 
 def flag(props: Any, name: str, default: bool) -> bool:
