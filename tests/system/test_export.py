@@ -10,6 +10,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.plugins.intersect import Frame
@@ -182,3 +183,37 @@ def test_xml_of_scene_3_keeps_its_depth_of_field(tmp_path):
     )
     assert from_xml.plan.blur == "report" and np.array_equal(from_xml.image, ours.image)
     assert not mrt.render(str(tmp_path / "scene.xml"), aa=1, focaldist=0).plan.blur
+
+
+def test_an_xml_file_is_exported_as_it_renders(tmp_path):
+    """Includes and parameters are filled in, and its pictures are found from elsewhere."""
+    (tmp_path / "in").mkdir()
+    Image.new("RGB", (4, 4), (200, 100, 50)).save(tmp_path / "in" / "t.png")
+    (tmp_path / "in" / "sky.xml").write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
+    (tmp_path / "in" / "a.xml").write_text(
+        """<scene version="3.0.0"><default name="r" value="1"/><default name="focaldist" value="4"/>
+        <include filename="sky.xml"/><sensor type="perspective"><film type="hdrfilm">
+        <integer name="width" value="16"/><integer name="height" value="12"/></film></sensor>
+        <shape type="sphere"><float name="radius" value="$r"/><point name="center" value="0 0 5"/>
+        <bsdf type="mrt_bsdf"><texture name="diffuse_reflectance" type="mrt_texture">
+        <string name="filename" value="t.png"/></texture></bsdf></shape></scene>"""
+    )
+    (written,) = write_xml(tmp_path / "in" / "a.xml", tmp_path / "b.xml", params={"r": 0.5})
+    before, after = mrt.render(tmp_path / "in" / "a.xml", params={"r": 0.5}), mrt.render(written)
+    assert np.array_equal(before.image, after.image) and before.plan.focus == after.plan.focus
+    assert not np.array_equal(before.image, mrt.render(tmp_path / "in" / "a.xml").image)
+    for name in ("a.xml", "sky.xml", "t.png"):
+        with pytest.raises(mrt.OutputError, match="what is written is made from this file"):
+            write_xml(tmp_path / "in" / "a.xml", tmp_path / "in" / name)
+
+
+def test_an_obj_file_is_exported_as_it_renders(tmp_path):
+    (tmp_path / "t.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    view = {"width": 16, "height": 12, "camera": (0.4, 0.4, 2), "target": (0.3, 0.3, 0), "light": (1, 1, 3)}
+    written = write_xml(tmp_path / "t.obj", tmp_path / "t.xml", **view)
+    assert [Path(file).name for file in written] == ["t_mesh_0.ply", "t.xml"]
+    before, after = (
+        mrt.render(tmp_path / "t.obj", aa=1, **view),
+        mrt.render(written[1], aa=1, lattice="report"),
+    )
+    assert np.array_equal(before.image, after.image)

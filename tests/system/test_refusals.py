@@ -411,6 +411,16 @@ def test_scene_dict_refuses(arguments: dict[str, Any], text: str) -> None:
         mrt.scene_dict(0, **arguments)
 
 
+def test_objects_of_another_variant_are_named() -> None:
+    mi.set_variant("scalar_rgb")
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
+    integrator = mi.load_dict({"type": "path"})
+    mi.set_variant("llvm_ad_rgb")
+    for given in ({"scene": scene}, {"integrator": integrator}):
+        with pytest.raises(mrt.UsageError, match="was loaded in the variant scalar_rgb, and llvm_ad_rgb is"):
+            mrt.render(**TINY | given)
+
+
 def test_results_are_not_saved_by_another_tone_map(tmp_path: Path) -> None:
     with pytest.raises(mrt.UsageError, match="tonemap='neon': must be report or srgb"):
         mrt.render(0, **TINY).save(tmp_path / "a.png", tonemap="neon")

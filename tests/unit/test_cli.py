@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import json
 import os
 import signal
@@ -15,8 +17,10 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba.command import main as cli
+from mrt_mitsuba.command import options, registry
 from mrt_mitsuba.errors import MrtWarning, SceneError
 from mrt_mitsuba.output import files as output
+from mrt_mitsuba.validation.tools.compare import Difference
 
 
 class Recorder:
@@ -190,6 +194,7 @@ def render(*scene, **arguments):
 {work}
 sys.modules["mrt_mitsuba.rendering.api"] = types.SimpleNamespace(render=render)
 from mrt_mitsuba.command import main as cli
+from mrt_mitsuba.command import options, registry
 sys.exit(cli.main())
 """
 # What the signal meets: Python code, or a Dr.Jit kernel that runs for minutes (a million steps per entry).
@@ -246,6 +251,7 @@ def test_wrong_usage_starts_nothing_heavy(run_python) -> None:
     code = """
 import sys
 from mrt_mitsuba.command import main as cli
+from mrt_mitsuba.command import options, registry
 code = cli.main(["out", "width=0"])
 print(code, [name for name in ("drjit", "mitsuba", "numpy", "OpenEXR", "PIL", "tqdm") if name in sys.modules])
 """
@@ -282,9 +288,22 @@ def test_bar_on_a_terminal_shows_the_time_left() -> None:
     assert bars.text.endswith("\r")  # cleared at the end
 
 
-def test_header_survives_json() -> None:
-    """The options go into the EXR header as JSON."""
-    from mrt_mitsuba.command.options import parse
+def test_every_word_of_every_command_arrives() -> None:
+    """A command declares its words in its form, and its function takes each of them by name."""
+    for name, command in {**registry.COMMANDS, **registry.ALIASES}.items():
+        module, _, function = command.home.partition(":")
+        taken = inspect.signature(getattr(importlib.import_module(module), function)).parameters
+        names = {key for key, each in taken.items() if each.kind is each.KEYWORD_ONLY}
+        if "limits" in taken:
+            names |= {*Difference.__dataclass_fields__, "flip"}
+        if "--" not in command.form:
+            assert set(command.names()) - {"scene"} <= names, name
+            positional = [each for each in taken.values() if each.kind is each.POSITIONAL_OR_KEYWORD]
+            assert len(positional) == sum(word[0].isupper() for word in command.form.split()), name
 
-    arguments = parse(["o", "layers=depth", "motion=1,2,3", "memory=4G"]).render_arguments()
-    assert json.loads(json.dumps(arguments))["motion"] == [1, 2, 3]
+
+def test_every_option_arrives_at_the_render_or_is_the_commands_own() -> None:
+    own = {"scene", "format", "tonemap", "plan", "quiet", "log"}
+    assert {*options.parse(["o"]).render_arguments(), *own} == {*options.TABLE, "params"}
+    arguments = options.parse(["o", "layers=depth", "motion=1,2,3", "memory=4G"]).render_arguments()
+    assert json.loads(json.dumps(arguments))["motion"] == [1, 2, 3]  # they go into the header as JSON
