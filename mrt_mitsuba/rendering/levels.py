@@ -44,7 +44,9 @@ class Levels:
         pixels = np.arange(self._aa.size, dtype=np.uint32)
         return {1: pixels, 2: pixels}
 
-    def next(self, most: float, target: float | None) -> dict[int, np.ndarray] | None:
+    last = False
+
+    def next(self, most: float, rays: float, target: float | None) -> dict[int, np.ndarray] | None:
         """Return the pixels to double, by their new aa; None where ``most`` rays a pixel do not suffice.
 
         They leave half of the squared error of ``target`` in the others; those around them are doubled, too.
@@ -76,6 +78,10 @@ class Levels:
             self._aa.flat[pixels] = aa
             self._rays.flat[pixels] += aa**2
             advance(aa**2 * len(pixels))
+
+    def forecast(self) -> tuple[float, float]:
+        """Return the error, and no tail: nothing is random."""
+        return self.error().rmse, 0.0
 
     def error(self) -> ErrorEstimate:
         """Return the estimated error of the picture."""

@@ -1,69 +1,87 @@
-"""Sampling to an error: what two half pictures say about the noise, and where further rays are worth most.
+"""Sampling to an error: where further rays are worth most, and what they leave of the noise.
 
-Two pictures are exposed at once, each from rays of its own. Their difference estimates the error of their
-mean, whatever integrator, sampler and filter are at work. Which pixels of one get further rays is decided by
-the variance in the other alone: a value never decides how many values it is averaged with, so the mean stays
-unbiased. (A pixel that happened to miss a bright reflection would otherwise look quiet, and stay dark.)
+Four pictures are exposed at once, each from rays of its own. Two *halves* are averaged: their mean is the
+picture, and their difference estimates its error, whatever integrator, sampler and filter are at work. Two
+*scouts* of few rays are not averaged: they alone decide which pixels get how many further rays, and when to
+stop. So no value decides the weight with which it is averaged, and the mean is right (D. Kirk and J. Arvo,
+1991, have the bias of deciding by the values that are averaged; docs/maths.md has the proof).
 
 Rays are shared out in proportion to the standard deviation of a pixel (J. Neyman, 1934). A few rays estimate
 it badly, so it is smoothed over neighbours, and how far is decided by cross-validation: by which candidate,
-formed of one half, shares out rays best for the variance that the other half measures.
+formed of one scout, shares out rays best for the variance that the other scout measures.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from mrt_mitsuba.filters.dof import REACH
-from mrt_mitsuba.output.error import ErrorEstimate
-from mrt_mitsuba.rendering.exposing import Exposed, Exposer, Groups, Stack, channels_last
+from mrt_mitsuba.output.error import ErrorEstimate, tail_shape
+from mrt_mitsuba.rendering.exposing import Exposer, Groups, Stack
 from mrt_mitsuba.rendering.rounds import LEAST_GROWTH
-from mrt_mitsuba.rendering.windows import window_means
+from mrt_mitsuba.rendering.windows import dilated, window_means
 
-HALVES = 2
+PICTURES = 4
+HALVES, SCOUTS = [0, 1], [2, 3]
+SCOUTING = 1 / 15  # of the rays of a pixel that are averaged, so many go to scouts
 TILE = 16  # pixels, under a filter
-GROUP = 4  # rays that are traced together; two groups to a pixel begin
-# Times the rays there are must be there after another round: a short one costs more than it brings
-STEP = 1.5
+GROUP = 2  # rays that are traced together; each picture begins with one group to a pixel
 
 # Candidates for the smoothing of variances: half the width of a window, and how many rays its mean is worth
 _WINDOWS = ((1, 8), (1, 32), (2, 32), (2, math.inf), (4, math.inf), (8, math.inf))
-_FLOORS = (0.003, 0.03, 0.2, 1.0)  # share of the picture's mean in the variance of every pixel
+_FLOORS = (0.0, 0.01, 0.1, 0.5)  # share of a region's mean in the variance of every pixel
 _JUDGES = 2**12  # pixels, about, that choose among the candidates
 _REGION = 8  # half the width of the windows in which rays are compared with independent ones
 
 
 class Halves(Stack):
-    """Two half pictures, and the moments of the rays in each pixel, as they grow round by round."""
+    """Two half pictures and two scouts, and the moments of the rays in each pixel, as they grow by rounds.
+
+    What to trace in a round: the numbers of groups that each pixel gets in each picture.
+    """
+
+    last = False  #: was the last round decided?
 
     def __init__(
         self, exposer: Exposer, seed: int, blurred: Callable[[np.ndarray], np.ndarray] | None = None
     ) -> None:
         film = exposer.film
-        super().__init__(film, HALVES, len(exposer.names))
-        self._exposer, self._seed, self._blurred, self._step = exposer, seed, blurred, STEP
-        self._total, self._square = (channels_last(np.zeros((3, HALVES, *film.shape))) for _ in range(2))
+        super().__init__(film, 2, len(exposer.names))
+        self._exposer, self._seed, self._blurred = exposer, seed, blurred
+        self._traced = np.zeros((PICTURES, film.pixels))
+        self._total, self._square = np.zeros((2, PICTURES, *film.shape, 3))
+        self._peak = np.zeros((PICTURES, *film.shape))
+        self._bad = np.zeros(film.shape, bool)
 
     # ------------------------------------------- Rounds ---------------------------------------------
 
     def first(self) -> np.ndarray:
-        """Return one group for each pixel and half."""
-        return np.ones_like(self.rays, np.int64)
+        """Return one group for each pixel and picture."""
+        return np.ones((PICTURES, self.film.pixels), np.int64)
 
     def cost(self, chosen: np.ndarray) -> int:
-        """Return the number of rays that groups for chosen pixels take, with those around them."""
-        return GROUP * int(self.widened(chosen).sum())
+        """Return the number of rays that groups take, with those around the chosen pixels of halves."""
+        return GROUP * int(self.widened(chosen[:2]).sum() + chosen[2:].sum())
 
     def trace(self, chosen: np.ndarray, advance: Callable[[int], object]) -> None:
-        """Trace numbers of groups, [2, pixels]."""
-        groups = Groups.spread(GROUP, self.widened(chosen), self.rays)
+        """Trace groups of rays."""
+        counts = np.concatenate([self.widened(chosen[:2]), chosen[2:]])
+        groups = Groups.spread(GROUP, counts, self._traced)
         exposed = self._exposer.expose(
-            groups, self._seed, pictures=HALVES, progressive=True, moments=True, advance=advance
+            groups, self._seed, pictures=PICTURES, progressive=True, moments=True, advance=advance
         )
-        self.add(exposed, chosen > 0)
+        bad = ~np.isfinite(exposed.square).all(-1)
+        self._bad |= bad.any(0)
+        self._traced += exposed.rays
+        self._total += np.where(bad[..., None], 0, exposed.total)
+        self._square += np.where(bad[..., None], 0, exposed.square)
+        np.maximum(self._peak, np.where(bad, 0, exposed.peak[..., 0]), out=self._peak)
+        sums, weights, rays = (v[:2] for v in (exposed.sums, exposed.weights, exposed.rays))
+        self.add(replace(exposed, sums=sums, weights=weights, rays=rays), chosen[:2] > 0)
 
     def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the picture [H, W, 3], and the standard error and the rays of each pixel, [H, W]."""
@@ -71,147 +89,190 @@ class Halves(Stack):
         shown = image if self._blurred is None else self._blurred(image)
         return shown, np.sqrt(self.variance().mean(-1)), self.samples()
 
-    def add(self, exposed: Exposed, chosen: np.ndarray) -> None:
-        super().add(exposed, chosen)
-        self._total += exposed.total
-        self._square += exposed.square
+    def samples(self) -> np.ndarray:
+        """Return the rays of each pixel, those of scouts included, [H, W], without the border."""
+        return self._inside(self.rows(self._traced).sum(0))
 
     # ------------------------------------------- Errors ---------------------------------------------
 
-    def _squared_error(self) -> np.ndarray:
-        """Return an estimate for each pixel of the picture's squared error, mean of colours, [H, W].
-
-        The mean of two independent values has a variance of a quarter of their expected squared difference.
-        """
-        return _quarter_squares(*self.pictures()[..., :3])
-
     def error(self) -> ErrorEstimate:
-        """Return the estimated RMSE of the picture, without the border.
+        """Return the estimated RMSE of the picture, without the border, by its halves alone.
 
         The mean of squares of which each is as uncertain as it is large, correlated as the filter has it; the
         true error is a mean of as many squares, and as uncertain. The interval is that of a log-normal law,
-        wider upwards the fewer squares make up the mean: there may be others that no ray has met yet.
+        wider upwards the fewer squares make up the mean. Where the largest contributions of single rays have
+        so heavy a tail that rays not met yet may rule the error, there is no upper end.
         """
         halves, correlation = self.film.picture(self.pictures()[..., :3]), self.film.correlation
         if self._blurred is not None:
             halves = np.stack([self._blurred(half) for half in halves])
-        squares = _quarter_squares(*halves)
+        squares = self._clean(_quarter_squares(*halves))
         mean = float(squares.mean())
         if mean == 0:
-            return ErrorEstimate(0.0, 0.0, 0.0)
+            return ErrorEstimate(0.0, 0.0, 0.0, 0.0)
         if self._blurred is not None:  # pixels are as good as one in a window of the blur's reach
             squares, correlation = _blocks(squares, 2 * REACH), 1.0
         spread = math.sqrt(2 * correlation * float(np.square(squares).sum())) / float(squares.sum())
-        rmse, width = math.sqrt(mean), 1.96 * spread / 2
-        return ErrorEstimate(rmse, rmse * math.exp(-width), rmse * math.exp(width * (1 + spread)))
+        return ErrorEstimate.of(math.sqrt(mean), spread, self._tail(HALVES))
+
+    def forecast(self) -> tuple[float, float]:
+        """Return the RMSE of the picture, and the shape of its tail, as the scouts have them."""
+        left = self._inside(self._decisive([2], [3]) / self.rows(self.rays).sum(0))
+        return math.sqrt(float(left.mean())), self._tail(SCOUTS)
 
     def variance(self) -> np.ndarray:
         """Return the estimated variance of each channel in the picture, [H, W, 3], without the border."""
-        moments, rays = self._moments()
-        each = np.moveaxis((moments / rays[..., None]).sum(0), -1, 0)
-        each = _smoothed(each, window_means(each, 1), rays.mean(0), 8)
-        spread = channels_last(self.film.spread_out(each))
-        return self.film.picture(spread / 4 * self._better(moments.mean(-1), rays)[..., None])
+        each = np.moveaxis(self._smooth([0, 2], [1, 3]), -1, 0)
+        each = self.film.spread_out(each * (1 / self.rows(self.rays)).sum(0) / 4)
+        found = self._clean(_quarter_squares(*self.pictures()[..., :3]))
+        return self.film.picture(np.moveaxis(each * _gain(found, each.mean(0)), 0, -1))
 
-    def samples(self) -> np.ndarray:
-        """Return the rays of each pixel, [H, W], without the border."""
-        return self._inside(self.rows(self.rays).sum(0))
+    def _decisive(self, first: list[int], second: list[int]) -> np.ndarray:
+        """Return the variance of a pixel times its rays, [H, W], as two sets of pictures have it."""
+        means, inverse = [], np.zeros(self.film.shape)
+        for which in (first, second):
+            rays = self.rows(self._traced)[which].sum(0)
+            means.append(self._total[which].sum(0) / rays[..., None])
+            inverse += 1 / rays
+        gain = _gain(_quarter_squares(*means), self._moments(first + second)[0].mean(-1) * inverse / 4)
+        return self._smooth(first, second).mean(-1) * gain * self.film.averaging
+
+    def _smooth(self, first: list[int], second: list[int]) -> np.ndarray:
+        """Return the variance of a ray's value in each channel, [H, W, 3], by two sets of pictures.
+
+        Pixels that met no rare bright ray look quiet. So each borrows from its neighbours, and from as many
+        as make what one set says most likely by what the other says.
+        """
+        each, counts = zip(*(self._moments(which) for which in (first, second)), strict=True)
+        both, rays = np.stack([v.mean(-1) for v in each]), np.stack(counts)
+        tiny = 1e-6 * both.mean() + 1e-30
+        step = max(1, math.isqrt(both[0].size // _JUDGES))
+        some = (..., slice(None, None, step), slice(None, None, step))
+        other = both[::-1][some] + tiny
+        widths = {width: window_means(both, width)[some] for width in {_REGION, *(w for w, _ in _WINDOWS)}}
+
+        def unlikely(candidate: tuple[int, float, float]) -> float:
+            width, worth, floor = candidate
+            expected = _drawn(both[some], widths[width], rays[some], worth)
+            expected = expected + floor * (widths[_REGION] - expected) + tiny
+            return float(np.mean(np.log(expected) + other / expected))
+
+        windows = [w for w in _WINDOWS if w[0] >= self.film.reach] or _WINDOWS[-1:]
+        width, worth, floor = min(((*w, floor) for w in windows for floor in _FLOORS), key=unlikely)
+        moments, total = self._moments(first + second)
+        values = np.moveaxis(moments, -1, 0)
+        smooth = _drawn(values, window_means(values, width), total, worth)
+        return np.moveaxis(smooth + floor * (window_means(values, _REGION) - smooth), 0, -1)
+
+    def _moments(self, which: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variance of a ray's value in each channel, [H, W, 3], and the rays, [H, W]."""
+        rays = self.rows(self._traced)[which].sum(0)
+        total, square = (v[which].sum(0) for v in (self._total, self._square))
+        variance = (square - total**2 / rays[..., None]) / np.maximum(rays - 1, 1)[..., None]
+        return np.maximum(variance, 0), rays
+
+    def _tail(self, which: list[int]) -> float:
+        """Return the Pareto shape of what single rays contribute to the pixels of some pictures.
+
+        Of each pixel the brightest ray is known; the others are taken for alike, given all squares.
+        """
+        rays = self.rows(self._traced)[which]
+        mean = (self._total[which] / rays[..., None]).mean(-1)
+        squares = (self._square[which] - self._total[which] ** 2 / rays[..., None]).mean(-1)
+        most = np.maximum(self._peak[which] - mean, 0)
+        others = np.sqrt(np.maximum(squares - most**2, 0) / np.maximum(rays - 1, 1))
+        values, counts = np.stack([most, others]) / rays, np.stack([np.ones_like(rays), rays - 1])
+        return tail_shape(values.ravel(), counts.ravel())
+
+    def _clean(self, values: np.ndarray) -> np.ndarray:
+        """Return values [H, W] with 0 where radiance that is no number, or too large for one, was met."""
+        return np.where(np.isfinite(values) & ~dilated(self._bad, self.film.reach), values, 0)
 
     # ------------------------------------------- Sharing --------------------------------------------
 
-    def next(self, most: float, target: float | None) -> np.ndarray | None:
-        """Return numbers of further groups, [2, pixels]; None where ``most`` leaves no room.
+    def next(self, most: float, rays: float, target: float | None) -> np.ndarray | None:
+        """Return numbers of further groups; None where ``most`` leaves no room.
 
-        Enough for an RMSE of ``target``, if that takes a mean of no more than ``most`` rays a pixel in all.
+        The scouts decide, until a mean of ``most`` rays a pixel is enough for an RMSE of ``target``, or for all
+        of the ``rays`` to spend. The next round is the last then, and each half's part in it is decided by the
+        other half, too: it knows more, and what it knows cannot come back to it any more.
         """
-        deviation, most = np.sqrt(self._decisive()), most * self.film.pixels
+        deviation, room = (
+            np.sqrt(self._decisive([2], [3])).ravel(),
+            most * self.film.pixels - self._traced.sum(),
+        )
+        self.last = most >= rays
         if target is not None:
-            wanted = _quiet(self.rays, deviation, (target / self.error().rmse) ** 2)
-            least = self._step * self.rays.sum()
-            if least <= wanted.sum() <= most:
-                return self._groups(wanted)
-            if wanted.sum() < least:
-                most, self._step = min(most, least), 1.5 * self._step  # that it was short may be by chance
-        return self._within(most, deviation)
+            self.last = self.last or GROUP * self._due(0, deviation, target).sum() <= room / 2
+        if not self.last:
+            half = self._share(0, deviation, room / 2 / (1 + SCOUTING), None)
+            due = 2 * SCOUTING * (self.rays[0] + GROUP * half) - self._traced[SCOUTS].sum(0)
+            scout = self._whole(due / 2)
+            return np.stack([half, half, scout, scout])
+        room = rays * self.film.pixels - self._traced.sum()
+        if room < (LEAST_GROWTH - 1) * self._traced.sum():
+            return None
+        views = [np.sqrt(self._decisive([1 - half], SCOUTS)).ravel() for half in (0, 1)]
+        halves = [self._share(half, views[half], room / 2, target) for half in (0, 1)]
+        return np.stack([*halves, *np.zeros_like(halves)])
 
-    def _within(self, most: float, deviation: np.ndarray) -> np.ndarray | None:
-        """Return numbers of groups that make no more than so many rays in all, and not many fewer.
+    def _due(self, half: int, deviation: np.ndarray, target: float) -> np.ndarray:
+        """Return the groups that take the picture to a target, if the other half is like this one."""
+        have = self.rays[half]
+        now = float(np.mean(np.square(deviation) / (2 * have)))
+        return self._whole(_quiet(have, deviation, min(1, target**2 / now)) - have)
 
-        Rounding, and pixels under the filter, make of a budget more or less than it is. None where it makes
-        too few to be worth a round.
-        """
-        have, best, spent = float(self.rays.sum()), None, 0.0
-        room = budget = most - have
+    def _share(self, half: int, deviation: np.ndarray, room: float, target: float | None) -> np.ndarray:
+        """Return groups for a half: what a target takes, or as many as make no more than so many rays, and not
+        many fewer: rounding, and pixels under the filter, make of a budget more or less than it is."""
+        if target is not None:
+            best = self._due(half, deviation, target)
+            if GROUP * self.widened(best[None]).sum() <= room:
+                return best
+        have, best, budget = self.rays[half], np.zeros(self.film.pixels, np.int64), room
         low, left, high, over = 0.0, room, room, 0.0  # budgets, and how far they are from filling the room
         for _ in range(6):  # the Illinois method: what stays is counted for half
-            groups = self._groups(_water(self.rays, deviation, have + budget))
-            cost = self.cost(groups)
+            groups = self._whole(_water(have, deviation, have.sum() + budget) - have)
+            cost = GROUP * self.widened(groups[None]).sum()
             if cost <= room:
-                best, spent, low, left, over = groups, cost, budget, room - cost, over / 2
+                best, low, left, over = groups, budget, room - cost, over / 2
             else:
                 high, left, over = budget, left / 2, cost - room
-            if spent >= 0.95 * room or low == high:
+            if 0.95 * room <= cost <= room or low == high:
                 break
             budget = low + 0.98 * (high - low) * left / (left + over)
-        return best if spent >= (LEAST_GROWTH - 1) * have else None
+        return best
 
-    def _groups(self, due: np.ndarray) -> np.ndarray:
-        """Return whole numbers of groups for what is due; one at least."""
-        missing, rounding = (due - self.rays) / GROUP, self._rounding()
-        groups = np.floor(missing + rounding)
-        if not groups.any():
-            groups = (missing > 0) & (rounding >= rounding.max())
-        return np.asarray(groups, np.int64)
+    def _whole(self, rays: np.ndarray) -> np.ndarray:
+        """Return whole numbers of groups for numbers of rays."""
+        return np.asarray(np.floor(np.maximum(rays, 0) / GROUP + self._rounding()), np.int64)
 
     def _rounding(self) -> np.ndarray:
         """Return random numbers to add before rounding down; alike in a tile, where a filter has rays traced
         around all pixels that need some."""
         tile = TILE if self.film.reach else 1
         rows, columns = (np.arange(n) // tile for n in self.film.shape)
-        random = np.random.default_rng((self._seed, int(self.rays.sum())))
+        random = np.random.default_rng((self._seed, int(self._traced.sum())))
         return random.random((rows[-1] + 1, columns[-1] + 1))[rows[:, None], columns].ravel()
-
-    def _decisive(self) -> np.ndarray:
-        """Return the variance of a ray's value that decides in each half, [2, pixels]: the other half's."""
-        moments, rays = self._moments()
-        moments = moments.mean(-1)
-        measured = moments * self._better(moments, rays)
-        mean = measured.mean((1, 2))[:, None, None]
-        candidates = [w for w in _WINDOWS if w[0] >= self.film.reach] or _WINDOWS[-1:]
-        around = {width: window_means(measured, width) for width, _ in candidates}
-        step = max(1, math.isqrt(measured[0].size // _JUDGES))
-        some = (slice(None), slice(None, None, step), slice(None, None, step))
-        other = measured[::-1][some]
-
-        def cost(smooth: np.ndarray, floor: float) -> float:
-            deviation = np.sqrt((1 - floor) * smooth + (floor * mean + 1e-30))
-            return float(((other / deviation).mean((1, 2)) * deviation.mean((1, 2))).sum())
-
-        smooth = {w: _smoothed(measured[some], around[w[0]][some], rays[some], w[1]) for w in candidates}
-        width, worth = best = min(candidates, key=lambda w: cost(smooth[w], _FLOORS[1]))
-        floor = min(_FLOORS, key=lambda floor: cost(smooth[best], floor))
-        variance = _smoothed(measured, around[width], rays, worth)
-        return ((1 - floor) * variance + (floor * mean + 1e-30))[::-1].reshape(HALVES, -1)
-
-    def _moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the variance of a ray in each half and channel, [2, H, W, 3], and its rays, [2, H, W]."""
-        rays = self.rows(self.rays)
-        variance = (self._square - self._total**2 / rays[..., None]) / np.maximum(rays - 1, 1)[..., None]
-        return np.float32(np.maximum(variance, 0)), np.float32(rays)
-
-    def _better(self, moments: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        """Return the squared error over that of independent rays whose value has this variance, [H, W].
-
-        Below 1 where rays are stratified, and where a filter averages pixels.
-        """
-        found = np.float32(self._squared_error())
-        expected = self.film.spread_out((moments / rays).sum(0)) / 4
-        few = 0.1  # windows without noise take the picture's ratio
-        found, expected = (window_means(v, _REGION) + few * v.mean() for v in (found, expected))
-        return np.float32(found / np.maximum(expected, 1e-30))
 
     def _inside(self, values: np.ndarray) -> np.ndarray:
         return self.film.picture(values[..., None])[..., 0]
+
+
+def _gain(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Return squared errors over those expected of independent rays, [H, W], in windows.
+
+    Below 1 where rays are stratified, and where a filter averages pixels.
+    """
+    few = 0.1  # windows without noise take the picture's ratio
+    found, expected = (window_means(v, _REGION) + few * v.mean() for v in (found, expected))
+    return found / np.maximum(expected, 1e-30)
+
+
+def _drawn(variance: np.ndarray, around: np.ndarray, rays: np.ndarray, worth: float) -> np.ndarray:
+    """Return variances [..., H, W] drawn towards their means in windows, the less the more rays."""
+    share = 1.0 if math.isinf(worth) else worth / (rays + worth)
+    return np.asarray(variance + share * (around - variance))
 
 
 def _quarter_squares(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -224,12 +285,6 @@ def _blocks(values: np.ndarray, side: int) -> np.ndarray:
     for axis, size in enumerate(values.shape):
         values = np.add.reduceat(values, np.arange(0, size, side), axis)
     return values
-
-
-def _smoothed(variance: np.ndarray, around: np.ndarray, rays: np.ndarray, worth: float) -> np.ndarray:
-    """Return variances [..., H, W, ...] drawn towards their means in windows, the less the more rays."""
-    share = 1.0 if math.isinf(worth) else worth / (rays + worth)
-    return np.asarray(variance + share * (around - variance))
 
 
 def _water(have: np.ndarray, shape: np.ndarray, amount: float) -> np.ndarray:

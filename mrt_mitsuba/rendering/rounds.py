@@ -13,7 +13,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from mrt_mitsuba.errors import MrtWarning
-from mrt_mitsuba.output.error import ErrorEstimate, Round, RoundPicture
+from mrt_mitsuba.output.error import DOUBTFUL, ErrorEstimate, Round, RoundPicture
 from mrt_mitsuba.rendering.progress import Advance
 
 log = logging.getLogger(__name__)
@@ -21,8 +21,8 @@ log = logging.getLogger(__name__)
 # Times the rays there are may be there after another round: the error is known better then. The first
 # doubling of a lattice takes up to 4.2
 GROWTH = 4.25
-MARGIN = 0.97  # of the target to aim at: an estimate is as often too low as too high
-SURE = 2.0  # times the target, the upper end of the error's interval may be
+MARGIN = 0.95  # of the target to aim at: a forecast is as often too low as too high
+MORE = 2  # times the rays are doubled where the tail of their values is in doubt
 LEAST_GROWTH = 1.05  # fewer rays, and a round costs more than it brings
 
 OnRound = Callable[[RoundPicture], object]
@@ -46,14 +46,22 @@ class Refinable(Protocol[Chosen]):
     def first(self) -> Chosen:
         """Return what to trace in the first round."""
 
-    def next(self, most: float, target: float | None) -> Chosen | None:
-        """Return what to trace for an error, or for a mean of at most so many rays a pixel in all."""
+    last: bool  #: was the last round decided?
+
+    def next(self, most: float, rays: float, target: float | None) -> Chosen | None:
+        """Return what to trace for an error, or for a mean of at most so many rays a pixel in all.
+
+        ``most``: after this round, unless it is the last; ``rays``: after the last.
+        """
 
     def cost(self, chosen: Chosen) -> int:
         """Return the number of rays that tracing takes."""
 
     def trace(self, chosen: Chosen, advance: Advance) -> None:
         """Trace and add rays."""
+
+    def forecast(self) -> tuple[float, float]:
+        """Return the expected error and the shape of its tail, by rays that are not in the picture."""
 
     def error(self) -> ErrorEstimate:
         """Return the estimated error of the picture."""
@@ -68,6 +76,7 @@ def run_rounds(picture: Refinable[Chosen], pixels: int, goal: Goal, stage: Stage
     Warns of a target that is not reached.
     """
     start, done, rays = time.perf_counter(), list[Round](), 0
+    doubled: list[float] = []  # rays a pixel where a heavy tail had more rays traced
     chosen: Chosen | None = picture.first()
     while chosen is not None:
         cost = picture.cost(chosen)
@@ -78,26 +87,30 @@ def run_rounds(picture: Refinable[Chosen], pixels: int, goal: Goal, stage: Stage
         done.append(Round(time.perf_counter() - start, rays / pixels, error.rmse))
         log.info("round %d: %.1f rays a pixel, error %.3g", len(done), done[-1].spp, done[-1].rmse)
         if goal.on_round is not None:
-            now, maps = done[-1], (np.asarray(values, np.float32) for values in picture.maps())
+            now, maps = done[-1], (np.array(values, np.float32) for values in picture.maps())
             if goal.on_round(RoundPicture(now.seconds, now.spp, now.rmse, *maps)) is False:
                 return done
-        chosen = _next(picture, goal, done[-1], error)
+        chosen = _next(picture, goal, done[-1], doubled)
     _warn_unless_reached(goal, done[-1])
     return done
 
 
-def _next(picture: Refinable[Chosen], goal: Goal, now: Round, error: ErrorEstimate) -> Chosen | None:
-    target = goal.target or 0.0
-    if error.rmse <= target and error.high <= SURE * target:
+def _next(picture: Refinable[Chosen], goal: Goal, now: Round, doubled: list[float]) -> Chosen | None:
+    """Return what to trace next: for the target, until a forecast has it; then twice more, if in doubt."""
+    if picture.last:
         return None
+    target, (rmse, tail) = goal.target or 0.0, picture.forecast()
     most = min(goal.rays, GROWTH * now.spp)
     if goal.seconds is not None:
         most = min(most, now.spp * goal.seconds / now.seconds)
     if most < LEAST_GROWTH * now.spp:
         return None
-    if error.rmse <= target:  # by chance, perhaps
-        return picture.next(min(most, 2 * now.spp), None)
-    return picture.next(most, None if goal.target is None else MARGIN * target)
+    if rmse > target:
+        return picture.next(most, goal.rays, goal.target and MARGIN * target)
+    if tail <= DOUBTFUL or len(doubled) == MORE:
+        return None
+    doubled.append(now.spp)
+    return picture.next(min(most, 2 * now.spp), goal.rays, None)
 
 
 def _warn_unless_reached(goal: Goal, now: Round) -> None:
