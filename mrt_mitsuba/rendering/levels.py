@@ -79,6 +79,10 @@ class Levels:
             self._rays.flat[pixels] += aa**2
             advance(aa**2 * len(pixels))
 
+    def unfit(self) -> str:
+        """Return nothing."""
+        return ""
+
     def forecast(self) -> tuple[float, float]:
         """Return the error, and no tail: nothing is random."""
         return self.error().rmse, 0.0

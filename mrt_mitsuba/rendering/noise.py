@@ -27,7 +27,9 @@ from mrt_mitsuba.rendering.windows import dilated, window_means
 
 PICTURES = 4
 HALVES, SCOUTS = [0, 1], [2, 3]
-SCOUTING = 1 / 15  # of the rays of a pixel that are averaged, so many go to scouts
+# Rays of scouts over those that are averaged: in the long run, and where rare rays may rule
+SCOUTING, WILD = 1 / 15, 1 / 4
+SUSPECT = 0.5  # shape of a tail where they may
 TILE = 16  # pixels, under a filter
 GROUP = 2  # rays that are traced together; each picture begins with one group to a pixel
 
@@ -55,7 +57,7 @@ class Halves(Stack):
         self._traced = np.zeros((PICTURES, film.pixels))
         self._total, self._square = np.zeros((2, PICTURES, *film.shape, 3))
         self._peak = np.zeros((PICTURES, *film.shape))
-        self._bad = np.zeros(film.shape, bool)
+        self._bad, self._unfit = np.zeros(film.shape, bool), 0.0
 
     # ------------------------------------------- Rounds ---------------------------------------------
 
@@ -75,13 +77,24 @@ class Halves(Stack):
             groups, self._seed, pictures=PICTURES, progressive=True, moments=True, advance=advance
         )
         bad = ~np.isfinite(exposed.square).all(-1)
-        self._bad |= bad.any(0)
+        if bad.any():
+            self._bad |= bad.any(0)
+            self._unfit = float(exposed.total[bad].max())
         self._traced += exposed.rays
         self._total += np.where(bad[..., None], 0, exposed.total)
         self._square += np.where(bad[..., None], 0, exposed.square)
         np.maximum(self._peak, np.where(bad, 0, exposed.peak[..., 0]), out=self._peak)
         sums, weights, rays = (v[:2] for v in (exposed.sums, exposed.weights, exposed.rays))
-        self.add(replace(exposed, sums=sums, weights=weights, rays=rays), chosen[:2] > 0)
+        with np.errstate(invalid="ignore"):
+            self.add(replace(exposed, sums=sums, weights=weights, rays=rays), chosen[:2] > 0)
+
+    def unfit(self) -> str:
+        """Return what radiance has no square in float32, and where; nothing if all has."""
+        bad = np.argwhere(self._inside(self._bad))
+        if not len(bad):
+            return ""
+        where = f"{len(bad)} pixels, the first at row {bad[0, 0]}, column {bad[0, 1]}"
+        return f"radiance of {self._unfit:.3g} was met in {where}: they are left out of the error"
 
     def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the picture [H, W, 3], and the standard error and the rays of each pixel, [H, W]."""
@@ -191,30 +204,27 @@ class Halves(Stack):
     # ------------------------------------------- Sharing --------------------------------------------
 
     def next(self, most: float, rays: float, target: float | None) -> np.ndarray | None:
-        """Return numbers of further groups; None where ``most`` leaves no room.
+        """Return numbers of further groups; None where ``rays`` leave no room.
 
-        The scouts decide, until a mean of ``most`` rays a pixel is enough for an RMSE of ``target``, or for all
-        of the ``rays`` to spend. The next round is the last then, and each half's part in it is decided by the
-        other half, too: it knows more, and what it knows cannot come back to it any more.
+        The scouts decide until ``most`` rays a pixel are enough for an RMSE of ``target``, or are all of the
+        ``rays`` to spend. The next round is the last then, and what a half gets in it is decided by the other
+        half, too: that knows more, and what it makes of this half's share cannot come back to it any more.
         """
-        deviation, room = (
-            np.sqrt(self._decisive([2], [3])).ravel(),
-            most * self.film.pixels - self._traced.sum(),
-        )
+        deviation, traced = np.sqrt(self._decisive([2], [3])).ravel(), self._traced.sum()
+        room = most * self.film.pixels - traced
         self.last = most >= rays
         if target is not None:
             self.last = self.last or GROUP * self._due(0, deviation, target).sum() <= room / 2
         if not self.last:
-            half = self._share(0, deviation, room / 2 / (1 + SCOUTING), None)
-            due = 2 * SCOUTING * (self.rays[0] + GROUP * half) - self._traced[SCOUTS].sum(0)
-            scout = self._whole(due / 2)
-            return np.stack([half, half, scout, scout])
-        room = rays * self.film.pixels - self._traced.sum()
-        if room < (LEAST_GROWTH - 1) * self._traced.sum():
-            return None
-        views = [np.sqrt(self._decisive([1 - half], SCOUTS)).ravel() for half in (0, 1)]
-        halves = [self._share(half, views[half], room / 2, target) for half in (0, 1)]
-        return np.stack([*halves, *np.zeros_like(halves)])
+            scouting = SCOUTING if self._tail(SCOUTS) < SUSPECT else WILD
+            half = self._share(0, deviation, room / 2 / (1 + scouting), None)
+            due = scouting * (self.rays[0] + GROUP * half) - self._traced[2]
+            return np.stack([half, half, *2 * [self._whole(due)]])
+        room = rays * self.film.pixels - traced
+        views = [np.sqrt(self._decisive([1 - half], SCOUTS)).ravel() for half in HALVES]
+        halves = [self._share(half, views[half], room / 2, target) for half in HALVES]
+        groups = np.stack([*halves, *np.zeros_like(halves)])
+        return groups if self.cost(groups) >= (LEAST_GROWTH - 1) * traced or target else None
 
     def _due(self, half: int, deviation: np.ndarray, target: float) -> np.ndarray:
         """Return the groups that take the picture to a target, if the other half is like this one."""
@@ -223,8 +233,8 @@ class Halves(Stack):
         return self._whole(_quiet(have, deviation, min(1, target**2 / now)) - have)
 
     def _share(self, half: int, deviation: np.ndarray, room: float, target: float | None) -> np.ndarray:
-        """Return groups for a half: what a target takes, or as many as make no more than so many rays, and not
-        many fewer: rounding, and pixels under the filter, make of a budget more or less than it is."""
+        """Return groups for a half: what a target takes, or as many as make nearly, but no more than, so many
+        rays: rounding, and pixels under the filter, make of a budget more or less than it is."""
         if target is not None:
             best = self._due(half, deviation, target)
             if GROUP * self.widened(best[None]).sum() <= room:
@@ -277,7 +287,8 @@ def _drawn(variance: np.ndarray, around: np.ndarray, rays: np.ndarray, worth: fl
 
 def _quarter_squares(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return a quarter of the squared difference of pictures, mean of colours, [H, W]."""
-    return np.asarray(np.square(first - second, dtype=np.float64).mean(-1) / 4)
+    with np.errstate(invalid="ignore", over="ignore"):  # what is no number is left out later
+        return np.asarray(np.square(first - second, dtype=np.float64).mean(-1) / 4)
 
 
 def _blocks(values: np.ndarray, side: int) -> np.ndarray:

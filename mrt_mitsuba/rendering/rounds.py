@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 # doubling of a lattice takes up to 4.2
 GROWTH = 4.25
 MARGIN = 0.95  # of the target to aim at: a forecast is as often too low as too high
+# Rays that a target takes at least, in the whole picture or a pixel: fewer do not show what is rare
+LEAST, LEAST_MEAN = 2**17, 64
 MORE = 2  # times the rays are doubled where the tail of their values is in doubt
 LEAST_GROWTH = 1.05  # fewer rays, and a round costs more than it brings
 
@@ -66,6 +68,9 @@ class Refinable(Protocol[Chosen]):
     def error(self) -> ErrorEstimate:
         """Return the estimated error of the picture."""
 
+    def unfit(self) -> str:
+        """Return what makes values unfit to estimate an error from, and where; nothing if none does."""
+
     def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the picture [H, W, 3], and the standard error and the rays of each pixel, [H, W]."""
 
@@ -73,10 +78,10 @@ class Refinable(Protocol[Chosen]):
 def run_rounds(picture: Refinable[Chosen], pixels: int, goal: Goal, stage: Stage) -> list[Round]:
     """Trace rounds until the goal is reached or ``on_round`` returns False; return what each has found.
 
-    Warns of a target that is not reached.
+    Warns of a target that is not reached, and of an error that cannot be trusted.
     """
     start, done, rays = time.perf_counter(), list[Round](), 0
-    doubled: list[float] = []  # rays a pixel where a heavy tail had more rays traced
+    least, doubled = min(goal.rays, LEAST_MEAN, LEAST / pixels) if goal.target else 0, 0
     chosen: Chosen | None = picture.first()
     while chosen is not None:
         cost = picture.cost(chosen)
@@ -84,46 +89,53 @@ def run_rounds(picture: Refinable[Chosen], pixels: int, goal: Goal, stage: Stage
         with stage("rounds", cost, _message(done, goal, cost / pixels)) as advance:
             picture.trace(chosen, advance)
         error = picture.error()
-        done.append(Round(time.perf_counter() - start, rays / pixels, error.rmse))
-        log.info("round %d: %.1f rays a pixel, error %.3g", len(done), done[-1].spp, done[-1].rmse)
+        now = Round(time.perf_counter() - start, rays / pixels, error.rmse)
+        done.append(now)
+        log.info("round %d: %.1f rays a pixel, error %.3g", len(done), now.spp, now.rmse)
         if goal.on_round is not None:
-            now, maps = done[-1], (np.array(values, np.float32) for values in picture.maps())
+            maps = (np.array(values, np.float32) for values in picture.maps())  # its own, to write into
             if goal.on_round(RoundPicture(now.seconds, now.spp, now.rmse, *maps)) is False:
                 return done
-        chosen = _next(picture, goal, done[-1], doubled)
-    _warn_unless_reached(goal, done[-1])
+        most = min(goal.rays, GROWTH * now.spp)
+        if goal.seconds is not None:
+            most = min(most, now.spp * goal.seconds / now.seconds)
+        forecast, tail = picture.forecast()
+        if picture.last or most < LEAST_GROWTH * now.spp:
+            break
+        if now.spp < least / LEAST_GROWTH:
+            chosen = picture.next(min(most, least), goal.rays, None)
+        elif goal.target is None or forecast > goal.target:
+            chosen = picture.next(most, goal.rays, goal.target and MARGIN * goal.target)
+        elif tail > DOUBTFUL and doubled < MORE:
+            chosen, doubled = picture.next(min(most, 2 * now.spp), goal.rays, None), doubled + 1
+        else:
+            break
+    _warn(goal, done[-1], error, picture.unfit())
     return done
 
 
-def _next(picture: Refinable[Chosen], goal: Goal, now: Round, doubled: list[float]) -> Chosen | None:
-    """Return what to trace next: for the target, until a forecast has it; then twice more, if in doubt."""
-    if picture.last:
-        return None
-    target, (rmse, tail) = goal.target or 0.0, picture.forecast()
-    most = min(goal.rays, GROWTH * now.spp)
-    if goal.seconds is not None:
-        most = min(most, now.spp * goal.seconds / now.seconds)
-    if most < LEAST_GROWTH * now.spp:
-        return None
-    if rmse > target:
-        return picture.next(most, goal.rays, goal.target and MARGIN * target)
-    if tail <= DOUBTFUL or len(doubled) == MORE:
-        return None
-    doubled.append(now.spp)
-    return picture.next(min(most, 2 * now.spp), goal.rays, None)
-
-
-def _warn_unless_reached(goal: Goal, now: Round) -> None:
-    if goal.target is None or now.rmse <= goal.target:
-        return
-    late = goal.seconds is not None and now.spp * goal.seconds < LEAST_GROWTH * now.spp * now.seconds
-    limit = f"maxseconds={goal.seconds:g}" if late else f"maxspp={goal.rays}"
-    warnings.warn(
-        f"target={goal.target:g} is not reached: {limit} ends the render at an error of {now.rmse:.3g}, "
-        f"after {now.spp:.1f} rays a pixel and {now.seconds:.1f} s",
-        MrtWarning,
-        stacklevel=8,  # the caller of render
-    )
+def _warn(goal: Goal, now: Round, error: ErrorEstimate, unfit: str) -> None:
+    """Warn of all that makes the error another than was asked for, or one not to be trusted."""
+    found = [unfit] if unfit else []
+    if error.tail > DOUBTFUL:
+        found.append(
+            f"a few rays rule the error of {error.rmse:.3g}, and it may be larger by any amount: the tail of "
+            f"what rays contribute has a Pareto shape of {error.tail:.2g}, above {DOUBTFUL}. What helps: "
+            "another integrator, larger lamps or rougher materials where such rays come from, more rays (spp, maxspp)"
+        )
+    if goal.target is not None and now.rmse > goal.target:
+        spent = f"an error of {now.rmse:.3g}, after {now.spp:.1f} rays a pixel and {now.seconds:.1f} s"
+        late = goal.seconds is not None and now.spp * goal.seconds < LEAST_GROWTH * now.spp * now.seconds
+        if late or now.spp * LEAST_GROWTH > goal.rays:
+            limit = f"maxseconds={goal.seconds:g}" if late else f"maxspp={goal.rays}"
+            found.append(f"target={goal.target:g} is not reached: {limit} ends the render at {spent}")
+        elif error.low > goal.target:
+            found.append(
+                f"target={goal.target:g} is missed by {spent}: rays that are not in the picture decide when "
+                "to stop, and met less noise. A smaller target helps"
+            )
+    if found:
+        warnings.warn("; ".join(found), MrtWarning, stacklevel=8)  # the caller of render
 
 
 def _message(done: list[Round], goal: Goal, more: float) -> str:
