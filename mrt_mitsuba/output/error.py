@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # Above this Pareto shape, a variance is unknown: rays not met yet may rule it (A. Vehtari and others, 2024)
 DOUBTFUL = 0.7
-RULING = 0.25  # share of the squares that the largest have at least, if they are that heavy
+FEWEST, MANY = 10, 25  # values that tell a shape; those that are many to share half of the squares
 
 
 @dataclass(frozen=True)
@@ -60,23 +60,21 @@ class RoundPicture(Round):
 def tail_shape(values: np.ndarray, counts: np.ndarray) -> float:
     """Return the Pareto shape k of the largest of some values, each there so many times.
 
-    How many are the largest is given by A. Vehtari and others, "Pareto smoothed importance sampling" (2024).
-    A few rare ones are lost among so many; so it is the shape of the largest 1/16 or 1/4 where that is more.
-    Values without a variance leave most of the sum of squares to the largest. Where those have little of it, a
-    shape above 1/2 is that of a mixture (some pixels are noisier than others), and says nothing.
+    The largest are twice as many as make up half of the squares, or as many as A. Vehtari and others take
+    ("Pareto smoothed importance sampling", 2024), if that is less: of more, most would not matter. A tail with a
+    shape above 1/2 leaves half of the squares to a few; where it takes many, what looks like one is a mixture.
     """
     count, total = int(counts.sum()), float((counts * values**2).sum())
-    size = int(min(0.2 * count, 3 * math.sqrt(count)))
+    size = max(int(min(0.2 * count, 3 * math.sqrt(count))), 1)
     order = np.argsort(values)[::-1]
     order = order[: np.searchsorted(np.cumsum(counts[order]), size + 1) + 1]
     largest = np.repeat(values[order], counts[order].astype(np.int64))[: size + 1]
-    found = [0.0]
-    for n in (size // 16, size // 4, size):
-        if n >= 10 and largest[0] > largest[n]:
-            ruling = float(np.square(largest[:n]).sum()) > RULING * total
-            shape = _shape(largest[n - 1 :: -1] - largest[n])
-            found.append(shape if ruling else min(shape, 0.5))
-    return max(found)
+    half = int(np.searchsorted(np.cumsum(np.square(largest)), total / 2)) + 1
+    size = min(max(2 * half, FEWEST), len(largest) - 1)
+    if size < FEWEST or largest[0] <= largest[size]:
+        return 0.0
+    shape = _shape(largest[size - 1 :: -1] - largest[size])
+    return shape if half <= MANY else min(shape, 0.5)
 
 
 def _shape(excess: np.ndarray) -> float:

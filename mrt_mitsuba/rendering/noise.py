@@ -119,7 +119,7 @@ class Halves(Stack):
         halves, correlation = self.film.picture(self.pictures()[..., :3]), self.film.correlation
         if self._blurred is not None:
             halves = np.stack([self._blurred(half) for half in halves])
-        squares = self._clean(_quarter_squares(*halves))
+        squares = np.where(self._inside(self._unknown), 0, _quarter_squares(*halves))
         mean = float(squares.mean())
         if mean == 0:
             return ErrorEstimate(0.0, 0.0, 0.0, 0.0)
@@ -137,7 +137,7 @@ class Halves(Stack):
         """Return the estimated variance of each channel in the picture, [H, W, 3], without the border."""
         each = np.moveaxis(self._smooth([0, 2], [1, 3]), -1, 0)
         each = self.film.spread_out(each * (1 / self.rows(self.rays)).sum(0) / 4)
-        found = self._clean(_quarter_squares(*self.pictures()[..., :3]))
+        found = np.where(self._unknown, 0, _quarter_squares(*self.pictures()[..., :3]))
         return self.film.picture(np.moveaxis(each * _gain(found, each.mean(0)), 0, -1))
 
     def _decisive(self, first: list[int], second: list[int]) -> np.ndarray:
@@ -197,9 +197,10 @@ class Halves(Stack):
         values, counts = np.stack([most, others]) / rays, np.stack([np.ones_like(rays), rays - 1])
         return tail_shape(values.ravel(), counts.ravel())
 
-    def _clean(self, values: np.ndarray) -> np.ndarray:
-        """Return values [H, W] with 0 where radiance that is no number, or too large for one, was met."""
-        return np.where(np.isfinite(values) & ~dilated(self._bad, self.film.reach), values, 0)
+    @property
+    def _unknown(self) -> np.ndarray:
+        """Where the picture is no number, or one that has no square, [H, W]."""
+        return dilated(self._bad, self.film.reach)
 
     # ------------------------------------------- Sharing --------------------------------------------
 

@@ -121,7 +121,7 @@ def _warn(goal: Goal, now: Round, error: ErrorEstimate, unfit: str) -> None:
         found.append(
             f"a few rays rule the error of {error.rmse:.3g}, and it may be larger by any amount: the tail of "
             f"what rays contribute has a Pareto shape of {error.tail:.2g}, above {DOUBTFUL}. What helps: "
-            "another integrator, larger lamps or rougher materials where such rays come from, more rays (spp, maxspp)"
+            "another integrator, larger lamps or rougher materials where such rays come from, or more rays"
         )
     if goal.target is not None and now.rmse > goal.target:
         spent = f"an error of {now.rmse:.3g}, after {now.spp:.1f} rays a pixel and {now.seconds:.1f} s"
