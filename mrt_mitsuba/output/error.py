@@ -61,8 +61,8 @@ def tail_shape(values: np.ndarray, counts: np.ndarray) -> float:
     """Return the Pareto shape k of the largest of some values, each there so many times.
 
     The largest are twice as many as make up half of the squares, or as many as A. Vehtari and others take
-    ("Pareto smoothed importance sampling", 2024), if that is less: of more, most would not matter. A tail with
-    a shape above 1/2 leaves half of the squares to a few; where it takes many, a mixture looks like one.
+    ("Pareto smoothed importance sampling", 2024), if that is less: of more, most would not matter. Shapes
+    above 1/2 leave half of the squares to a few; where it takes many, a mixture looks like such a tail.
     """
     count, total = int(counts.sum()), float((counts * values**2).sum())
     size = max(int(min(0.2 * count, 3 * math.sqrt(count))), 1)
