@@ -87,12 +87,17 @@ def run(study: Study, *, quick: bool) -> None:
             samplings[number] = found.points
         del trade, found  # the scenes with them
     if extent.repeats > 1:  # else a disturbance would decide
-        rows = [[number, *(best([points], e) for e in ANSWERS)] for number, points in samplings.items()]
-        if len(samplings) > 1:
-            rows.append(["all of these", *(best([*samplings.values()], e) for e in ANSWERS)])
-        columns = ["scene", *(f"RMSE at most {error:g}" for error in ANSWERS)]
-        note = "The fastest of all modes of anti-aliasing, amounts and lattices: aamode, aa, lattice."
-        study.table("choose", "Which settings for an error of x?", columns, rows, note, first=True)
+        choose(study, samplings)
+
+
+def choose(study: Study, samplings: Mapping[Any, Points]) -> None:
+    """Add which settings to take for which error: in each scene, and one that does for all of them."""
+    rows = [[number, *(best([points], e) for e in ANSWERS)] for number, points in samplings.items()]
+    if len(samplings) > 1:
+        rows.append(["all of these", *(best([*samplings.values()], e) for e in ANSWERS)])
+    columns = ["scene", *(f"RMSE at most {error:g}" for error in ANSWERS)]
+    note = "The fastest of all modes of anti-aliasing, amounts and lattices: aamode, aa, lattice."
+    study.table("choose", "Which settings for an error of x?", columns, rows, note, first=True)
 
 
 def best(scenes: Sequence[Points], error: float) -> str:

@@ -215,7 +215,7 @@ def other_ways(extent: Extent) -> Iterator[Pair]:
     ):
         make = partial(_left_out, scene, change, options)
         yield Pair(f"scene 0 without {what} / with", make, 1.05, _other_picture, INVISIBLE, why)
-    if usable_cores() > 1:
+    if usable_cores() > 1 and extent.repeats > 1:  # workers take seconds to start
         grid = {"material_0.alpha": np.linspace(0.02, 0.5, max(3, extent.growth // 10)).tolist()}
         make = partial(_sweep_and_loop, grid, {**size, "aa": 2})
         yield Pair("a sweep by two workers / a loop", make, 0.6)

@@ -34,33 +34,20 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
     if not found.points:
         return
     numbered = list(enumerate((point for points in found.families.values() for point in points), 1))
-    ahead = front([p for p in found.points.values() if p.resolved]) if found.repeats > 1 else []
-    caption = ["Down and to the left is better. Bars are 95 % intervals, numbers those of the table."]
-    if ahead:
-        names = "; ".join(f"{p.name} ({p.seconds:.2g} s, RMSE {p.rmse:.2g})" for p in ahead)
-        caption.append(f"Ahead of the others: {names}.")
-    caption += [f"Reference: {truth}."] if truth else []
-    own = f"about {found.reference_error:.2g}; no claim is made below twice that."
-    unknown = "not known: every RMSE has it in it."
-    caption.append(f"The RMSE of the reference itself is {own if found.reference_error else unknown}")
     figure = diagram(found, numbered)
-    study.plot(f"{prefix}diagram", f"{title}: work and precision", figure, " ".join(caption + found.verdicts))
+    study.plot(f"{prefix}diagram", f"{title}: work and precision", figure, _caption(found, truth))
     for number, (seconds, shown) in enumerate(found.strips, 1):
         text = "In sRGB; where a picture is cut, it is where the cases differ most."
         figure = strip_figure(found, shown)
         study.plot(f"{prefix}strip-{number}", f"{title}: what {seconds:.2g} s buy", figure, text)
     if found.errors:
-        rows = []
-        for curve in found.families:
-            times = [found.times[error][curve] for error in found.errors]
-            rows.append([curve, *(str(t) if np.isfinite(t.value) else "not reached" for t in times)])
         columns = ["curve", *(f"RMSE {error:g}" for error in found.errors)]
         note = (
             "With 95 % intervals. Between measured cases a curve is straight in logarithms; beyond them "
             "nothing is assumed."
         )
         what = f"{title}: seconds to an error"
-        study.table(f"{prefix}times", what, columns, rows, note, first=not name)
+        study.table(f"{prefix}times", what, columns, _times(found), note, first=not name)
     best = {p.name for p in front(list(found.points.values())) if found.repeats > 1}
     note = (
         "Seconds: medians of warm renders without loading the scene; cold: a first run. Errors in units of "
@@ -71,6 +58,29 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
     if found.failed:
         reasons = [list(item) for item in found.failed.items()]
         study.table(f"{prefix}failed", f"{title}: cases that failed", ["case", "why"], reasons)
+
+
+def _caption(found: Findings, truth: str) -> str:
+    """Return what the diagram shows, who is ahead, how good the reference is, and the verdicts."""
+    ahead = front([p for p in found.points.values() if p.resolved]) if found.repeats > 1 else []
+    caption = ["Down and to the left is better. Bars are 95 % intervals, numbers those of the table."]
+    if ahead:
+        names = "; ".join(f"{p.name} ({p.seconds:.2g} s, RMSE {p.rmse:.2g})" for p in ahead)
+        caption.append(f"Ahead of the others: {names}.")
+    caption += [f"Reference: {truth}."] if truth else []
+    own = f"about {found.reference_error:.2g}; no claim is made below twice that."
+    unknown = "not known: every RMSE has it in it."
+    caption.append(f"The RMSE of the reference itself is {own if found.reference_error else unknown}")
+    return " ".join(caption + found.verdicts)
+
+
+def _times(found: Findings) -> list[list[str]]:
+    """Return the seconds in which each curve comes down to each error."""
+    rows = []
+    for curve in found.families:
+        times = [found.times[error][curve] for error in found.errors]
+        rows.append([curve, *(str(t) if np.isfinite(t.value) else "not reached" for t in times)])
+    return rows
 
 
 def front(points: Sequence[Point]) -> list[Point]:

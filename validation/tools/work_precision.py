@@ -189,23 +189,37 @@ def _measure(
                     continue
                 cold.setdefault(name, result)
                 runs[name] += [result] if turn >= 0 else []
-    points = {}
-    for name in [name for name in cases if name not in failed]:
-        errors = [np.stack([r.image.ravel() - half.ravel() for r in runs[name]]) for half in halves]
-        gram = errors[0] @ errors[1].T / errors[0].shape[1]
-        points[name] = Point(
-            name=name,
-            options=cases[name],
-            times=np.array([_seconds(r) for r in runs[name]]),
-            gram=(gram + gram.T) / 2,
-            cold=_seconds(cold[name]),
-            compile=cold[name].timings.compile,
-            rays=dict(runs[name][0].rays),
-            image=runs[name][0].image,
-            difference=compare.compare(runs[name][0].image, (halves[0] + halves[1]) / 2),
-            reference_error=own_error,
-        )
-    return points, {name: failed[name] for name in cases if name in failed}
+    points = {
+        name: _point(name, cases[name], cold[name], runs[name], halves, own_error)
+        for name in cases
+        if name not in failed
+    }
+    return points, failed
+
+
+def _point(
+    name: str,
+    options: Options,
+    cold: Result,
+    runs: Sequence[Result],
+    halves: tuple[np.ndarray, np.ndarray],
+    own_error: float,
+) -> Point:
+    """Return the figures of a case."""
+    errors = [np.stack([r.image.ravel() - half.ravel() for r in runs]) for half in halves]
+    gram = errors[0] @ errors[1].T / errors[0].shape[1]
+    return Point(
+        name=name,
+        options=options,
+        times=np.array([_seconds(r) for r in runs]),
+        gram=(gram + gram.T) / 2,
+        cold=_seconds(cold),
+        compile=cold.timings.compile,
+        rays=dict(runs[0].rays),
+        image=runs[0].image,
+        difference=compare.compare(runs[0].image, (halves[0] + halves[1]) / 2),
+        reference_error=own_error,
+    )
 
 
 def _round_errors(points: Any, floor: float) -> list[float]:
