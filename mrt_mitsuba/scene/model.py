@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
@@ -150,39 +150,44 @@ class Scene:
         Raises ``SceneError`` for a camera, a sky or an object of numbers that make no sense.
         """
         _check(self)
-        materials = _Materials(lambda m: _mrt_bsdf(m, fresnel, self.texturing))
+        names: dict[Material, str] = {}  # one definition for each material that differs
+
+        def bsdf(material: Material) -> dict[str, str]:
+            return {"type": "ref", "id": names.setdefault(material, f"material_{len(names)}")}
+
         shapes: dict[str, Any] = {}
-        for kind in OBJECTS:
-            single, grouped = _split(getattr(self, f"{kind}s"))
+        for kind, plugin in OBJECTS.items():
+            things = getattr(self, f"{kind}s")
+            many = bool(things) and len(things) > MOST_SINGLE[plugin]
+            single = [thing for thing in things if not many or thing.material.texture is not None]
             for i, thing in enumerate(single):
-                shapes[f"{kind}_{i}"] = {**_shape(kind, thing), "bsdf": materials.reference(thing.material)}
-            if grouped:
-                shapes[f"{kind}s"] = _group(kind, grouped, materials, fresnel)
+                shapes[f"{kind}_{i}"] = {**_shape(kind, thing), "bsdf": bsdf(thing.material)}
+            if len(single) < len(things):
+                grouped = [thing for thing in things if thing.material.texture is None]
+                shape, own = _group(kind, grouped, fresnel)
+                shapes[f"{kind}s"] = {**shape, "bsdf": own or bsdf(grouped[0].material)}
         for i, p in enumerate(self.planes):
-            shapes[f"plane_{i}"] = {
-                "type": "mrt_plane",
-                "normal": list(p.normal),
-                "distance": float(p.distance),
-                "bsdf": materials.reference(p.material),
-            }
+            place = {"normal": list(p.normal), "distance": float(p.distance)}
+            shapes[f"plane_{i}"] = {"type": "mrt_plane", **place, "bsdf": bsdf(p.material)}
         for i, m in enumerate(self.meshes):
-            shapes[f"mesh_{i}"] = {**_mesh(m, self.texturing), "bsdf": materials.reference(m.material)}
+            shapes[f"mesh_{i}"] = {**_mesh(m, self.texturing), "bsdf": bsdf(m.material)}
         lights = {
             f"light_{i}": {
                 "type": "mrt_light",
-                "position": list(light.position),
-                "intensity": _rgb(light.color),
+                "position": list(each.position),
+                "intensity": _rgb(each.color),
             }
-            for i, light in enumerate(self.lights)
+            for i, each in enumerate(self.lights)
         }
         return {
             "type": "scene",
-            **_ray_options(self.meshes),
+            # by default, Embree lets rays through between slivers
+            **({"embree_use_robust_intersections": True} if self.meshes else {}),
             "integrator": {"type": "mrt_whitted"},
             "sensor": self._sensor(width, height),
             "sky": {"type": "constant", "radiance": _rgb(self.sky)},
             **lights,
-            **materials.definitions,
+            **{name: _mrt_bsdf(material, fresnel, self.texturing) for material, name in names.items()},
             **shapes,
         }
 
@@ -261,27 +266,6 @@ def _all_finite(values: Sequence[float], count: int) -> bool:
         return False
 
 
-class _Materials:
-    """BSDF definitions by material: one for each that differs, referred to by the shapes."""
-
-    def __init__(self, to_bsdf: Callable[[Material], dict[str, Any]]) -> None:
-        self._to_bsdf = to_bsdf
-        self._names: dict[Material, str] = {}
-        self.definitions: dict[str, Any] = {}
-
-    def reference(self, material: Material) -> dict[str, str]:
-        name = self._names.get(material)
-        if name is None:
-            name = self._names[material] = f"material_{len(self._names)}"
-            self.definitions[name] = self._to_bsdf(material)
-        return {"type": "ref", "id": name}
-
-
-def _ray_options(meshes: tuple[Mesh, ...]) -> dict[str, bool]:
-    """Return options of the scene for meshes: by default, Embree lets rays through between slivers."""
-    return {"embree_use_robust_intersections": True} if meshes else {}
-
-
 def _rgb(color: Color) -> dict[str, Any]:
     return {"type": "rgb", "value": list(color)}
 
@@ -290,18 +274,16 @@ def _rgb(color: Color) -> dict[str, Any]:
 OBJECTS: dict[str, type] = {"sphere": Sphere, "cone": Cone, "cylinder": Cylinder}
 
 
-def _parameters(thing: Any) -> dict[str, Any]:
-    return {f.name: getattr(thing, f.name) for f in fields(thing) if f.name != "material"}
-
-
 def _shape(kind: str, thing: Any) -> dict[str, Any]:
-    *points, (name, radius) = _parameters(thing).items()
+    *points, radius = (f.name for f in fields(thing) if f.name != "material")
+    places = {name: list(getattr(thing, name)) for name in points}
     plugin = "sphere" if kind == "sphere" else f"mrt_{kind}"
-    return {"type": plugin, **{key: list(point) for key, point in points}, name: float(radius)}
+    return {"type": plugin, **places, radius: float(getattr(thing, radius))}
 
 
 def _numbers(thing: Any) -> tuple[float, ...]:
-    *points, radius = _parameters(thing).values()
+    """Return the coordinates of an object's points, and its radius."""
+    *points, radius = (getattr(thing, f.name) for f in fields(thing) if f.name != "material")
     return (*(x for point in points for x in point), radius)
 
 
@@ -311,29 +293,16 @@ def _numbers(thing: Any) -> tuple[float, ...]:
 MOST_SINGLE = dict.fromkeys(OBJECTS.values(), 100) | {Sphere: 1000}
 
 
-def _split(objects: tuple) -> tuple[tuple, tuple]:
-    """Return objects that become single shapes and those for a group; textures need the former."""
-    if not objects or len(objects) <= MOST_SINGLE[type(objects[0])]:
-        return objects, ()
-    return (
-        tuple(o for o in objects if o.material.texture is not None),
-        tuple(o for o in objects if o.material.texture is None),
-    )
-
-
-def _group(kind: str, objects: tuple, materials: _Materials, fresnel: str) -> dict[str, Any]:
-    """Return one shape of many objects, with one BSDF that looks up values by object if they differ."""
+def _group(kind: str, objects: list, fresnel: str) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """Return one shape of many objects, and a BSDF that looks up values by object if they differ."""
     import mitsuba as mi
     import numpy as np
 
-    shape = {
-        "type": "mrt_group",
-        "kind": kind,
-        "numbers": mi.Bitmap(np.array([_numbers(o) for o in objects], np.float32)),
-    }
+    numbers = mi.Bitmap(np.array([_numbers(o) for o in objects], np.float32))
+    shape = {"type": "mrt_group", "kind": kind, "numbers": numbers}
     own = [o.material for o in objects]
     if len(set(own)) == 1:
-        return {**shape, "bsdf": materials.reference(own[0])}
+        return shape, None
     columns = {
         "alpha": [(m.alpha,) for m in own],
         "int_ior": [(max(m.ior, _SMALLEST_IOR),) for m in own],
@@ -344,7 +313,7 @@ def _group(kind: str, objects: tuple, materials: _Materials, fresnel: str) -> di
     for name, values in columns.items():
         shape[f"face_{name}"] = mi.Bitmap(np.array(values, np.float32))
         bsdf[name] = {"type": "mesh_attribute", "name": f"face_{name}"}
-    return {**shape, "bsdf": bsdf}
+    return shape, bsdf
 
 
 def _mesh(m: Mesh, texturing: str) -> dict[str, Any]:
@@ -368,7 +337,9 @@ _SMALLEST_IOR = 1e-8
 
 
 def _mrt_bsdf(m: Material, fresnel: str, texturing: str) -> dict[str, Any]:
-    diffuse = _rgb(m.diffuse) if m.texture is None else _texture(m.texture, texturing)
+    diffuse = _rgb(m.diffuse)
+    if m.texture is not None:  # looked up as in the report, or as by Mitsuba: bilinear, sRGB-aware, repeated
+        diffuse = {"type": "mrt_texture" if texturing == "report" else "bitmap", "filename": m.texture}
     return {
         "type": "mrt_bsdf",
         "alpha": float(m.alpha),
@@ -377,8 +348,3 @@ def _mrt_bsdf(m: Material, fresnel: str, texturing: str) -> dict[str, Any]:
         "diffuse_reflectance": diffuse,
         "specular_reflectance": _rgb(m.specular),
     }
-
-
-def _texture(path: str, texturing: str) -> dict[str, Any]:
-    """Return a texture looked up as in the report, or as by Mitsuba: bilinear, sRGB-aware, repeated."""
-    return {"type": {"report": "mrt_texture", "standard": "bitmap"}[texturing], "filename": path}
