@@ -25,6 +25,7 @@ from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.scene.files import picture_size, require_file
 
 DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from about 3000 on
+MOST_SAMPLES = 2**24  # of a pixel; some samplers divide by none, or never end at 2^31
 _PICTURES = ("mrt_texture", "bitmap", "envmap")  # plugins that read one
 _NATIVE = (".so", ".dylib", ".dll")
 
@@ -110,8 +111,9 @@ def _parse(parse: Callable[[Any], Any], name: str, budget: Budget | None) -> Any
         kind, filename = node.props.plugin_name(), node.props.get("filename", None)
         _check_plugin(kind, name)
         samples = node.props.get("sample_count", 1)
-        if isinstance(samples, int) and samples < 1:  # some samplers divide by it
-            raise SceneError(f"cannot load {name}: {kind}: sample_count is {samples}; give 1 or more")
+        if isinstance(samples, int) and not 1 <= samples <= MOST_SAMPLES:
+            text = f"{kind}: sample_count is {samples}; give 1 to {MOST_SAMPLES}"
+            raise SceneError(f"cannot load {name}: {text}")
         if isinstance(filename, str):
             _check_data(filename)
             found = _resolved(filename)

@@ -135,7 +135,7 @@ SCENES: list[Case] = [
     (xml("", SENSOR.format("<integer name='height' value='0'/>")), "out scene=a.xml", 1, "768x0: give it"),
     (xml("", "<sensor type='irradiancemeter'/>"), "out scene=a.xml", 1, "irradiancemeter outside of a shape"),
     (xml("", SENSOR.format(FILTER)), "out scene=a.xml", 1, "a.xml has a filter of radius"),
-    (xml("", SAMPLER), "out scene=a.xml", 1, "multijitter: sample_count is 0; give 1 or more"),
+    (xml("", SAMPLER), "out scene=a.xml", 1, "multijitter: sample_count is 0; give 1 to 16777216"),
     (xml(""), "out scene=a.xml fresnel=schlick", 2, "it is a parameter of mrt_bsdf"),
 ]
 
