@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.rays.divisor import Divisor
+from mrt_mitsuba.rays.divisor import constants
 from mrt_mitsuba.rays.film import Film
 
 MOST_LANES = 2**17  # of a kernel, each with as many sums
@@ -69,6 +67,9 @@ class Canvas:
             pixels: where they start, ascending; those of the second picture follow on those of the first.
             rays: how many start there, one after the other.
         """
+        if isinstance(place, np.ndarray):
+            self._put_one_by_one(place, np.asarray(values), np.repeat(pixels, rays))
+            return
         counts = np.zeros((self._pictures, self._film.pixels), np.uint32)
         counts.ravel()[pixels] = rays
         padded = self._padded(counts)
@@ -78,23 +79,52 @@ class Canvas:
         for start in range(int(low) // lanes * lanes, int(high), lanes):
             self._put(place, values, max(start, int(low)), min(start + lanes, int(high)), first)
 
+    def _put_one_by_one(self, place: np.ndarray, values: np.ndarray, pixels: np.ndarray) -> None:
+        """Add values [channels, rays] at places [2, rays], of rays that start in these pixels."""
+        film, evaluate = self._film, self._film.sensor.film().rfilter().eval
+        picture, pixel = np.divmod(pixels, film.pixels)
+        row, column = np.divmod(pixel, film.width)
+        at = (picture * self._height + row + film.reach) * self._width + column + film.reach
+        if len(self._moments):
+            colors = values[:3]
+            for plane, value in zip(self._moments, [*colors, *colors**2], strict=False):
+                np.add.at(plane, at, value)
+            np.maximum.at(self._moments[6], at, colors.mean(0))
+        away = (place - np.stack([column, row]) - 0.5).T.tolist()
+        given = np.stack([*values, np.ones(len(pixels))]) * self._shares[at]
+        for down in range(-film.reach, film.reach + 1):
+            for across in range(-film.reach, film.reach + 1):
+                weight = np.ones(len(pixels))
+                if film.reach:
+                    weight *= [evaluate(across - x) * evaluate(down - y) for x, y in away]
+                for plane, value in zip(self._sums, given, strict=True):
+                    np.add.at(plane, at + down * self._width + across, value * weight)
+
     def _put(self, place: Any, values: Sequence[Any], start: int, stop: int, first: np.ndarray) -> None:
         """Add the rays of padded places from ``start`` to ``stop``, given the number of the first of each."""
         import drjit as dr
+        import mitsuba as mi
 
-        reach = self._film.reach
+        reach, lane = self._film.reach, dr.arange(mi.UInt32, stop - start)
         # one more than there are lanes, so that Dr.Jit gathers them: to load them, it would compile another
         # kernel for every alignment of NumPy's memory
-        runs = self._runs(start, first[start : stop + 1], self._shares[start : stop + 1])
-        more = runs.moments(values[:3]) if len(self._moments) else []
-        dr.eval(more)
-        for index, found in enumerate(more):
-            known = self._moments[index, start:stop]
-            (np.add if index < 6 else np.maximum)(known, np.asarray(found), out=known)
+        numbers = mi.UInt32(first[start : stop + 1])
+        run = dr.gather(mi.UInt32, numbers, lane), dr.gather(mi.UInt32, numbers, lane + 1)
+        share = dr.gather(mi.Float, mi.Float(self._shares[start : stop + 1]), lane)
+        if len(self._moments):
+            more = _moments(values[:3], *run)
+            dr.eval(more)
+            for index, found in enumerate(more):
+                known = self._moments[index, start:stop]
+                (np.add if index < 6 else np.maximum)(known, np.asarray(found), out=known)
+        sizes = constants(width=self._width, height=self._height)
+        row, column = sizes["width"].divide(lane + dr.opaque(mi.UInt32, start))
+        _, row = sizes["height"].divide(row)
+        centre = mi.Float(column) - reach + 0.5, mi.Float(row) - reach + 0.5
         rows = max(1, MOST_SUMS // ((2 * reach + 1) * len(self._sums)))
         for above in range(-reach, reach + 1, rows):
             down = range(above, min(above + rows, reach + 1))
-            given = runs.given(self._film, place, values, down)
+            given = [total * share for total in self._given(place, values, run, centre, down)]
             dr.eval(given)
             for index, step in enumerate(down):
                 near = self._row(given[index * len(given) // len(down) :], stop - start)
@@ -110,78 +140,44 @@ class Canvas:
                 total[step : step + lanes] += np.asarray(found)
         return near
 
-    def _runs(self, start: int, first: np.ndarray, shares: np.ndarray) -> _Runs:
-        """Return the rays of places in padded pictures from ``start`` on, given the first of each."""
+    def _given(
+        self, place: Any, values: Sequence[Any], run: tuple[Any, Any], centre: tuple[Any, Any], down: range
+    ) -> list[Any]:
+        """Return what rays at places on the film give to pixels in reach, so many rows further down.
+
+        Each lane adds up a ``run`` of rays, from the first to the last, of the pixel with this ``centre``.
+        """
         import drjit as dr
         import mitsuba as mi
 
-        lane, numbers = dr.arange(mi.UInt32, len(first) - 1), mi.UInt32(first)
-        begin, end = dr.gather(mi.UInt32, numbers, lane), dr.gather(mi.UInt32, numbers, lane + 1)
-        share = dr.gather(mi.Float, mi.Float(shares), lane)
-        width, height = _divisors(self._width, self._height, mi.variant())
-        row, column = width.divide(lane + dr.opaque(mi.UInt32, start))
-        _, row = height.divide(row)
-        reach = self._film.reach
-        return _Runs(begin, end, share, mi.Float(column) - reach, mi.Float(row) - reach)
-
-
-@dataclass(frozen=True)
-class _Runs:
-    """The rays of each of some pixels, which follow on each other."""
-
-    first: Any  #: number of the first
-    last: Any  #: and of the one after the last
-    share: Any  #: weight of each ray
-    column: Any  #: of the pixel
-    row: Any
-
-    def given(self, film: Film, place: Any, values: Sequence[Any], down: range) -> list[Any]:
-        """Return what rays at places on a film give to pixels in reach so many rows further down."""
-        import drjit as dr
-        import mitsuba as mi
-
-        rfilter, across = film.sensor.film().rfilter(), range(-film.reach, film.reach + 1)
-        rows = [dr.opaque(mi.Float, step) for step in down]
-
-        def one(ray: Any) -> list[Any]:
-            channels = [*(dr.gather(mi.Float, value, ray) for value in values), mi.Float(1)]
-            if not film.reach:
-                return channels
-            x = dr.gather(mi.Float, place.x, ray) - (self.column + 0.5)
-            y = dr.gather(mi.Float, place.y, ray) - (self.row + 0.5)
-            along = [rfilter.eval(step - x) for step in across]
-            shown = ([value * rfilter.eval(step - y) for value in channels] for step in rows)
-            return [value * weight for values in shown for weight in along for value in values]
-
-        count = len(rows) * len(across) * (len(values) + 1)
-        return [total * self.share for total in self._summed(one, count)]
-
-    def moments(self, values: Sequence[Any]) -> list[Any]:
-        """Return the sums of values, those of their squares, and the largest mean of a ray's values, or 0."""
-        import drjit as dr
-        import mitsuba as mi
-
-        def add(ray: Any, sums: list[Any], most: Any) -> tuple[Any, list[Any], Any]:
-            found = [dr.gather(mi.Float, value, ray) for value in values]
-            sums = [a + b for a, b in zip(sums, [*found, *(value * value for value in found)], strict=True)]
-            return ray + 1, sums, dr.maximum(most, sum(found) / len(found))
-
-        state = self.first, [mi.Float(0)] * (2 * len(values)), mi.Float(0)
-        _, sums, most = dr.while_loop(state, lambda ray, *_: ray < self.last, add)
-        return [*sums, most]
-
-    def _summed(self, one: Callable[[Any], list[Any]], count: int) -> list[Any]:
-        """Return sums over each run of what ``one`` returns of a ray."""
-        import drjit as dr
-        import mitsuba as mi
+        reach, rfilter = self._film.reach, self._film.sensor.film().rfilter()
+        across, rows = range(-reach, reach + 1), [dr.opaque(mi.Float, step) for step in down]
 
         def add(ray: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            return ray + 1, [total + value for total, value in zip(sums, one(ray), strict=True)]
+            found = [*(dr.gather(mi.Float, value, ray) for value in values), mi.Float(1)]
+            if reach:
+                x = dr.gather(mi.Float, place.x, ray) - centre[0]
+                y = dr.gather(mi.Float, place.y, ray) - centre[1]
+                along = [rfilter.eval(step - x) for step in across]
+                shown = [[value * rfilter.eval(step - y) for value in found] for step in rows]
+                found = [value * weight for row in shown for weight in along for value in row]
+            return ray + 1, [total + value for total, value in zip(sums, found, strict=True)]
 
-        state = self.first, [mi.Float(0)] * count
-        return list(dr.while_loop(state, lambda ray, _: ray < self.last, add)[1])
+        state = run[0], [mi.Float(0)] * (len(rows) * len(across) * (len(values) + 1))
+        return list(dr.while_loop(state, lambda ray, _: ray < run[1], add)[1])
 
 
-@lru_cache(maxsize=16)
-def _divisors(width: int, height: int, variant: str) -> tuple[Divisor, Divisor]:
-    return Divisor.opaque(width), Divisor.opaque(height)
+def _moments(values: Sequence[Any], first: Any, last: Any) -> list[Any]:
+    """Return sums over runs of rays of their values, those of their squares, and the largest mean of a ray's
+    values, or 0."""
+    import drjit as dr
+    import mitsuba as mi
+
+    def add(ray: Any, sums: list[Any], most: Any) -> tuple[Any, list[Any], Any]:
+        found = [dr.gather(mi.Float, value, ray) for value in values]
+        sums = [a + b for a, b in zip(sums, [*found, *(value * value for value in found)], strict=True)]
+        return ray + 1, sums, dr.maximum(most, sum(found) / len(found))
+
+    state = first, [mi.Float(0)] * (2 * len(values)), mi.Float(0)
+    _, sums, most = dr.while_loop(state, lambda ray, *_: ray < last, add)
+    return [*sums, most]

@@ -1,14 +1,15 @@
-"""Division of lane numbers by numbers that are data of a kernel."""
+"""Numbers that are data of a kernel, so that others need no other kernel; and division by them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 
 @dataclass(frozen=True)
 class Divisor:
-    """A number to divide lane numbers by, as data of a kernel: another number needs no other kernel.
+    """A whole number to divide lane numbers by.
 
     A processor divides the integers of a packet one after the other, which takes as long as tracing the ray;
     so vectorised variants multiply by the inverse in double precision. The half added keeps n/d away from
@@ -16,15 +17,7 @@ class Divisor:
     """
 
     number: Any
-    inverse: Any = None
-
-    @classmethod
-    def opaque(cls, number: int) -> Divisor:
-        """Return a divisor for vectorised variants."""
-        import drjit as dr
-        import mitsuba as mi
-
-        return cls(dr.opaque(mi.UInt32, number), dr.opaque(mi.Float64, 1 / number))
+    inverse: Any = None  #: in vectorised variants
 
     def divide(self, n: Any) -> tuple[Any, Any]:
         """Return quotient and remainder."""
@@ -34,3 +27,25 @@ class Divisor:
             return divmod(n, self.number)
         quotient = mi.UInt32((mi.Float64(n) + 0.5) * self.inverse)
         return quotient, n - quotient * self.number
+
+
+def constants(**numbers: float) -> dict[str, Any]:
+    """Return numbers by name as kernels of the current variant take them: whole ones as a ``Divisor``."""
+    import mitsuba as mi
+
+    return _constants(mi.variant(), *numbers.items())
+
+
+@lru_cache(maxsize=64)
+def _constants(variant: str, *numbers: tuple[str, float]) -> dict[str, Any]:
+    import drjit as dr
+    import mitsuba as mi
+
+    if variant.startswith("scalar"):
+        return {name: Divisor(n) if isinstance(n, int) else n for name, n in numbers}
+    return {
+        name: Divisor(dr.opaque(mi.UInt32, n), dr.opaque(mi.Float64, 1 / n if n else 0))
+        if isinstance(n, int)
+        else dr.opaque(mi.Float, n)
+        for name, n in numbers
+    }

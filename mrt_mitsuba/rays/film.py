@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.rays.divisor import Divisor
+from mrt_mitsuba.rays.divisor import constants
 
 STEPS = 32  # of a pixel, where integrals over a filter are summed
 
@@ -77,28 +77,16 @@ class Film:
         sampler.set_sample_count(count)
         return int(sampler.sample_count())
 
-    def numbers(self) -> Numbers:
-        """Return the data of ``rays``."""
+    def place(self, pixel: Any, sampler: Any) -> tuple[Any, Any]:
+        """Return places in pixels that a sampler draws: on the film, and in the picture, [0, 1]²."""
         import mitsuba as mi
 
-        return _opaque_numbers(self.width, self.height, self.border, mi.variant())
-
-    def rays(self, pixel: Any, sampler: Any, numbers: Numbers) -> tuple[Any, Any, Any]:
-        """Return places in the film's pixels, in pixels, and rays through them with their weights.
-
-        Draws from the sampler what Mitsuba's integrators draw, in their order.
-        """
-        import mitsuba as mi
-
-        row, column = numbers.width.divide(pixel)
+        border = float(self.border)
+        across, down = self.width - 2 * border, self.height - 2 * border
+        numbers = constants(width=self.width, border=border, across=across, down=down)
+        row, column = numbers["width"].divide(pixel)
         place = mi.Point2f(mi.Float(column), mi.Float(row)) + sampler.next_2d()
-        inside = (place - numbers.border) / numbers.size
-        sensor, time = self.sensor, mi.Float(self.sensor.shutter_open())
-        aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-        if sensor.shutter_open_time() > 0:
-            time += sampler.next_1d() * sensor.shutter_open_time()
-        wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
-        return place, *sensor.sample_ray_differential(time, wavelength, inside, aperture)
+        return place, (place - numbers["border"]) / mi.Vector2f(numbers["across"], numbers["down"])
 
     @cached_property
     def weights(self) -> np.ndarray:
@@ -106,8 +94,11 @@ class Film:
         import mitsuba as mi
 
         places = np.arange(-self.reach, self.reach + 1)[:, None] + (np.arange(STEPS) + 0.5) / STEPS - 0.5
-        # a list is copied; for NumPy's memory, Dr.Jit would compile a kernel for every alignment
-        values = self.sensor.film().rfilter().eval(mi.Float(places.ravel().tolist()))
+        rfilter, flat = self.sensor.film().rfilter(), places.ravel().tolist()
+        if mi.variant().startswith("scalar"):
+            values = [rfilter.eval(place) for place in flat]
+        else:  # a list is copied; for NumPy's memory, Dr.Jit would compile a kernel for every alignment
+            values = rfilter.eval(mi.Float(flat))
         return np.asarray(values, np.float64).reshape(places.shape)
 
     @cached_property
@@ -143,24 +134,6 @@ class Film:
                 total += pair
             variance = np.moveaxis(total, 0, axis)
         return variance
-
-
-@dataclass(frozen=True)
-class Numbers:
-    """The size of a film as the kernel has it."""
-
-    width: Divisor
-    border: Any
-    size: Any  #: of the picture, in pixels
-
-
-@lru_cache(maxsize=16)
-def _opaque_numbers(width: int, height: int, border: int, variant: str) -> Numbers:
-    import drjit as dr
-    import mitsuba as mi
-
-    size = [float(n - 2 * border) for n in (width, height)]
-    return Numbers(Divisor.opaque(width), dr.opaque(mi.Float, border), dr.opaque(mi.Vector2f, size))
 
 
 def spectral_bands(film: Any) -> tuple[str, ...]:

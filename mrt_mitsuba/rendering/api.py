@@ -8,9 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import lru_cache
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,11 +18,9 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.interrupts import surfacing
 from mrt_mitsuba.memory import Budget, Workspace
 from mrt_mitsuba.output.layers import AVERAGED, TABLE
-from mrt_mitsuba.rays.exposure import Exposure
 from mrt_mitsuba.rays.film import pixel_format, spectral_bands
-from mrt_mitsuba.rays.lattice import FILM
 from mrt_mitsuba.rendering.defaults import decided
-from mrt_mitsuba.rendering.job import Job, Kernels, counting_kernels
+from mrt_mitsuba.rendering.job import Job
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import FilmFacts, Plan, RenderFacts, make_plan
 from mrt_mitsuba.rendering.progress import Progress, default
@@ -32,9 +28,8 @@ from mrt_mitsuba.rendering.result import Result, Timings
 from mrt_mitsuba.rendering.rounds import Goal, OnRound
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, shader_for
-from mrt_mitsuba.rendering.trace import Tracer
 from mrt_mitsuba.rendering.view import View
-from mrt_mitsuba.scene.open import Source, reopen_scene, sized
+from mrt_mitsuba.scene.open import Source, open_scene, sized
 
 log = logging.getLogger(__name__)
 
@@ -165,11 +160,14 @@ def render(
 
 
 def render_with(
-    scene: Any, settings: RenderSettings, progress: Progress, *, opener: Callable[..., Source] = reopen_scene
+    scene: Any, settings: RenderSettings, progress: Progress, *, opener: Callable[..., Source] = open_scene
 ) -> Result:
-    """Render a scene as ``render`` does; ``opener`` takes the place of ``reopen_scene``."""
+    """Render a scene as ``render`` does; ``opener`` takes the place of ``open_scene``."""
+    import drjit as dr
+
     start = time.perf_counter()
-    with counting_kernels(progress) as kernels:
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
         runtime.use(settings.variant)
         runtime.warn_if_slow()
         budget = Budget.of(settings.memory)
@@ -184,40 +182,53 @@ def render_with(
             model=settings.model(),
         )
         with sized(source):
-            result = _render(source, settings, budget, kernels, start)
-    log.info("%d kernels: compiled in %.3f s, ran for %.3f s", kernels.launches, kernels.compile, kernels.run)
-    return result
+            return _render(source, settings, budget, Job(progress), start)
 
 
-def _render(
-    source: Source, settings: RenderSettings, budget: Budget, kernels: Kernels, start: float
-) -> Result:
+def _render(source: Source, settings: RenderSettings, budget: Budget, job: Job, start: float) -> Result:
     """Render an open scene."""
     shader = shader_for(source.scene, source.integrator)
     facts = _facts(source, shader, settings)
     settings = decided(settings, facts)
-    plan = _planned(facts, settings.but(integrator=None, params=None, on_round=None))
-    exposures = _exposures(plan, settings.seed)
-    job = Job(kernels.progress, _workspace(plan, exposures, budget), kernels)
+    plan = make_plan(facts, settings)
+    job.workspace = Workspace.next_to(
+        plan.seen.width,
+        plan.seen.height,
+        plan.channels,
+        pictures=min(plan.frames, 2),  # the frames' sum, and one of them
+        rays_per_pixel=plan.places(0).size,
+        budget=budget,
+    )
     job.progress.plan(plan)
     shader.prepare(plan.kernel)
     load = time.perf_counter() - start
     log.info("scene %s loaded in %.3f s for %s", source.name, load, plan.variant)
     view = View(source.sensor, source.width, source.height, settings.motion)
-    tracer = Tracer(shader, view, job.workspace)
+    most = plan.repeats if settings.maxspp is None else settings.maxspp
+    on_round: Any = settings.on_round
+    goal = Goal(settings.rmse, most, settings.maxseconds, on_round)
     total: dict[str, np.ndarray] = {}
-    for passes in _each_picture(job, tracer, plan, exposures, settings):
-        _add(total, passes.run())
+    for frame in range(plan.frames):
+        # two passes in a frame, each with random numbers of its own
+        passes = Passes(
+            job, shader, view, plan, settings.seed + 2 * frame, frame if plan.frames > 1 else None
+        )
+        for name, values in passes.run(goal).items():
+            if name not in total:
+                total[name] = values
+            elif _averaged(name):  # of others, those of the first frame stay
+                total[name] += values
     image, layers = _mean(total, plan)
-    kernels.collect()
+    job.collect()
+    log.info("%d kernels: compiled in %.3f s, ran for %.3f s", job.launches, job.compiling, job.running)
     seconds = time.perf_counter() - start
     return Result(
         image,
         layers,
         plan,
-        Timings(seconds, load, kernels.compile, kernels.run, job.passes),
-        tracer.rays,
-        kernels.launches,
+        Timings(seconds, load, job.compiling, job.running, job.passes),
+        job.rays,
+        job.launches,
         _in_force(settings, plan, source),
         runtime.versions(),
         view.matrices(),
@@ -225,9 +236,6 @@ def _render(
         passes.error,
         tuple(passes.rounds),
     )
-
-
-_planned = lru_cache(maxsize=16)(make_plan)  # most renders are like one before
 
 
 def _in_force(settings: RenderSettings, plan: Plan, source: Source) -> dict[str, Any]:
@@ -247,6 +255,13 @@ def _in_force(settings: RenderSettings, plan: Plan, source: Source) -> dict[str,
 def _facts(source: Source, shader: Shader, settings: RenderSettings) -> RenderFacts:
     import mitsuba as mi
 
+    own, film = None, source.sensor.film()
+    if source.own:
+        sampler, rfilter = source.sensor.sampler(), film.rfilter()
+        kinds = sampler.class_name(), rfilter.class_name()
+        own = FilmFacts(
+            int(sampler.sample_count()), *kinds, pixel_format(film), spectral_bands(film), shader.aovs
+        )
     return RenderFacts(
         scene=source.name,
         variant=str(mi.variant()),
@@ -256,64 +271,15 @@ def _facts(source: Source, shader: Shader, settings: RenderSettings) -> RenderFa
         focus=settings.focus(source.focal_distance, source.focal_range),
         traceable=shader.layers,
         random=shader.random,
-        film=_film_facts(source, shader) if source.own else None,
+        film=own,
         kernel=shader.kernel,
         parts=shader.facts,
     )
 
 
-def _film_facts(source: Source, shader: Shader) -> FilmFacts:
-    film, sampler = source.sensor.film(), source.sensor.sampler()
-    return FilmFacts(
-        int(sampler.sample_count()),
-        sampler.class_name(),
-        film.rfilter().class_name(),
-        pixel_format(film),
-        spectral_bands(film),
-        shader.aovs,
-    )
-
-
-def _each_picture(
-    job: Job, tracer: Tracer, plan: Plan, exposures: Sequence[Exposure], settings: RenderSettings
-) -> Iterator[Passes]:
-    kind = Passes
-    if plan.lattice.kind == FILM:  # a seventh of all that is imported
-        from mrt_mitsuba.rendering.film_passes import FilmPasses as kind
-    rays = plan.repeats if settings.maxspp is None else settings.maxspp
-    on_round: Any = settings.on_round
-    goal = Goal(settings.rmse, rays, settings.maxseconds, on_round)
-    for exposure in exposures:
-        yield kind(job, tracer, plan, exposure, goal)
-
-
-def _exposures(plan: Plan, seed: int) -> list[Exposure]:
-    """Return what to average: one picture, or the frames of a camera's way if each needs its own filters."""
-    whole = Exposure(plan.lattice, plan.repeats, plan.motion, plan.motion_samples, seed)
-    if plan.frames == 1:
-        return [whole]
-    # two passes in a frame, each with random numbers of its own
-    return [replace(whole, seed=seed + 2 * frame, frame=frame) for frame in range(plan.frames)]
-
-
-def _workspace(plan: Plan, exposures: Sequence[Exposure], budget: Budget) -> Workspace:
-    return Workspace.next_to(
-        plan.seen.width,
-        plan.seen.height,
-        plan.channels,
-        pictures=min(len(exposures), 2),  # the frames' sum, and one of them
-        rays_per_pixel=exposures[0].rays_per_pixel,
-        budget=budget,
-    )
-
-
-def _add(total: dict[str, np.ndarray], picture: dict[str, np.ndarray]) -> None:
-    """Add a picture's averaged layers to the total; of others, those of the first picture stay."""
-    for name, values in picture.items():
-        if name not in total:
-            total[name] = values
-        elif name not in TABLE or TABLE[name].source == AVERAGED:
-            total[name] += values
+def _averaged(name: str) -> bool:
+    """Is a layer a mean over rays, as are the channels of the film and the integrator."""
+    return name not in TABLE or TABLE[name].source == AVERAGED
 
 
 def _mean(total: dict[str, np.ndarray], plan: Plan) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -324,10 +290,9 @@ def _mean(total: dict[str, np.ndarray], plan: Plan) -> tuple[np.ndarray, dict[st
     shape, inside = (plan.seen.height, plan.seen.width), plan.region.inside(plan.seen)
     channels, layers = dict[str, np.ndarray](), dict[str, np.ndarray]()
     for name, values in total.items():
-        own = name not in TABLE  # a channel of the film's or the integrator's
-        if plan.frames > 1 and (own or TABLE[name].source == AVERAGED):
+        if plan.frames > 1 and _averaged(name):
             values /= np.float32(plan.frames)
-        if own:
+        if name not in TABLE:
             channels[name] = values.reshape(shape)[inside]
         elif name in plan.layers:
             for index, letter in enumerate(TABLE[name].letters):

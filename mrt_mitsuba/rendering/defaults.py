@@ -20,14 +20,15 @@ def decided(settings: RenderSettings, facts: RenderFacts) -> RenderSettings:
     plain = film is not None and facts.random and settings.aa is None
     if aamode is None:
         aamode = NOISE if settings.rmse is not None else "none" if plain else "sobel"
-    lattice = settings.lattice or (FILM if film else "report")
-    if facts.variant.startswith("scalar") and lattice == FILM and not settings.lattice:
-        lattice = "centered"
+    lattice = settings.lattice or (FILM if film or aamode == NOISE else "report")
     aa = settings.aa or (1 if aamode == NOISE or (plain and aamode == "none") else 4)
     spp = settings.spp or (film.rays if film and plain and settings.aamode is None else 1)
     most = settings.maxspp or (MAX_SPP if settings.rmse is not None else None)
     settings = settings.but(aa=aa, aamode=aamode, lattice=lattice, spp=spp, maxspp=most)
-    _check(settings, facts)
+    if aamode == NOISE and settings.rmse is None and spp < MIN_SPP:
+        raise UsageError(
+            f"aamode=noise: give the mean of a pixel's rays as spp, {MIN_SPP} or more, or a target"
+        )
     return settings
 
 
@@ -46,24 +47,9 @@ def _check_rounds(settings: RenderSettings) -> None:
         raise UsageError(f"{rounds} with spp={settings.spp}: leave one of them out, or bound it by maxspp")
     if settings.aa is not None:
         raise UsageError(f"{rounds} with aa={settings.aa}: rounds decide it; leave one of them out")
+    if settings.lattice not in (None, FILM):
+        raise UsageError(
+            f"{rounds} with lattice={settings.lattice}: rounds follow the film; leave lattice out"
+        )
     if settings.region is not None:
         raise UsageError(f"{rounds} with region: rounds share the rays out over the whole picture")
-
-
-def _check(settings: RenderSettings, facts: RenderFacts) -> None:
-    if settings.lattice == FILM and facts.variant.startswith("scalar"):
-        raise UsageError("lattice=film needs arrays of rays: choose variant=llvm_ad_rgb")
-    if settings.aamode != NOISE:
-        return
-    if settings.lattice != FILM and facts.random:
-        raise UsageError(f"aamode=noise: a random integrator needs lattice=film, not {settings.lattice}")
-    if settings.lattice != FILM and settings.motion and settings.motionmode == "frames":
-        raise UsageError(
-            "aamode=noise: the frames of motionmode=frames have errors of their own; choose stratified"
-        )
-    if settings.rmse is None and settings.lattice != FILM:
-        raise UsageError("aamode=noise: without random numbers, give the error to reach as target=")
-    if settings.rmse is None and (settings.spp or 1) < MIN_SPP:
-        raise UsageError(
-            f"aamode=noise: give the mean of a pixel's rays as spp, {MIN_SPP} or more, or a target"
-        )

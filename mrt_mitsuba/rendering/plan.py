@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 
@@ -13,10 +14,9 @@ from mrt_mitsuba.output import layers
 from mrt_mitsuba.output.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.plugins import kernel_plan
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
-from mrt_mitsuba.rays.lattice import FILM, Lattice
+from mrt_mitsuba.rays.lattice import CENTRE, FILM, Lattice, Places
 from mrt_mitsuba.rays.region import Region
-from mrt_mitsuba.rendering.detectors import DETECTORS
-from mrt_mitsuba.rendering.settings import NOISE, Focus, RenderSettings
+from mrt_mitsuba.rendering.settings import DETECTORS, NOISE, Focus, RenderSettings
 
 # Float32 channels of a pixel that its statistics take while rounds are shared out
 ROUND_CHANNELS = 122
@@ -36,7 +36,7 @@ _WHY = {
     "spectrum": "the picture is the colour of the spectrum that the film sees, and rounds go by it",
     "one-sequence": "rounds continue one sequence of numbers in each pixel",
     "lattice": "the lattice that was asked for places and averages samples",
-    "arrays": "a scalar variant traces a lattice, ray by ray",
+    "arrays": "a scalar variant draws independent numbers, ray by ray",
 }
 
 
@@ -145,19 +145,38 @@ class Plan(RenderFacts):
         if self.lattice.kind == FILM:
             # sums by pixel, in double precision, while a film is exposed
             more = len(self.film.bands + self.film.aovs) if self.film else 0
-            channels += (ROUND_CHANNELS if ROUNDS in self.steps else 28) + 5 * more
+            channels += (ROUND_CHANNELS if ROUNDS in {step.name for step in self.passes} else 28) + 5 * more
         return channels
-
-    @property
-    def steps(self) -> frozenset[str]:
-        """Names of the passes."""
-        return frozenset(step.name for step in self.passes)
 
     @cached_property
     def seen(self) -> Region:
         """The region with the pixels around it that filters look at."""
         reach = (edges.REACH if self.detector else 0) + (dof.REACH if self.blur else 0)
         return self.region.grown(reach, self.width, self.height)
+
+    @property
+    def on_film(self) -> bool:
+        """Is a film exposed by its own rules, rather than a lattice."""
+        return self.lattice.kind == FILM
+
+    def places(self, seed: int, frame: int | None = None, first: int = 0) -> Places:
+        """Return the lattice's samples from ``first`` on; ``frame``: of the only moment that is seen."""
+        count = self.lattice.count - first
+        if self.motion == "stratified":  # every ray of a pixel in a part of its own
+            repeats = self.repeats * math.ceil(self.motion_samples / (count * self.repeats))
+            return Places(self.lattice, first, count, repeats, count * repeats, None, seed)
+        return replace(self.centre(frame), lattice=self.lattice, first=first, count=count)
+
+    def centre(self, frame: int | None) -> Places:
+        """Return the pixel's centre alone, at the same times in every pixel."""
+        if self.motion is None or frame is not None:
+            return replace(self.first_hit(frame), repeats=self.repeats)
+        repeats, phase = self.repeats * self.motion_samples, 0.0 if self.motion == "frames" else 0.5
+        return Places(CENTRE, repeats=repeats, moments=self.motion_samples, phase=phase)
+
+    def first_hit(self, frame: int | None) -> Places:
+        """Return the pixel's centre when the shutter opens, or at the moment of the frame."""
+        return Places(CENTRE, moments=int(self.motion is not None), phase=(frame or 0) / self.motion_samples)
 
     @property
     def frames(self) -> int:
@@ -226,7 +245,6 @@ def _possible(facts: RenderFacts, settings: RenderSettings) -> frozenset[str]:
     """Return the layers that can be made."""
     made = facts.traceable | layers.named(DERIVED)
     made -= {"error", "variance"} if settings.aamode != NOISE else set()
-    made -= {"variance"} if settings.lattice != FILM else set()
     return made - ({"edges"} if settings.aamode not in DETECTORS else set())
 
 
@@ -237,8 +255,6 @@ def _check_layers(asked: frozenset[str], facts: RenderFacts, settings: RenderSet
         )
     if asked & {"error", "variance"} and settings.aamode != NOISE:
         raise UsageError("layers=error,variance: only rounds estimate them; give a target= or aamode=noise")
-    if "variance" in asked and settings.lattice != FILM:
-        raise UsageError("layers=variance: without random numbers there is none; choose lattice=film")
     missing = sorted(asked - facts.traceable - layers.named(DERIVED))
     if missing:
         raise UsageError(
@@ -254,8 +270,8 @@ def _traced(
     if facts.focus.distance:
         wanted |= {"depth"}
     if detector:
-        wanted |= set(DETECTORS[detector].reads)
-        if (settings.spp or 1) > 1 and DETECTORS[detector].takes_variance:
+        wanted |= set(DETECTORS[detector])
+        if (settings.spp or 1) > 1 and "image" in DETECTORS[detector]:
             wanted |= {"square"}
     if settings.count_rays:
         wanted |= {name for name, layer in TABLE.items() if layer.counts} & facts.traceable
@@ -272,7 +288,7 @@ def _passes(
     passes, repeats, film = [], _repeats(settings, lattice), lattice.kind == FILM
     at_centre = traced & layers.named(FIRST_HIT)
     noise = settings.aamode == NOISE
-    if at_centre and (film or noise or (detector is None and not lattice.holds_centre)):
+    if at_centre and (film or (detector is None and not lattice.holds_centre)):
         # layers of the first hit belong to the pixel's centre
         passes.append(Pass(FIRST_HITS, at_centre, 1))
         traced -= at_centre
@@ -281,7 +297,7 @@ def _passes(
     elif detector is None:
         passes.append(Pass(RENDERING, traced, lattice.count, repeats=repeats, film=film))
     else:
-        noisy = facts.random and repeats == 1 and DETECTORS[detector].takes_variance
+        noisy = facts.random and repeats == 1 and "image" in DETECTORS[detector]
         passes += [
             Pass(RENDERING, traced, 1, repeats=repeats, film=film),
             Pass(EDGES, mode=detector, noisy=noisy),
@@ -330,13 +346,14 @@ def _film_left_out(facts: RenderFacts, settings: RenderSettings) -> list[Omissio
     if film is None:
         return []
     if settings.lattice != FILM:
-        reason = "arrays" if facts.variant.startswith("scalar") else "lattice"
-        return [Omission(f"{film.rfilter} and {film.sampler}", reason)]
+        return [Omission(f"{film.rfilter} and {film.sampler}", "lattice")]
     left_out = []
     if film.pixel_format.startswith("xyz"):
         left_out.append(Omission(f"pixel format {film.pixel_format}", "linear-rgb"))
     if film.bands:
         left_out.append(Omission(f"{', '.join(film.bands)} in the picture, only as layers", "spectrum"))
-    if settings.aamode == NOISE:
+    if facts.variant.startswith("scalar"):
+        left_out += [Omission(film.sampler, "arrays")] if film.sampler != "IndependentSampler" else []
+    elif settings.aamode == NOISE:
         left_out.append(Omission(film.sampler, "one-sequence"))
     return left_out

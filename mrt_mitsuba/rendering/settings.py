@@ -29,9 +29,11 @@ from mrt_mitsuba.options import (
 )
 from mrt_mitsuba.output.layers import LAYERS
 from mrt_mitsuba.rays.lattice import LATTICES
-from mrt_mitsuba.rendering.detectors import DETECTORS
 from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE
 
+#: The edge detectors as ``aamode`` names them: ``filters.<name>_edges``, and the layers that each reads, in
+#: the order of its arguments; those of the picture can distinguish noise from edges
+DETECTORS = {"luma": ("image",), "sobel": ("image",), "geometry": ("normal", "depth")}
 NOISE = "noise"  # the aamode that puts rays where the variance is
 MIN_SPP = 16  # rays of a pixel from which its variance is known
 MAX_SPP = 4096  # of a pixel on average, where a target alone would ask for more

@@ -6,16 +6,15 @@ any other sampling integrator gives the picture, and Mitsuba the first hit.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError
-from mrt_mitsuba.output.layers import FIRST_HIT, TABLE, named
+from mrt_mitsuba.output.layers import FIRST_HIT, named
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.plugins.parameters import ParameterError
 from mrt_mitsuba.plugins.protocols import LayeredIntegrator
-from mrt_mitsuba.rays.bundle import Samples
 from mrt_mitsuba.rendering.view import View
 
 
@@ -187,11 +186,6 @@ class Shader:
     def prepare(self, kernel: KernelPlan | None) -> None:
         """Get ready to trace by a plan of the kernels."""
 
-    def trace(self, names: Iterable[str], view: View, samples: Samples, sampler: Any) -> dict[str, Any]:
-        """Return layers along each ray through some places on the film."""
-        values = self.values(view, *view.rays(samples, sampler), sampler)
-        return {name: TABLE[name].value(values) for name in names}
-
     @property
     def aovs(self) -> tuple[str, ...]:
         """Names of the integrator's own channels."""
@@ -242,7 +236,7 @@ def components(value: Any) -> list[Any]:
     """Return the channels of a layer's value."""
     import drjit as dr
 
-    return list(value) if dr.depth_v(value) > 1 else [value]
+    return list(value) if dr.size_v(value) > 1 else [value]
 
 
 def to_rgb(spectrum: Any, ray: Any) -> Any:

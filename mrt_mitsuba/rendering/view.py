@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
-
-from mrt_mitsuba.rays.bundle import Samples
 
 
 @dataclass(frozen=True)
@@ -21,21 +17,26 @@ class View:
     height: int
     motion: tuple[float, float, float] | None = None
 
-    def rays(self, samples: Samples, sampler: Any) -> tuple[Any, Any]:
-        """Return the rays through some places on the film, and their weights."""
+    def rays(self, place: Any, time: Any, sampler: Any) -> tuple[Any, Any]:
+        """Return the rays through places in the picture, [0, 1]², and their weights.
+
+        ``time``: from 0, when the shutter opens, to 1; None: the sampler draws it, as for Mitsuba's sensors.
+        Draws what Mitsuba's integrators draw, in their order.
+        """
         import mitsuba as mi
 
-        aperture = sampler.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
+        sensor, moment = self.sensor, time
+        aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+        if time is None:
+            moment = mi.Float(sensor.shutter_open())
+            if sensor.shutter_open_time() > 0:
+                moment += sampler.next_1d() * sensor.shutter_open_time()
         wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
-        ray, weight = self.sensor.sample_ray(mi.Float(samples.time), wavelength, samples.place, aperture)
-        return self.moved(mi.Ray3f(ray), samples.time), weight
-
-    def moved(self, ray: Any, time: Any) -> Any:
-        """Return a ray as the camera sees it on its way, at a time from 0 to 1."""
+        ray, weight = sensor.sample_ray_differential(moment, wavelength, place, aperture)
         if self.motion is not None:
-            ray.o += self._shift(time)
-            ray.time = time
-        return ray
+            ray.time = sampler.next_1d() if time is None else time
+            ray.o += self._shift(ray.time)
+        return ray, weight
 
     def distance(self, si: Any) -> Any:
         """Return the distance of a hit from the eye; along the ray where the sensor has no single eye."""
@@ -58,9 +59,8 @@ class View:
         way = mi.Vector3f(self.motion) if scalar else dr.opaque(mi.Vector3f, self.motion)
         return mi.Vector3f(way) * time
 
-    def matrices(self) -> Mapping[str, np.ndarray]:
-        """Return the camera's matrices as they are now, float64 [4, 4] for row vectors on their left, as EXR
-        defines them; computed when they are read.
+    def matrices(self) -> dict[str, np.ndarray]:
+        """Return the camera's matrices, float64 [4, 4] for row vectors on their left, as EXR defines them.
 
         ``worldToCamera``: to a camera at the origin that looks along -z, with x to the right and y up.
         ``worldToNDC``, of pinhole cameras: to the picture, x from 0 to 1 to the right and y downwards.
@@ -68,66 +68,18 @@ class View:
         """
         import mitsuba as mi
 
-        film, found = self.sensor.film(), _collector(mi.variant())(self.sensor)
-        # copies share the numbers, and stay as they are when the sensor's change
-        numbers = {name: type(value)(value) for name, value in found.values.items()}
-        sizes = film.size(), film.crop_size(), film.crop_offset()
-        world = self.sensor.world_transform().matrix
-        return Matrices(type(world)(world), numbers, sizes)
-
-
-@cache
-def _collector(variant: str) -> type:
-    """Return the class of what collects a sensor's numbers, for a variant; ``mi.traverse`` takes ten times as
-    long."""
-    import mitsuba as mi
-
-    class Collector(mi.TraversalCallback):
-        def __init__(self, sensor: Any) -> None:
-            super().__init__()
-            self.sensor, self.values = sensor, dict[str, Any]()
-            sensor.traverse(self)
-
-        def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
-            if name in _PINHOLE:
-                value = value if cpptype is None else mi.get_property(value, cpptype, self.sensor)
-                self.values[name] = value
-
-    return Collector
-
-
-_PINHOLE = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
-
-
-class Matrices(Mapping[str, np.ndarray]):
-    """The matrices of a camera, computed when the first is read."""
-
-    def __init__(self, world: Any, numbers: Mapping[str, Any], sizes: Sequence[np.ndarray]) -> None:
-        self._given = world, numbers, sizes
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        return self._found[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._found)
-
-    def __len__(self) -> int:
-        return len(self._found)
-
-    @cached_property
-    def _found(self) -> dict[str, np.ndarray]:
-        world, numbers, sizes = self._given
-        size, crop, start = (np.array(pair, float) for pair in sizes)
-        to_world = np.array(world, np.float64).reshape(4, 4)
+        to_world = np.array(self.sensor.world_transform().matrix, np.float64).reshape(4, 4)
         if not np.isfinite(to_world).all() or np.linalg.matrix_rank(to_world) < 4:
             return {}
         # Mitsuba's cameras look along +z, with x to the left
-        to_camera = np.diag([-1.0, 1.0, -1.0, 1.0]) @ np.linalg.inv(to_world)
-        found = {"worldToCamera": to_camera}
-        fov, *shift = (np.array(numbers.get(name, 0.0)).item() for name in _PINHOLE)
+        found = {"worldToCamera": np.diag([-1.0, 1.0, -1.0, 1.0]) @ np.linalg.inv(to_world)}
+        numbers, film = mi.traverse(self.sensor), self.sensor.film()
+        names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
+        fov, *shift = (np.array(numbers.get(name, 0.0)).item() for name in names)
         if fov:
+            size, crop = np.array(film.size(), float), np.array(film.crop_size(), float)
             pixels = size[0] / (2 * np.tan(np.deg2rad(fov) / 2))  # at a distance of one
-            centre = (0.5 - np.array(shift)) * size - start
+            centre = (0.5 - np.array(shift)) * size - np.array(film.crop_offset(), float)
             projection = np.array(
                 [
                     [pixels / crop[0], 0, -centre[0] / crop[0], 0],
@@ -136,5 +88,5 @@ class Matrices(Mapping[str, np.ndarray]):
                     [0, 0, -1, 0],
                 ]
             )
-            found["worldToNDC"] = projection @ to_camera
+            found["worldToNDC"] = projection @ found["worldToCamera"]
         return {name: matrix.T for name, matrix in found.items()}

@@ -6,8 +6,7 @@ import operator
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
@@ -85,34 +84,6 @@ def open_scene(
     set_parameters(loaded, keys)
     view, integrator = _sensor(name, loaded, sensor), _integrator(integrator, loaded)
     return Source(name, loaded, view, integrator, width, height, own.focal_distance, own.focal_range, fresnel)
-
-
-def reopen_scene(
-    scene: Any,
-    *,
-    size: tuple[int | None, int | None],
-    fresnel: str | None,
-    integrator: Any,
-    sensor: int,
-    params: Mapping[str, Any] | None,
-    model: Mapping[str, Any],
-    budget: Budget,
-) -> Source:
-    """Open a scene as ``open_scene`` does, for callers who leave it as it is; numbered ones may be kept."""
-    numbered = hasattr(scene, "__index__") and not params and not model.keys() - {"convention"}
-    if not numbered or report_scene(operator.index(scene)).meshes:
-        how: dict[str, Any] = {"size": size, "fresnel": fresnel, "integrator": integrator, "sensor": sensor}
-        return open_scene(scene, **how, params=params, model=model, budget=budget)
-    import mitsuba as mi
-
-    found = _numbered(operator.index(scene), size, fresnel, str(mi.variant()))
-    view, chosen = _sensor(found.name, found.scene, sensor), _integrator(integrator, found.scene)
-    return replace(found, sensor=view, integrator=chosen)
-
-
-@lru_cache(maxsize=4)  # few, as their memory stays taken
-def _numbered(number: int, size: tuple[int | None, int | None], fresnel: str | None, variant: str) -> Source:
-    return open_scene(number, size=size, fresnel=fresnel)
 
 
 @contextmanager

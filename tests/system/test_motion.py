@@ -11,9 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rays.bundle import Bundle
-from mrt_mitsuba.rays.lattice import Lattice
-from mrt_mitsuba.rays.shutter import Shutter
+from mrt_mitsuba.rays.lattice import Lattice, Places
 from mrt_mitsuba.scene.report import report_scene
 
 SMALL = {"width": 96, "height": 72, "focaldist": 0}
@@ -30,22 +28,26 @@ def _shifted(number: int, way: tuple[float, ...]):
     return dataclasses.replace(scene, camera=dataclasses.replace(camera, position=position, target=target))
 
 
-def _times(shutter: Shutter, pixels: int = 64, lattice: int = 4, repeats: int = 1) -> np.ndarray:
+def _times(pixels: int = 64, aa: int = 4, repeats: int = 1, **shutter) -> np.ndarray:
     """Times of all rays, [pixels, rays of a pixel]."""
-    bundle = Bundle(
-        range(pixels), Lattice("report", lattice), count=lattice**2, repeats=repeats, shutter=shutter
-    )
-    return np.array(bundle.placed(bundle.numbers(8, pixels // 8)).time).reshape(pixels, -1)
+    places = Places(Lattice("report", aa), 0, aa**2, repeats, **shutter)
+    pixel, ray = np.divmod(np.arange(pixels * places.size, dtype=np.uint32), places.size)
+    numbers = places.numbers(8, pixels // 8)
+    if mi.variant().startswith("scalar"):
+        times = [places.at(int(p), int(r), numbers)[1] for p, r in zip(pixel, ray, strict=True)]
+    else:
+        times = places.at(mi.UInt32(pixel), mi.UInt32(ray), numbers)[1]
+    return np.array(times).reshape(pixels, -1)
 
 
 # ------------------------------------------------- Times -------------------------------------------------
 
 
 @settings(max_examples=40)
-@given(lattice=st.integers(1, 9), repeats=st.integers(1, 5), seed=st.integers(0, 2**32 - 1))
-def test_every_ray_of_a_pixel_has_a_part_of_the_time_of_its_own(lattice, repeats, seed):
-    moments = lattice**2 * repeats
-    times = _times(Shutter(moments, seed=seed), lattice=lattice, repeats=repeats)
+@given(aa=st.integers(1, 9), repeats=st.integers(1, 5), seed=st.integers(0, 2**32 - 1))
+def test_every_ray_of_a_pixel_has_a_part_of_the_time_of_its_own(aa, repeats, seed):
+    moments = aa**2 * repeats
+    times = _times(aa=aa, repeats=repeats, moments=moments, phase=None, seed=seed)
     assert times.min() >= 0 and times.max() <= 1
     parts = np.sort(
         np.floor(times * moments - (times * moments % 1).mean(axis=1, keepdims=True) + 0.5), axis=1
@@ -56,14 +58,14 @@ def test_every_ray_of_a_pixel_has_a_part_of_the_time_of_its_own(lattice, repeats
 @pytest.mark.parametrize("aa", [3, 4, 5, 8])
 def test_place_and_time_do_not_go_together(aa):
     """A moving edge needs all places at all times; in the order of the lattice, rows correlate by 0.97."""
-    times = _times(Shutter(aa**2, 0.5), lattice=aa)[0]
+    times = _times(aa=aa, moments=aa**2, phase=0.5)[0]
     i, j = np.divmod(np.arange(aa**2), aa)
     for places in (i, j, i + j, i - j):
         assert abs(np.corrcoef(places, times)[0, 1]) < 0.35
 
 
 def test_pixels_have_other_times_than_their_neighbours_and_others_with_another_seed():
-    first, second = _times(Shutter(16, seed=1)), _times(Shutter(16, seed=2))
+    first, second = (_times(moments=16, phase=None, seed=seed) for seed in (1, 2))
     assert len(np.unique(first[:, 0])) == 64
     assert (first != second).all()
     # the mean of 1024 stratified times: 1/16 / sqrt(12 * 64 pixels) = 0.0023 of deviation
@@ -71,17 +73,17 @@ def test_pixels_have_other_times_than_their_neighbours_and_others_with_another_s
 
 
 def test_frames_are_at_multiples_and_start_when_the_shutter_opens():
-    times = _times(Shutter(5, 0.0), repeats=5)
+    times = _times(repeats=5, moments=5)
     assert (times[:, 0] == 0).all()
     for sample in times.reshape(-1, 5):
         np.testing.assert_allclose(np.sort(sample), [0, 0.2, 0.4, 0.6, 0.8], atol=1e-7)
 
 
 def test_scalar_variants_have_the_same_times():
-    fast = _times(Shutter(16, seed=3), pixels=8)
+    options = {"pixels": 8, "moments": 16, "phase": None, "seed": 3}
+    fast = _times(**options)
     mi.set_variant("scalar_rgb")
-    bundle = Bundle(range(8), Lattice("report", 4), count=16, shutter=Shutter(16, seed=3))
-    slow = np.array([sample.time for sample in bundle.each_sample(8, 1)]).reshape(8, 16)
+    slow = _times(**options)
     # float32 against double of the same integers
     np.testing.assert_allclose(slow, fast, atol=1e-6)
 

@@ -1,12 +1,66 @@
-"""Random numbers that fill each pixel evenly, however many rays it gets in the end."""
+"""Random numbers: of each ray, whichever others are traced with it; or filling each pixel evenly, however
+many rays it gets in the end."""
 
 from __future__ import annotations
 
 import functools
 from typing import Any
 
+# The golden ratio in 32 bits: seeds that follow each other must not meet those of later rays
+_STRIDE = 0x9E3779B9
 # Sobol's second coordinate: bit i of the index takes part where Pascal's triangle is odd, in five doublings
 _PASCAL = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))
+
+
+def ray_sampler() -> Any:
+    """Return a Mitsuba sampler for the current variant; call ``start`` for the rays that it is to serve."""
+    import mitsuba as mi
+
+    return _sampler_class(mi.variant())(mi.Properties("ray_sampler"))
+
+
+@functools.cache
+def _sampler_class(variant: str) -> type:
+    import drjit as dr
+    import mitsuba as mi
+
+    class RaySampler(mi.Sampler):
+        """Draws the numbers of Mitsuba's ``independent``, with rays that need not begin with number 0.
+
+        ``independent`` numbers the rays of every wavefront from 0, so that pictures would depend on how they
+        are cut into wavefronts.
+        """
+
+        def __init__(self, props: Any) -> None:
+            mi.Sampler.__init__(self, props)
+            self.random = mi.PCG32()
+
+        def start(self, seed: Any, number: Any) -> None:
+            """Turn to the rays of these numbers, or of this one in scalar variants.
+
+            ``seed``: a number, or an array of one.
+            """
+            if mi.variant().startswith("scalar"):
+                seed = (seed + (number >> 32) * _STRIDE) % 2**32
+                state, sequence = mi.sample_tea_32(seed, number % 2**32)
+            else:
+                mi.Sampler.seed(self, 0, dr.width(number))  # which only notes how many there are
+                seed = seed if dr.is_array_v(seed) else dr.opaque(mi.UInt32, seed)
+                start = seed + mi.UInt32(number >> 32) * _STRIDE
+                state, sequence = mi.sample_tea_32(start, mi.UInt32(number))
+            self.random = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
+
+        def next_1d(self, active: Any = True) -> Any:
+            return self.random.next_float32(active)
+
+        def next_2d(self, active: Any = True) -> Any:
+            x = self.random.next_float32(active)
+            return mi.Point2f(x, self.random.next_float32(active))
+
+        def to_string(self) -> str:
+            return "RaySampler[]"
+
+    return RaySampler
 
 
 def pixel_sequence() -> Any:
