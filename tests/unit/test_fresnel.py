@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from itertools import product
-from pathlib import Path
 
 import drjit as dr
 import drjit.scalar
@@ -16,7 +14,7 @@ from hypothesis import strategies as st
 from mpmath import mp
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.plugins.fresnel import ETA_MAX, f0_from_ior, fresnel_dielectric, fresnel_schlick
+from mrt_mitsuba.plugins.fresnel import f0_from_ior, fresnel_dielectric, fresnel_schlick
 from mrt_mitsuba.validation.oracles import exact
 
 needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, reason="no LLVM to run kernels")
@@ -55,16 +53,6 @@ def test_course_table_to_six_decimals() -> None:
     np.testing.assert_allclose(np.array(fresnel_dielectric(*columns)), truth, rtol=0, atol=5e-7)
 
 
-def test_course_file_where_at_hand(original_data: Path) -> None:
-    """Its sixth decimal is that of its own float32 arithmetic, up to 1.4e-6 off, at (0.5, 1.5, 1.3)."""
-    with (original_data / "fresnel.csv").open() as lines:
-        rows = [[*map(float, row.values())] for row in csv.DictReader(lines)]
-    errors = {tuple(row[:3]): abs(fresnel_dielectric(*row[:3]) - row[3]) for row in rows}
-    assert len(errors) == 81
-    assert errors.pop((0.5, 1.5, 1.3)) < 1.5e-6
-    assert max(errors.values()) < 6e-7
-
-
 def test_schlick_and_its_f0_keep_their_digits() -> None:
     """F₀ next to an index of 1 is a small difference's square; the exact form is the stability study's."""
     near_one, large, small = (10 ** np.linspace(*ends, 400) for ends in ((-6.5, -2), (0.01, 6), (-9, -0.2)))
@@ -91,7 +79,7 @@ def test_sine_serves_where_the_cosine_is_rounded_to_one() -> None:
     np.testing.assert_array_equal(np.array(reflected) == 1, np.array(s2) >= 1e-10)
 
 
-@pytest.mark.parametrize("values", [0, 1e-45, 1e-30, 1e30, 3e38])
+@pytest.mark.parametrize("values", [0, 1e-45, 1e-30, 1e9, 1e30, 3e38])
 def test_extreme_indices_stay_in_range(values: float) -> None:
     eta, c = float32([values]), float32([0.5])
     one = float32([1.0])
@@ -127,22 +115,6 @@ def test_total_reflection_begins_at_the_critical_angle(n1: float, ratio: float, 
     assert fresnel_dielectric(math.sqrt((1 - sin_theta) * (1 + sin_theta)), n1, n2) == 1
     sin_theta = sin_critical * (1 - beyond)
     assert fresnel_dielectric(math.sqrt((1 - sin_theta) * (1 + sin_theta)), n1, n2) < 1
-
-
-def test_index_is_limited_far_from_where_it_matters() -> None:
-    assert fresnel_dielectric(0.3, 1.0, ETA_MAX) == pytest.approx(1, abs=1e-7)
-    assert fresnel_dielectric(0.3, 1.0, 1e300) == pytest.approx(1, abs=1e-7)
-
-
-def test_colours_and_arrays_give_what_numbers_give() -> None:
-    cosines, f0 = [0.2, 0.9], (0.04, 0.5, 0.9)
-    color = drjit.scalar.Array3f64(f0)
-    for c in cosines:
-        expected = [fresnel_schlick(c, f) for f in f0]
-        np.testing.assert_allclose(np.array(fresnel_schlick(c, color)), expected, rtol=1e-15)
-    array = drjit.scalar.ArrayXf64(cosines)
-    expected = [fresnel_dielectric(c, 1.0, 1.5) for c in cosines]
-    np.testing.assert_allclose(np.array(fresnel_dielectric(array, 1.0, 1.5)), expected, rtol=1e-15)
 
 
 @needs_llvm

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.command.toml import read_toml
 
 ROOT = Path(__file__).parents[2]
 
@@ -140,20 +139,3 @@ for integrator in ("direct", "path", "mrt_whitted"):
 print("written" if "mrt_plane" in text else "lost")
 """
     assert lines(run_python, code) == ["written"]
-
-
-def test_entry_points_register_as_mitsuba_loads_them(run_python) -> None:
-    """Mitsuba 3.10 imports each module once a variant is set, and reloads it after every switch."""
-    modules = read_toml(ROOT / "pyproject.toml")["project"]["entry-points"]["mitsuba"]
-    code = """
-import importlib, sys
-variants = ["scalar_rgb", "llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral"]
-loaded = []
-for variant in variants:
-    mi.set_variant(variant)
-    loaded = [importlib.reload(module) for module in loaded] or [
-        importlib.import_module(name) for name in sys.argv[1:]]
-    draws("direct", "mrt_whitted")
-print("done")
-"""
-    assert lines(run_python, code, *modules.values()) == ["done"]
