@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import drjit.scalar
 import numpy as np
 
-from .columns import Vector3
 from .hit_errors import CURVED, flat_triangles
 from .intersect import Frame
 from .protocols import PlaneShape, QuadricShape
@@ -66,11 +66,11 @@ def _holding(boxes: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _on_quadrics(table: QuadricTable, boxes: np.ndarray, p: np.ndarray) -> bool:
     near, slack = _holding(boxes, p)
-    kind = KINDS[table.kind]
+    kind, vector = KINDS[table.kind], drjit.scalar.Array3f64
     for k in np.flatnonzero(near)[:MOST_LOOKED_AT]:
-        origin, x, y, z = (Vector3(row.tolist()) for row in (table.origins[k], *table.rows[k]))
+        origin, x, y, z = (vector(row.tolist()) for row in (table.origins[k], *table.rows[k]))
         frame = Frame(origin, x, y, z)
-        feet = np.array([kind.surface(Vector3(p.tolist()), part, frame).p for part in kind.parts])
+        feet = np.array([kind.surface(vector(p.tolist()), part, frame).p for part in kind.parts])
         # A part goes on beyond the object, but not within its box, or nearly so
         there = [_holding(boxes[k : k + 1], foot)[0][0] for foot in feet]
         if (there & (np.linalg.norm(feet - p, axis=1) <= slack[k])).any():

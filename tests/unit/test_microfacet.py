@@ -11,7 +11,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from mpmath import mp
 
-from mrt_mitsuba.plugins.columns import Vector3
+from mrt_mitsuba.plugins.columns import Columns
 from mrt_mitsuba.plugins.microfacet import (
     TAN2_MAX,
     beckmann_d,
@@ -41,8 +41,8 @@ def float32(values) -> drjit.scalar.ArrayXf:
     return drjit.scalar.ArrayXf(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def vectors32(values: np.ndarray) -> Vector3:
-    return Vector3(float32(column) for column in values.T)
+def vectors32(values: np.ndarray) -> Columns:
+    return Columns(float32(column) for column in values.T)
 
 
 def relative_errors(found, truth: list) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import VariantError
-from mrt_mitsuba.plugins.columns import Vector3
+from mrt_mitsuba.plugins.columns import Columns
 from mrt_mitsuba.plugins.fresnel import fresnel_dielectric, fresnel_schlick
 from mrt_mitsuba.plugins.microfacet import smith_g1
 from mrt_mitsuba.validation.oracles import exact
@@ -42,7 +42,7 @@ def _g1(alpha: float) -> tuple[Function, Function]:
         x = exact.number(c)
         return exact.smith_g1((exact.mp.sqrt(1 - x * x), 0, x), rough)
 
-    return lambda c: smith_g1(Vector3((dr.sqrt((1 - c) * (1 + c)), c * 0, c)), rough), truth
+    return lambda c: smith_g1(Columns((dr.sqrt((1 - c) * (1 + c)), c * 0, c)), rough), truth
 
 
 # Functions of the cosine by name, in any precision and in 50 digits
