@@ -400,12 +400,3 @@ print(set(found) - {"done"})
 def test_ctrl_c_in_a_render_is_always_an_interrupt(run_python) -> None:
     done = run_python(INTERRUPTED)
     assert (done.returncode, done.stdout) == (0, "{'KeyboardInterrupt'}\n"), done.stdout + done.stderr
-
-
-def test_hang_up_ends_the_command_as_a_termination_does(start, tmp_path: Path) -> None:
-    with start(MRT, "out", "3", "width=3000", "height=3000", "aamode=none", "aa=4") as process:
-        process.stdout.readline()  # the command has begun
-        time.sleep(0.5)
-        process.send_signal(signal.SIGHUP)
-        assert process.wait(timeout=20) in (143, 129), process.stderr.read()
-    assert list(tmp_path.iterdir()) == []

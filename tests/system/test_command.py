@@ -42,12 +42,6 @@ def test_same_command_twice_gives_the_same_bytes(mrt_command, tmp_path: Path) ->
         assert (tmp_path / f"a.{ending}").read_bytes() == (tmp_path / f"b.{ending}").read_bytes()
 
 
-def test_plan_is_shown(mrt_command) -> None:
-    done = mrt_command("out", "0", *SMALL, "aa=1", "plan=show")
-    assert done.returncode == 0
-    assert "Plan for 0" in done.stdout and "without depth of field" in done.stdout
-
-
 def test_scene_file_keeps_its_size(mrt_command, tmp_path: Path) -> None:
     (tmp_path / "mine.xml").write_text(
         """<scene version="3.0.0">
@@ -76,19 +70,6 @@ def test_model_is_seen_from_where_the_camera_is_put(mrt_command, tmp_path: Path)
     assert sorted(half) == [False, True] and not np.array_equal(front, back)
     done = mrt_command("along", *common, "camera=0,5,0")
     assert done.returncode == 2 and "looks along up" in done.stderr and done.stderr.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "text"),
-    [("out scene=a.obj", 1, "a.obj:2: v has 2 numbers"), ("out scene=a.obj fov=0", 2, "fov must be degrees")],
-)
-def test_bad_input(mrt_command, tmp_path: Path, arguments: str, code: int, text: str) -> None:
-    """The installed command refuses as ``test_refusals.py`` shows, where the table of cases is."""
-    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0\n")
-    done = mrt_command(*arguments.split(), "quiet=1")
-    assert (done.returncode, done.stdout) == (code, "")
-    assert text in done.stderr and done.stderr.startswith("mrt: ") and done.stderr.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["a.obj"]
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")

@@ -44,19 +44,6 @@ def test_xml_renders_the_same_picture_as_the_dict(number):
     assert np.array_equal(*images)
 
 
-def test_dicts_are_plain_and_share_materials():
-    scene = mrt.scene_dict(4)
-    materials = {
-        name for name, node in scene.items() if isinstance(node, dict) and node["type"] == "mrt_bsdf"
-    }
-    shapes = [
-        node for node in scene.values() if isinstance(node, dict) and node["type"] in ("sphere", "mrt_plane")
-    ]
-    assert len(shapes) == 603 and len(materials) == 13
-    assert all(shape["bsdf"] == {"type": "ref", "id": shape["bsdf"]["id"]} for shape in shapes)
-    assert {shape["bsdf"]["id"] for shape in shapes} == materials
-
-
 @pytest.mark.parametrize("number", NUMBERS)
 def test_stock_flavour_opens_without_our_plugins(number, run_python):
     """Read in a process that never imports the package, as the ``mitsuba`` command would do."""

@@ -352,6 +352,7 @@ NAN, INFINITE = math.nan, math.inf
         ({"layers": ["depth", "depth"]}, "each once"),
         ({"motion": (1, 2)}, "motion=(1, 2): must be three finite numbers"),
         ({"aamode": "none", "layers": ["edges"]}, "edges"),
+        ({"fresnel": "exact"}, "fresnel='exact': must be schlick or dielectric"),
         ({"integrator": 3}, "the integrator is 3: it must be a sampling integrator"),
         ({"integrator": {"type": "ptracer"}}, "it must be a sampling integrator"),
         ({"integrator": "prb"}, "the integrator PRBIntegrator computes derivatives"),
@@ -398,19 +399,6 @@ def test_scenes_that_cannot_be_drawn(scene: Any, text: str) -> None:
     assert "Traceback" not in str(caught.value) and ".cpp:" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        ({"width": 0}, "width=0"),
-        ({"fresnel": "exact"}, "fresnel='exact': must be schlick or dielectric"),
-        ({"flavor": "vanilla"}, "flavor='vanilla': must be mrt or stock"),
-    ],
-)
-def test_scene_dict_refuses(arguments: dict[str, Any], text: str) -> None:
-    with pytest.raises(mrt.UsageError, match=re.escape(text)):
-        mrt.scene_dict(0, **arguments)
-
-
 def test_objects_of_another_variant_are_named() -> None:
     mi.set_variant("scalar_rgb")
     scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
@@ -419,20 +407,6 @@ def test_objects_of_another_variant_are_named() -> None:
     for given in ({"scene": scene}, {"integrator": integrator}):
         with pytest.raises(mrt.UsageError, match="was loaded in the variant scalar_rgb, and llvm_ad_rgb is"):
             mrt.render(**TINY | given)
-
-
-def test_results_are_not_saved_by_another_tone_map(tmp_path: Path) -> None:
-    with pytest.raises(mrt.UsageError, match="tonemap='neon': must be report or srgb"):
-        mrt.render(0, **TINY).save(tmp_path / "a.png", tonemap="neon")
-    assert list(tmp_path.iterdir()) == []
-
-
-CORNERS = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
-
-
-def _mesh(**arrays: np.ndarray) -> dict[str, Any]:
-    arrays = {"positions": CORNERS, "faces": np.array([[[0, 1, 2]]], np.uint32), **arrays}
-    return {"type": "mrt_mesh", **{name: mi.Bitmap(array) for name, array in arrays.items()}}
 
 
 UP = {"type": "mrt_plane", "normal": [0, 1, 0]}
@@ -481,6 +455,9 @@ def test_plugins_name_the_parameter(variant: str, plugin: dict[str, Any], text: 
     assert plugin["type"] in str(caught.value)
 
 
+CORNERS = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
+
+
 @pytest.mark.parametrize(
     ("arrays", "text"),
     [
@@ -492,5 +469,6 @@ def test_plugins_name_the_parameter(variant: str, plugin: dict[str, Any], text: 
     ],
 )
 def test_meshes_name_the_array(variant: str, arrays: dict[str, np.ndarray], text: str) -> None:
+    arrays = {"positions": CORNERS, "faces": np.array([[[0, 1, 2]]], np.uint32), **arrays}
     with pytest.raises(RuntimeError, match=re.escape(text)):
-        mi.load_dict(_mesh(**arrays))
+        mi.load_dict({"type": "mrt_mesh", **{name: mi.Bitmap(array) for name, array in arrays.items()}})

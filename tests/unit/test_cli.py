@@ -73,22 +73,10 @@ def test_render_writes_and_says_what_the_report_says(renderer: Recorder, tmp_pat
     assert not {"filename", "scene", "format", "tonemap", "quiet", "plan"} & arguments.keys()
 
 
-def test_plan_is_shown_before_the_first_stage(renderer: Recorder, tmp_path: Path, capsys) -> None:
-    assert cli.main([str(tmp_path / "out"), "plan=show"]) == 0
-    text = capsys.readouterr().out
-    assert text.index("Width") < text.index("THE PLAN") < text.index("Computing")
-
-
 def test_quiet_prints_nothing(renderer: Recorder, tmp_path: Path, capsys) -> None:
     assert cli.main([str(tmp_path / "out"), "quiet=1", "plan=show", "format=png"]) == 0
     assert capsys.readouterr() == ("", "")
     assert [path.name for path in tmp_path.iterdir()] == ["out.png"]
-
-
-def test_scene_file_goes_to_the_renderer(renderer: Recorder, tmp_path: Path, capsys) -> None:
-    assert cli.main([str(tmp_path / "out"), "scene=mine.xml", "focaldist=3"]) == 0
-    assert renderer.calls[0][0] == "mine.xml"
-    assert "F distance: 3.0" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -102,32 +90,14 @@ def test_banner_names_the_scenes_own_focus(
     assert f"F distance: {distance}\n" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("arguments", [["help"], ["--help"], ["-h"]])
-def test_help(arguments: list[str], capsys) -> None:
-    assert cli.main(arguments) == 0
-    text, errors = capsys.readouterr()
-    assert text.startswith("usage: mrt FILENAME [SCENE] [name=value ...]") and errors == ""
-
-
-def test_no_argument_prints_the_usage(capsys) -> None:
-    assert cli.main([]) == 2
-    text, errors = capsys.readouterr()
-    assert text == "" and errors.startswith("usage: mrt FILENAME")
-
-
-def test_scenes(capsys) -> None:
+def test_listings(capsys) -> None:
+    for words in (["help"], ["--help"], ["-h"]):
+        assert cli.main(words) == 0
+        text, errors = capsys.readouterr()
+        assert text.startswith("usage: mrt FILENAME [SCENE] [name=value ...]") and errors == ""
+    assert cli.main([]) == 2 and capsys.readouterr() == ("", text)
     assert cli.main(["scenes"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines][:5] == ["0", "1", "2", "3", "4"]
-    assert all(len(line) > 10 for line in lines)
-
-
-def test_unwritable_target_is_found_before_rendering(renderer: Recorder, tmp_path: Path, capsys) -> None:
-    (tmp_path / "out.exr").mkdir()
-    assert cli.main([str(tmp_path / "out")]) == 1
-    text, errors = capsys.readouterr()
-    assert "out.exr: it is a folder" in errors and text == ""
-    assert renderer.calls == [] and not (tmp_path / "out.png").exists()
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list("0123456789")
 
 
 @pytest.mark.parametrize(
@@ -144,19 +114,16 @@ def test_unwritable_target_is_found_before_rendering(renderer: Recorder, tmp_pat
     ],
 )
 def test_failures_are_one_line(
-    renderer: Recorder, tmp_path: Path, capsys, error: BaseException, code: int, text: str
+    renderer: Recorder, tmp_path: Path, monkeypatch, capsys, error: BaseException, code: int, text: str
 ) -> None:
     renderer.error = error
     assert cli.main([str(tmp_path / "out")]) == code
     assert capsys.readouterr().err == text
     assert list(tmp_path.iterdir()) == []
-
-
-def test_unexpected_errors_show_where_on_request(renderer: Recorder, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setenv(cli.TRACEBACK, "1")
-    renderer.error = RuntimeError("inside")
-    with pytest.raises(RuntimeError, match="inside"):
-        cli.main([str(tmp_path / "out")])
+    if "MRT_TRACEBACK" in text:
+        monkeypatch.setenv(cli.TRACEBACK, "1")
+        with pytest.raises(RuntimeError, match="second"):
+            cli.main([str(tmp_path / "out")])
 
 
 @pytest.mark.parametrize(("quiet", "text"), [("0", "mrt: warning: slow\\nhere\n"), ("1", "")])
