@@ -54,12 +54,23 @@ class View:
         return np.broadcast_to(self.wi, (count, 3)), np.broadcast_to(self.uv, (count, 2))
 
 
-@dataclass
+@dataclass(frozen=True)
+class Pairs(Lanes):
+    """N pairs of directions, and what ``eval`` and ``pdf`` give."""
+
+    wi: Array
+    wo: Array
+    uv: Array
+    value: Array  # [N, channels]
+    pdf: Array
+    eta: Array  # index of refraction at wo over that at wi
+
+
 class Case(Subject):
     """A BSDF under examination, and what several laws need to know of it."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def __init__(self, given: Any, quick: bool, seed: int) -> None:
+        super().__init__(given, quick, seed)
         self.probe = Probe(self.plugin)
 
     def uniform(self, count: int) -> Array:
@@ -68,7 +79,7 @@ class Case(Subject):
     @cached_property
     def views(self) -> list[View]:
         """Samples at every angle of incidence, at random azimuths and texture coordinates."""
-        count = self.count(2**16, 2**18)
+        count = self.count(2**16, 2**19)
         found = []
         for angle in QUICK_ANGLES if self.quick else ANGLES:
             wi = direction(np.cos(np.radians(angle)), self.rng.uniform(0, 2 * np.pi))
@@ -82,13 +93,41 @@ class Case(Subject):
     @cached_property
     def densities(self) -> list[tuple[View, Integrals | None]]:
         """The integrals of the density for each view, in cells that resolve it; None where none do."""
-        return [(view, _integrals(self, view)) for view in self.views]
+        return [(view, self._integrals(view)) for view in self.views]
+
+    def _integrals(self, view: View) -> Integrals | None:
+        pilot = view.samples.wo[: view.pilot][view.density[: view.pilot] > 0]
+        # around the mirror direction at all scales, where lobes may be that are not sampled
+        spread = 10 ** self.rng.uniform(-4, 0, (600, 1)) * self.rng.normal(size=(600, 3))
+        seeds = encode(np.concatenate([pilot, unit(view.wi * [-1, -1, 1] + spread)]))
+        most = max(view.pilot // 1000, 8)
+        cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
+        if len(pilot):
+            held = np.bincount(cells.find(encode(pilot)), minlength=len(cells.start))[cells.level == DEPTH]
+            # at the normal, all azimuths of the finest cells are one place
+            centre = (np.hypot(*pilot.T[:2]) < np.sqrt(2) * 0.5**DEPTH).sum()
+            if max(held[held > 4 * most].sum(), centre) > 0.01 * len(pilot):
+                return None
+
+        def pdf(wo: Array) -> Array:
+            wis, uvs = view.around(len(wo))
+            return np.maximum(self.probe.pdf(wis, wo, uvs), 0)[:, None]
+
+        codes, share = view.judged
+        density = view.density[view.pilot :]
+        found = integrate(pdf, cells, self.rng, codes, np.ones(len(codes)), len(density))
+        # samples in cells of whose points less than two are expected where the lobe is
+        cell = found.cells.find(codes)
+        covered = np.bincount(
+            cell, 1 / (len(density) * density[density > 0]), minlength=len(found.cells.start)
+        )
+        overlooked = (covered * POINTS < 2 * found.cells.solid_angle)[cell].sum() / len(density)
+        return found if found.mean.sum() > share or overlooked < OVERLOOKED else None
 
     def copy(self) -> Case:
         """Return a case whose parameters can be changed, with a BSDF of its own if it can be loaded."""
-        loaded = self.plugin if self.recipe.description is None else self.recipe.load()
-        made = Case(loaded, self.recipe, self.quick, self.seed)
-        made.pairs = self.pairs
+        made = Case(self.plugin if self.description is None else self.load(), self.quick, self.seed)
+        made.description, made.pairs = self.description, self.pairs
         return made
 
     @cached_property
@@ -104,80 +143,37 @@ class Case(Subject):
     def pairs(self) -> Pairs:
         """Directions of incidence over the sphere with one exitant each: some sampled, some at random."""
         count = self.count(2**13, 2**15)
-        cos, phi = self.rng.uniform(-1, 1, count), self.rng.uniform(0, 2 * np.pi, count)
-        wi, uv = direction(cos, phi), self.rng.random((count, 2), np.float32)
+        wi, uv = self.units(count), self.rng.random((count, 2), np.float32)
         samples = self.probe.sample(wi, self.uniform(count), uv)
         usable = np.isfinite(samples.wo).all(axis=1) & ~samples.delta & (samples.weight != 0).any(axis=1)
         usable &= (self.rng.random(count) < 0.75) & ~narrow(wi, samples)
-        other = direction(self.rng.uniform(-1, 1, count), self.rng.uniform(0, 2 * np.pi, count))
-        wo = unit(np.where(usable[:, None], samples.wo, other))
+        wo = unit(np.where(usable[:, None], samples.wo, self.units(count)))
         value, pdf = self.probe.both(wi, wo, uv)
-        across = usable & (wi[:, 2] * wo[:, 2] < 0)
-        eta = np.ones(count)
+        crosses = wi[:, 2] * wo[:, 2] < 0
+        across, eta = usable & crosses, np.ones(count)
         for side in (wi[:, 2] > 0, wi[:, 2] < 0):
             known = across & side & np.isfinite(samples.eta)
-            eta[side & (wi[:, 2] * wo[:, 2] < 0)] = np.median(samples.eta[known]) if known.any() else 1
+            eta[side & crosses] = np.median(samples.eta[known]) if known.any() else 1
         return Pairs(wi, wo, uv, value, pdf, np.where(across, samples.eta, eta))
+
+    @cached_property
+    def lit(self) -> Pairs:
+        """The pairs with a value, away from the horizon, over which values jump."""
+        p = self.pairs
+        up = (np.abs(p.wo[:, 2]) > 0.05) & (np.abs(p.wi[:, 2]) > 0.05)
+        return p.only(up & np.isfinite(p.value).all(axis=1) & (p.value > 0).any(axis=1))
 
     def spread(self, quantity: Any, wi: Array, wo: Array, uv: Array, *others: Array) -> Array:
         """Return the largest change of ``quantity(wi, wo, uv, …)`` as directions move by a rounding."""
         return spread(lambda i, o: quantity(i, o, uv, *others), (wi, wo), self.rng)
 
     def snippet(self, body: str, **names: Any) -> str:
-        return snippets.program("bsdf", self.plugin, self.recipe.description, body, **names)
+        return snippets.program("bsdf", self, body, **names)
 
     def at(self, body: str, pairs: Pairs, **more: Any) -> Callable[[int], str]:
         """Return what makes the snippet of one pair; arrays have a row for each."""
         names = {"wi": pairs.wi, "uv": pairs.uv, "wo": pairs.wo, **more}
         return lambda i: self.snippet(body, **row(names, i))
-
-
-@dataclass(frozen=True)
-class Pairs(Lanes):
-    """N pairs of directions, and what ``eval`` and ``pdf`` give."""
-
-    wi: Array
-    wo: Array
-    uv: Array
-    value: Array  # [N, channels]
-    pdf: Array
-    eta: Array  # index of refraction at wo over that at wi
-
-
-def _integrals(case: Case, view: View) -> Integrals | None:
-    pilot = view.samples.wo[: view.pilot][view.density[: view.pilot] > 0]
-    seeds = encode(np.concatenate([pilot, _mirrored(view.wi, case.rng)]))
-    most = max(view.pilot // 1000, 8)
-    cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
-    if len(pilot):
-        held = np.bincount(cells.find(encode(pilot)), minlength=len(cells.start))[cells.level == DEPTH]
-        # at the normal, all azimuths of the finest cells are one place
-        centre = (np.hypot(*pilot.T[:2]) < np.sqrt(2) * 0.5**DEPTH).sum()
-        if max(held[held > 4 * most].sum(), centre) > 0.01 * len(pilot):
-            return None
-
-    def pdf(wo: Array) -> Array:
-        wis, uvs = view.around(len(wo))
-        return np.maximum(case.probe.pdf(wis, wo, uvs), 0)[:, None]
-
-    codes, share = view.judged
-    found = integrate(pdf, cells, case.rng, codes, np.ones(len(codes)), len(view.density) - view.pilot)
-    return found if found.mean.sum() > share or _overlooked(view, found) < OVERLOOKED else None
-
-
-def _overlooked(view: View, found: Integrals) -> float:
-    """Return the share of samples in cells of whose points less than two are expected where the lobe is."""
-    density = view.density[view.pilot :]
-    cell = found.cells.find(view.judged[0])
-    covered = np.bincount(cell, 1 / (len(density) * density[density > 0]), minlength=len(found.cells.start))
-    fine = covered * POINTS < 2 * found.cells.solid_angle
-    return float(fine[cell].sum() / len(density))
-
-
-def _mirrored(wi: Array, rng: np.random.Generator, count: int = 600) -> Array:
-    """Return directions around the mirror direction at all scales, where unsampled lobes may be."""
-    spread = 10 ** rng.uniform(-4, 0, (count, 1)) * rng.normal(size=(count, 3))
-    return unit(wi * [-1, -1, 1] + spread)
 
 
 def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Derivatives of a BSDF's values by its parameters, against differences."""
+"""Derivatives of a BSDF's values by its parameters, against differences, and those of its samples."""
 
 from __future__ import annotations
 
@@ -8,12 +8,51 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.validation.checks import snippets
-from mrt_mitsuba.validation.checks.bsdf_case import Case, Pairs, changed, copied, excess, parameters
-from mrt_mitsuba.validation.checks.law import Law, Skip
+from mrt_mitsuba.validation.checks.bsdf_case import Case, changed, copied, excess, live, narrow, parameters
+from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip
 from mrt_mitsuba.validation.checks.probe import Array, Probe, as_mitsuba, context, interaction, is_scalar
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
+IN_THE_MEAN = 5e-2  # where outlines of lobes move, derivatives of samples miss them
+WIDTHS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  # of differences, over the parameter
+
+GRADIENT_SNIPPET = """point wo
+params, key = mi.traverse(bsdf), {key!r}
+before = type(params[key])(params[key])
+
+def value(shift):
+    params[key] = type(before)(before + shift)
+    params.update()
+    return dr.sum(bsdf.eval(ctx, si, wo), axis=None)
+
+shift = mi.Float(0)
+dr.enable_grad(shift)
+found = value(shift)
+if dr.grad_enabled(found):
+    dr.forward(shift)
+print("derivative:", dr.grad(found), "difference:", (value(1e-3) - value(-1e-3)) / 2e-3)
+"""
+SAMPLED = """point
+params, key = mi.traverse(bsdf), {key!r}
+shift = mi.Float(0)
+dr.enable_grad(shift)
+params[key] = type(params[key])(params[key] + shift)
+params.update()
+u = {u}
+bs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))
+value, pdf = bsdf.eval_pdf(ctx, si, dr.detach(bs.wo))
+found, expected = dr.sum(weight, axis=None), dr.sum(value / dr.detach(pdf), axis=None)
+dr.forward(shift)
+print("does the direction move?", dr.grad_enabled(bs.wo))
+print("derivative of the weight:", dr.grad(found), "of eval() over a constant density:", dr.grad(expected))
+"""
+UPDATE = """point wo
+params, key = mi.traverse(bsdf), {key!r}
+print("eval():", bsdf.eval(ctx, si, wo))
+params[key] = type(params[key])(params[key] * 0 + {number})
+params.update()
+print("after an update to {number}:", bsdf.eval(ctx, si, wo), "should be", {value})
+"""
 
 
 def gradients(law: Law, case: Case) -> None:
@@ -21,14 +60,20 @@ def gradients(law: Law, case: Case) -> None:
     if is_scalar() or "_ad_" not in mi.variant():
         raise Skip(f"{mi.variant()} has no derivatives")
     case.need_smooth()
-    if not len(_lit(case).wi):
+    if not len(case.lit.wi):
         raise Skip("values are 0")
     case = case.copy()
     params = mi.traverse(case.plugin)
     keys = [k for k, _ in parameters(case) if not params.flags(k) & int(mi.ParamFlags.NonDifferentiable)]
     if not keys:
         raise Skip("traverse() marks no parameter as differentiable")
-    detached = [key for key in keys if not _holds(law, case, key)]
+    detached = []
+    for key in keys:
+        if not _holds(law, case, key):
+            detached.append(key)
+        else:
+            with changed(case, key, _inside):
+                _sampled(law, case, key)
     if detached:
         law.notes.append(f"detached: {', '.join(detached)}")
     if not law.parts:
@@ -37,48 +82,109 @@ def gradients(law: Law, case: Case) -> None:
 
 def _holds(law: Law, case: Case, key: str) -> bool:
     """Hold the derivative by one parameter to differences; return False where it is detached, and wrong."""
+    few, shift = case.lit, mi.Float(0)
+    dr.enable_grad(shift)
     with changed(case, key, _inside):
-        found, attached, broken = _derivatives(case, key)
+        with changed(case, key, lambda old: _moved(old, shift)):
+            values = _values(case)
+            found = np.zeros(dr.width(values))
+            attached = dr.grad_enabled(values)
+            if attached:
+                dr.forward(shift)
+                found = np.array(dr.grad(values), np.float64)
+        broken, found = ~np.isfinite(found), np.nan_to_num(found, posinf=0, neginf=0)
         slope, error = _differences(case, key)
     if not attached and not slope.any():
         law.notes.append(f"{key} changes no value")
         _reached(law, case, key)
-    off, few = np.abs(found - slope), _lit(case)
-    known = np.isfinite(error)
+    off, known = np.abs(found - slope), np.isfinite(error)
     if known.sum() < 20:
         law.notes.append(f"{key}: its least differences move lobes away, and cannot judge derivatives")
         return True
     usual = known & (off <= np.quantile(off[known], 0.98))  # where values have a kink, no slope is
     beyond = np.maximum(off - error, 0)[usual].sum()
     measured = beyond / max(np.abs(slope)[usual].sum(), np.abs(found)[usual].sum(), 1e-30)
-    show = case.at(snippets.GRADIENT, few, key=key)
-    what = (
-        f"derivative of values by {key}{'' if attached else ' (detached)'}, relative, beyond the error of "
-        "differences"
-    )
+    show = case.at(GRADIENT_SNIPPET, few, key=key)
+    what = f"derivative of values by {key}{'' if attached else ' (detached)'}, relative"
     why = "differences of two widths agree better than that, or the difference is allowed for"
-    law.at_most(what, measured, GRADIENT, why, show(int(np.where(usual, off, 0).argmax())))
+    worst = show(int(np.where(usual, off, 0).argmax()))
+    law.at_most(f"{what}, beyond the error of differences", measured, GRADIENT, why, worst)
     why = "one of them spoils a whole gradient"
     law.none(f"derivatives by {key} that are not finite, of finite values", broken, why, show)
     return attached or measured <= GRADIENT
 
 
+def _sampled(law: Law, case: Case, key: str) -> None:
+    """Hold the derivative of samples' weights to that of values over a density that does not change.
+
+    Integrators follow a sample as a constant direction. Where a direction moves with the parameter, its weight
+    may change otherwise: only means over smooth light are then the same.
+    """
+    count = case.count(2**14, 2**16)
+    wi, u, uv = case.units(count), case.uniform(count), case.rng.random((count, 2), np.float32)
+    shift = mi.Float(0)
+    dr.enable_grad(shift)
+    with changed(case, key, lambda old: _moved(old, shift)):
+        si = interaction(as_mitsuba("Vector3f", wi), as_mitsuba("Point2f", uv))
+        bs, weight = case.plugin.sample(
+            context(), si, as_mitsuba("Float", u[:, 0]), as_mitsuba("Point2f", u[:, 1:])
+        )
+        wo = dr.detach(bs.wo)
+        value, pdf = case.plugin.eval_pdf(context(), si, wo)
+        moves, light = dr.grad_enabled(bs.wo), 1 + 0.5 * bs.wo.x + 0.25 * dr.square(bs.wo.z)
+        one = _total(weight) * (light if moves else dr.detach(light))
+        other = _total(value) / dr.detach(dr.select(pdf > 0, pdf, 1)) * dr.detach(light)
+        if not (dr.grad_enabled(one) or dr.grad_enabled(other)):
+            return
+        dr.forward(shift)
+        grads = [np.array(dr.grad(x), np.float64) if dr.grad_enabled(x) else np.zeros(count) for x in (one, other)]
+    found, expected = (np.broadcast_to(x, count) for x in grads)
+    samples = case.probe.sample(wi, u, uv)
+    counts = live(wi, samples, *case.probe.both(wi, np.nan_to_num(samples.wo), uv)) & ~narrow(wi, samples)
+    counts &= np.isfinite(found) & np.isfinite(expected) & (np.abs(wi[:, 2]) > 0.05)
+    counts &= np.abs(samples.wo[:, 2]) > 0.05
+    if counts.sum() < 100:
+        return
+    off = np.where(counts, np.abs(found - expected), 0)
+    size = max(np.abs(expected[counts]).mean(), 1e-3 * np.abs(samples.weight[counts]).mean(), 1e-30)
+    show = case.snippet(SAMPLED, wi=wi[off.argmax()], uv=uv[off.argmax()], u=u[off.argmax()], key=key)
+    if moves:
+        apart = (found - expected)[counts]
+        apart = np.clip(apart, *np.quantile(apart, (1e-3, 1 - 1e-3)))
+        beyond = max(abs(apart.mean()) - SIGMAS * apart.std() / np.sqrt(len(apart)), 0)
+        what = f"mean derivative of weights by {key}, of directions that move with it, against that of values"
+        title = f"{what}, relative, beyond {SIGMAS} standard errors"
+        law.at_most(title, beyond / size, IN_THE_MEAN, DETACHED, show)
+        return
+    usual = counts & (off <= np.quantile(off[counts], 0.98))
+    what = f"derivative of weights by {key} against that of eval() over a constant density, relative"
+    law.at_most(what, off[usual].sum() / (size * usual.sum()), GRADIENT, DETACHED, show)
+
+
+DETACHED = "integrators follow a sample's direction as a constant: its density must not change, either"
+
+
+def _total(spectrum: Any) -> Any:
+    value = mi.unpolarized_spectrum(spectrum)
+    total = sum(value[i] for i in range(len(value)))
+    return dr.select(dr.isfinite(total), total, 0)
+
+
 def _reached(law: Law, case: Case, key: str) -> None:
     """A parameter whose updates change no value should change none where it is loaded, either."""
-    name, few = key.removesuffix(".value"), _lit(case)
-    if case.recipe.description is None or "." in name:
+    name, few = key.removesuffix(".value"), case.lit
+    if case.description is None or "." in name:
         return
     number = 0.8 * float(np.mean(np.array(mi.traverse(case.plugin)[key]))) or 0.5
     try:
-        other = Probe(case.recipe.with_(**{name: number}).load())
+        other = Probe(case.load(**{name: number}))
     except RuntimeError:  # what is loaded goes by another name, or takes other numbers
         return
-    allowed = case.spread(case.probe.eval, few.wi, few.wo, few.uv)
     value = other.eval(few.wi, few.wo, few.uv)
-    error = excess(value, few.value, allowed)
+    error = excess(value, few.value, case.spread(case.probe.eval, few.wi, few.wo, few.uv))
     what = f"values that loading with another {key} changes, but params.update() does not, relative"
     why = "parameters_changed() has to compute anew what is made of parameters"
-    law.most(what, error, GRADIENT, why, case.at(snippets.UPDATE, few, key=key, number=number, value=value))
+    law.most(what, error, GRADIENT, why, case.at(UPDATE, few, key=key, number=number, value=value))
 
 
 def _inside(value: Any) -> Any:
@@ -87,45 +193,19 @@ def _inside(value: Any) -> Any:
     return type(value)(value * 0.9) if number == 1 else type(value)(value + 0.1) if number == 0 else value
 
 
-def _lit(case: Case) -> Pairs:
-    """Return pairs away from the horizon, over which values jump."""
-    p = case.pairs
-    up = (np.abs(p.wo[:, 2]) > 0.05) & (np.abs(p.wi[:, 2]) > 0.05)
-    return p.only(up & np.isfinite(p.value).all(axis=1) & (p.value > 0).any(axis=1))
-
-
-def _values(case: Case) -> Any:
-    """Return values at pairs as a Dr.Jit array with derivatives, each over what it is without a change."""
-    few = _lit(case)
-    wi, wo = (as_mitsuba("Vector3f", x) for x in (few.wi, few.wo))
-    si = interaction(wi, as_mitsuba("Point2f", few.uv))
-    scale = np.maximum(few.value.max(axis=1), 1e-3 * few.value.max())
-    value = mi.unpolarized_spectrum(case.plugin.eval(context(), si, wo))
-    total = sum(value[i] for i in range(len(value))) / as_mitsuba("Float", scale)
-    return dr.select(dr.isfinite(total), total, 0)
-
-
-def _derivatives(case: Case, key: str) -> tuple[Array, bool, Array]:
-    """Return derivatives by ``_moved``, if there is a way to the parameter at all, and which are none."""
-    shift = mi.Float(0)
-    dr.enable_grad(shift)
-    with changed(case, key, lambda old: _moved(old, shift)):
-        values = _values(case)
-        if not dr.grad_enabled(values):
-            none = np.zeros(dr.width(values))
-            return none, False, none.astype(bool)
-        dr.forward(shift)
-        found = np.array(dr.grad(values), np.float64)
-        return np.nan_to_num(found, posinf=0, neginf=0), True, ~np.isfinite(found)
-
-
 def _moved(old: Any, shift: Any) -> Any:
     """Return a parameter with ``shift`` of each number added: a spectrum's may be of many sizes."""
     usual = float(np.mean(np.abs(np.array(old)))) or 0.05
     return type(old)(old + dr.select(old == 0, usual, dr.abs(dr.detach(old))) * shift)
 
 
-WIDTHS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  # of differences, over the parameter
+def _values(case: Case) -> Any:
+    """Return values at pairs as a Dr.Jit array with derivatives, each over what it is without a change."""
+    few = case.lit
+    wi, wo = (as_mitsuba("Vector3f", x) for x in (few.wi, few.wo))
+    si = interaction(wi, as_mitsuba("Point2f", few.uv))
+    scale = np.maximum(few.value.max(axis=1), 1e-3 * few.value.max())
+    return _total(case.plugin.eval(context(), si, wo)) / as_mitsuba("Float", scale)
 
 
 def _differences(case: Case, key: str) -> tuple[Array, Array]:

@@ -9,11 +9,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy import stats
 
 from mrt_mitsuba.validation.checks.bsdf_case import BEYOND, ROUNDED, excess, spread
 from mrt_mitsuba.validation.checks.law import LEVEL, Law, Skip
 from mrt_mitsuba.validation.checks.probe import Array, Lanes, at_wavelengths, is_scalar, lanes
 from mrt_mitsuba.validation.checks.sphere import Cells, chi_square, encode, integrate
+from mrt_mitsuba.validation.tools.image_tests import sidak
 
 SAME = 1e-3  # relative: the same formula, evaluated once more
 TURNED = 4 * ROUNDED  # a direction passes through angles, a transform, and back
@@ -136,7 +138,8 @@ def sampling(law: Law, case: Case) -> None:
     integrals = integrate(
         lambda d: case.seen(d)[0][:, None], cells, case.rng, codes, np.ones(len(codes)), len(codes)
     )
-    p, _ = chi_square(integrals, codes, len(codes))
+    tests, _ = chi_square(integrals, codes, len(codes))
+    p = sidak(min(float(stats.chi2.sf(*test)) for test in tests), len(tests))
     law.at_least("chance of such counts if directions follow pdf_direction()", p, LEVEL, "one in a million")
 
 

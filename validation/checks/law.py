@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
+import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -20,10 +24,15 @@ from mrt_mitsuba.validation.tools.study import Bound, Study
 TITLE = "Laws of plugins"
 LEVEL = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction
 SIGMAS = 6  # the same for a normal distribution: 2e-9
+TIMEOUT = 120.0  # seconds for each law: sound plugins take a few, those of scalar variants a dozen
 
 
 class Skip(Exception):
     """Raised by the check of a law that makes no sense for its subject; the text is the reason."""
+
+
+class TimedOut(BaseException):
+    """Raised within a law that takes too long. No ``except Exception`` of a plugin catches it."""
 
 
 @dataclass(frozen=True)
@@ -79,9 +88,8 @@ class Law:
     @property
     def worst(self) -> Part:
         """Return the figure that uses most of its limit."""
-        return max(
-            self.parts, key=lambda part: (not part.holds, part.severity), default=Part("", math.nan, math.nan)
-        )
+        none = Part("", math.nan, math.nan)
+        return max(self.parts, key=lambda part: (not part.holds, part.severity), default=none)
 
     @property
     def holds(self) -> bool:
@@ -116,8 +124,7 @@ class Law:
     def __str__(self) -> str:
         if self.skipped:
             return f"{self.verdict:<7} {self.name}: {self.skipped}"
-        sign = "<=" if self.worst.at_most else ">="
-        return f"{self.verdict:<7} {self.name}: {self.measured:.4g} {sign} {self.limit:.4g}, {self.note}"
+        return f"{self.verdict:<7} {self.name}: {self.measured:.4g} {self.worst.sign} {self.limit:.4g}, {self.note}"
 
 
 @dataclass(frozen=True)
@@ -180,32 +187,73 @@ def examine(
     *,
     only: Iterable[str] | None = None,
     quick: bool = False,
+    timeout: float = TIMEOUT,
 ) -> Check:
-    """Check laws one by one; what a plugin raises fails the law during which it did."""
+    """Check laws one by one; a law fails if the plugin raises while it is checked, or takes too long."""
     chosen = list(laws if only is None else only)
     unknown = [name for name in chosen if name not in laws]
     if unknown:
         raise UsageError(f"unknown law {unknown[0]!r}: choose from {', '.join(laws)}")
     start, variant, found = time.perf_counter(), mi.variant(), {}
     for name in laws:
-        if name in chosen:
-            law = found[name] = Law(name)
+        if name not in chosen:
+            continue
+        law = found[name] = Law(name)
+        with settings_restored():
             try:
-                # what is not finite is the law ``finite``'s to deal with
-                with warnings.catch_warnings(), np.errstate(all="ignore"):
-                    # Mitsuba loads its integrators anew with each variant, and Dr.Jit counts how often
-                    warnings.filterwarnings("ignore", "The AST-transforming decorator")
+                with _limited(timeout):
                     laws[name](law, case)
             except Skip as reason:
                 law.skipped = str(reason)
+            except TimedOut:
+                law.at_most("it took too long, in seconds", math.inf, timeout, f"took longer than {timeout:g} s")
             except Exception as error:
                 lines = str(error).strip().splitlines() or [""]
                 # Mitsuba quotes the traceback of an error in a Python plugin, with the error last
                 line = lines[-1] if lines[0].startswith("Traceback") else lines[0]
-                law.at_most(
-                    f"it raised {type(error).__name__}: {line}", math.inf, 0, "a plugin must not raise"
-                )
-            finally:
-                if mi.variant() != variant:
-                    mi.set_variant(variant)
+                what = f"it raised {type(error).__name__}: {line}"
+                law.at_most(what, math.inf, 0, "a plugin must not raise")
     return Check(subject, variant, found, time.perf_counter() - start, quick)
+
+
+@contextmanager
+def settings_restored() -> Iterator[None]:
+    """Put back the variant and Dr.Jit's flags, which a plugin or a switch of variants may change."""
+    variant, flags = mi.variant(), {f: dr.flag(f) for f in dr.JitFlag if f != dr.JitFlag.Default}
+    try:
+        # what is not finite is the law ``finite``'s to deal with
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            # Mitsuba loads its integrators anew with each variant, and Dr.Jit counts how often
+            warnings.filterwarnings("ignore", "The AST-transforming decorator")
+            yield
+    finally:
+        if mi.variant() != variant:
+            mi.set_variant(variant)
+        for flag, value in flags.items():
+            if dr.flag(flag) != value:
+                dr.set_flag(flag, value)
+
+
+@contextmanager
+def _limited(seconds: float) -> Iterator[None]:
+    """Raise ``TimedOut`` in this thread's Python code after so many seconds. A kernel is not interrupted."""
+    thread, over, lock = ctypes.c_ulong(threading.get_ident()), threading.Event(), threading.Lock()
+    done = False
+
+    def interrupt() -> None:
+        with lock:
+            if not done:
+                over.set()
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(TimedOut))
+
+    timer = threading.Timer(seconds, interrupt)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    except Exception as error:  # Mitsuba passes on what a Python plugin raises as an error of its own
+        raise (TimedOut if over.is_set() else error) from error
+    finally:
+        timer.cancel()
+        with lock:
+            done = True

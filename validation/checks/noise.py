@@ -1,7 +1,8 @@
 """The noise of a float32 function without a reference, after Moré and Wild, and its conditioning.
 
 Along a line of inputs a few float32 steps apart, what a function *should* do is smooth, and differences of
-high order make it vanish; what is left is noise. Source: Moré and Wild, "Estimating Computational Noise",
+high order make it vanish; what is left is noise. Digits that are lost leave stairs: those on a slope show at
+no step that is small against them, so that coarser lines are looked at, too. Source: Moré and Wild, "Estimating Computational Noise",
 SIAM J. Sci. Comput. 33(3), 2011, §§ 3 and 5: with T_k the differences of order k, σ² ≈ γ_k ⟨T_k²⟩,
 γ_k = (k!)² / (2k)!.
 """
@@ -20,6 +21,9 @@ LOST = 2.5  # sound formulas stay below 1.6
 STEEP = 0.05
 POINTS = 9  # of each line; Moré and Wild find seven to nine enough
 STRIDES = (2, 64, 2**11, 2**15)  # the most float32 steps from one to the next
+COARSE = (2**13, 2**15, 2**17, 2**19)  # the same for stairs on a slope
+TABLES = 1000.0  # roundings: linear interpolation in a table of 64 entries leaves up to 150
+ALIKE = 3  # a kink's noise is four times as large at four times the step
 REACHES = tuple(2**k for k in (2, 5, 8, 11, 13))  # float32 steps to either side, for the slope
 
 
@@ -37,12 +41,13 @@ class Noise:
         return self.noise / np.hypot(2 * self.explained, allowance)
 
 
-def ecnoise(lines: Array) -> Array:
+def ecnoise(lines: Array, *, coarse: bool = False) -> Array:
     """Return the noise [N] of values along lines [P, N], in their own unit; 0 where nothing is noise.
 
     The first order k counts from which on three estimates agree to a factor of four and whose differences
     have both signs. If none is so, it is the smallest of all; or NaN where the line is too long to tell, for
     the values change along it by more than ``STEEP`` of the largest; and NaN wherever they change by half.
+    ``coarse``: the least of all orders from the third, and 0 where values change by half.
     """
     table, gamma, levels, signs = lines.astype(np.float64), 1.0, [], []
     for k in range(1, len(lines)):
@@ -51,6 +56,8 @@ def ecnoise(lines: Array) -> Array:
         signs.append((table.min(axis=0) < 0) & (table.max(axis=0) > 0))
     level = np.array(levels)
     change = np.ptp(lines, axis=0) / np.abs(lines).max(axis=0)
+    if coarse:
+        return np.where(change > 0.5, 0, level[2:].min(axis=0))
     found = np.where(change > STEEP, np.nan, level[:-2].min(axis=0))
     for k in reversed(range(len(level) - 2)):
         three = level[k : k + 3]
@@ -73,25 +80,36 @@ def measure(
     size: Array | None = None,
     strides: Sequence[int] = STRIDES,
     seed: int = 0,
+    project: Callable[[Array], Array] | None = None,
 ) -> Noise:
     """Estimate the noise of ``function([M, K]) -> [M]`` at float32 inputs [N, K], and what they explain.
 
     ``size`` [N]: what roundings are of, the value itself if left out. ``strides``: the most float32 steps
     between points of a line, in ascending order; the first counts along which the value changes at half of
     them, since digits that are lost leave stairs, flat where a line is short. A slope is a central
-    difference; of several widths, the one that agrees best with its neighbour counts.
+    difference; of several widths, the one that agrees best with its neighbour counts. ``project``: what makes
+    inputs valid again that are far from the first; with it, ``COARSE`` lines are looked at as well. Stairs are
+    as high at any step that is large against them, unlike kinks and what is left of a smooth function: noise
+    counts that is ``ALIKE`` at two steps.
     """
     count, width = inputs.shape
     inputs = inputs.astype(np.float32)
     rng = np.random.default_rng(seed)
-    steps = [np.arange(POINTS)[:, None, None] * rng.integers(-s, s + 1, (count, width)) for s in strides]
+    coarse = COARSE if project else ()
+    steps = [
+        np.arange(POINTS)[:, None, None] * rng.integers(-s, s + 1, (count, width))
+        for s in (*strides, *coarse)
+    ]
     axes = np.eye(width, dtype=int)[:, None, :]
     sides = np.concatenate([s * reach * axes for reach in REACHES for s in (1, -1)])
     everything = np.concatenate([*steps, np.broadcast_to(sides, (len(sides), count, width))])
     moved = steps_away(np.broadcast_to(inputs, everything.shape), everything)
+    fine, far = POINTS * len(strides), POINTS * (len(strides) + len(coarse))
+    if project:
+        moved[fine:far] = project(moved[fine:far].reshape(-1, width)).reshape(-1, count, width)
     values = function(moved.reshape(-1, width)).reshape(len(everything), count).astype(np.float64)
-    lines = values[: POINTS * len(strides)].reshape(len(strides), POINTS, count)
-    ends = values[POINTS * len(strides) :].reshape(len(REACHES), 2, width, count)
+    lines = values[:fine].reshape(len(strides), POINTS, count)
+    ends = values[far:].reshape(len(REACHES), 2, width, count)
     flat = (np.diff(lines, axis=1) == 0).mean(axis=1) > 0.5
     chosen = np.where(flat.all(axis=0), len(strides) - 1, flat.argmin(axis=0))
     line = np.take_along_axis(lines, chosen[None, None], axis=0)[0]
@@ -102,4 +120,11 @@ def measure(
     explained = np.sqrt((best**2).sum(axis=0) / 12)
     with np.errstate(divide="ignore", invalid="ignore"):
         unit = ROUNDING * np.abs(line[0] if size is None else size)
-        return Noise(line[0], ecnoise(line) / unit, explained / unit, np.take(strides, chosen))
+        noise = ecnoise(line)
+        if project:
+            lines = values[fine:far].reshape(len(coarse), POINTS, count)
+            stairs = np.array([ecnoise(line, coarse=True) for line in lines])
+            small, large = np.minimum(stairs[:-1], stairs[1:]), np.maximum(stairs[:-1], stairs[1:])
+            both = np.where((large <= ALIKE * small) & (small > TABLES * unit), small, 0).max(axis=0)
+            noise = np.where(np.nan_to_num(noise) < both, both, noise)
+        return Noise(line[0], noise / unit, explained / unit, np.take(strides, chosen))

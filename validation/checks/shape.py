@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.checks.law import Check, Law, examine
+from mrt_mitsuba import runtime
+from mrt_mitsuba.validation.checks.law import TIMEOUT, Check, Law, examine, settings_restored
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import lanes
-from mrt_mitsuba.validation.checks.recipe import elsewhere, opened, other_kind
+from mrt_mitsuba.validation.checks.recipe import elsewhere, other_kind
 from mrt_mitsuba.validation.checks.shape_case import FLAT, HIT_ROUNDINGS, Case, corners, trace
 from mrt_mitsuba.validation.checks.shape_range import far, finite, scale
 from mrt_mitsuba.validation.checks.shape_samples import sampling
@@ -20,20 +19,23 @@ from mrt_mitsuba.validation.checks.shape_surface import hits, normals, surface, 
 
 
 def check_shape(
-    shape: Any, *, quick: bool = False, seed: int = 0, only: Iterable[str] | None = None
+    shape: Any,
+    *,
+    quick: bool = False,
+    seed: int = 0,
+    only: Iterable[str] | None = None,
+    timeout: float = TIMEOUT,
 ) -> Check:
     """Check the laws of a shape in the current variant: a dict for ``mi.load_dict``, or a loaded one.
 
     Any other object that has ``ray_intersect``, ``ray_test`` and ``bbox`` will do as well.
-    ``quick``: fewer rays. ``only``: names of ``LAWS``. Raises ``UsageError`` for anything else, and
-    ``SceneError`` for a dict that Mitsuba cannot load.
+    ``quick``: fewer rays. ``only``: names of ``LAWS``. ``timeout``: seconds after which a law fails that is
+    not done. Raises ``UsageError`` for anything else, and ``SceneError`` for a dict that Mitsuba cannot load.
     """
-    loaded, recipe, name = opened(shape)
-    if not all(hasattr(loaded, name) for name in ("ray_intersect", "ray_test", "bbox")):
-        raise UsageError(
-            f"{type(loaded).__name__} is not a shape of {mi.variant()}: give a dict or a loaded shape"
-        )
-    return examine(name, Case(loaded, recipe, quick, seed), LAWS, only=only, quick=quick)
+    runtime.use()
+    with settings_restored():
+        case = Case(shape, quick, seed)
+        return examine(case.name, case, LAWS, only=only, quick=quick, timeout=timeout)
 
 
 def bbox(law: Law, case: Case) -> None:
@@ -59,11 +61,11 @@ def bbox(law: Law, case: Case) -> None:
 
 def variants(law: Law, case: Case) -> None:
     """Hits in the scalar variant against those in the vectorised one."""
-    case.recipe.with_()
+    case.with_()
     other = other_kind()
     few = slice(0, case.count(500, 2000))
     o, d, seen = case.seen[0][few], case.seen[1][few], case.seen[2].only(few)
-    there = elsewhere(other, lambda: trace(case.recipe.scene(), o, d))
+    there = elsewhere(other, lambda: trace(case.scene(), o, d))
     steep = np.abs((seen.n * d).sum(axis=1)) > FLAT
     bad = (there.found != seen.found) & (steep | ~seen.found)
     both = there.found & seen.found & steep

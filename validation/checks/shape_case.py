@@ -22,6 +22,10 @@ FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
 HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
 MOST_HITS = 16  # along a line
 
+RAY = """ray
+print(scene.ray_intersect(mi.Ray3f(o, d)))
+"""
+
 
 @dataclass(frozen=True)
 class Hits(Lanes):
@@ -60,19 +64,21 @@ def walk(target: Any, o: Array, d: Array, first: Hits | None = None) -> Iterator
         hits = trace(target, leave(hits.p, hits.n, d), d)
 
 
-@dataclass
 class Case(Subject):
     """A shape under examination, rays towards it and what they meet."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def __init__(self, given: Any, quick: bool, seed: int) -> None:
+        super().__init__(given, quick, seed)
+        if not all(hasattr(self.plugin, name) for name in ("ray_intersect", "ray_test", "bbox")):
+            kind = type(self.plugin).__name__
+            raise UsageError(f"{kind} is not a shape of {mi.variant()}: give a dict or a loaded shape")
         self.target = self.plugin
         if isinstance(self.plugin, mi.Shape):
             name = self.plugin.id()
             if self.plugin.class_name() == "Instance":
-                if self.recipe.description is None:
+                if self.description is None:
                     raise UsageError("a loaded instance does not give its group away: give a dict of both")
-                self.target = self.recipe.scene()
+                self.target = self.scene()
             else:
                 self.target = mi.load_dict({"type": "scene", "shape": self.plugin})
                 self.plugin.set_id(name)  # which the scene has changed
@@ -86,9 +92,6 @@ class Case(Subject):
             low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
         self.low, self.high, self.middle = low, high, (low + high) / 2
         self.size = float(np.linalg.norm(high - low))
-
-    def units(self, count: int) -> Array:
-        return unit(self.rng.normal(size=(count, 3)))
 
     def around(self, count: int, distance: float = 1.5) -> Array:
         """Return points that look at the shape, from so many sizes away."""
@@ -146,15 +149,13 @@ class Case(Subject):
             last[line] = p
         return met & clear, even
 
-    def snippet(self, o: Array, d: Array, body: str = snippets.RAY, **names: Any) -> str:
-        return snippets.program("shape", self.plugin, self.recipe.description, body, o=o, d=d, **names)
+    def program(self, body: str) -> str:
+        return snippets.program("shape", self, body)
 
-    @property
-    def positions(self) -> str:
-        """Return the snippet about sampled positions."""
-        return snippets.program("shape", self.plugin, self.recipe.description, snippets.POSITIONS)
+    def snippet(self, o: Array, d: Array, body: str = RAY, **names: Any) -> str:
+        return snippets.program("shape", self, body, o=o, d=d, **names)
 
-    def at(self, o: Array, d: Array, body: str = snippets.RAY, **names: Any) -> Callable[[int], str]:
+    def at(self, o: Array, d: Array, body: str = RAY, **names: Any) -> Callable[[int], str]:
         """Return what makes the snippet of one ray of many; arrays have a row for each."""
         return lambda i: self.snippet(o[i], d[i], body, **row(names, i))
 

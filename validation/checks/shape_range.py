@@ -5,20 +5,30 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.law import Law, Skip
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import unit
-from mrt_mitsuba.validation.checks.recipe import Transform
+from mrt_mitsuba.validation.checks.recipe import Kept
 from mrt_mitsuba.validation.checks.shape_case import FLAT, HIT_ROUNDINGS, Case, corners, trace
 
 FAR = 1e4  # sizes away
 
+SCALED = """ray
+print("as it is, t:", scene.ray_intersect(mi.Ray3f(o, d)).t)
+scene = mi.load_dict({{"type": "scene", "shape": load(2.0**{power})}})
+print("scaled, t over the scale:", scene.ray_intersect(mi.Ray3f(o * 2.0**{power}, d)).t / 2.0**{power})
+"""
+TWICE = """ray
+for o in (o, mi.Point3f({other})):
+    dr.make_opaque(o)
+    print("from", o, "it is met at", scene.ray_intersect(mi.Ray3f(o, d)).p)
+"""
+
 
 def scale(law: Law, case: Case) -> None:
     """A millionth and a million times the size: the same, scaled. Powers of two leave no roundings."""
-    given = (case.recipe.with_().description or {}).get("to_world")
-    matrix = given.matrix if isinstance(given, Transform) else np.eye(4)
+    given = case.with_().get("to_world")
+    matrix = given.values if isinstance(given, Kept) else np.eye(4)
     o, d, seen = case.seen
     few = slice(0, case.count(2**12, 2**14))
     o, d, seen = o[few], d[few], seen.only(few)
@@ -26,8 +36,8 @@ def scale(law: Law, case: Case) -> None:
     for power in (-20, -10, 10, 20):
         larger = np.diag([2.0**power] * 3 + [1]) @ matrix
         try:
-            recipe = case.recipe.with_(to_world=mi.ScalarTransform4f(larger))
-            shape = recipe.load()
+            transform = mi.ScalarTransform4f(larger)
+            shape = case.load(to_world=transform)
         except RuntimeError as problem:
             raise Skip(
                 f"to_world is not accepted: {str(problem).strip().splitlines()[-1][:200]}"
@@ -36,18 +46,18 @@ def scale(law: Law, case: Case) -> None:
         grown = np.linalg.norm(np.ravel(np.array(box.max, np.float64) - np.array(box.min, np.float64)))
         if not np.isclose(grown, 2.0**power * case.size, rtol=1e-3):
             raise Skip("to_world does not scale all of it (of curves, the radius stays)")
-        there = trace(recipe.scene(), (o * 2.0**power).astype(np.float32), d)
+        there = trace(case.scene(to_world=transform), (o * 2.0**power).astype(np.float32), d)
         bad = steep & (there.found != seen.found)
         what = f"rays answered otherwise at 2^{power} of the size"
         why = "scaling by a power of two rounds nothing; grazing rays are left out"
-        law.none(what, bad, why, case.at(o, d, snippets.SCALED, power=power))
+        law.none(what, bad, why, case.at(o, d, SCALED, power=power))
         both = steep & there.found & seen.found
         apart = np.where(both, np.abs(there.t / 2.0**power - seen.t) / np.where(both, seen.t, 1), 0)
         turned = np.where(both, 1 - (there.n * seen.n).sum(axis=1), 0)
         error = np.maximum(apart, turned)
         what = f"distance (relative) or normal at 2^{power} of the size, off"
         why = "some dozen operations, on scaled numbers"
-        law.most(what, error, HIT_ROUNDINGS * ROUNDING, why, case.at(o, d, snippets.SCALED, power=power))
+        law.most(what, error, HIT_ROUNDINGS * ROUNDING, why, case.at(o, d, SCALED, power=power))
 
 
 def far(law: Law, case: Case) -> None:
@@ -73,7 +83,7 @@ def far(law: Law, case: Case) -> None:
         f"share of rays from afar that miss what is met from nearby, or meet it {HIT_ROUNDINGS} roundings off"
     )
     why = "the origin is rounded, and some dozen operations with it; next to edges, more hangs on them"
-    law.share(what, bad, 1e-3, why, case.at(origin, d, snippets.TWICE, other=closer))
+    law.share(what, bad, 1e-3, why, case.at(origin, d, TWICE, other=closer))
 
 
 def finite(law: Law, case: Case) -> None:

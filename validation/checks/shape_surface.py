@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import stats
 
-from mrt_mitsuba.validation.checks import noise, snippets
+from mrt_mitsuba.validation.checks import noise
 from mrt_mitsuba.validation.checks.law import LEVEL, Law, Skip
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import Array, lanes, unit
@@ -24,7 +24,29 @@ from mrt_mitsuba.validation.checks.shape_case import (
     trace,
 )
 
+TYPICAL = 16  # roundings: twice the most that was measured of sound shapes
+TILTED = 2e-3
 NORMAL = 1e-5  # a few roundings of a square root and a quotient
+
+MAXT = """ray
+ray = mi.Ray3f(o, d)
+print("meets the surface at", scene.ray_intersect(ray).t)
+ray.maxt = float("{maxt}")
+print("up to", ray.maxt, "ray_test():", scene.ray_test(ray), "ray_intersect():", scene.ray_intersect(ray).t)
+"""
+BEHIND = """ray
+si = scene.ray_intersect(mi.Ray3f(o, d))
+back = scene.ray_intersect(mi.Ray3f(si.spawn_ray(d).o, -d))
+print("from the front:", si.n, "and from just behind:", back.n, "at", back.t)
+"""
+NEIGHBOUR = """ray
+aside = mi.Vector3f({aside})
+si = scene.ray_intersect(mi.Ray3f(o, d))
+near = scene.ray_intersect(mi.Ray3f(o + 1e-3 * {size} * aside, d))
+step, uv = near.p - si.p, near.uv - si.uv
+print("slope against the normal:", dr.dot(step, si.n) / dr.norm(step))
+print("step", step, "by partial derivatives:", si.dp_du * uv.x + si.dp_dv * uv.y)
+"""
 
 
 def hits(law: Law, case: Case) -> None:
@@ -56,7 +78,7 @@ def _agree(
     for name, answer in zip(("ray_test()", "ray_intersect()"), found, strict=True):
         wrong = steep & (answer[:, 0].astype(bool) != (seen.found & met))
         why = "one question, one answer; rays that graze are left out, but for those that just miss"
-        show = case.at(o, d, snippets.MAXT, maxt=limit)
+        show = case.at(o, d, MAXT, maxt=limit)
         law.share(
             f"share of rays {what} on which {name} is wrong", wrong, 5e-4 if maxt is None else 0, why, show
         )
@@ -70,6 +92,27 @@ def surface(law: Law, case: Case) -> None:
     error = np.abs(along - met.p).max(axis=1) / (ROUNDING * largest)
     what = "hit point off the ray at its distance, in roundings of the largest number"
     law.most(what, error, HIT_ROUNDINGS, "some dozen operations", case.at(o, d))
+    # from near by, and from the other side, numbers are small; a shape whose points are off is off by as much
+    few = met.only(slice(0, case.count(2**12, 2**15)))
+    close, along = (few.p - 0.05 * case.size * d[: len(few.t)]).astype(np.float32), d[: len(few.t)]
+    again = trace(case.target, close, along)
+    same = again.found & near(few.p, again.p)
+    largest = np.abs(few.p).max(axis=1) + 0.05 * case.size
+    off = np.abs(close + again.t[:, None].astype(np.float64) * along - again.p).max(axis=1)
+    back = case.behind.only(slice(0, len(few.t)))
+    turned = np.abs(((back.p - again.p).astype(np.float64) * few.n).sum(axis=1))
+    # such rays start aside by the offset
+    alike = (offset(few.p) ** 2 < ROUNDING * largest * case.size) & back.found & (back.part == few.part)
+    alike &= ((back.n * few.n).sum(axis=1) > 0.9) & (np.linalg.norm(few.p - back.p, axis=1) < 0.01 * case.size)
+    for what, error, known in (
+        ("hit point off a ray of a twentieth of the size", off, same),
+        ("hit points from in front and from behind, across the surface", turned, same & alike),
+    ):
+        if known.sum() > 20:
+            rounded = np.where(known, error / (ROUNDING * largest), np.nan)
+            show = case.at(close, along)
+            title = f"{what}, in roundings of the largest coordinate, median"
+            law.quantile(title, rounded, 0.5, TYPICAL, "a few operations", show)
     count = case.count(10**5, 10**6)
     few = met.only(case.rng.integers(len(met.t), size=count))
     away = case.units(count)
@@ -134,7 +177,19 @@ def normals(law: Law, case: Case) -> None:
     o, d, met = case.met
     apart = (met.n * met.shading).sum(axis=1) <= 0
     law.none("shading normals on the other side than the geometric one", apart, "one surface", case.at(o, d))
-    _two_sides(law, case)
+    expected = _interpolated(case, met)
+    if expected is not None:
+        apart = np.linalg.norm(met.shading - expected, axis=1)
+        what = "shading normal against the geometric one, or the interpolated one of a mesh, 9 in 10"
+        law.quantile(what, apart, 0.9, TILTED, "the same, but for some roundings", case.at(o, d))
+    # the normal is the surface's, not the ray's: the same for a ray that comes back from behind
+    back = case.behind
+    same = back.found & near(met.p, back.p) & (back.part == met.part)
+    if same.sum() > 20:
+        what = "share of normals that turn where the same point is met from behind"
+        turned = same & ((back.n * met.n).sum(axis=1) < -0.5)
+        why = "a surface has one normal; thin parts are left room for"
+        law.share(what, turned, 1e-3, why, case.at(o, d, BEHIND))
     usable = (np.linalg.norm(met.du, axis=1) > 0) & (np.linalg.norm(met.dv, axis=1) > 0)
     if usable.any():
         slant = np.maximum(*(np.abs((unit(v) * met.n).sum(axis=1)) for v in (met.du, met.dv)))
@@ -145,17 +200,27 @@ def normals(law: Law, case: Case) -> None:
     _differences(law, case)
 
 
-def _two_sides(law: Law, case: Case) -> None:
-    """The normal is the surface's, not the ray's: the same for a ray that comes back from behind."""
-    o, d, met = case.met
-    back = case.behind
-    same = back.found & near(met.p, back.p) & (back.part == met.part)
-    if same.sum() > 20:
-        what = "share of normals that turn where the same point is met from behind"
-        why = "a surface has one normal; thin parts are left room for"
-        law.share(
-            what, same & ((back.n * met.n).sum(axis=1) < -0.5), 1e-3, why, case.at(o, d, snippets.BEHIND)
-        )
+def _interpolated(case: Case, met: Hits) -> Array | None:
+    """Return what shading normals should be; None where the shape is smoothed in a way of its own."""
+    shape = case.plugin
+    if isinstance(shape, mi.Shape) and shape.class_name() in SMOOTHED:
+        return None
+    if not isinstance(shape, mi.Mesh) or not shape.has_vertex_normals():
+        return met.n
+    params = mi.traverse(shape)
+    if not {"vertex_positions", "vertex_normals", "faces"} <= set(params.keys()):
+        return None
+    faces = np.array(params["faces"]).reshape(-1, 3)[met.part.astype(int)]
+    a, b, c = (np.array(params["vertex_positions"], np.float64).reshape(-1, 3)[faces[:, k]] for k in range(3))
+    normals = np.array(params["vertex_normals"], np.float64).reshape(-1, 3)[faces]  # [N, corner, 3]
+    across = np.cross(b - a, c - a)
+    area = (across**2).sum(axis=1)
+    v, w = ((np.cross(x, y) * across).sum(axis=1) / area for x, y in ((met.p - a, c - a), (b - a, met.p - a)))
+    mixed = np.einsum("nk,nkx->nx", np.stack([1 - v - w, v, w], axis=1), normals)
+    return (-1 if shape.has_flipped_normals() else 1) * mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
+
+
+SMOOTHED = ("SDFGrid", "BSplineCurve", "LinearCurve", "Instance")
 
 
 def _differences(law: Law, case: Case) -> None:
@@ -181,7 +246,7 @@ def _differences(law: Law, case: Case) -> None:
         if np.isfinite(error).sum() < 20 or (what.startswith("step") and not met.du.any()):
             continue
         why = "extrapolated to no step; edges may part neighbours"
-        show = case.at(o, d, snippets.NEIGHBOUR, aside=aside, size=case.size)
+        show = case.at(o, d, NEIGHBOUR, aside=aside, size=case.size)
         law.quantile(f"{what}, 95 in 100", error, 0.95, 1e-2, why, show)
 
 
@@ -193,7 +258,7 @@ def watertight(law: Law, case: Case) -> None:
     blind = steep & ~case.behind.found
     if blind.mean() > 1e-2:
         what = "share of rays that pass the surface from behind"
-        law.share(what, blind, 1e-2, "it has two sides; edges have room", case.at(o, d, snippets.BEHIND))
+        law.share(what, blind, 1e-2, "it has two sides; edges have room", case.at(o, d, BEHIND))
         return
     if not case.closed:
         raise Skip("the shape is open: lines do not leave it as often as they enter")

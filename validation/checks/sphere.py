@@ -11,8 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
-
 from mrt_mitsuba.validation.checks.probe import Lanes
 
 Array = np.ndarray
@@ -81,17 +79,26 @@ class Cells(Lanes):
         level = np.repeat(self.level + 1, 4)
         return Cells(_quarters(self.start, level.reshape(-1, 4)[:, :1]), level)
 
-    def points(self, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return random directions in each cell, one in each part [C, POINTS, 3], and dω [C, POINTS]."""
+    def at(self, i: Array, j: Array) -> tuple[Array, Array]:
+        """Return directions [C, P, 3] at places of each cell, from 0 to 1, and r there."""
         r0, turn0 = (x[:, None] for x in _corner(self.start % HEMISPHERE))
         width = (0.5**self.level)[:, None]
-        i, j = np.divmod(np.arange(POINTS), SIDE)
-        shift = rng.random((2, len(self.start), POINTS))
-        r, turn = r0 + width * (i + shift[0]) / SIDE, turn0 + width * (j + shift[1]) / SIDE
+        r, turn = r0 + width * i, turn0 + width * j
         z = np.where(self.start >= HEMISPHERE, -1, 1)[:, None] * (1 - r * r)
         sin, phi = r * np.sqrt(2 - r * r), 2 * np.pi * (turn - 0.5)
-        wo = np.stack([sin * np.cos(phi), sin * np.sin(phi), z], axis=-1).astype(np.float32)
-        return wo, 4 * np.pi * r * (width / SIDE) ** 2
+        return np.stack([sin * np.cos(phi), sin * np.sin(phi), z], axis=-1).astype(np.float32), r
+
+    @property
+    def middles(self) -> Array:
+        """The directions of their middles. [C, 3]"""
+        return self.at(np.array([0.5]), np.array([0.5]))[0][:, 0]
+
+    def points(self, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Return random directions in each cell, one in each part [C, POINTS, 3], and dω [C, POINTS]."""
+        i, j = np.divmod(np.arange(POINTS), SIDE)
+        shift = rng.random((2, len(self.start), POINTS))
+        wo, r = self.at((i + shift[0]) / SIDE, (j + shift[1]) / SIDE)
+        return wo, 4 * np.pi * r * ((0.5**self.level)[:, None] / SIDE) ** 2
 
     @property
     def solid_angle(self) -> Array:
@@ -171,14 +178,26 @@ def _estimate(
     return values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
 
 
-def chi_square(found: Integrals, codes: Array, count: int) -> tuple[float, tuple]:
-    """Return p of the counts, in groups of cells that expect 25 or more, and the cell that is most off."""
+def chi_square(
+    found: Integrals, codes: Array, count: int, known: float = 0.0
+) -> tuple[list[tuple[float, int]], tuple]:
+    """Compare the counts of samples with those that integrals expect.
+
+    Return χ² and its degrees of freedom in six ways to group cells, so that faults of any width show:
+    neighbours that expect 25 samples or more, a 128th and a 16th of all, and slices along x, y and z of a
+    16th; and the cell that is most off. ``known``: to how much the density is known, relative.
+    """
     seen = np.bincount(found.cells.find(codes), minlength=len(found.cells.start))
     expected, variance = count * found.mean[:, 0], count**2 * found.variance[:, 0]
-    group = np.floor(np.cumsum(expected) / 25).astype(int)
-    group = np.minimum(group, max(group[-1] - 1, 0))
-    seen_in, expected_in, variance_in = (np.bincount(group, x) for x in (seen, expected, variance))
-    used = (seen_in > 0) | (expected_in > 1e-6)
-    pull = (seen_in - expected_in)[used] ** 2 / np.maximum(expected_in + variance_in, 1e-6)[used]
+    neighbours, tests = np.arange(len(seen)), []
+    slices = [np.argsort(axis) for axis in found.cells.middles.T]
+    for parts, order in ((count / 25, neighbours), (128, neighbours), *((16, o) for o in (neighbours, *slices))):
+        group = np.floor(np.cumsum(expected[order]) / max(count / parts, 25)).astype(int)
+        group = np.minimum(group, max(group[-1] - 1, 0))
+        seen_in, expected_in, variance_in = (np.bincount(group, x[order]) for x in (seen, expected, variance))
+        used = (seen_in > 0) | (expected_in > 1e-6)
+        variance_in += expected_in + (known * expected_in) ** 2
+        pull = (seen_in - expected_in)[used] ** 2 / np.maximum(variance_in, 1e-6)[used]
+        tests.append((float(pull.sum()), max(len(pull), 1)))
     cell = int(np.argmax(np.abs(seen - expected) / np.sqrt(expected + variance + 1)))
-    return float(stats.chi2.sf(pull.sum(), max(len(pull), 1))), found.cells.bounds(cell)
+    return tests, found.cells.bounds(cell)
