@@ -117,8 +117,8 @@ def _holds(law: Law, case: Case, key: str) -> bool:
 def _sampled(law: Law, case: Case, key: str) -> None:
     """Hold the derivative of samples' weights to that of values over a density that does not change.
 
-    Integrators follow a sample as a constant direction. Where a direction moves with the parameter, its weight
-    may change otherwise: only means over smooth light are then the same.
+    Integrators follow a sample as a constant direction. Where one moves with the parameter, its weight may
+    change otherwise: only means over smooth light are then the same.
     """
     count = case.count(2**14, 2**16)
     wi, u, uv = case.units(count), case.uniform(count), case.rng.random((count, 2), np.float32)
@@ -137,7 +137,9 @@ def _sampled(law: Law, case: Case, key: str) -> None:
         if not (dr.grad_enabled(one) or dr.grad_enabled(other)):
             return
         dr.forward(shift)
-        grads = [np.array(dr.grad(x), np.float64) if dr.grad_enabled(x) else np.zeros(count) for x in (one, other)]
+        grads = [
+            np.array(dr.grad(x), np.float64) if dr.grad_enabled(x) else np.zeros(count) for x in (one, other)
+        ]
     found, expected = (np.broadcast_to(x, count) for x in grads)
     samples = case.probe.sample(wi, u, uv)
     counts = live(wi, samples, *case.probe.both(wi, np.nan_to_num(samples.wo), uv)) & ~narrow(wi, samples)

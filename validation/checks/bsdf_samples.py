@@ -80,7 +80,7 @@ BROAD = 20.0  # a density per steradian: lobes are then wide against a cap
 
 
 def _caps(law: Law, case: Case) -> None:
-    """Samples of all angles with broad lobes in small caps, for faults in one place whatever the incidence."""
+    """Samples of all angles with broad lobes in small caps, for faults in one place at any incidence."""
     views = [view for view in case.views if 0 < view.density.max() < BROAD]
     if not views:
         return
@@ -209,7 +209,9 @@ def energy(law: Law, case: Case) -> None:
     law.at_most(what, albedo, 1 + FIT, "no more light leaves than arrives; 0.5 % for fits of G1", show)
     if apart:
         error, view = max(apart, key=lambda found: found[0])
-        what = f"albedo by quadrature of eval() against mean weight, relative, beyond {SIGMAS} standard errors"
+        what = (
+            f"albedo by quadrature of eval() against mean weight, relative, beyond {SIGMAS} standard errors"
+        )
         show = case.snippet(ALBEDO, wi=view.wi, uv=view.uv)
         law.at_most(what, error, 2 * FIT, "0.5 % for fits of G1 in the density", show)
 

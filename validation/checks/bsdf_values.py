@@ -149,7 +149,9 @@ def _delta_either_way(law: Law, case: Case) -> None:
     other = case.probe.sample(wi, first, uv, context(importance=True))
     alike = there.delta & (np.abs(other.wo - there.wo) < 1e-3).all(axis=1)
     error = np.where(alike, excess(there.weight * there.eta[:, None] ** 2, other.weight, 0 * there.weight), 0)
-    what = "weight of a single direction (delta), times eta^2, against that in the mode of importance, relative"
+    what = (
+        "weight of a single direction (delta), times eta^2, against that in the mode of importance, relative"
+    )
     law.most(what, error, POINTWISE, EITHER_WAY, show)
 
 

@@ -124,7 +124,8 @@ class Law:
     def __str__(self) -> str:
         if self.skipped:
             return f"{self.verdict:<7} {self.name}: {self.skipped}"
-        return f"{self.verdict:<7} {self.name}: {self.measured:.4g} {self.worst.sign} {self.limit:.4g}, {self.note}"
+        figure = f"{self.measured:.4g} {self.worst.sign} {self.limit:.4g}"
+        return f"{self.verdict:<7} {self.name}: {figure}, {self.note}"
 
 
 @dataclass(frozen=True)
@@ -206,7 +207,9 @@ def examine(
             except Skip as reason:
                 law.skipped = str(reason)
             except TimedOut:
-                law.at_most("it took too long, in seconds", math.inf, timeout, f"took longer than {timeout:g} s")
+                law.at_most(
+                    "it took too long, in seconds", math.inf, timeout, f"took longer than {timeout:g} s"
+                )
             except Exception as error:
                 lines = str(error).strip().splitlines() or [""]
                 # Mitsuba quotes the traceback of an error in a Python plugin, with the error last

@@ -2,9 +2,9 @@
 
 Along a line of inputs a few float32 steps apart, what a function *should* do is smooth, and differences of
 high order make it vanish; what is left is noise. Digits that are lost leave stairs: those on a slope show at
-no step that is small against them, so that coarser lines are looked at, too. Source: Moré and Wild, "Estimating Computational Noise",
-SIAM J. Sci. Comput. 33(3), 2011, §§ 3 and 5: with T_k the differences of order k, σ² ≈ γ_k ⟨T_k²⟩,
-γ_k = (k!)² / (2k)!.
+no step that is small against them, so that coarser lines are looked at, too.
+Source: Moré and Wild, "Estimating Computational Noise", SIAM J. Sci. Comput. 33(3), 2011, §§ 3, 5: with T_k
+the differences of order k, σ² ≈ γ_k ⟨T_k²⟩, γ_k = (k!)² / (2k)!.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def measure(
     between points of a line, in ascending order; the first counts along which the value changes at half of
     them, since digits that are lost leave stairs, flat where a line is short. A slope is a central
     difference; of several widths, the one that agrees best with its neighbour counts. ``project``: what makes
-    inputs valid again that are far from the first; with it, ``COARSE`` lines are looked at as well. Stairs are
+    inputs valid again that are far from the first; with it, ``COARSE`` lines are looked at, too. Stairs are
     as high at any step that is large against them, unlike kinks and what is left of a smooth function: noise
     counts that is ``ALIKE`` at two steps.
     """

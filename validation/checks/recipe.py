@@ -19,7 +19,7 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True)
 class Kept:
-    """A tensor or transform of a dict: loading uses up the one, and the type of the other is the variant's."""
+    """A tensor or transform of a dict: loading uses up the one, and the other's type is the variant's."""
 
     kind: str  # what makes it: "TensorXf" or "ScalarTransform4f"
     values: np.ndarray
@@ -51,7 +51,9 @@ class Subject:
     def scene(self, **changes: Any) -> Any:
         """Load a scene that holds the shape alone, or an instance with its group. Raises ``Skip`` as well."""
         given = self.with_(**changes)
-        groups = [k for k, value in given.items() if isinstance(value, dict) and value["type"] == "shapegroup"]
+        groups = [
+            k for k, value in given.items() if isinstance(value, dict) and value["type"] == "shapegroup"
+        ]
         nodes = {"shape": given}
         if given.get("type") == "instance" and groups:
             reference = {"type": "ref", "id": "group"}

@@ -22,7 +22,6 @@ from mrt_mitsuba.validation.checks.shape_case import (
     walk,
 )
 
-
 POSITIONS = """
 n = 100_000
 rng = mi.PCG32(n)
@@ -128,7 +127,9 @@ def _uniform(law: Law, case: Case, p: Array, points: Array, bunch: float) -> Non
     statistic = (pull / (mean / total[0] + bunch * mean / total[1] + (2e-3 * mean) ** 2))[used].sum()
     what = "chance of such counts in parts of the surface if positions follow its area"
     why = "a false alarm in a million checks"
-    law.at_least(what, float(stats.chi2.sf(statistic, max(used.sum() - 1, 1))), LEVEL, why, case.program(POSITIONS))
+    law.at_least(
+        what, float(stats.chi2.sf(statistic, max(used.sum() - 1, 1))), LEVEL, why, case.program(POSITIONS)
+    )
 
 
 def _directions(law: Law, case: Case, u: Array) -> None:

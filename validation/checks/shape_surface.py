@@ -103,7 +103,9 @@ def surface(law: Law, case: Case) -> None:
     turned = np.abs(((back.p - again.p).astype(np.float64) * few.n).sum(axis=1))
     # such rays start aside by the offset
     alike = (offset(few.p) ** 2 < ROUNDING * largest * case.size) & back.found & (back.part == few.part)
-    alike &= ((back.n * few.n).sum(axis=1) > 0.9) & (np.linalg.norm(few.p - back.p, axis=1) < 0.01 * case.size)
+    alike &= ((back.n * few.n).sum(axis=1) > 0.9) & (
+        np.linalg.norm(few.p - back.p, axis=1) < 0.01 * case.size
+    )
     for what, error, known in (
         ("hit point off a ray of a twentieth of the size", off, same),
         ("hit points from in front and from behind, across the surface", turned, same & alike),

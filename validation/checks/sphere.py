@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+
 from mrt_mitsuba.validation.checks.probe import Lanes
 
 Array = np.ndarray
@@ -191,7 +192,11 @@ def chi_square(
     expected, variance = count * found.mean[:, 0], count**2 * found.variance[:, 0]
     neighbours, tests = np.arange(len(seen)), []
     slices = [np.argsort(axis) for axis in found.cells.middles.T]
-    for parts, order in ((count / 25, neighbours), (128, neighbours), *((16, o) for o in (neighbours, *slices))):
+    for parts, order in (
+        (count / 25, neighbours),
+        (128, neighbours),
+        *((16, o) for o in (neighbours, *slices)),
+    ):
         group = np.floor(np.cumsum(expected[order]) / max(count / parts, 25)).astype(int)
         group = np.minimum(group, max(group[-1] - 1, 0))
         seen_in, expected_in, variance_in = (np.bincount(group, x[order]) for x in (seen, expected, variance))
