@@ -181,7 +181,7 @@ def read_channels(path: Path) -> tuple[dict[str, Image], dict[str, dict[str, Any
             raise OutputError(f"cannot read {name}: it is not a regular file")
         with open(name, "rb") as file:  # reports an unreadable file better than the library
             file.read(1)
-        with _silenced():
+        with silenced():
             parts = OpenEXR.File(name, header_only=True).parts
             deep = any("deep" in str(part.type()) for part in parts)
             parts = [] if deep else OpenEXR.File(name, separate_channels=True).parts
@@ -202,7 +202,7 @@ def read_channels(path: Path) -> tuple[dict[str, Image], dict[str, dict[str, Any
 
 
 @contextlib.contextmanager
-def _silenced() -> Iterator[None]:
+def silenced() -> Iterator[None]:
     """Keep the EXR library from printing about broken files, in Python and in its own code."""
     sys.stderr.flush()
     before = os.dup(2)

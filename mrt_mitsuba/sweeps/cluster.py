@@ -42,7 +42,7 @@ def check_engine(cluster: Any, **numbers: Any) -> None:
 
 @contextmanager
 def connected(
-    cluster: Any, jobs: int, *, workers: int | None, retries: int, dashboard: int | None, variant: str
+    cluster: Any, jobs: int, workers: int | None, dashboard: int | None, variant: str
 ) -> Iterator[tuple[Client, int]]:
     """Give a client, and how many workers to wait for; see ``sweep``.
 
@@ -64,7 +64,7 @@ def connected(
         if cluster is None:
             devices = gpus() if variant.startswith("cuda") else []
             count = workers or min(len(devices) or usable_cores(), jobs)
-            cluster = stack.enter_context(_local(count, retries, dashboard, devices))
+            cluster = stack.enter_context(_local(count, dashboard, devices))
         try:
             client = stack.enter_context(Client(cluster, timeout=CONNECTING, set_as_default=False))
         except (OSError, ValueError, TypeError) as error:
@@ -75,13 +75,12 @@ def connected(
         yield client, count
 
 
-def _local(count: int, retries: int, dashboard: int | None, devices: list[str]) -> Any:
+def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
     """Return a scheduler in this process, and workers in processes of their own with one thread for jobs.
 
     They are started anew, not forked, nor do they import the caller's script: it needs no
     ``if __name__ == "__main__"``.
     """
-    import dask
     from distributed import Scheduler, SpecCluster
     from distributed.deploy.subprocess import SubprocessWorker
     from distributed.system import MEMORY_LIMIT
@@ -98,14 +97,12 @@ def _local(count: int, retries: int, dashboard: int | None, devices: list[str]) 
         pinned = {"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]} if devices else {}
         workers[number] = {"cls": SubprocessWorker, "options": {"worker_kwargs": options | {"env": pinned}}}
     scheduler = {
-        "allowed_failures": retries,
+        "allowed_failures": 0,  # jobs are handed over again by whoever knows which had begun
         "host": "127.0.0.1",
         "dashboard": dashboard is not None,
         "dashboard_address": f":{dashboard or 0}",
     }
-    # A worker that dies is held against all jobs that it had: let it have one
-    with dask.config.set({"distributed.scheduler.worker-saturation": 1.0}):
-        return SpecCluster(workers=workers, scheduler={"cls": Scheduler, "options": scheduler})
+    return SpecCluster(workers=workers, scheduler={"cls": Scheduler, "options": scheduler})
 
 
 def gpus() -> list[str]:

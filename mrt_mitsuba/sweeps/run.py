@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -22,6 +23,8 @@ from mrt_mitsuba.sweeps.worker import Setting, attempts, is_fresh, made_with, na
 
 if TYPE_CHECKING:
     from distributed import Client, Future
+
+MOST_DEATHS = 10  # of workers that had been given a job which they did not begin
 
 
 def sweep(
@@ -95,28 +98,18 @@ def sweep(
         if not rest:
             table.write()
             return table
-        steps = sum(map(len, parts.values())) + (len(rest) if tiles else 0)
         variant = options.get("variant") or ""
-        with connected(
-            cluster, steps, workers=workers, retries=retries, dashboard=dashboard, variant=variant
-        ) as (client, count):
+        with connected(cluster, sum(map(len, parts.values())), workers, dashboard, variant) as (
+            client,
+            count,
+        ):
             check_parameters(planned)  # while workers start
             local = cluster is None
             sharing = inspect(client, scratch, count, local)
             setting = Setting(folder, scratch, png, software(), local, sharing)
             table.write()
-            with shown.stage("Sweep", steps) as advance, _explained():
-                futures = _submit(client, rest, parts, setting, retries, resume)
-                try:
-                    for job, facts in _ended(client, futures):
-                        if job.name in parts:
-                            begun = max(attempts(each.name, setting) for each in parts[job.name])
-                            table.add(job.name, facts | {"attempts": begun, "versions": here["versions"]})
-                        advance(1)
-                finally:
-                    table.write()
-                    if client.status == "running":
-                        client.cancel(list(futures))
+            with _explained():
+                _render(_Work(client, setting, retries), parts, rest, setting, table, shown, resume)
     return table
 
 
@@ -149,50 +142,98 @@ def _refuse_to_replace(folder: str, name: str, listed: bool, png: bool) -> None:
             )
 
 
-def _submit(
-    client: Client,
-    rest: Sequence[Job],
-    parts: Mapping[str, Sequence[Job]],
-    setting: Setting,
-    retries: int,
-    resume: bool,
-) -> dict[Future, Job]:
-    """Hand over the pictures or their tiles, but for those tiles that are there; return what is to end."""
-    prefix = os.path.basename(setting.scratch)
-    given: dict[str, Any] = {"retries": retries, "pure": False}
-    wanted = [
-        each
-        for job in rest
-        for each in parts[job.name]
-        if each is job or not (resume and is_fresh(each, setting.folder, png=False))
-    ]
-    keys = [(prefix, job.name) for job in wanted]
-    futures = client.map(render_job, wanted, key=keys, setting=setting, **given)
-    found = dict(zip(futures, wanted, strict=True))
-    by_name = {job.name: future for future, job in found.items()}
-    for job in rest:
-        if job.name not in by_name:
-            tiles = parts[job.name]
-            made, key = [by_name.get(tile.name) for tile in tiles], (f"{prefix}-joined", job.name)
-            found[client.submit(assemble, job, tiles, made, setting, key=key, **given)] = job
-    return found
+class _Work:
+    """Jobs as the engine has them.
 
+    The engine holds a worker's death against all jobs that it had been given: those that have not begun too
+    often are handed over again.
+    """
 
-def _ended(client: Client, futures: dict[Future, Job]) -> Iterator[tuple[Job, dict[str, Any]]]:
-    """Yield jobs as they end, each with its facts by its own account or the engine's."""
-    from distributed import KilledWorker, as_completed
+    def __init__(self, client: Client, setting: Setting, retries: int) -> None:
+        from distributed import as_completed
 
-    for future in as_completed(list(futures), client.loop):
-        job = futures.pop(future)
-        if future.status == "error":
-            error = future.exception()
-            text = " ".join(f"{type(error).__name__}: {error}".split())
+        self._client, self._setting, self._retries = client, setting, retries
+        self._calls: dict[Future, tuple[Any, ...]] = {}
+        self._deaths: Counter[str] = Counter()
+        self._coming = as_completed(loop=client.loop)
+
+    def hand_over(self, function: Any, job: Job, *more: Any) -> None:
+        """Let a worker call a function with a job."""
+        name = f"{job.name} {function.__name__} {self._deaths[job.name]}"
+        key, options = (os.path.basename(self._setting.scratch), name), {"retries": self._retries}
+        future = self._client.submit(function, job, *more, self._setting, key=key, pure=False, **options)
+        self._calls[future] = function, job, *more
+        self._coming.add(future)
+
+    def ended(self) -> Iterator[tuple[Job, dict[str, Any]]]:
+        """Yield jobs as they end, each with its facts by its own account or the engine's."""
+        from distributed import KilledWorker
+
+        for future in self._coming:
+            function, job, *more = self._calls.pop(future)
+            error = future.exception() if future.status == "error" else None
             if isinstance(error, KilledWorker):
+                self._deaths[job.name] += 1
+                begun = attempts(job.name, self._setting)
+                if begun <= self._retries and self._deaths[job.name] < MOST_DEATHS:
+                    self.hand_over(function, job, *more)
+                    continue
                 text = "every worker that rendered it died, perhaps for want of memory: give each worker more"
-            yield job, {"error": text}
-        else:
-            yield job, dict(future.result())
-        future.release()  # what no one needs is not computed again when its worker goes
+                yield job, {"error": text}
+            elif error is not None:
+                yield job, {"error": " ".join(f"{type(error).__name__}: {error}".split())}
+            else:
+                yield job, dict(future.result())
+            future.release()  # what no one needs is not computed again when its worker goes
+
+    def cancel(self) -> None:
+        """Take back what has not ended."""
+        if self._client.status == "running":
+            self._client.cancel(list(self._calls))
+
+
+def _render(
+    work: _Work,
+    parts: Mapping[str, Sequence[Job]],
+    rest: Sequence[Job],
+    setting: Setting,
+    table: Table,
+    shown: Progress,
+    resume: bool,
+) -> None:
+    """Let workers render pictures, or their tiles (``parts``, by the picture's name) and put these together;
+    each picture's row goes into the table as it ends."""
+    folder, made = setting.folder, dict[str, dict[str, Any]]()
+    whole = {part.name: job for job in rest for part in parts[job.name]}
+    new = [
+        part
+        for job in rest
+        for part in parts[job.name]
+        if part is job or not (resume and is_fresh(part, folder))
+    ]
+    left = Counter(whole[part.name].name for part in new)
+    try:
+        with shown.stage("Sweep", len(new) + sum(job.name not in whole for job in rest)) as advance:
+            for part in new:
+                work.hand_over(render_job, part)
+            for job in rest:
+                if not left[job.name]:
+                    work.hand_over(assemble, job, parts[job.name], [None])
+            for job, facts in work.ended():
+                picture = whole.get(job.name, job)
+                if picture is job:
+                    begun = max(1, *(attempts(part.name, setting) for part in parts[job.name]))
+                    table.add(job.name, facts | {"attempts": begun, "versions": named(versions())})
+                else:
+                    made[job.name] = facts
+                    left[picture.name] -= 1
+                    if not left[picture.name]:
+                        tiles = parts[picture.name]
+                        work.hand_over(assemble, picture, tiles, [made.get(tile.name) for tile in tiles])
+                advance(1)
+    finally:
+        table.write()
+        work.cancel()
 
 
 @contextmanager

@@ -63,11 +63,11 @@ def describe(path: str, local: bool, dask_worker: Any = None) -> dict[str, Any]:
 
 
 def attempts(name: str, setting: Setting) -> int:
-    """Return how often a worker has begun a job, 1 at least."""
+    """Return how often workers have begun a job."""
     try:
-        return max(1, os.path.getsize(os.path.join(setting.scratch, f"{name}.begun")))
+        return os.path.getsize(os.path.join(setting.scratch, f"{name}.begun"))
     except FileNotFoundError:
-        return 1
+        return 0
 
 
 def render_job(job: Job, setting: Setting) -> dict[str, Any]:
@@ -125,18 +125,21 @@ def _render(job: Job, setting: Setting, scratch: str, worker: Any) -> dict[str, 
     }
 
 
-def is_fresh(job: Job, folder: str, png: bool) -> bool:
+def is_fresh(job: Job, folder: str, png: bool = False) -> bool:
     """Return whether a picture is there, whole, and made with the same scene, settings and versions."""
     import OpenEXR
     from PIL import Image
+
+    from mrt_mitsuba.output.files import silenced
 
     path = os.path.join(folder, job.name)
     if made_with(f"{path}.exr") != job.made_with:
         return False
     try:
-        file = OpenEXR.InputFile(f"{path}.exr")
-        for _ in strips(file, list(file.header()["channels"])):
-            pass
+        with silenced():
+            file = OpenEXR.InputFile(f"{path}.exr")
+            for _ in strips(file, list(file.header()["channels"])):
+                pass
         if png:
             with Image.open(f"{path}.png") as picture:
                 picture.load()
@@ -149,11 +152,16 @@ def made_with(path: str) -> str | None:
     """Return the fingerprint in the header of a picture that a sweep made; None for any other file."""
     import OpenEXR
 
+    from mrt_mitsuba.output.files import silenced
+
+    if not os.path.isfile(path):
+        return None
     try:
-        found = OpenEXR.File(path, header_only=True).header().get(MADE_WITH) if os.path.isfile(path) else None
+        with silenced():
+            found = OpenEXR.File(path, header_only=True).header().get(MADE_WITH)
     except (OSError, RuntimeError, ValueError, TypeError):
         return None
-    return str(found) if found is not None else None
+    return found if isinstance(found, str) else None
 
 
 def strips(file: Any, channels: list[str]) -> Iterator[dict[str, bytes]]:
