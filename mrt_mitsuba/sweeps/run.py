@@ -89,8 +89,11 @@ def sweep(
         fresh = {job.name for job in pictures if resume and is_fresh(job, folder, png)}
         rest = [job for job in pictures if job.name not in fresh]
         parts = {job.name: cut(job, tiles) if tiles else [job] for job in rest}
-        for tile in itertools.chain(*parts.values()) if tiles else ():
-            _refuse_to_replace(folder, tile.name, False, False)
+        new = list(itertools.chain(*parts.values()))
+        if tiles:
+            for tile in new:
+                _refuse_to_replace(folder, tile.name, False, False)
+            new = [tile for tile in new if not (resume and is_fresh(tile, folder))]
         here = {"error": "", "versions": named(versions())}
         for job in pictures:
             if job.name in fresh:
@@ -99,7 +102,7 @@ def sweep(
             table.write()
             return table
         variant = options.get("variant") or ""
-        with connected(cluster, sum(map(len, parts.values())), workers, dashboard, variant) as (
+        with connected(cluster, len(new) or 1, workers, dashboard, variant) as (
             client,
             count,
         ):
@@ -109,7 +112,7 @@ def sweep(
             setting = Setting(folder, scratch, png, software(), local, sharing)
             table.write()
             with _explained():
-                _render(_Work(client, setting, retries), parts, rest, setting, table, shown, resume)
+                _render(_Work(client, setting, retries), parts, rest, new, setting, table, shown)
     return table
 
 
@@ -160,8 +163,9 @@ class _Work:
     def hand_over(self, function: Any, job: Job, *more: Any) -> None:
         """Let a worker call a function with a job."""
         name = f"{job.name} {function.__name__} {self._deaths[job.name]}"
-        key, options = (os.path.basename(self._setting.scratch), name), {"retries": self._retries}
-        future = self._client.submit(function, job, *more, self._setting, key=key, pure=False, **options)
+        key = (os.path.basename(self._setting.scratch), name)
+        spare = max(0, self._retries - attempts(job.name, self._setting))
+        future = self._client.submit(function, job, *more, self._setting, key=key, retries=spare, pure=False)
         self._calls[future] = function, job, *more
         self._coming.add(future)
 
@@ -196,21 +200,15 @@ def _render(
     work: _Work,
     parts: Mapping[str, Sequence[Job]],
     rest: Sequence[Job],
+    new: Sequence[Job],
     setting: Setting,
     table: Table,
     shown: Progress,
-    resume: bool,
 ) -> None:
     """Let workers render pictures, or their tiles (``parts``, by the picture's name) and put these together;
-    each picture's row goes into the table as it ends."""
-    folder, made = setting.folder, dict[str, dict[str, Any]]()
+    each picture's row goes into the table as it ends. ``new``: parts that no earlier sweep left."""
+    made: dict[str, dict[str, Any]] = {}
     whole = {part.name: job for job in rest for part in parts[job.name]}
-    new = [
-        part
-        for job in rest
-        for part in parts[job.name]
-        if part is job or not (resume and is_fresh(part, folder))
-    ]
     left = Counter(whole[part.name].name for part in new)
     try:
         with shown.stage("Sweep", len(new) + sum(job.name not in whole for job in rest)) as advance:
