@@ -73,14 +73,26 @@ def tail_shape(values: np.ndarray, counts: np.ndarray) -> float:
     size = min(max(2 * half, FEWEST), len(largest) - 1)
     if size < FEWEST or largest[0] <= largest[size]:
         return 0.0
-    shape = _shape(largest[size - 1 :: -1] - largest[size])
+    shape, _ = _pareto(largest[size - 1 :: -1] - largest[size])
     return shape if half <= MANY else min(shape, 0.5)
 
 
-def _shape(excess: np.ndarray) -> float:
-    """Return the shape of a generalised Pareto distribution, given what exceeds its threshold, ascending.
+def exceedance(values: np.ndarray) -> float:
+    """Return the probability that the largest of some values is as large as it is, given their tail."""
+    ordered = np.sort(values[values > 0], axis=None)
+    size = int(min(0.2 * ordered.size, 3 * math.sqrt(ordered.size)))
+    if size < FEWEST or ordered[-size - 1] == ordered[-1]:
+        return 1.0
+    excess = ordered[-size:] - ordered[-size - 1]
+    shape, scale = _pareto(excess)
+    beyond = max(1 + shape * excess[-1] / scale, 0) ** (-1 / shape)
+    return float(-np.expm1(-size * beyond))
 
-    The fit of J. Zhang and M. Stephens (Technometrics 2009), drawn to 1/2 by as much as ten values weigh.
+
+def _pareto(excess: np.ndarray) -> tuple[float, float]:
+    """Return shape and scale of a generalised Pareto distribution, given what exceeds a threshold.
+
+    The fit of J. Zhang and M. Stephens (Technometrics 2009), drawn to a shape of 1/2 as by ten values.
     """
     size, most = len(excess), excess[-1]
     grid = 30 + math.isqrt(size)
@@ -89,4 +101,5 @@ def _shape(excess: np.ndarray) -> float:
     shape = np.log1p(-slope[:, None] * excess).mean(1)
     likelihood = size * (np.log(-slope / shape) - shape - 1)
     best = float(np.average(slope, weights=np.exp(likelihood - likelihood.max())))
-    return float((np.log1p(-best * excess).sum() + 10 * 0.5) / (size + 10))
+    total = float(np.log1p(-best * excess).sum())
+    return (total + 10 * 0.5) / (size + 10), -total / size / best

@@ -22,7 +22,6 @@ import numpy as np
 from mrt_mitsuba.filters.dof import REACH
 from mrt_mitsuba.output.error import ErrorEstimate, tail_shape
 from mrt_mitsuba.rendering.exposing import Exposer, Groups, Stack
-from mrt_mitsuba.rendering.rounds import LEAST_GROWTH
 from mrt_mitsuba.rendering.windows import dilated, window_means
 
 PICTURES = 4
@@ -36,6 +35,7 @@ GROUP = 2  # rays that are traced together; each picture begins with one group t
 # Candidates for the smoothing of variances: half the width of a window, and how many rays its mean is worth
 _WINDOWS = ((1, 8), (1, 32), (2, 32), (2, math.inf), (4, math.inf), (8, math.inf))
 _FLOORS = (0.0, 0.01, 0.1, 0.5)  # share of a region's mean in the variance of every pixel
+_REGIONS = (8, math.inf)  # half the width of such regions; all of the picture
 _JUDGES = 2**12  # pixels, about, that choose among the candidates
 _REGION = 8  # half the width of the windows in which rays are compared with independent ones
 
@@ -79,7 +79,8 @@ class Halves(Stack):
         bad = ~np.isfinite(exposed.square).all(-1)
         if bad.any():
             self._bad |= bad.any(0)
-            self._unfit = float(exposed.total[bad].max())
+            worst = exposed.total[bad].max()
+            self._unfit = float(exposed.peak[bad].max() if np.isfinite(worst) else worst)
         self._traced += exposed.rays
         self._total += np.where(bad[..., None], 0, exposed.total)
         self._square += np.where(bad[..., None], 0, exposed.square)
@@ -162,20 +163,21 @@ class Halves(Stack):
         step = max(1, math.isqrt(both[0].size // _JUDGES))
         some = (..., slice(None, None, step), slice(None, None, step))
         other = both[::-1][some] + tiny
-        widths = {width: window_means(both, width)[some] for width in {_REGION, *(w for w, _ in _WINDOWS)}}
+        widths = {width: _around(both, width)[some] for width in (*_REGIONS, *(w for w, _ in _WINDOWS))}
 
-        def unlikely(candidate: tuple[int, float, float]) -> float:
-            width, worth, floor = candidate
+        def unlikely(candidate: tuple[int, float, float, float]) -> float:
+            width, worth, floor, region = candidate
             expected = _drawn(both[some], widths[width], rays[some], worth)
-            expected = expected + floor * (widths[_REGION] - expected) + tiny
+            expected = expected + floor * (widths[region] - expected) + tiny
             return float(np.mean(np.log(expected) + other / expected))
 
         windows = [w for w in _WINDOWS if w[0] >= self.film.reach] or _WINDOWS[-1:]
-        width, worth, floor = min(((*w, floor) for w in windows for floor in _FLOORS), key=unlikely)
+        candidates = [(*w, floor, region) for w in windows for floor in _FLOORS for region in _REGIONS]
+        width, worth, floor, region = min(candidates, key=unlikely)
         moments, total = self._moments(first + second)
         values = np.moveaxis(moments, -1, 0)
-        smooth = _drawn(values, window_means(values, width), total, worth)
-        return np.moveaxis(smooth + floor * (window_means(values, _REGION) - smooth), 0, -1)
+        smooth = _drawn(values, _around(values, width), total, worth)
+        return np.moveaxis(smooth + floor * (_around(values, region) - smooth), 0, -1)
 
     def _moments(self, which: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Return the variance of a ray's value in each channel, [H, W, 3], and the rays, [H, W]."""
@@ -204,14 +206,14 @@ class Halves(Stack):
 
     # ------------------------------------------- Sharing --------------------------------------------
 
-    def next(self, most: float, rays: float, target: float | None) -> np.ndarray | None:
-        """Return numbers of further groups; None where ``rays`` leave no room.
+    def next(self, most: float, rays: float, target: float | None) -> np.ndarray:
+        """Return numbers of further groups.
 
         The scouts decide until ``most`` rays a pixel are enough for an RMSE of ``target``, or are all of the
         ``rays`` to spend. The next round is the last then, and what a half gets in it is decided by the other
         half, too: that knows more, and what it makes of this half's share cannot come back to it any more.
         """
-        deviation, traced = np.sqrt(self._decisive([2], [3])).ravel(), self._traced.sum()
+        deviation, traced = self._deviation([2], [3]), self._traced.sum()
         room = most * self.film.pixels - traced
         self.last = most >= rays
         if target is not None:
@@ -222,10 +224,13 @@ class Halves(Stack):
             due = scouting * (self.rays[0] + GROUP * half) - self._traced[2]
             return np.stack([half, half, *2 * [self._whole(due)]])
         room = rays * self.film.pixels - traced
-        views = [np.sqrt(self._decisive([1 - half], SCOUTS)).ravel() for half in HALVES]
+        views = [self._deviation([1 - half], SCOUTS) for half in HALVES]
         halves = [self._share(half, views[half], room / 2, target) for half in HALVES]
-        groups = np.stack([*halves, *np.zeros_like(halves)])
-        return groups if self.cost(groups) >= (LEAST_GROWTH - 1) * traced or target else None
+        return np.stack([*halves, *np.zeros_like(halves)])
+
+    def _deviation(self, first: list[int], second: list[int]) -> np.ndarray:
+        """Return the deviation by which pixels share rays out, [pixels]; alike, where none was met."""
+        return np.sqrt(self._decisive(first, second).ravel() + 1e-30)
 
     def _due(self, half: int, deviation: np.ndarray, target: float) -> np.ndarray:
         """Return the groups that take the picture to a target, if the other half is like this one."""
@@ -278,6 +283,13 @@ def _gain(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
     few = 0.1  # windows without noise take the picture's ratio
     found, expected = (window_means(v, _REGION) + few * v.mean() for v in (found, expected))
     return found / np.maximum(expected, 1e-30)
+
+
+def _around(values: np.ndarray, reach: float) -> np.ndarray:
+    """Return means of values [..., H, W] in windows, or of all."""
+    if math.isinf(reach):
+        return np.broadcast_to(values.mean((-2, -1), keepdims=True), values.shape)
+    return window_means(values, int(reach))
 
 
 def _drawn(variance: np.ndarray, around: np.ndarray, rays: np.ndarray, worth: float) -> np.ndarray:

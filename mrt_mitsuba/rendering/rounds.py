@@ -50,7 +50,7 @@ class Refinable(Protocol[Chosen]):
 
     last: bool  #: was the last round decided?
 
-    def next(self, most: float, rays: float, target: float | None) -> Chosen | None:
+    def next(self, most: float, rays: float, target: float | None) -> Chosen:
         """Return what to trace for an error, or for a mean of at most so many rays a pixel in all.
 
         ``most``: after this round, unless it is the last; ``rays``: after the last.
@@ -82,9 +82,8 @@ def run_rounds(picture: Refinable[Chosen], pixels: int, goal: Goal, stage: Stage
     """
     start, done, rays = time.perf_counter(), list[Round](), 0
     least, doubled = min(goal.rays, LEAST_MEAN, LEAST / pixels) if goal.target else 0, 0
-    chosen: Chosen | None = picture.first()
-    while chosen is not None:
-        cost = picture.cost(chosen)
+    chosen = picture.first()
+    while cost := picture.cost(chosen):
         rays += cost
         with stage("rounds", cost, _message(done, goal, cost / pixels)) as advance:
             picture.trace(chosen, advance)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba.errors import OutputError, UsageError
+from mrt_mitsuba.output.error import exceedance
 from mrt_mitsuba.output.files import read_channels, write_exr, write_png
 from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.result import Result
@@ -20,6 +21,7 @@ from mrt_mitsuba.validation.tools import image_tests
 ORDER = {letter: index for index, letter in enumerate("RGBXYZUVA")}  # of channels within a layer
 # What may stand next to a picture and says how well it is known: the layer, and its power of the deviation
 SPREADS = {"error": 2, "variance": 1}
+CELL = 16  # pixels, a side of the cells whose means are compared
 MEASURES = ("mae", "rmse", "rel_mse", "psnr", "largest", "flip", "p_value")
 # Why a measure may be None
 UNDEFINED = {
@@ -97,7 +99,6 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
 
     The p-value needs a layer "error" (standard error) or "variance" (of the mean) next to the picture, as
     ``render(target=...)`` and ``aamode="noise"`` write it, and pixels that are independent: a box filter.
-    It is too small where a few very bright rays rule the noise.
 
     An EXR of several parts has each as a layer, by its name. Raises ``UsageError`` for what cannot be
     compared: another size or data window, no such layer, NaN.
@@ -205,19 +206,20 @@ def _channels_of(channels: Mapping[str, np.ndarray], layer: str) -> list[str]:
 
 
 def _p_value(sides: Sequence[Layer]) -> float | None:
-    """Return the probability of so much difference by noise.
+    """Return the probability of so much difference by noise, of the mean of channels.
 
-    One deviation for all channels, their root mean square, bounds that of their mean, of which the test is
-    then made: it rejects equal pictures less often than it says, never more.
+    Cells and the whole picture by Student's test, which takes the noise from the differences themselves:
+    that of a few very bright rays makes it careful, not wrong. Single pixels by how the largest difference
+    over its deviation continues the tail of the others.
     """
     if all(side.variance is None for side in sides):
         return None
-    of_mean = any(side.variance is not None and side.variance.shape[2] == 1 for side in sides)
-    estimates = []
-    for side in sides:
-        values = side.values.astype(np.float64)
-        variance = np.zeros_like(values) if side.variance is None else side.variance
-        if of_mean:
-            values, variance = (x.mean(axis=2, keepdims=True) for x in (values, variance))
-        estimates.append(image_tests.Estimate(values, variance, side.samples))
-    return image_tests.compare(*estimates).p
+    values = [side.values.astype(np.float64).mean(axis=2) for side in sides]
+    variance = sum(side.variance.mean(axis=2) for side in sides if side.variance is not None)
+    brightness = np.maximum(*np.abs(values))
+    rounding = image_tests.ROUNDING * (brightness + brightness.mean())
+    difference = values[0] - values[1]
+    difference -= np.clip(difference, -rounding, rounding)
+    cells = [image_tests.p_of_means(difference, size) for size in (CELL, max(difference.shape))]
+    pixels = exceedance(np.abs(difference) / np.sqrt(variance + rounding**2 + 1e-300))
+    return image_tests.sidak(min(*cells, pixels), 3)

@@ -121,6 +121,19 @@ def compare(
     return Comparison(largest, p_values, level, distance, z=by_question[0])
 
 
+def p_of_means(difference: np.ndarray, size: int) -> float:
+    """Return the probability of the differences [H, W] between equal pictures, by Student's test of the means
+    over cells of ``size`` × ``size`` pixels, whose noise is independent and as often positive as negative."""
+    from scipy import stats
+
+    values = np.stack([np.ones_like(difference), difference, difference**2], axis=-1)
+    count, total, square = np.moveaxis(_cell_sums(values, size), -1, 0)
+    spread = np.sqrt(np.maximum(count * square - total**2, 0) / np.maximum(count - 1, 1))
+    t = np.divide(total, spread, out=np.where(total == 0, 0, np.inf), where=spread > 0)
+    p = 2 * stats.t.sf(np.abs(t), count - 1)[(count > 1) & (square > 0)]
+    return sidak(float(p.min(initial=1)), p.size)
+
+
 def sidak(p: float, count: int) -> float:
     """Return the probability 1 - (1 - p)^count that the smallest of ``count`` p values is ``p`` or less."""
     return 1.0 if p >= 1 else float(-np.expm1(count * np.log1p(-p)))
