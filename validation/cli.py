@@ -23,7 +23,7 @@ from mrt_mitsuba.validation.tools.timing import own_cache
 
 # By name: the module, imported when it is run; what --list says of it; seconds of a quick and of a full run
 # on two idle cores, about
-STUDIES = {
+STUDIES: dict[str, tuple[str, str, int, int]] = {
     "laws": ("bsdf_laws", "does the material obey its own laws", 6, 60),
     "roughconductor": ("roughconductor", "is the material the function that Mitsuba's is", 10, 90),
     "stock": ("stock", "are light, gloss, mirrors and stand-ins what Mitsuba computes", 15, 60),
@@ -76,9 +76,10 @@ def _parser() -> argparse.ArgumentParser:
 
 def listing() -> str:
     """Return a line on each study, with how long it takes on two idle cores."""
-    total = [sum(entry[i] for entry in STUDIES.values()) for i in (2, 3)]  # type: ignore[misc]
+    in_all = [sum(seconds) for seconds in zip(*(entry[2:] for entry in STUDIES.values()), strict=True)]
     lines = [f"  {'':<15}{'quick':>7}{'full':>8}"]
-    for name, (_, about, quick, full) in {**STUDIES, "all": ("", "all of these", *total)}.items():
+    rows = [(name, *entry[1:]) for name, entry in STUDIES.items()]
+    for name, about, quick, full in [*rows, ("all", "all of these", in_all[0], in_all[1])]:
         lines.append(f"  {name:<15}{_spoken(quick):>7}{_spoken(full):>8}  {about}")
     return "\n".join(lines)
 
@@ -94,7 +95,7 @@ def _validate(options: argparse.Namespace) -> int:
         packages = " ".join(missing)
         raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
     report.prepare(options.out, "summary.json", "index.html")
-    seconds = sum(STUDIES[name][2 if options.quick else 3] for name in names)
+    seconds = sum(STUDIES[name][2] if options.quick else STUDIES[name][3] for name in names)
     print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
     # With a cache of their own, studies of speed see how long compilation takes
     with nullcontext() if options.quick or not set(names) & set(TIMED) else own_cache():

@@ -204,8 +204,8 @@ def _in_turns(scene: Any, repeats: int) -> list[dict[str, np.ndarray]]:
             kept.append((picture, rays, seconds))
     found = []
     for kept in spent:
-        mean = np.mean([picture for picture, _, _ in kept], axis=0, dtype=np.float64)
+        mean = np.asarray(np.mean([picture for picture, _, _ in kept], axis=0, dtype=np.float64))
         squares = [rmse(picture, mean) ** 2 * repeats / (repeats - 1) for picture, _, _ in kept]
-        rays, seconds = (np.array([one[i] for one in kept]) for i in (1, 2))
-        found.append({"squares": np.array(squares), "rays": rays, "seconds": seconds})
+        spent_on = {name: np.array([one[i] for one in kept]) for i, name in ((1, "rays"), (2, "seconds"))}
+        found.append({"squares": np.array(squares), **spent_on})
     return found

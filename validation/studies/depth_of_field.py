@@ -54,7 +54,7 @@ def compare(study: Study, number: int, *, size: tuple[int, int], aa: int, spp: i
     sharp = mrt.render(scene, width=width, height=height, layers=["depth", "normal"], **options)
     depth = sharp.layers["depth.Z"]
     focus: dict[str, Any] = {"focal_distance": scene.focal_distance, "focal_range": scene.focal_range}
-    pictures = {"sharp": sharp.image}
+    pictures: dict[str, np.ndarray] = {"sharp": sharp.image}
     pictures |= {mode: filters.gaussian_dof(sharp.image, depth, **focus, mode=mode) for mode in MODES}
     lens = fit_lens(scene, depth)
     nodes = scene.to_dict(width=width, height=height)

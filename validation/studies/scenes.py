@@ -154,7 +154,7 @@ def hold(study: Study, name: str, judgement: Judgement, cut: float) -> None:
     study.at_most(f"scene {name}: median difference", np.median(error), MEDIAN, why)
     study.at_most(f"scene {name}: difference of 99 %", np.quantile(error, 0.99), most, why)
     why = "rounding sends single pixels to the other side of an edge: measured up to two in ten thousand"
-    study.at_most(f"scene {name}: share of pixels off by > 1/255", np.mean(error > STEP), SHARE, why)
+    study.at_most(f"scene {name}: share of pixels off by > 1/255", float(np.mean(error > STEP)), SHARE, why)
     why = "silhouettes, edges of shadows and steep shading are reasons, found by moved rays"
     left = np.sum(reason == REASONS.index("unexplained"))
     study.at_most(f"scene {name}: pixels off without a reason", left, 0, why)

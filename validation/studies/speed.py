@@ -254,7 +254,8 @@ def _sweep_and_loop(grid: dict[str, list[float]], options: dict[str, Any]) -> tu
 
 def growth(extent: Extent) -> Iterator[Pair]:
     """Yield tasks against smaller ones; the code must not grow with them."""
-    times, small = extent.growth, {"width": 40, "height": 30}
+    times = extent.growth
+    small: dict[str, Any] = {"width": 40, "height": 30}
     side = round(times**0.5)
     larger = {name: value * side for name, value in small.items()}
 
@@ -291,9 +292,12 @@ def on_device(variant: str, sizes: Sequence[tuple[int, int]], triangles: int) ->
     which is better. Raises ``VariantError`` where there is no device.
     """
     runtime.use(variant)
-    others = {"direct": {"type": "direct"}, "path": {"type": "path", "max_depth": 6}}
+    others: dict[str, dict[str, Any]] = {
+        "direct": {"type": "direct"},
+        "path": {"type": "path", "max_depth": 6},
+    }
     for width, height in sizes:
-        size = {"width": width, "height": height}
+        size: dict[str, Any] = {"width": width, "height": height}
         flavors: dict[str, list[Callable[[], Any]]] = {
             f"scene {n}": [partial(mrt.scene_dict, n, flavor=f, **size) for f in ("mrt", "stock")]
             for n in range(5)

@@ -313,7 +313,7 @@ def physical(scene: Scene, *, diffuse: bool = False) -> Scene:
     return with_materials(scene, material)
 
 
-def both_flavors(scene: Scene, **size: int) -> tuple[Nodes, Nodes]:
+def both_flavors(scene: Scene, **size: Any) -> tuple[Nodes, Nodes]:
     """Return a scene of our plugins, but for the lights and finite planes of the other, and of Mitsuba's."""
     stock = mrt.scene_dict(scene, flavor="stock", **size)
     theirs = {name: node for name, node in stock.items() if name.startswith(("light_", "plane_"))}

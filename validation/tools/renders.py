@@ -41,7 +41,7 @@ def _without(nodes: Nodes, *kinds: str) -> Nodes:
     return {name: node for name, node in nodes.items() if not name.startswith(kinds)}
 
 
-def with_lights(count: int, **size: int) -> Nodes:
+def with_lights(count: int, **size: Any) -> Nodes:
     """Return scene 4 with its light from points above, each of its own brightness."""
     nodes = _without(mrt.scene_dict(4, **size), "light_")
     for i in range(count):
@@ -55,7 +55,7 @@ def with_lights(count: int, **size: int) -> Nodes:
     return nodes
 
 
-def with_triangles(count: int, **size: int) -> Nodes:
+def with_triangles(count: int, **size: Any) -> Nodes:
     """Return hills under the camera and the lights of scene 0."""
     import mitsuba as mi
 
@@ -75,7 +75,7 @@ def with_triangles(count: int, **size: int) -> Nodes:
     return _without(mrt.scene_dict(0, **size), "plane_") | {"hills": hills}
 
 
-def crowd(count: int, kind: str, **size: int) -> Nodes:
+def crowd(count: int, kind: str, **size: Any) -> Nodes:
     """Return the room of scene 4 with so many spheres, or cones as high and wide, in any direction.
 
     Of the kind "group", the spheres are one shape.
@@ -134,8 +134,9 @@ def _with_update(**options: Any) -> Render:
 def _prepared() -> Render:
     """Return a prepared render; of versions that have none, the nearest thing: a render of a loaded scene."""
     scene = load(mrt.scene_dict(3, **SMALL))
-    if hasattr(mrt, "prepare"):
-        prepared: Render = mrt.prepare(scene, **ONE_RAY)
+    prepare: Any = getattr(mrt, "prepare", None)
+    if prepare is not None:
+        prepared: Render = prepare(scene, **ONE_RAY)
         return prepared
     return partial(mrt.render, scene, **ONE_RAY)
 
