@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from functools import reduce
+from operator import or_
 from typing import Any
 
 import drjit as dr
@@ -97,13 +99,13 @@ class MrtBSDF(mi.BSDF):
     def _update(self) -> None:
         # Opaque numbers travel as data: instances share one compiled function, new values need no new kernel
         dr.make_opaque(*(p for p in self.parameters.values() if not isinstance(p, mi.Texture)))
-        self.m_components, self.m_flags = [], 0
+        components = []
         for lobe in LOBES:
             flags = getattr(mi.BSDFFlags, lobe.flag) | mi.BSDFFlags.FrontSide
             if any(self._varies(name) for name in (lobe.reflectance, *lobe.numbers)):
                 flags |= mi.BSDFFlags.SpatiallyVarying
-            self.m_components = [*self.m_components, flags]
-            self.m_flags |= flags
+            components.append(flags)
+        self.m_components, self.m_flags = components, reduce(or_, components)
 
     def _varies(self, name: str) -> bool:
         parameter = self.parameters.get(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import itemgetter
 from typing import Any
 
 import drjit.scalar
@@ -12,7 +13,7 @@ import numpy as np
 class Columns(list):
     """Three columns, which Dr.Jit's ``dot``, ``norm`` and ``normalize`` take for a vector."""
 
-    x, y, z = (property(lambda self, k=k: self[k]) for k in range(3))
+    x, y, z = (property(itemgetter(k)) for k in range(3))
 
     @classmethod
     def of(cls, array: np.ndarray) -> Columns:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -57,6 +57,31 @@ class Pair:
         return cls(wi, wo, tan2, active)
 
 
+class Lobe(Protocol):
+    """A row of ``LOBES``."""
+
+    name: str
+    reflectance: str  # the parameter that scales it
+    default: float  # of that parameter
+    flag: str  # of its component, among ``mi.BSDFFlags``
+    numbers: tuple[str, ...]  # the other parameters that it depends on
+
+    def value(self, at: Lobes, pair: Pair) -> mi.UnpolarizedSpectrum:
+        """Return f cos θo."""
+
+    def density(self, at: Lobes, pair: Pair) -> mi.Float:
+        """Return the density of the samples."""
+
+    def sample(self, at: Lobes, wi: mi.Vector3f, sample2: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
+        """Draw a direction; return it, and tan² of the half vector."""
+
+    def albedo(self, at: Lobes) -> mi.UnpolarizedSpectrum:
+        """Return what it reflects of light from ``at.wi``, by which it is chosen."""
+
+    def bound(self, alpha: float, f0: float) -> float:
+        """Return a bound of the value for a reflectance of 1."""
+
+
 class Diffuse:
     """Lambert's lobe."""
 
@@ -86,7 +111,7 @@ class Specular:
 
     name, reflectance, default = "specular", "specular_reflectance", 1.0
     flag = "GlossyReflection"
-    numbers = ("alpha", "int_ior", "ext_ior", "f0")
+    numbers: tuple[str, ...] = ("alpha", "int_ior", "ext_ior", "f0")
 
     def value(self, at: Lobes, pair: Pair) -> mi.UnpolarizedSpectrum:
         fresnel = at.fresnel(*half_vector_angles(pair.wi, pair.wo))
@@ -125,11 +150,8 @@ class Specular:
         return max(1, f0) * 0.25 * peak / (math.pi * size**2) * shadowed
 
 
-# In the order of the components of the BSDF. A lobe has a name, the name and default of the parameter that
-# scales it, the flag of its component, and the other parameters that it depends on; its value f cos θo, the
-# density of samples, samples (with tan² of the half vector), the reflectance by which it is chosen, and a
-# bound of the value for a reflectance of 1
-LOBES = (Diffuse(), Specular())
+# In the order of the components of the BSDF
+LOBES: tuple[Lobe, ...] = (Diffuse(), Specular())
 
 # Numbers, of which a table of materials has up to four
 TABLED = ("alpha", "int_ior", "ext_ior")
@@ -209,7 +231,7 @@ class Lobes:
         wo, tan2_theta_h = dr.detach(wo), dr.detach(tan2_theta_h)
         return wo, Pair.above(dr.select(above, self.wi, up), wo, above, tan2_theta_h), component
 
-    def _chances(self, ctx: mi.BSDFContext) -> list[tuple[int, Any, mi.Float]]:
+    def _chances(self, ctx: mi.BSDFContext) -> list[tuple[int, Lobe, mi.Float]]:
         """Return the enabled lobes, and how likely each is drawn from: after their reflectances."""
         lobes = _enabled(ctx)
         if len(lobes) < 2:
@@ -221,7 +243,7 @@ class Lobes:
         return [(k, lobe, p) for (k, lobe), p in zip(lobes, [1 - sum(shares), *shares], strict=True)]
 
 
-def _enabled(ctx: mi.BSDFContext) -> list[tuple[int, Any]]:
+def _enabled(ctx: mi.BSDFContext) -> list[tuple[int, Lobe]]:
     """Return the lobes that take part, with their places in ``LOBES``."""
     return [(k, x) for k, x in enumerate(LOBES) if ctx.is_enabled(getattr(mi.BSDFFlags, x.flag), k)]
 

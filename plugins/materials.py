@@ -73,7 +73,8 @@ class MaterialTable:
 
     def __init__(self, shapes: Sequence[mi.Shape], materials: Sequence[np.ndarray]) -> None:
         self.fresnel = shapes[0].bsdf().fresnel
-        counts, rows = [len(m) for m in materials], np.concatenate(materials)
+        counts = [len(m) for m in materials]
+        rows: Any = np.concatenate(materials)
         # For each shape: the row of its numbers, or, where objects of a shape differ, their first row and how
         # many rows lie between two faces of the stand-ins
         self.rows: mi.Float | None = None

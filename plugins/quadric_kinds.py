@@ -245,8 +245,12 @@ def _join(parts: Sequence[UnitMesh], more_faces: np.ndarray | None = None) -> Un
     first = np.cumsum([0] + [len(p.points) for p in parts])
     faces = [p.faces + np.uint32(start) for p, start in zip(parts, first, strict=False)]
     faces += [] if more_faces is None else [more_faces]
-    columns = (np.concatenate([getattr(p, name) for p in parts]) for name in ("points", "gradients", "uvs"))
-    return UnitMesh(*columns, np.concatenate(faces).astype(np.uint32))
+    return UnitMesh(
+        np.concatenate([p.points for p in parts]),
+        np.concatenate([p.gradients for p in parts]),
+        np.concatenate([p.uvs for p in parts]),
+        np.concatenate(faces).astype(np.uint32),
+    )
 
 
 @dataclass(frozen=True)
