@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # Above this Pareto shape, a variance is unknown: rays not met yet may rule it (A. Vehtari and others, 2024)
 DOUBTFUL = 0.7
-FEWEST, MANY = 10, 25  # values that tell a shape; those that are many to share half of the squares
+FEWEST, MANY = 20, 25  # values that tell a shape; those that are many to share half of the squares
 
 
 @dataclass(frozen=True)
