@@ -19,7 +19,16 @@ from mrt_mitsuba.sweeps.grid import Job, jobs
 from mrt_mitsuba.sweeps.scenes import check_parameters, fingerprint, identify, send
 from mrt_mitsuba.sweeps.table import Table
 from mrt_mitsuba.sweeps.tiles import assemble, check_tiles, cut
-from mrt_mitsuba.sweeps.worker import Setting, attempts, is_fresh, made_with, named, render_job, software
+from mrt_mitsuba.sweeps.worker import (
+    Setting,
+    attempts,
+    endings,
+    is_fresh,
+    made_with,
+    named,
+    render_job,
+    software,
+)
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -133,14 +142,14 @@ def _sent(jobs: Sequence[Job], scratch: str) -> list[Job]:
 def _refuse_to_replace(folder: str, name: str, listed: bool, png: bool) -> None:
     """Raise ``OutputError`` for a file of the user's own under the name of a picture.
 
-    A sweep's own has a mark in its header or, where that is broken, a row in the table; a PNG is next to it.
+    A sweep's own has a mark in its header or, where that is broken, a row in the table (``listed``).
     """
-    path = os.path.join(folder, name)
-    for file in (f"{path}.exr", f"{path}.png") if png else (f"{path}.exr",):
-        ours = os.path.isfile(file) and (listed or made_with(f"{path}.exr") is not None)
-        if os.path.lexists(file) and not ours:
+    for ending in endings(png):
+        path = os.path.join(folder, f"{name}.{ending}")
+        found = made_with(path)
+        if os.path.lexists(path) and not (found or (found is None and listed and os.path.isfile(path))):
             raise OutputError(
-                f"{file} was not made by a sweep, which would replace it: move it away, or choose "
+                f"{path} was not made by a sweep, which would replace it: move it away, or choose "
                 "another folder"
             )
 

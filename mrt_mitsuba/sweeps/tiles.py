@@ -6,6 +6,7 @@ picture is written some rows at a time, so that no process ever holds it.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
@@ -16,7 +17,7 @@ from typing import Any
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.sweeps.grid import Job
 from mrt_mitsuba.sweeps.scenes import fingerprint, receive
-from mrt_mitsuba.sweeps.worker import MADE_WITH, Setting, strips
+from mrt_mitsuba.sweeps.worker import MADE_WITH, Setting, made_with, strips
 
 # Memory for a tile, unless the caller says: what is kept of a pixel is 84 bytes at most
 BYTES_PER_PIXEL = 128
@@ -81,9 +82,12 @@ def assemble(
     try:
         _join(job, tiles, paths, scratch)
         os.replace(scratch, os.path.join(setting.folder, job.file))
-        for path in paths:
-            os.unlink(path)
-        os.rmdir(os.path.dirname(paths[0]))
+        own = os.path.dirname(paths[0])
+        for path in (os.path.join(own, name) for name in os.listdir(own)):
+            if made_with(path):  # also those of another number of tiles
+                os.unlink(path)
+        with contextlib.suppress(OSError):  # something of the user's own is in there
+            os.rmdir(own)
     except (OSError, RuntimeError) as error:
         return facts | {"error": f"cannot put {job.name} together: {error}"}
     for name in ("seconds", "rays"):  # unknown of tiles that an earlier sweep made

@@ -18,7 +18,8 @@ from mrt_mitsuba.options import SMALLEST_MEMORY
 from mrt_mitsuba.sweeps.grid import Job
 from mrt_mitsuba.sweeps.scenes import identify, is_copy, receive
 
-MADE_WITH = "mrt:sweep"  # header attribute: fingerprint of scene, settings and versions
+MADE_WITH = "mrt:sweep"  # in the header of each picture: fingerprint of scene, settings and versions
+UNREADABLE = (OSError, RuntimeError, ValueError, TypeError, SyntaxError)  # what libraries raise for files
 ROWS = 64  # of a picture, read at a time; a multiple of the 16 that are compressed together
 
 
@@ -95,8 +96,10 @@ def _render(job: Job, setting: Setting, scratch: str, worker: Any) -> dict[str, 
     if here != setting.software:
         raise MrtError(f"the worker has {named(here)}; the sweep began with {named(setting.software)}")
     import drjit as dr
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
 
-    from mrt_mitsuba.output.files import save
+    from mrt_mitsuba.output.files import save, to_8bit
     from mrt_mitsuba.rendering.api import render
     from mrt_mitsuba.rendering.progress import Progress
 
@@ -112,10 +115,14 @@ def _render(job: Job, setting: Setting, scratch: str, worker: Any) -> dict[str, 
     if not is_copy(job.scene) and identify(job.scene) != job.identity:
         raise MrtError(f"{job.scene} has changed since the sweep began: run it again")
     header = result.header() | {MADE_WITH: job.made_with}
-    for ending in ("exr", "png") if setting.png else ("exr",):
+    save(f"{scratch}.exr", result.image, layers=result.layers, header=header)
+    if setting.png:
+        mark = PngInfo()
+        mark.add_text(MADE_WITH, job.made_with)
+        Image.fromarray(to_8bit(result.image)).save(f"{scratch}.png", pnginfo=mark)
+    for ending in endings(setting.png):
         target = os.path.join(setting.folder, f"{job.name}.{ending}")
         os.makedirs(os.path.dirname(target), exist_ok=True)
-        save(f"{scratch}.{ending}", result.image, layers=result.layers, header=header)
         os.replace(f"{scratch}.{ending}", target)
     return {
         "file": job.file,
@@ -133,7 +140,7 @@ def is_fresh(job: Job, folder: str, png: bool = False) -> bool:
     from mrt_mitsuba.output.files import silenced
 
     path = os.path.join(folder, job.name)
-    if made_with(f"{path}.exr") != job.made_with:
+    if any(made_with(f"{path}.{ending}") != job.made_with for ending in endings(png)):
         return False
     try:
         with silenced():
@@ -143,25 +150,33 @@ def is_fresh(job: Job, folder: str, png: bool = False) -> bool:
         if png:
             with Image.open(f"{path}.png") as picture:
                 picture.load()
-    except (OSError, RuntimeError, ValueError, TypeError, SyntaxError):
+    except UNREADABLE:
         return False
     return True
 
 
+def endings(png: bool) -> tuple[str, ...]:
+    """Return the kinds of files that a job leaves."""
+    return ("exr", "png") if png else ("exr",)
+
+
 def made_with(path: str) -> str | None:
-    """Return the fingerprint in the header of a picture that a sweep made; None for any other file."""
+    """Return the fingerprint in a picture that a sweep made, "" in any other; None for what is no picture."""
     import OpenEXR
+    from PIL import Image
 
     from mrt_mitsuba.output.files import silenced
 
     if not os.path.isfile(path):
         return None
     try:
+        if path.endswith(".png"):
+            with Image.open(path) as picture:
+                return str(picture.info.get(MADE_WITH, ""))
         with silenced():
-            found = OpenEXR.File(path, header_only=True).header().get(MADE_WITH)
-    except (OSError, RuntimeError, ValueError, TypeError):
+            return str(OpenEXR.File(path, header_only=True).header().get(MADE_WITH, ""))
+    except UNREADABLE:
         return None
-    return found if isinstance(found, str) else None
 
 
 def strips(file: Any, channels: list[str]) -> Iterator[dict[str, bytes]]:

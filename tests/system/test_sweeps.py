@@ -215,14 +215,18 @@ def test_a_picture_that_was_cut_is_made_again(tmp_path: Path, monkeypatch: pytes
     assert capfd.readouterr() == ("", "")  # nothing of what libraries print about broken files
 
 
-@pytest.mark.parametrize("name", ["table.csv", "seed=1.exr", "seed=1.png", "link", "picture.tiles/0,0.exr"])
+@pytest.mark.parametrize(
+    "name", ["table.csv", "seed=1.exr", "seed=1.png", "link", "own.png", "picture.tiles/0,0.exr"]
+)
 def test_a_file_of_the_users_own_is_refused_by_name(tmp_path: Path, name: str) -> None:
-    mine = tmp_path / ("seed=1.exr" if name == "link" else name)
+    mine = tmp_path / {"link": "seed=1.exr", "own.png": "seed=1.png"}.get(name, name)
     mine.parent.mkdir(exist_ok=True)
     options: dict[str, Any] = {"tiles": (1, 2)} if "tiles" in name else {"grid": {"seed": [1]}, "png": True}
+    if name == "own.png":  # next to a picture that a sweep made
+        mrt.sweep(3, tmp_path, grid={"seed": [1]}, workers=1, **SMALL)
     if name == "link":
         mine.symlink_to(tmp_path / "nothing")
-    elif name.endswith("exr"):
+    elif name.endswith(".exr") or name == "own.png":
         mrt.render(0, width=8, height=8, aa=1).save(mine)
     else:
         mine.write_text("file,error\nmine,\n")
