@@ -54,18 +54,23 @@ class MrtMesh(mi.Mesh):
             extras |= {name: extras[name] @ placement.inverse for name in ("normals",) if name in extras}
         sizes = len(positions), len(faces)
         construct(self, "mrt_mesh", sizes, props, **{name: name in extras for name in _EXTRAS})
-        buffers = {"positions": positions, **extras}
-        if "texcoords" in extras:
-            buffers["texcoords"] = extras["texcoords"][:, :2]
-        if "normals" in extras:
-            lengths = np.linalg.norm(extras["normals"], axis=1, keepdims=True)
-            buffers["normals"] = extras["normals"] / np.where(lengths == 0, 1, lengths)
-        flat = {f"vertex_{name}": array.astype(np.float32).ravel() for name, array in buffers.items()}
+        arrays = {"positions": positions, **extras}
+        flat = {f"vertex_{name}": _buffer(name, array) for name, array in arrays.items()}
         write_buffers(self, **flat, faces=faces.astype(np.uint32).ravel())
         self.content = f"positions={len(positions)}, faces={len(faces)}"
 
     def to_string(self) -> str:
         return f"MrtMesh[{self.content}]"
+
+
+def _buffer(name: str, array: np.ndarray) -> np.ndarray:
+    """Return what Mitsuba takes: two texture coordinates, unit normals."""
+    if name == "texcoords":
+        array = array[:, :2]
+    if name == "normals":
+        lengths = np.linalg.norm(array, axis=1, keepdims=True)
+        array = array / np.where(lengths == 0, 1, lengths)
+    return array.astype(np.float32).ravel()
 
 
 def _array(props: mi.Properties, name: str, *widths: int) -> np.ndarray:

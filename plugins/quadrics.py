@@ -10,7 +10,7 @@ import numpy as np
 
 from .intersect import LATERAL, Frame
 from .lookup import aligned, shape_ids
-from .quadric_kinds import KINDS, SurfacePoint
+from .quadric_kinds import KINDS, QuadricTable, SurfacePoint
 from .tree import Tree
 from .variants import is_jit
 
@@ -30,14 +30,7 @@ class Quadrics:
         self.kinds = sorted({t.kind for t in tables})  # the kernel holds these only
         self.flipped = any(t.flipped for t in tables)
         boxes = np.concatenate([t.boxes() for t in tables])
-        # A row and a coordinate of the origin, three times; kind, size of coordinates, nothing, side of the
-        # normal: a kernel reads four numbers at a time
-        numbers = np.zeros((self.count, 4, 4))
-        numbers[:, :3, :3] = np.concatenate([t.rows for t in tables])
-        numbers[:, :3, 3] = np.concatenate([t.origins for t in tables])
-        numbers[:, 3, 0] = np.repeat([self.kinds.index(t.kind) for t in tables], counts)
-        numbers[:, 3, 1] = np.abs(boxes).max(axis=(1, 2))
-        numbers[:, 3, 3] = np.repeat([-1 if t.flipped else 1 for t in tables], counts)
+        numbers = _numbers(tables, self.kinds, boxes)
         owners = np.repeat(np.arange(len(shapes)), counts)
         faces = np.concatenate([t.first_faces for t in tables])
         if not is_jit():
@@ -161,3 +154,18 @@ class Quadrics:
             other = function(KINDS[name])
             found = tuple(dr.select(kind == k, *pair) for pair in zip(other, found, strict=True))
         return found
+
+
+def _numbers(tables: list[QuadricTable], kinds: list[str], boxes: np.ndarray) -> np.ndarray:
+    """Return what a kernel reads of each quadric, [n, 4, 4]: four numbers at a time.
+
+    A row and a coordinate of the origin, three times; kind, size of coordinates, nothing, side of the normal.
+    """
+    counts = [len(t.rows) for t in tables]
+    numbers = np.zeros((len(boxes), 4, 4))
+    numbers[:, :3, :3] = np.concatenate([t.rows for t in tables])
+    numbers[:, :3, 3] = np.concatenate([t.origins for t in tables])
+    numbers[:, 3, 0] = np.repeat([kinds.index(t.kind) for t in tables], counts)
+    numbers[:, 3, 1] = np.abs(boxes).max(axis=(1, 2))
+    numbers[:, 3, 3] = np.repeat([-1 if t.flipped else 1 for t in tables], counts)
+    return numbers
