@@ -6,7 +6,7 @@ import difflib
 import re
 from collections.abc import Sequence
 from importlib import import_module
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mrt_mitsuba.errors import UsageError
 
@@ -25,7 +25,10 @@ class Command(NamedTuple):
 
     def run(self, name: str, words: Sequence[str]) -> int:
         """Import the command and run it; return its exit code."""
-        plain, given = ([list(words)], {}) if "--" in self.form else self._read(f"mrt {name}", words)
+        plain: list[Any] = [list(words)]
+        given: dict[str, str] = {}
+        if "--" not in self.form:
+            plain, given = self._read(f"mrt {name}", words)
         module, _, function = self.home.partition(":")
         code: int = getattr(import_module(module), function)(*plain, **given)
         return code

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from mrt_mitsuba import runtime
@@ -72,6 +72,7 @@ def write_xml(
     check_model_options(scene, model)
     files: dict[str, Any] = {}  # shapes by the paths of the files that hold them
     inputs: Iterable[str] = ()
+    focus: dict[str, Any] = {}
     if isinstance(scene, str | os.PathLike) and not is_obj(scene):
         given = {"fresnel": fresnel, "width": width, "height": height, "flavor=stock": flavor != "mrt"}
         useless = [name for name, value in given.items() if value]
@@ -87,20 +88,20 @@ def write_xml(
             raise UsageError(f"params: only an XML file declares names, such as {next(iter(params))}")
         if not isinstance(scene, Scene):
             scene = model_scene(scene, **model) if is_obj(scene) else report_scene(scene)  # type: ignore[arg-type]
-        size = {"width": width or SIZE[0], "height": height or SIZE[1]}
-        mine = scene_dict(scene, fresnel=fresnel or "schlick", **size)
+        width, height = width or SIZE[0], height or SIZE[1]
+        mine = scene_dict(scene, fresnel=fresnel or "schlick", width=width, height=height)
         for name, node in mine.items():
             if isinstance(node, dict) and node["type"] in _IN_FILES[flavor]:
                 file = f"{os.path.splitext(os.fspath(path))[0]}_{name}.ply"
                 files[file] = node
                 mine[name] = _ply_node(node, os.path.basename(file))
         text = _text_of(mine, scene, flavor)
-        has_focus = scene.focal_distance is not None
-        focus = {"focaldist": scene.focal_distance, "focalrange": scene.focal_range} if has_focus else {}
+        if scene.focal_distance is not None:
+            focus = {"focaldist": scene.focal_distance, "focalrange": scene.focal_range}
         inputs = scene.files
     with replacing_together([*files, path], inputs) as opened:
-        for file, node in zip(opened, files.values(), strict=False):
-            file.write(_ply(node))
+        for stream, node in zip(opened, files.values(), strict=False):
+            stream.write(_ply(node))
         opened[-1].write((_with_focus(text, focus) + "\n").encode())
     return [*files, os.fspath(path)]
 
@@ -151,99 +152,85 @@ def _ply(node: dict[str, Any]) -> bytes:
     return bytes(stream.read(stream.size()))
 
 
-def _stock(scene_as_dict: dict[str, Any], scene: Scene) -> dict[str, Any]:
+def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
     """Replace every plugin of this project by its nearest stock equivalent, which may take several nodes."""
     result: dict[str, Any] = {}
-    for name, node in scene_as_dict.items():
+    for name, node in nodes.items():
         kind = node["type"] if isinstance(node, dict) else ""
         if kind in _WITHOUT_STOCK:
-            raise SceneError(
-                f"{name} has no counterpart among Mitsuba's plugins: {kind} {_WITHOUT_STOCK[kind]}"
-            )
-        if kind == "mrt_cylinder":
-            result |= {f"{name}_{part}": child for part, child in _stock_tube(node).items()}
-        else:
-            result[name] = _REPLACEMENTS[kind](node, scene) if kind in _REPLACEMENTS else node
+            reason = f"{kind} {_WITHOUT_STOCK[kind]}"
+            raise SceneError(f"{name} has no counterpart among Mitsuba's plugins: {reason}")
+        result[name] = node
+        if kind == "mrt_whitted":
+            result[name] = {"type": "path", "max_depth": 4}
+        elif kind == "mrt_bsdf":
+            result[name] = _stock_bsdf(node)
+        elif kind == "mrt_light":  # with falloff, of the same irradiance at the camera's target
+            squared = sum((a - b) ** 2 for a, b in zip(node["position"], scene.camera.target, strict=True))
+            color = {**node["intensity"], "value": [c * squared for c in node["intensity"]["value"]]}
+            result[name] = {"type": "point", "position": node["position"], "intensity": color}
+        elif kind == "mrt_plane":
+            normal = _unit(node["normal"])
+            square = _facing([-node["distance"] * c for c in normal], normal, STOCK_EXTENT / 2)
+            result[name] = {"type": "rectangle", "to_world": square, "bsdf": node["bsdf"]}
+        elif kind == "mrt_cylinder":
+            result |= _stock_cylinder(name, result.pop(name))
     return result
 
 
-def _stock_integrator(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
-    return {"type": "path", "max_depth": 4}
-
-
-def _stock_bsdf(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
+def _stock_bsdf(node: dict[str, Any]) -> dict[str, Any]:
     """Return the same lobes over a diffuse base; colours above one and negative roughness have no stock
     counterpart."""
-
-    def clipped(color: dict[str, Any]) -> dict[str, Any]:
-        if color["type"] == "mrt_texture":
-            return _stock_texture(color)
-        return {**color, "value": [min(c, 1.0) for c in color["value"]]} if color["type"] == "rgb" else color
-
+    colors = {}
+    for name in ("diffuse_reflectance", "specular_reflectance"):
+        color = node[name]
+        if color["type"] == "rgb":
+            color = {**color, "value": [min(c, 1.0) for c in color["value"]]}
+        elif color["type"] == "mrt_texture":
+            # The nearest texel as stored; half a texel off the report's look-up, which shrinks the picture so
+            # far
+            stored = {"raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+            color = {"type": "bitmap", "filename": os.path.abspath(color["filename"]), **stored}
+        colors[name] = color
     if node["specular_reflectance"].get("value") == [0.0, 0.0, 0.0]:
-        return {"type": "diffuse", "reflectance": clipped(node["diffuse_reflectance"])}
-    return {
+        return {"type": "diffuse", "reflectance": colors["diffuse_reflectance"]}
+    alpha, ior = max(abs(node["alpha"]), 1e-4), node["int_ior"]
+    base = {
         "type": "roughplastic",
         "distribution": "beckmann",
-        "alpha": max(abs(node["alpha"]), 1e-4),
-        "int_ior": node["int_ior"],
+        "alpha": alpha,
+        "int_ior": ior,
         "ext_ior": 1.0,
-        "diffuse_reflectance": clipped(node["diffuse_reflectance"]),
-        "specular_reflectance": clipped(node["specular_reflectance"]),
     }
+    return base | colors
 
 
-def _stock_light(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
-    """Return a light with falloff, of the same irradiance at the camera's target."""
-    squared = sum((a - b) ** 2 for a, b in zip(node["position"], scene.camera.target, strict=True))
-    color = {**node["intensity"], "value": [c * squared for c in node["intensity"]["value"]]}
-    return {"type": "point", "position": node["position"], "intensity": color}
-
-
-def _stock_plane(node: dict[str, Any], scene: Scene) -> dict[str, Any]:
-    length = sum(c * c for c in node["normal"]) ** 0.5
-    normal = [c / length for c in node["normal"]]
-    foot = [-node["distance"] * c for c in normal]
-    return {"type": "rectangle", "to_world": _facing(foot, normal, STOCK_EXTENT / 2), "bsdf": node["bsdf"]}
-
-
-def _stock_tube(node: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def _stock_cylinder(name: str, node: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return an open tube, and at each end a disc that faces away from the other."""
-    p0, p1, radius = node["p0"], node["p1"], node["radius"]
-
-    def disc(center: list[float], opposite: list[float]) -> dict[str, Any]:
+    nodes = {f"{name}_tube": {**node, "type": "cylinder"}}
+    ends = node["p0"], node["p1"]
+    for number, (center, opposite) in enumerate((ends, ends[::-1])):
         away = [c - o for c, o in zip(center, opposite, strict=True)]
-        return {"type": "disk", "to_world": _facing(center, away, radius), "bsdf": node["bsdf"]}
+        place = _facing(center, away, node["radius"])
+        nodes[f"{name}_disc{number}"] = {"type": "disk", "to_world": place, "bsdf": node["bsdf"]}
+    return nodes
 
-    tube = {"type": "cylinder", "p0": p0, "p1": p1, "radius": radius, "bsdf": node["bsdf"]}
-    return {"tube": tube, "disc0": disc(p0, p1), "disc1": disc(p1, p0)}
+
+def _unit(vector: list[float]) -> list[float]:
+    length = sum(c * c for c in vector) ** 0.5
+    return [c / length for c in vector]
 
 
 def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
     """Return what takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
     import mitsuba as mi
 
-    length = sum(c * c for c in normal) ** 0.5
-    normal = [c / length for c in normal]
+    normal = _unit(normal)
     up = [0, 0, 1] if abs(normal[2]) < 0.9 else [1, 0, 0]
     target = [c + n for c, n in zip(center, normal, strict=True)]
     to_world = mi.ScalarTransform4f().look_at(center, target, up)
     return to_world @ mi.ScalarTransform4f().scale([half_size, half_size, 1])
 
-
-def _stock_texture(node: dict[str, Any]) -> dict[str, Any]:
-    """Return the nearest texel as stored; half a texel off the report's look-up, which shrinks the picture so
-    far."""
-    stored = {"raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
-    return {"type": "bitmap", "filename": os.path.abspath(node["filename"]), **stored}
-
-
-_REPLACEMENTS: dict[str, Callable[[dict[str, Any], Scene], dict[str, Any]]] = {
-    "mrt_whitted": _stock_integrator,
-    "mrt_bsdf": _stock_bsdf,
-    "mrt_light": _stock_light,
-    "mrt_plane": _stock_plane,
-}
 
 # Solids that Mitsuba's own plugins show as meshes
 _AS_MESHES = {f"mrt_{kind}" for kind in OBJECTS} - {"mrt_sphere", "mrt_cylinder"}

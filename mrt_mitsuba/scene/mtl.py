@@ -93,7 +93,7 @@ def _value(
         if found is None:
             missing = f"{where}: the texture {name or text} {MISSING} {folder}; Kd is used in its place"
             findings.add("textures", missing)
-        return found and str(found)
+        return None if found is None else str(found)
     colored = statement.startswith("K")
     if colored and words and words[0] in ("spectral", "xyz"):
         raise SceneError(f"{where}: {statement} {words[0]} is not supported; give red, green and blue")
