@@ -110,11 +110,8 @@ def sweep(
         if not rest:
             table.write()
             return table
-        variant = options.get("variant") or ""
-        with connected(cluster, len(new) or 1, workers, dashboard, variant) as (
-            client,
-            count,
-        ):
+        variant, most = options.get("variant") or "", max(1, len(new))
+        with connected(cluster, most, workers, dashboard, variant) as (client, count):
             check_parameters(planned)  # while workers start
             local = cluster is None
             sharing = inspect(client, scratch, count, local)
