@@ -57,7 +57,14 @@ def read_text(path: Path) -> bytes:
     data = _join_continued(data.removeprefix(b"\xef\xbb\xbf"))
     if not data.endswith(b"\n"):
         data += b"\n"
-    _check_lengths(path, data)
+    step = LONGEST_LINE // 2
+    for middle in range(0, len(data), step):
+        if data.find(b"\n", middle, middle + step) < 0:  # only long lines hold a whole step
+            start, end = data.rfind(b"\n", 0, middle) + 1, data.find(b"\n", middle)
+            if end - start > LONGEST_LINE:
+                number = data.count(b"\n", 0, start) + 1
+                text = f"a line of {end - start} bytes; at most {LONGEST_LINE} are read"
+                raise SceneError(f"{path}:{number}: {text}")
     return data
 
 
@@ -72,19 +79,6 @@ def _join_continued(data: bytes) -> bytes:
             parts += [b"\n" * (owed + 1), following]
             owed = 0
     return b"".join([*parts, b"\n" * owed])
-
-
-def _check_lengths(path: Path, data: bytes) -> None:
-    """Refuse a line that is too long; only long ones hold a whole step."""
-    step = LONGEST_LINE // 2
-    for middle in range(0, len(data), step):
-        if data.find(b"\n", middle, middle + step) < 0:
-            start, end = data.rfind(b"\n", 0, middle) + 1, data.find(b"\n", middle)
-            if end - start > LONGEST_LINE:
-                number = data.count(b"\n", 0, start) + 1
-                raise SceneError(
-                    f"{path}:{number}: a line of {end - start} bytes; at most {LONGEST_LINE} are read"
-                )
 
 
 def decode(data: bytes) -> str:

@@ -275,8 +275,10 @@ def _mesh(
     """Return the mesh of some faces, with the vertices that they use."""
     v, vt, vn = (np.concatenate([_triangles(getattr(f, kind)) for f in faces]) for kind in ("v", "vt", "vn"))
     if material.texture is None and normals is None:
-        used, index = _compact(v, len(points))
-        return Mesh(points[used], index, material)
+        used = np.zeros(len(points), bool)
+        used[v] = True
+        new = np.cumsum(used, dtype=np.uint32) - np.uint32(1)  # the vertices used, in their order
+        return Mesh(points[used], new[v], material)
     # Each corner becomes a vertex: a point may have another texture or normal in another triangle
     index = np.arange(v.size, dtype=np.uint32).reshape(-1, 3)
     textured = None if material.texture is None else uvs[vt.ravel()]
@@ -291,14 +293,6 @@ def _triangles(index: np.ndarray) -> np.ndarray:
         return index
     fan = [index[:, [0, k, k + 1]] for k in range(1, corners - 1)]
     return np.stack(fan, axis=1).reshape(-1, 3)
-
-
-def _compact(index: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices used, in their order, and the faces in terms of them."""
-    used = np.zeros(count, bool)
-    used[index] = True
-    new = np.cumsum(used, dtype=np.uint32) - np.uint32(1)
-    return np.flatnonzero(used), new[index]
 
 
 def _rest(text: bytes, keyword: str) -> str:
