@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from mrt_mitsuba.plugins.microfacet import beckmann_d, smith_g1, smith_g1_over_cos, tan2_theta
 from mrt_mitsuba.plugins.variants import first, is_jit, updatable
+from mrt_mitsuba.validation.studies.power import changed_bsdf
 
 # Each mistake, and the laws that it breaks: a value without its cosine is no reciprocal one, and what
 # sample() and eval() disagree on shows in the energy as well
@@ -64,6 +65,18 @@ def _stairs(value, wi, wo):
     return value * dr.detach(dr.select(value > 0, step / value, 0))
 
 
+def _stairs_on_a_slope(value, wi, wo):
+    if not is_jit():
+        return value
+    c, large = wi.z * wo.z, dr.opaque(mi.Float, 3e4)
+    return value * (1 + ((c + large) - large - c))
+
+
+def _attached(bs, weight, u, ctx):
+    """A weight whose density changes with the parameters as the value does."""
+    return bs, dr.detach(weight)
+
+
 def _steep(value, wi, wo):
     return value + dr.sqrt(dr.maximum(0, dr.select(wo.x > 0.7, value - dr.detach(value), 0)))
 
@@ -97,6 +110,14 @@ CHANGES = {
     "NaN at the end of random numbers": (DIFFUSE, "sample", _weight(_nan_at_the_end), {"finite"}),
     "albedo 1.02 near the horizon": (DIFFUSE, "value", _brighter, {"energy"}),
     "stairs": (GLOSS, "value", _stairs, {"roundoff"}),
+    "stairs on a slope": (DIFFUSE, "value", _stairs_on_a_slope, {"roundoff"}),
+    "more light in one mode": (
+        DIFFUSE,
+        "mode",
+        lambda value, wi, wo: 1.02 * value,
+        {"reciprocity", "energy"},
+    ),
+    "attached sampling": (GLOSS, "sample", _attached, {"gradients"}),
     "derivatives that are NaN": ({"type": "specimen"}, "value", _steep, {"gradients"}),
     "other values in scalar variants": (DIFFUSE, "value", _other_in_scalar, {"variants"}),
     "black back": (DIFFUSE, "flags", +mi.BSDFFlags.BackSide, {"components"}),
@@ -107,46 +128,8 @@ CHANGES = {
 
 def register() -> None:
     """Define the classes anew for the current variant."""
-    mi.register_bsdf("changed", _changed())
+    mi.register_bsdf("changed", changed_bsdf(CHANGES))
     mi.register_bsdf("specimen", _specimen())
-
-
-def _changed() -> type:
-    class Changed(mi.BSDF):
-        def __init__(self, props):
-            mi.BSDF.__init__(self, props)
-            self.nested, name = props["nested"], props["change"]
-            self.kind, self.change = CHANGES[name][1:3] if name else ("", None)
-            more = self.change if self.kind == "flags" else 0
-            self.m_components = [
-                int(self.nested.flags(i)) | more for i in range(self.nested.component_count())
-            ]
-            self.m_flags = int(self.nested.flags()) | more
-
-        def traverse(self, callback):
-            callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
-
-        def eval(self, ctx, si, wo, active=True):
-            value = self.nested.eval(ctx, si, wo, True if self.kind == "active" else active)
-            return self.change(value, si.wi, wo) if self.kind == "value" else value
-
-        def pdf(self, ctx, si, wo, active=True):
-            pdf = self.nested.pdf(ctx, si, wo, active)
-            return self.change(pdf, si.wi, wo) if self.kind == "pdf" else pdf
-
-        def eval_pdf(self, ctx, si, wo, active=True):
-            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
-
-        def sample(self, ctx, si, sample1, sample2, active=True):
-            bs, weight = self.nested.sample(ctx, si, sample1, sample2, active)
-            if self.kind == "value":
-                weight = self.change(weight, si.wi, bs.wo)
-            return self.change(bs, weight, sample2, ctx) if self.kind == "sample" else (bs, weight)
-
-        def to_string(self):
-            return f"Changed[{self.kind}]"
-
-    return Changed
 
 
 def _specimen() -> type:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,7 @@ STOCK = {
     "dielectric": ({}, set()),
     "thindielectric": ({}, set()),
     "conductor": ({"material": "Au"}, set()),
-    "plastic": ({}, set()),
+    "plastic": ({}, {"gradients"}),
     "roughdielectric": ({"alpha": 0.2}, set()),
     "roughconductor": ({"distribution": "ggx"}, set()),
     "roughplastic": ({}, {"sampling", "finite", "gradients"}),
@@ -96,7 +97,7 @@ STOCK = {
     ),
     "blendbsdf": (
         {"weight": 0.3, "a": {"type": "diffuse"}, "b": {"type": "dielectric"}},
-        {"weights", "components"},
+        {"weights", "gradients", "components"},
     ),
 }
 
@@ -181,12 +182,17 @@ def test_kernels_do_not_depend_on_numbers() -> None:
             assert len(launched) > 200 and (seed == 0 or not compiled)
 
 
-def test_a_plugin_of_one_variant_only() -> None:
+def test_a_plugin_of_one_variant_only_that_never_ends_and_changes_flags() -> None:
     class Once(mi.BSDF):
+        endless = False
+
         def __init__(self, props: Any) -> None:
             mi.BSDF.__init__(self, props)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            dr.set_flag(dr.JitFlag.SymbolicCalls, False)
+            while self.endless:
+                time.sleep(0.001)
             return mi.Spectrum(0)
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
@@ -198,6 +204,12 @@ def test_a_plugin_of_one_variant_only() -> None:
     mi.register_bsdf("once", Once)
     law = mrt.check_bsdf({"type": "once"}, quick=True, only=["variants"]).laws["variants"]
     assert "does not know the plugin" in law.skipped
+    assert dr.flag(dr.JitFlag.SymbolicCalls)
+    Once.endless = True
+    check = mrt.check_bsdf({"type": "once"}, quick=True, only=["weights", "finite"], timeout=0.2)
+    assert check.failed == ["weights"] and "took longer than 0.2 s" in check.laws["weights"].note
+    assert "a law before it took longer" in check.laws["finite"].skipped
+    assert dr.flag(dr.JitFlag.SymbolicCalls)
 
 
 def test_wrong_usage() -> None:

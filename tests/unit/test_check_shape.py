@@ -13,6 +13,7 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.checks.shape import LAWS
+from mrt_mitsuba.validation.studies.power import ChangedShape
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -166,6 +167,33 @@ def test_each_mistake_fails_its_own_laws(mistake: str) -> None:
     check = mrt.check_shape(Wrapped(**changes), quick=True)
     assert set(check.failed) == laws, str(check)
     assert "loaded object" in check.laws["scale"].skipped
+
+
+def tilted(si: Any, ray: Any) -> Any:
+    si.sh_frame.n = dr.normalize(si.sh_frame.n + mi.Normal3f(0.006, 0.005, 0.006))
+    return si
+
+
+def too_far(si: Any, ray: Any) -> Any:
+    si.t, si.p = si.t + 1e-5, si.p + 1e-5 * ray.d
+    return si
+
+
+@pytest.mark.parametrize(
+    ("changes", "law"),
+    [
+        ({}, None),
+        ({"area": 1.02}, "sampling"),
+        ({"first": 1.03, "given": {"type": "rectangle"}}, "sampling"),
+        ({"hit": tilted}, "normals"),
+        ({"hit": changed(p=lambda si: si.p + 1e-5 * si.n)}, "surface"),
+        ({"hit": too_far}, "surface"),
+    ],
+    ids=["none", "area", "crowded", "shading", "point", "distance"],
+)
+def test_small_faults_are_found_in_full(changes: dict[str, Any], law: str | None) -> None:
+    only = [law] if law else ["sampling", "normals", "surface"]
+    assert mrt.check_shape(ChangedShape(**changes), only=only).failed == ([law] if law else [])
 
 
 def mesh(change: Callable[[np.ndarray], np.ndarray]) -> mi.Mesh:

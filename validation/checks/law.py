@@ -195,11 +195,14 @@ def examine(
     unknown = [name for name in chosen if name not in laws]
     if unknown:
         raise UsageError(f"unknown law {unknown[0]!r}: choose from {', '.join(laws)}")
-    start, variant, found = time.perf_counter(), mi.variant(), {}
+    start, variant, found, late = time.perf_counter(), mi.variant(), {}, ""
     for name in laws:
         if name not in chosen:
             continue
         law = found[name] = Law(name)
+        if late:
+            law.skipped = f"a law before it {late}"
+            continue
         with settings_restored():
             try:
                 with _limited(timeout):
@@ -207,9 +210,8 @@ def examine(
             except Skip as reason:
                 law.skipped = str(reason)
             except TimedOut:
-                law.at_most(
-                    "it took too long, in seconds", math.inf, timeout, f"took longer than {timeout:g} s"
-                )
+                late = f"took longer than {timeout:g} s"
+                law.at_most(f"it {late}", math.inf, timeout, "a plugin must come to an end")
             except Exception as error:
                 lines = str(error).strip().splitlines() or [""]
                 # Mitsuba quotes the traceback of an error in a Python plugin, with the error last

@@ -99,16 +99,14 @@ def surface(law: Law, case: Case) -> None:
     same = again.found & near(few.p, again.p)
     largest = np.abs(few.p).max(axis=1) + 0.05 * case.size
     off = np.abs(close + again.t[:, None].astype(np.float64) * along - again.p).max(axis=1)
-    back = case.behind.only(slice(0, len(few.t)))
-    turned = np.abs(((back.p - again.p).astype(np.float64) * few.n).sum(axis=1))
-    # such rays start aside by the offset
-    alike = (offset(few.p) ** 2 < ROUNDING * largest * case.size) & back.found & (back.part == few.part)
-    alike &= ((back.n * few.n).sum(axis=1) > 0.9) & (
-        np.linalg.norm(few.p - back.p, axis=1) < 0.01 * case.size
-    )
+    # the same line the other way around, from as far behind
+    back = trace(case.target, (few.p + 0.05 * case.size * along).astype(np.float32), -along)
+    apart = np.linalg.norm(back.p.astype(np.float64) - again.p, axis=1) * np.abs((few.n * along).sum(axis=1))
+    alike = same & back.found & (back.part == few.part) & (apart < 0.01 * case.size)
+    alike &= case.behind.found.mean() > 0.5  # else rays pass it from behind
     for what, error, known in (
         ("hit point off a ray of a twentieth of the size", off, same),
-        ("hit points from in front and from behind, across the surface", turned, same & alike),
+        ("hit points from in front and from behind, across the surface", apart, alike),
     ):
         if known.sum() > 20:
             rounded = np.where(known, error / (ROUNDING * largest), np.nan)

@@ -204,7 +204,7 @@ FAULTS: Sequence[Fault] = (
     Fault("sampling", "area too large, and the density of positions too small", PERCENTS, "shape",
           lambda s: {"area": 1 + s}),
     Fault("sampling", "positions crowded to one side: u to the power of 1 and this", PERCENTS, "shape",
-          lambda s: {"first": 1 + s}),
+          lambda s: {"first": 1 + s}, {"type": "rectangle"}),
     Fault("bbox", "a box too small, in sizes", SMALL, "shape",
           lambda s: {"bbox": lambda box: mi.BoundingBox3f((1 - 2 * s) * box.min, (1 - 2 * s) * box.max)}),
 )  # fmt: skip
@@ -235,7 +235,7 @@ def least_found(fault: Fault, changes: dict[str, Any], *, quick: bool = False) -
     nested = GLOSS if fault.law == "gradients" else DIFFUSE
     for size in fault.sizes:
         if fault.kind == "shape":
-            changed = ChangedShape(**fault.change(size))
+            changed = ChangedShape(fault.nested, **fault.change(size))
             found = check_shape(changed, only=[fault.law], quick=quick)
         else:
             name = f"{fault.what} {size}"
