@@ -30,6 +30,7 @@ STUDIES: dict[str, tuple[str, str, int, int]] = {
     "scenes": ("scenes", "are the report's scenes right, with a reason for each pixel off", 10, 60),
     "antialiasing": ("antialiasing", "does refining edges give the picture of refining all", 6, 60),
     "adaptive": ("adaptive", "are own scenes Mitsuba's, and errors as stated and cheap", 10, 180),
+    "honest": ("honest", "is the mean right and the error as stated, calm to wild", 20, 1200),
     "depth-of-field": ("depth_of_field", "what do the blur filters get wrong against a lens", 3, 60),
     "stability": ("stability", "where must float32 give out, and where does it not", 8, 60),
     "exhaustive": ("exhaustive", "how far off are formulas, over every float32 cosine", 2, 120),

@@ -11,7 +11,7 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.memory import Workspace
-from mrt_mitsuba.validation.studies import adaptive
+from mrt_mitsuba.validation.studies import adaptive, honest
 from mrt_mitsuba.validation.tools.own_scenes import SCENES, SPP, load, own_scene, sensor
 from mrt_mitsuba.validation.tools.study import findings
 
@@ -183,8 +183,9 @@ def test_size_sensor_and_parameters(tmp_path):
 
 
 def test_stated_errors_hold_and_means_are_unbiased():
-    found = findings(adaptive.run, quick=True)
-    assert found.passed, found.missed
+    for study in (adaptive, honest):
+        found = findings(study.run, quick=True)
+        assert found.passed, found.missed
 
 
 @pytest.mark.parametrize("spp", [16, 40, 100])

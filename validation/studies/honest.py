@@ -1,0 +1,110 @@
+"""Errors that can be trusted: is the mean right, is the error as stated, or is doubt stated, calm to wild?"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.validation.tools.own_scenes import sensor
+from mrt_mitsuba.validation.tools.study import Study
+
+TITLE = "Errors that can be trusted"
+SIZE, SPP = 48, 64
+BALLS: dict[str, dict[str, Any]] = {
+    "matte": {"type": "diffuse"},
+    "plastic": {"type": "plastic"},
+    "brushed": {"type": "roughconductor", "alpha": 0.3},
+    "polished": {"type": "roughconductor", "alpha": 0.05},
+    "mirror": {"type": "conductor"},
+    "frosted": {"type": "roughdielectric", "alpha": 0.1},
+    "glass": {"type": "dielectric"},
+}
+LAMPS = {"large": 0.8, "middle": 0.4, "small": 0.15}  # radii
+CALM = ("matte", "plastic", "brushed")  # under lamps that are not small
+QUICK = (("matte", "large"), ("glass", "small"))
+
+
+def scene(ball: str, lamp: str) -> Any:
+    """Return a ball on a floor under a lamp and a faint sky."""
+    to, radius = mi.ScalarTransform4f(), LAMPS[lamp]
+    box = {"width": SIZE, "height": SIZE}
+    light = {"type": "area", "radiance": {"type": "rgb", "value": 4 / radius**2}}
+    floor = {"type": "rectangle", "to_world": to.rotate([1, 0, 0], -90).scale(10)}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path"},
+            "sensor": sensor([0, 2, 5], [0, 0.6, 0], "box", film=box),
+            "floor": floor | {"bsdf": {"type": "diffuse"}},
+            "ball": {"type": "sphere", "center": [0, 0.9, 0], "radius": 0.8, "bsdf": BALLS[ball]},
+            "lamp": {"type": "sphere", "center": [1.5, 4, 1], "radius": radius, "emitter": light},
+            "sky": {"type": "constant", "radiance": 0.05},
+        }
+    )
+
+
+def run(study: Study, *, quick: bool) -> None:
+    """Render to the error of so many rays a pixel, with many seeds; compare with the converged picture."""
+    cases = QUICK if quick else [(ball, lamp) for ball in BALLS for lamp in LAMPS]
+    seeds, truth_rays = (10, 2**13) if quick else (100, 2**17)
+    rows: list[tuple[Any, ...]] = []
+    for ball, lamp in study.each("Renders to an error", cases):
+        rows.append((f"{ball}, {lamp} lamp", *_measured(scene(ball, lamp), seeds, truth_rays)))
+    study.table(
+        "honest",
+        f"Renders to the error of {SPP} rays, {SIZE}x{SIZE}: shares of {seeds} seeds",
+        (
+            "scene",
+            "held or doubted",
+            "doubted",
+            "mean off, %",
+            "±",
+            "true / stated of pixels: least",
+            "largest",
+        ),
+        rows,
+        "Pixels: the root mean squares of tenths sorted by the stated error, where nothing is in doubt.",
+        first=True,
+    )
+    why = "an interval of 95 %, and what the picture to compare with has of noise"
+    study.at_least("stated errors that hold, or are doubted: worst scene", min(r[1] for r in rows), 0.9, why)
+    calm = [r[2] for r in rows if r[0].startswith(CALM) and "small" not in r[0]]
+    study.at_most("calm scenes that are doubted", max(calm), 0.02, "nothing there is rare")
+    off = max(abs(r[3]) / r[4] for r in rows)
+    study.at_most(
+        "means off, in standard errors", off, 3.5, "the largest of 21 is 3.5 once in a hundred times"
+    )
+
+
+def _measured(scene: Any, seeds: int, truth_rays: int) -> tuple[float, ...]:
+    once = min(truth_rays, 2**12)
+    pictures = [np.array(mi.render(scene, spp=once, seed=10_000 + k)) for k in range(truth_rays // once)]
+    truth = np.mean(pictures, axis=0, dtype=np.float64)
+    own = np.std([p.mean() for p in pictures], ddof=1) / len(pictures) ** 0.5  # of its mean
+    target = float(np.sqrt(np.mean(np.var(pictures, axis=0, ddof=1)) * once / SPP))
+    held, doubted, means, stated, true = 0, 0, [], [], []
+    for seed in range(seeds):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", mrt.MrtWarning)
+            result = mrt.render(scene, target=target, maxspp=512, seed=seed)
+        error, squares = result.error, np.square(result.image - truth)
+        assert error is not None  # there was a target
+        doubt = error.high == np.inf
+        held += doubt or error.low <= np.sqrt(squares.mean()) <= error.high
+        doubted += doubt
+        means.append(result.image.mean(dtype=np.float64))
+        if not doubt:
+            stated.append(np.square(result.layers["error.Y"]))
+            true.append(squares.mean(-1))
+    ratios = [np.nan]
+    if stated:
+        order = np.array_split(np.argsort(stated, axis=None), 10)
+        ratios = [float(np.sqrt(np.mean(np.ravel(true)[i]) / np.mean(np.ravel(stated)[i]))) for i in order]
+    mean = truth.mean()
+    spread = float(np.hypot(np.std(means, ddof=1) / seeds**0.5, own))
+    off = 100 * (np.mean(means) / mean - 1)
+    return held / seeds, doubted / seeds, float(off), 100 * spread / float(mean), min(ratios), max(ratios)
