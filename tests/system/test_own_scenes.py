@@ -182,6 +182,7 @@ def test_size_sensor_and_parameters(tmp_path):
 # ---------------------------------------------- To an error ---------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:a few rays rule the error")
 def test_stated_errors_hold_and_means_are_unbiased():
     for study in (adaptive, honest):
         found = findings(study.run, quick=True)

@@ -118,7 +118,8 @@ def test_doubt_is_for_errors_that_few_rays_rule(draw: Draw, doubtful: bool) -> N
         warnings.simplefilter("always")
         results = [_render(Draws(draw), seed) for seed in range(20)]
     ruled = [r for r in results if r.image.max() > 1.5] if doubtful else results  # that met one at all
-    assert len(ruled) > 9 and np.mean([r.error.high == np.inf for r in ruled]) == doubtful
+    share = np.mean([r.error.high == np.inf for r in ruled])
+    assert len(ruled) > 9 and (share >= 0.9 if doubtful else share == 0)
     assert ["tail" in str(w.message) for w in warned].count(True) == sum(
         r.error.tail > DOUBTFUL for r in results
     )

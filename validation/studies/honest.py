@@ -81,29 +81,31 @@ def run(study: Study, *, quick: bool) -> None:
 
 
 def _measured(scene: Any, seeds: int, truth_rays: int) -> tuple[float, ...]:
-    once = min(truth_rays, 2**12)
-    pictures = [np.array(mi.render(scene, spp=once, seed=10_000 + k)) for k in range(truth_rays // once)]
+    once = truth_rays // 16
+    pictures = [np.array(mi.render(scene, spp=once, seed=10_000 + k)) for k in range(16)]
     truth = np.mean(pictures, axis=0, dtype=np.float64)
     own = np.std([p.mean() for p in pictures], ddof=1) / len(pictures) ** 0.5  # of its mean
-    target = float(np.sqrt(np.mean(np.var(pictures, axis=0, ddof=1)) * once / SPP))
+    noise = np.var(pictures, axis=0, ddof=1).mean(-1) / len(pictures)  # squared error of the truth
+    target = float(np.sqrt(noise.mean() * truth_rays / SPP))
     held, doubted, means, stated, true = 0, 0, [], [], []
     for seed in range(seeds):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", mrt.MrtWarning)
             result = mrt.render(scene, target=target, maxspp=512, seed=seed)
-        error, squares = result.error, np.square(result.image - truth)
+        error, squares = result.error, np.square(result.image - truth).mean(-1) - noise
         assert error is not None  # there was a target
         doubt = error.high == np.inf
-        held += doubt or error.low <= np.sqrt(squares.mean()) <= error.high
+        held += doubt or error.low**2 <= squares.mean() <= error.high**2
         doubted += doubt
         means.append(result.image.mean(dtype=np.float64))
         if not doubt:
             stated.append(np.square(result.layers["error.Y"]))
-            true.append(squares.mean(-1))
+            true.append(squares)
     ratios = [np.nan]
     if stated:
         order = np.array_split(np.argsort(stated, axis=None), 10)
-        ratios = [float(np.sqrt(np.mean(np.ravel(true)[i]) / np.mean(np.ravel(stated)[i]))) for i in order]
+        ratios = [np.mean(np.ravel(true)[i]) / np.mean(np.ravel(stated)[i]) for i in order]
+        ratios = [float(np.sqrt(max(ratio, 0))) for ratio in ratios]
     mean = truth.mean()
     spread = float(np.hypot(np.std(means, ddof=1) / seeds**0.5, own))
     off = 100 * (np.mean(means) / mean - 1)
