@@ -314,7 +314,7 @@ def test_errors_are_those_of_the_finished_picture():
         ({"aamode": "noise", "spp": 8}, "16 or more"),
         ({"target": 0.1, "aamode": "sobel"}, "target=0.1 with aamode=sobel: leave one of them out"),
         ({"target": -1}, "target=-1: must be a positive number"),
-        ({"target": 0.1, "lattice": "centered"}, "rounds follow the film; leave it out"),
+        ({"target": 0.1, "lattice": "centered"}, "rounds follow the film; leave lattice out"),
         ({"layers": ["error"]}, "only rounds estimate them"),
         ({"camera": (0, 0, 1)}, "camera is of use only with an OBJ file"),
         ({"params": {"x": 1}}, "only an XML file declares names"),
