@@ -60,7 +60,9 @@ class Result:
         changes when it is made again.
         """
         version = self.versions["mrt-mitsuba"]
-        error = self.error and {"rmse": self.error.rmse, "low": self.error.low, "high": self.error.high}
+        error = self.error and {name: getattr(self.error, name) for name in ("rmse", "low", "high", "tail")}
+        if error and error["high"] == np.inf:
+            error["high"] = None  # JSON has no infinity
         rounds = [{"spp": each.spp, "rmse": each.rmse} for each in self.rounds]
         return {
             "software": f"mrt-mitsuba {version}",
