@@ -8,7 +8,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.validation.checks.bsdf_case import Case, changed, copied, excess, live, narrow, parameters
+from mrt_mitsuba.validation.checks.bsdf_case import (
+    ROUNDED,
+    Case,
+    changed,
+    copied,
+    excess,
+    live,
+    narrow,
+    parameters,
+)
 from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip
 from mrt_mitsuba.validation.checks.probe import Array, Probe, as_mitsuba, context, interaction, is_scalar
 
@@ -144,7 +153,7 @@ def _sampled(law: Law, case: Case, key: str) -> None:
     samples = case.probe.sample(wi, u, uv)
     counts = live(wi, samples, *case.probe.both(wi, np.nan_to_num(samples.wo), uv)) & ~narrow(wi, samples)
     counts &= np.isfinite(found) & np.isfinite(expected) & (np.abs(wi[:, 2]) > 0.05)
-    counts &= np.abs(samples.wo[:, 2]) > 0.05
+    counts &= (np.abs(samples.wo[:, 2]) > 0.05) & (samples.pdf < (1024 * ROUNDED) ** -2)  # a rounding shows
     if counts.sum() < 100:
         return
     off = np.where(counts, np.abs(found - expected), 0)
