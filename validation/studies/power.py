@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -246,3 +247,10 @@ def least_found(fault: Fault, changes: dict[str, Any], *, quick: bool = False) -
             break
         least = size
     return float(least)
+
+
+if __name__ == "__main__":  # the table of docs/check_your_plugin.md
+    shown = Study("power", TITLE)
+    run(shown, quick="--quick" in sys.argv)
+    for row in shown.tables["power"].rows:
+        print("| " + " | ".join(str(value) for value in row) + " |")
