@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from mrt_mitsuba.errors import VariantError as VariantError
     from mrt_mitsuba.rendering.api import Result as Result
     from mrt_mitsuba.rendering.api import render as render
+    from mrt_mitsuba.rendering.prepare import prepare as prepare
     from mrt_mitsuba.runtime import register as register
     from mrt_mitsuba.scene.export import scene_dict as scene_dict
     from mrt_mitsuba.sweeps import sweep as sweep
@@ -46,6 +47,7 @@ _HOME = {
     "compare": "mrt_mitsuba.validation.tools.compare",
     "compare_roughconductor": "mrt_mitsuba.validation.studies.roughconductor",
     "error_vs_time": "mrt_mitsuba.validation.tools.work_precision",
+    "prepare": "mrt_mitsuba.rendering.prepare",
     "register": "mrt_mitsuba.runtime",
     "render": "mrt_mitsuba.rendering.api",
     "scene_dict": "mrt_mitsuba.scene.export",

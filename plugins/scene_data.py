@@ -50,6 +50,7 @@ class Traced:
     quadrics: Any
     errors: HitErrors
     spheres: Spheres | None
+    rays: list[Any] | None = None  # what Mitsuba's ray queries read; None: not known yet
 
 
 class SceneData:
@@ -80,6 +81,7 @@ class SceneData:
             (now.shape_part, now.material_part, plan.merged),
             lambda: MaterialTable(now.shapes, reading.materials) if plan.merged else None,
         )
+        self._traced = traced
         self.path_limit: Any = plan.cut_off.paths
         if is_jit() and self.path_limit not in (0, math.inf, self.facts.lights + 1):
             self.path_limit = dr.opaque(mi.Float, self.path_limit)  # a brighter sky needs no new kernel
@@ -96,6 +98,21 @@ class SceneData:
         pairs = [(point_buffer(places, *thing.hulls()), thing) for thing in things]
         buffers = [(buffer, thing) for buffer, thing in pairs if buffer is not None]
         return buffers if len(buffers) == len(pairs) else []
+
+    def arrays(self, scene: mi.Scene) -> list[Any] | None:
+        """Return all that the kernels read; None where they call plugins, which may read anything."""
+        plan = self.plan
+        tabled = plan.merged and (plan.lights == "none" or self.facts.tabled)
+        tabled = tabled and (plan.spheres == "table" or not plan.bvh)
+        sky = self.environment
+        if not tabled or (sky is not None and sky.class_name() != "ConstantBackgroundEmitter"):
+            return None
+        if self._traced.rays is None:
+            self._traced.rays = _ray_arrays(self.bvh or scene) if plan.bvh else []
+        own = _arrays_in(
+            [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.buffers, self.merged]
+        )
+        return [*own, *self._traced.rays, self.path_limit, sky]
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 
@@ -277,3 +294,38 @@ def _eval_bsdf(
         context.type_mask = +mi.BSDFFlags.DeltaReflection
         reflectance = mi.unpolarized_spectrum(bsdf.sample(context, si, mi.Float(0), mi.Point2f(0), active)[1])
     return values, reflectance, int_ior
+
+
+def _ray_arrays(scene: mi.Scene) -> list[Any]:
+    """Return what Embree's queries read of a scene; elsewhere, the scene.
+
+    To see a scene, Dr.Jit looks at all objects of all scenes, which takes 20 µs for each.
+    """
+    if not mi.variant().startswith("llvm"):
+        return [scene]
+    with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal):
+        indices = dr.detail.collect_indices(scene)
+    handles, shapes = [mi.UInt64(0)] * 3, mi.UInt32(0)
+    found: list[Any] = dr.detail.update_indices([*handles, shapes], indices[:4])
+    expected = dr.reinterpret_array(mi.UInt32, scene.shapes_dr())
+    numbers, known = (np.sort(array) for array in (found[-1], expected))
+    return found if np.array_equal(numbers, known) else [scene]  # fields may come in another order
+
+
+def _arrays_in(things: list[Any]) -> list[Any]:
+    """Return the arrays in objects of this package and in what they hold."""
+    found, waiting, seen = list[Any](), list(things), set[int]()
+    while waiting:
+        value = waiting.pop()
+        if id(value) in seen or isinstance(value, type):
+            continue
+        seen.add(id(value))
+        if dr.is_array_v(value):
+            found += [value] if dr.width(value) else []  # Dr.Jit aborts on an array of nothing
+        elif isinstance(value, dict):
+            waiting += value.values()
+        elif isinstance(value, list | tuple):
+            waiting += value
+        elif type(value).__module__.startswith(f"{__package__}.") and hasattr(value, "__dict__"):
+            waiting.append(vars(value))
+    return found

@@ -1,0 +1,165 @@
+"""Rendering one scene again and again, with the Python code of its kernels run once.
+
+Running the code that describes the kernels of a small picture takes ten times as long as running the kernels.
+Where it can be spared, ``prepare`` has Dr.Jit launch recorded kernels again (``dr.freeze``), after a check:
+what was recorded must equal ``mrt.render`` to the bit. All else is rendered as ``mrt.render`` does it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.interrupts import surfacing
+from mrt_mitsuba.plugins.protocols import LayeredIntegrator
+from mrt_mitsuba.plugins.snapshot import Part
+from mrt_mitsuba.rays.lattice import FILM
+from mrt_mitsuba.rendering.api import render_with
+from mrt_mitsuba.rendering.progress import default
+from mrt_mitsuba.rendering.result import Result
+from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.rendering.view import View
+from mrt_mitsuba.scene.open import Source, open_scene
+
+
+class Prepared:
+    """A scene ready to be rendered: ``again(seed=…)`` is to the bit what ``mrt.render`` returns of it.
+
+    ``params``: its parameters by keys of ``mi.traverse``; what is set there is seen by the next picture. What
+    shapes the code of the kernels is fixed; a change of that, such as the first mirror, makes them anew.
+    """
+
+    def __init__(self, scene: Any, options: dict[str, Any]) -> None:
+        self._scene, self._settings = scene, RenderSettings.of(**options)
+        self._source: Source | None = None
+        self._state: Part | None = None  # of camera and integrator, for which the kernels were recorded
+        self._launch: Any = None  # what launches them; None where nothing is recorded
+        with surfacing(), runtime.one_at_a_time:
+            self._made = self._render(self._settings.seed)  # result from which others differ by the picture
+            self._record()
+
+    def __call__(self, seed: int = 0) -> Result:
+        """Render the scene as it is now; ``seed`` is of all random numbers."""
+        with surfacing(), runtime.one_at_a_time:
+            runtime.use(self._made.plan.variant)
+            self.params.update()
+            if self._launch is None:
+                return self._render(seed)
+            data = self._integrator.prepare(self._source.scene)
+            if data.plan != self._data.plan or self._look() is not self._state:
+                self._made = self._render(seed)
+                self._record()
+                return self._made
+            self._data = data
+            plan, options = replace(self._made.plan, parts=data.facts), {**self._made.options, "seed": seed}
+            return replace(self._made, image=self._picture(seed), plan=plan, options=options)
+
+    def _render(self, seed: int) -> Result:
+        def opened(scene: Any, **how: Any) -> Source:
+            if self._source is None:
+                import mitsuba as mi
+
+                self._source = open_scene(scene, **how)
+                self.params = mi.traverse(self._source.scene)
+                self._integrator = self._source.integrator
+            return self._source
+
+        return render_with(self._scene, replace(self._settings, seed=seed), default(), opener=opened)
+
+    def _look(self) -> Part:
+        """Return the state of the camera and the integrator, the same object if it is the same."""
+        now, settings = Part(), vars(self._integrator)
+        now.add(self._source.sensor, ())
+        now.state += [settings[name] for name in sorted(settings) if not name.startswith("_")]
+        return now.close(self._state)
+
+    def _record(self) -> None:
+        """Record the kernels, if they read nothing but what is known and give the picture that they should."""
+        import drjit as dr
+        import mitsuba as mi
+
+        self._launch, plan, made = None, self._made.plan, self._made
+        sensor, film = self._source.sensor, self._source.sensor.film()
+        size = [plan.width, plan.height]
+        plain = plan.film is None or (plan.film.sampler, plan.film.rfilter, plan.film.pixel_format) == (
+            "IndependentSampler", "BoxFilter", "rgb")  # fmt: skip
+        if not (
+            plain and isinstance(self._integrator, LayeredIntegrator) and plan.variant == "llvm_ad_rgb"
+            and [step.layers for step in plan.passes] == [{"image"}] and not plan.layers and plan.motion is None
+            and (plan.lattice.kind == FILM or plan.lattice.count * plan.repeats == 1)
+            and (plan.region.width, plan.region.height) == (plan.width, plan.height)
+            and sensor.class_name() == "PerspectiveCamera" and sensor.shutter_open_time() == 0
+            and (list(film.crop_size()) != size or list(film.size()) == size)
+        ):  # fmt: skip
+            return
+        self._data, self._state = self._integrator.prepare(self._source.scene), None
+        if self._data.arrays(self._source.scene) is None:
+            return
+        self._state = self._look()
+        self._sensor = mi.load_dict(
+            {"type": "perspective", "near_clip": sensor.near_clip(), "far_clip": sensor.far_clip(),
+             "film": {"type": "hdrfilm", "width": plan.width, "height": plan.height}}
+        )  # fmt: skip
+        own, theirs = mi.traverse(self._sensor), mi.traverse(sensor)
+        for name in ("x_fov", "principal_point_offset_x", "principal_point_offset_y", "to_world"):
+            own[name] = theirs[name]
+        own.update()
+        self._size = dr.opaque(mi.Vector2f, size)
+        self._launch = dr.freeze(lambda seed, inputs: self._trace(seed))
+        try:
+            same = all(np.array_equal(self._picture(made.options["seed"]), made.image) for _ in range(2))
+        except RuntimeError:  # something else is read
+            same = False
+        if not same:
+            self._launch = None
+        self._made = replace(made, camera=View(self._sensor, plan.width, plan.height, None).matrices())
+
+    def _picture(self, seed: int) -> np.ndarray:
+        import mitsuba as mi
+
+        rays = self._made.plan.lattice.count * self._made.plan.repeats
+        inputs = [self._data.arrays(self._source.scene), self._integrator.sky, self._sensor, self._size]
+        channels = self._launch(mi.UInt32(seed), inputs)
+        shape = self._made.plan.height, self._made.plan.width
+        planes = [np.asarray(c).astype(np.float64).reshape(shape) / rays for c in channels]
+        return np.stack(planes, axis=-1).astype(np.float32)
+
+    def _trace(self, seed: Any) -> list[Any]:
+        """Return the sums of the channels over the rays of each pixel, drawn as the film's rules say."""
+        import drjit as dr
+        import mitsuba as mi
+
+        plan, rays = self._made.plan, self._made.plan.lattice.count * self._made.plan.repeats
+        lane = dr.arange(mi.UInt32, plan.width * plan.height * rays)
+        pixel = lane // rays
+        corner = mi.Point2f(mi.Float(pixel % plan.width), mi.Float(pixel // plan.width))
+        offset = mi.Point2f(0.5)
+        if plan.lattice.kind == FILM:
+            state, sequence = mi.sample_tea_32(seed, lane)
+            random = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
+            x = random.next_float32()
+            offset = mi.Point2f(x, random.next_float32())
+        place, time = (corner + offset) / self._size, mi.Float(self._sensor.shutter_open())
+        ray, weight = self._sensor.sample_ray(time, mi.Float(0), place, mi.Point2f(0.5))
+        traced = self._integrator.trace(self._source.scene, None, mi.Ray3f(ray), True, self._data)
+        channels = list(mi.Color3f(traced.radiance * mi.unpolarized_spectrum(weight)))
+        dr.eval(channels)
+        return [dr.block_reduce(dr.ReduceOp.Add, channel, rays) for channel in channels] if rays > 1 else channels
+
+
+def prepare(scene: Any = 0, **options: Any) -> Prepared:
+    """Read a scene and record its kernels once, for many renders of it; ``options`` are those of ``render``.
+
+    .. code-block:: python
+
+        again = mrt.prepare(scene, width=64, height=48, aa=1, aamode="none")
+        again.params["ball.bsdf.alpha"] = 0.2
+        result = again(seed=1)
+
+    Of kernels that draw random numbers, call plugins, or are followed by filters, nothing is recorded; they
+    are run as ``render`` does.
+    """
+    return Prepared(scene, options)
