@@ -77,7 +77,7 @@ class Prepared:
         return now.close(self._state)
 
     def _record(self) -> None:
-        """Record the kernels, if they read nothing but what is known and give the picture that they should."""
+        """Record the kernels, if they read only what is known and give the picture that they should."""
         import drjit as dr
         import mitsuba as mi
 
@@ -88,7 +88,8 @@ class Prepared:
             "IndependentSampler", "BoxFilter", "rgb")  # fmt: skip
         if not (
             plain and isinstance(self._integrator, LayeredIntegrator) and plan.variant == "llvm_ad_rgb"
-            and [step.layers for step in plan.passes] == [{"image"}] and not plan.layers and plan.motion is None
+            and [step.layers for step in plan.passes] == [{"image"}]
+            and not plan.layers and plan.motion is None
             and (plan.lattice.kind == FILM or plan.lattice.count * plan.repeats == 1)
             and (plan.region.width, plan.region.height) == (plan.width, plan.height)
             and sensor.class_name() == "PerspectiveCamera" and sensor.shutter_open_time() == 0
@@ -147,7 +148,11 @@ class Prepared:
         traced = self._integrator.trace(self._source.scene, None, mi.Ray3f(ray), True, self._data)
         channels = list(mi.Color3f(traced.radiance * mi.unpolarized_spectrum(weight)))
         dr.eval(channels)
-        return [dr.block_reduce(dr.ReduceOp.Add, channel, rays) for channel in channels] if rays > 1 else channels
+        return (
+            [dr.block_reduce(dr.ReduceOp.Add, channel, rays) for channel in channels]
+            if rays > 1
+            else channels
+        )
 
 
 def prepare(scene: Any = 0, **options: Any) -> Prepared:
