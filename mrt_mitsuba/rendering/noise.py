@@ -137,9 +137,14 @@ class Halves(Stack):
     def variance(self) -> np.ndarray:
         """Return the estimated variance of each channel in the picture, [H, W, 3], without the border."""
         each = np.moveaxis(self._smooth([0, 2], [1, 3]), -1, 0)
+        both = np.stack([self._moments(which)[0].mean(-1) for which in ([0, 2], [1, 3])])
+        quiet = window_means(both, 1) == 0
+        if not both[::-1][quiet].any():  # where one half of the rays met no noise at all, the other met none
+            each[:, quiet.all(0)] = 0
         each = self.film.spread_out(each * (1 / self.rows(self.rays)).sum(0) / 4)
         found = np.where(self._unknown, 0, _quarter_squares(*self.pictures()[..., :3]))
-        return self.film.picture(np.moveaxis(each * _gain(found, each.mean(0)), 0, -1))
+        rounding = np.nan_to_num(np.square(2.0**-24 * self.mean()[..., :3], dtype=np.float64), posinf=0)
+        return self.film.picture(np.moveaxis(each * _gain(found, each.mean(0)), 0, -1)) + rounding
 
     def _decisive(self, first: list[int], second: list[int]) -> np.ndarray:
         """Return the variance of a pixel times its rays, [H, W], as two sets of pictures have it."""
@@ -184,7 +189,8 @@ class Halves(Stack):
         rays = self.rows(self._traced)[which].sum(0)
         total, square = (v[which].sum(0) for v in (self._total, self._square))
         variance = (square - total**2 / rays[..., None]) / np.maximum(rays - 1, 1)[..., None]
-        return np.maximum(variance, 0), rays
+        rounding = 1e-6 * square / rays[..., None]
+        return np.where(variance > rounding, variance, 0), rays
 
     def _tail(self, which: list[int]) -> float:
         """Return the Pareto shape of what single rays contribute to the pixels of some pictures.
