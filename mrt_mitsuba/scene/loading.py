@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.loaders import mitsuba_first, mitsuba_home
 from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.scene.files import picture_size, require_file
@@ -131,7 +132,8 @@ def _instantiate(state: Any, merge: bool = True) -> Any:
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel, config.merge_meshes = False, merge
     mi.parser.transform_all(config, state)
-    return mi.parser.instantiate(config, state)
+    with held():  # an interrupt leaves plugins half made, at which later renders crash
+        return mi.parser.instantiate(config, state)
 
 
 @contextlib.contextmanager
