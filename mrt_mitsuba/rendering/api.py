@@ -119,40 +119,8 @@ def render(
         SceneError: for a scene that cannot be read.
         VariantError: for a variant that cannot run here.
     """
-    settings = RenderSettings.of(
-        width=width,
-        height=height,
-        aa=aa,
-        aamode=aamode,
-        target=target,
-        maxspp=maxspp,
-        maxseconds=maxseconds,
-        on_round=on_round,
-        lattice=lattice,
-        fresnel=fresnel,
-        focaldist=focaldist,
-        focalrange=focalrange,
-        dof=dof,
-        layers=layers,
-        motion=motion,
-        motionsamples=motionsamples,
-        motionmode=motionmode,
-        convention=convention,
-        texturing=texturing,
-        camera=camera,
-        up=up,
-        fov=fov,
-        light=light,
-        sensor=sensor,
-        variant=variant,
-        memory=memory,
-        seed=seed,
-        integrator=integrator,
-        spp=spp,
-        count_rays=count_rays,
-        params=params,
-        region=region,
-    )
+    given = dict(locals())  # first of all: the arguments, by name
+    settings = RenderSettings.of(**{name: given[name] for name in given.keys() - {"scene", "progress"}})
     if progress is not None and not isinstance(progress, Progress):
         raise UsageError(f"progress={progress!r}: must be a rendering.progress.Progress")
     with surfacing(), runtime.one_at_a_time:
