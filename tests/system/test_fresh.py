@@ -87,6 +87,7 @@ def interrupted(scene: mi.Scene, integrator: Any, calls: int) -> None:
         sys.setprofile(None)
 
 
+@pytest.mark.attack
 @pytest.mark.parametrize("plane", [True, False], ids=["plane", "no plane"])
 def test_a_picture_is_that_of_the_scene_as_it_is(plane: bool) -> None:
     integrator, scene = mi.load_dict({"type": "mrt_whitted"}), mi.load_dict(content(plane))
