@@ -68,6 +68,22 @@ def test_noise_alone_and_more_than_noise(spread: str, tmp_path: Path) -> None:
     assert mrt.compare(noisy("a.exr", 1.02), 0.5 * np.ones((24, 32, 3))).p_value < 1e-6  # one side exact
 
 
+def test_p_value_holds_where_a_few_rays_rule_the_noise(tmp_path: Path) -> None:
+    """Of 64 rays, 1 % is bright: most pixels state far too small an error, which is no difference."""
+
+    def noisy(name: str, rng: np.random.Generator) -> Path:
+        rays = 0.5 + 0.01 * rng.random((64, 24, 32, 1)) + 50 * (rng.random((64, 24, 32, 1)) < 0.01)
+        error = rays.std(axis=0, ddof=1)[..., 0] / 8
+        layers = {"samples": np.full((24, 32), 64), "error": error}
+        write_exr(tmp_path / name, np.repeat(rays.mean(axis=0), 3, axis=-1), layers)
+        return tmp_path / name
+
+    generators = [np.random.default_rng(seed) for seed in (2, 3, 4)]
+    p = [mrt.compare(noisy("a.exr", g), noisy("b.exr", g)).p_value for g in generators for _ in range(40)]
+    assert sum(value < 0.05 for value in p) <= 14  # 6 expected; more than 14 once in a thousand times
+    assert 0.4 < np.mean(p) < 0.75
+
+
 def test_results_have_layers(variant) -> None:
     result = mrt.render(0, width=24, height=18, aa=1, layers=["depth", "normal"])
     assert mrt.compare(result, result.image).largest == 0
