@@ -11,13 +11,14 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import mrt_mitsuba as mrt  # before mitsuba: it chooses the LLVM library
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+import mrt_mitsuba as mrt  # before mitsuba: it chooses the LLVM library
+
 EDITS = 6  # of each scene
-# Keys that shape the film, or that edits may not take to any value
+# Keys that shape the film, that hold an address of memory, or that edits may not take to any value
 LEFT_ALONE = (
     "film",
     "sampler",
@@ -169,8 +170,7 @@ def edit(scene: mi.Scene, kind: str, number: float) -> None:
         one.set_bsdf(other.bsdf())
         return
     params = mi.traverse(scene)
-    # Some keys hold an address of memory
-    keys = sorted(k for k in params.keys() if not any(word in k for word in LEFT_ALONE) and "_0x" not in k)
+    keys = sorted(k for k in params.keys() if not any(word in k for word in LEFT_ALONE))  # noqa: SIM118
     kept = [
         k
         for k in keys
@@ -217,7 +217,7 @@ def _interrupted(run: Callable[[], object], calls: int) -> None:
         sys.setprofile(None)
 
 
-def live(content: dict[str, Any], edits: list[Edit], shared: Any) -> Iterator[np.ndarray]:
+def live(content: dict[str, Any], edits: list[Edit]) -> Iterator[np.ndarray]:
     """Yield pictures of one scene after each edit; another scene of its objects is rendered in between."""
     scene = mi.load_dict(content)
     yield drawn(scene)

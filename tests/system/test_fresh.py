@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
+import edits
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -13,6 +16,8 @@ import pytest
 import mrt_mitsuba as mrt
 
 pytestmark = pytest.mark.usefixtures("variant")
+
+ROUNDS = int(os.environ.get("MRT_ATTACK_ROUNDS", "0"))  # of 504 pictures: 5,040 by make attack
 
 RED, GREEN = ({"type": "mrt_bsdf", "diffuse_reflectance": {"type": "rgb", "value": c}} for c in
               ([0.8, 0.1, 0.1], [0.1, 0.8, 0.1]))  # fmt: skip
@@ -39,70 +44,28 @@ def content(plane: bool, fresnel: str = "schlick") -> dict[str, Any]:
     }  # fmt: skip
 
 
-def edit(scene: mi.Scene, rng: np.random.Generator) -> None:
-    """Change something, in one of several ways."""
-    parameters, kind = mi.traverse(scene), rng.integers(6)
-    shapes = {shape.id(): shape for shape in scene.shapes()}
-    if kind == 0:
-        shapes[f"s{rng.integers(4)}"].set_bsdf(shapes[f"s{rng.integers(4)}"].bsdf())
-        return
-    if kind == 1:
-        for _ in range(2):  # several updates before a render, in the same bounding box
-            points = np.array(parameters["mesh.vertex_positions"]).reshape(-1, 3)
-            parameters["mesh.vertex_positions"] = mi.Float(np.roll(points, 3, axis=0).ravel())
-            parameters.update()
-        return
-    if kind == 2:
-        faces = np.array(parameters["mesh.faces"]).reshape(-1, 3)
-        parameters["mesh.faces"] = mi.UInt32(np.roll(faces, 1, axis=0)[:, ::-1].ravel())
-    elif kind == 3:
-        parameters["sky.radiance.value"] = mi.Float(float(rng.uniform(0, 2)))
-    elif kind == 4:
-        parameters["light.position"] = mi.Point3f(*rng.uniform(2, 5, 3).tolist())
-    else:
-        parameters["cone.apex"] = mi.Point3f(0, float(rng.uniform(1, 3)), -1)
-    parameters.update()
-
-
 def picture(scene: mi.Scene, integrator: Any) -> np.ndarray:
     return np.array(mi.render(scene, integrator=integrator, spp=1, seed=1))
 
 
-def interrupted(scene: mi.Scene, integrator: Any, calls: int) -> None:
-    """Render, and stop at some call of a function."""
-    left = [calls]
-
-    def count(*_: Any) -> None:
-        left[0] -= 1
-        if left[0] == 0:
-            sys.setprofile(None)
-            raise KeyboardInterrupt
-
-    sys.setprofile(count)
-    try:
-        integrator.prepare(scene)
-    except KeyboardInterrupt:
-        pass
-    finally:
-        sys.setprofile(None)
-
-
-@pytest.mark.attack
-@pytest.mark.parametrize("plane", [True, False], ids=["plane", "no plane"])
-def test_a_picture_is_that_of_the_scene_as_it_is(plane: bool) -> None:
-    integrator, scene = mi.load_dict({"type": "mrt_whitted"}), mi.load_dict(content(plane))
-    rounds = int(os.environ.get("MRT_ATTACK_ROUNDS", "0")) or 12
-    seeds, rng = list[int](), np.random.default_rng(7)
-    picture(scene, integrator)
-    for _ in range(rounds):
-        seeds.append(int(rng.integers(2**31)))
-        edit(scene, np.random.default_rng(seeds[-1]))
-        interrupted(scene, integrator, int(rng.integers(1, 400)))
-        anew = mi.load_dict(content(plane))
-        for seed in seeds:
-            edit(anew, np.random.default_rng(seed))
-        expected = picture(anew, mi.load_dict({"type": "mrt_whitted"}))
-        np.testing.assert_array_equal(picture(scene, integrator), expected)
+@pytest.mark.parametrize("part", [0, 1, pytest.param(2, marks=pytest.mark.attack)])
+def test_edited_scenes_are_drawn_as_scenes_made_anew(part: int, variant: str, tmp_path: Path) -> None:
+    """To the bit, and those made anew in another process."""
+    mi.set_log_level(mi.LogLevel.Error)
+    first, count = 1000 * part, 20 if part < 2 else 72 * ROUNDS
+    path = tmp_path / "anew.npz"
+    words = [sys.executable, edits.__file__, str(first), str(count), str(path)]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as other:
+        pictures = {
+            number: list(edits.live(content, done)) for number, content, done in edits.stories(first, count)
+        }
+        _, said = other.communicate(timeout=300 + 10 * count)
+    assert other.returncode == 0, said
+    with np.load(path) as anew:
+        for number, content, done in edits.stories(first, count):
+            for step, (live, fresh) in enumerate(zip(pictures[number], anew[str(number)], strict=True)):
+                where = f"story {number}, after {[kind for kind, _ in done[:step]]}: {list(content)}"
+                np.testing.assert_array_equal(live, fresh, err_msg=where)
 
 
 def test_an_integrator_may_serve_several_scenes() -> None:
