@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Sequence
-from types import ModuleType
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import drjit as dr
@@ -35,7 +34,15 @@ class Grid:
             raise UsageError(
                 f"image has shape {shape}; expected [rows, columns] or [rows, columns, channels]"
             )
-        module = _backend_module(image)
+        mitsuba = sys.modules.get("mitsuba")
+        variant = mitsuba.variant() if mitsuba else None
+        if dr.is_tensor_v(image):
+            name = _MODULES.get(dr.backend_v(image), "drjit.scalar")
+        elif variant is not None:
+            name = f"drjit.{variant.partition('_')[0]}"
+        else:
+            name = "drjit.scalar" if runtime.obstacle(runtime.FAST) else "drjit.llvm"
+        module = importlib.import_module(name)
         self._tensor = module.TensorXf
         self._kind = type(image) if dr.is_tensor_v(image) else np.ndarray
         self.Float: Any = dr.array_t(module.TensorXf)
@@ -112,6 +119,20 @@ class Grid:
         return theirs(ours(flat, shape))
 
 
+def bands(height: int, rows: int, halo: int) -> Iterator[tuple[slice, slice, slice]]:
+    """Yield a picture's bands from top to bottom: the rows of each, those to read, and its own among these.
+
+    A filter that reads only some rows above and below a pixel, its halo, gives the same bits for a band with
+    its halo as for the whole picture. A band reads at most ``rows`` rows, or three halos; the halo ends at
+    the borders of the picture.
+    """
+    step = height if height <= rows else max(rows - 2 * halo, halo, 1)
+    for start in range(0, height, step):
+        stop = min(start + step, height)
+        top, bottom = max(start - halo, 0), min(stop + halo, height)
+        yield slice(start, stop), slice(top, bottom), slice(start - top, stop - top)
+
+
 def finite(planes: Sequence[Any]) -> Any:
     """Return where all of several planes hold finite numbers."""
     result = dr.isfinite(planes[0])
@@ -122,13 +143,3 @@ def finite(planes: Sequence[Any]) -> Any:
 
 def _shape(array: Any) -> tuple[int, ...]:
     return tuple(array.shape) if hasattr(array, "shape") else np.shape(array)
-
-
-def _backend_module(image: Any) -> ModuleType:
-    if dr.is_tensor_v(image):
-        return importlib.import_module(_MODULES.get(dr.backend_v(image), "drjit.scalar"))
-    mitsuba = sys.modules.get("mitsuba")
-    variant = mitsuba.variant() if mitsuba else None
-    if variant is None:
-        return importlib.import_module("drjit.scalar" if runtime.obstacle(runtime.FAST) else "drjit.llvm")
-    return importlib.import_module(f"drjit.{variant.partition('_')[0]}")

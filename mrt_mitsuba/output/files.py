@@ -10,6 +10,7 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import IO, TYPE_CHECKING, Any
 
 from mrt_mitsuba.cores import usable_cores
@@ -106,19 +107,33 @@ def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
 
 
 def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Mapping[str, Any]) -> None:
+    """Write the picture [H, W, 3] and its layers, [H, W] for each channel; arrays are copied only where the
+    library would. Raises ``OutputError`` if a shape does not fit."""
+    import numpy as np
     import OpenEXR
 
-    plain = {
-        name: value if isinstance(value, str | int | float) else json.dumps(value)
-        for name, value in header.items()
-    }
+    planes = {"RGB": np.ascontiguousarray(image, np.float32)}
+    if planes["RGB"].ndim != 3 or planes["RGB"].shape[2] != 3:
+        raise OutputError(f"the picture has shape {planes['RGB'].shape}; expected [H, W, 3]")
+    for name, array in layers.items():
+        array = np.asarray(array, np.float32)
+        if array.shape[:2] != np.shape(image)[:2] or array.ndim not in (2, 3):
+            raise OutputError(f"layer {name} of shape {array.shape} does not fit the picture")
+        array = np.atleast_3d(array)
+        letters = LAYERS[name].letters if name in LAYERS else "RGB" if array.shape[2] == 3 else "Y"
+        names = [name] if "." in name or name == "A" else [f"{name}.{letter}" for letter in letters]
+        if len(names) != array.shape[2]:
+            raise OutputError(f"layer {name} has {array.shape[2]} channels in place of {len(names)}")
+        planes |= {each: np.ascontiguousarray(array[:, :, index]) for index, each in enumerate(names)}
+    texts = {name: v if isinstance(v, str | int | float) else json.dumps(v) for name, v in header.items()}
     kind = compression(image.shape[0] * image.shape[1])
-    # The library does not report a full disk when it opens the file itself, so the file is ours.
-    picture = OpenEXR.File(
-        {**plain, "compression": kind, "type": OpenEXR.scanlineimage}, _channels(image, layers)
-    )
+    picture = OpenEXR.File({**texts, "compression": kind, "type": OpenEXR.scanlineimage}, planes)
+    # The library does not report a full disk when it opens the file itself, so the file is ours. It writes a
+    # few rows at a time by code in Python: within its own code, and that of Python's files, a signal would
+    # wait until all is written.
+    stream = SimpleNamespace(tell=file.tell, seek=file.seek, write=lambda rows: file.write(rows))
     with contextlib.nullcontext() if kind == OpenEXR.NO_COMPRESSION else compressing():
-        picture.write(_Stream(file))
+        picture.write(stream)
 
 
 def compression(pixels: int) -> Any:
@@ -140,18 +155,6 @@ def compressing() -> Iterator[None]:
         yield
     finally:
         OpenEXR.set_global_thread_count(before)
-
-
-class _Stream:
-    """A file that the EXR library writes to, a few rows at a time, by code in Python: in its own code, and in
-    that of Python's files, a signal would wait until all is written."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self.tell, self.seek = file.tell, file.seek
-        self._file = file
-
-    def write(self, data: bytes) -> int:
-        return self._file.write(data)
 
 
 def read_exr(path: Path) -> Picture:
@@ -248,27 +251,3 @@ def _blocks(image: Image, tonemap: str) -> Iterator[tuple[int, NDArray[np.uint8]
         yield row, values.astype(np.uint8)
     if lost:
         warnings.warn(f"{lost} pixels are NaN; the PNG holds 0 there", MrtWarning, stacklevel=4)
-
-
-def _channels(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
-    """Return what the EXR library takes: the picture [H, W, 3], and its layers by channel, [H, W] each.
-
-    Arrays are copied only where the library would. Raises ``OutputError`` if a shape does not fit.
-    """
-    import numpy as np
-
-    result: dict[str, Image] = {"RGB": np.ascontiguousarray(image, np.float32)}
-    if result["RGB"].ndim != 3 or result["RGB"].shape[2] != 3:
-        raise OutputError(f"the picture has shape {result['RGB'].shape}; expected [H, W, 3]")
-    for name, array in layers.items():
-        array = np.asarray(array, np.float32)
-        if array.shape[:2] != np.shape(image)[:2] or array.ndim not in (2, 3):
-            raise OutputError(f"layer {name} of shape {array.shape} does not fit the picture")
-        array = np.atleast_3d(array)
-        letters = LAYERS[name].letters if name in LAYERS else "RGB" if array.shape[2] == 3 else "Y"
-        names = [name] if "." in name or name == "A" else [f"{name}.{letter}" for letter in letters]
-        if len(names) != array.shape[2]:
-            raise OutputError(f"layer {name} has {array.shape[2]} channels in place of {len(names)}")
-        for index, channel in enumerate(names):
-            result[channel] = np.ascontiguousarray(array[:, :, index])
-    return result

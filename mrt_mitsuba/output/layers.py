@@ -5,17 +5,13 @@ A new layer takes one row. What its ``value`` is computed from along camera rays
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 FIRST_HIT = "first hit"  # of the first ray of a pixel; a mean would name no point
 AVERAGED = "averaged"  # over the rays of a pixel, as the picture is
 DERIVED = "derived"  # by a pass over the picture
-
-
-def _derived(values: Any) -> Any:
-    raise TypeError("a derived layer has no values along rays")
 
 
 @dataclass(frozen=True)
@@ -26,7 +22,7 @@ class Layer:
     letters: str  #: names of its EXR channels, in the order of the last axis
     source: str  #: ``FIRST_HIT``, ``AVERAGED`` or ``DERIVED``
     doc: str  #: for the page of the command
-    value: Callable[[Any], Any] = _derived  #: along rays
+    value: Any = None  #: function of what is known along rays; None of a derived layer
     free_with: tuple[str, ...] = ()  #: the passes that make it in any case
     counts: str = ""  #: the kind of rays that it counts
     internal: bool = False  #: cannot be asked for

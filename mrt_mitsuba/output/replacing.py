@@ -128,7 +128,13 @@ def _temporary(folder: str) -> Iterator[IO[bytes]]:
     """Give a new file in a folder, locked, with the rights of the user's umask; remove it at the end."""
     if folder not in _tidied:
         _tidied.add(folder)
-        _tidy(folder)
+        for left in Folder(folder).glob(_TEMPORARY.format("*")):  # by killed processes
+            with contextlib.suppress(OSError):
+                found = left.lstat()
+                if stat.S_ISREG(found.st_mode) and time.time() - found.st_mtime > _OLD:
+                    with left.open("rb") as locked:
+                        fcntl.flock(locked, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
+                        left.unlink()
     name = os.path.join(folder, _TEMPORARY.format(os.urandom(8).hex()))
     _unfinished.add(name)
     try:
@@ -144,14 +150,3 @@ def _temporary(folder: str) -> Iterator[IO[bytes]]:
         with contextlib.suppress(OSError):
             os.unlink(name)
         _unfinished.discard(name)
-
-
-def _tidy(folder: str) -> None:
-    """Remove what killed processes left in a folder."""
-    for path in Folder(folder).glob(_TEMPORARY.format("*")):
-        with contextlib.suppress(OSError):
-            found = path.lstat()
-            if stat.S_ISREG(found.st_mode) and time.time() - found.st_mtime > _OLD:
-                with path.open("rb") as file:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
-                    path.unlink()

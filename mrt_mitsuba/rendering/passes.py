@@ -184,13 +184,13 @@ class Passes:
 
         edges, samples = (self._add(name).reshape(self._shape) for name in ("edges", "samples"))
         with self._job.stage(step.name, len(self._pixels)) as advance:
-            for band in self._bands(REACH):
-                read = [self._picture(name)[band.seen] for name in DETECTORS[step.mode]]
-                options = {"variance": self._variance(band.seen)} if "square" in self.layers else {}
+            for rows, seen, inner in self._bands(REACH):
+                read = [self._picture(name)[seen] for name in DETECTORS[step.mode]]
+                options = {"variance": self._variance(seen)} if "square" in self.layers else {}
                 found = getattr(filters, f"{step.mode}_edges")(*read, **options)
-                mask = found.mask[band.inner]
-                edges[band.rows] = found.value[band.inner]
-                samples[band.rows] = np.where(mask, np.float32(self._plan.lattice.count), np.float32(1))
+                mask = found.mask[inner]
+                edges[rows] = found.value[inner]
+                samples[rows] = np.where(mask, np.float32(self._plan.lattice.count), np.float32(1))
                 advance(mask.size)
         self.layers.pop("square", None)
 
@@ -208,26 +208,28 @@ class Passes:
 
         amount = self._add("blur").reshape(self._shape) if "blur" in self._plan.layers else None
         with self._job.stage(step.name, len(self._pixels), "Computing depth of field..") as advance:
-            for band in self._blurring(self._picture("image")):
+            for rows in self._blurring(self._picture("image")):
                 if amount is not None:
-                    depth = self._picture("depth")[band.rows]
-                    amount[band.rows] = filters.blur_amount(depth, **self._focus)
-                advance((band.stop - band.start) * self._shape[1])
+                    amount[rows] = filters.blur_amount(self._picture("depth")[rows], **self._focus)
+                advance((rows.stop - rows.start) * self._shape[1])
 
-    def _blurring(self, image: np.ndarray) -> Iterator[Any]:
-        """Blur a picture in place, band by band; what the next band sees of this one is kept as it was."""
+    def _blurring(self, image: np.ndarray) -> Iterator[slice]:
+        """Blur a picture in place, band by band, and yield their rows.
+
+        What the next band sees of this one is kept as it was.
+        """
         from mrt_mitsuba import filters
         from mrt_mitsuba.filters.dof import REACH
 
         depth, above = self._picture("depth"), image[:0]
-        for band in self._bands(REACH):
-            sharp = image[band.start : band.bottom]
+        for rows, seen, inner in self._bands(REACH):
+            sharp = image[rows.start : seen.stop]
             if len(above):
                 sharp = np.concatenate([above, sharp])
-            blurred = filters.gaussian_dof(sharp, depth[band.seen], **self._focus, mode=str(self._plan.blur))
-            above = sharp[: band.stop - band.top][-REACH:].copy()
-            image[band.rows] = blurred[band.inner]
-            yield band
+            blurred = filters.gaussian_dof(sharp, depth[seen], **self._focus, mode=str(self._plan.blur))
+            above = sharp[: inner.stop][-REACH:].copy()
+            image[rows] = blurred[inner]
+            yield rows
 
     def _blurred(self, picture: np.ndarray) -> np.ndarray:
         """Return a picture [H, W, 3] with depth of field."""
@@ -241,8 +243,8 @@ class Passes:
         focus = self._plan.focus
         return {"focal_distance": focus.distance, "focal_range": focus.range}
 
-    def _bands(self, halo: int) -> Iterator[Any]:
-        from mrt_mitsuba.filters.bands import bands
+    def _bands(self, halo: int) -> Iterator[tuple[slice, slice, slice]]:
+        from mrt_mitsuba.filters.grid import bands
 
         rows = self._rows_at_once
         yield from bands(self._shape[0], rows, halo)

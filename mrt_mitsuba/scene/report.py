@@ -24,7 +24,7 @@ SCENE_4_MATERIALS = (
 )
 
 
-def _scene_0() -> Scene:
+def scene_0() -> Scene:
     grey = (0.5, 0.5, 0.5)
     colors = {(0, 0, 0): grey, (1, 0, 0): (0.5, 0, 0), (0, 1, 0): (0, 0.5, 0.5), (0, 0, 1): (0, 0, 0.5)}
     return Scene(
@@ -42,7 +42,7 @@ def _row(i: int) -> float:
     return round(-1.5 + i / 3, 9)
 
 
-def _scene_1() -> Scene:
+def scene_1() -> Scene:
     lower = [
         Sphere(
             (0, 0, _row(i)), 0.15, Material(1.1382, (10 - i) / 90, (1, 0.992, 0.98), (0.301, 0.034, 0.039))
@@ -64,7 +64,7 @@ def _scene_1() -> Scene:
     )
 
 
-def _scene_2() -> Scene:
+def scene_2() -> Scene:
     def material(column: int, row: int) -> Material:
         # The two leftmost columns have a negative roughness, as in the original
         return Material(
@@ -88,7 +88,7 @@ def _scene_2() -> Scene:
     )
 
 
-def _scene_3() -> Scene:
+def scene_3() -> Scene:
     dark = (0.014, 0.012, 0.012)
     return Scene(
         title="six spheres in the corner of three planes",
@@ -147,7 +147,7 @@ def scene_of_spheres(count: int = 600) -> Scene:
     )
 
 
-def _scene_9() -> Scene:
+def scene_9() -> Scene:
     wood = Material(1.0771, 0.0589, (0.26, 0.036, 0.014), (1, 0.852, 1.172))
     return Scene(
         title="a cone above a plane",
@@ -180,7 +180,7 @@ def c_rand(seed: int = 1) -> Iterator[int]:
         yield words[-1] >> 1
 
 
-_BUILDERS = {0: _scene_0, 1: _scene_1, 2: _scene_2, 3: _scene_3, 4: scene_of_spheres, 9: _scene_9}
+_BUILDERS = {0: scene_0, 1: scene_1, 2: scene_2, 3: scene_3, 4: scene_of_spheres, 9: scene_9}
 _DEMOS = (5, 6, 7, 8)
 NUMBERS = tuple(sorted({*_BUILDERS, *_DEMOS}))
 

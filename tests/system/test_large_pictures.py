@@ -16,7 +16,7 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import memory
-from mrt_mitsuba.filters.bands import bands
+from mrt_mitsuba.filters.grid import bands
 
 # ---------------------------------------------- Bands ----------------------------------------------
 
@@ -27,11 +27,11 @@ from mrt_mitsuba.filters.bands import bands
 def test_bands_cover_every_row_once_and_see_their_neighbours(height: int, rows: int, halo: int) -> None:
     image = np.arange(height)
     found = list(bands(height, rows, halo))
-    np.testing.assert_array_equal(np.concatenate([image[band.seen][band.inner] for band in found]), image)
-    for band in found:
-        np.testing.assert_array_equal(image[band.rows], image[band.seen][band.inner])
-        assert band.top == max(band.start - halo, 0) and band.bottom == min(band.stop + halo, height)
-        assert band.bottom - band.top <= max(rows, 3 * halo, 1)
+    np.testing.assert_array_equal(np.concatenate([image[own] for own, _, _ in found]), image)
+    for own, seen, inner in found:
+        np.testing.assert_array_equal(image[own], image[seen][inner])
+        assert seen == slice(max(own.start - halo, 0), min(own.stop + halo, height))
+        assert seen.stop - seen.start <= max(rows, 3 * halo, 1)
     assert len(found) == 1 or height > rows
 
 
