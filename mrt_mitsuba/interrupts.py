@@ -1,7 +1,8 @@
-"""Lets an interrupt surface as what it is, whatever libraries make of it on the way.
+"""Lets signals wait for a safe place.
 
-A ``KeyboardInterrupt`` that is raised while Mitsuba or Dr.Jit calls Python becomes an error of theirs, or is
-lost.
+Python acts on a signal between any two of its steps. Raised in a method that Mitsuba or Dr.Jit calls, or
+while they are imported, an interrupt is lost, becomes an error of theirs, or leaves them in a state in which
+they crash later. So signals wait while ``held``, and are heeded where no such call is under way.
 """
 
 from __future__ import annotations
@@ -9,62 +10,59 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import Any
 
+PATIENCE = 1.0  # seconds; who sends a second signal after that does not want to wait
 
-@contextlib.contextmanager
-def surfacing(kinds: Mapping[int, type[KeyboardInterrupt]] | None = None) -> Iterator[None]:
-    """Raise exceptions on signals in the block; the first of them is what the block raises at last.
-
-    ``kinds``: exceptions by number; by default ``KeyboardInterrupt`` for SIGINT, unless that is handled.
-    Without effect outside the main thread, where Python sets no handlers.
-    """
-    if kinds is None:
-        heeded = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        kinds = {signal.SIGINT: KeyboardInterrupt} if heeded else {}
-    if not kinds or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    raised: list[KeyboardInterrupt] = []
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        raised.append(kinds[number]())
-        raise raised[-1]
-
-    before = {number: signal.signal(number, handle) for number in kinds}
-    try:
-        yield
-    except Exception as error:
-        if raised:
-            raise raised[0] from error
-        raise
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    if raised:
-        raise raised[0]
+_HELD = ("SIGTERM", "SIGHUP", "SIGINT")
+_handlers: dict[int, Callable[..., Any]] = {}  # of the signals that are held, as they were before
+_waiting: list[tuple[int, float]] = []  # signals, and when they came
 
 
 @contextlib.contextmanager
 def held() -> Iterator[None]:
-    """Let signals that Python handles wait for the end of the block.
+    """Let signals that Python handles wait for ``heed`` or the end of the block.
 
-    An interrupt that is raised while Mitsuba and Dr.Jit are being imported ends the process in their code.
+    A second one is heeded wherever it comes. A block inside another, or in a thread other than the main one,
+    which gets no signals, changes nothing.
     """
-    if threading.current_thread() is not threading.main_thread():
+    if _handlers or threading.current_thread() is not threading.main_thread():
         yield
         return
-    numbers = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}
-    before = {number: signal.getsignal(number) for number in numbers}
-    before = {number: handler for number, handler in before.items() if callable(handler)}
-    waiting: list[int] = []
-    for number in before:
-        signal.signal(number, lambda number, frame: waiting.append(number))
     try:
+        for number in [getattr(signal, name) for name in _HELD if hasattr(signal, name)]:
+            handler = signal.getsignal(number)
+            if callable(handler):
+                _handlers[number] = handler
+                signal.signal(number, _note)
         yield
     finally:
+        before = _handlers.copy()
+        _handlers.clear()
         for number, handler in before.items():
             signal.signal(number, handler)
-        if waiting:
-            signal.raise_signal(waiting[0])
+        _heed(before)
+
+
+def heed() -> None:
+    """Act on the signals that wait; called where an exception does no harm."""
+    if _waiting and threading.current_thread() is threading.main_thread():
+        _heed(_handlers)
+
+
+def _heed(handlers: dict[int, Callable[..., Any]]) -> None:
+    while _waiting:
+        number, _ = _waiting.pop(0)
+        if number in handlers:
+            handlers[number](number, None)
+
+
+def _note(number: int, frame: FrameType | None) -> None:
+    now = time.monotonic()
+    if _waiting and number in _handlers and now - _waiting[0][1] > PATIENCE:
+        _handlers[number](number, frame)
+    else:
+        _waiting.append((number, now))

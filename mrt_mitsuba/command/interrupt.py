@@ -12,9 +12,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-
-from mrt_mitsuba.interrupts import surfacing
+from collections.abc import Callable, Iterator, Mapping
+from types import FrameType
 
 GRACE = 1.0  # seconds; more than an orderly end takes without a kernel, and well under the two promised
 
@@ -47,13 +46,37 @@ def ending_soon(clean_up: Callable[[], object]) -> Iterator[None]:
     heeded = {number: kind for number, kind in SIGNALS.items() if signal.getsignal(number) in _DEFAULTS}
     wakeup = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
     try:
-        with surfacing(heeded):
+        with _surfacing(heeded):
             yield
     finally:
         signal.set_wakeup_fd(wakeup)
         ended.set()
         os.close(write_end)  # ends the thread
         watcher.join(GRACE)
+
+
+@contextlib.contextmanager
+def _surfacing(kinds: Mapping[int, type[KeyboardInterrupt]]) -> Iterator[None]:
+    """Raise exceptions on signals in the block; the first of them is what the block raises at last, whatever
+    Mitsuba and Dr.Jit make of it on the way."""
+    raised: list[KeyboardInterrupt] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        raised.append(kinds[number]())
+        raise raised[-1]
+
+    before = {number: signal.signal(number, handle) for number in kinds}
+    try:
+        yield
+    except Exception as error:
+        if raised:
+            raise raised[0] from error
+        raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if raised:
+        raise raised[0]
 
 
 _DEFAULTS = (signal.SIG_DFL, signal.default_int_handler)

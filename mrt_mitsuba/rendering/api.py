@@ -15,7 +15,7 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.interrupts import surfacing
+from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.memory import Budget, Workspace
 from mrt_mitsuba.output.layers import AVERAGED, TABLE
 from mrt_mitsuba.rays.film import pixel_format, spectral_bands
@@ -123,7 +123,7 @@ def render(
     settings = RenderSettings.of(**{name: given[name] for name in given.keys() - {"scene", "progress"}})
     if progress is not None and not isinstance(progress, Progress):
         raise UsageError(f"progress={progress!r}: must be a rendering.progress.Progress")
-    with surfacing(), runtime.one_at_a_time:
+    with runtime.one_at_a_time, held():
         return render_with(scene, settings, default() if progress is None else progress)
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from mrt_mitsuba.interrupts import heed
 from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.output.layers import channels as channel_count
 from mrt_mitsuba.rays.canvas import Canvas
@@ -305,6 +306,7 @@ class Exposer:
         import drjit as dr
         import mitsuba as mi
 
+        heed()
         if mi.variant().startswith("scalar"):
             place, values = self._one_by_one(groups, start, moments)
         else:
@@ -361,6 +363,7 @@ class Exposer:
             if at is not None:
                 number = (lane + int(offsets[at[group]])) % 2**32
             place, values = self._ray(int(pixel), rest, number, start, moments)
+            heed()
             places.append((0, 0) if place is None else (place.x, place.y))
             for name, channels in values.items():
                 found.setdefault(name, []).append(channels)

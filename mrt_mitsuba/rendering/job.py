@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from mrt_mitsuba.interrupts import heed
 from mrt_mitsuba.memory import Workspace
 from mrt_mitsuba.rendering.progress import Advance, Progress
 
@@ -56,6 +57,7 @@ class Job:
 
             def advance_and_collect(steps: int) -> None:
                 advance(steps)
+                heed()
                 if time.perf_counter() - self.collected > SECONDS:
                     self.collect()
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.interrupts import surfacing
+from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.plugins.protocols import LayeredIntegrator
 from mrt_mitsuba.plugins.snapshot import Part
 from mrt_mitsuba.rays.lattice import FILM
@@ -37,13 +37,13 @@ class Prepared:
         self._source: Source | None = None
         self._state: Part | None = None  # of camera and integrator, for which the kernels were recorded
         self._launch: Any = None  # what launches them; None where nothing is recorded
-        with surfacing(), runtime.one_at_a_time:
+        with runtime.one_at_a_time, held():
             self._made = self._render(self._settings.seed)  # result from which others differ by the picture
             self._record()
 
     def __call__(self, seed: int = 0) -> Result:
         """Render the scene as it is now; ``seed`` is of all random numbers."""
-        with surfacing(), runtime.one_at_a_time:
+        with runtime.one_at_a_time, held():
             runtime.use(self._made.plan.variant)
             self.params.update()
             if self._launch is None:

@@ -91,3 +91,22 @@ def test_a_held_interrupt_comes_at_the_end_of_the_block() -> None:
             signal.raise_signal(signal.SIGINT)  # ignored before, and still
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_a_held_interrupt_is_heeded_at_safe_places_and_a_second_one_anywhere(monkeypatch) -> None:
+    done = []
+    with pytest.raises(KeyboardInterrupt), interrupts.held():
+        with interrupts.held():
+            signal.raise_signal(signal.SIGINT)
+        done.append("the end of an inner block is no safe place")
+        interrupts.heed()
+        done.append("never")
+    assert len(done) == 1
+    monkeypatch.setattr(interrupts, "PATIENCE", -1.0)
+    with pytest.raises(KeyboardInterrupt), interrupts.held():
+        signal.raise_signal(signal.SIGINT)
+        done.append("waits")
+        signal.raise_signal(signal.SIGINT)
+        done.append("never")
+    assert done[1:] == ["waits"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    interrupts.heed()  # nothing is left
