@@ -18,7 +18,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.checks import noise
 from mrt_mitsuba.validation.checks.bsdf import LAWS
-from mrt_mitsuba.validation.studies.stability.formulas import Ours, Report
+from mrt_mitsuba.validation.studies.stability.formulas import mrt_bsdf, report
 from mrt_mitsuba.validation.studies.stability.lobes import lobes_with_truth
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -236,19 +236,21 @@ def test_what_a_check_leaves(tmp_path: Path) -> None:
 # ------------------------------------------- Noise of rounding --------------------------------------------
 
 
-@pytest.mark.parametrize(("formula", "alpha"), [(Report, 0.1), (Report, 0.01), (Ours, 0.1), (Ours, 0.01)])
+@pytest.mark.parametrize(
+    ("formula", "alpha"), [(report, 0.1), (report, 0.01), (mrt_bsdf, 0.1), (mrt_bsdf, 0.01)]
+)
 def test_noise_is_found_without_a_reference(formula: Any, alpha: float) -> None:
     """Against 50 digits: the estimate is a deviation, 1.5 medians of an error, within a factor of 3."""
     lobes, truth = lobes_with_truth(2)
     here = np.isclose(lobes.alpha, alpha) & (lobes.cell[:, 1] < 5) & (lobes.steepness < 16)
-    few, form = lobes.only(here), formula()
+    few = lobes.only(here)
 
     def density(x: np.ndarray) -> np.ndarray:
         wi, wo = (mi.Vector3f(np.ascontiguousarray(v.T)) for v in (x[:, :3], x[:, 3:]))
         alphas, iors = (mi.Float(np.tile(v, len(x) // len(few))) for v in (few.alpha, few.ior))
-        return np.array(dr.detach(form.terms(wi, wo, alphas, iors).d))
+        return np.array(dr.detach(formula(wi, wo, alphas, iors)["d"]))
 
     found = noise.measure(density, np.concatenate([few.wi, few.wo], axis=1))
-    error = np.abs(found.value / truth.d[here] - 1) / noise.ROUNDING
+    error = np.abs(found.value / truth["d"][here] - 1) / noise.ROUNDING
     assert 1 / 3 < np.median(found.noise) / (1.5 * np.median(error)) < 3
-    assert (np.quantile(found.lost(noise.ALLOWANCE), 0.9) > noise.LOST) == (formula is Report)
+    assert (np.quantile(found.lost(noise.ALLOWANCE), 0.9) > noise.LOST) == (formula is report)

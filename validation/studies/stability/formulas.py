@@ -1,13 +1,13 @@
 """One reflectance three times in float32: as in the report, as in Mitsuba, and as in this project.
 
 All take local directions, alpha and the index of refraction as float32 arrays; the Fresnel term is the exact
-dielectric one, outside index 1. Values are those of Mitsuba's convention, BSDF times cos θo; densities are of
-sampling visible normals.
+dielectric one, outside index 1. They return ``d``, ``g``, ``value`` (by Mitsuba's convention, BSDF times
+cos θo) and ``pdf`` (of sampling visible normals), one number for each pair of directions.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -43,75 +43,45 @@ def report_fresnel(cos_theta: Any, ext_ior: Any, int_ior: Any, sin2_theta: Any =
     return dr.select(total, 1, 0.5 * (rs * rs + rp * rp))
 
 
-@dataclass(frozen=True)
-class Terms:
-    """Arrays of one value for each pair of directions."""
-
-    d: Any
-    g: Any
-    value: Any
-    pdf: Any
+Terms = dict[str, Any]
 
 
-class Report:
-    """The formulas of the report, term by term."""
-
-    name = "report"
-
-    def terms(self, wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
-        h = dr.normalize(wi + wo)
-        d = microfacet.beckmann_d(report_tan2_theta(h), alpha)
-        g_i, g_o = report_smith_g1(wi, alpha), report_smith_g1(wo, alpha)
-        f = self.fresnel(dr.dot(wi, h), ior)
-        return Terms(d, g_i * g_o, d * f * g_i * g_o / (4 * wi.z * wo.z) * wo.z, d * g_i / (4 * wi.z))
-
-    def fresnel(self, cos_theta: Any, ior: Any) -> Any:
-        return report_fresnel(cos_theta, 1, ior)
+def report(wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
+    """Return the formulas of the report, term by term."""
+    h = dr.normalize(wi + wo)
+    d, f = microfacet.beckmann_d(report_tan2_theta(h), alpha), report_fresnel(dr.dot(wi, h), 1, ior)
+    g_i, g_o = report_smith_g1(wi, alpha), report_smith_g1(wo, alpha)
+    value = d * f * g_i * g_o / (4 * wi.z * wo.z) * wo.z
+    return {"d": d, "g": g_i * g_o, "value": value, "pdf": d * g_i / (4 * wi.z)}
 
 
-class Mitsuba:
-    """The terms of ``roughconductor`` for a material without absorption, by Mitsuba's own functions.
-
-    Mitsuba raises alpha to 1e-4.
-    """
-
-    name = "roughconductor"
-
-    def terms(self, wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
-        microfacets = mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, alpha)
-        h = dr.normalize(wi + wo)
-        d, g = microfacets.eval(h), microfacets.G(wi, wo, h)
-        value = d * g / (4 * wi.z) * self.fresnel(dr.dot(wi, h), ior)
-        return Terms(d, g, value, d * microfacets.smith_g1(wi, h) / (4 * wi.z))
-
-    def fresnel(self, cos_theta: Any, ior: Any) -> Any:
-        return mi.fresnel_conductor(cos_theta, mi.Complex2f(ior, 0))
+def roughconductor(wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
+    """Return Mitsuba's own terms for a material without absorption; they raise alpha to 1e-4."""
+    microfacets = mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, alpha)
+    h = dr.normalize(wi + wo)
+    d, g = microfacets.eval(h), microfacets.G(wi, wo, h)
+    value = d * g / (4 * wi.z) * mi.fresnel_conductor(dr.dot(wi, h), mi.Complex2f(ior, 0))
+    return {"d": d, "g": g, "value": value, "pdf": d * microfacets.smith_g1(wi, h) / (4 * wi.z)}
 
 
-class Ours:
-    """``mrt_bsdf`` and the functions it is made of."""
+def mrt_bsdf(wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
+    """Return value and density of the plugin, given one alpha and index a pair, and of its functions."""
+    bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": "dielectric", "diffuse_reflectance": 0.0})
+    parameters = mi.traverse(bsdf)
+    for name, values in (("alpha", alpha), ("int_ior", ior)):
+        parameters[name] = type(parameters[name])(values)
+    parameters.update()
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = wi
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(mi.TransportMode.Radiance, 0xFFFFFFFF, 1), si, wo)
+    d = microfacet.beckmann_d(microfacet.tan2_theta(wi + wo), alpha)
+    g = microfacet.smith_g1(wi, alpha) * microfacet.smith_g1(wo, alpha)
+    return {"d": d, "g": g, "value": value[0], "pdf": pdf}
 
-    name = "mrt_bsdf"
 
-    def __init__(self) -> None:
-        self.bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": "dielectric", "diffuse_reflectance": 0.0})
-
-    def terms(self, wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
-        d = microfacet.beckmann_d(microfacet.tan2_theta(wi + wo), alpha)
-        g = microfacet.smith_g1(wi, alpha) * microfacet.smith_g1(wo, alpha)
-        value, pdf = self._plugin(wi, wo, alpha, ior)
-        return Terms(d, g, value, pdf)
-
-    def _plugin(self, wi: Any, wo: Any, alpha: Any, ior: Any) -> tuple[Any, Any]:
-        """Return the plugin itself, given one alpha and index for each pair of directions."""
-        parameters = mi.traverse(self.bsdf)
-        for name, values in (("alpha", alpha), ("int_ior", ior)):
-            parameters[name] = type(parameters[name])(values)
-        parameters.update()
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        si.wi = wi
-        value, pdf = self.bsdf.eval_pdf(mi.BSDFContext(mi.TransportMode.Radiance, 0xFFFFFFFF, 1), si, wo)
-        return value[0], pdf
-
-    def fresnel(self, cos_theta: Any, ior: Any) -> Any:
-        return fresnel.fresnel_dielectric(cos_theta, 1, ior)
+# For each formula its terms, and its Fresnel term by cosine and index
+FORMULAS: dict[str, tuple[Callable[..., Terms], Callable[[Any, Any], Any]]] = {
+    "report": (report, lambda cos, ior: report_fresnel(cos, 1, ior)),
+    "roughconductor": (roughconductor, lambda cos, ior: mi.fresnel_conductor(cos, mi.Complex2f(ior, 0))),
+    "mrt_bsdf": (mrt_bsdf, lambda cos, ior: fresnel.fresnel_dielectric(cos, 1, ior)),
+}

@@ -43,17 +43,18 @@ class Lobes(Lanes):
         return (alpha >= first) & (alpha <= last) & (self.steepness <= STEEPNESS[5])
 
 
-def draw_lobes(per_cell: int, seed: int = 1) -> Lobes:
-    """Return up to ``per_cell`` pairs in every cell of the grid that float32 directions reach."""
-    rng = np.random.default_rng(seed)
-    parts = [_draw(rng, a, c, per_cell) for a in range(len(ALPHAS)) for c in range(len(COSINES))]
-    return Lobes(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Lobes)))
-
-
 def _draw(rng: np.random.Generator, a: int, c: int, per_cell: int) -> Lobes:
+    """Return pairs of one cell of roughness and cosine: most near the mirror direction, some anywhere."""
     alpha = np.float32(ALPHAS[a])
     wi = _directions(rng, np.full(CANDIDATES, COSINES[c]))
-    wo = np.where(rng.random((CANDIDATES, 1)) < 0.8, _mirrored(rng, wi, alpha), _anywhere(rng))
+    near = rng.random((CANDIDATES, 1)) < 0.8
+    # mirrored in normals of all steepnesses
+    tan = alpha * np.sqrt(rng.uniform(0, STEEPNESS[-1], CANDIDATES) * rng.random(CANDIDATES))
+    psi = rng.uniform(0, 2 * np.pi, CANDIDATES)
+    m = np.stack([tan * np.cos(psi), tan * np.sin(psi), np.ones(CANDIDATES)], axis=1)
+    m /= np.linalg.norm(m, axis=1, keepdims=True)
+    anywhere = _directions(rng, 10 ** rng.uniform(np.log10(COSINES[-1]), 0, CANDIDATES))
+    wo = np.where(near, 2 * (wi * m).sum(axis=1, keepdims=True) * m - wi, anywhere)
     wi, wo = wi.astype(np.float32), wo.astype(np.float32)
     up = wo[:, 2] > 0.5 * COSINES[-1]
     wi, wo = wi[up], wo[up]
@@ -72,40 +73,21 @@ def _directions(rng: np.random.Generator, cosines: np.ndarray) -> np.ndarray:
     return np.stack([sines * np.cos(phi), sines * np.sin(phi), cosines], axis=1)
 
 
-def _anywhere(rng: np.random.Generator) -> np.ndarray:
-    return _directions(rng, 10 ** rng.uniform(np.log10(COSINES[-1]), 0, CANDIDATES))
-
-
-def _mirrored(rng: np.random.Generator, wi: np.ndarray, alpha: float) -> np.ndarray:
-    """Return ``wi`` mirrored in normals of all steepnesses."""
-    tan = alpha * np.sqrt(rng.uniform(0, STEEPNESS[-1], len(wi)) * rng.random(len(wi)))
-    psi = rng.uniform(0, 2 * np.pi, len(wi))
-    m = np.stack([tan * np.cos(psi), tan * np.sin(psi), np.ones(len(wi))], axis=1)
-    m /= np.linalg.norm(m, axis=1, keepdims=True)
-    return 2 * (wi * m).sum(axis=1, keepdims=True) * m - wi
-
-
 # ------------------------------------------- The truth in 50 digits ---------------------------------------
 
 
-@dataclass(frozen=True)
-class Truth:
-    """50-digit values rounded to float64: [N] each; ``slope`` is what errors of the gradient are taken of."""
-
-    d: np.ndarray
-    g: np.ndarray
-    value: np.ndarray
-    pdf: np.ndarray
-    gradient: np.ndarray  # of the value, with respect to alpha
-    slope: np.ndarray  # the sum of the sizes of the terms of that gradient
-
-
 @lru_cache(maxsize=4)
-def lobes_with_truth(per_cell: int, seed: int = 1) -> tuple[Lobes, Truth]:
-    """Return ``draw_lobes`` and what they should give."""
-    lobes = draw_lobes(per_cell, seed)
+def lobes_with_truth(per_cell: int, seed: int = 1) -> tuple[Lobes, dict[str, np.ndarray]]:
+    """Return up to ``per_cell`` pairs in every cell that float32 directions reach, and what they should give.
+
+    The truth has 50 digits, rounded to float64: ``d``, ``g``, ``value``, ``pdf``, the ``gradient`` of the
+    value with respect to alpha, and as its ``slope`` the sum of the sizes of the terms of that gradient.
+    """
+    rng = np.random.default_rng(seed)
+    parts = [_draw(rng, a, c, per_cell) for a in range(len(ALPHAS)) for c in range(len(COSINES))]
+    lobes = Lobes(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Lobes)))
     rows = [_exact(*pair) for pair in zip(lobes.wi, lobes.wo, lobes.alpha, lobes.ior, strict=True)]
-    return lobes, Truth(*np.array(rows).T)
+    return lobes, dict(zip(("d", "g", "value", "pdf", "gradient", "slope"), np.array(rows).T, strict=True))
 
 
 @mp.workdps(exact.DIGITS)
@@ -117,10 +99,8 @@ def _exact(wi: np.ndarray, wo: np.ndarray, alpha: float, ior: float) -> tuple[fl
     g_i, slope_i = _g1_and_slope(wi, a)
     g_o, slope_o = _g1_and_slope(wo, a)
     # Components are not rounded again: the cosine between the directions is that of them made one unit long
-    cos_d = (
-        mp.sqrt(sum((p + q) ** 2 for p, q in zip(exact.unit(list(wi)), exact.unit(list(wo)), strict=True)))
-        / 2
-    )
+    sides = zip(exact.unit(list(wi)), exact.unit(list(wo)), strict=True)
+    cos_d = mp.sqrt(sum((p + q) ** 2 for p, q in sides)) / 2
     f = exact.fresnel("dielectric", cos_d, 1, ior)
     z_i = exact.number(wi[2])
     value = d * f * g_i * g_o / (4 * z_i)
