@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.oracles import exact
-from mrt_mitsuba.validation.studies.stability.cases import Cases, hexadecimal
+from mrt_mitsuba.validation.studies.stability.cases import Cases
 from mrt_mitsuba.validation.studies.stability.formulas import FORMULAS
 from mrt_mitsuba.validation.studies.stability.lobes import ALPHAS, COSINES, STEEPNESS, Lobes, lobes_with_truth
 from mrt_mitsuba.validation.tools.study import Study
@@ -156,7 +156,9 @@ def _worst_cases(study: Study, lobes: Lobes, angles: Angles, ours: dict[str, np.
             inputs = {"cos": angles[0][i], "IOR": angles[1][i]}
         else:
             inputs = {"wi": lobes.wi[i], "wo": lobes.wo[i], "alpha": lobes.alpha[i], "IOR": lobes.ior[i]}
-        text = ", ".join(f"{word} {hexadecimal(np.atleast_1d(x))}" for word, x in inputs.items())
+        # in Python's exact notation, which ``float.fromhex`` reads back
+        exactly = ((word, (float(x).hex() for x in np.atleast_1d(v))) for word, v in inputs.items())
+        text = ", ".join(f"{word} {' '.join(numbers)}" for word, numbers in exactly)
         rows.append((title, float(ours[name][i]), steepness, text))
     heading = "The worst of the whole grid, with their inputs"
     study.table("bsdf-worst", heading, ("quantity", "relative error", "tan²θh/alpha²", "inputs"), rows)

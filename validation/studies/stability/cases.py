@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import mitsuba as mi
@@ -62,11 +62,6 @@ class Cases:
         name, limit = bound.name.removeprefix(f"{self.title}: "), f"{bound.sign} {bound.limit:.3g}"
         self.rows.append((name, what, expected, bound.measured, limit, bound.verdict))
         self.bounds.append(bound)
-
-
-def hexadecimal(values: Iterable[float]) -> str:
-    """Return numbers in Python's exact notation, which ``float.fromhex`` reads back."""
-    return " ".join(float(value).hex() for value in values)
 
 
 def both_variants() -> Iterator[str]:

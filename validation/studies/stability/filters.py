@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
-from functools import partial
 from itertools import product
 from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba import filters
-from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.oracles import filters as loops
 from mrt_mitsuba.validation.studies.stability.cases import Cases, both_variants
 from mrt_mitsuba.validation.tools.study import Study
@@ -37,33 +33,11 @@ def run(study: Study, *, quick: bool) -> None:
     del quick  # all of it is quick
     cases = Cases(study, "filters", "Filters")
     for suffix in both_variants():
-        for case in CASES:
-            cases.at_most(case.name + suffix, case.what, case.expected, case.measure(), case.limit)
+        for name, what, expected, limit, measure in CASES:
+            cases.at_most(name + suffix, what, expected, measure(), limit)
     why = "the smallest weights are 2⁻³⁰: their products are below the least normal float32 and become 0"
     cases.beyond_float32("constant pictures of 1e-30, blur", "relative change", _constant_blur((1e-30,)), why)
     cases.close()
-
-
-@dataclass(frozen=True)
-class _Case:
-    name: str
-    what: str
-    expected: str
-    limit: float
-    measure: Callable[[], float]
-
-
-CASES: list[_Case] = []
-
-
-def _case(name: str, what: str, expected: str = "none", limit: float = 0.0, *arguments: Any) -> Any:
-    """Make a function one of the cases, or one more with other arguments; ``what`` says what it returns."""
-
-    def add(measure: Callable[..., float]) -> Callable[..., float]:
-        CASES.append(_Case(name, what, expected, limit, partial(measure, *arguments)))
-        return measure
-
-    return add
 
 
 def _constant(shape: Sequence[int], value: float) -> np.ndarray:
@@ -92,13 +66,6 @@ def _depths(shape: Sequence[int], seed: int = 2) -> np.ndarray:
 # ------------------------------------------------ Figures --------------------------------------------------
 
 
-@_case(
-    "constant pictures, blur",
-    "1×1 … 40×30, values 1e-25, 0.3, 1e30: relative change",
-    "a mean of equals",
-    MEAN,
-    (1e-25, 0.3, 1e30),
-)
 def _constant_blur(values: Sequence[float]) -> float:
     return max(
         np.abs(_blurred(_constant(shape, value), _depths(shape), mode) / value - 1).max()
@@ -106,7 +73,6 @@ def _constant_blur(values: Sequence[float]) -> float:
     )
 
 
-@_case("constant pictures, edges", "1×1 … 40×30, values 0.5, 100, 1e6: edge pixels, all detectors")
 def _constant_edges() -> float:
     return sum(
         np.asarray(find(_constant(shape, value), np.full(shape, 3, np.float32)).mask).sum()
@@ -114,12 +80,6 @@ def _constant_edges() -> float:
     )
 
 
-@_case(
-    "range of a blur",
-    "values to 1e20, negative ones too: how far means leave their range",
-    "not at all",
-    MEAN,
-)
 def _outside_range() -> float:
     excess = 0.0
     for shape, mode in product(SHAPES, MODES):
@@ -129,35 +89,18 @@ def _outside_range() -> float:
     return excess
 
 
-@_case("infinity in a picture, blur", "the same", "none: damage stays local", 0.0, np.inf)
-@_case(
-    "NaN in a picture, blur",
-    "other pixels that are not finite afterwards",
-    "none: damage stays local",
-    0.0,
-    np.nan,
-)
 def _spread_of_damage(value: float) -> float:
     image, depth = _noise((40, 30)), _depths((40, 30))
     image[20, 15, 1] = value
     return sum((~np.isfinite(_blurred(image, depth, mode)).all(axis=-1)).sum() - 1 for mode in MODES)
 
 
-@_case("NaN in a picture, kept", "1 if the pixel itself is hidden", "it stays to be seen")
 def _damage_kept() -> float:
     image, depth = _noise((40, 30)), _depths((40, 30))
     image[20, 15, 1] = np.nan
     return any(not np.isnan(_blurred(image, depth, mode)[20, 15, 1]) for mode in MODES)
 
 
-@_case("infinity in a picture, edges", "the same", "none", 0.0, np.inf)
-@_case(
-    "NaN in a picture, edges",
-    "pixels not marked in its 3×3, or marked elsewhere",
-    "none: reported, and local",
-    0.0,
-    np.nan,
-)
 def _damage_reported(value: float) -> float:
     wrong = 0
     for name, find in EDGES.items():
@@ -174,12 +117,6 @@ def _damage_reported(value: float) -> float:
     return wrong
 
 
-@_case(
-    "Sobel beyond 0 … 1",
-    "error of the value at steps above 1 and below 0",
-    "one grey level on either side",
-    8.0,
-)
 def _sobel_range() -> float:
     errors = []
     for low, high in ((2.0, 3.0), (10.0, 4000.0), (-1.0, 0.5), (-2.0, -1.0), (-0.001, 0.001)):
@@ -193,7 +130,6 @@ def _sobel_range() -> float:
     return max(errors)
 
 
-@_case("focal distance 0", "calls that do not return the very picture, for none, 0 and -1")
 def _no_focus() -> float:
     image, depth = _noise((8, 9)), _depths((8, 9))
     return sum(
@@ -202,14 +138,6 @@ def _no_focus() -> float:
     )
 
 
-@_case("the corrected blur", "the same", "sums of 81 products, and quotients of them", 1e-6, "corrected")
-@_case(
-    "the report's blur",
-    "30×24, all amounts: largest difference from float64 loops",
-    "sums of 32 products",
-    1e-6,
-    "report",
-)
 def _loops(mode: str) -> float:
     image, depth = _noise((30, 24)), _depths((30, 24))
     amount = loops.blur_amount(depth, BLUR["focal_distance"], BLUR["focal_range"])
@@ -221,7 +149,6 @@ def _loops(mode: str) -> float:
     return np.abs(_blurred(image, depth, mode) - truth).max()
 
 
-@_case("edges", "30×24 in patches: pixels that float64 loops decide otherwise, or see another value in")
 def _edge_loops() -> float:
     image = np.repeat(np.repeat(_noise((10, 8)), 3, axis=0), 3, axis=1)
     wrong = 0
@@ -233,7 +160,6 @@ def _edge_loops() -> float:
     return wrong
 
 
-@_case("blur in the middle", "change at the border")
 def _border() -> float:
     image, depth = _noise((40, 30)), np.full((40, 30), 2.0, np.float32)
     depth[18:22, 13:17] = 30.0
@@ -244,7 +170,6 @@ def _border() -> float:
     return np.abs(changes).max()
 
 
-@_case("huge ranges, blur", "values that are not finite, pictures 1e-38 … 1e34, depths 1e-30 … 1e30")
 def _huge_range() -> float:
     image = (10 ** np.random.default_rng(5).uniform(-38, 34, (20, 20, 3))).astype(np.float32)
     depth = (10 ** np.random.default_rng(6).uniform(-30, 30, (20, 20))).astype(np.float32)
@@ -254,7 +179,6 @@ def _huge_range() -> float:
     )
 
 
-@_case("huge ranges, edges", "NaN among the values, pictures to ±1e34")
 def _edges_finite() -> float:
     rng = np.random.default_rng(7)
     image = (10 ** rng.uniform(-38, 34, (20, 20, 3)) * rng.choice([-1, 1], (20, 20, 3))).astype(np.float32)
@@ -262,23 +186,37 @@ def _edges_finite() -> float:
     return sum(np.isnan(np.asarray(find(image, depth).value)).sum() for find in EDGES.values())
 
 
-@_case("senseless arguments", "calls that are not refused with a UsageError")
-def _refused() -> float:
-    image, depth = _noise((4, 4)), _depths((4, 4))
-    calls: Sequence[Callable[[], Any]] = (
-        lambda: filters.gaussian_dof(image, depth, focal_distance=np.nan),
-        lambda: filters.gaussian_dof(image, depth, focal_distance=1.0, focal_range=np.nan),
-        lambda: filters.gaussian_dof(image, depth, focal_distance=1.0, mode="other"),
-        lambda: filters.gaussian_dof(image, depth[:3], focal_distance=1.0),
-        lambda: filters.gaussian_dof(image[..., :2], depth, focal_distance=1.0),
-        lambda: filters.sobel_edges(image, threshold=np.nan),
-        lambda: filters.luma_edges(image[:, :0]),
-        lambda: filters.geometry_edges(image, depth, crease_angle=0),
-        lambda: filters.geometry_edges(image, depth, depth_step=0),
-    )
-    taken = 0
-    for call in calls:
-        with suppress(UsageError):
-            call()
-            taken += 1
-    return taken
+# -------------------------------------------------- Cases --------------------------------------------------
+
+SAME, LOCAL = "the same", "none: damage stays local"
+
+# One row for each case: name, what its figure is, what is expected, limit, and how it is found
+CASES: tuple[tuple[str, str, str, float, Callable[[], float]], ...] = (
+    ("constant pictures, blur", "1×1 … 40×30, values 1e-25, 0.3, 1e30: relative change", "a mean of equals",
+     MEAN, lambda: _constant_blur((1e-25, 0.3, 1e30))),
+    ("constant pictures, edges", "1×1 … 40×30, values 0.5, 100, 1e6: edge pixels, all detectors", "none", 0,
+     _constant_edges),
+    ("range of a blur", "values to 1e20, negative ones too: how far means leave their range", "not at all",
+     MEAN, _outside_range),
+    ("NaN in a picture, blur", "other pixels that are not finite afterwards", LOCAL, 0,
+     lambda: _spread_of_damage(np.nan)),
+    ("infinity in a picture, blur", SAME, LOCAL, 0, lambda: _spread_of_damage(np.inf)),
+    ("NaN in a picture, kept", "1 if the pixel itself is hidden", "it stays to be seen", 0, _damage_kept),
+    ("NaN in a picture, edges", "pixels not marked in its 3×3, or marked elsewhere",
+     "none: reported, and local", 0, lambda: _damage_reported(np.nan)),
+    ("infinity in a picture, edges", SAME, "none", 0, lambda: _damage_reported(np.inf)),
+    ("Sobel beyond 0 … 1", "error of the value at steps above 1 and below 0",
+     "one grey level on either side", 8, _sobel_range),
+    ("focal distance 0", "calls that do not return the very picture, for none, 0 and -1", "none", 0,
+     _no_focus),
+    ("the report's blur", "30×24, all amounts: largest difference from float64 loops",
+     "sums of 32 products", 1e-6, lambda: _loops("report")),
+    ("the corrected blur", SAME, "sums of 81 products, and quotients of them", 1e-6,
+     lambda: _loops("corrected")),
+    ("edges", "30×24 in patches: pixels that float64 loops decide otherwise, or see another value in",
+     "none", 0, _edge_loops),
+    ("blur in the middle", "change at the border", "none", 0, _border),
+    ("huge ranges, blur", "values that are not finite, pictures 1e-38 … 1e34, depths 1e-30 … 1e30", "none", 0,
+     _huge_range),
+    ("huge ranges, edges", "NaN among the values, pictures to ±1e34", "none", 0, _edges_finite),
+)  # fmt: skip

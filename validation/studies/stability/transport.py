@@ -136,57 +136,68 @@ PATHS: Sequence[Path] = (
 def run(study: Study, *, quick: bool) -> None:
     """Check every case against the float64 tracer, sums over bounces in closed form, whole renders."""
     cases = Cases(study, "transport", "Light transport")
-    rows = [_case(cases, path) for path in PATHS]
+    for path in PATHS:
+        _path(cases, path)
     _cut_offs(cases)
-    _bounces(cases, (1, 3, 10) if quick else range(1, 11))
-    _whole_renders(cases, quick=quick)
+    for suffix in both_variants():
+        for reflectance, clamp in product((0.999,) if suffix else (0.5, 0.999, 1.0, 1.5), (True, False)):
+            name = f"one to ten bounces, Ks {reflectance:g}, clamp {'on' if clamp else 'off'}{suffix}"
+            what = "relative error of the light of a ray between facing mirrors, for every number of bounces"
+            error = _to_and_fro(reflectance, clamp, (1, 3, 10) if quick else range(1, 11))
+            # ten additions and products, and the reflectance itself
+            cases.at_most(name, what, "the geometric sum, ever growing", error, 2e-6)
+    every = (2, 3) if quick else range(5), FORMS[: 1 if quick else 2], (False,) if quick else (True, False)
+    for number, fresnel, clamp in product(*every):
+        bad = not_a_colour(_render(report_scene(number), fresnel=fresnel, clamp=clamp))
+        name = f"scene {number}, {fresnel}, clamp {'on' if clamp else 'off'}"
+        cases.at_most(name, "values that are not finite, or negative", "none", bad, 0)
     cases.close(
         "Differences to the float64 tracer, relative to the value plus a thousandth, of 95 % of the pixels."
     )
-    columns = ("case", "what", "difference of 95 %", "bound", "that of the fault", "largest value")
-    study.table("paths", "Pictures of the cases, one ray per pixel", columns, rows)
 
 
-def _case(cases: Cases, path: Path) -> tuple[Any, ...]:
+def _path(cases: Cases, path: Path) -> None:
     settings = {"fresnel": "dielectric", "clamp": True, **path.settings}
-    size = {"width": WIDTH, "height": HEIGHT}
     image = _render(path.scene, **settings)
-    truth = reference_render(path.truth or path.scene, **size, **settings).image
-    changed = path.fault if isinstance(path.fault, dict) else {}
-    scene = path.scene if isinstance(path.fault, dict) else path.fault
-    found = difference(image, truth)
-    fault = difference(reference_render(scene, **size, **{**settings, **changed}).image, truth)
-    what = f"{path.what}: difference of 95 % of the pixels"
-    alike = (_difference(path), fault)
-    cases.at_most(path.name, what, "roundings", found, path.limit, fault=alike)
-    bad = int((~np.isfinite(image)).sum() + (image < 0).sum())
-    cases.at_most(f"{path.name}, bad", "values that are not finite, or negative", "none", bad, 0)
-    return path.name, path.what, found, path.limit, fault, float(image.max())
-
-
-def _difference(path: Path) -> str:
-    """Say how the fault differs from the case: by which numbers."""
+    right = path.truth or path.scene
+    truth = reference_render(right, width=WIDTH, height=HEIGHT, **settings).image
+    scene, changed = (path.scene, path.fault) if isinstance(path.fault, dict) else (path.fault, {})
+    wrong = reference_render(scene, width=WIDTH, height=HEIGHT, **{**settings, **changed}).image
     if isinstance(path.fault, dict):
-        return ", ".join(f"{name} = {value}" for name, value in path.fault.items())
-    return "; ".join(_changes(path.truth or path.scene, path.fault))
+        alike = ", ".join(f"{name} = {value}" for name, value in path.fault.items())
+    else:
+        had, has = dict(_numbers(right)), dict(_numbers(scene))
+        alike = "; ".join(
+            f"{n} {has.get(n)} for {had.get(n)}" for n in {**had, **has} if had.get(n) != has.get(n)
+        )
+    what = f"{path.what}: difference of 95 % of the pixels"
+    fault = (alike, _difference(wrong, truth))
+    cases.at_most(path.name, what, "roundings", _difference(image, truth), path.limit, fault=fault)
+    what = "values that are not finite, or negative"
+    cases.at_most(f"{path.name}, bad", what, "none", not_a_colour(image), 0)
 
 
-def _changes(right: Any, wrong: Any, name: str = "") -> Iterator[str]:
-    """Yield the numbers in which two scenes differ, with their names."""
-    if is_dataclass(right) and is_dataclass(wrong):
-        for f in fields(right):
-            yield from _changes(getattr(right, f.name), getattr(wrong, f.name), f.name)
-    elif isinstance(right, tuple) and right and is_dataclass(right[0]) and len(right) == len(wrong):
-        for one, other in zip(right, wrong, strict=True):
-            yield from _changes(one, other, name)
-    elif right != wrong:
-        yield f"{name} {wrong or 'none'} for {right}"
+def _numbers(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the parts of a scene by their names, such as ``spheres[0].material.alpha``."""
+    if is_dataclass(value):
+        for f in fields(value):
+            yield from _numbers(getattr(value, f.name), f"{name}.{f.name}".strip("."))
+    elif isinstance(value, tuple) and value and is_dataclass(value[0]):
+        for k, entry in enumerate(value):
+            yield from _numbers(entry, f"{name}[{k}]")
+    else:
+        yield name, value
 
 
-def difference(image: np.ndarray, truth: np.ndarray) -> float:
+def _difference(image: np.ndarray, truth: np.ndarray) -> float:
     """Return the largest difference in a channel that 95 % of the pixels stay below."""
     relative = (np.abs(image - truth) / (truth + SMALL)).max(axis=-1)
     return float(np.quantile(np.nan_to_num(relative, nan=np.inf), SHARE))
+
+
+def not_a_colour(image: np.ndarray) -> int:
+    """Return how many values are not finite, or negative."""
+    return int((~(image >= 0) | np.isinf(image)).sum())
 
 
 def _render(scene: Scene, *, fresnel: str, clamp: bool, least: float = 0.0) -> np.ndarray:
@@ -215,56 +226,24 @@ def _cut_offs(cases: Cases) -> None:
         cases.at_most(f"cut-off under {name}", what, expected, change, CUT_OFF, fault=fault)
 
 
-# -------------------------------------------- Bounces in closed form ---------------------------------------
-
-
-def _bounces(cases: Cases, depths: Sequence[int]) -> None:
-    """Check a ray to and fro between two mirrors: the geometric sum of what both send back."""
-    what = (
-        "relative error of the light that a ray between facing mirrors collects, for every number of bounces"
-    )
-    for suffix in both_variants():
-        for reflectance, clamp in product((0.999,) if suffix else (0.5, 0.999, 1.0, 1.5), (True, False)):
-            scene = mi.load_dict(_corridor(reflectance))
-            truth = np.cumsum(_direct(reflectance, clamp) * reflectance ** np.arange(10))
-            found = [_to_and_fro(scene, clamp, depth) for depth in depths]
-            error = np.abs(np.array(found) / truth[np.array(depths) - 1] - 1).max()
-            name = f"one to ten bounces, Ks {reflectance:g}, clamp {'on' if clamp else 'off'}{suffix}"
-            # ten additions and products, and the reflectance itself
-            cases.at_most(name, what, "the geometric sum, ever growing", error, 2e-6)
-
-
-def _corridor(reflectance: float) -> dict[str, Any]:
+def _to_and_fro(reflectance: float, clamp: bool, depths: Sequence[int]) -> float:
+    """Return the error of a ray between two mirrors, at some depths, to the sum of what both send back."""
     form = {"type": "mrt_bsdf", "fresnel": "unity", "alpha": 0.5, "diffuse_reflectance": 0.25}
-    material = {**form, "specular_reflectance": reflectance}
-    walls = {
-        f"wall_{k}": {"type": "mrt_plane", "normal": [0, 0, k], "distance": 1.0, "bsdf": material}
-        for k in (1, -1)
-    }
-    return {"type": "scene", **walls, "light": {"type": "mrt_light", "position": [1, 0, 0], "intensity": 3.0}}
-
-
-def _to_and_fro(scene: Any, clamp: bool, depth: int) -> float:
-    ray = mi.Ray3f(mi.Point3f(0, 0, 0.5), mi.Vector3f(0, 0, -1))
-    settings: dict[str, Any] = {"bounce_budget": "plain", "min_contribution": 0.0}
-    value = traced(scene, ray, clamp=clamp, max_depth=depth, **settings).radiance[0]
-    return float(value if isinstance(value, float) else value[0])
-
-
-def _direct(reflectance: float, clamp: bool) -> float:
-    """Return what one wall sends back along its normal, in float64: the light is seen at 45° from both."""
+    wall = {"type": "mrt_plane", "distance": 1.0, "bsdf": {**form, "specular_reflectance": reflectance}}
+    walls = {f"wall_{k}": {**wall, "normal": [0, 0, k]} for k in (1, -1)}
+    light = {"type": "mrt_light", "position": [1, 0, 0], "intensity": 3.0}
+    scene = mi.load_dict({"type": "scene", **walls, "light": light})
+    # what one wall sends back along its normal: the light is seen at 45° from both
     half = np.sqrt(0.5)
     with np.errstate(divide="ignore"):
         up, to_light = np.array([[0, 0, 1.0]]), np.array([[half, 0, half]])
         lobe = specular_lobe(up, to_light, up, np.array([0.5]))[0]
-    value = 3.0 * half * (0.25 / np.pi + reflectance * lobe)
-    return float(min(value, 1.0) if clamp else value)
-
-
-def _whole_renders(cases: Cases, *, quick: bool) -> None:
-    every = (2, 3) if quick else range(5), FORMS[: 1 if quick else 2], (False,) if quick else (True, False)
-    for number, fresnel, clamp in product(*every):
-        image = _render(report_scene(number), fresnel=fresnel, clamp=clamp)
-        bad = int((~(image >= 0) | np.isinf(image)).sum())
-        name = f"scene {number}, {fresnel}, clamp {'on' if clamp else 'off'}"
-        cases.at_most(name, "values that are not finite, or negative", "none", bad, 0)
+    direct = 3.0 * half * (0.25 / np.pi + reflectance * lobe)
+    truth = np.cumsum((min(direct, 1.0) if clamp else direct) * reflectance ** np.arange(10))
+    ray = mi.Ray3f(mi.Point3f(0, 0, 0.5), mi.Vector3f(0, 0, -1))
+    settings: dict[str, Any] = {"clamp": clamp, "bounce_budget": "plain", "min_contribution": 0.0}
+    errors = []
+    for depth in depths:
+        value = traced(scene, ray, max_depth=depth, **settings).radiance[0]
+        errors.append(abs(float(np.ravel(value)[0]) / float(truth[depth - 1]) - 1))
+    return max(errors)
