@@ -1,12 +1,12 @@
-"""Rendering one scene again and again, with the Python code of its kernels run once.
+"""Rendering one scene again and again by kernels that Dr.Jit recorded once (``dr.freeze``).
 
-Running the code that describes the kernels of a small picture takes ten times as long as running the kernels.
-Where it can be spared, ``prepare`` has Dr.Jit launch recorded kernels again (``dr.freeze``), after a check:
-what was recorded must equal ``mrt.render`` to the bit. All else is rendered as ``mrt.render`` does it.
+What was recorded must equal the picture of ``mrt.render`` to the bit; all else is rendered as ``mrt.render``
+does it.
 """
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 from typing import Any
 
@@ -82,8 +82,7 @@ class Prepared:
         import mitsuba as mi
 
         self._launch, plan, made = None, self._made.plan, self._made
-        sensor, film = self._source.sensor, self._source.sensor.film()
-        size = [plan.width, plan.height]
+        sensor, film, size = self._source.sensor, self._source.sensor.film(), [plan.width, plan.height]
         plain = plan.film is None or (plan.film.sampler, plan.film.rfilter, plan.film.pixel_format) == (
             "IndependentSampler", "BoxFilter", "rgb")  # fmt: skip
         if not (
@@ -108,32 +107,30 @@ class Prepared:
         for name in ("x_fov", "principal_point_offset_x", "principal_point_offset_y", "to_world"):
             own[name] = theirs[name]
         own.update()
-        self._size = dr.opaque(mi.Vector2f, size)
-        self._launch = dr.freeze(lambda seed, inputs: self._trace(seed))
+        self._size, self._rays = dr.opaque(mi.Vector2f, size), plan.lattice.count * plan.repeats
+        # By a weak reference: in a ring, garbage collection would free recordings in the midst of another one
+        self._launch = dr.freeze(lambda seed, inputs, me=weakref.ref(self): me()._trace(seed))
         try:
-            same = all(np.array_equal(self._picture(made.options["seed"]), made.image) for _ in range(2))
+            if not all(np.array_equal(self._picture(made.options["seed"]), made.image) for _ in range(2)):
+                self._launch = None
         except RuntimeError:  # something else is read
-            same = False
-        if not same:
             self._launch = None
         self._made = replace(made, camera=View(self._sensor, plan.width, plan.height, None).matrices())
 
     def _picture(self, seed: int) -> np.ndarray:
         import mitsuba as mi
 
-        rays = self._made.plan.lattice.count * self._made.plan.repeats
         inputs = [self._data.arrays(self._source.scene), self._integrator.sky, self._sensor, self._size]
         channels = self._launch(mi.UInt32(seed), inputs)
-        shape = self._made.plan.height, self._made.plan.width
-        planes = [np.asarray(c).astype(np.float64).reshape(shape) / rays for c in channels]
-        return np.stack(planes, axis=-1).astype(np.float32)
+        means = np.stack([np.asarray(c).astype(np.float64) / self._rays for c in channels], axis=-1)
+        return means.astype(np.float32).reshape(self._made.image.shape)
 
     def _trace(self, seed: Any) -> list[Any]:
         """Return the sums of the channels over the rays of each pixel, drawn as the film's rules say."""
         import drjit as dr
         import mitsuba as mi
 
-        plan, rays = self._made.plan, self._made.plan.lattice.count * self._made.plan.repeats
+        plan, rays = self._made.plan, self._rays
         lane = dr.arange(mi.UInt32, plan.width * plan.height * rays)
         pixel = lane // rays
         corner = mi.Point2f(mi.Float(pixel % plan.width), mi.Float(pixel // plan.width))
@@ -148,11 +145,7 @@ class Prepared:
         traced = self._integrator.trace(self._source.scene, None, mi.Ray3f(ray), True, self._data)
         channels = list(mi.Color3f(traced.radiance * mi.unpolarized_spectrum(weight)))
         dr.eval(channels)
-        return (
-            [dr.block_reduce(dr.ReduceOp.Add, channel, rays) for channel in channels]
-            if rays > 1
-            else channels
-        )
+        return [dr.block_reduce(dr.ReduceOp.Add, c, rays) for c in channels] if rays > 1 else channels
 
 
 def prepare(scene: Any = 0, **options: Any) -> Prepared:
@@ -164,7 +157,6 @@ def prepare(scene: Any = 0, **options: Any) -> Prepared:
         again.params["ball.bsdf.alpha"] = 0.2
         result = again(seed=1)
 
-    Of kernels that draw random numbers, call plugins, or are followed by filters, nothing is recorded; they
-    are run as ``render`` does.
+    Kernels that call plugins, or that filters follow, are not recorded but run as ``render`` does.
     """
     return Prepared(scene, options)
