@@ -10,6 +10,8 @@ import weakref
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
@@ -39,6 +41,7 @@ class Prepared:
         self._launch: Any = None  # what launches them; None where nothing is recorded
         with runtime.one_at_a_time, held():
             self._made = self._render(self._settings.seed)  # result from which others differ by the picture
+            self._integrator, self.params = self._source.integrator, mi.traverse(self._source.scene)
             self._record()
 
     def __call__(self, seed: int = 0) -> Result:
@@ -59,12 +62,7 @@ class Prepared:
 
     def _render(self, seed: int) -> Result:
         def opened(scene: Any, **how: Any) -> Source:
-            if self._source is None:
-                import mitsuba as mi
-
-                self._source = open_scene(scene, **how)
-                self.params = mi.traverse(self._source.scene)
-                self._integrator = self._source.integrator
+            self._source = self._source or open_scene(scene, **how)
             return self._source
 
         return render_with(self._scene, replace(self._settings, seed=seed), default(), opener=opened)
@@ -78,17 +76,13 @@ class Prepared:
 
     def _record(self) -> None:
         """Record the kernels, if they read only what is known and give the picture that they should."""
-        import drjit as dr
-        import mitsuba as mi
-
         self._launch, plan, made = None, self._made.plan, self._made
         sensor, film, size = self._source.sensor, self._source.sensor.film(), [plan.width, plan.height]
         plain = plan.film is None or (plan.film.sampler, plan.film.rfilter, plan.film.pixel_format) == (
             "IndependentSampler", "BoxFilter", "rgb")  # fmt: skip
         if not (
             plain and isinstance(self._integrator, LayeredIntegrator) and plan.variant == "llvm_ad_rgb"
-            and [step.layers for step in plan.passes] == [{"image"}]
-            and not plan.layers and plan.motion is None
+            and [step.layers for step in plan.passes] == [{"image"}] and not plan.layers and plan.motion is None
             and (plan.lattice.kind == FILM or plan.lattice.count * plan.repeats == 1)
             and (plan.region.width, plan.region.height) == (plan.width, plan.height)
             and sensor.class_name() == "PerspectiveCamera" and sensor.shutter_open_time() == 0
@@ -104,12 +98,12 @@ class Prepared:
              "film": {"type": "hdrfilm", "width": plan.width, "height": plan.height}}
         )  # fmt: skip
         own, theirs = mi.traverse(self._sensor), mi.traverse(sensor)
-        for name in ("x_fov", "principal_point_offset_x", "principal_point_offset_y", "to_world"):
-            own[name] = theirs[name]
-        own.update()
+        names = "x_fov", "principal_point_offset_x", "principal_point_offset_y", "to_world"
+        own.update({name: theirs[name] for name in names})
         self._size, self._rays = dr.opaque(mi.Vector2f, size), plan.lattice.count * plan.repeats
         # By a weak reference: in a ring, garbage collection would free recordings in the midst of another one
-        self._launch = dr.freeze(lambda seed, inputs, me=weakref.ref(self): me()._trace(seed))
+        me: Any = weakref.ref(self)
+        self._launch = dr.freeze(lambda seed, inputs: me()._trace(seed))
         try:
             if not all(np.array_equal(self._picture(made.options["seed"]), made.image) for _ in range(2)):
                 self._launch = None
@@ -118,8 +112,6 @@ class Prepared:
         self._made = replace(made, camera=View(self._sensor, plan.width, plan.height, None).matrices())
 
     def _picture(self, seed: int) -> np.ndarray:
-        import mitsuba as mi
-
         inputs = [self._data.arrays(self._source.scene), self._integrator.sky, self._sensor, self._size]
         channels = self._launch(mi.UInt32(seed), inputs)
         means = np.stack([np.asarray(c).astype(np.float64) / self._rays for c in channels], axis=-1)
@@ -127,9 +119,6 @@ class Prepared:
 
     def _trace(self, seed: Any) -> list[Any]:
         """Return the sums of the channels over the rays of each pixel, drawn as the film's rules say."""
-        import drjit as dr
-        import mitsuba as mi
-
         plan, rays = self._made.plan, self._rays
         lane = dr.arange(mi.UInt32, plan.width * plan.height * rays)
         pixel = lane // rays
@@ -138,8 +127,7 @@ class Prepared:
         if plan.lattice.kind == FILM:
             state, sequence = mi.sample_tea_32(seed, lane)
             random = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
-            x = random.next_float32()
-            offset = mi.Point2f(x, random.next_float32())
+            offset = mi.Point2f(random.next_float32(), random.next_float32())
         place, time = (corner + offset) / self._size, mi.Float(self._sensor.shutter_open())
         ray, weight = self._sensor.sample_ray(time, mi.Float(0), place, mi.Point2f(0.5))
         traced = self._integrator.trace(self._source.scene, None, mi.Ray3f(ray), True, self._data)
