@@ -82,7 +82,7 @@ class Prepared:
             "IndependentSampler", "BoxFilter", "rgb")  # fmt: skip
         if not (
             plain and isinstance(self._integrator, LayeredIntegrator) and plan.variant == "llvm_ad_rgb"
-            and [step.layers for step in plan.passes] == [{"image"}] and not plan.layers and plan.motion is None
+            and [step.layers for step in plan.passes] == [{"image"}] and not plan.layers and not plan.motion
             and (plan.lattice.kind == FILM or plan.lattice.count * plan.repeats == 1)
             and (plan.region.width, plan.region.height) == (plan.width, plan.height)
             and sensor.class_name() == "PerspectiveCamera" and sensor.shutter_open_time() == 0
