@@ -47,18 +47,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Wrong usage ends the process with 2, as argparse does it.
     """
-    options = _parser().parse_args(arguments)
-    with warnings.catch_warnings():
-        warnings.showwarning = _show_warning
-        try:
-            return _validate(options)
-        except MrtError as error:
-            return _fail(str(error), error.exit_code)
-        except KeyboardInterrupt:
-            return _fail("interrupted; no report was written", INTERRUPTED)
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="mrt-validate",
         description="Compare the renderer with Mitsuba, with exact numbers and with itself.",
@@ -72,7 +60,15 @@ def _parser() -> argparse.ArgumentParser:
     add("--quick", action="store_true", help="fewer samples and cases")
     add("--out", type=Path, default=Path("validation-report"), metavar="DIR",
         help="folder of the report, made if need be (default: validation-report)")  # fmt: skip
-    return parser
+    options = parser.parse_args(arguments)
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        try:
+            return _validate(options)
+        except MrtError as error:
+            return _fail(str(error), error.exit_code)
+        except KeyboardInterrupt:
+            return _fail("interrupted; no report was written", INTERRUPTED)
 
 
 def listing() -> str:

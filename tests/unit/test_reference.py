@@ -22,8 +22,7 @@ from mrt_mitsuba.scene.model import (
     Sphere,
 )
 from mrt_mitsuba.validation.oracles import exact
-from mrt_mitsuba.validation.oracles.reference import camera_directions, fresnel, reference_render
-from mrt_mitsuba.validation.tools.sensitivity import sensitivity
+from mrt_mitsuba.validation.oracles.reference import camera_directions, fresnel, reference_render, sensitivity
 
 WOOD = Material(1.5, 0.3, (0.5, 0.4, 0.3), (0.2, 0.3, 0.4))
 # A camera on the x axis, with one pixel: its ray runs along -x

@@ -11,7 +11,7 @@ other forms where there are any, and the geometry is its own. Slow, and small en
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -84,6 +84,37 @@ def reference_render(scene: Scene, *, width: int, height: int, **settings: Any) 
         film = _Tracer(scene, chosen).film(np.tile(np.array(scene.camera.position, float), (len(d), 1)), d)
     # The first row is the lowest
     return ReferenceResult(**{k: v.reshape(height, width, *v.shape[1:])[::-1] for k, v in film.items()})
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """The changes in a pixel when its ray is moved by a small part of a pixel; all [H, W].
+
+    Every pixel is of at most one kind: ``silhouette`` where the rays meet other objects, else ``shadow``
+    where a light appears or vanishes (the edge of a shadow, or a terminator). ``spread`` is the largest
+    difference in a channel.
+    """
+
+    reference: ReferenceResult
+    silhouette: np.ndarray  # bool
+    shadow: np.ndarray  # bool
+    spread: np.ndarray  # float64
+
+
+def sensitivity(
+    scene: Scene, *, width: int, height: int, displacement: float = 1e-2, **settings: Any
+) -> Sensitivity:
+    """Compare the reference with four displaced by ``displacement`` pixels, left, right, down and up.
+
+    ``settings`` are those of ``reference_render``, with ``aa`` = 1.
+    """
+    steps = [(displacement, 0.0), (-displacement, 0.0), (0.0, displacement), (0.0, -displacement)]
+    reference = reference_render(scene, width=width, height=height, **settings)
+    others = [reference_render(scene, width=width, height=height, displacement=s, **settings) for s in steps]
+    silhouette = np.any([other.path != reference.path for other in others], axis=0)
+    shadow = np.any([other.lights != reference.lights for other in others], axis=0) & ~silhouette
+    spread = np.max([np.abs(other.image - reference.image).max(axis=-1) for other in others], axis=0)
+    return Sensitivity(reference, silhouette, shadow, spread)
 
 
 def camera_directions(camera: Camera, width: int, height: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -289,7 +320,15 @@ class _Tracer:
         self.scene, self.settings = scene, settings
         self.reach = ORIGINAL_REACH if settings.start == "original" else np.inf
         # Each with the numbers of its objects; all triangles of a mesh are one object
-        self.groups: list[tuple[Any, np.ndarray]] = list(_groups(scene))
+        axial = (*scene.cones, *scene.cylinders)
+        self.groups: list[tuple[Any, np.ndarray]] = []
+        first = 0
+        for kind, members in ((Spheres, scene.spheres), (Planes, scene.planes), (Axial, axial)):
+            if members:
+                self.groups.append((kind(members), first + np.arange(len(members))))  # type: ignore[arg-type]
+            first += len(members)
+        for number, mesh in enumerate(scene.meshes, first):
+            self.groups.append((Triangles(mesh), np.full(len(mesh.faces), number)))
         things: list[Any] = [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
         materials = [thing.material for thing in things]
         self.ior, self.alpha = (np.array([getattr(m, name) for m in materials]) for name in ("ior", "alpha"))
@@ -337,12 +376,14 @@ class _Tracer:
         t = np.broadcast_to(reach, len(o)).copy()
         group, row = np.full(len(o), -1), np.zeros(len(o), int)
         for g, (shapes, numbers) in enumerate(self.groups):
-            for part in _batches(len(o), len(numbers)):
+            step = max(1, BATCH // len(numbers))
+            for start in range(0, len(o), step):
+                part = slice(start, start + step)
                 found = shapes.distances(o[part], d[part])
                 k = found.argmin(axis=1)
                 closest = found[np.arange(len(k)), k]
-                closer = closest < t[part]
-                t[part[closer]], group[part[closer]], row[part[closer]] = closest[closer], g, k[closer]
+                closer = start + np.flatnonzero(closest < t[part])
+                t[closer], group[closer], row[closer] = closest[closer - start], g, k[closer - start]
         return t, group, row
 
     def hits(self, pixel: Any, o: Any, d: Any, throughput: Any, depth: Any) -> tuple[_Hits, Any, np.ndarray]:
@@ -418,19 +459,6 @@ class _Tracer:
         return hits.pixel[on], o[on], d[on], throughput[on], depth[on]
 
 
-def _groups(scene: Scene) -> Iterator[tuple[Any, np.ndarray]]:
-    """Yield objects that are intersected together, with their numbers among all of the scene."""
-    axial = (*scene.cones, *scene.cylinders)
-    kinds: list[tuple[Any, Any]] = [(Spheres, scene.spheres), (Planes, scene.planes), (Axial, axial)]
-    first = 0
-    for kind, members in kinds:
-        if members:
-            yield kind(members), first + np.arange(len(members))
-        first += len(members)
-    for number, mesh in enumerate(scene.meshes, first):
-        yield Triangles(mesh), np.full(len(mesh.faces), number)
-
-
 def _picture(scene: Scene, thing: Any) -> np.ndarray:
     """Return the texels [rows, columns, 3] of a mesh's material, as they are stored."""
     from PIL import Image
@@ -439,11 +467,6 @@ def _picture(scene: Scene, thing: Any) -> np.ndarray:
         raise SceneError("the float64 reference draws textures on triangles only, looked up as in the report")
     with Image.open(str(thing.material.texture)) as picture:
         return np.asarray(picture.convert("RGB")) / 255
-
-
-def _batches(rays: int, objects: int) -> Iterator[np.ndarray]:
-    step = max(1, BATCH // objects)
-    return (np.arange(start, min(start + step, rays)) for start in range(0, rays, step))
 
 
 def _mix(hashed: np.ndarray, value: np.ndarray) -> np.ndarray:

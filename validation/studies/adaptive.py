@@ -13,7 +13,7 @@ import numpy as np
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.tools.own_scenes import LOCAL, SCENES, SPP, load
 from mrt_mitsuba.validation.tools.study import Study
-from mrt_mitsuba.validation.tools.timing import timed
+from mrt_mitsuba.validation.tools.timing import in_turns, timed
 
 TITLE = "Scenes of one's own, and rendering to an error"
 
@@ -197,15 +197,12 @@ def _in_turns(scene: Any, repeats: int) -> list[dict[str, np.ndarray]]:
     ]
     for kind in kinds:
         kind(1000)  # compiles
-    spent: list[list[tuple[np.ndarray, float, float]]] = [[] for _ in kinds]
-    for seed in range(repeats):
-        for kind, kept in zip(kinds, spent, strict=True):
-            (picture, rays), seconds = timed(lambda: kind(seed))  # noqa: B023
-            kept.append((picture, rays, seconds))
+    sides = [lambda seed, kind=kind: timed(lambda: kind(seed)) for kind in kinds]  # type: ignore[misc]
     found = []
-    for kept in spent:
-        mean = np.asarray(np.mean([picture for picture, _, _ in kept], axis=0, dtype=np.float64))
-        squares = [rmse(picture, mean) ** 2 * repeats / (repeats - 1) for picture, _, _ in kept]
-        spent_on = {name: np.array([one[i] for one in kept]) for i, name in ((1, "rays"), (2, "seconds"))}
-        found.append({"squares": np.array(squares), **spent_on})
+    for side in in_turns(sides, repeats):
+        pictures, rays = zip(*(result for result, _ in side), strict=True)
+        mean = np.asarray(np.mean(pictures, axis=0, dtype=np.float64))
+        squares = [rmse(picture, mean) ** 2 * repeats / (repeats - 1) for picture in pictures]
+        seconds = [seconds for _, seconds in side]
+        found.append({"squares": np.array(squares), "rays": np.array(rays), "seconds": np.array(seconds)})
     return found

@@ -61,7 +61,13 @@ def compare(study: Study, number: int, *, size: tuple[int, int], aa: int, spp: i
     nodes["sensor"] |= lens
     one, other = (mrt.render(nodes, **options, spp=spp, seed=seed).image for seed in (1, 100_001))
     truth = pictures["thinlens"] = (one + other) / 2
-    regions = _regions(sharp)
+    normal = np.stack([sharp.layers[f"normal.{axis}"] for axis in "XYZ"], axis=-1)
+    border = np.ones(depth.shape, bool)
+    border[REACH:-REACH, REACH:-REACH] = False
+    outlines = np.asarray(filters.geometry_edges(normal, depth, crease_angle=180).mask)
+    steps = binary_dilation(outlines, iterations=REACH) & ~border
+    regions = {"all": np.ones(depth.shape, bool), "near depth steps": steps}
+    regions |= {"at the border": border, "elsewhere": ~(steps | border)}
     squares = {mode: np.square(pictures[mode] - truth) for mode in ("sharp", *MODES)}
     errors = {
         (mode, region): float(np.sqrt(square[mask].mean()))
@@ -80,9 +86,6 @@ def compare(study: Study, number: int, *, size: tuple[int, int], aa: int, spp: i
     sheet = np.concatenate(list(pictures.values()), axis=1)
     caption = f"Left to right: {', '.join(pictures)}."
     study.picture(f"pictures-{number}", f"Scene {number}", sheet, caption, exr=True)
-    sheet = np.concatenate([np.abs(pictures[mode] - truth) for mode in MODES], axis=1)
-    title = f"Scene {number}: difference from the lens, five times"
-    study.picture(f"errors-{number}", title, 5 * sheet, f"Left to right: {', '.join(MODES)}.")
     return [
         {
             "scene": number,
@@ -114,14 +117,3 @@ def disc_radius(amount: np.ndarray) -> np.ndarray:
     The whole amount k is continued to all numbers, and by a² below 1, where the report does not blur.
     """
     return np.where(amount < 1, amount, np.sqrt(np.maximum(2 * amount - 1, 0)))
-
-
-def _regions(sharp: Any) -> dict[str, np.ndarray]:
-    depth = sharp.layers["depth.Z"]
-    normal = np.stack([sharp.layers[f"normal.{axis}"] for axis in "XYZ"], axis=-1)
-    border = np.ones(depth.shape, bool)
-    border[REACH:-REACH, REACH:-REACH] = False
-    outlines = np.asarray(filters.geometry_edges(normal, depth, crease_angle=180).mask)
-    steps = binary_dilation(outlines, iterations=REACH) & ~border
-    every = np.ones(depth.shape, bool)
-    return {"all": every, "near depth steps": steps, "at the border": border, "elsewhere": ~(steps | border)}

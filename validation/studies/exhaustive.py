@@ -7,7 +7,7 @@ that at cosines drawn at random, and judge the worst.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -63,29 +63,27 @@ def run(study: Study, *, quick: bool) -> None:
     """Show the table of errors, of some hundred million cosines each, or of some hundred thousand."""
     if runtime.obstacle(runtime.FAST):
         raise VariantError(f"every cosine needs llvm arrays: {runtime.obstacle(runtime.FAST)}")
+    from drjit.llvm import Float64
+
     stride = QUICK if quick else 1
     rows, confirmed = [], 0.0
     for name, (formula, truth) in study.each(TITLE, FORMULAS.items()):
         row = _errors(formula, truth, stride)
         rows.append({"formula": name, **row})
-        confirmed = max(confirmed, _reference_error(formula, truth, float.fromhex(row["at the cosine"])))
-        worst = row["largest error, ulp"]
-        study.at_most(f"{name}: largest error, ulp", worst, BOUND, "a rounding for each step")
+        # float64 against 50 digits, at random cosines and the worst
+        bits = np.random.default_rng(6).integers(LEAST, ONE, CONFIRMED).astype(np.uint32)
+        known = np.array([float.fromhex(row["at the cosine"]), 1], np.float32)
+        cosines = np.append(bits.view(np.float32), known)
+        right = np.array([float(truth(c)) for c in cosines])
+        error = np.abs(np.array(formula(Float64(cosines.astype(np.float64)))) - right)
+        confirmed = max(confirmed, float((error / np.spacing(right.astype(np.float32))).max()))
+        what, why = f"{name}: largest error, ulp", "a rounding for each step"
+        study.at_most(what, row["largest error, ulp"], BOUND, why)
     note = f"Every {stride}th float32 cosine." if quick else "Every float32 cosine in [0, 1]."
     note += " 1 ulp: the step between float32 numbers."
     study.records("exhaustive", "Largest errors", rows, note)
     what = "error of the float64 reference against 50 digits, ulp of float32"
     study.at_most(what, confirmed, 1e-6, "some dozen roundings of float64, 2e-9 of a float32 step each")
-
-
-def _chunks(stride: int) -> Iterator[Any]:
-    """Yield all float32 numbers from 0 to 1, in ascending order, by their bits."""
-    from drjit.llvm import Float, UInt32
-
-    for start in range(0, ONE + 1, CHUNK * stride):
-        count = min(CHUNK, (ONE - start) // stride + 1)
-        bits = dr.opaque(UInt32, start) + dr.arange(UInt32, count) * stride
-        yield dr.reinterpret_array(Float, dr.select(bits < LEAST, 0, bits))
 
 
 def _errors(formula: Function, truth: Function, stride: int) -> dict[str, Any]:
@@ -98,7 +96,10 @@ def _errors(formula: Function, truth: Function, stride: int) -> dict[str, Any]:
 
     count, flushed, brightest = 0, 0, 0.0
     above, worst, cosine = np.zeros(len(STEPS), np.int64), -1.0, 0.0
-    for cosines in _chunks(stride):
+    for start in range(0, ONE + 1, CHUNK * stride):  # all float32 numbers from 0 to 1, by their bits
+        size = min(CHUNK, (ONE - start) // stride + 1)
+        bits = dr.opaque(UInt32, start) + dr.arange(UInt32, size) * stride
+        cosines = dr.reinterpret_array(Float, dr.select(bits < LEAST, 0, bits))
         found, wide = formula(cosines), formula(Float64(cosines))
         exponent = dr.reinterpret_array(UInt32, Float(wide)) & 0x7F800000
         step = Float64(dr.reinterpret_array(Float, dr.maximum(exponent, LEAST))) * 2.0**-23
@@ -123,15 +124,3 @@ def _errors(formula: Function, truth: Function, stride: int) -> dict[str, Any]:
         "flushed to 0": flushed,
         "all at cosines up to": brightest,
     }
-
-
-def _reference_error(formula: Function, truth: Function, worst: float) -> float:
-    """Return the largest error of the float64 values against 50 digits, at random cosines and the worst."""
-    from drjit.llvm import Float64
-
-    rng = np.random.default_rng(6)
-    bits = rng.integers(LEAST, ONE, CONFIRMED).astype(np.uint32)
-    cosines = np.append(bits.view(np.float32), np.array([worst, 1], np.float32))
-    right = np.array([float(truth(c)) for c in cosines])
-    found = np.array(formula(Float64(cosines.astype(np.float64))))
-    return float((np.abs(found - right) / np.spacing(right.astype(np.float32)).astype(np.float64)).max())

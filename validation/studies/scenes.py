@@ -18,9 +18,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.oracles.reference import reference_render
-from mrt_mitsuba.validation.tools.gallery import panels
-from mrt_mitsuba.validation.tools.sensitivity import sensitivity
+from mrt_mitsuba.validation.oracles.reference import reference_render, sensitivity
 from mrt_mitsuba.validation.tools.study import Study
 
 TITLE = "Pictures of the scenes, judged in float64"
@@ -163,11 +161,17 @@ def hold(study: Study, name: str, judgement: Judgement, cut: float) -> None:
 
 def run(study: Study, *, quick: bool) -> None:
     """Judge our pictures, and the original's where they are at hand."""
-    judged, rows = {}, []
+    for part in (pictures, lattices, original):
+        part(study, quick=quick)
+
+
+def pictures(study: Study, *, quick: bool) -> None:
+    """Judge our pictures of all scenes."""
+    rows = []
     for name, case in study.each("Scenes in float64", CASES.items()):
         size = case.quick if quick else case.size
         form: dict[str, Any] = {"fresnel": case.fresnel}
-        found = judged[name] = judge(draw(case.scene, size, **form), case.scene, **form)
+        found = judge(draw(case.scene, size, **form), case.scene, **form)
         image, _, error, reason = found
         cut = np.abs(draw(case.scene, size, **form, cut=True) - image)
         hold(study, name, found, float(cut.max()))
@@ -180,12 +184,9 @@ def run(study: Study, *, quick: bool) -> None:
         "Schlick's in the last two scenes. Pixels off by more than 1/255 are counted by reason."
     )
     study.table("scenes", "Our pictures against the float64 tracer", columns, rows, note=note)
-    _lattices(study)
-    _pictures(study, judged)
-    _original(study, quick)
 
 
-def _lattices(study: Study) -> None:
+def lattices(study: Study, *, quick: bool) -> None:
     """Hold four samples a pixel to those of the tracer, at the places that each lattice says."""
     scene = report_scene(0)
     size: dict[str, Any] = {"width": 80, "height": 60}
@@ -199,29 +200,8 @@ def _lattices(study: Study) -> None:
         study.at_most(f"four samples, lattice={lattice}: difference of 99 %", error, 5e-6, why)
 
 
-def _pictures(study: Study, judged: dict[str, Judgement]) -> None:
-    from matplotlib.colors import LogNorm
-
-    figure, axes = panels(8, 2.6 * len(judged), len(judged), 2)
-    for (left, right), (name, (image, _, error, reasons)) in zip(axes, judged.items(), strict=True):
-        left.imshow(np.clip(image, 0, 1))
-        left.set_ylabel(f"scene {name}")
-        shown = right.imshow(np.maximum(error, 1e-8), norm=LogNorm(1e-8, 1), cmap="magma")
-        for index, (reason, color) in enumerate(zip(REASONS, ("cyan", "yellow", "lime", "red"), strict=True)):
-            y, x = np.nonzero(reasons == index)
-            right.scatter(x, y, s=40, facecolors="none", edgecolors=color, label=reason)
-        figure.colorbar(shown, ax=right, label="difference")
-        for axis in (left, right):
-            axis.set(xticks=[], yticks=[])
-    axes[0][1].legend(loc="upper right", fontsize="x-small")
-    caption = (
-        "Left: our picture. Right: the largest difference in a channel, on a logarithmic scale. Circles: "
-        "pixels off by more than 1/255, by reason."
-    )
-    study.plot("differences", "Where float32 and float64 differ", figure, caption)
-
-
-def _original(study: Study, quick: bool) -> None:
+def original(study: Study, *, quick: bool) -> None:
+    """Judge the original's renders, where they are at hand, by the same truth."""
     sibling = Path(__file__).resolve().parents[3] / "shared" / "reference"
     folder = Path(os.environ.get("MRT_REFERENCE", sibling)) / "renders"  # or next to the checkout
     if not folder.is_dir():

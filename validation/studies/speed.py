@@ -134,8 +134,9 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
             agree = partial(_other_light, factor=bright)
             yield Pair(name, partial(_direct, extent, n, flavor), 0.9, agree, SAME_MEAN, why)
         name = f"mrt_bsdf / roughconductor, scene {n}"
-        yield Pair(name, partial(_conductor, extent, n), 1.05, _other_light, SAME_MEAN, why)
-        yield Pair(f"mrt_bsdf / roughplastic, scene {n}", partial(_plastic, extent, n), 1.05)
+        make = partial(_other_material, extent, n)
+        yield Pair(name, partial(make, "conductor"), 1.05, _other_light, SAME_MEAN, why)
+        yield Pair(f"mrt_bsdf / roughplastic, scene {n}", partial(make, "plastic"), 1.05)
 
 
 def _other_light(ours: Run, other: Run, factor: float = 1) -> float:
@@ -161,28 +162,22 @@ def _direct(extent: Extent, number: int, flavor: str) -> tuple[Run, Run]:
     return _by_mitsuba(extent, nodes, ours), _by_mitsuba(extent, nodes, theirs)
 
 
-def _conductor(extent: Extent, number: int) -> tuple[Run, Run]:
-    """Return the scene with every material a conductor with F = 1."""
+def _other_material(extent: Extent, number: int, kind: str) -> tuple[Run, Run]:
+    """Return the scene of Mitsuba's plugins with our materials and with Mitsuba's.
 
-    def side(material: Callable[[float], dict[str, Any]]) -> Run:
-        nodes = extent.nodes(number, flavor="stock")
-        for name in _plastics(nodes):
-            color = {"specular_reflectance": nodes[name]["specular_reflectance"]}
-            nodes[name] = material(nodes[name]["alpha"]) | color
-        return _by_mitsuba(extent, nodes)
-
-    return side(roughconductor.ours), side(roughconductor.theirs)
-
-
-def _plastic(extent: Extent, number: int) -> tuple[Run, Run]:
-    """Return the scene's materials as they are, and as Mitsuba's nearest."""
-    mine, stock = extent.nodes(number, fresnel="dielectric"), extent.nodes(number, flavor="stock")
-    materials = {name: mine[name] | {"alpha": stock[name]["alpha"]} for name in _plastics(stock)}
-    return _by_mitsuba(extent, stock | materials), _by_mitsuba(extent, stock)
-
-
-def _plastics(nodes: dict[str, Any]) -> list[str]:
-    return [n for n, node in nodes.items() if isinstance(node, dict) and node["type"] == "roughplastic"]
+    They are conductors with F = 1, or, of the kind "plastic", those of the scene.
+    """
+    stock, mine = extent.nodes(number, flavor="stock"), extent.nodes(number, fresnel="dielectric")
+    sides = stock, stock.copy()
+    for name, node in stock.copy().items():
+        if not isinstance(node, dict) or node["type"] != "roughplastic":
+            continue
+        if kind == "plastic":
+            sides[0][name] = mine[name] | {"alpha": node["alpha"]}
+            continue
+        for side, material in zip(sides, (roughconductor.ours, roughconductor.theirs), strict=True):
+            side[name] = material(node["alpha"]) | {"specular_reflectance": node["specular_reflectance"]}
+    return _by_mitsuba(extent, sides[0]), _by_mitsuba(extent, sides[1])
 
 
 # ------------------------------------------------ Other ways ------------------------------------------------
@@ -208,17 +203,31 @@ def other_ways(extent: Extent) -> Iterator[Pair]:
     scene = partial(extent.nodes, 0)
     far = {"type": "mrt_cone", "apex": [1e3, 1, 0], "base_center": [1e3, 0, 0], "radius": 0.1}
     why = "half a step of an 8-bit picture; a lamp that is left out changes hundreds"
+
+    def off(ours: Run, other: Run) -> float:
+        return float(np.abs(ours().image - other().image).max())
+
     for what, change, options in (
         ("cone code", {"far": far}, {}),
         ("paths that cannot matter", {}, {"integrator": {"type": "mrt_whitted", "min_contribution": 0.0}}),
         ("layers", {}, {"layers": ["depth", "normal", "albedo", "direct", "reflection", "bounces"]}),
     ):
         make = partial(_left_out, scene, change, options)
-        yield Pair(f"scene 0 without {what} / with", make, 1.05, _other_picture, INVISIBLE, why)
+        yield Pair(f"scene 0 without {what} / with", make, 1.05, off, INVISIBLE, why)
     if usable_cores() > 1 and extent.repeats > 1:  # workers take seconds to start
-        grid = {"material_0.alpha": np.linspace(0.02, 0.5, max(3, extent.growth // 10)).tolist()}
-        make = partial(_sweep_and_loop, grid, {**size, "aa": 2})
-        yield Pair("a sweep by two workers / a loop", make, 0.6)
+        key, values = "material_0.alpha", np.linspace(0.02, 0.5, max(3, count // 10)).tolist()
+        small: dict[str, Any] = {**size, "aa": 2}
+
+        def sweep() -> None:
+            with TemporaryDirectory() as folder:
+                mrt.sweep(3, folder, grid={key: values}, workers=2, progress=Progress(), **small)
+
+        def loop() -> None:
+            with TemporaryDirectory() as folder:
+                for i, value in enumerate(values):
+                    mrt.render(3, params={key: value}, **small).save(Path(folder, f"{i}.exr"))
+
+        yield Pair("a sweep by two workers / a loop", lambda: (sweep, loop), 0.6)
 
 
 def _left_out(scene: Callable[[], Any], change: dict[str, Any], more: dict[str, Any]) -> tuple[Run, Run]:
@@ -226,27 +235,9 @@ def _left_out(scene: Callable[[], Any], change: dict[str, Any], more: dict[str, 
     return partial(mrt.render, without, **PLAIN), partial(mrt.render, forced, **PLAIN, **more)
 
 
-def _other_picture(ours: Run, other: Run) -> float:
-    return float(np.abs(ours().image - other().image).max())
-
-
 def _other_hits(ours: Run, other: Run) -> float:
     depths = [np.nan_to_num(side().layers["depth.Z"], posinf=1e6) for side in (ours, other)]
     return float(np.mean(np.abs(depths[0] - depths[1]) > 1e-3 * depths[1]))
-
-
-def _sweep_and_loop(grid: dict[str, list[float]], options: dict[str, Any]) -> tuple[Run, Run]:
-    def sweep() -> None:
-        with TemporaryDirectory() as folder:
-            mrt.sweep(3, folder, grid=grid, workers=2, progress=Progress(), **options)
-
-    def loop() -> None:
-        ((key, values),) = grid.items()
-        with TemporaryDirectory() as folder:
-            for i, value in enumerate(values):
-                mrt.render(3, params={key: value}, **options).save(Path(folder, f"{i}.exr"))
-
-    return sweep, loop
 
 
 # -------------------------------------------------- Growth --------------------------------------------------
@@ -268,17 +259,16 @@ def growth(extent: Extent) -> Iterator[Pair]:
     def of_triangles(count: int) -> Run:
         return of(renders.with_triangles(count, **small), aa=4)
 
+    def longer_code(ours: Run, other: Run) -> float:
+        return operations(ours) / operations(other) - 1
+
     for name, make, goal in (
         ("pixels", lambda: (of(mrt.scene_dict(3, **larger)), of(mrt.scene_dict(3, **small))), side * side),
         ("lights", lambda: (of_lights(16 * times), of_lights(16)), times),
         ("triangles", lambda: (of_triangles(100 * times), of_triangles(100)), 10),
     ):
         why = "numbers are data, not code; a loop that is unrolled makes it as many times longer"
-        yield Pair(f"{times} times the {name}", make, goal, _longer_code, MOST_CODE - 1, why)
-
-
-def _longer_code(ours: Run, other: Run) -> float:
-    return operations(ours) / operations(other) - 1
+        yield Pair(f"{times} times the {name}", make, goal, longer_code, MOST_CODE - 1, why)
 
 
 # ------------------------------------------------- A device -------------------------------------------------
@@ -296,6 +286,16 @@ def on_device(variant: str, sizes: Sequence[tuple[int, int]], triangles: int) ->
         "direct": {"type": "direct"},
         "path": {"type": "path", "max_depth": 6},
     }
+
+    def make(
+        mine: Callable[[], Any], theirs: Callable[[], Any], integrator: dict[str, Any]
+    ) -> tuple[Run, Run]:
+        ours, stock, chosen = load(mine()), load(theirs()), mi.load_dict(integrator)
+        return (
+            lambda: mrt.render(ours, **PLAIN).image,
+            lambda: np.array(mi.render(stock, integrator=chosen, spp=1)),
+        )
+
     for width, height in sizes:
         size: dict[str, Any] = {"width": width, "height": height}
         flavors: dict[str, list[Callable[[], Any]]] = {
@@ -305,15 +305,5 @@ def on_device(variant: str, sizes: Sequence[tuple[int, int]], triangles: int) ->
         flavors[f"{triangles} triangles"] = [partial(renders.with_triangles, triangles, **size)] * 2
         for name, (mine, theirs) in flavors.items():
             for other, integrator in others.items():
-                make = partial(_on_device, mine, theirs, integrator)
-                yield Pair(f"{name}, {width}x{height}, mrt_whitted / {other}", make, 1.0)
-
-
-def _on_device(
-    mine: Callable[[], Any], theirs: Callable[[], Any], integrator: dict[str, Any]
-) -> tuple[Run, Run]:
-    ours, stock, chosen = load(mine()), load(theirs()), mi.load_dict(integrator)
-    return (
-        lambda: mrt.render(ours, **PLAIN).image,
-        lambda: np.array(mi.render(stock, integrator=chosen, spp=1)),
-    )
+                what = f"{name}, {width}x{height}, mrt_whitted / {other}"
+                yield Pair(what, partial(make, mine, theirs, integrator), 1.0)

@@ -50,7 +50,7 @@ class Difference:
     def flip(self) -> float | None:
         """Mean of FLIP, the difference that a viewer sees, from 0 to 1; None where it is not defined."""
         try:
-            return image_tests.flip(*reversed(self.pictures))[0]
+            return image_tests.flip(*reversed(self.pictures))
         except (UsageError, ImportError):
             return None
 
@@ -120,12 +120,14 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
         relative = np.divide(square, np.square(second, dtype=np.float64) + image_tests.EPSILON)
     relative[np.isinf(square)] = np.inf
     mse = float(square.mean())
+    with np.errstate(divide="ignore"):
+        psnr = float(20 * np.log10(peak) - 10 * np.log10(mse))
     index = np.unravel_index(np.argmax(np.abs(difference)), difference.shape)
     return Difference(
         mae=float(np.abs(difference).mean()),
         rmse=mse**0.5,
         rel_mse=float(relative.mean()),
-        psnr=_psnr(mse, peak),
+        psnr=psnr,
         largest=float(np.abs(difference[index])),
         place=(int(index[0]), int(index[1])),
         p_value=_p_value(sides),
@@ -133,11 +135,6 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
         pictures=(first, second),
         inputs=tuple(os.fspath(side) for side in (a, b) if isinstance(side, str | os.PathLike)),
     )
-
-
-def _psnr(mse: float, peak: float) -> float:
-    with np.errstate(divide="ignore"):
-        return float(20 * np.log10(peak) - 10 * np.log10(mse))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -158,16 +157,11 @@ def rel_rmse(image: ArrayLike, reference: ArrayLike) -> float:
     return float(np.sqrt(np.mean((a - b) ** 2 / (b**2 + EPSILON))))
 
 
-def flip(
-    reference: ArrayLike, image: ArrayLike, *, exposures: Mapping[str, float] | None = None
-) -> tuple[float, np.ndarray, Mapping[str, float]]:
+def flip(reference: ArrayLike, image: ArrayLike) -> float:
     """Return HDR-FLIP of a linear picture [H, W, 3] against a reference (Andersson et al. 2021): the mean of
-    the perceived difference, its map [H, W] in [0, 1], and the exposures that it was seen at.
+    the perceived difference, from 0 to 1.
 
-    ``exposures``: those of an earlier result. FLIP derives them from the reference, so within a series they
-    must be given, or its values cannot be compared.
-
-    Raises ``UsageError`` for what cannot be compared.
+    It derives exposures from the reference. Raises ``UsageError`` for what cannot be compared.
     """
     import flip_evaluator
 
@@ -179,10 +173,4 @@ def flip(
             raise UsageError(f"FLIP needs finite values >= 0; the {name} has others")
     if not a.any():
         raise UsageError("FLIP takes its exposures from the reference, which is black")
-    parameters: dict[str, Any] = dict(exposures or {})
-    try:
-        found, mean, used = flip_evaluator.evaluate(a, b, "HDR", applyMagma=False, parameters=parameters)
-    except SystemExit as error:  # its answer to arguments that it does not like
-        raise UsageError(f"FLIP refused its arguments: exposures={exposures}") from error
-    kept = {name: used[name] for name in ("startExposure", "stopExposure", "numExposures")}
-    return float(mean), np.asarray(found)[..., 0] if np.ndim(found) == 3 else np.asarray(found), kept
+    return float(flip_evaluator.evaluate(a, b, "HDR", applyMagma=False, parameters={})[1])

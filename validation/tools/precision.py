@@ -7,25 +7,83 @@ error, that of the rest the squared bias; the difference is the variance.
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba.validation.tools.compare import Difference
-from mrt_mitsuba.validation.tools.intervals import Estimate, estimate
 
 RESOLVED = 2.0  # times the reference's own error from which on an error can be distinguished from it
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?"
 NOTHING = 1e-15  # an RMSE of 0, as logarithms have it
+LEVEL = 0.95
+RESAMPLES = 999
+FAR = 1e100  # stands for infinity and NaN in resamples: scipy takes their mean
 
 Options = Mapping[str, Any]
 Interval = tuple[float, float]
 Panel = tuple[str, float, np.ndarray]  # name, seconds and picture of what a curve reaches in some time
 Strip = tuple[float, Sequence[Panel]]  # that time, and a panel of each curve
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its interval; NaN where nothing is known, infinite where it is never reached."""
+
+    value: float
+    low: float
+    high: float
+
+    def overlaps(self, other: Estimate) -> bool:
+        """Return whether the intervals share a value; NaN shares all."""
+        return not (self.high < other.low or other.high < self.low)
+
+    def __str__(self) -> str:
+        if np.isnan(self.low):
+            return f"{self.value:.3g}"
+        return f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
+
+
+def estimate(count: int, statistic: Callable[[np.ndarray], np.ndarray], *, log: bool = True) -> Estimate:
+    """Return a statistic of ``count`` repeats with its 95 % interval.
+
+    ``statistic`` gets indices [..., repeats] and returns one value for each row of them. Its standard error
+    is that of a bootstrap over repeats, times √(n/(n−1)), for resamples of so few spread too little; the
+    interval is Student's, so for a mean it is the classical one. ``log``: of a positive quantity, taken in
+    logarithms. NaN for a single repeat. Where some resamples never reach a value, the interval is open.
+    """
+    from scipy import stats
+
+    value = float(statistic(np.arange(count)[None])[0])
+    if count < 2:
+        return Estimate(value, np.nan, np.nan)
+    found = stats.bootstrap(
+        (np.arange(count),),
+        lambda index, axis=-1: np.nan_to_num(statistic(index), nan=FAR, posinf=FAR),
+        n_resamples=RESAMPLES,
+        method="percentile",
+        vectorized=True,
+        random_state=np.random.default_rng(count),
+    ).bootstrap_distribution
+    finite = found[found < FAR]
+    reach = stats.t.ppf((1 + LEVEL) / 2, count - 1) * np.sqrt(count / (count - 1))
+    if not log:
+        low, high = value - reach * finite.std(), value + reach * finite.std()
+    elif not len(finite):
+        low, high = np.inf, np.inf
+    elif not (finite > 0).all():
+        low, high = 0.0, finite.max()
+    else:  # around the value, or where that is infinite around the finite resamples
+        logs = np.log(finite)
+        centre = np.log(value) if np.isfinite(value) else logs.mean()
+        low, high = np.exp(centre - reach * logs.std()), np.exp(centre + reach * logs.std())
+    never = log and len(finite) < (1 + LEVEL) / 2 * len(found)
+    return Estimate(value, float(low), np.inf if never else float(high))
 
 
 @dataclass(frozen=True)
@@ -59,18 +117,19 @@ class Point:
 
     @cached_property
     def bias_squared(self) -> Estimate:
-        return estimate(len(self.times), self._bias_squared_of, log=False)
+        """By pairs of different repeats; of one repeat, or resamples of the same one, NaN."""
+
+        def of(index: np.ndarray) -> np.ndarray:
+            other = index[..., :, None] != index[..., None, :]
+            total = np.where(other, self.gram[index[..., :, None], index[..., None, :]], 0).sum(axis=(-2, -1))
+            count = other.sum(axis=(-2, -1))
+            return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+
+        return estimate(len(self.times), of, log=False)
 
     def rmse_of(self, index: np.ndarray) -> np.ndarray:
         """Return the RMSE over some repeats, [..., repeats] of them."""
         return np.sqrt(np.maximum(np.diag(self.gram)[index].mean(axis=-1), NOTHING**2))
-
-    def _bias_squared_of(self, index: np.ndarray) -> np.ndarray:
-        """Return the squared bias by pairs of different repeats; of one repeat, or the same one, NaN."""
-        other = index[..., :, None] != index[..., None, :]
-        total = np.where(other, self.gram[index[..., :, None], index[..., None, :]], 0).sum(axis=(-2, -1))
-        count = other.sum(axis=(-2, -1))
-        return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
 
     @property
     def seconds(self) -> float:
@@ -116,8 +175,8 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Findings:
-    """The findings about several cases."""
+class WorkPrecision:
+    """The findings of ``error_vs_time``."""
 
     scene: str
     points: Mapping[str, Point]
@@ -142,8 +201,22 @@ class Findings:
 
         Between measured cases the curve is a straight line in logarithms; beyond them nothing is assumed.
         """
+        error *= 1 + 1e-9  # an error that is met to rounding is met
+
+        def crossing(index: np.ndarray, points: Sequence[Point]) -> np.ndarray:
+            seconds = np.stack([np.median(p.times[index], axis=-1) for p in points])  # [points, ...]
+            rmse = np.stack([p.rmse_of(index) for p in points])
+            found = np.where(rmse[0] <= error, seconds[0], np.inf)
+            for i in range(1, len(points)):
+                ends = np.log([rmse[i - 1], rmse[i]])
+                steps = np.where(ends[0] > ends[1], ends[0] - ends[1], 1)
+                share = np.clip((ends[0] - np.log(error)) / steps, 0, 1)
+                between = seconds[i - 1] ** (1 - share) * seconds[i] ** share
+                found = np.where(np.isinf(found) & (rmse[i] <= error), between, found)
+            return found
+
         return {
-            name: estimate(self.repeats, partial(_crossing, points, error))
+            name: estimate(self.repeats, lambda index, points=points: crossing(index, points))
             for name, points in self.families.items()
         }
 
@@ -157,7 +230,33 @@ class Findings:
         """A sentence for each of ``errors``; it names a winner only if its interval meets no other."""
         if self.repeats < 2:
             return ["No verdict on time: a single repeat has no interval."]
-        return [_verdict(error, self.times[error]) for error in self.errors]
+        sentences = []
+        for error, times in self.times.items():
+            reached = sorted((time.value, name) for name, time in times.items() if np.isfinite(time.value))
+            best = reached[0][1] if reached else ""
+            like = [name for _, name in reached[1:] if times[name].overlaps(times[best])]
+            if not reached:
+                verdict = "no case comes so low"
+            elif like:
+                verdict = f"no winner, for the intervals overlap: {', '.join([best, *like])}"
+            elif len(reached) == 1:
+                verdict = f"only {best} comes so low, in {times[best]} s"
+            else:
+                verdict = f"{best} is the fastest, {times[best]} s; {reached[1][1]} takes "
+                verdict += f"{reached[1][0] / reached[0][0]:.2g} times as long"
+            sentences.append(f"RMSE of {error:g}: {verdict}.")
+        return sentences
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""
+        from mrt_mitsuba.validation.tools import precision_page, report
+
+        report.save(folder, precision_page.study(self), title=precision_page.TITLE)
+
+    def _repr_html_(self) -> str:
+        from mrt_mitsuba.validation.tools import precision_page, report
+
+        return report.notebook(precision_page.study(self), title=precision_page.TITLE)
 
     def __str__(self) -> str:
         width = max(map(len, [*self.points, *self.failed]), default=0)
@@ -165,34 +264,3 @@ class Findings:
         lines += [f"{name:<{width}}  FAILED {why}" for name, why in self.failed.items()]
         own = f"{self.reference_error:.2g}" if self.reference_error else "not known"
         return "\n".join([*lines, f"the reference's own error: {own}", *self.verdicts])
-
-
-def _crossing(points: Sequence[Point], error: float, index: np.ndarray) -> np.ndarray:
-    """Return the seconds in which a curve, fastest point first, comes down to an error, by some repeats."""
-    error *= 1 + 1e-9  # an error that is met to rounding is met
-    seconds = np.stack([np.median(p.times[index], axis=-1) for p in points])  # [points, ...]
-    rmse = np.stack([p.rmse_of(index) for p in points])
-    found = np.where(rmse[0] <= error, seconds[0], np.inf)
-    for i in range(1, len(points)):
-        ends = np.log([rmse[i - 1], rmse[i]])
-        steps = np.where(ends[0] > ends[1], ends[0] - ends[1], 1)
-        share = np.clip((ends[0] - np.log(error)) / steps, 0, 1)
-        between = seconds[i - 1] ** (1 - share) * seconds[i] ** share
-        found = np.where(np.isinf(found) & (rmse[i] <= error), between, found)
-    return found
-
-
-def _verdict(error: float, times: Mapping[str, Estimate]) -> str:
-    where = f"RMSE of {error:g}"
-    reached = sorted(((t.value, name) for name, t in times.items() if np.isfinite(t.value)))
-    if not reached:
-        return f"{where}: no case comes so low."
-    best = reached[0][1]
-    like = [name for _, name in reached[1:] if times[name].overlaps(times[best])]
-    if like:
-        return f"{where}: no winner, for the intervals overlap: {', '.join([best, *like])}."
-    if len(reached) == 1:
-        return f"{where}: only {best} comes so low, in {times[best]} s."
-    value, second = reached[1]
-    ratio = value / reached[0][0]
-    return f"{where}: {best} is the fastest, {times[best]} s; {second} takes {ratio:.2g} times as long."

@@ -13,7 +13,7 @@ import platform
 import re
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.output.files import to_8bit, write_exr
 from mrt_mitsuba.output.replacing import check_target, replacing
-from mrt_mitsuba.validation.tools.study import Image, Study, Table
+from mrt_mitsuba.validation.tools.study import Study, Table
 
 LONG_TABLE = 12  # rows from which on a table of the page is folded
 LONG_LIST = 30  # bounds from which on they are folded if all hold
@@ -89,6 +89,10 @@ def save(
 
     A figure is drawn once: the file and the page hold the same bytes. Raises ``OutputError``.
     """
+    from importlib.resources import files
+
+    import jinja2
+
     place = Path(folder)
     prepare(place, "summary.json", "index.html")
     sections = [_section(place, study) for study in studies]
@@ -101,7 +105,13 @@ def save(
         "studies": {study.name: study.summary() for study in studies},
     }
     _write(place / "summary.json", json.dumps(result, indent=2, allow_nan=False).encode() + b"\n")
-    _write(place / "index.html", _page(sections, result, title).encode())
+    template = (files("mrt_mitsuba.validation.tools") / "templates" / "report.html").read_text("utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    environment.filters["cell"] = cell
+    page = environment.from_string(template).render(
+        sections=sections, long_list=LONG_LIST, title=title, explain=title == VALIDATION, **result
+    )
+    _write(place / "index.html", page.encode())
 
 
 def notebook(study: Study, *, title: str) -> str:
@@ -114,6 +124,8 @@ def notebook(study: Study, *, title: str) -> str:
 
 def _section(folder: Path, study: Study) -> dict[str, Any]:
     """Write the files of one study and return what the page shows of it."""
+    import PIL.Image
+
     section: dict[str, Any] = {"study": study, "texts": [], "images": [], "tables": []}
     for part in study.parts:
         if isinstance(part, str):
@@ -129,44 +141,23 @@ def _section(folder: Path, study: Study) -> dict[str, Any]:
             folded = len(part.rows) >= LONG_TABLE
             section["tables"].append({"part": part, "numeric": numeric, "folded": folded})
             continue
-        png = _png(part)
-        _write(folder / f"{stem}.png", png)
-        if part.exr:
-            write_exr(folder / f"{stem}.exr", part.content)
+        buffer = io.BytesIO()
         if part.is_plot:
             kind, broad = "plot", part.content.get_figwidth() > COLUMN
+            part.content.savefig(
+                buffer, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight", facecolor="white"
+            )
+            if "matplotlib.pyplot" in sys.modules:  # which keeps every figure that it made
+                sys.modules["matplotlib.pyplot"].close(part.content)
         else:
             kind, broad = "picture", part.content.shape[1] > BROAD * part.content.shape[0]
-        data = base64.b64encode(png).decode()
+            PIL.Image.fromarray(to_8bit(part.content, "srgb")).save(buffer, format="PNG")
+        _write(folder / f"{stem}.png", buffer.getvalue())
+        if part.exr:
+            write_exr(folder / f"{stem}.exr", part.content)
+        data = base64.b64encode(buffer.getvalue()).decode()
         section["images"].append({"part": part, "data": data, "kind": kind, "broad": bool(broad)})
     return section
-
-
-def _png(image: Image) -> bytes:
-    import PIL.Image
-
-    buffer = io.BytesIO()
-    if not image.is_plot:
-        PIL.Image.fromarray(to_8bit(image.content, "srgb")).save(buffer, format="PNG")
-        return buffer.getvalue()
-    image.content.savefig(buffer, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight", facecolor="white")
-    if "matplotlib.pyplot" in sys.modules:  # which keeps every figure that it made
-        sys.modules["matplotlib.pyplot"].close(image.content)
-    return buffer.getvalue()
-
-
-def _page(sections: Sequence[Mapping[str, Any]], result: Mapping[str, Any], title: str) -> str:
-    """Return the self-contained HTML page."""
-    from importlib.resources import files
-
-    import jinja2
-
-    template = (files("mrt_mitsuba.validation.tools") / "templates" / "report.html").read_text("utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    environment.filters["cell"] = cell
-    return environment.from_string(template).render(
-        sections=sections, long_list=LONG_LIST, title=title, explain=title == VALIDATION, **result
-    )
 
 
 def cell(value: Any) -> str:

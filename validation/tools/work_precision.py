@@ -5,10 +5,10 @@ Each case is repeated with other seeds; ``precision`` says what is made of the p
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,24 +19,12 @@ from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.rendering.result import Result
 from mrt_mitsuba.scene.open import open_scene
-from mrt_mitsuba.validation.tools import compare, precision_page, report, timing
-from mrt_mitsuba.validation.tools.precision import RESOLVED, Findings, Options, Panel, Point, Strip
+from mrt_mitsuba.validation.tools import compare, timing
+from mrt_mitsuba.validation.tools.precision import RESOLVED, Options, Panel, Point, Strip, WorkPrecision
 
 REFERENCE_SEEDS = (2**20 + 1, 2**20 + 2)  # far from those of the repeats
 STEPS = (1, 2, 5)  # of the errors that the time is asked for, times powers of ten
 MOST_ERRORS = 4
-
-
-@dataclass(frozen=True)
-class WorkPrecision(Findings):
-    """The findings of ``error_vs_time``."""
-
-    def save(self, folder: str | os.PathLike[str]) -> None:
-        """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""
-        report.save(folder, precision_page.study(self), title=precision_page.TITLE)
-
-    def _repr_html_(self) -> str:
-        return report.notebook(precision_page.study(self), title=precision_page.TITLE)
 
 
 def error_vs_time(
@@ -189,37 +177,24 @@ def _measure(
                     continue
                 cold.setdefault(name, result)
                 runs[name] += [result] if turn >= 0 else []
-    points = {
-        name: _point(name, cases[name], cold[name], runs[name], halves, own_error)
-        for name in cases
-        if name not in failed
-    }
+    points = {}
+    for name in (name for name in cases if name not in failed):
+        results = runs[name]
+        errors = [np.stack([r.image.ravel() - half.ravel() for r in results]) for half in halves]
+        gram = errors[0] @ errors[1].T / errors[0].shape[1]
+        points[name] = Point(
+            name=name,
+            options=cases[name],
+            times=np.array([_seconds(r) for r in results]),
+            gram=(gram + gram.T) / 2,
+            cold=_seconds(cold[name]),
+            compile=cold[name].timings.compile,
+            rays=dict(results[0].rays),
+            image=results[0].image,
+            difference=compare.compare(results[0].image, (halves[0] + halves[1]) / 2),
+            reference_error=own_error,
+        )
     return points, failed
-
-
-def _point(
-    name: str,
-    options: Options,
-    cold: Result,
-    runs: Sequence[Result],
-    halves: tuple[np.ndarray, np.ndarray],
-    own_error: float,
-) -> Point:
-    """Return the figures of a case."""
-    errors = [np.stack([r.image.ravel() - half.ravel() for r in runs]) for half in halves]
-    gram = errors[0] @ errors[1].T / errors[0].shape[1]
-    return Point(
-        name=name,
-        options=options,
-        times=np.array([_seconds(r) for r in runs]),
-        gram=(gram + gram.T) / 2,
-        cold=_seconds(cold),
-        compile=cold.timings.compile,
-        rays=dict(runs[0].rays),
-        image=runs[0].image,
-        difference=compare.compare(runs[0].image, (halves[0] + halves[1]) / 2),
-        reference_error=own_error,
-    )
 
 
 def _round_errors(points: Any, floor: float) -> list[float]:
@@ -234,25 +209,27 @@ def _round_errors(points: Any, floor: float) -> list[float]:
 
 
 def _strips(found: WorkPrecision, runner: _Runner) -> list[Strip]:
-    """Render what each curve of several cases reaches in times that all of them have."""
-    curves = {name: points for name, points in found.families.items() if len(points) > 1}
+    """Render what each curve of several cases reaches in times that all of them have.
+
+    That is the case nearest to the time, with as many samples as fill it where they can be chosen.
+    """
+    curves = [points for points in found.families.values() if len(points) > 1]
     if len(curves) < 2:
         return []
-    low = max(points[0].seconds for points in curves.values())
-    high = min(points[-1].seconds for points in curves.values())
-    budgets = [low, high] if high > 3 * low else [np.sqrt(low * high)]
-    return [(t, [_panel(p, t, runner, found.repeats) for p in curves.values()]) for t in budgets]
-
-
-def _panel(points: Sequence[Point], seconds: float, runner: _Runner, seed: int) -> Panel:
-    """Return the case nearest to a time, with as many samples as fill it where they can be chosen."""
-    near = min(points, key=lambda p: abs(np.log(p.seconds / seconds)))
-    spp = near.options.get("spp")
-    wanted = max(1, round(spp * seconds / near.seconds)) if isinstance(spp, int) else spp
-    if wanted == spp:
-        return near.name, near.seconds, near.image
-    try:
-        result = runner({**near.options, "spp": wanted}, seed)
-    except Exception:  # so many samples may not fit
-        return near.name, near.seconds, near.image
-    return f"{near.family}, {wanted} spp", _seconds(result), result.image
+    low = max(points[0].seconds for points in curves)
+    high = min(points[-1].seconds for points in curves)
+    strips: list[Strip] = []
+    for seconds in [low, high] if high > 3 * low else [np.sqrt(low * high)]:
+        panels: list[Panel] = []
+        for points in curves:
+            near = min(points, key=lambda p: abs(np.log(p.seconds / seconds)))
+            panel = near.name, near.seconds, near.image
+            spp = near.options.get("spp")
+            wanted = max(1, round(spp * seconds / near.seconds)) if isinstance(spp, int) else spp
+            if wanted != spp:
+                with suppress(Exception):  # so many samples may not fit
+                    result = runner({**near.options, "spp": wanted}, found.repeats)
+                    panel = f"{near.family}, {wanted} spp", _seconds(result), result.image
+            panels.append(panel)
+        strips.append((seconds, panels))
+    return strips
