@@ -7,7 +7,7 @@ import math
 import os
 import stat
 import warnings
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 
 from mrt_mitsuba.errors import MrtWarning, SceneError
@@ -54,7 +54,16 @@ def read_text(path: Path) -> bytes:
         raise SceneError(f"{path}: is not a text file (it holds a zero byte); export it as OBJ or MTL text")
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    data = _join_continued(data.removeprefix(b"\xef\xbb\xbf"))
+    first, *others = data.removeprefix(b"\xef\xbb\xbf").split(b"\\\n")
+    parts, owed = [first], 0
+    for part in others:
+        rest, end, following = part.partition(b"\n")
+        owed += 1
+        parts += [b" ", rest]
+        if end:
+            parts += [b"\n" * (owed + 1), following]
+            owed = 0
+    data = b"".join([*parts, b"\n" * owed])
     if not data.endswith(b"\n"):
         data += b"\n"
     step = LONGEST_LINE // 2
@@ -66,19 +75,6 @@ def read_text(path: Path) -> bytes:
                 text = f"a line of {end - start} bytes; at most {LONGEST_LINE} are read"
                 raise SceneError(f"{path}:{number}: {text}")
     return data
-
-
-def _join_continued(data: bytes) -> bytes:
-    first, *others = data.split(b"\\\n")
-    parts, owed = [first], 0
-    for part in others:
-        rest, end, following = part.partition(b"\n")
-        owed += 1
-        parts += [b" ", rest]
-        if end:
-            parts += [b"\n" * (owed + 1), following]
-            owed = 0
-    return b"".join([*parts, b"\n" * owed])
 
 
 def decode(data: bytes) -> str:
@@ -124,21 +120,11 @@ def picture_size(path: str) -> tuple[int, int] | None:
         return None
 
 
-@dataclass
-class Findings:
-    """Warnings of one reading: the first of each kind is shown, with the number of those like it."""
-
-    texts: dict[str, list[str]] = field(default_factory=dict)
-
-    def add(self, kind: str, text: str) -> None:
-        """Note a warning; ``kind`` is the plural of what it is about."""
-        self.texts.setdefault(kind, []).append(text)
-
-    def warn(self) -> None:
-        """Give the warnings."""
-        for kind, (first, *others) in self.texts.items():
-            more = f" (and so do {len(others)} more {kind})" if others else ""
-            warnings.warn(f"{first}{more}", MrtWarning, stacklevel=4)
+def warn(findings: Mapping[str, list[str]]) -> None:
+    """Show what a reading found, by the plural of what it is about: the first, and how many more."""
+    for kind, (first, *others) in findings.items():
+        more = f" (and so do {len(others)} more {kind})" if others else ""
+        warnings.warn(f"{first}{more}", MrtWarning, stacklevel=4)
 
 
 def numbers(where: str, statement: str, words: list[str], least: int, most: int) -> list[float]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError
-from mrt_mitsuba.scene.files import MISSING, Findings, decode, find, numbers, read_text
+from mrt_mitsuba.scene.files import MISSING, decode, find, numbers, read_text, warn
 from mrt_mitsuba.scene.model import Color, Material
 
 CONVENTIONS = ("report", "standard")
@@ -55,7 +54,7 @@ def read_mtl(
     Raises ``SceneError`` with file and line for what cannot be read.
     """
     path = Path(path)
-    findings = Findings()
+    findings: dict[str, list[str]] = {}
     blocks: dict[str, dict[str, Any]] = {}
     block: dict[str, Any] | None = None
     for number, line in enumerate(decode(read_text(path)).split("\n"), 1):
@@ -71,14 +70,26 @@ def read_mtl(
             block[statement] = _value(statement, text, where, folder or path.parent, path.parent, findings)
         # the report's reading defines itself; from the standard's, statements may be missing
         elif statement and convention == "standard" and text not in _WITHOUT_EFFECT.get(statement, ()):
-            findings.add("statements", f"{where}: {statement} {text[:40]} is not used")
-    findings.warn()
-    make = {"report": _report_material, "standard": _standard_material}[convention]
-    return {name: replace(make(block), texture=block.get("map_Kd")) for name, block in blocks.items()}
+            findings.setdefault("statements", []).append(f"{where}: {statement} {text[:40]} is not used")
+    warn(findings)
+    materials = {}
+    for name, block in blocks.items():
+        if convention == "standard":
+            alpha = math.sqrt(2 / (block.get("Ns", 0.0) + 2))
+            found = Material(block.get("Ni", 1.0), alpha, (0.0, 0.0, 0.0), (0.8, 0.8, 0.8))
+        else:
+            (ior, *_), alpha = (
+                block.get("Ka", (DEFAULT_MATERIAL.ior,)),
+                block.get("Ni", DEFAULT_MATERIAL.alpha),
+            )
+            found = replace(DEFAULT_MATERIAL, ior=ior, alpha=alpha)
+        colours = {"specular": block.get("Ks", found.specular), "diffuse": block.get("Kd", found.diffuse)}
+        materials[name] = replace(found, **colours, texture=block.get("map_Kd"))
+    return materials
 
 
 def _value(
-    statement: str, text: str, where: str, folder: Path, library: Path, findings: Findings
+    statement: str, text: str, where: str, folder: Path, library: Path, findings: dict[str, list[str]]
 ) -> Color | float | str | None:
     """Return a colour, a number, or the path of a picture; None, with a warning, for one that is missing.
 
@@ -92,7 +103,7 @@ def _value(
         found = find(text, [folder, library]) or (find(name, [folder, library]) if name else None)
         if found is None:
             missing = f"{where}: the texture {name or text} {MISSING} {folder}; Kd is used in its place"
-            findings.add("textures", missing)
+            findings.setdefault("textures", []).append(missing)
         return None if found is None else str(found)
     colored = statement.startswith("K")
     if colored and words and words[0] in ("spectral", "xyz"):
@@ -105,25 +116,6 @@ def _value(
         raise SceneError(f"{where}: {statement} has 2 numbers, but must have 1 or 3")
     return (
         values[0] if not colored else (values[0], values[-1] if len(values) == 1 else values[1], values[-1])
-    )
-
-
-def _report_material(block: Mapping[str, Any]) -> Material:
-    default = DEFAULT_MATERIAL
-    return Material(
-        ior=block.get("Ka", (default.ior,))[0],
-        alpha=block.get("Ni", default.alpha),
-        specular=block.get("Ks", default.specular),
-        diffuse=block.get("Kd", default.diffuse),
-    )
-
-
-def _standard_material(block: Mapping[str, Any]) -> Material:
-    return Material(
-        ior=block.get("Ni", 1.0),
-        alpha=math.sqrt(2 / (block.get("Ns", 0.0) + 2)),
-        specular=block.get("Ks", (0.0, 0.0, 0.0)),
-        diffuse=block.get("Kd", (0.8, 0.8, 0.8)),
     )
 
 

@@ -8,6 +8,7 @@ with the size of the file whatever it holds: the lengths of numbers and gaps in 
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from dataclasses import dataclass, field, replace
@@ -16,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.scene.files import MISSING, Findings, decode, find, numbers, read_text
+from mrt_mitsuba.scene.files import MISSING, decode, find, numbers, read_text, warn
 from mrt_mitsuba.scene.model import Material, Mesh
 from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, read_mtl
 
@@ -85,17 +86,6 @@ def read_model(
 
 
 @dataclass
-class _Faces:
-    """Faces of as many corners each: indices of vertex, texture and normal from 0, −1 for none."""
-
-    v: np.ndarray  # int64 [F, corners]
-    vt: np.ndarray  # int64 [F, corners]
-    vn: np.ndarray  # int64 [F, corners]
-    material: str | None
-    lines: np.ndarray  # int64 [F]
-
-
-@dataclass
 class _Reader:
     path: Path
     convention: str
@@ -104,11 +94,13 @@ class _Reader:
     def __post_init__(self) -> None:
         self.arrays: dict[str, list[np.ndarray]] = {"v": [], "vt": [], "vn": []}
         self.counts = {"v": 0, "vt": 0, "vn": 0}
-        self.faces: list[_Faces] = []
+        # Of faces of as many corners, one on each line: indices from 0, int64 [F, corners], −1 for none, of
+        # "v", "vt" and "vn"; the material; the first line
+        self.faces: list[tuple[dict[str, np.ndarray], str | None, int]] = []
         self.material: str | None = None
         self.line = 1
         self.unknown_materials: set[str] = set()
-        self.findings = Findings()
+        self.findings: dict[str, list[str]] = {}
         self.libraries: set[str] = set()
 
     def fail(self, text: str, line: int | None = None) -> None:
@@ -152,7 +144,14 @@ class _Reader:
         elif keyword == "f":
             self._face(words)
         elif keyword == "usemtl":
-            self._use(_rest(text, "usemtl"))
+            name = self.material = _rest(text, "usemtl")
+            if not name:
+                self.fail("usemtl has no name; write usemtl NAME")
+            if name not in self.materials and name not in self.unknown_materials:
+                self.unknown_materials.add(name)
+                self.findings.setdefault("materials", []).append(
+                    f"{where}: no library has the material {name!r}; it gets the default"
+                )
         elif keyword == "mtllib":
             self._library(_rest(text, "mtllib"))
         elif keyword not in _IGNORED:
@@ -203,23 +202,10 @@ class _Reader:
                     else "indices count from 1, or back from -1"
                 )
                 self.fail(f"f has the {kind} index {bad}: {reason}", self.line + row)
-        lines = np.arange(self.line, self.line + len(indices))
-        none = np.full_like(resolved["v"], -1)
-        vt, vn = resolved.get("vt", none), resolved.get("vn", none)
-        self.faces.append(_Faces(resolved["v"], vt, vn, self.material, lines))
+        missing = dict.fromkeys(("vt", "vn"), np.full_like(resolved["v"], -1))
+        self.faces.append((missing | resolved, self.material, self.line))
 
     # ---------------------------------------- Materials ------------------------------------------------
-
-    def _use(self, name: str) -> None:
-        if not name:
-            self.fail("usemtl has no name; write usemtl NAME")
-        if name not in self.materials and name not in self.unknown_materials:
-            self.unknown_materials.add(name)
-            where = f"{self.path}:{self.line}"
-            self.findings.add(
-                "materials", f"{where}: no library has the material {name!r}; it gets the default"
-            )
-        self.material = name
 
     def _library(self, rest: str) -> None:
         if not rest:
@@ -229,7 +215,7 @@ class _Reader:
             found = find(name, [folder])
             if found is None:
                 text = f"{self.path}:{self.line}: the material library {name} {MISSING} {folder}"
-                self.findings.add("libraries", f"{text}; its materials get the default")
+                self.findings.setdefault("libraries", []).append(f"{text}; its materials get the default")
             else:
                 self.libraries.add(str(found))
                 self.materials |= read_mtl(found, convention=self.convention, folder=folder)
@@ -238,18 +224,23 @@ class _Reader:
 
     def meshes(self) -> tuple[Mesh, ...]:
         """Return one mesh for each material, in the order of their first use."""
-        self.findings.warn()
-        self._check_ranges()
+        warn(self.findings)
+        for kind, (index, _, line) in itertools.product(_USED, self.faces):
+            beyond = index[kind] >= self.counts[kind]
+            if beyond.any():
+                row = int(np.argmax(beyond.any(axis=1)))
+                bad = int(index[kind][row][beyond[row]][0]) + 1
+                self.fail(f"f has the {kind} index {bad}, but the file has {self.counts[kind]}", line + row)
         points, uvs, normals = (
             np.concatenate(self.arrays[kind] or [np.empty((0, _USED[kind]), np.float32)]) for kind in _USED
         )
-        by_material: dict[tuple[Material, bool], list[_Faces]] = {}
-        for faces in self.faces:
-            material = self.materials.get(faces.material or "", DEFAULT_MATERIAL)
-            if faces.vt[0, 0] < 0:
+        by_material: dict[tuple[Material, bool], list[dict[str, np.ndarray]]] = {}
+        for index, name, _ in self.faces:
+            material = self.materials.get(name or "", DEFAULT_MATERIAL)
+            if index["vt"][0, 0] < 0:
                 material = replace(material, texture=None)  # no coordinates to look it up
-            smooth = self.convention == "standard" and faces.vn[0, 0] >= 0
-            by_material.setdefault((material, smooth), []).append(faces)
+            smooth = self.convention == "standard" and index["vn"][0, 0] >= 0
+            by_material.setdefault((material, smooth), []).append(index)
         if not by_material:
             raise SceneError(f"{self.path}: has no faces; export the model with its geometry")
         return tuple(
@@ -257,23 +248,16 @@ class _Reader:
             for (material, smooth), faces in by_material.items()
         )
 
-    def _check_ranges(self) -> None:
-        for kind in ("v", "vt", "vn"):
-            for faces in self.faces:
-                index = getattr(faces, kind)
-                beyond = index >= self.counts[kind]
-                if beyond.any():
-                    row = int(np.argmax(beyond.any(axis=1)))
-                    bad = int(index[row][beyond[row]][0]) + 1
-                    text = f"f has the {kind} index {bad}, but the file has {self.counts[kind]}"
-                    self.fail(text, int(faces.lines[row]))
-
 
 def _mesh(
-    points: np.ndarray, uvs: np.ndarray, normals: np.ndarray | None, faces: list[_Faces], material: Material
+    points: np.ndarray,
+    uvs: np.ndarray,
+    normals: np.ndarray | None,
+    faces: list[dict[str, np.ndarray]],
+    material: Material,
 ) -> Mesh:
     """Return the mesh of some faces, with the vertices that they use."""
-    v, vt, vn = (np.concatenate([_triangles(getattr(f, kind)) for f in faces]) for kind in ("v", "vt", "vn"))
+    v, vt, vn = (np.concatenate([_triangles(f[kind]) for f in faces]) for kind in _USED)
     if material.texture is None and normals is None:
         used = np.zeros(len(points), bool)
         used[v] = True

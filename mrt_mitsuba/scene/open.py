@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import operator
 import os
 from collections.abc import Iterator, Mapping
@@ -13,7 +14,6 @@ from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, check_model_options, is_obj
-from mrt_mitsuba.scene.parameters import set_parameters
 from mrt_mitsuba.scene.report import report_scene
 
 WIDEST_FILTER = 1024  # pixels: the largest radius of a film's filter
@@ -84,6 +84,26 @@ def open_scene(
     set_parameters(loaded, keys)
     view, integrator = _sensor(name, loaded, sensor), _integrator(integrator, loaded)
     return Source(name, loaded, view, integrator, width, height, own.focal_distance, own.focal_range, fresnel)
+
+
+def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
+    """Set values by their ``mi.traverse`` key; raise ``UsageError`` for unknown ones and wrong types."""
+    import mitsuba as mi
+
+    if not values:
+        return
+    parameters = mi.traverse(scene)
+    for key, value in values.items():
+        if key not in parameters:
+            close = difflib.get_close_matches(key, parameters.keys(), n=1)
+            hint = f"did you mean {close[0]}?" if close else "print(mi.traverse(scene)) lists all"
+            raise UsageError(f"the scene has no parameter {key}: {hint}")
+        kind = type(parameters[key])
+        try:
+            parameters[key] = kind(value)
+        except (TypeError, ValueError, RuntimeError):
+            raise UsageError(f"{key}={value!r}: must be a {kind.__name__}") from None
+    parameters.update()
 
 
 @contextmanager

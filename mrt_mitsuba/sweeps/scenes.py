@@ -67,8 +67,7 @@ def identify(sent: Any) -> str:
 def check_parameters(jobs: Sequence[Job]) -> None:
     """Raise ``UsageError`` if a job sets what its scene does not have; each scene is loaded once."""
     from mrt_mitsuba import runtime
-    from mrt_mitsuba.scene.open import open_scene
-    from mrt_mitsuba.scene.parameters import set_parameters
+    from mrt_mitsuba.scene.open import open_scene, set_parameters
 
     loaded: dict[tuple[int, str], Any] = {}
     for job in jobs:
