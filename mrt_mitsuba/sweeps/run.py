@@ -5,9 +5,8 @@ from __future__ import annotations
 import itertools
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from concurrent.futures import CancelledError
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +14,8 @@ from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
 from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps.cluster import ClusterError, check_engine, connected, inspect
-from mrt_mitsuba.sweeps.grid import Job, jobs
-from mrt_mitsuba.sweeps.scenes import check_parameters, fingerprint, identify, send
+from mrt_mitsuba.sweeps.jobs import Job, jobs
+from mrt_mitsuba.sweeps.scenes import check_parameters, sent
 from mrt_mitsuba.sweeps.table import Table
 from mrt_mitsuba.sweeps.tiles import assemble, check_tiles, cut
 from mrt_mitsuba.sweeps.worker import (
@@ -92,7 +91,7 @@ def sweep(
     table = Table(folder, tuple(grid or {}), planned)
     shown = TerminalProgress(unit=" pictures") if progress is None else progress
     with TemporaryDirectory(prefix=".mrt-", dir=folder, ignore_cleanup_errors=True) as scratch:
-        pictures = _sent(planned, scratch)
+        pictures = sent(planned, scratch)
         for job in pictures:
             _refuse_to_replace(folder, job.name, job.file in table.earlier, png)
         fresh = {job.name for job in pictures if resume and is_fresh(job, folder, png)}
@@ -110,6 +109,8 @@ def sweep(
         if not rest:
             table.write()
             return table
+        from distributed.client import ClosedClientError
+
         variant, most = options.get("variant") or "", max(1, len(new))
         with connected(cluster, most, workers, dashboard, variant) as (client, count):
             check_parameters(planned)  # while workers start
@@ -117,23 +118,14 @@ def sweep(
             sharing = inspect(client, scratch, count, local)
             setting = Setting(folder, scratch, png, software(), local, sharing)
             table.write()
-            with _explained():
-                _render(_Work(client, setting, retries), parts, rest, new, setting, table, shown)
+            try:
+                _render(client, setting, retries, parts, rest, new, table, shown)
+            except (CancelledError, ClosedClientError, OSError) as error:
+                raise ClusterError(
+                    "the scheduler is gone: start it and its workers, then run the same sweep again; "
+                    "it continues"
+                ) from error
     return table
-
-
-def _sent(jobs: Sequence[Job], scratch: str) -> list[Job]:
-    """Return jobs as workers take them, with their fingerprints; they need no values of the grid."""
-    sent = {key: send(scene, scratch) for key, scene in {id(job.scene): job.scene for job in jobs}.items()}
-    identities = {key: identify(scene) for key, scene in sent.items()}
-    found = []
-    for job in jobs:
-        identity = identities[id(job.scene)]
-        pixels = sorted((key, value) for key, value in job.arguments.items() if key != "memory")
-        made = fingerprint(identity, pixels, versions())
-        scene = sent[id(job.scene)]
-        found.append(replace(job, scene=scene, parameters={}, identity=identity, made_with=made))
-    return found
 
 
 def _refuse_to_replace(folder: str, name: str, listed: bool, png: bool) -> None:
@@ -151,105 +143,76 @@ def _refuse_to_replace(folder: str, name: str, listed: bool, png: bool) -> None:
             )
 
 
-class _Work:
-    """Jobs as the engine has them.
-
-    The engine holds a worker's death against all jobs that it had been given: those that have not begun too
-    often are handed over again.
-    """
-
-    def __init__(self, client: Client, setting: Setting, retries: int) -> None:
-        from distributed import as_completed
-
-        self._client, self._setting, self._retries = client, setting, retries
-        self._calls: dict[Future, tuple[Any, ...]] = {}
-        self._deaths: Counter[str] = Counter()
-        self._coming = as_completed(loop=client.loop)
-
-    def hand_over(self, function: Any, job: Job, *more: Any) -> None:
-        """Let a worker call a function with a job."""
-        name = f"{job.name} {function.__name__} {self._deaths[job.name]}"
-        key = (os.path.basename(self._setting.scratch), name)
-        spare = max(0, self._retries - attempts(job.name, self._setting))
-        future = self._client.submit(function, job, *more, self._setting, key=key, retries=spare, pure=False)
-        self._calls[future] = function, job, *more
-        self._coming.add(future)
-
-    def ended(self) -> Iterator[tuple[Job, dict[str, Any]]]:
-        """Yield jobs as they end, each with its facts by its own account or the engine's."""
-        from distributed import KilledWorker
-
-        for future in self._coming:
-            function, job, *more = self._calls.pop(future)
-            error = future.exception() if future.status == "error" else None
-            if isinstance(error, KilledWorker):
-                self._deaths[job.name] += 1
-                begun = attempts(job.name, self._setting)
-                if begun <= self._retries and self._deaths[job.name] < MOST_DEATHS:
-                    self.hand_over(function, job, *more)
-                    continue
-                text = "every worker that rendered it died, perhaps for want of memory: give each worker more"
-                yield job, {"error": text}
-            elif error is not None:
-                yield job, {"error": " ".join(f"{type(error).__name__}: {error}".split())}
-            else:
-                yield job, dict(future.result())
-            future.release()  # what no one needs is not computed again when its worker goes
-
-    def cancel(self) -> None:
-        """Take back what has not ended."""
-        if self._client.status == "running":
-            self._client.cancel(list(self._calls))
-
-
 def _render(
-    work: _Work,
+    client: Client,
+    setting: Setting,
+    retries: int,
     parts: Mapping[str, Sequence[Job]],
     rest: Sequence[Job],
     new: Sequence[Job],
-    setting: Setting,
     table: Table,
     shown: Progress,
 ) -> None:
     """Let workers render pictures, or their tiles (``parts``, by the picture's name) and put these together;
     each picture's row goes into the table as it ends. ``new``: parts that no earlier sweep left."""
+    from distributed import KilledWorker, as_completed
+
+    calls: dict[Future, tuple[Any, ...]] = {}
+    deaths: Counter[str] = Counter()
+    coming = as_completed(loop=client.loop)
     made: dict[str, dict[str, Any]] = {}
     whole = {part.name: job for job in rest for part in parts[job.name]}
     left = Counter(whole[part.name].name for part in new)
+
+    def hand_over(function: Any, job: Job, *more: Any) -> None:
+        key = (os.path.basename(setting.scratch), f"{job.name} {function.__name__} {deaths[job.name]}")
+        spare = max(0, retries - attempts(job.name, setting))
+        future = client.submit(function, job, *more, setting, key=key, retries=spare, pure=False)
+        calls[future] = function, job, *more
+        coming.add(future)
+
+    def outcome(future: Future) -> tuple[Job, dict[str, Any] | None]:
+        """Facts by the job's own account or the engine's. This holds a worker's death against all jobs that
+        the worker had been given: those not begun too often are handed over again, and have no facts."""
+        function, job, *more = calls.pop(future)
+        error = future.exception() if future.status == "error" else None
+        if error is None:
+            return job, dict(future.result())
+        if not isinstance(error, KilledWorker):
+            return job, {"error": " ".join(f"{type(error).__name__}: {error}".split())}
+        deaths[job.name] += 1
+        if attempts(job.name, setting) <= retries and deaths[job.name] < MOST_DEATHS:
+            hand_over(function, job, *more)
+            return job, None
+        text = "every worker that rendered it died, perhaps for want of memory: give each worker more"
+        return job, {"error": text}
+
+    def ended(job: Job, facts: dict[str, Any]) -> None:
+        picture = whole.get(job.name, job)
+        if picture is job:
+            begun = max(1, *(attempts(part.name, setting) for part in parts[job.name]))
+            table.add(job.name, facts | {"attempts": begun, "versions": named(versions())})
+            return
+        made[job.name] = facts
+        left[picture.name] -= 1
+        if not left[picture.name]:
+            tiles = parts[picture.name]
+            hand_over(assemble, picture, tiles, [made.get(tile.name) for tile in tiles])
+
     try:
         with shown.stage("Sweep", len(new) + sum(job.name not in whole for job in rest)) as advance:
             for part in new:
-                work.hand_over(render_job, part)
+                hand_over(render_job, part)
             for job in rest:
                 if not left[job.name]:
-                    work.hand_over(assemble, job, parts[job.name], [None])
-            for job, facts in work.ended():
-                picture = whole.get(job.name, job)
-                if picture is job:
-                    begun = max(1, *(attempts(part.name, setting) for part in parts[job.name]))
-                    table.add(job.name, facts | {"attempts": begun, "versions": named(versions())})
-                else:
-                    made[job.name] = facts
-                    left[picture.name] -= 1
-                    if not left[picture.name]:
-                        tiles = parts[picture.name]
-                        work.hand_over(assemble, picture, tiles, [made.get(tile.name) for tile in tiles])
-                advance(1)
+                    hand_over(assemble, job, parts[job.name], [None])
+            for future in coming:
+                job, facts = outcome(future)
+                if facts is not None:
+                    ended(job, facts)
+                    advance(1)
+                    future.release()  # what no one needs is not computed again when its worker goes
     finally:
         table.write()
-        work.cancel()
-
-
-@contextmanager
-def _explained() -> Iterator[None]:
-    """Say what it means that the engine does not answer."""
-    from concurrent.futures import CancelledError
-
-    from distributed.client import ClosedClientError
-
-    try:
-        yield
-    except (CancelledError, ClosedClientError, OSError) as error:
-        raise ClusterError(
-            "the scheduler is gone: start it and its workers, then run the same sweep again; it continues"
-        ) from error
+        if client.status == "running":
+            client.cancel(list(calls))

@@ -9,33 +9,44 @@ import os
 import pickle
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, SupportsIndex
 
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.sweeps.grid import Job
+from mrt_mitsuba.runtime import use, versions
+from mrt_mitsuba.scene.open import open_scene, set_parameters
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.sweeps.jobs import Job
 
 SENT = ".scene"  # ending of a scene that is written next to the pictures, for the workers to read
 
 
-def send(scene: Any, folder: str) -> Any:
-    """Return what a worker is given in place of a scene: numbers and paths as they are, anything else in a
-    file in ``folder``.
+def sent(jobs: Sequence[Job], folder: str) -> list[Job]:
+    """Return jobs as workers take them, with their fingerprints; they need no values of the grid.
 
-    Raises ``UsageError`` for a number without a scene and for what cannot leave this process.
+    Scenes that are numbers and paths stay, anything else goes into a file in ``folder``. Raises
+    ``UsageError`` for a number without a scene and for what cannot leave this process.
     """
-    if isinstance(scene, str | os.PathLike):
-        return os.path.abspath(scene)
-    if isinstance(scene, SupportsIndex):
-        from mrt_mitsuba.scene.report import report_scene
-
-        number = operator.index(scene)
-        report_scene(number)
-        return number
-    payload = _encode(scene, "the scene")
-    path = os.path.join(folder, hashlib.sha256(payload).hexdigest()[:32] + SENT)
-    with open(path, "wb") as file:
-        file.write(payload)
-    return path
+    scenes: dict[int, tuple[Any, str]] = {}
+    for key, scene in {id(job.scene): job.scene for job in jobs}.items():
+        if isinstance(scene, str | os.PathLike):
+            scene = os.path.abspath(scene)
+        elif isinstance(scene, SupportsIndex):
+            scene = operator.index(scene)
+            report_scene(scene)
+        else:
+            payload = _encode(scene, "the scene")
+            scene = os.path.join(folder, hashlib.sha256(payload).hexdigest()[:32] + SENT)
+            with open(scene, "wb") as file:
+                file.write(payload)
+        scenes[key] = scene, identify(scene)
+    found = []
+    for job in jobs:
+        scene, identity = scenes[id(job.scene)]
+        pixels = sorted((key, value) for key, value in job.arguments.items() if key != "memory")
+        made = fingerprint(identity, pixels, versions())
+        found.append(replace(job, scene=scene, parameters={}, identity=identity, made_with=made))
+    return found
 
 
 def is_copy(sent: Any) -> bool:
@@ -66,16 +77,13 @@ def identify(sent: Any) -> str:
 
 def check_parameters(jobs: Sequence[Job]) -> None:
     """Raise ``UsageError`` if a job sets what its scene does not have; each scene is loaded once."""
-    from mrt_mitsuba import runtime
-    from mrt_mitsuba.scene.open import open_scene, set_parameters
-
     loaded: dict[tuple[int, str], Any] = {}
     for job in jobs:
         params = job.arguments.get("params", {})
         declared = {name: value for name, value in params.items() if "." not in name}
         which = id(job.scene), repr(declared)
         if params and which not in loaded:
-            runtime.use()
+            use()
             loaded[which] = open_scene(job.scene, params=declared).scene
         if params.keys() > declared.keys():
             set_parameters(loaded[which], {key: params[key] for key in params.keys() - declared.keys()})

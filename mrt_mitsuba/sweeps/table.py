@@ -12,7 +12,7 @@ from typing import Any
 
 from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.output.replacing import check_target, replacing
-from mrt_mitsuba.sweeps.grid import Job, word
+from mrt_mitsuba.sweeps.jobs import Job, word
 
 FACTS = {
     "file": str,

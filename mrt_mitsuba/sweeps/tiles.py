@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import Any
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.sweeps.grid import Job
+from mrt_mitsuba.sweeps.jobs import Job
 from mrt_mitsuba.sweeps.scenes import fingerprint, receive
 from mrt_mitsuba.sweeps.worker import MADE_WITH, Setting, made_with, strips
 

@@ -15,7 +15,7 @@ from mrt_mitsuba.cores import affinity, usable_cores
 from mrt_mitsuba.errors import MrtError
 from mrt_mitsuba.memory import free_memory
 from mrt_mitsuba.options import SMALLEST_MEMORY
-from mrt_mitsuba.sweeps.grid import Job
+from mrt_mitsuba.sweeps.jobs import Job
 from mrt_mitsuba.sweeps.scenes import identify, is_copy, receive
 
 MADE_WITH = "mrt:sweep"  # in the header of each picture: fingerprint of scene, settings and versions
