@@ -11,7 +11,7 @@ from nodes import rgb, sensor
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
-from mrt_mitsuba.validation.tools.precision import Estimate, Point, WorkPrecision, estimate
+from mrt_mitsuba.validation.tools.precision import Point, WorkPrecision, estimate
 from mrt_mitsuba.validation.tools.precision_page import front
 
 for needed in ("matplotlib", "jinja2", "scipy", "flip_evaluator"):
@@ -217,11 +217,6 @@ def test_intervals_cover_what_they_should(count, statistic):
         inside += e.low <= truth <= e.high
     assert inside >= 0.88 * 200
     assert np.isnan(estimate(1, lambda index: index[..., 0] + 1.0).low)
-
-
-def test_estimates_overlap_unless_they_are_apart():
-    a, b, unknown = Estimate(1, 0.5, 1.5), Estimate(2, 1.6, 3), Estimate(1, np.nan, np.nan)
-    assert not a.overlaps(b) and not b.overlaps(a) and a.overlaps(a) and a.overlaps(unknown)
 
 
 # ---------------------------------------------- The command ----------------------------------------------

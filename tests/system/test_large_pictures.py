@@ -38,7 +38,19 @@ def test_bands_cover_every_row_once_and_see_their_neighbours(height: int, rows: 
 # --------------------------------------------- The same bits ---------------------------------------------
 
 SIZE = {"width": 231, "height": 173}  # rows and columns that no part divides
-MODES = list(itertools.product(["none", "luma", "sobel", "geometry"], [None, "report", "corrected"]))
+FOCUS = {"focaldist": 2.0, "focalrange": 0.5}
+WAYS = [
+    *({"aamode": aamode, "dof": dof, **FOCUS, "lattice": "centered" if dof == "corrected" else "report",
+       "layers": ["normal", "reflection", *["edges"] * (aamode != "none"), *["blur"]]}
+      for aamode, dof in itertools.product(["none", "luma", "sobel", "geometry"], ["report", "corrected"])),
+    *({"aamode": aamode, "integrator": "path", "spp": 2, "focaldist": 2.0, "seed": 5}
+      for aamode in ("none", "sobel")),
+    {"aamode": "sobel", "focaldist": 0, "layers": ["samples"]},
+    {"aamode": "sobel", "lattice": "film"},
+    {"aamode": "noise", "spp": 16, "aa": None},
+    {"motion": (0.2, 0, 0.1), "motionsamples": 3, "layers": ["albedo"]},
+    {"motion": (0.2, 0, 0.1), "motionsamples": 3, "motionmode": "stratified"},
+]  # fmt: skip
 
 
 @pytest.fixture
@@ -62,36 +74,18 @@ def assert_same(one: mrt.Result, other: mrt.Result) -> None:
 
 
 @pytest.mark.usefixtures("threads")
-@pytest.mark.parametrize(("aamode", "dof"), MODES)
-def test_parts_and_threads_do_not_change_a_bit(
-    monkeypatch: pytest.MonkeyPatch, aamode: str, dof: str | None
-) -> None:
-    focus = {"dof": dof, "focaldist": 2.0, "focalrange": 0.5} if dof else {"focaldist": 0}
-    lattice = "centered" if dof == "corrected" else "report"
-    layers = ["normal", "reflection", "samples"] + ["edges"] * (aamode != "none") + ["blur"] * bool(dof)
-    options = {**SIZE, **focus, "aa": 2, "aamode": aamode, "lattice": lattice, "layers": layers}
+@pytest.mark.parametrize("options", WAYS, ids=str)
+def test_parts_and_threads_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch, options: dict) -> None:
+    scene = mrt.scene_dict(3, **SIZE) if "integrator" in options else 3
+    options = {**({} if "integrator" in options else SIZE), "aa": 2, "count_rays": True, **options}
     dr.set_thread_count(2)
-    whole = mrt.render(3, **options, count_rays=True)
+    whole = mrt.render(scene, **options)
     for count, pixels, rays in ((1, 41 * 231, 30_011), (2, 100 * 231, 2**23), (1, 2**22, 2**23)):
         dr.set_thread_count(count)
         in_parts(monkeypatch, pixels, rays)
-        assert_same(mrt.render(3, **options, count_rays=True), whole)
-
-
-def test_frames_in_parts_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    options = {**SIZE, "aa": 2, "motion": [0.2, 0.0, 0.1], "motionsamples": 3, "layers": ["albedo"]}
-    whole = mrt.render(3, **options)
-    in_parts(monkeypatch, 50 * 231, 50_000)
-    assert_same(mrt.render(3, **options), whole)
-
-
-@pytest.mark.parametrize("aamode", ["none", "sobel"])
-def test_random_numbers_do_not_depend_on_the_parts(monkeypatch: pytest.MonkeyPatch, aamode: str) -> None:
-    scene = mrt.scene_dict(3, **SIZE)
-    options = {"aa": 2, "aamode": aamode, "integrator": "path", "spp": 2, "focaldist": 2.0, "seed": 5}
-    whole = mrt.render(scene, **options)
-    in_parts(monkeypatch, 30 * 231, 50_000)
-    assert_same(mrt.render(scene, **options), whole)
+        parts = mrt.render(scene, **options)
+        assert_same(parts, whole)
+        assert rays == 2**23 or parts.kernel_launches > whole.kernel_launches
 
 
 # ------------------------------------------------ Memory ------------------------------------------------

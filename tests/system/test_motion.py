@@ -173,17 +173,6 @@ def test_stratified_and_frames_agree(aamode, lattice, moments):
     assert stratified.rays["primary"] < 0.3 * frames.rays["primary"]
 
 
-def test_stratified_error_falls_faster_than_random_times_would():
-    """Strata: between 1/n (smooth) and 1/n^0.75 (edges) in the error; independent times would give 1/√n."""
-    options = {**SMALL, "aa": 1, "aamode": "none", "motion": WAY}
-    truth = mrt.render(0, **options, motionsamples=512, motionmode="stratified", seed=99).image
-    counts = np.array([4, 16, 64])
-    found = [mrt.render(0, **options, motionsamples=int(n), motionmode="stratified").image for n in counts]
-    errors = [np.sqrt(np.mean((image - truth) ** 2)) for image in found]
-    slope = np.polyfit(np.log(counts), np.log(errors), 1)[0]
-    assert -1.2 < slope < -0.6
-
-
 def test_a_detector_sees_no_noise_in_a_stratified_picture():
     """Unrefined pixels are the centre at n moments, the same in every pixel."""
     options = {**SMALL, "aa": 2, "motion": WAY, "motionsamples": 8, "motionmode": "stratified"}

@@ -410,6 +410,7 @@ def test_objects_of_another_variant_are_named() -> None:
 
 
 UP = {"type": "mrt_plane", "normal": [0, 1, 0]}
+TIP = {"type": "mrt_cone", "apex": [0, 0, 1], "base_center": [0, 0, 0]}
 PLUGINS: list[tuple[dict[str, Any], str]] = [
     ({"type": "mrt_bsdf", "alpha": NAN}, '"alpha" is nan, but must be a finite number'),
     ({"type": "mrt_bsdf", "alpha": 1e39}, '"alpha" is 1e+39, but must be a finite number'),
@@ -444,6 +445,15 @@ PLUGINS: list[tuple[dict[str, Any], str]] = [
     ({"type": "mrt_texture"}, "give one of"),
     ({"type": "mrt_texture", "filename": "nothing.png"}, "nothing.png"),
     ({"type": "mrt_texture", "bitmap": 3}, '"bitmap" is 3, but must be a mi.Bitmap'),
+    ({"type": "mrt_cone"}, '"apex" is missing'),
+    ({"type": "mrt_cone", "apex": [0, 0, 1]}, '"base_center" is missing'),
+    (TIP | {"radius": -1.0}, '"radius" is -1'),
+    (TIP | {"radius": NAN}, '"radius" is nan'),
+    (TIP | {"segments": 2}, '"segments" is 2, but must be an integer from 3 to 65536'),
+    (TIP | {"segments": 10**8}, "from 3 to 65536"),
+    (TIP | {"apex": [0, 0, 0]}, "two points"),
+    (TIP | {"capped": 1}, "true or false"),
+    (TIP | {"to_world": mi.scalar_rgb.ScalarTransform4f().scale([0.0, 1, 1])}, "not invertible"),
 ]
 
 
@@ -456,11 +466,15 @@ def test_plugins_name_the_parameter(variant: str, plugin: dict[str, Any], text: 
 
 
 CORNERS = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
+ONE = np.array([[0, 0, 0, 1]], np.float32)
 
 
 @pytest.mark.parametrize(
     ("arrays", "text"),
     [
+        ({"faces": None}, '"faces" must be'),
+        ({"positions": CORNERS[0]}, '"positions" has the shape'),
+        ({"faces": np.array([[[0, 1, 3]]], np.uint32)}, '"faces" holds 3, but there are 3'),
         ({"positions": CORNERS * np.float32(np.nan)}, '"positions" holds a number that is not finite'),
         ({"positions": CORNERS[:, :, :2]}, "must have [1, N, 3]"),
         ({"texcoords": CORNERS[:, :2]}, '"texcoords" has 2 entries for 3 positions'),
@@ -470,5 +484,24 @@ CORNERS = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
 )
 def test_meshes_name_the_array(variant: str, arrays: dict[str, np.ndarray], text: str) -> None:
     arrays = {"positions": CORNERS, "faces": np.array([[[0, 1, 2]]], np.uint32), **arrays}
+    bitmaps = {name: mi.Bitmap(array) for name, array in arrays.items() if array is not None}
     with pytest.raises(RuntimeError, match=re.escape(text)):
-        mi.load_dict({"type": "mrt_mesh", **{name: mi.Bitmap(array) for name, array in arrays.items()}})
+        mi.load_dict({"type": "mrt_mesh", **bitmaps})
+
+
+@pytest.mark.parametrize(
+    ("keys", "text"),
+    [
+        ({}, '"numbers" must be a mi.Bitmap'),
+        ({"numbers": ONE[:, :3]}, "3 numbers for an object, but must have 4"),
+        ({"numbers": -ONE}, "row 0 of .*radius"),
+        ({"numbers": ONE * np.float32("nan")}, "row 0 of .*not finite"),
+        ({"numbers": np.ones((1, 7), np.float32), "kind": "cone"}, "axis of no length"),
+        ({"numbers": ONE, "face_x": np.ones((2, 1), np.float32)}, "has 2 rows for 1 objects"),
+        ({"numbers": ONE, "kind": "cube"}, "sphere, cone, cylinder"),
+    ],
+)
+def test_groups_name_the_array(variant: str, keys: dict[str, Any], text: str) -> None:
+    bitmaps = {name: mi.Bitmap(v) if isinstance(v, np.ndarray) else v for name, v in keys.items()}
+    with pytest.raises(RuntimeError, match=f"mrt_group.*{text}"):
+        mi.load_dict({"type": "mrt_group", **bitmaps})

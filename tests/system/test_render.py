@@ -88,52 +88,30 @@ def test_no_focal_distance_means_no_depth_kept():
     assert result.kernel_launches < blurred.kernel_launches <= result.kernel_launches + 10
 
 
-def test_all_in_focus_is_not_blurred():
-    """Inside a room, with a range as wide as that: kernels and picture are those without a focal distance."""
-    (floor,) = report_scene(0).planes
-    wall = dataclasses.replace(floor, normal=(1, 0, 0), distance=20)
-    room = dataclasses.replace(report_scene(0), planes=(floor, wall))
-    options = {**SMALL, "aa": 1, "aamode": "none"}
-    sharp = mrt.render(room, **options, focaldist=0, layers=["depth"])
-    for dof in ("report", "corrected"):
-        focused = mrt.render(room, **options, focaldist=1.0, focalrange=1e6, dof=dof)
-        assert "depth of field" not in _omitted(focused)
-        assert focused.kernel_launches == sharp.kernel_launches
-        assert np.array_equal(focused.image, sharp.image)
-
-
 def test_aa_1_has_no_edge_pass_unless_edges_are_asked_for():
     assert "edge pass" in _omitted(mrt.render(0, **SMALL, aa=1, aamode="sobel"))
     asked = mrt.render(0, **SMALL, aa=1, aamode="sobel", layers=["edges"])
     assert asked.layers["edges.Y"].max() > 0 and asked.rays["primary"] == 160 * 120
 
 
+@pytest.mark.parametrize("lattice", ["report", "centered"])
+@pytest.mark.parametrize("aa", [2, 3])
+def test_edge_pixels_hold_the_whole_lattice_and_others_their_first_ray(lattice, aa):
+    options = {**SMALL, "aa": aa, "lattice": lattice, "focaldist": 0}
+    found, whole = (mrt.render(0, **options, aamode=mode) for mode in ("sobel", "none"))
+    edges = found.layers["samples.Y"] > 1
+    assert 0 < edges.mean() < 0.5
+    # sums in two parts, of values up to one
+    np.testing.assert_allclose(found.image[edges], whole.image[edges], atol=1e-6)
+    if lattice == "centered":
+        single = mrt.render(0, **{**options, "aa": 1}, aamode="none").image
+        np.testing.assert_allclose(found.image[~edges], single[~edges], atol=1e-6)
+
+
 # ------------------------------------------ The same picture ------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"aamode": "none", "layers": ["normal", "bounces"], "focaldist": 2.0},
-        {"aamode": "sobel"},
-        {"lattice": "film", "aamode": "sobel"},
-        {"aamode": "noise", "spp": 16},
-        {"motion": (0.3, 0.1, 0), "motionsamples": 3, "motionmode": "stratified"},
-    ],
-    ids=str,
-)
-def test_splitting_wavefronts_changes_nothing(options, monkeypatch):
-    options = {"width": 40, "height": 30, "aa": None if options.get("spp") else 2, **options}
-    whole = mrt.render(3, **options)
-    monkeypatch.setattr("mrt_mitsuba.memory.MOST_RAYS", 1000)
-    parts = mrt.render(3, **options)
-    assert parts.rays == whole.rays and parts.kernel_launches > whole.kernel_launches
-    np.testing.assert_array_equal(parts.image, whole.image)
-    for name, values in whole.layers.items():
-        np.testing.assert_array_equal(parts.layers[name], values, err_msg=name)
-
-
-@pytest.mark.parametrize("number", SCENES)
+@pytest.mark.parametrize("number", [*SCENES, 9])
 def test_scalar_variant_draws_the_same_picture(number):
     """Sums in another order and fused operations differ in the last digits; a flipped shadow decision is a
     whole light."""
@@ -313,4 +291,6 @@ def test_depth_is_the_distance_from_the_eye():
     result = mrt.render(0, width=101, height=75, aa=1, aamode="none", layers=["depth"])
     descent = 0.7 / np.hypot(3, 0.7)  # for each unit along the ray
     # the eye is one unit up; float32 camera rays are good to a few 1e-7
-    assert result.layers["depth.Z"][37, 50] == pytest.approx(1 / descent, rel=1e-6)
+    depth = result.layers["depth.Z"]
+    assert depth[37, 50] == pytest.approx(1 / descent, rel=1e-6)
+    assert np.isinf(depth[0]).all()  # the sky

@@ -8,6 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import sensor
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -98,6 +99,30 @@ def test_mirrors_follow_the_interpolated_normal() -> None:
     found = radiance({"mesh": mesh, "wall": wall, "light": light}, (0, 0, 5), (0, 0, -1))
     # straight across from the light: cos 0, the diffuse part alone
     np.testing.assert_allclose(found, 0.5 / np.pi, rtol=1e-4)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+def test_a_plane_hides_lights_behind_it_only(scale: float) -> None:
+    floor = {**FLOOR, "bsdf": MATTE}
+    for height, lit in ((0.5, False), (1.5, True)):
+        wall = {"type": "mrt_plane", "normal": [0, 0, -1], "distance": height * scale}
+        light = {"type": "mrt_light", "position": [0, 0, scale]}
+        d = np.array([1, 0, -0.2])
+        found = radiance({"floor": floor, "wall": wall, "light": light}, -0.1 * scale * d, d)
+        assert (found > 0.1).all() if lit else (found == 0).all()
+
+
+@pytest.mark.parametrize("kind", ["rectangle", "sphere", "disk"])
+def test_a_lamp_is_not_in_its_own_shadow(kind: str) -> None:
+    place = mi.ScalarTransform4f().translate([0.3, 0.2, 3]).rotate([1, 0, 0], 180)
+    scene = mi.load_dict({
+        "type": "scene",
+        "integrator": WHITTED,
+        "sensor": sensor([0, 0, 1], [0, 0, 0], (32, 24)),
+        "floor": {**FLOOR, "bsdf": MATTE},
+        "lamp": {"type": kind, "to_world": place, "emitter": {"type": "area", "radiance": 1.0}},
+    })  # fmt: skip
+    assert (np.array(mi.render(scene, spp=1)) > 1e-3).all()
 
 
 @pytest.mark.parametrize("f0", [0.0, 0.02])

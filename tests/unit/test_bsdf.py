@@ -184,29 +184,6 @@ def test_flags(variant: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("diffuse", "specular"),
-    [
-        (lambda: context(0), lambda: context(1)),
-        (
-            lambda: context(flags=mi.BSDFFlags.DiffuseReflection),
-            lambda: context(flags=mi.BSDFFlags.GlossyReflection),
-        ),
-    ],
-)
-def test_context_selects_lobes(diffuse, specular) -> None:
-    wi, wo = lobe_pairs(1000, 0.4)
-    b = colored(alpha=0.4)
-    whole, _ = evaluate(b, wi, wo)
-    parts = [evaluate(b, wi, wo, ctx()) for ctx in (diffuse, specular)]
-    np.testing.assert_allclose(parts[0][0] + parts[1][0], whole, rtol=1e-6)  # one rounding of the sum
-    np.testing.assert_allclose(parts[0][0], np.outer(wo[:, 2], KD) / np.pi, rtol=1e-6)
-    np.testing.assert_allclose(parts[0][1], wo[:, 2] / np.pi, rtol=1e-6)
-    wi = at_angle(40)
-    assert (draw(b, wi, 100, context(5)).weight == 0).all()
-    assert (evaluate(b, *lobe_pairs(10, 0.4), context(5))[0] == 0).all()
-
-
-@pytest.mark.parametrize(
     ("diffuse", "specular", "share"), [((1, 1, 1), (1, 1, 1), 0.5), ((0.5, 0, 0), (0, 1, 1), 0.8)]
 )
 def test_lobes_are_chosen_by_their_mean_reflectance(diffuse: tuple, specular: tuple, share: float) -> None:
@@ -318,46 +295,6 @@ def test_mirror_reflectance_is_ks_times_fresnel(form: str) -> None:
     assert max(KS) >= b.mirror_bound().reflectance >= max(KS) * 0.999
     bright = bsdf(f0=rgb((3, 1, 1)))
     assert bright.mirror_bound().reflectance >= 2.99  # an F₀ above 1 is allowed, and the bound knows
-
-
-@pytest.mark.parametrize("key", ["int_ior", "diffuse_reflectance.value", "specular_reflectance.value"])
-def test_derivatives_are_those_of_the_picture(key: str) -> None:
-    """A wall under a white sky: samples that moved with the parameters would take 2 % of it away.
-
-    A million rays leave 0.2 % of noise, differences of pictures of the same rays 0.1 %.
-    """
-    look = mi.ScalarTransform4f().look_at([3, 0, 3], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}}
-    material = {"type": "mrt_bsdf", "alpha": 0.4, "int_ior": 1.8, "fresnel": "dielectric"}
-    colors = {"diffuse_reflectance": 0.4, "specular_reflectance": 0.9}
-    scene = mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "direct"},
-        "sensor": {"type": "perspective", "fov": 20, "to_world": look, "film": film},
-        "wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(9), "bsdf": material | colors},
-        "sky": {"type": "constant", "radiance": 1.0},
-    })  # fmt: skip
-    parameters = mi.traverse(scene)
-    key = f"wall.bsdf.{key}"
-    middle = mi.Float(parameters[key])
-
-    def mean(shift: Any) -> Any:
-        parameters[key] = middle + shift
-        parameters.update()
-        return dr.mean(mi.render(scene, parameters, spp=2**16, seed=7, seed_grad=8).array)
-
-    difference = (mean(0.02)[0] - mean(-0.02)[0]) / 0.04
-    for enter in (dr.forward_to, dr.backward):
-        shift = mi.Float(0)
-        dr.enable_grad(shift)
-        found = mean(shift)
-        if enter is dr.backward:
-            enter(found)
-            derivative = dr.grad(shift)
-        else:
-            dr.set_grad(shift, 1)
-            derivative = enter(found)
-        assert derivative[0] == pytest.approx(difference, rel=8e-3)
 
 
 # -------------------------------------------- Extreme values -------------------------------------------

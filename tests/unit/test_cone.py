@@ -159,26 +159,3 @@ def test_scenes_keep_the_shapes_apart() -> None:
            for name in SHAPES for i in range(3)},
     })  # fmt: skip
     assert sorted(s.kind for s in scene.shapes()) == ["cone"] * 3 + ["cylinder"] * 3
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"radius": -1.0}, ["mrt_cone", "radius", "-1", "> 0"]),
-        ({"radius": float("nan")}, ["radius", "nan", "> 0"]),
-        ({"segments": 2}, ["segments", "2", "from 3 to 65536"]),
-        ({"segments": 10**8}, ["segments", "100000000", "from 3 to 65536"]),
-        ({"apex": [0.5, 0.4, 0.3]}, ["apex", "base_center", "two points"]),
-        ({"capped": 1}, ["capped", "true or false"]),
-        ({"apex": None}, ['"apex" is missing']),
-        ({"base_center": None}, ['"base_center" is missing']),
-        ({"to_world": [0.0, 1.0, 1.0]}, ["to_world", "not invertible"]),
-    ],
-)
-def test_wrong_parameters_are_named(change: dict, words: list[str]) -> None:
-    if "to_world" in change:
-        change = {"to_world": mi.ScalarTransform4f().scale(change["to_world"])}
-    with pytest.raises(RuntimeError) as error:
-        mi.load_dict({key: x for key, x in (SHAPES["cone"] | change).items() if x is not None})
-    for word in words:
-        assert word in str(error.value)

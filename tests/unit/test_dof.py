@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Any
 
 import drjit as dr
@@ -116,32 +115,6 @@ def test_report_equals_the_loops(
         np.array(found), reference.gaussian_dof(image, amount), atol=REPORT_TOLERANCE, rtol=0
     )
     np.testing.assert_array_equal(np.array(found)[amount < 1], image[amount < 1])
-
-
-def launches(filter_: Callable[[], Any]) -> list[int]:
-    """Return the widths of the kernels that a call runs."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        filter_()
-        return [entry["size"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
-
-
-@needs_llvm
-def test_report_runs_only_what_is_needed() -> None:
-    image, amount = tensor("llvm", colours((60, 80), 0)), np.zeros((60, 80))
-
-    def small_launches() -> set[int]:
-        depth = tensor("llvm", far(amount=amount))
-        sizes = launches(lambda: gaussian_dof(image, depth, focal_distance=1.0, focal_range=0))
-        assert max(sizes) == 60 * 80  # the maps of amounts and sizes, once for all
-        return set(sizes) - {60 * 80}
-
-    assert small_launches() == set()
-    amount[30, 40:43] = 4.5
-    # along columns the three pixels themselves, along rows the eight rows of their windows
-    assert small_launches() == {3, 3 * 8}
-    amount[10, 10] = 7
-    assert small_launches() == {3 + 1, 3 * 8 + 14}  # in the same launches
 
 
 # ---- both modes ----
@@ -275,20 +248,6 @@ def test_a_point_becomes_a_disc_of_the_stated_size(amount: float, side: Callable
     assert (found * column**2).sum() == pytest.approx((2 * amount - 1) / 4, rel=0.1)
 
 
-def test_no_steps_in_the_amount() -> None:
-    """Blurring a little more changes the picture a little; the report's filter jumps wherever k steps."""
-    image = colours((16, 16), 2)
-
-    def largest_change(mode: str, frames: int) -> float:
-        depths = [np.full((16, 16), far(amount=a)) for a in np.linspace(0, 3, frames)]
-        pictures = [blurred(image, depth, mode=mode) for depth in depths]
-        return max(np.abs(b - a).max() for a, b in pairwise(pictures))
-
-    coarse, fine = largest_change("corrected", 61), largest_change("corrected", 121)
-    assert fine < 0.6 * coarse  # half the step, half the change, and a little for its curvature
-    assert largest_change("report", 121) > 10 * fine
-
-
 def test_a_foreground_covers_no_more_than_all() -> None:
     """Small discs close by and large ones around them: their shares at the pixel between them exceed one."""
     image = np.zeros((21, 21, 3))
@@ -299,13 +258,3 @@ def test_a_foreground_covers_no_more_than_all() -> None:
     found = blurred(image, depth, focal_distance=10.0, mode="corrected")
     assert found[10, 10].tolist() == [0, 0, 0]  # hidden, and not more than hidden
     assert found.min() == 0
-
-
-@needs_llvm
-def test_corrected_computes_only_what_a_disc_reaches() -> None:
-    image, amount = tensor("llvm", colours((60, 80), 0)), np.zeros((60, 80))
-    amount[30, 40] = 8
-    depth = tensor("llvm", far(amount=amount))
-    sizes = launches(lambda: gaussian_dof(image, depth, focal_distance=1.0, focal_range=0, mode="corrected"))
-    assert 9 * 9 in sizes  # the largest disc reaches four pixels each way
-    assert set(sizes) <= {81, 60 * 80, 3 * 60 * 80}

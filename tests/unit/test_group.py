@@ -129,24 +129,3 @@ def test_texture_coordinates_of_a_sphere_are_mitsubas() -> None:
     found, expected = np.array(hit.si.uv), np.array(sphere.ray_intersect(ray).uv)
     assert np.array(hit.found).mean() > 0.9
     np.testing.assert_allclose(found[:, np.array(hit.found)], expected[:, np.array(hit.found)], atol=1e-3)
-
-
-ONE = np.array([[0, 0, 0, 1]], np.float32)
-
-
-@pytest.mark.parametrize(
-    ("keys", "words"),
-    [
-        ({}, '"numbers" must be a mi.Bitmap'),
-        ({"numbers": ONE[:, :3]}, "3 numbers for an object, but must have 4"),
-        ({"numbers": -ONE}, "row 0 of .*radius"),
-        ({"numbers": ONE * np.float32("nan")}, "row 0 of .*not finite"),
-        ({"numbers": np.ones((1, 7), np.float32), "kind": "cone"}, "axis of no length"),
-        ({"numbers": ONE, "face_x": np.ones((2, 1), np.float32)}, "has 2 rows for 1 objects"),
-        ({"numbers": ONE, "kind": "cube"}, "sphere, cone, cylinder"),
-    ],
-)
-def test_wrong_parameters_are_named(keys: dict, words: str) -> None:
-    bitmaps = {name: mi.Bitmap(v) if isinstance(v, np.ndarray) else v for name, v in keys.items()}
-    with pytest.raises(RuntimeError, match=f"mrt_group.*{words}"):
-        mi.load_dict({"type": "mrt_group", **bitmaps})

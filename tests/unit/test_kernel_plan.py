@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from nodes import sensor
 
-from mrt_mitsuba.plugins.kernel_plan import RULES, CutOff, KernelPlan
+from mrt_mitsuba.plugins.kernel_plan import RULES, CutOff, KernelPlan, held
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -116,7 +116,11 @@ def test_kernel_obeys(name: str) -> None:
         return
     assert getattr(plan, name) != other
     image, kernels = kernel(loaded)
-    integrator.kernel_plan = lambda facts: replace(plan, **{name: other})
+    turned = replace(plan, **{name: other})
+    assert held(turned, facts := integrator.scene_facts(loaded)) != held(
+        plan, facts
+    )  # as ``plan=show`` tells
+    integrator.kernel_plan = lambda facts: turned
     changed, other_kernels = kernel(loaded)
     assert kernels != other_kernels
     if same:
@@ -155,6 +159,7 @@ def test_kernel_obeys(name: str) -> None:
             "max_depth admits no mirror ray",
         ),
         ({"a": SPHERE}, "textures", "every material is uniform"),
+        ({"a": SPHERE}, "shading_frames", "no mesh in the scene"),
         ({"a": GROUP}, "textures", "every material is uniform"),
         ({"a": SPHERE}, "tangents", "no material depends on the direction of texture coordinates"),
         (

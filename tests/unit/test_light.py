@@ -86,12 +86,6 @@ def test_at_its_own_place_it_has_some_direction(variant: str) -> None:
     np.testing.assert_allclose(spectrum(weight), stock_spectrum(1.0), rtol=1e-6)
 
 
-def test_colour() -> None:
-    color = {"type": "rgb", "value": [3.0, 0.5, 0.0]}
-    _, weight = light(intensity=color).sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
-    np.testing.assert_allclose(spectrum(weight), [3, 0.5, 0], rtol=1e-6)
-
-
 @pytest.mark.parametrize("variant", ["llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"], indirect=True)
 def test_light_is_unpolarised(variant: str) -> None:
     _, weight = light().sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
@@ -114,18 +108,6 @@ def lit_floor(emitter: dict[str, Any], integrator: str, *more: dict[str, Any]) -
     }
     scene |= {f"more_{i}": thing for i, thing in enumerate(more)}
     return np.array(mi.render(mi.load_dict(scene), spp=4))[0, 0]
-
-
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
-@pytest.mark.parametrize("integrator", ["direct", "path"])
-def test_stock_integrators_see_no_falloff(variant: str, integrator: str) -> None:
-    """Radiance of a white diffuse floor: intensity cos θ / π, near and far; a stock point light falls off."""
-    for distance in (0.5, 50):
-        position = [0, 0.6 * distance, 0.8 * distance]
-        ours = lit_floor({"type": "mrt_light", "position": position, "intensity": 3.0}, integrator)
-        assert ours == pytest.approx(3 * 0.8 / np.pi, rel=1e-3)  # the pixel is 9e-4 wide
-        stock = {"type": "point", "position": position, "intensity": 3.0 * distance**2}
-        assert lit_floor(stock, integrator) == pytest.approx(ours, rel=4e-3)  # which its falloff squares
 
 
 def test_things_in_between_cast_a_shadow() -> None:
@@ -159,24 +141,6 @@ def test_parameters_can_be_updated(variant: str) -> None:
     np.testing.assert_allclose(entries(ds.d), [0, 0, 1])
     np.testing.assert_allclose(spectrum(weight), stock_spectrum(1.0 if mi.is_spectral else 4.0), rtol=1e-6)
     assert list(it.bbox().min) == [0, 0, 2]
-
-
-def test_gradients() -> None:
-    """Derivatives of a floor's cosine by the light's height, and of its light by the intensity."""
-    it = light(position=[3, 0, 4], intensity=2.0)
-    parameters = mi.traverse(it)
-    position = mi.Point3f(3, 0, 4)
-    intensity = mi.Float(2)
-    dr.enable_grad(position, intensity)
-    parameters["position"], parameters["intensity.value"] = position, intensity
-    parameters.update()
-    ds, weight = it.sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
-    dr.backward(ds.d.z * weight.x)
-    # cos = z / √(x² + z²): ∂/∂x = −x z / r³, ∂/∂z = x² / r³; times 2
-    np.testing.assert_allclose(
-        np.array(dr.grad(position)).ravel(), [2 * -12 / 125, 0, 2 * 9 / 125], rtol=1e-5
-    )
-    np.testing.assert_allclose(np.array(dr.grad(intensity)), 0.8, rtol=1e-6)
 
 
 @in_variants

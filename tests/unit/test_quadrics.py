@@ -14,19 +14,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import mrt_mitsuba as mrt
 from mrt_mitsuba.plugins import intersect
 from mrt_mitsuba.plugins.intersect import BASE, LATERAL, TOP
 from mrt_mitsuba.plugins.quadric_kinds import KINDS
 from mrt_mitsuba.plugins.quadrics import Quadrics
-from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
+from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Scene
 from mrt_mitsuba.validation.oracles import reference
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 V = dr.scalar.Array3f64
 MATTE = Material(0.5, 0.5, (0, 0, 0), (0.8, 0.8, 0.8))
-GLOSSY = Material(1.5, 0.2, (0.5, 0.5, 0.5), (0.3, 0.4, 0.5))
 # Apex or upper end at (0, 0, 1), base disc of radius 1 in the plane z = 0
 UNIT = {kind: KINDS[kind].frame(V(0, 0, 1), V(0, 0, 0), 1.0) for kind in ("cone", "cylinder")}
 
@@ -233,44 +231,6 @@ def test_equal_objects_in_one_place_hide_nothing() -> None:
 
 
 # ------------------------------------------------- Scenes -------------------------------------------------
-
-
-def everything(material: Material = GLOSSY) -> Scene:
-    small = Cone((2, 0, 0), (1.2, 0.5, 0.1), 0.4, MATTE)
-    return Scene(
-        camera=Camera((3, 2, 4), (0, 0.4, 0)),
-        sky=(0.2, 0.3, 0.7),
-        lights=(Light((3, 5, 1), (1.5, 1.5, 1.5)), Light((-2, 4, 5), (1, 1, 1))),
-        spheres=(Sphere((0.2, 0.4, 1.2), 0.4, material),),
-        planes=(Plane((0, 1, 0), 0, material),),
-        cones=(Cone((-0.5, 1.5, 0), (-0.4, 0, 0.1), 0.6, material), small),
-        cylinders=(Cylinder((1, 0, -1), (0.7, 1.2, -1), 0.4, material),),
-    )
-
-
-def test_variants_agree() -> None:
-    scalar, vector = (
-        mrt.render(everything(), width=60, height=40, aa=1, variant=name).image
-        for name in ("scalar_rgb", "llvm_ad_rgb")
-    )
-    # float32 both: but for a pixel at a silhouette or a shadow's edge, roundings only
-    assert np.quantile(np.abs(scalar - vector), 0.995) < 1e-4
-
-
-def test_exact_shapes_look_like_fine_meshes() -> None:
-    """Against the meshes that other integrators see, through ``direct``: one light, no mirrors, no clamp."""
-    left_out = ("sky", "light_1", "plane_0", "integrator")
-    nodes = everything(MATTE).to_dict(width=160, height=120)
-    nodes = {name: node for name, node in nodes.items() if name not in left_out}
-    for node in nodes.values():
-        if isinstance(node, dict) and node["type"] in ("mrt_cone", "mrt_cylinder"):
-            node["segments"] = 1024
-    exact = mrt.render(nodes, aa=1, integrator={"type": "mrt_whitted", "clamp": False}).image
-    mesh = mrt.render(nodes, aa=1, integrator="direct").image
-    assert exact.max() > 0.2
-    # The normals of a mesh are wrong near an apex, by half a turn of 2π/1024
-    assert np.quantile(np.abs(exact - mesh), 0.97) < 2e-3
-    assert np.abs(exact.mean() / mesh.mean() - 1) < 5e-3
 
 
 def test_kernel_does_not_grow_with_the_number_of_cones() -> None:

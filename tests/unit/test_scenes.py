@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -15,22 +14,13 @@ from mrt_mitsuba.scene import shapes as models
 from mrt_mitsuba.scene.model import Material, Mesh, Scene
 from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL
 from mrt_mitsuba.scene.placement import obj_scene
-from mrt_mitsuba.scene.report import NUMBERS, c_rand, report_scene
+from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
 REPORT = (0, 1, 2, 3, 4, 9)
 SIZE = {"width": 96, "height": 72, "aa": 1}
 
 
 # ---- the report's scenes ----
-
-
-def test_c_rand_is_the_c_librarys() -> None:
-    """The well-known first numbers of glibc's rand() without a seed, a far one, and those of another seed."""
-    first = [1804289383, 846930886, 1681692777, 1714636915, 1957747793, 424238335, 719885386, 1649760492]
-    assert list(islice(c_rand(), 8)) == first
-    assert next(islice(c_rand(), 9_999, None)) == 1908609430
-    assert list(islice(c_rand(42), 3)) == [71876166, 708592740, 1483128881]
-    assert all(0 <= x < 2**31 for x in islice(c_rand(), 1000))
 
 
 def numbers_of(scene: Scene) -> list[float]:

@@ -30,44 +30,6 @@ def test_large_surfaces_near_the_origin_have_no_dark_spots(variant: str, kind: s
     assert (render(scene, aa=1, lattice="report").image > 0.02).all()
 
 
-def test_moving_a_sphere_has_the_right_derivative(variant: str) -> None:
-    """The derivative of the light along fixed rays is that of central differences."""
-    integrator = mi.load_dict(
-        {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
-    )
-    rng = np.random.default_rng(1)
-    o = np.tile([0.0, 0.0, 4.0], (200, 1))
-    d = rng.uniform(-0.5, 0.5, (200, 3)) - o
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-
-    def light(x: mi.Float) -> tuple[mi.Float, mi.Scene]:
-        scene = mi.load_dict(
-            {
-                "type": "scene",
-                "sphere": {"type": "sphere", "bsdf": {"type": "mrt_bsdf", "alpha": 0.3}},
-                "light": {"type": "mrt_light", "position": [2, 3, 4]},
-            }
-        )
-        parameters = mi.traverse(scene)
-        parameters["sphere.to_world"] = mi.Transform4f().translate(mi.Point3f(x, 0.5 * x, 0))
-        parameters.update()
-        found = integrator.trace(scene, None, mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T))).direct[0]
-        dr.eval(found)
-        return found, scene  # which must outlive derivatives
-
-    x, step = mi.Float(0), 1e-2
-    dr.enable_grad(x)
-    found, scene = light(x)
-    dr.forward(x)
-    derivative = np.array(dr.grad(found))
-    del scene
-    after, before = (np.array(light(mi.Float(shift))[0]) for shift in (step, -step))
-    differences = (after - before) / (2 * step)
-    assert np.abs(differences).max() > 0.1
-    # step² times a third derivative of about 10; with the hit held on the sphere as it was, 1e-2 are missing
-    np.testing.assert_allclose(derivative, differences, atol=1e-3)
-
-
 def floor(kind: str, half: float, turn: mi.ScalarTransform4f) -> dict[str, Any]:
     if kind == "rectangle":
         return {"type": "rectangle", "to_world": turn.scale([half, half, 1])}

@@ -120,19 +120,3 @@ def test_mesh_from_arrays() -> None:
     )
     assert (mesh.vertex_count(), mesh.face_count(), mesh.surface_area()[0]) == (4, 2, 4)
     assert not mesh.has_vertex_normals() and not mesh.has_vertex_texcoords()
-
-
-@pytest.mark.parametrize(
-    ("keys", "words"),
-    [
-        ({"positions": SQUARE[None]}, '"faces" must be'),
-        ({"positions": SQUARE, "faces": FACES[None]}, '"positions" has the shape'),
-        (
-            {"positions": SQUARE[None], "faces": FACES[None] + np.uint32(2)},
-            '"faces" holds 5, but there are 4',
-        ),
-    ],
-)
-def test_wrong_arrays_are_named(keys: dict, words: str) -> None:
-    with pytest.raises(RuntimeError, match=words):
-        mi.load_dict({"type": "mrt_mesh", **{name: mi.Bitmap(array) for name, array in keys.items()}})
