@@ -49,6 +49,14 @@ class Case:
     points: Array
     rng: np.random.Generator
 
+    @staticmethod
+    def within(scene: Any, emitter: Any, rng: np.random.Generator) -> Case:
+        """Return a case with points in and about the box of a scene."""
+        box = scene.bbox()
+        low, high = (np.nan_to_num(np.ravel(np.array(c)), posinf=1, neginf=-1) for c in (box.min, box.max))
+        points = rng.uniform(1.1 * low - 0.1 * high, 1.1 * high - 0.1 * low, (2**12, 3))
+        return Case(emitter, points.astype(np.float32), rng)
+
     @property
     def around(self) -> bool:
         """Whether light comes from all around, and not from single directions, a surface or a point."""

@@ -159,7 +159,8 @@ def lanes(call: Callable[..., list[Any]], *columns: tuple[str, Array]) -> list[A
     with dr.suspend_grad():
         found = call(mi, *(as_mitsuba(kind, column) for kind, column in columns))
         dr.eval(found)
-    return [_rows(value, count) for value in found]
+    columns_of = ([value] if dr.depth_v(value) == 1 else value for value in found)
+    return [np.stack([np.broadcast_to(np.array(x), count) for x in value], axis=-1) for value in columns_of]
 
 
 def as_mitsuba(kind: str, column: Array) -> Any:
@@ -168,12 +169,6 @@ def as_mitsuba(kind: str, column: Array) -> Any:
     Dr.Jit compiles a kernel for every number of rows of a matrix, and for every alignment of memory.
     """
     return getattr(mi, kind)(*(aligned(row) for row in np.atleast_2d(column.T)))
-
-
-def _rows(value: Any, count: int) -> Array:
-    """Return a Dr.Jit array as [N, k]."""
-    components = [value] if dr.depth_v(value) == 1 else value
-    return np.stack([np.broadcast_to(np.array(component), count) for component in components], axis=-1)
 
 
 def unit(v: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,17 +71,13 @@ class SceneCheck:
 
     def save(self, folder: str | Path) -> None:
         """Write the page (``index.html``), ``summary.json`` and CSV files. Raises ``OutputError``."""
-        studies = [check.study() for check in (*self.checks.values(), self._pixels())]
-        report.save(folder, *studies, title=f"{TITLE}: {self.name}")
-
-    def _pixels(self) -> Check:
         law = Law("pixels", notes=[str(self.fault)] if self.fault else [])
-        law.at_most(
-            "pixels that are not finite", self.fault.pixels if self.fault else 0, 0, "a picture is of numbers"
-        )
-        return Check(
-            "picture", next(iter(self.checks.values())).variant if self.checks else "", {"pixels": law}, 0.0
-        )
+        bad = self.fault.pixels if self.fault else 0
+        law.at_most("pixels that are not finite", bad, 0, "a picture is of numbers")
+        variant = next((check.variant for check in self.checks.values()), "")
+        pixels = Check("picture", variant, {"pixels": law}, 0.0)
+        studies = [check.study() for check in (*self.checks.values(), pixels)]
+        report.save(folder, *studies, title=f"{TITLE}: {self.name}")
 
     def _repr_html_(self) -> str:
         from html import escape
@@ -100,16 +96,30 @@ def check_scene(
     """
     runtime.use()
     source = open_scene(scene, **options)
-    plugins = _plugins(source.scene)
+    kinds: dict[str, list[Any]] = {}
+    for kind, plugin in _all(source.scene):
+        kinds.setdefault(kind, []).append(plugin)
+    plugins: dict[str, tuple[str, Any]] = {}
+    left_out: tuple[str, ...] = ()
+    for kind, alike in kinds.items():
+        step = max(len(alike) // ALIKE, 1)
+        for number, plugin in enumerate(alike[::step]):
+            name = f"{kind} {plugin.id() or number * step}"
+            plugins[name if name not in plugins else f"{name} ({number * step})"] = (kind, plugin)
+        more = len(alike) - len(alike[::step])
+        left_out += (f"{more} more of {kind} are like those that were checked",) if more else ()
     checks: dict[str, Check] = {}
     with (progress or Progress()).stage("Laws", len(plugins)) as advance:
         for name, (kind, plugin) in plugins.items():
-            checks[name] = _examine(kind, name, plugin, source.scene, quick, seed)
+            if kind.startswith("BSDF"):
+                found = check_bsdf(plugin, quick=quick, seed=seed)
+            elif kind.startswith("shape"):
+                found = check_shape(plugin, quick=quick, seed=seed)
+            else:
+                case = emitter.Case.within(source.scene, plugin, np.random.default_rng(seed))
+                found = examine(name, case, emitter.LAWS, quick=quick)
+            checks[name] = replace(found, subject=name)
             advance(1)
-    left = Counter(kind for kind, _ in _all(source.scene)) - Counter(kind for kind, _ in plugins.values())
-    left_out = tuple(
-        f"{count} more of {kind} are like those that were checked" for kind, count in left.items()
-    )
     instances = sum(shape.class_name() == "Instance" for shape in source.scene.shapes())
     if instances:
         left_out += (f"{instances} instances are not checked: give a dict of one with its group",)
@@ -124,35 +134,6 @@ def _all(scene: Any) -> Iterator[tuple[str, Any]]:
         yield from ((f"{word} {class_name(plugin)}", plugin) for plugin in plugins)
 
 
-def _plugins(scene: Any) -> dict[str, tuple[str, Any]]:
-    """Return plugins by a name of their own; a few of each kind."""
-    kinds: dict[str, list[Any]] = {}
-    for kind, plugin in _all(scene):
-        kinds.setdefault(kind, []).append(plugin)
-    found: dict[str, tuple[str, Any]] = {}
-    for kind, plugins in kinds.items():
-        step = max(len(plugins) // ALIKE, 1)
-        for number, plugin in enumerate(plugins[::step]):
-            name = f"{kind} {plugin.id() or number * step}"
-            found[name if name not in found else f"{name} ({number * step})"] = (kind, plugin)
-    return found
-
-
-def _examine(kind: str, name: str, plugin: Any, scene: Any, quick: bool, seed: int) -> Check:
-    word = kind.split()[0]
-    if word == "BSDF":
-        found = check_bsdf(plugin, quick=quick, seed=seed)
-    elif word == "shape":
-        found = check_shape(plugin, quick=quick, seed=seed)
-    else:
-        rng = np.random.default_rng(seed)
-        box = scene.bbox()
-        low, high = (np.nan_to_num(np.ravel(np.array(c)), posinf=1, neginf=-1) for c in (box.min, box.max))
-        points = rng.uniform(1.1 * low - 0.1 * high, 1.1 * high - 0.1 * low, (2**12, 3)).astype(np.float32)
-        found = examine(name, emitter.Case(plugin, points, rng), emitter.LAWS, quick=quick)
-    return Check(name, found.variant, found.laws, found.seconds, found.quick)
-
-
 # ------------------------------------------------- The hunt -----------------------------------------------
 
 
@@ -162,23 +143,20 @@ def _hunt(source: Any, quick: bool, seed: int) -> Fault | None:
     bad = _bad(source, spp, seed)
     if not bad.any():
         return None
-    film = source.sensor.film()
-    offset = np.array(film.crop_offset())
+    left, top = map(int, np.array(source.sensor.film().crop_offset()))
     y, x = (int(axis[0]) for axis in np.nonzero(bad))
-    crop, count = (int(offset[0]), int(offset[1]), bad.shape[1], bad.shape[0]), spp
     width, height = 1, 1
     while width < bad.shape[1] or height < bad.shape[0]:
-        candidate = (
-            int(offset[0]) + x // width * width,
-            int(offset[1]) + y // height * height,
-            width,
-            height,
-        )
-        seen = _seen_again(source, candidate, MOST_SAMPLES // (width * height), seed)
-        if seen:
-            crop, count = candidate, seen
+        crop, count = (left + x // width * width, top + y // height * height, width, height), 16
+        most = max(MOST_SAMPLES // (width * height), 16)
+        with _cropped(source.sensor, crop):
+            while count <= most and not _bad(source, count, seed).any():
+                count *= 8
+        if count <= most:
             break
         width, height = min(2 * width, bad.shape[1]), min(2 * height, bad.shape[0])
+    else:
+        crop, count = (left, top, bad.shape[1], bad.shape[0]), spp
     with _cropped(source.sensor, crop):
         culprit = _culprit(source, count, seed)
     return Fault(int(bad.sum()), crop, count, culprit)
@@ -188,17 +166,6 @@ def _bad(source: Any, spp: int, seed: int) -> np.ndarray:
     """Return which pixels are not finite. [H, W]"""
     picture = mi.render(source.scene, integrator=source.integrator, sensor=source.sensor, spp=spp, seed=seed)
     return ~np.isfinite(np.array(picture)).all(axis=-1)
-
-
-def _seen_again(source: Any, crop: tuple[int, int, int, int], most: int, seed: int) -> int:
-    """Return the samples of a pixel at which the crop shows a fault, or 0."""
-    spp = 16
-    with _cropped(source.sensor, crop):
-        while spp <= max(most, 16):
-            if _bad(source, spp, seed).any():
-                return spp
-            spp *= 8
-    return 0
 
 
 @contextmanager
@@ -232,18 +199,12 @@ def _culprit(source: Any, spp: int, seed: int) -> str:
     return "no object's own numbers: by the integrator, or a sum that overflows"
 
 
-def _camera_rays(source: Any, rng: Any) -> Any:
-    """Return rays through random points of the film's crop."""
-    draw = rng.next_float32
-    # the unit square covers the crop of a cropped film
-    ray, _ = source.sensor.sample_ray(draw(), draw(), mi.Point2f(draw(), draw()), mi.Point2f(draw(), draw()))
-    return ray
-
-
 def _follow(source: Any, count: int, seed: int) -> Counter[str]:
     """Trace one batch of paths; return how often each object was the first to give an infinity or NaN."""
     scene, ctx, rng = source.scene, mi.BSDFContext(), mi.PCG32(count, initstate=seed)
-    ray, active, draw = _camera_rays(source, rng), mi.Bool(True), rng.next_float32
+    active, draw = mi.Bool(True), rng.next_float32
+    # the unit square covers the crop of a cropped film
+    ray, _ = source.sensor.sample_ray(draw(), draw(), mi.Point2f(draw(), draw()), mi.Point2f(draw(), draw()))
     counts: Counter[str] = Counter()
 
     def note(bad: Any, name: Callable[[Any], str], pointers: Any, plugins: Iterable[Any]) -> Any:
@@ -270,7 +231,7 @@ def _follow(source: Any, count: int, seed: int) -> Counter[str]:
         lit = dr.any(mi.unpolarized_spectrum(weight) != 0)
         bad = not_finite(mi.unpolarized_spectrum(value), pdf, mi.unpolarized_spectrum(weight))
         bad |= lit & not_finite(bs.wo, bs.pdf)
-        active &= lit & note(bad, _bsdf_on, si.shape, shapes)
+        active &= lit & note(bad, lambda s: f"the BSDF {_name(s.bsdf())}, on {_name(s)}", si.shape, shapes)
         ray = si.spawn_ray(si.to_world(bs.wo))
         dr.eval(ray, active, rng)
         if not dr.any(active):
@@ -280,10 +241,6 @@ def _follow(source: Any, count: int, seed: int) -> Counter[str]:
 
 def _emitter(emitter: Any) -> str:
     return f"the emitter {_name(emitter)}"
-
-
-def _bsdf_on(shape: Any) -> str:
-    return f"the BSDF {_name(shape.bsdf())}, on {_name(shape)}"
 
 
 def _name(plugin: Any) -> str:

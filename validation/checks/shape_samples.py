@@ -55,28 +55,24 @@ def sampling(law: Law, case: Case) -> None:
     ):
         law.at_most(f"{what}, relative", measured, 1e-3, "the same number", show)
     few = slice(0, case.count(2**14, 2**17))
-    _on_the_surface(law, case, p[few], n[few])
+    # sampled positions, and their normals, as rays meet them
+    start, inwards = (p + n * 0.01 * case.size).astype(np.float32)[few], -n[few]
+    back = trace(case.target, start, unit(inwards))
+    away = np.where(back.found, np.linalg.norm(back.p - p[few], axis=1), np.inf)
+    # another part of the surface may be nearer than a hundredth of the size
+    what = "sampled positions off the surface, 9 in 10, in roundings of the largest coordinate"
+    rounded = away / (ROUNDING * (np.abs(p[few]).max(axis=1) + 0.01 * case.size))
+    law.quantile(what, rounded, 0.9, 2 * HIT_ROUNDINGS, "a few roundings", case.at(start, inwards))
+    if back.found.any():
+        alike = -np.minimum((inwards * back.shading).sum(axis=1), (inwards * back.n).sum(axis=1))
+        turned = np.where(back.found, 1 - alike / np.linalg.norm(inwards, axis=1), np.nan)
+        what = "normals of sampled positions against those of rays, 1 - cosine, 9 in 10"
+        law.quantile(what, turned, 0.9, 1e-3, "one surface", case.at(start, inwards))
     if case.behind.found.mean() > 0.5:
         _area(law, case, p, n, area)
     else:
         law.notes.append("rays pass it from behind: their crossings do not count its area")
     _directions(law, case, u[few])
-
-
-def _on_the_surface(law: Law, case: Case, p: Array, n: Array) -> None:
-    """Sampled positions, and their normals, as rays meet them."""
-    start = (p + n * 0.01 * case.size).astype(np.float32)
-    back = trace(case.target, start, unit(-n))
-    away = np.where(back.found, np.linalg.norm(back.p - p, axis=1), np.inf)
-    # another part of the surface may be nearer than a hundredth of the size
-    what = "sampled positions off the surface, 9 in 10, in roundings of the largest coordinate"
-    rounded = away / (ROUNDING * (np.abs(p).max(axis=1) + 0.01 * case.size))
-    law.quantile(what, rounded, 0.9, 2 * HIT_ROUNDINGS, "a few roundings", case.at(start, -n))
-    if back.found.any():
-        alike = np.maximum((n * back.shading).sum(axis=1), (n * back.n).sum(axis=1))
-        turned = np.where(back.found, 1 - alike / np.linalg.norm(n, axis=1), np.nan)
-        what = "normals of sampled positions against those of rays, 1 - cosine, 9 in 10"
-        law.quantile(what, turned, 0.9, 1e-3, "one surface", case.at(start, -n))
 
 
 def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
@@ -166,11 +162,8 @@ def _directions(law: Law, case: Case, u: Array) -> None:
     law.share(what, bad, 1e-2, why, case.at(o, d))
     visible = drawn & met.found & (met.t > dist[:, 0] * (1 - 1e-3))
     weight = np.where(visible, 1 / np.where(drawn, pdf[:, 0], 1), 0)
-    _solid_angle(law, case, *_moments(case, o, d, met.p, weight))
-
-
-def _solid_angle(law: Law, case: Case, mean: Array, variance: Array) -> None:
-    """Hold moments of what is visible, by samples, to those by uniform directions."""
+    mean, variance = _moments(case, o, d, met.p, weight)
+    # the same by uniform directions
     o = case.around(case.count(2**17, 2**19))
     away = _cone(case, o)
     met = trace(case.target, o, away)

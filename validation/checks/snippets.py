@@ -62,7 +62,14 @@ def program(name: str, subject: Subject, body: str, **names: Any) -> str:
     variant = mi.variant()
     if "PCG32(n)" in text:
         variant = variant.replace("scalar_", "llvm_ad_")
-    shown = {key: value if isinstance(value, str) else _literal(value) for key, value in names.items()}
+    shown = dict(names)
+    for key, value in names.items():
+        if isinstance(value, np.ndarray):  # float32 in the fewest digits that give it back
+            inner = ", ".join(str(x) for x in value.astype(np.float32))
+            vector = value.dtype == np.float32 and len(value) in (2, 3)
+            shown[key] = inner if vector else f"[{inner}]"
+        elif not isinstance(value, str):
+            shown[key] = repr(value.item() if isinstance(value, np.generic) else value)
     given = source(subject.description) if subject.description is not None else None
     ours = given is not None and "'mrt_" in given
     lines = ["import mrt_mitsuba as mrt  # before mitsuba"] if ours else []
@@ -81,11 +88,3 @@ def program(name: str, subject: Subject, body: str, **names: Any) -> str:
             lines += ["", "def load():", f"    return mi.load_dict({given})"]
         lines += ["", f"{name} = load()"]
     return "\n".join([*lines, ""]) + text.format(variant=variant, **shown)
-
-
-def _literal(value: Any) -> str:
-    """Return float32 numbers in the fewest digits that give them back; a vector without brackets."""
-    if isinstance(value, np.ndarray):
-        inner = ", ".join(str(x) for x in value.astype(np.float32))
-        return f"[{inner}]" if value.dtype != np.float32 or len(value) not in (2, 3) else inner
-    return repr(value.item() if isinstance(value, np.generic) else value)

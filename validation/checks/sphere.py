@@ -149,7 +149,12 @@ def integrate(
     for attempt in range(8):
         ends = cells.start, cells.start + 4 ** (DEPTH - cells.level)
         hint = np.diff([below[np.searchsorted(codes, end)] for end in ends], axis=0)[0]
-        mean, variance = _estimate(function, cells, rng)
+        wo, omega = cells.points(rng)
+        values = function(wo.reshape(-1, 3))
+        values = (
+            np.where(np.isfinite(values), values, 0).reshape(*omega.shape, -1) * omega[..., None] * POINTS
+        )
+        mean, variance = values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
         share = np.abs(mean) / (np.abs(mean).sum(axis=0) + 1e-12)
         spread = variance / (np.abs(mean).sum(axis=0) + 1e-12) ** 2
         # half of what chance does to the count of the samples, or one sample, is known well enough
@@ -161,22 +166,10 @@ def integrate(
             break
         done.append(Integrals(cells.only(~bad), mean[~bad], variance[~bad]))
         cells = cells.only(bad).quartered()
-    start = np.concatenate([d.cells.start for d in done])
+    rows = [(d.cells.start, d.cells.level, d.mean, d.variance) for d in done]
+    start, level, mean, variance = (np.concatenate(column) for column in zip(*rows, strict=True))
     order = np.argsort(start)
-    level, mean, variance = (
-        np.concatenate(x)[order]
-        for x in ([d.cells.level for d in done], [d.mean for d in done], [d.variance for d in done])
-    )
-    return Integrals(Cells(start[order], level), mean, variance)
-
-
-def _estimate(
-    function: Callable[[Array], Array], cells: Cells, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    wo, omega = cells.points(rng)
-    values = function(wo.reshape(-1, 3))
-    values = np.where(np.isfinite(values), values, 0).reshape(*omega.shape, -1) * omega[..., None] * POINTS
-    return values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
+    return Integrals(Cells(start[order], level[order]), mean[order], variance[order])
 
 
 def chi_square(

@@ -24,7 +24,7 @@ Edges = Callable[[np.ndarray, np.ndarray], Any]
 EDGES: dict[str, Edges] = {
     "luma": lambda image, depth: filters.luma_edges(image),
     "sobel": lambda image, depth: filters.sobel_edges(image),
-    "geometry": lambda image, depth: filters.geometry_edges(_flat_normals(image), depth),
+    "geometry": lambda image, depth: filters.geometry_edges(image * 0 + np.float32([0, 0, 1]), depth),
 }
 
 
@@ -36,16 +36,12 @@ def run(study: Study, *, quick: bool) -> None:
         for name, what, expected, limit, measure in CASES:
             cases.at_most(name + suffix, what, expected, measure(), limit)
     why = "the smallest weights are 2⁻³⁰: their products are below the least normal float32 and become 0"
-    cases.beyond_float32("constant pictures of 1e-30, blur", "relative change", _constant_blur((1e-30,)), why)
+    cases.beyond_float32("constant pictures of 1e-30, blur", "relative change", constant_blur((1e-30,)), why)
     cases.close()
 
 
 def _constant(shape: Sequence[int], value: float) -> np.ndarray:
     return np.full((*shape, 3), value, np.float32)
-
-
-def _flat_normals(image: np.ndarray) -> np.ndarray:
-    return np.broadcast_to(np.array([0, 0, 1], np.float32), image.shape)
 
 
 def _blurred(image: np.ndarray, depth: np.ndarray, mode: str, **changes: Any) -> np.ndarray:
@@ -66,21 +62,21 @@ def _depths(shape: Sequence[int], seed: int = 2) -> np.ndarray:
 # ------------------------------------------------ Figures --------------------------------------------------
 
 
-def _constant_blur(values: Sequence[float]) -> float:
+def constant_blur(values: Sequence[float]) -> float:
     return max(
         np.abs(_blurred(_constant(shape, value), _depths(shape), mode) / value - 1).max()
         for shape, value, mode in product(SHAPES, values, MODES)
     )
 
 
-def _constant_edges() -> float:
+def constant_edges() -> float:
     return sum(
         np.asarray(find(_constant(shape, value), np.full(shape, 3, np.float32)).mask).sum()
         for shape, value, find in product(SHAPES, (0.5, 100.0, 1e6), EDGES.values())
     )
 
 
-def _outside_range() -> float:
+def outside_range() -> float:
     excess = 0.0
     for shape, mode in product(SHAPES, MODES):
         image = _noise(shape) * np.float32(1e20) - np.float32(3e19)
@@ -89,19 +85,19 @@ def _outside_range() -> float:
     return excess
 
 
-def _spread_of_damage(value: float) -> float:
+def spread_of_damage(value: float) -> float:
     image, depth = _noise((40, 30)), _depths((40, 30))
     image[20, 15, 1] = value
     return sum((~np.isfinite(_blurred(image, depth, mode)).all(axis=-1)).sum() - 1 for mode in MODES)
 
 
-def _damage_kept() -> float:
+def damage_kept() -> float:
     image, depth = _noise((40, 30)), _depths((40, 30))
     image[20, 15, 1] = np.nan
     return any(not np.isnan(_blurred(image, depth, mode)[20, 15, 1]) for mode in MODES)
 
 
-def _damage_reported(value: float) -> float:
+def damage_reported(value: float) -> float:
     wrong = 0
     for name, find in EDGES.items():
         image, depth = _constant((12, 10), 0.5), np.full((12, 10), 3, np.float32)
@@ -117,7 +113,7 @@ def _damage_reported(value: float) -> float:
     return wrong
 
 
-def _sobel_range() -> float:
+def sobel_range() -> float:
     errors = []
     for low, high in ((2.0, 3.0), (10.0, 4000.0), (-1.0, 0.5), (-2.0, -1.0), (-0.001, 0.001)):
         image = _constant((5, 6), low)
@@ -130,7 +126,7 @@ def _sobel_range() -> float:
     return max(errors)
 
 
-def _no_focus() -> float:
+def no_focus() -> float:
     image, depth = _noise((8, 9)), _depths((8, 9))
     return sum(
         filters.gaussian_dof(image, depth, focal_distance=distance, mode=mode) is not image
@@ -138,7 +134,7 @@ def _no_focus() -> float:
     )
 
 
-def _loops(mode: str) -> float:
+def from_loops(mode: str) -> float:
     image, depth = _noise((30, 24)), _depths((30, 24))
     amount = loops.blur_amount(depth, BLUR["focal_distance"], BLUR["focal_range"])
     if mode == "report":
@@ -149,7 +145,7 @@ def _loops(mode: str) -> float:
     return np.abs(_blurred(image, depth, mode) - truth).max()
 
 
-def _edge_loops() -> float:
+def edge_loops() -> float:
     image = np.repeat(np.repeat(_noise((10, 8)), 3, axis=0), 3, axis=1)
     wrong = 0
     for name in ("luma", "sobel"):
@@ -160,7 +156,7 @@ def _edge_loops() -> float:
     return wrong
 
 
-def _border() -> float:
+def border() -> float:
     image, depth = _noise((40, 30)), np.full((40, 30), 2.0, np.float32)
     depth[18:22, 13:17] = 30.0
     cut, changes = (slice(4, -4), slice(4, -4)), []
@@ -170,7 +166,7 @@ def _border() -> float:
     return np.abs(changes).max()
 
 
-def _huge_range() -> float:
+def huge_range() -> float:
     image = (10 ** np.random.default_rng(5).uniform(-38, 34, (20, 20, 3))).astype(np.float32)
     depth = (10 ** np.random.default_rng(6).uniform(-30, 30, (20, 20))).astype(np.float32)
     return sum(
@@ -179,7 +175,7 @@ def _huge_range() -> float:
     )
 
 
-def _edges_finite() -> float:
+def edges_finite() -> float:
     rng = np.random.default_rng(7)
     image = (10 ** rng.uniform(-38, 34, (20, 20, 3)) * rng.choice([-1, 1], (20, 20, 3))).astype(np.float32)
     depth = (10 ** rng.uniform(-37, 37, (20, 20))).astype(np.float32)
@@ -193,30 +189,30 @@ SAME, LOCAL = "the same", "none: damage stays local"
 # One row for each case: name, what its figure is, what is expected, limit, and how it is found
 CASES: tuple[tuple[str, str, str, float, Callable[[], float]], ...] = (
     ("constant pictures, blur", "1×1 … 40×30, values 1e-25, 0.3, 1e30: relative change", "a mean of equals",
-     MEAN, lambda: _constant_blur((1e-25, 0.3, 1e30))),
+     MEAN, lambda: constant_blur((1e-25, 0.3, 1e30))),
     ("constant pictures, edges", "1×1 … 40×30, values 0.5, 100, 1e6: edge pixels, all detectors", "none", 0,
-     _constant_edges),
+     constant_edges),
     ("range of a blur", "values to 1e20, negative ones too: how far means leave their range", "not at all",
-     MEAN, _outside_range),
+     MEAN, outside_range),
     ("NaN in a picture, blur", "other pixels that are not finite afterwards", LOCAL, 0,
-     lambda: _spread_of_damage(np.nan)),
-    ("infinity in a picture, blur", SAME, LOCAL, 0, lambda: _spread_of_damage(np.inf)),
-    ("NaN in a picture, kept", "1 if the pixel itself is hidden", "it stays to be seen", 0, _damage_kept),
+     lambda: spread_of_damage(np.nan)),
+    ("infinity in a picture, blur", SAME, LOCAL, 0, lambda: spread_of_damage(np.inf)),
+    ("NaN in a picture, kept", "1 if the pixel itself is hidden", "it stays to be seen", 0, damage_kept),
     ("NaN in a picture, edges", "pixels not marked in its 3×3, or marked elsewhere",
-     "none: reported, and local", 0, lambda: _damage_reported(np.nan)),
-    ("infinity in a picture, edges", SAME, "none", 0, lambda: _damage_reported(np.inf)),
+     "none: reported, and local", 0, lambda: damage_reported(np.nan)),
+    ("infinity in a picture, edges", SAME, "none", 0, lambda: damage_reported(np.inf)),
     ("Sobel beyond 0 … 1", "error of the value at steps above 1 and below 0",
-     "one grey level on either side", 8, _sobel_range),
+     "one grey level on either side", 8, sobel_range),
     ("focal distance 0", "calls that do not return the very picture, for none, 0 and -1", "none", 0,
-     _no_focus),
+     no_focus),
     ("the report's blur", "30×24, all amounts: largest difference from float64 loops",
-     "sums of 32 products", 1e-6, lambda: _loops("report")),
+     "sums of 32 products", 1e-6, lambda: from_loops("report")),
     ("the corrected blur", SAME, "sums of 81 products, and quotients of them", 1e-6,
-     lambda: _loops("corrected")),
+     lambda: from_loops("corrected")),
     ("edges", "30×24 in patches: pixels that float64 loops decide otherwise, or see another value in",
-     "none", 0, _edge_loops),
-    ("blur in the middle", "change at the border", "none", 0, _border),
+     "none", 0, edge_loops),
+    ("blur in the middle", "change at the border", "none", 0, border),
     ("huge ranges, blur", "values that are not finite, pictures 1e-38 … 1e34, depths 1e-30 … 1e30", "none", 0,
-     _huge_range),
-    ("huge ranges, edges", "NaN among the values, pictures to ±1e34", "none", 0, _edges_finite),
+     huge_range),
+    ("huge ranges, edges", "NaN among the values, pictures to ±1e34", "none", 0, edges_finite),
 )  # fmt: skip

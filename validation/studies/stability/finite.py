@@ -43,7 +43,7 @@ def run(study: Study, *, quick: bool) -> None:
         cases.at_most(name, f"{count:.0e} random and adversarial evaluations: {what}", "none", bad, 0)
     bad, scenes = 0, 3 if quick else 40
     for seed in range(scenes):
-        scene = _random_scene(np.random.default_rng(seed))
+        scene = random_scene(np.random.default_rng(seed))
         described = scene.to_dict(width=64, height=48, fresnel=FRESNEL[seed % 3])
         described["integrator"] = {"type": "mrt_whitted", "clamp": bool(seed % 2)}
         bad += not_a_colour(render(described, aa=1, lattice="report").image)
@@ -108,7 +108,7 @@ def _not_unit(v: Any) -> Any:
 # ------------------------------------------------ Plugins --------------------------------------------------
 
 
-def _bsdf(form: str, visible: bool) -> Callable[[_Draw], Any]:
+def bsdf_lanes(form: str, visible: bool) -> Callable[[_Draw], Any]:
     """Return value, density, sample and mirror reflectance, with an alpha and indices for each lane."""
 
     def evaluate(draw: _Draw) -> Any:
@@ -133,7 +133,7 @@ def _bsdf(form: str, visible: bool) -> Callable[[_Draw], Any]:
     return evaluate
 
 
-def _light(draw: _Draw) -> Any:
+def light_lanes(draw: _Draw) -> Any:
     light = mi.load_dict({"type": "mrt_light", "intensity": 1e3})
     parameters = mi.traverse(light)
     parameters["position"] = draw.vector(mi.Point3f)
@@ -146,7 +146,7 @@ def _light(draw: _Draw) -> Any:
     return _bad(weight, ds.dist, ds.pdf) | (far & _not_unit(ds.d)) | ~dr.all(dr.isfinite(ds.d))
 
 
-def _texture(draw: _Draw) -> Any:
+def texture_lanes(draw: _Draw) -> Any:
     texels = np.random.default_rng(9).random((5, 7, 3)).astype(np.float32)
     texture = mi.load_dict({"type": "mrt_texture", "bitmap": mi.Bitmap(texels)})
     si = dr.zeros(mi.SurfaceInteraction3f, draw.count)
@@ -155,7 +155,7 @@ def _texture(draw: _Draw) -> Any:
     return _bad(color) | (dr.max(color) > 1)
 
 
-def _quadric(kind: Any) -> Callable[[_Draw], Any]:
+def quadric_lanes(kind: Any) -> Callable[[_Draw], Any]:
     """Return a check of distance and normal of a random shape in each lane; some rays start at its end."""
 
     def evaluate(draw: _Draw) -> Any:
@@ -174,9 +174,9 @@ def _quadric(kind: Any) -> Callable[[_Draw], Any]:
     return evaluate
 
 
-def _whitted(draw: _Draw) -> Any:
+def whitted_lanes(draw: _Draw) -> Any:
     """Return bad results of random rays through a scene of every kind of shape, some from inside."""
-    scene = mi.load_dict(_random_scene(np.random.default_rng(0)).to_dict())
+    scene = mi.load_dict(random_scene(np.random.default_rng(0)).to_dict())
     ray = mi.Ray3f(draw.vector(mi.Point3f), draw.unit())
     trace = traced(scene, ray, clamp=False, min_contribution=0.0)
     si = trace.hit.si
@@ -188,26 +188,26 @@ def _whitted(draw: _Draw) -> Any:
 
 # What is evaluated in bulk: plugin, results that are looked at, and the function of the lanes
 BULK: Sequence[tuple[str, str, Callable[[_Draw], Any]]] = (
-    *((f"mrt_bsdf, {form}", "values, densities, samples and reflectances", _bsdf(form, True))
+    *((f"mrt_bsdf, {form}", "values, densities, samples and reflectances", bsdf_lanes(form, True))
       for form in FRESNEL),
-    ("mrt_bsdf, normals drawn from D", "the same", _bsdf("dielectric", False)),
-    ("mrt_light", "directions, distances and weights", _light),
-    ("mrt_texture", "colours, which are of [0, 1]", _texture),
+    ("mrt_bsdf, normals drawn from D", "the same", bsdf_lanes("dielectric", False)),
+    ("mrt_light", "directions, distances and weights", light_lanes),
+    ("mrt_texture", "colours, which are of [0, 1]", texture_lanes),
     ("mrt_plane", "distances", lambda draw: ~(
         intersect_plane(draw.vector(mi.Point3f), draw.unit(), draw.unit(), draw.coordinate()) > 0)),
     ("sphere of the float64 tracer", "distances", lambda draw: ~(
         intersect_sphere(draw.vector(mi.Point3f), draw.unit(), draw.vector(mi.Point3f),
                          draw.log(1e-6, 1e6, (1e-7, 0.5, 1, 1e7))) > 0)),
-    ("mrt_cone", "distances, normals and texture coordinates", _quadric(KINDS["cone"])),
-    ("mrt_cylinder", "the same", _quadric(KINDS["cylinder"])),
-    ("mrt_whitted", "radiance, distances and normals", _whitted),
+    ("mrt_cone", "distances, normals and texture coordinates", quadric_lanes(KINDS["cone"])),
+    ("mrt_cylinder", "the same", quadric_lanes(KINDS["cylinder"])),
+    ("mrt_whitted", "radiance, distances and normals", whitted_lanes),
 )  # fmt: skip
 
 
 # --------------------------------------------- Whole renders -----------------------------------------------
 
 
-def _random_scene(rng: np.random.Generator) -> Scene:
+def random_scene(rng: np.random.Generator) -> Scene:
     def color() -> tuple[float, float, float]:
         r, g, b = map(float, rng.choice([0, 1e-30, 0.5, 1, 10], 3))
         return (r, g, b)

@@ -54,16 +54,12 @@ def run(study: Study, *, quick: bool) -> None:
     for solid in SOLIDS:
         sizes = DECADES[::3] if quick else DECADES
         found = [_measure(solid, size, 300 if quick else 3000) for size in sizes]
-        for figure in FIGURES:
-            worst, fault = (
-                max(f[name] for f in found)
-                for name in (figure.name, figure.name + ", fault" * bool(figure.fault))
-            )
-            limit = solid.normal if figure.name == "normal" else figure.limit
-            made = (figure.fault, fault) if figure.fault else None
-            cases.at_most(
-                f"{solid.name}, {figure.name}", figure.what, figure.expected, worst, limit, fault=made
-            )
+        limits = {"place": ACROSS, "normal": solid.normal}
+        for figure, what, expected, fault in FIGURES:
+            worst, made = (max(f.get(figure + word, 0) for f in found) for word in ("", ", fault"))
+            seen = (fault, made) if fault else None
+            limit = limits.get(figure, 0)
+            cases.at_most(f"{solid.name}, {figure}", what, expected, worst, limit, fault=seen)
         hits = sum(f["hits"] for f in found)
         cases.at_least(f"{solid.name}, hits", WHERE, "the other figures mean something", hits, 500)
     _grazing(cases, 100_000 if quick else 1_000_000)
@@ -90,14 +86,6 @@ class Solid:
     alone: bool = False  # else another shape is in the scene, out of the way
 
 
-def _sphere(size: float) -> dict[str, Any]:
-    return {"type": "sphere", "radius": size}
-
-
-def _plane(size: float) -> dict[str, Any]:
-    return {"type": "mrt_plane", "normal": NORMAL_OF_PLANE.tolist(), "distance": PLANE_DISTANCE * size}
-
-
 def _triangle(size: float) -> dict[str, Any]:
     """Return the triangle, mirrored and of size 1, with what puts it right."""
     positions = mi.Bitmap((CORNERS * [1, 1, -1]).astype(np.float32)[np.newaxis])
@@ -106,58 +94,57 @@ def _triangle(size: float) -> dict[str, Any]:
     return {"type": "mrt_mesh", "positions": positions, "faces": faces, "to_world": right}
 
 
-def _cone(size: float) -> dict[str, Any]:
-    ends = {"apex": (APEX * size).tolist(), "base_center": (BASE * size).tolist()}
-    return {"type": "mrt_cone", **ends, "radius": RADIUS * size}
+def _axial(kind: Any, first: str, second: str) -> Solid:
+    """Return a cone or a cylinder, whose ends go by these names."""
+    name = kind.__name__.lower()
+    return Solid(
+        name,
+        lambda s: {
+            "type": f"mrt_{name}",
+            first: (APEX * s).tolist(),
+            second: (BASE * s).tolist(),
+            "radius": RADIUS * s,
+        },
+        lambda s: reference.Axial([kind(APEX * s, BASE * s, RADIUS * s, MATTE)]),
+        30,
+    )
 
 
-def _cylinder(size: float) -> dict[str, Any]:
-    ends = {"p0": (APEX * size).tolist(), "p1": (BASE * size).tolist()}
-    return {"type": "mrt_cylinder", **ends, "radius": RADIUS * size}
-
-
-def _axial(kind: Any) -> Callable[[float], Any]:
-    return lambda s: reference.Axial([kind(APEX * s, BASE * s, RADIUS * s, MATTE)])
-
-
-def _spheres(size: float) -> Any:
-    return reference.Spheres([Sphere((0, 0, 0), size, MATTE)])
-
-
-SOLIDS = (
-    Solid("sphere alone", _sphere, _spheres, 12, alone=True),
-    Solid("sphere", _sphere, _spheres, 12),
-    Solid("plane", _plane,
-          lambda s: reference.Planes([Plane(tuple(NORMAL_OF_PLANE), PLANE_DISTANCE * s, MATTE)]), 3),
-    Solid("triangle", _triangle,
-          lambda s: reference.Triangles(Mesh(CORNERS * s, np.array([[0, 1, 2]]), MATTE)), 6),
-    Solid("cone", _cone, _axial(Cone), 30),
-    Solid("cylinder", _cylinder, _axial(Cylinder), 30),
-)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Figure:
-    """What is measured of a solid; ``fault`` is one that was made, in words."""
-
-    name: str
-    what: str
-    expected: str = "none"
-    limit: float = 0
-    fault: str = ""
+SPHERE = Solid(
+    "sphere",
+    lambda s: {"type": "sphere", "radius": s},
+    lambda s: reference.Spheres([Sphere((0, 0, 0), s, MATTE)]),
+    12,
+)
+PLANE = Solid(
+    "plane",
+    lambda s: {"type": "mrt_plane", "normal": NORMAL_OF_PLANE.tolist(), "distance": PLANE_DISTANCE * s},
+    lambda s: reference.Planes([Plane(tuple(NORMAL_OF_PLANE), PLANE_DISTANCE * s, MATTE)]),
+    3,
+)
+TRIANGLE = Solid(
+    "triangle",
+    _triangle,
+    lambda s: reference.Triangles(Mesh(CORNERS * s, np.array([[0, 1, 2]]), MATTE)),
+    6,
+)
+CONE, CYLINDER = _axial(Cone, "apex", "base_center"), _axial(Cylinder, "p0", "p1")
+SOLIDS = (replace(SPHERE, name="sphere alone", alone=True), SPHERE, PLANE, TRIANGLE, CONE, CYLINDER)
 
 
 WHERE = f"sizes 1e-6 … 1e6, from 1e-6 to {FARTHEST:g} sizes away and from inside"
+LARGEST = "roundings of the largest coordinate"
+# What is measured of a solid: name, what it is, what is expected, and a fault that was made, in words
 FIGURES = (
-    Figure("place", f"{WHERE}: worst distance error across the surface, in "
-           "roundings of the largest coordinate",
-           "a few roundings", ACROSS, "hits 1 in 100,000 further away"),
-    Figure("normal", "its worst angle times the cosine of incidence, in roundings of the largest coordinate "
-           "over the size", "a few roundings", fault="normals turned by 2 in 100,000"),
-    Figure("hits and misses", f"rays that hit or miss wrongly, {OUTLINE} roundings and more off the outline"),
-    Figure("mirror rays", "mirror rays that meet the surface they leave"),
-    Figure("shadow rays", "points that their own surface hides from a light above it"),
-    Figure("finite", "distances, normals and colours that are no finite numbers"),
+    ("place", f"{WHERE}: worst distance error across the surface, in {LARGEST}",
+     "a few roundings", "hits 1 in 100,000 further away"),
+    ("normal", f"its worst angle times the cosine of incidence, in {LARGEST} over the size",
+     "a few roundings", "normals turned by 2 in 100,000"),
+    ("hits and misses", f"rays that hit or miss wrongly, {OUTLINE} roundings and more off the outline",
+     "none", ""),
+    ("mirror rays", "mirror rays that meet the surface they leave", "none", ""),
+    ("shadow rays", "points that their own surface hides from a light above it", "none", ""),
+    ("finite", "distances, normals and colours that are no finite numbers", "none", ""),
 )  # fmt: skip
 
 
