@@ -85,9 +85,12 @@ def gaussian_dof(
     grid = Grid(image)
     planes = grid.planes(image, "image")
     distance = grid.flat(depth, (), "depth")
-    arrays = isinstance(image, np.ndarray) and isinstance(depth, np.ndarray)
-    if arrays and _all_sharp(depth, focus, focal_range, mode):
-        return np.array(image, np.float32)
+    if isinstance(image, np.ndarray) and isinstance(depth, np.ndarray):
+        # Is no amount large enough to change a pixel? The extreme distances have the largest
+        low, high = (np.float32(reduce(depth, axis=None)) for reduce in (np.fmin.reduce, np.fmax.reduce))
+        largest = max(abs(np.float32(focus) - end) - np.float32(focal_range) for end in (low, high))
+        if low > 0 and high < math.inf and (largest < 1 if mode == "report" else largest <= 0):
+            return np.array(image, np.float32)
     amount = _amount(grid, distance, focus, focal_range)
     if mode == "report":
         blurred = _report(grid, planes, amount)
@@ -104,15 +107,6 @@ def _focus(focal_distance: float | None, focal_range: float) -> float:
         if value is not None and math.isnan(value):
             raise UsageError(f"{name} is not a number; give one")
     return max(focal_distance or 0.0, 0.0)
-
-
-def _all_sharp(depth: np.ndarray, focus: float, focal_range: float, mode: str) -> bool:
-    """Return whether no amount is large enough to change a pixel; the extreme distances have the largest."""
-    low, high = (np.float32(reduce(depth, axis=None)) for reduce in (np.fmin.reduce, np.fmax.reduce))
-    if low <= 0 or high == math.inf:
-        return False
-    largest = max(abs(np.float32(focus) - distance) - np.float32(focal_range) for distance in (low, high))
-    return bool(largest < 1 if mode == "report" else largest <= 0)
 
 
 def _amount(grid: Grid, distance: Any, focus: float, focal_range: float) -> Any:

@@ -15,7 +15,6 @@ from mrt_mitsuba.scene.model import (
     Plane,
     Scene,
     Sphere,
-    Vector,
 )
 
 EVENING = (0.75, 0.45, 0.3)
@@ -109,7 +108,9 @@ def scene_7() -> Scene:
     water = Material(1.33, 0.03, (0.7, 0.75, 0.8), (0.02, 0.08, 0.12))
     ground = ((0.08, matte(0.7, 0.62, 0.42)), (0.75, matte(0.2, 0.42, 0.12)), (1.25, matte(0.42, 0.38, 0.34)),
               (9.0, matte(0.95, 0.95, 1.0)))  # fmt: skip
-    places = [place for k in range(400) for place in [_forest_place(k)] if 0.12 < place[1] < 0.6][:60]
+    k = np.arange(400)  # places by a low-discrepancy sequence, Roberts' R₂
+    x, z = (k * 0.7548776662) % 1 * 8 - 4, (k * 0.5698402910) % 1 * 8 - 5
+    places = [place for place in zip(x, _hills(x, z), z, strict=True) if 0.12 < place[1] < 0.6][:60]
     crowns, trunks = models.pines(places, 0.45, matte(0.06, 0.26, 0.1), matte(0.3, 0.18, 0.1))
     boat = models.block((0.35, 0.03, 1.7), (0.5, 0.12, 0.18), matte(0.6, 0.15, 0.1), turn=30)
     return Scene(
@@ -129,12 +130,6 @@ def _hills(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     return (
         bowl + ridges * (0.35 + 0.12 * np.abs(x)) + 0.3 * np.exp(-((x + 2.4) ** 2 + (z + 4.2) ** 2) / 1.5) * 4
     )
-
-
-def _forest_place(k: int) -> Vector:
-    """Return the k-th place on the ground of a low-discrepancy sequence (Roberts' R₂)."""
-    x, z = (k * 0.7548776662) % 1 * 8 - 4, (k * 0.5698402910) % 1 * 8 - 5
-    return x, float(_hills(np.array(x), np.array(z))), z
 
 
 def scene_8() -> Scene:

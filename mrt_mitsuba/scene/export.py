@@ -70,7 +70,7 @@ def write_xml(
     from mrt_mitsuba.scene.placement import model_scene
 
     check_model_options(scene, model)
-    files: dict[str, Any] = {}  # shapes by the paths of the files that hold them
+    files: dict[str, bytes] = {}  # of shapes, by their paths
     inputs: Iterable[str] = ()
     focus: dict[str, Any] = {}
     if isinstance(scene, str | os.PathLike) and not is_obj(scene):
@@ -93,16 +93,18 @@ def write_xml(
         for name, node in mine.items():
             if isinstance(node, dict) and node["type"] in _IN_FILES[flavor]:
                 file = f"{os.path.splitext(os.fspath(path))[0]}_{name}.ply"
-                files[file] = node
-                mine[name] = _ply_node(node, os.path.basename(file))
+                mine[name], files[file] = _in_file(node, os.path.basename(file))
         text = _text_of(mine, scene, flavor)
         if scene.focal_distance is not None:
             focus = {"focaldist": scene.focal_distance, "focalrange": scene.focal_range}
         inputs = scene.files
+    # What Mitsuba's cameras have no parameters for, and ``render`` reads
+    lines = [f'\n    <default name="{name}" value="{value}"/>' for name, value in focus.items()]
+    start = text.index(">", text.index("<scene")) + 1
+    text = f"{text[:start]}{''.join(lines)}{text[start:]}\n"
     with replacing_together([*files, path], inputs) as opened:
-        for stream, node in zip(opened, files.values(), strict=False):
-            stream.write(_ply(node))
-        opened[-1].write((_with_focus(text, focus) + "\n").encode())
+        for stream, content in zip(opened, (*files.values(), text.encode()), strict=True):
+            stream.write(content)
     return [*files, os.fspath(path)]
 
 
@@ -129,27 +131,17 @@ def _text_of(mine: dict[str, Any], model: Scene, flavor: str) -> str:
     return str(mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(variant), mine)))
 
 
-def _with_focus(text: str, focus: Mapping[str, Any]) -> str:
-    """Add what Mitsuba's cameras have no parameters for, and ``render`` reads."""
-    start = text.index(">", text.index("<scene")) + 1
-    lines = [f'\n    <default name="{name}" value="{value}"/>' for name, value in focus.items()]
-    return text[:start] + "".join(lines) + text[start:]
-
-
-def _ply_node(node: dict[str, Any], filename: str) -> dict[str, Any]:
-    """Return a shape that reads the file; triangles of ``mrt_mesh`` are flat."""
-    flat = {"face_normals": True} if node["type"] == "mrt_mesh" else {}
-    return {"type": "ply", "filename": filename, **flat, "bsdf": node["bsdf"]}
-
-
-def _ply(node: dict[str, Any]) -> bytes:
-    """Return the mesh of a shape as a binary PLY file."""
+def _in_file(node: dict[str, Any], filename: str) -> tuple[dict[str, Any], bytes]:
+    """Return a shape that reads its mesh from a binary PLY file, and the file. Triangles of ``mrt_mesh`` are
+    flat."""
     import mitsuba as mi
 
+    flat = {"face_normals": True} if node["type"] == "mrt_mesh" else {}
     stream = mi.MemoryStream()
     mi.load_dict({name: value for name, value in node.items() if name != "bsdf"}).write_ply(stream)
     stream.seek(0)
-    return bytes(stream.read(stream.size()))
+    content = bytes(stream.read(stream.size()))
+    return {"type": "ply", "filename": filename, **flat, "bsdf": node["bsdf"]}, content
 
 
 def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
