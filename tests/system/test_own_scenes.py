@@ -12,7 +12,7 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba.memory import Workspace
 from mrt_mitsuba.validation.studies import adaptive, honest
-from mrt_mitsuba.validation.tools.own_scenes import SCENES, SPP, load, own_scene, sensor
+from mrt_mitsuba.validation.tools.own_scenes import SCENES, SPP, load, sensor
 from mrt_mitsuba.validation.tools.study import findings
 
 WIDTH, HEIGHT = 32, 24
@@ -26,7 +26,7 @@ def _load(name: str, **more: Any) -> Any:
 
 
 def _sensor_of(name: str) -> dict[str, Any]:
-    found = own_scene(name)["sensor"]
+    found = SCENES[name]()["sensor"]
     return found | {"film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT} | found["film"]}
 
 

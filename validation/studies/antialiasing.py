@@ -56,7 +56,7 @@ def modes(study: Study, *, quick: bool) -> None:
         scene = load(mrt.scene_dict(number, width=width, height=height))
         options: dict[str, Any] = {"lattice": "report"}
         reference = mrt.render(scene, aa=extent.reference_aa, aamode="none", **options).image
-        found: dict[tuple[str, int], tuple[float, int, np.ndarray]] = {}
+        found: dict[tuple[str, int], tuple[float, int, float]] = {}
         off = []
         for mode in MODES:
             for aa in extent.amounts:
@@ -65,10 +65,10 @@ def modes(study: Study, *, quick: bool) -> None:
                 refined, rays = refined_pixels(result), result.rays["primary"]
                 if mode != "none":
                     off.append(rays - refined.size - int(refined.sum()) * (aa**2 - 1))
-                found[mode, aa] = rmse, rays, refined
+                found[mode, aa] = rmse, rays, float(refined.mean())
         for (mode, aa), (rmse, rays, refined) in found.items():
             full = found["none", aa]
-            rows.append([number, mode, aa, rmse, rmse / full[0], rays, rays / full[1], refined.mean()])
+            rows.append([number, mode, aa, rmse, rmse / full[0], rays, rays / full[1], refined])
         title = f"scene {number}: camera rays other than one a pixel and aa² - 1 in refined ones"
         study.at_most(title, max(map(abs, off)), 0, "a count")
         least = max(extent.amounts)
@@ -78,10 +78,6 @@ def modes(study: Study, *, quick: bool) -> None:
         )
         ratio = found["sobel", least][0] / found["none", least][0]
         study.at_most(f"scene {number}: error of sobel / full at aa={least}", ratio, 2.2, why)
-        masks = [found[mode, min(extent.amounts)][2] for mode in MODES[1:]]
-        maps = [filters.EdgeMap(mask=mask, value=mask.astype(np.float32)) for mask in masks]
-        title, caption = f"Scene {number}: refined pixels", "Left to right: luma, sobel, geometry."
-        study.picture(f"contours-{number}", title, filters.contours(*maps), caption)
     columns = ["scene", "mode", "aa", "RMSE", "error / full", "rays", "rays / full", "pixels refined"]
     title = f"Error to aa={extent.reference_aa} of the same lattice, {width}x{height}"
     study.table("modes", title, columns, rows)

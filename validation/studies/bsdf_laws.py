@@ -110,7 +110,7 @@ def furnace(study: Study, *, quick: bool) -> None:
         lines[f"α = {alpha}"] = angles, np.array([albedo(bsdf, at_angle(a)).max() for a in angles])
     albedos_found = [found for _, found in lines.values()]
     title = "White furnace: albedo of the lobe with F = 1, Ks = 1, Kd = 0"
-    figure = curves(lines, "angle of incidence [°]", "albedo", log=False, level=1)
+    figure = curves(lines, "angle of incidence [°]", "albedo", level=1)
     caption = "Light that a second bounce between facets would bring back is missing, the more the rougher."
     study.plot("furnace", title, figure, caption)
     what = "largest albedo of a lobe with F = 1, Ks = 1"

@@ -7,11 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.studies.depth_of_field import fit_lens
 from mrt_mitsuba.validation.tools.precision import Point
 from mrt_mitsuba.validation.tools.precision_page import describe
-from mrt_mitsuba.validation.tools.renders import load
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.work_precision import error_vs_time
 
@@ -46,9 +43,9 @@ class Extent:
 
 ALL = (0, 1, 2, 3, 4, 7, 9)
 # Under path, scenes of broad highlights: elsewhere rare, very bright paths rule every mean square
-OF_TRADES = {"sampling": ALL, "whitted": ALL, "path": (0, 7, 9), "lens": (3, 4)}
+OF_TRADES = {"sampling": ALL, "whitted": ALL, "path": (0, 7, 9)}
 FULL = Extent((240, 180), (1, 2, 4, 8), 48, (1, 4, 16, 64), 2048, OF_TRADES, 5)
-QUICK_TRADES = {"sampling": (0,), "whitted": (0,), "path": (0,), "lens": (3,)}
+QUICK_TRADES = {"sampling": (0,), "whitted": (0,), "path": (0,)}
 QUICK = Extent((64, 48), (1, 4), 24, (1, 16), 512, QUICK_TRADES, 1)
 
 
@@ -203,38 +200,8 @@ def path(number: int, extent: Extent) -> Trade:
     )
 
 
-def lens(number: int, extent: Extent) -> Trade:
-    """Return both depth-of-field filters, and a thin lens at rising spp."""
-
-    def hold(study: Study, where: str, points: Points) -> None:
-        ratio = points["filter corrected"].rmse / points["filter report"].rmse
-        what, why = f"{where}: RMSE of corrected / report", "the corrected filter is no worse"
-        study.at_most(what, ratio, 1, why)
-
-    width, height = extent.size
-    shared: Options = {"aa": 2, "aamode": "none", "lattice": "centered"}
-    scene = extent.scene(number)
-    sharp = mrt.render(load(scene), **shared, layers=["depth"])
-    scene["sensor"] |= fit_lens(report_scene(number), sharp.layers["depth.Z"])
-    cases: dict[str, Options] = {
-        f"filter {dof}": {"scene": number, "width": width, "height": height, "dof": dof}
-        for dof in ("report", "corrected")
-    }
-    return Trade(
-        scene,
-        "depth of field as a filter and through a lens",
-        f"a lens fitted to the report's blur, {extent.reference_spp} rays a pixel",
-        cases | {f"thinlens spp={4 * spp}": {"spp": spp} for spp in extent.spp},
-        {"spp": extent.reference_spp // 4},  # of four samples
-        shared,
-        hold,
-        strips=True,
-    )
-
-
 TRADES: dict[str, Callable[[int, Extent], Trade]] = {
     "sampling": sampling,
     "whitted": whitted,
     "path": path,
-    "lens": lens,
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -103,7 +103,7 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
     An EXR of several parts has each as a layer, by its name. Raises ``UsageError`` for what cannot be
     compared: another size or data window, no such layer, NaN.
     """
-    sides = [Layer.read(side, layer, name) for side, name in ((a, "a"), (b, "b"))]
+    sides = [read_layer(side, layer, name) for side, name in ((a, "a"), (b, "b"))]
     first, second = (side.values for side in sides)
     if first.shape != second.shape:
         sizes = " and ".join(f"{s.shape[1]}x{s.shape[0]} with {s.shape[2]} channels" for s in (first, second))
@@ -143,55 +143,49 @@ class Layer:
 
     values: np.ndarray
     variance: np.ndarray | None = None
-    samples: np.ndarray | float = np.inf
     window: tuple[int, ...] | None = None  #: of an EXR: first column and row, last column and row
 
-    @classmethod
-    def read(cls, source: Any, layer: str = "", name: str = "the picture") -> Layer:
-        """Return the picture, or a layer of it, of whatever ``compare`` takes. Raises ``UsageError``."""
-        if isinstance(source, str | os.PathLike):
-            try:
-                channels, headers = read_channels(source)
-            except OutputError as error:
-                raise UsageError(f"{error}; only EXR files can be compared") from error
-            found = cls.of(channels, layer, os.fspath(source))
-            header = headers[_channels_of(channels, layer)[0]]
-            return replace(found, window=tuple(int(n) for corner in header["dataWindow"] for n in corner))
-        if isinstance(source, Result):
-            channels = {letter: source.image[..., i] for i, letter in enumerate("RGB")}
-            return cls.of({**channels, **source.layers}, layer, f"result {name}")
+
+def read_layer(source: Any, layer: str = "", name: str = "the picture") -> Layer:
+    """Return the picture, or a layer of it, of whatever ``compare`` takes. Raises ``UsageError``."""
+    channels: Mapping[str, np.ndarray] = {}
+    headers: Mapping[str, Any] = {}
+    if isinstance(source, str | os.PathLike):
+        name = os.fspath(source)
+        try:
+            channels, headers = read_channels(source)
+        except OutputError as error:
+            raise UsageError(f"{error}; only EXR files can be compared") from error
+    elif isinstance(source, Result):
+        name = f"result {name}"
+        channels = {**{letter: source.image[..., i] for i, letter in enumerate("RGB")}, **source.layers}
+    elif layer:
+        raise UsageError(f"{name} is an array, which has no layer {layer!r}: give a result or an EXR")
+    else:
         values = np.asarray(source, np.float32)
-        if layer:
-            raise UsageError(f"{name} is an array, which has no layer {layer!r}: give a result or an EXR")
         if values.ndim not in (2, 3) or not values.size:
             raise UsageError(f"{name} has the shape {values.shape}: a picture is [H, W] or [H, W, C]")
-        return cls._checked(np.atleast_3d(values), name)
-
-    @classmethod
-    def of(cls, channels: Mapping[str, np.ndarray], layer: str, name: str) -> Layer:
-        """Return a layer of a picture by its channels."""
+        values = np.atleast_3d(values)
+    window = variance = None
+    if channels:
         chosen = _channels_of(channels, layer)
         if not chosen:
             named = sorted({key.rpartition(".")[0] or key for key in channels})
             raise UsageError(f"{name} has no layer {layer or 'R, G, B'!r}; it has {', '.join(named)}")
-        picture = cls._checked(np.stack([channels[key] for key in chosen], axis=-1), name)
-        for spread, power in SPREADS.items():
-            known = [] if layer else _channels_of(channels, spread)
-            if known:
+        values = np.stack([channels[key] for key in chosen], axis=-1)
+        if headers:
+            window = tuple(int(n) for corner in headers[chosen[0]]["dataWindow"] for n in corner)
+        for spread, power in () if layer else SPREADS.items():
+            known = _channels_of(channels, spread)
+            if known and variance is None:
                 variance = np.stack([channels[key] for key in known], axis=-1).astype(np.float64) ** power
-                samples = channels.get("samples.Y", np.array(np.inf))
-                return cls(picture.values, variance, np.maximum(samples, 2)[..., None])
-        return picture
-
-    @classmethod
-    def _checked(cls, values: np.ndarray, name: str) -> Layer:
-        bad = np.isnan(values).any(axis=-1)
-        if bad.any():
-            row, column = np.argwhere(bad)[0]
-            raise UsageError(
-                f"{name} is NaN in {bad.sum()} pixels, the first at row {row}, column {column}: mend it first"
-            )
-        return cls(values)
+    bad = np.isnan(values).any(axis=-1)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise UsageError(
+            f"{name} is NaN in {bad.sum()} pixels, the first at row {row}, column {column}: mend it first"
+        )
+    return Layer(values, variance, window)
 
 
 def _channels_of(channels: Mapping[str, np.ndarray], layer: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
@@ -9,15 +10,13 @@ import numpy as np
 
 Node = dict[str, Any]
 SPP = 64  # of their samplers
-SCENES = ("envmap", "instances", "thin_lens", "gloss", "rough_glass",
-          "area_light", "spot", "crop", "texture_and_sky", "stratified")  # fmt: skip
 # Where most of the noise is in a part of the picture
 LOCAL = ("thin_lens", "gloss", "texture_and_sky", "rough_glass")
 
 
 def load(name: str, width: int, height: int, *, film: Node | None = None, **more: Any) -> Any:
     """Return a scene by name, at a size; ``film`` and further nodes replace its own."""
-    nodes = own_scene(name)
+    nodes = SCENES[name]()
     size: Node = {"width": width, "height": height}
     if name == "crop":
         window = {"crop_offset_x": width // 4, "crop_offset_y": height // 4}
@@ -40,11 +39,6 @@ def sensor(origin: list[float], target: list[float], rfilter: str = "gaussian", 
     } | more
 
 
-def own_scene(name: str) -> Node:
-    """Return the nodes of a scene, its sensor among them."""
-    return (_under_skies() | _indoors())[name]
-
-
 def _to() -> Any:
     return mi.ScalarTransform4f()
 
@@ -62,8 +56,12 @@ def _diffuse(reflectance: Any) -> Node:
     return {"type": "diffuse", "reflectance": reflectance}
 
 
+def _rectangle(place: Any, **more: Node) -> Node:
+    return {"type": "rectangle", "to_world": place, **more}
+
+
 def _floor(bsdf: Node) -> Node:
-    return {"type": "rectangle", "to_world": _to().rotate([1, 0, 0], -90).scale(10), "bsdf": bsdf}
+    return _rectangle(_to().rotate([1, 0, 0], -90).scale(10), bsdf=bsdf)
 
 
 def _ball(center: list[float], radius: float, bsdf: Node) -> Node:
@@ -83,91 +81,87 @@ def _sky(*color: float) -> Node:
     return {"type": "constant", "radiance": _rgb(*color)}
 
 
-def _under_skies() -> dict[str, Node]:
-    """Return scenes with a sky or an environment all around."""
+def _sun() -> np.ndarray:
+    """Return an environment with a bright place."""
     pixels = np.full((16, 32, 3), 0.4, np.float32)
     pixels[3:5, 10:12] = 30
-    places = [_to().translate([i % 3 - 1, 0.4, i // 3 - 1]) for i in range(9)]
-    member = {"type": "instance", "g": {"type": "ref", "id": "group"}}
-    lens: Node = {"type": "thinlens", "aperture_radius": 0.2, "focus_distance": 6.0}
-    return {
-        "envmap": {
-            "sensor": sensor([0, 2, 6], [0, 0.5, 0]),
-            "around": {"type": "envmap", "bitmap": mi.Bitmap(pixels)},
-            "floor": _floor(_diffuse(_rgb(0.6))),
-            "ball": _ball([0, 1, 0], 1, {"type": "roughconductor", "alpha": 0.2}),
-        },
-        "instances": {
-            "sensor": sensor([0, 3, 6], [0, 0.5, 0], "box"),
-            "group": {"type": "shapegroup", "a": _ball([0, 0, 0], 0.4, _diffuse(_rgb(0.7)))},
-            **{f"at{i}": member | {"to_world": place} for i, place in enumerate(places)},
-            "floor": _floor(_diffuse(_checks(8))),
-            "sky": _sky(0.3, 0.4, 0.5),
-            "lamp": _lamp([3, 5, 3], 0.7, 20),
-        },
-        "thin_lens": {
-            "sensor": sensor([0, 1.5, 6], [0, 0.6, 0], **lens),
-            "floor": _floor(_diffuse(_checks(20))),
-            "near": _ball([-1, 0.5, 3], 0.5, _diffuse(_rgb(0.7, 0.2, 0.2))),
-            "far": _ball([1, 0.5, -2], 0.5, _diffuse(_rgb(0.2, 0.2, 0.7))),
-            "sky": _sky(0.6, 0.7, 0.9),
-        },
-        "texture_and_sky": {
-            "sensor": sensor([0, 1.5, 6], [0, 2.5, 0], fov=60),
-            "floor": _floor(_diffuse(_checks(30))),
-            "ball": _ball([-1, 0.6, 1], 0.6, _diffuse(_checks(12))),
-            "sky": _sky(0.5, 0.7, 1.0),
-        },
-        "gloss": {
-            "sensor": sensor([0, 1.5, 5], [0, 0.7, 0], "box"),
-            "floor": _floor({"type": "roughconductor", "alpha": 0.1}),
-            "ball": _ball([0, 0.7, 0], 0.7, {"type": "roughplastic", "alpha": 0.1}),
-            "sky": _sky(0.2),
-            "lamp": _lamp([1.2, 3, -1], 0.1, 200),
-        },
-    }
+    return pixels
 
 
-def _indoors() -> dict[str, Node]:
-    """Return scenes that lamps light."""
-    back = _to().translate([0, 2, -2]).scale(4)
-    above = _to().translate([0, 4, 0]).rotate([1, 0, 0], 90)
-    spot = {"type": "spot", "intensity": _rgb(40, 36, 30), "cutoff_angle": 25}
-    return {
-        "rough_glass": {
-            "sensor": sensor([0, 1.2, 5], [0, 0.8, 0]),
-            "floor": _floor(_diffuse(_checks(8))),
-            "ball": _ball([0, 0.9, 0], 0.8, {"type": "roughdielectric", "alpha": 0.3}),
-            "lamp": _lamp([0, 4, 0], 1.0, 6),
-            "sky": _sky(0.2),
+MEMBER = {"type": "instance", "g": {"type": "ref", "id": "group"}}
+
+SCENES: dict[str, Callable[[], Node]] = {
+    "envmap": lambda: {
+        "sensor": sensor([0, 2, 6], [0, 0.5, 0]),
+        "around": {"type": "envmap", "bitmap": mi.Bitmap(_sun())},
+        "floor": _floor(_diffuse(_rgb(0.6))),
+        "ball": _ball([0, 1, 0], 1, {"type": "roughconductor", "alpha": 0.2}),
+    },
+    "instances": lambda: {
+        "sensor": sensor([0, 3, 6], [0, 0.5, 0], "box"),
+        "group": {"type": "shapegroup", "a": _ball([0, 0, 0], 0.4, _diffuse(_rgb(0.7)))},
+        **{f"at{i}": MEMBER | {"to_world": _to().translate([i % 3 - 1, 0.4, i // 3 - 1])} for i in range(9)},
+        "floor": _floor(_diffuse(_checks(8))),
+        "sky": _sky(0.3, 0.4, 0.5),
+        "lamp": _lamp([3, 5, 3], 0.7, 20),
+    },
+    "thin_lens": lambda: {
+        "sensor": sensor([0, 1.5, 6], [0, 0.6, 0], type="thinlens", aperture_radius=0.2, focus_distance=6.0),
+        "floor": _floor(_diffuse(_checks(20))),
+        "near": _ball([-1, 0.5, 3], 0.5, _diffuse(_rgb(0.7, 0.2, 0.2))),
+        "far": _ball([1, 0.5, -2], 0.5, _diffuse(_rgb(0.2, 0.2, 0.7))),
+        "sky": _sky(0.6, 0.7, 0.9),
+    },
+    "gloss": lambda: {
+        "sensor": sensor([0, 1.5, 5], [0, 0.7, 0], "box"),
+        "floor": _floor({"type": "roughconductor", "alpha": 0.1}),
+        "ball": _ball([0, 0.7, 0], 0.7, {"type": "roughplastic", "alpha": 0.1}),
+        "sky": _sky(0.2),
+        "lamp": _lamp([1.2, 3, -1], 0.1, 200),
+    },
+    "rough_glass": lambda: {
+        "sensor": sensor([0, 1.2, 5], [0, 0.8, 0]),
+        "floor": _floor(_diffuse(_checks(8))),
+        "ball": _ball([0, 0.9, 0], 0.8, {"type": "roughdielectric", "alpha": 0.3}),
+        "lamp": _lamp([0, 4, 0], 1.0, 6),
+        "sky": _sky(0.2),
+    },
+    "area_light": lambda: {
+        "sensor": sensor([0, 1.5, 6], [0, 1, 0], "mitchell"),
+        "floor": _floor(_diffuse(_rgb(0.8, 0.4, 0.3))),
+        "wall": _rectangle(_to().translate([0, 2, -2]).scale(4), bsdf=_diffuse(_rgb(0.5))),
+        "box": _box(),
+        "light": _rectangle(
+            _to().translate([0, 4, 0]).rotate([1, 0, 0], 90), emitter={"type": "area", "radiance": _rgb(6)}
+        ),
+    },
+    "spot": lambda: {
+        "sensor": sensor([0, 3, 6], [0, 0.5, 0], "tent"),
+        "floor": _floor(_diffuse(_rgb(0.7))),
+        "box": {"type": "cube", "to_world": _to().translate([0, 0.5, 0]).scale(0.5)},
+        "light": {
+            "type": "spot",
+            "intensity": _rgb(40, 36, 30),
+            "cutoff_angle": 25,
+            "to_world": _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0]),
         },
-        "area_light": {
-            "sensor": sensor([0, 1.5, 6], [0, 1, 0], "mitchell"),
-            "floor": _floor(_diffuse(_rgb(0.8, 0.4, 0.3))),
-            "wall": {"type": "rectangle", "to_world": back, "bsdf": _diffuse(_rgb(0.5))},
-            "box": _box(),
-            "light": {
-                "type": "rectangle",
-                "to_world": above,
-                "emitter": {"type": "area", "radiance": _rgb(6)},
-            },
-        },
-        "spot": {
-            "sensor": sensor([0, 3, 6], [0, 0.5, 0], "tent"),
-            "floor": _floor(_diffuse(_rgb(0.7))),
-            "box": {"type": "cube", "to_world": _to().translate([0, 0.5, 0]).scale(0.5)},
-            "light": spot | {"to_world": _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])},
-        },
-        "crop": {
-            "sensor": sensor([0, 2, 6], [0, 0.5, 0], film={"sample_border": True}),
-            "floor": _floor(_diffuse(_checks(8))),
-            "ball": _ball([0, 1, 0], 1, {"type": "plastic"}),
-            "lamp": _lamp([2, 4, 2], 0.5, 15),
-        },
-        "stratified": {
-            "sensor": sensor([0, 2, 6], [0, 0.5, 0], "box", sampler="stratified"),
-            "floor": _floor(_diffuse(_checks(8))),
-            "box": _box(),
-            "lamp": _lamp([0, 4, 1], 1.0, 5),
-        },
-    }
+    },
+    "crop": lambda: {
+        "sensor": sensor([0, 2, 6], [0, 0.5, 0], film={"sample_border": True}),
+        "floor": _floor(_diffuse(_checks(8))),
+        "ball": _ball([0, 1, 0], 1, {"type": "plastic"}),
+        "lamp": _lamp([2, 4, 2], 0.5, 15),
+    },
+    "texture_and_sky": lambda: {
+        "sensor": sensor([0, 1.5, 6], [0, 2.5, 0], fov=60),
+        "floor": _floor(_diffuse(_checks(30))),
+        "ball": _ball([-1, 0.6, 1], 0.6, _diffuse(_checks(12))),
+        "sky": _sky(0.5, 0.7, 1.0),
+    },
+    "stratified": lambda: {
+        "sensor": sensor([0, 2, 6], [0, 0.5, 0], "box", sampler="stratified"),
+        "floor": _floor(_diffuse(_checks(8))),
+        "box": _box(),
+        "lamp": _lamp([0, 4, 1], 1.0, 5),
+    },
+}

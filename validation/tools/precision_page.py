@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.validation.tools.gallery import gallery, panels
+from mrt_mitsuba.output.files import to_8bit
+from mrt_mitsuba.validation.tools.gallery import panels
 from mrt_mitsuba.validation.tools.precision import Interval, Panel, Point, WorkPrecision
 from mrt_mitsuba.validation.tools.study import Study
 
@@ -142,24 +143,31 @@ def diagram(found: WorkPrecision, numbered: Sequence[tuple[int, Point]]) -> Any:
     return figure
 
 
-def strip_figure(found: WorkPrecision, panels: Sequence[Panel]) -> Any:
+def strip_figure(found: WorkPrecision, strip: Sequence[Panel]) -> Any:
     """Return the pictures of a strip side by side, the reference last, each with its seconds and error.
 
     Of larger pictures it shows the window of ``PANEL`` pixels where they differ most from the reference.
     """
     reference = found.reference
     width, height = (min(most, size) for most, size in zip(PANEL, reference.shape[1::-1], strict=True))
-    errors = np.square(np.stack([image for _, _, image in panels]) - reference).sum(axis=(0, 3))
+    errors = np.square(np.stack([image for _, _, image in strip]) - reference).sum(axis=(0, 3))
     sums = np.pad(errors.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
     windows = (
         sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
     )
     row, column = np.unravel_index(np.argmax(windows), windows.shape)
-    pictures = {}
-    for name, seconds, image in panels:
-        rmse = np.sqrt(np.mean((image - reference) ** 2))
-        pictures[f"{name}\n{seconds:.3g} s, RMSE {rmse:.2g}"] = image
-    pictures["reference"] = reference
-    cut = slice(row, row + height), slice(column, column + width)
-    cuts = {title: np.asarray(picture[cut], np.float32) for title, picture in pictures.items()}
-    return gallery(cuts, columns=min(4, len(cuts)), width=10, title=0.6)
+    shown = [
+        (f"{name}\n{seconds:.3g} s, RMSE {np.sqrt(np.mean((image - reference) ** 2)):.2g}", image)
+        for name, seconds, image in strip
+    ]
+    shown.append(("reference", reference))
+    columns = min(4, len(shown))
+    rows = -(-len(shown) // columns)
+    figure, axes = panels(10, rows * (10 / columns * height / width + 0.6), rows, columns, squeeze=False)
+    for axis in axes.ravel():
+        axis.set_axis_off()
+    for axis, (title, image) in zip(axes.ravel(), shown, strict=False):
+        cut = np.asarray(image[row : row + height, column : column + width], np.float32)
+        axis.imshow(to_8bit(cut, "srgb"), interpolation="nearest")
+        axis.set_title(title, fontsize="small")
+    return figure

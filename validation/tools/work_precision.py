@@ -120,7 +120,7 @@ def _reference(reference: Any, runner: _Runner) -> tuple[tuple[np.ndarray, np.nd
     if isinstance(reference, Sequence) and not isinstance(reference, str):
         first, second = (_picture(runner(r, s)) for r, s in zip(reference, REFERENCE_SEEDS, strict=True))
         return (first, first), _rms(first - second)
-    picture = compare.Layer.read(reference)
+    picture = compare.read_layer(reference)
     known = 0.0 if picture.variance is None else float(picture.variance.mean()) ** 0.5
     values = picture.values.astype(np.float64)
     return (values, values), known
