@@ -118,12 +118,13 @@ def test_references_of_other_kinds(variant, tmp_path):
 def test_renders_to_an_error_are_cases_too(scene):
     """They come to it, and their own estimate is not what they are judged by."""
     cases = {
-        "target 0.01": {"integrator": "path", "target": 0.01, "maxspp": 256},
+        "target 0.0015": {"integrator": "path", "target": 0.0015, "maxspp": 512},
         "noise": path(64, aamode="noise"),
     }
-    found = mrt.error_vs_time(scene, cases, reference=path(2048, **ONE_RAY), repeats=3)
+    found = mrt.error_vs_time(scene, cases, reference=path(4096, **ONE_RAY), repeats=3)
     assert not found.failed
-    assert found.points["target 0.01"].rmse == pytest.approx(0.01, rel=0.3)
+    # So few pixels take more rays than the target needs, for fewer do not show what is rare
+    assert 0.2 * 0.0015 < found.points["target 0.0015"].rmse < 1.2 * 0.0015
     assert found.points["noise"].bias_interval[0] == 0
 
 
