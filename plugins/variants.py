@@ -41,3 +41,13 @@ def varies(texture: mi.Texture) -> bool:
 def varies_by_face(texture: mi.Texture) -> bool:
     """Return whether a texture is the same all over each face of a mesh."""
     return texture.class_name() == "MeshAttribute" and 'name = "face_' in str(texture)
+
+
+def construct_quietly(integrator: mi.SamplingIntegrator, props: mi.Properties) -> None:
+    """Construct the base class without Mitsuba's warning about scalar variants; ``mrt.render`` gives one."""
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        mi.SamplingIntegrator.__init__(integrator, props)
+    finally:
+        mi.set_log_level(level)

@@ -16,7 +16,7 @@ from .parameters import LARGEST, choice, flag, integer, number, spectrum
 from .protocols import LayeredIntegrator
 from .scene_data import Hit, SceneData
 from .snapshot import Kept, Snapshot
-from .variants import but_not
+from .variants import but_not, construct_quietly
 
 # A sixteenth of a step of an 8-bit picture: what many cut paths add up to stays below half a step, and on
 # average over the report's scenes below 1e-5
@@ -103,7 +103,7 @@ class MrtWhitted(mi.SamplingIntegrator):
     plugin_name = "mrt_whitted"
 
     def __init__(self, props: mi.Properties) -> None:
-        _construct(self, props)
+        construct_quietly(self, props)
         self.max_depth = integer(props, "max_depth", 10, least=1, most=2**32 - 1)
         self.sky: Any = spectrum(props, "sky", emissive=True) if "sky" in props else None
         self.clamp = flag(props, "clamp", True)
@@ -378,16 +378,6 @@ class MrtWhitted(mi.SamplingIntegrator):
         if data.plan.sky == "parameter":
             return dr.select(active, self.sky.eval(si, active), 0)
         return dr.select(active, mi.unpolarized_spectrum(data.environment.eval(si, active)), 0)
-
-
-def _construct(integrator: mi.SamplingIntegrator, props: mi.Properties) -> None:
-    """Construct the base class without Mitsuba's warning about scalar variants; ``mrt.render`` gives one."""
-    level = mi.log_level()
-    mi.set_log_level(mi.LogLevel.Error)
-    try:
-        mi.SamplingIntegrator.__init__(integrator, props)
-    finally:
-        mi.set_log_level(level)
 
 
 LayeredIntegrator.register(MrtWhitted)

@@ -9,6 +9,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -102,7 +103,8 @@ def render(
         variant: Mitsuba variant; by default the current one, else ``llvm_ad_rgb``.
         memory: bytes (or text such as "4G") to stay within.
         seed: of all random numbers.
-        integrator: name, dict or instance of a sampling integrator; by default the scene's own.
+        integrator: name, dict or instance of an integrator; by default the scene's own. One that gives whole
+            pictures only, such as ``ptracer``, knows no layers, edges, motion or depth of field.
         spp: rays for each sample, for integrators that draw random numbers: 1, or as its sampler says in a
             scene of one's own where ``aa`` and ``aamode`` are left out, too; the mean of a pixel's rays for
             aamode="noise". From 2 on, "luma" and "sobel" know the variance of every pixel and ignore what
@@ -149,6 +151,11 @@ def render_with(
             params=settings.params,
             model=settings.model(),
         )
+        if hasattr(source.integrator, "nested"):  # mrt_adaptive, which says where to stop
+            if settings.rmse is None and settings.aamode is None and settings.spp is None:
+                given = {k: v for k, v in source.integrator.options().items() if getattr(settings, k) is None}
+                settings = settings.but(**given)
+            source = replace(source, integrator=source.integrator.nested)
         with sized(source):
             return _render(source, settings, budget, Job(progress), start)
 

@@ -16,11 +16,13 @@ def decided(settings: RenderSettings, facts: RenderFacts) -> RenderSettings:
     """
     film, aamode = facts.film, settings.aamode
     _check_rounds(settings)
+    if facts.whole:
+        _check_whole(settings, facts)
     # Mitsuba's integrators draw random numbers for every ray, and their noise would pass for edges
-    plain = film is not None and facts.random and settings.aa is None
+    plain = (film is not None or facts.whole) and facts.random and settings.aa is None
     if aamode is None:
-        aamode = NOISE if settings.rmse is not None else "none" if plain else "sobel"
-    lattice = settings.lattice or (FILM if film or aamode == NOISE else "report")
+        aamode = NOISE if settings.rmse is not None else "none" if plain or facts.whole else "sobel"
+    lattice = settings.lattice or (FILM if film or facts.whole or aamode == NOISE else "report")
     aa = settings.aa or (1 if aamode == NOISE or (plain and aamode == "none") else 4)
     spp = settings.spp or (film.rays if film and plain and settings.aamode is None else 1)
     most = settings.maxspp or (MAX_SPP if settings.rmse is not None else None)
@@ -30,6 +32,23 @@ def decided(settings: RenderSettings, facts: RenderFacts) -> RenderSettings:
             f"aamode=noise: give the mean of a pixel's rays as spp, {MIN_SPP} or more, or a target"
         )
     return settings
+
+
+def _check_whole(settings: RenderSettings, facts: RenderFacts) -> None:
+    """Raise ``UsageError`` for options that need single rays from the camera."""
+    given = {
+        f"aamode={settings.aamode}": settings.aamode not in (None, "none", NOISE),
+        f"lattice={settings.lattice}": settings.lattice not in (None, FILM),
+        "motion": settings.motion is not None,
+        f"focaldist={facts.focus.distance}": facts.focus.distance is not None,
+    }
+    wrong = next((name for name, is_given in given.items() if is_given), None)
+    if wrong is not None:
+        way = "write focaldist=0" if wrong.startswith("focaldist") else "leave it out"
+        raise UsageError(
+            f"{wrong}: the integrator {facts.integrator} gives whole pictures, and no single rays; "
+            f"{way}, or choose another, such as path"
+        )
 
 
 def _check_rounds(settings: RenderSettings) -> None:

@@ -23,6 +23,7 @@ from mrt_mitsuba.rendering.rounds import Goal, run_rounds
 from mrt_mitsuba.rendering.settings import DETECTORS
 from mrt_mitsuba.rendering.shading import Shader
 from mrt_mitsuba.rendering.view import View
+from mrt_mitsuba.rendering.whole import Wholes
 
 
 class Passes:
@@ -116,6 +117,12 @@ class Passes:
     def _expose(self, step: Pass) -> None:
         """Expose every pixel alike."""
         exposer, rays = self._exposer(step), self._film.rays_near(step.samples * step.repeats)
+        if self._plan.whole:
+            wholes = Wholes(exposer, self._seed)
+            with self._job.stage(step.name, wholes.cost([rays])) as advance:
+                wholes.trace([rays], advance)
+            self._develop(exposer, wholes)
+            return
         moments = "square" in step.layers
         self._stack = Stack(self._film, 1, len(exposer.names))
         with self._job.stage(step.name, len(self._near) * rays) as advance:
@@ -146,7 +153,9 @@ class Passes:
 
         keep_freed_blocks()
         exposer = self._exposer(step)
-        halves = Halves(exposer, self._seed, self._blurred if self._plan.blur else None)
+        blurred = self._blurred if self._plan.blur else None
+        whole = self._plan.whole
+        halves = Wholes(exposer, self._seed) if whole else Halves(exposer, self._seed, blurred)
         self.rounds = run_rounds(halves, self._film.pixels, goal, self._job.stage)
         self.error = halves.error()
         self._develop(exposer, halves)
@@ -155,7 +164,7 @@ class Passes:
         self._set("error", np.sqrt(variance.mean(-1, keepdims=True)))
         self._set("samples", halves.samples()[..., None])
 
-    def _develop(self, exposer: Exposer, stack: Stack) -> None:
+    def _develop(self, exposer: Exposer, stack: Stack | Wholes) -> None:
         """Turn what is exposed into layers."""
         picture = stack.mean()
         self._set("image", picture[..., :3])

@@ -68,6 +68,11 @@ class RenderFacts:
     kernel: KernelPlan | None  #: what the tracing kernels hold; None where the integrator does not say
     parts: SceneFacts | None  #: what the kernels depend on
 
+    @property
+    def whole(self) -> bool:
+        """Does the integrator give whole pictures only, and nothing along single rays."""
+        return not self.traceable
+
 
 @dataclass(frozen=True)
 class Omission:

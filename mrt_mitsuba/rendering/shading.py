@@ -200,6 +200,37 @@ class Shader:
         return SampledValues(self.scene, view, ray, weight, sample)
 
 
+class DerivativeShader(Shader):
+    """An integrator for derivatives, such as ``prb``, which gives a picture as others do."""
+
+    def __init__(self, scene: Any, integrator: Any) -> None:
+        super().__init__(scene, integrator)
+        self.name = type(integrator).__name__
+
+    def values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
+        import drjit as dr
+        import mitsuba as mi
+
+        radiance, valid, aovs, _ = self.integrator.sample(
+            mode=dr.ADMode.Primal,
+            scene=self.scene,
+            sampler=sampler,
+            ray=mi.RayDifferential3f(ray),
+            depth=mi.UInt32(0),
+            δL=None,
+            δaovs=None,
+            state_in=None,
+            active=mi.Bool(True),
+        )
+        return SampledValues(self.scene, view, ray, weight, (radiance, valid, aovs))
+
+
+class WholeShader(Shader):
+    """An integrator that gives whole pictures only, such as ``ptracer``, which starts at the lamps."""
+
+    layers = frozenset()
+
+
 class LayeredShader(Shader):
     """A ``LayeredIntegrator`` on a scene, such as ``mrt_whitted``."""
 
@@ -228,7 +259,15 @@ class LayeredShader(Shader):
 
 def shader_for(scene: Any, integrator: Any) -> Shader:
     """Return the shader that an integrator is capable of."""
-    kind = LayeredShader if isinstance(integrator, LayeredIntegrator) else Shader
+    import mitsuba as mi
+
+    kind = WholeShader
+    if isinstance(integrator, LayeredIntegrator):
+        kind = LayeredShader
+    elif isinstance(integrator, mi.CppADIntegrator):
+        kind = DerivativeShader
+    elif isinstance(integrator, mi.SamplingIntegrator) and "StokesIntegrator" not in repr(integrator):
+        kind = Shader  # Mitsuba would crash in a sample of stokes, also inside another
     return kind(scene, integrator)
 
 

@@ -106,6 +106,12 @@ def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
     parameters.update()
 
 
+def opened(name: str, scene: Any, sensor: Any, integrator: Any) -> Source:
+    """Return the source of a loaded scene of one's own, seen by one of its sensors."""
+    _check_sensor(name, sensor)
+    return Source(name, scene, sensor, integrator, *map(int, sensor.film().crop_size()), own=True)
+
+
 @contextmanager
 def sized(source: Source) -> Iterator[None]:
     """Give the film of a source's sensor the source's size for the block; another size has no crop window."""
@@ -182,7 +188,14 @@ def _sensor(name: str, scene: Any, number: int) -> Any:
         raise SceneError(f"{name} has no sensor: add one, so that there is something to look through")
     if number >= len(sensors):
         raise UsageError(f"sensor={number}: {name} has {len(sensors)}, counted from 0")
-    sensor = sensors[number]
+    _check_sensor(name, sensors[number])
+    return sensors[number]
+
+
+def _check_sensor(name: str, sensor: Any) -> None:
+    """Raise ``SceneError`` for a sensor that cannot be rendered."""
+    import mitsuba as mi
+
     parts = [sensor] if sensor.class_name() != "BatchSensor" else mi.traverse(sensor).hierarchy
     for part in parts:
         if part.class_name() == "IrradianceMeter" and part.get_shape() is None:  # Mitsuba would crash
@@ -194,7 +207,6 @@ def _sensor(name: str, scene: Any, number: int) -> Any:
     if not 0 <= film.rfilter().radius() <= WIDEST_FILTER:
         radius = film.rfilter().radius()
         raise SceneError(f"{name} has a filter of radius {radius:g}: give at most {WIDEST_FILTER} pixels")
-    return sensor
 
 
 def _integrator(integrator: Any, scene: Any) -> Any:
@@ -208,17 +220,9 @@ def _integrator(integrator: Any, scene: Any) -> Any:
         integrator = {"type": integrator}
     if isinstance(integrator, dict):
         integrator = load_dict(integrator, f"the integrator {integrator.get('type')!r}")
-    if isinstance(integrator, mi.CppADIntegrator):
-        raise UsageError(
-            f"the integrator {type(integrator).__name__} computes derivatives, by mi.render(scene, params): "
-            "choose another for a picture, such as path or direct"
-        )
     _check_variant("integrator", integrator)
-    if not isinstance(integrator, mi.SamplingIntegrator):
+    if not isinstance(integrator, mi.Integrator):
         raise UsageError(
-            f"the integrator is {' '.join(repr(integrator).split())}: "
-            "it must be a sampling integrator, such as path or direct"
+            f"the integrator is {' '.join(repr(integrator).split())}: it must be one, such as path"
         )
-    if "StokesIntegrator" in repr(integrator):  # also inside another; Mitsuba would crash
-        raise UsageError("the integrator stokes works by mi.render alone: choose another, such as path")
     return integrator

@@ -1,0 +1,167 @@
+"""``mrt_adaptive``: what ``mrt.render`` does with a ``target``, as an integrator of Mitsuba."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mrt_mitsuba.plugins.parameters import ParameterError, integer, number
+from mrt_mitsuba.plugins.variants import construct_quietly
+
+NUMBERS = ("target", "max_spp", "max_seconds", "spp")
+FEWEST = 8  # rays of a pixel in the first round
+
+
+class MrtAdaptive(mi.SamplingIntegrator):
+    r"""Renders to an error with another integrator: rays go in rounds to the pixels that need them.
+
+    It does what ``mrt.render`` does with ``target``, where there is only ``mi.render`` or an XML file. The
+    scene's film is filled by its own rules, and holds the channels of the nested integrator, then
+    ``error.Y``, the standard error of each pixel, and ``samples.Y``, its rays; a ``specfilm`` holds its bands
+    only. Derivatives are those of the nested integrator, at the ``spp`` that ``mi.render`` is given.
+
+    ================ =========== ======== ================================================================
+    name             type        default  unit or range
+    ================ =========== ======== ================================================================
+    ``target``       float       0.01     > 0, RMSE to the converged picture, in linear values
+    ``max_spp``      integer     4096     >= 8, rays of a pixel at most, on average
+    ``max_seconds``  float       0        >= 0, time to spend at most; 0 for no limit
+    ``spp``          integer     (none)   >= 8, in place of ``target``: a mean of so many rays a pixel
+    (any name)       integrator           required: the nested integrator, any but ``mrt_adaptive``
+    ================ =========== ======== ================================================================
+
+    .. code-block:: python
+
+        {'type': 'mrt_adaptive', 'target': 0.01, 'nested': {'type': 'path'}}
+
+    .. code-block:: xml
+
+        <integrator type="mrt_adaptive">
+            <float name="target" value="0.01"/>
+            <integrator type="path"/>
+        </integrator>
+
+    Nearest stock plugin: none; ``moment`` shows the noise, and does nothing about it. An ``spp`` given to
+    ``mi.render`` bounds the mean rays of a pixel, from 8 on; that of the scene's sampler does not count.
+    """
+
+    plugin_name = "mrt_adaptive"
+
+    def __init__(self, props: mi.Properties) -> None:
+        construct_quietly(self, props)
+        given = {name: props[name] for name in props if name not in NUMBERS}
+        inner = [thing for thing in given.values() if isinstance(thing, mi.Integrator)]
+        others = [name for name, thing in given.items() if not isinstance(thing, mi.Integrator)]
+        if others:
+            raise ParameterError(
+                f'mrt_adaptive: "{others[0]}" is none of its parameters: {", ".join(NUMBERS)}'
+            )
+        if len(inner) != 1 or isinstance(inner[0], MrtAdaptive):
+            raise ParameterError("mrt_adaptive: give one integrator inside, such as path")
+        if "spp" in props and "target" in props:
+            raise ParameterError('mrt_adaptive: give "target" or "spp", not both')
+        self.nested = inner[0]
+        self.target = None if "spp" in props else number(props, "target", 0.01, above=0)
+        self.most = integer(props, "max_spp", 4096, least=FEWEST, most=2**24)
+        self.seconds = number(props, "max_seconds", 0.0, least=0) or None
+        if "spp" in props:
+            self.most = integer(props, "spp", self.most, least=FEWEST, most=65536)
+
+    def options(self, spp: int = 0) -> dict[str, Any]:
+        """Return what ``mrt.render`` is to be given, with a bound of ``spp`` rays, if any."""
+        most = min(self.most, spp or self.most) if self.target else spp or self.most
+        return {
+            "target": self.target,
+            "aamode": None if self.target else "noise",
+            "spp": None if self.target else max(most, 16),
+            "maxspp": max(most, FEWEST),
+            "maxseconds": self.seconds,
+        }
+
+    def render(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor | int = 0,
+        seed: int = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
+        from mrt_mitsuba.interrupts import surfacing
+        from mrt_mitsuba.rendering.api import render_with
+        from mrt_mitsuba.rendering.progress import Progress
+        from mrt_mitsuba.rendering.settings import RenderSettings
+        from mrt_mitsuba.runtime import one_at_a_time
+        from mrt_mitsuba.scene.open import opened
+
+        if 0 < spp < FEWEST:
+            warnings.warn(f"mrt_adaptive takes {FEWEST} rays a pixel at least, not spp={spp}", stacklevel=2)
+        number = sensor if isinstance(sensor, int) else 0
+        view = _sensor(scene, sensor)
+        seed = int(seed[0] if dr.is_array_v(seed) else seed) % 2**32
+        settings = RenderSettings(seed=seed, sensor=number).but(**self.options(spp))
+        with surfacing(), one_at_a_time, dr.suspend_grad():
+            source = opened("a Mitsuba scene", scene, view, self.nested)
+            result = render_with(scene, settings, Progress(), opener=lambda *_, **__: source)
+            film, layers, bands = view.film(), result.layers, result.plan.film.bands
+            names = self.aov_names() if _further(film) else []
+            colors = [layers[name] for name in bands] or list(np.moveaxis(result.image, -1, 0))
+            alpha = [layers["A"]] if "A" in layers else []
+            planes = [*colors, *alpha, np.ones_like(result.image[..., 0]), *(layers[name] for name in names)]
+            film.prepare(names)
+            values = mi.TensorXf(np.ascontiguousarray(np.stack(planes, -1), np.float32))
+            film.put_block(mi.ImageBlock(values, film.crop_offset(), film.rfilter(), border=False))
+            return self._seen(film.develop()) if develop else mi.TensorXf()
+
+    def aov_names(self) -> list[str]:
+        return [*self.nested.aov_names(), "error.Y", "samples.Y"]
+
+    def _seen(self, picture: mi.TensorXf) -> mi.TensorXf:
+        """Return the channels that ``mi.render`` shows of the nested integrator, and those of this one."""
+        if self.nested.class_name() != "AOVIntegrator" or "A" not in (n[-1] for n in self.aov_names()[3:4]):
+            return picture
+        # the picture of its first integrator is the colours once more, and Mitsuba leaves it out
+        further = len(self.aov_names())
+        return dr.concat([picture[..., :-further], picture[..., 4 - further :]], axis=2)
+
+    def render_forward(
+        self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: int = 0, spp: int = 0
+    ) -> mi.TensorXf:
+        found = self.nested.render_forward(scene, params, sensor, seed, spp)
+        further = _further(_sensor(scene, sensor).film())
+        return dr.concat([found, dr.zeros(mi.TensorXf, (*found.shape[:2], further))], axis=2)
+
+    def render_backward(
+        self,
+        scene: mi.Scene,
+        params: Any,
+        grad_in: mi.TensorXf,
+        sensor: mi.Sensor | int = 0,
+        seed: int = 0,
+        spp: int = 0,
+    ) -> None:
+        kept = grad_in.shape[2] - _further(_sensor(scene, sensor).film())
+        self.nested.render_backward(scene, params, grad_in[..., :kept], sensor, seed, spp)
+
+    def traverse(self, callback: Any) -> None:
+        callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
+
+    def to_string(self) -> str:
+        goal = f"target={self.target:g}, max_spp={self.most}" if self.target else f"spp={self.most}"
+        return f"MrtAdaptive[{goal}, max_seconds={self.seconds or 0:g}, nested={self.nested}]"
+
+
+def _sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
+    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+
+
+def _further(film: mi.Film) -> int:
+    """Return the number of channels that a film takes up besides those of the nested integrator."""
+    return 0 if mi.has_flag(film.flags(), mi.FilmFlags.Special) else 2  # specfilm has its bands only
+
+
+mi.register_integrator(MrtAdaptive.plugin_name, MrtAdaptive)
