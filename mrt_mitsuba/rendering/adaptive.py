@@ -91,7 +91,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> mi.TensorXf:
-        from mrt_mitsuba.interrupts import surfacing
+        from mrt_mitsuba.interrupts import held
         from mrt_mitsuba.rendering.api import render_with
         from mrt_mitsuba.rendering.progress import Progress
         from mrt_mitsuba.rendering.settings import RenderSettings
@@ -104,7 +104,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
         view = _sensor(scene, sensor)
         seed = int(seed[0] if dr.is_array_v(seed) else seed) % 2**32
         settings = RenderSettings(seed=seed, sensor=number).but(**self.options(spp))
-        with surfacing(), one_at_a_time, dr.suspend_grad():
+        with one_at_a_time, held(), dr.suspend_grad():
             source = opened("a Mitsuba scene", scene, view, self.nested)
             result = render_with(scene, settings, Progress(), opener=lambda *_, **__: source)
             film, layers, bands = view.film(), result.layers, result.plan.film.bands
