@@ -119,12 +119,13 @@ def test_frames_without_filters_are_one_wavefront():
     assert many.rays["primary"] == 16 * 4 * 96 * 72
 
 
-@pytest.mark.parametrize("aamode", ["none", "luma"])
-def test_random_frames_draw_numbers_of_their_own(aamode):
+@pytest.mark.parametrize(
+    "options", [{"aamode": "none"}, {"aamode": "luma", "aa": 2, "lattice": "report"}], ids=str
+)
+def test_random_frames_draw_numbers_of_their_own(options):
     """A camera that stands still: n frames are n times the rays, and the noise falls by √n."""
     scene = mi.load_dict(mrt.scene_dict(0, width=48, height=36, flavor="stock"))
-    options = {"integrator": {"type": "path", "max_depth": 4}, "aa": 1, "aamode": aamode, "motion": (0, 0, 0)}
-    options["layers"] = ["edges"] if aamode != "none" else []
+    options = {"integrator": {"type": "path", "max_depth": 4}, "aa": 1, "motion": (0, 0, 0), **options}
 
     def noise(frames: int) -> float:
         images = [mrt.render(scene, **options, motionsamples=frames, seed=seed).image for seed in (11, 5000)]

@@ -111,16 +111,6 @@ def test_edge_pixels_hold_the_whole_lattice_and_others_their_first_ray(lattice, 
 # ------------------------------------------ The same picture ------------------------------------------
 
 
-@pytest.mark.parametrize("number", [*SCENES, 9])
-def test_scalar_variant_draws_the_same_picture(number):
-    """Sums in another order and fused operations differ in the last digits; a flipped shadow decision is a
-    whole light."""
-    size = {"width": 32, "height": 24, "aa": 1, "aamode": "none", "focaldist": 0}
-    fast = mrt.render(number, **size, variant="llvm_ad_rgb")
-    slow = mrt.render(number, **size, variant="scalar_rgb")
-    assert np.abs(fast.image - slow.image).mean() < 1e-5
-
-
 def test_slow_variants_are_warned_of_once_in_a_process(run_python):
     render = 'mrt.render(0, width=2, height=1, aa=1, variant="scalar_rgb")'
     done = run_python(f"import mrt_mitsuba as mrt\n{render}\n{render}")

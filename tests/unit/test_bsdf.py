@@ -42,15 +42,6 @@ def colored(**parameters: Any) -> mi.BSDF:
     return bsdf(**{"diffuse_reflectance": rgb(KD), "specular_reflectance": rgb(KS), **parameters})
 
 
-def context(component: int = -1, flags: mi.BSDFFlags | None = None) -> mi.BSDFContext:
-    made = mi.BSDFContext()
-    if component >= 0:
-        made.component = component
-    if flags is not None:
-        made.type_mask = +flags
-    return made
-
-
 @pytest.mark.parametrize("name", bsdf_laws.MATERIALS)
 def test_obeys_the_laws_of_any_bsdf(name: str) -> None:
     """Sampling, weights, energy, reciprocity, gradients and the others."""

@@ -162,24 +162,6 @@ def test_derivatives_by_enable_grad(update: bool) -> None:
     assert float(dr.grad(alpha)[0]) == pytest.approx(difference("ball.bsdf.alpha", 1e-2), rel=1e-2)
 
 
-def test_an_optimiser_finds_roughness_and_light() -> None:
-    wanted = scene()
-    target = mi.render(wanted, **RAYS)
-    loaded = scene()
-    parameters = mi.traverse(loaded)
-    optimiser = mi.ad.Adam(lr=0.02)
-    optimiser["ball.bsdf.alpha"] = mi.Float(0.4)
-    optimiser["light.intensity.value"] = mi.Color3f(0.8)
-    for _ in range(60):
-        parameters.update(optimiser)
-        image = mi.render(loaded, parameters, **WITH_GRADIENTS)
-        dr.backward(dr.mean(dr.square(image - target).array))
-        optimiser.step()
-        optimiser["ball.bsdf.alpha"] = dr.clip(optimiser["ball.bsdf.alpha"], 0.05, 1)
-    assert float(optimiser["ball.bsdf.alpha"][0]) == pytest.approx(0.3, abs=0.01)
-    assert np.array(optimiser["light.intensity.value"]).ravel() == pytest.approx([1.1, 1.0, 0.9], abs=0.02)
-
-
 @pytest.mark.parametrize("kind", ["cone", "cylinder"])
 def test_places_of_exact_shapes(kind: str) -> None:
     """They are the exact surface's; those of a cone's mesh, which other integrators see, are a third off."""

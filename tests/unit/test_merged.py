@@ -101,25 +101,6 @@ def test_other_materials_are_called(other: dict[str, Any]) -> None:
     assert not merged(mi.load_dict(spheres(3, more=more)))
 
 
-def test_parameters_follow_updates_and_derivatives() -> None:
-    scene = mi.load_dict(spheres(3, integrator={"type": "mrt_whitted", "max_depth": 1}))
-    before = picture(scene)
-    parameters = mi.traverse(scene)
-    name = "sphere1.bsdf.alpha"
-    parameters[name] = mi.Float(0.9)
-    parameters.update()
-    assert merged(scene)
-    assert np.abs(picture(scene) - before).max() > 0.01
-    alpha = mi.Float(0.4)
-    dr.enable_grad(alpha)
-    parameters[name] = alpha
-    parameters.update()
-    assert not merged(scene)
-    loss = dr.mean(mi.render(scene, parameters, spp=4).array)
-    dr.backward(loss)
-    assert abs(dr.grad(alpha)[0]) > 1e-5
-
-
 def test_a_scene_without_shapes_is_the_sky() -> None:
     scene = spheres(0)
     del scene["floor"]
