@@ -120,8 +120,8 @@ def test_a_light_that_is_no_number_and_instances() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "give one scene"),
-        (["3", "scene=a.xml"], "give one scene"),
+        ([], "SCENE|scene=PATH is missing"),
+        (["3", "scene=a.xml"], "unexpected argument 'a.xml'"),
         (["3", "quick=yes"], "must be 0 or 1"),
         (["3", "fast=1"], "unknown option 'fast'"),
         (["99"], "99"),
