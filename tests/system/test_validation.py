@@ -266,7 +266,7 @@ FAULTS: list[tuple[str, Fault, str]] = [
     ("roughconductor:pointwise", ROUGH, "value"),
     ("roughconductor:pointwise", FLIPPED, "value"),
     ("roughconductor:metals", of_bsdf(f0=lambda _: 0.5), "F₀ of"),
-    ("bsdf_laws:dielectric_terms", SCHLICK, "F against Mitsuba's"),
+    ("bsdf_laws:dielectric_terms", SCHLICK, "reflection against Mitsuba's"),
     ("bsdf_laws:published", SCHLICK, "published albedos"),
     ("bsdf_laws:published", BRIGHT, "published albedos"),
     ("bsdf_laws:never_negative", in_bsdf(below_zero), "least value"),

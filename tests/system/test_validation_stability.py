@@ -97,7 +97,7 @@ DENSITY = lobes.Lobes.density
         (
             filters,
             [(mrt_filters, "gaussian_dof", spreading)],
-            {f"Filters: {name}" for name in ("NaN in a picture, blur", "focal distance 0")},
+            {"Filters: NaN in a picture, blur"},
         ),
         (
             finite,

@@ -93,9 +93,10 @@ class Case(Subject):
     @cached_property
     def densities(self) -> list[tuple[View, Integrals | None]]:
         """The integrals of the density for each view, in cells that resolve it; None where none do."""
-        return [(view, self._integrals(view)) for view in self.views]
+        return [(view, self.integrals(view)) for view in self.views]
 
-    def _integrals(self, view: View) -> Integrals | None:
+    def integrals(self, view: View) -> Integrals | None:
+        """Return the integrals of the density for one view; None where no cells resolve it."""
         pilot = view.samples.wo[: view.pilot][view.density[: view.pilot] > 0]
         # around the mirror direction at all scales, where lobes may be that are not sampled
         spread = 10 ** self.rng.uniform(-4, 0, (600, 1)) * self.rng.normal(size=(600, 3))
