@@ -11,8 +11,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.plugins.intersect import intersect_plane, intersect_sphere
-from mrt_mitsuba.plugins.quadric_kinds import KINDS
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.validation.checks.probe import not_finite
@@ -60,7 +58,7 @@ class _Draw:
     """Random numbers of N lanes; every third is an extreme one."""
 
     def __init__(self, count: int, seed: int) -> None:
-        self.count = count
+        self.count, self.seed = count, seed
         self._generator = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))
 
     def uniform(self) -> Any:
@@ -155,28 +153,9 @@ def texture_lanes(draw: _Draw) -> Any:
     return _bad(color) | (dr.max(color) > 1)
 
 
-def quadric_lanes(kind: Any) -> Callable[[_Draw], Any]:
-    """Return a check of distance and normal of a random shape in each lane; some rays start at its end."""
-
-    def evaluate(draw: _Draw) -> Any:
-        end, axis = draw.vector(mi.Point3f), draw.unit()
-        frame = kind.frame(
-            end, end + axis * draw.log(1e-2, 1e2, (1e-3, 1, 1e3)), draw.log(1e-2, 1e2, (1e-3, 1, 1e3))
-        )
-        straight = dr.isfinite(dr.norm(frame.z))  # the ends are not one point after rounding
-        o = dr.select(draw.uniform() < 0.2, end, draw.vector(mi.Point3f))
-        d = draw.unit()
-        hit = kind.intersect(o, d, frame)
-        found = hit.t < 1e10
-        point = kind.surface(dr.select(found, o + d * hit.t, end), hit.part, frame)
-        return straight & (~(hit.t > 0) | (found & (_not_unit(point.n) | ~dr.isfinite(point.u + point.v))))
-
-    return evaluate
-
-
 def whitted_lanes(draw: _Draw) -> Any:
     """Return bad results of random rays through a scene of every kind of shape, some from inside."""
-    scene = mi.load_dict(random_scene(np.random.default_rng(0)).to_dict())
+    scene = mi.load_dict(random_scene(np.random.default_rng(draw.seed)).to_dict())
     ray = mi.Ray3f(draw.vector(mi.Point3f), draw.unit())
     trace = traced(scene, ray, clamp=False, min_contribution=0.0)
     si = trace.hit.si
@@ -193,13 +172,6 @@ BULK: Sequence[tuple[str, str, Callable[[_Draw], Any]]] = (
     ("mrt_bsdf, normals drawn from D", "the same", bsdf_lanes("dielectric", False)),
     ("mrt_light", "directions, distances and weights", light_lanes),
     ("mrt_texture", "colours, which are of [0, 1]", texture_lanes),
-    ("mrt_plane", "distances", lambda draw: ~(
-        intersect_plane(draw.vector(mi.Point3f), draw.unit(), draw.unit(), draw.coordinate()) > 0)),
-    ("sphere of the float64 tracer", "distances", lambda draw: ~(
-        intersect_sphere(draw.vector(mi.Point3f), draw.unit(), draw.vector(mi.Point3f),
-                         draw.log(1e-6, 1e6, (1e-7, 0.5, 1, 1e7))) > 0)),
-    ("mrt_cone", "distances, normals and texture coordinates", quadric_lanes(KINDS["cone"])),
-    ("mrt_cylinder", "the same", quadric_lanes(KINDS["cylinder"])),
     ("mrt_whitted", "radiance, distances and normals", whitted_lanes),
 )  # fmt: skip
 
