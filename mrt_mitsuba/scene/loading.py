@@ -48,7 +48,7 @@ def load_dict(
     """
     import mitsuba as mi
 
-    with _resolving(None), _explained(name):
+    with _loading(name):
         _check_dict(scene, name)
         return _instantiate(_parse(lambda config: mi.parser.parse_dict(config, scene), name, budget), merge)
 
@@ -95,7 +95,7 @@ def _file(
     if not path.lower().endswith(".xml"):
         raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
     given = {key: str(value) for key, value in parameters.items()}
-    with _resolving(os.path.dirname(path) or "."), _explained(path):
+    with _loading(path, os.path.dirname(path) or "."):
         values, files = _check_xml(path, given)
         if budget is not None:
             budget.inputs.update(files)
@@ -137,28 +137,19 @@ def _instantiate(state: Any, merge: bool = True) -> Any:
 
 
 @contextlib.contextmanager
-def _explained(name: str) -> Iterator[None]:
-    """Turn what Mitsuba raises into a ``SceneError``."""
-    try:
-        yield
-    except RuntimeError as error:
-        # Mitsuba quotes the traceback, too, where the plugin is written in Python
-        text = _CODE_PLACE.sub("", _TRACEBACK.sub("", str(error)))
-        raise SceneError(f"cannot load {name}: {' '.join(text.split())}") from error
-
-
-# ---------------------------------------------- Folders ------------------------------------------------
-
-
-@contextlib.contextmanager
-def _resolving(folder: str | None) -> Iterator[None]:
-    """Take plugins from Mitsuba's own folder within the block, and data from ``folder`` as well."""
+def _loading(name: str, folder: str | None = None) -> Iterator[None]:
+    """Take plugins from Mitsuba's own folder within the block, and data from ``folder`` as well; turn what
+    Mitsuba raises into a ``SceneError``."""
     import mitsuba as mi
 
     before = mi.file_resolver()
     mitsuba_first(folder)
     try:
         yield
+    except RuntimeError as error:
+        # Mitsuba quotes the traceback, too, where the plugin is written in Python
+        text = _CODE_PLACE.sub("", _TRACEBACK.sub("", str(error)))
+        raise SceneError(f"cannot load {name}: {' '.join(text.split())}") from error
     finally:
         mi.set_file_resolver(before)
 

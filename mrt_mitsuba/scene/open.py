@@ -52,7 +52,13 @@ def open_scene(
     ``model_scene``.
     """
     check_model_options(scene, model or {})
-    own = _in_our_terms(scene, model or {})
+    terms = scene if isinstance(scene, Scene) else None  # the scene in the report's terms
+    if hasattr(scene, "__index__"):
+        terms = report_scene(operator.index(scene))
+    elif is_obj(scene):
+        from mrt_mitsuba.scene.placement import model_scene
+
+        terms = model_scene(scene, **(model or {}))
     # a key of mi.traverse has a dot, the name of a parameter of an XML file has none
     keys = {key: value for key, value in (params or {}).items() if "." in key}
     declared = {key: value for key, value in (params or {}).items() if "." not in key}
@@ -60,7 +66,7 @@ def open_scene(
         raise UsageError(
             f"params: {next(iter(declared))} is not a key of mi.traverse, and only an XML file declares names"
         )
-    if own is None:
+    if terms is None:
         if fresnel is not None:
             raise UsageError(
                 "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
@@ -68,22 +74,22 @@ def open_scene(
         name, loaded, values = _loaded(scene, budget, declared)
         if keys and loaded is scene:
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
-        set_parameters(loaded, keys)
-        view = _sensor(name, loaded, sensor)
-        width, height = (a or int(b) for a, b in zip(size, view.film().crop_size(), strict=True))
-        distance, reach = (_number(values.get(key)) for key in ("focaldist", "focalrange"))  # of write_xml
-        chosen, reach = _integrator(integrator, loaded), FOCAL_RANGE if reach is None else reach
-        return Source(name, loaded, view, chosen, width, height, distance, reach, own=True)
-    if budget is not None:
-        budget.inputs.update(own.files)
-    width, height, fresnel = size[0] or SIZE[0], size[1] or SIZE[1], fresnel or "schlick"
-    # its meshes have a material each: kept apart, they stay in order, and the same file has the same layers
-    nodes = own.to_dict(width=width, height=height, fresnel=fresnel)
-    name = str(operator.index(scene)) if hasattr(scene, "__index__") else own.title or "a scene"
-    loaded = load_dict(nodes, name, budget, merge=False)
+        # of write_xml
+        distance, reach = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
+    else:
+        if budget is not None:
+            budget.inputs.update(terms.files)
+        size, fresnel = (size[0] or SIZE[0], size[1] or SIZE[1]), fresnel or "schlick"
+        nodes = terms.to_dict(width=size[0], height=size[1], fresnel=fresnel)
+        name = str(operator.index(scene)) if hasattr(scene, "__index__") else terms.title or "a scene"
+        # its meshes have a material each: kept apart, they stay in order, and a file has the same layers
+        loaded = load_dict(nodes, name, budget, merge=False)
+        distance, reach = terms.focal_distance, terms.focal_range
     set_parameters(loaded, keys)
-    view, integrator = _sensor(name, loaded, sensor), _integrator(integrator, loaded)
-    return Source(name, loaded, view, integrator, width, height, own.focal_distance, own.focal_range, fresnel)
+    view, chosen = _sensor(name, loaded, sensor), _integrator(integrator, loaded)
+    columns, rows = view.film().crop_size()
+    width, height = size[0] or int(columns), size[1] or int(rows)
+    return Source(name, loaded, view, chosen, width, height, distance, reach, fresnel, own=terms is None)
 
 
 def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
@@ -131,17 +137,6 @@ def sized(source: Source) -> Iterator[None]:
         parameters.update(dict(zip(names, before, strict=True)))
 
 
-def _in_our_terms(scene: Any, options: Mapping[str, Any]) -> Scene | None:
-    """Return a scene in the report's terms, or None for any other."""
-    if hasattr(scene, "__index__"):
-        return report_scene(operator.index(scene))
-    if is_obj(scene):
-        from mrt_mitsuba.scene.placement import model_scene
-
-        return model_scene(scene, **options)
-    return scene if isinstance(scene, Scene) else None
-
-
 def _loaded(
     scene: Any, budget: Budget | None, declared: Mapping[str, Any]
 ) -> tuple[str, Any, Mapping[str, str]]:
@@ -171,11 +166,12 @@ def _check_variant(name: str, thing: Any) -> None:
         )
 
 
-def _number(text: str | None) -> float | None:
+def _number(values: Mapping[str, str], name: str, default: Any) -> Any:
+    """Return a number that an XML file declares, or the default."""
     try:
-        return None if text is None else max(0.0, float(text))
+        return max(0.0, float(values[name])) if name in values else default
     except ValueError:
-        return None
+        return default
 
 
 def _sensor(name: str, scene: Any, number: int) -> Any:
