@@ -91,7 +91,7 @@ def _validate(options: argparse.Namespace) -> int:
     if missing:
         packages = " ".join(missing)
         raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
-    report.prepare(options.out, "summary.json", "index.html")
+    report.prepare(options.out)
     seconds = sum(STUDIES[name][2] if options.quick else STUDIES[name][3] for name in names)
     print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
     # With a cache of their own, studies of speed see how long compilation takes

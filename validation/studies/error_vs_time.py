@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,8 +45,7 @@ ALL = (0, 1, 2, 3, 4, 7, 9)
 # Under path, scenes of broad highlights: elsewhere rare, very bright paths rule every mean square
 OF_TRADES = {"sampling": ALL, "whitted": ALL, "path": (0, 7, 9)}
 FULL = Extent((240, 180), (1, 2, 4, 8), 48, (1, 4, 16, 64), 2048, OF_TRADES, 5)
-QUICK_TRADES = {"sampling": (0,), "whitted": (0,), "path": (0,)}
-QUICK = Extent((64, 48), (1, 4), 24, (1, 16), 512, QUICK_TRADES, 1)
+QUICK = Extent((64, 48), (1, 4), 24, (1, 16), 512, dict.fromkeys(OF_TRADES, (0,)), 1)
 
 
 @dataclass(frozen=True)
@@ -105,24 +104,16 @@ def best(scenes: Sequence[Points], error: float) -> str:
     return f"{fastest}: {1000 * seconds[fastest]:.3g} ms" if fastest else "none of these"
 
 
-def _ends(names: Iterable[str], pattern: str) -> tuple[str, str, float]:
-    """Return the cases of least and most of a number, "none aa={} centered", and how much less that is."""
-    before, after = pattern.split("{}")
-    numbers = {float(n[len(before) : len(n) - len(after)]): n for n in names
-               if n.startswith(before) and n.endswith(after)}  # fmt: skip
-    few, many = min(numbers), max(numbers)
-    return numbers[few], numbers[many], few / many
-
-
 def sampling(number: int, extent: Extent) -> Trade:
     """Return which pixels get how many samples, and where in the pixel."""
     most = extent.reference_aa
 
     def hold(study: Study, where: str, points: Points) -> float:
-        few, many, share = _ends(points, "none aa={} centered")
+        least, greatest = extent.amounts[0], extent.amounts[-1]
+        few, many = (f"none aa={aa} centered" for aa in (least, greatest))
         what, ratio = f"{where}: RMSE of {many} / {few}", points[many].rmse / points[few].rmse
         why = "an edge of the lattice is known to 1 / aa; twice that: samples that do not help leave 1"
-        study.at_most(what, ratio, 2 * share, why)
+        study.at_most(what, ratio, 2 * least / greatest, why)
         return points[many].rmse
 
     return Trade(
@@ -175,8 +166,9 @@ def path(number: int, extent: Extent) -> Trade:
     """Return Mitsuba's path and direct at rising spp, and mrt_whitted, against converged path."""
 
     def hold(study: Study, where: str, points: Points) -> float:
-        few, many, share = _ends(points, "path spp={}")
-        ratio = points[many].rmse / points[few].rmse / share**0.5
+        least, greatest = extent.spp[0], extent.spp[-1]
+        few, many = (f"path spp={spp}" for spp in (least, greatest))
+        ratio = points[many].rmse / points[few].rmse * (greatest / least) ** 0.5
         why = "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15"
         study.at_most(f"{where}: |RMSE of {many} / {few} / theory - 1|", abs(ratio - 1), 0.15, why)
         return points[many].rmse
@@ -200,8 +192,4 @@ def path(number: int, extent: Extent) -> Trade:
     )
 
 
-TRADES: dict[str, Callable[[int, Extent], Trade]] = {
-    "sampling": sampling,
-    "whitted": whitted,
-    "path": path,
-}
+TRADES: dict[str, Callable[[int, Extent], Trade]] = {"sampling": sampling, "whitted": whitted, "path": path}

@@ -7,7 +7,6 @@ from typing import Any
 
 from mrt_mitsuba.command.toml import read_toml
 from mrt_mitsuba.errors import MrtError, SceneError, UsageError
-from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.validation.tools.study import Bound
 
 MISSED = 1  # the exit code where a limit is missed, a law does not hold, or a case failed
@@ -46,9 +45,10 @@ def check(scene: str, *, out: str | None = None, quick: str = "0") -> int:
         raise UsageError(f"quick={quick}: must be 0 or 1")
     from mrt_mitsuba.rendering.progress import TerminalProgress
     from mrt_mitsuba.validation.checks.scene import check_scene
+    from mrt_mitsuba.validation.tools import report
 
     if out is not None:
-        _prepare(out, scene)
+        report.prepare(Path(out), inputs=[scene])
     try:
         found = check_scene(_scene(scene), quick=quick == "1", progress=TerminalProgress(unit="plugin"))
     except SceneError as error:  # nothing was checked
@@ -67,9 +67,9 @@ def error_vs_time(scene: str, *, cases: str, out: str = "error-vs-time") -> int:
     settings = read_cases(cases)
     with own_cache():  # cold times are then those of the compiler; before Dr.Jit starts
         from mrt_mitsuba.rendering.progress import TerminalProgress
-        from mrt_mitsuba.validation.tools import work_precision
+        from mrt_mitsuba.validation.tools import report, work_precision
 
-        _prepare(out, scene, cases)
+        report.prepare(Path(out), inputs=[scene, cases])
         progress = TerminalProgress(unit="render")
         try:
             found = work_precision.error_vs_time(_scene(scene), progress=progress, **settings)
@@ -90,16 +90,6 @@ def read_cases(path: str) -> dict[str, Any]:
         wrong = f"an unknown entry {unknown[0]!r}" if unknown else f"no entry {missing[0]!r}"
         raise UsageError(f"{path} has {wrong}: it holds {', '.join(KEYS)}")
     return found
-
-
-def _prepare(folder: str, *inputs: str) -> None:
-    """Make the folder of a report, and find out before the work whether its files can be written there."""
-    from mrt_mitsuba.validation.tools import report
-
-    names = ("summary.json", "index.html")
-    report.prepare(Path(folder), *names)
-    for name in names:
-        check_target(Path(folder) / name, inputs)
 
 
 def _scene(text: str) -> Any:

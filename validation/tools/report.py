@@ -68,18 +68,18 @@ def terminal_table(studies: Sequence[Study]) -> str:
     return "\n".join(lines[1:])
 
 
-def prepare(folder: Path, *names: str) -> None:
+def prepare(folder: Path, *names: str, inputs: Sequence[str] = ()) -> None:
     """Make the folder, and find out now whether files of these names can be written there, before the work.
 
-    Raises ``OutputError``.
+    By default those of a report; none of them may be one of the ``inputs``. Raises ``OutputError``.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         problem = f"cannot make the folder {folder}: {error.strerror}; choose another --out"
         raise OutputError(problem) from error
-    for name in names:
-        check_target(folder / name)
+    for name in names or ("summary.json", "index.html"):
+        check_target(folder / name, inputs)
 
 
 def save(
@@ -94,7 +94,7 @@ def save(
     import jinja2
 
     place = Path(folder)
-    prepare(place, "summary.json", "index.html")
+    prepare(place)
     sections = [_section(place, study) for study in studies]
     result = {
         **versions(),
