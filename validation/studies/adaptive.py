@@ -197,7 +197,7 @@ def _in_turns(scene: Any, repeats: int) -> list[dict[str, np.ndarray]]:
     ]
     for kind in kinds:
         kind(1000)  # compiles
-    sides = [lambda seed, kind=kind: timed(lambda: kind(seed)) for kind in kinds]  # type: ignore[misc]
+    sides = [lambda seed, kind=kind: timed(lambda: kind(seed)) for kind in kinds]
     found = []
     for side in in_turns(sides, repeats):
         pictures, rays = zip(*(result for result, _ in side), strict=True)

@@ -66,18 +66,18 @@ def modes(study: Study, *, quick: bool) -> None:
                 if mode != "none":
                     off.append(rays - refined.size - int(refined.sum()) * (aa**2 - 1))
                 found[mode, aa] = rmse, rays, float(refined.mean())
-        for (mode, aa), (rmse, rays, refined) in found.items():
+        for (mode, aa), (rmse, rays, share) in found.items():
             full = found["none", aa]
-            rows.append([number, mode, aa, rmse, rmse / full[0], rays, rays / full[1], refined])
+            rows.append([number, mode, aa, rmse, rmse / full[0], rays, rays / full[1], share])
         title = f"scene {number}: camera rays other than one a pixel and aa² - 1 in refined ones"
         study.at_most(title, max(map(abs, off)), 0, "a count")
-        least = max(extent.amounts)
+        most = max(extent.amounts)
         why = (
             "scene 4 leaves a fifth of its pixels alone and twice the error, scene 2 the outlines of its "
             "dark spheres; a detector that finds nothing has four times the error or more"
         )
-        ratio = found["sobel", least][0] / found["none", least][0]
-        study.at_most(f"scene {number}: error of sobel / full at aa={least}", ratio, 2.2, why)
+        ratio = found["sobel", most][0] / found["none", most][0]
+        study.at_most(f"scene {number}: error of sobel / full at aa={most}", ratio, 2.2, why)
     columns = ["scene", "mode", "aa", "RMSE", "error / full", "rays", "rays / full", "pixels refined"]
     title = f"Error to aa={extent.reference_aa} of the same lattice, {width}x{height}"
     study.table("modes", title, columns, rows)

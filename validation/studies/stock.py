@@ -275,10 +275,9 @@ def physical(scene: Scene) -> Scene:
     """
 
     def material(m: Material) -> Material:
-        specular = tuple(min(c, 1.0) for c in m.specular)
-        return dataclasses.replace(
-            m, alpha=max(abs(m.alpha), 0.1), specular=specular, diffuse=(0.0, 0.0, 0.0)
-        )
+        r, g, b = (min(c, 1.0) for c in m.specular)
+        alpha = max(abs(m.alpha), 0.1)
+        return dataclasses.replace(m, alpha=alpha, specular=(r, g, b), diffuse=(0.0, 0.0, 0.0))
 
     return with_materials(scene, material)
 
@@ -345,11 +344,11 @@ def whole_scenes(study: Study, *, quick: bool) -> None:
                 add(name, mean(change(ours), PATH, 0), theirs)
     # The clamp has no counterpart among Mitsuba's plugins: our own render loses it
     scene_1 = mrt.scene_dict(1, fresnel="dielectric", **size)
-    pair = [
+    unclamped, clamped = (
         mean(scene_1, {"type": "mrt_whitted", "clamp": clamp}, seed, lattice="film")
         for clamp, seed in ((False, 0), (True, 1000))
-    ]
-    add("dropped clamp", *pair)
+    )
+    add("dropped clamp", unclamped, clamped)
     title = "mrt_bsdf against roughplastic in whole scenes, right and with mistakes: p values of equality"
     note = (
         f"{RENDERS} renders of {spp} samples a pixel each; equal pictures are rejected once in {1 / LEVEL:g}."

@@ -11,7 +11,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -203,7 +203,7 @@ class WorkPrecision:
         """
         error *= 1 + 1e-9  # an error that is met to rounding is met
 
-        def crossing(index: np.ndarray, points: Sequence[Point]) -> np.ndarray:
+        def crossing(points: Sequence[Point], index: np.ndarray) -> np.ndarray:
             seconds = np.stack([np.median(p.times[index], axis=-1) for p in points])  # [points, ...]
             rmse = np.stack([p.rmse_of(index) for p in points])
             found = np.where(rmse[0] <= error, seconds[0], np.inf)
@@ -216,8 +216,7 @@ class WorkPrecision:
             return found
 
         return {
-            name: estimate(self.repeats, lambda index, points=points: crossing(index, points))
-            for name, points in self.families.items()
+            name: estimate(self.repeats, partial(crossing, points)) for name, points in self.families.items()
         }
 
     @cached_property
