@@ -30,7 +30,7 @@ from mrt_mitsuba.validation.tools.bsdf_probe import (
     rgb,
 )
 from mrt_mitsuba.validation.tools.image_tests import Comparison
-from mrt_mitsuba.validation.tools.scenery import ball_scene, side_by_side
+from mrt_mitsuba.validation.tools.scenery import ball_scene
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.timing import in_turns, timed
 
@@ -272,7 +272,8 @@ def rendered(study: Study, *, quick: bool) -> None:
         study.at_least(what, found.test.p, LEVEL, why)
         study.record(f"relRMSE of the averages, {at}", found.test.rel_rmse)
         study.record(f"time, ours over theirs, {at}", found.timings["ratio"])
-        sheet = side_by_side(found.images["ours"], found.images["theirs"], gain=20)
+        one, other, difference = found.images.values()
+        sheet = np.concatenate([one, other, 20 * np.abs(difference)], axis=1)
         caption = f"{found.samples} samples per pixel each, independent: the difference is noise."
         title = f"Ours, Mitsuba's, |difference| × 20; {at}"
         study.picture(f"pictures-{alpha:g}", title, sheet, caption, exr=True)

@@ -82,8 +82,3 @@ def _fields() -> dict[str, Any]:
     """Return a sky of 16 × 8 fields with random brightness, a decade from the median to the brighter ones."""
     fields = 10 ** np.random.default_rng(0).normal(-0.5, 0.5, (8, 16, 1)) * np.ones(3)
     return {"type": "envmap", "bitmap": mi.Bitmap(fields.astype(np.float32))}
-
-
-def side_by_side(one: np.ndarray, other: np.ndarray, *, gain: float) -> np.ndarray:
-    """Return two pictures [H, W, 3] and their absolute difference, enlarged, in a row."""
-    return np.concatenate([one, other, gain * np.abs(one - other)], axis=1)
