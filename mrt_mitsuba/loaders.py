@@ -1,4 +1,4 @@
-"""How Mitsuba loads: plugins from its own folder first, and this project's objects one after the other."""
+"""What is changed in Mitsuba: how it loads, and that threads change and render scenes one after the other."""
 
 from __future__ import annotations
 
@@ -71,6 +71,28 @@ def one_by_one() -> None:
         loader = getattr(mi, name)
         if not hasattr(loader, "__wrapped__"):
             setattr(mi, name, in_turn(loader, mentions))
+
+
+def exclusive(lock: contextlib.AbstractContextManager[Any]) -> None:
+    """Let ``mi.render`` and changes by ``mi.traverse`` hold a lock: done at once, they end the process.
+
+    Idempotent.
+    """
+    import mitsuba as mi
+
+    def guarded(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def call(*args: Any, **given: Any) -> Any:
+            with lock:
+                return function(*args, **given)
+
+        return call
+
+    parameters = mi.SceneParameters
+    for owner, name in ((mi, "render"), (parameters, "update"), (parameters, "__setitem__")):
+        function = getattr(owner, name)
+        if not hasattr(function, "__wrapped__"):
+            setattr(owner, name, guarded(function))
 
 
 def _is_mentioned(scene: Any) -> bool:

@@ -370,6 +370,55 @@ def test_a_signal_leaves_both_pictures_old_or_new(start, tmp_path: Path, attempt
     assert sorted(tmp_path.iterdir()) == sorted(old)
 
 
+EDITED = """
+import random, sys, threading, time
+import numpy as np
+import mrt_mitsuba as mrt
+mrt.register()
+import mitsuba as mi
+grey, own = {"type": "rgb", "value": 0.5}, {"type": "mrt_bsdf"}
+materials = [own | {"diffuse_reflectance": grey}, {"type": "diffuse", "reflectance": grey}]
+shapes = {f"ball{i}": {"type": "sphere", "center": [i - 2, 0, 5], "radius": 0.5, "bsdf": materials[i % 2]}
+          for i in range(4)}
+film = {"type": "hdrfilm", "width": 32, "height": 24}
+scene = mi.load_dict({
+    "type": "scene", "integrator": {"type": "mrt_whitted"}, "sensor": {"type": "perspective", "film": film},
+    "light": {"type": "point", "position": [0, 4, 0]}, "cube": {"type": "cube", "bsdf": own},
+    "cone": {"type": "mrt_cone", "apex": [0, 2, 6], "base_center": [0, 0, 6], "radius": 0.5}, **shapes})
+doors = {"mrt": lambda: mrt.render(scene).image, "mi": lambda: np.array(mi.render(scene, spp=4))}
+render, params = doors[sys.argv[1]], mi.traverse(scene)
+keys = [key for key in params.keys() if key.endswith(("reflectance.value", "positions", "apex"))]
+before, first, edits, done = {key: type(params[key])(params[key]) for key in keys}, render(), 0, False
+def edit():
+    global edits
+    while not done:
+        for key in keys:
+            params[key] = before[key] * (1 + edits % 5 / 50)
+            time.sleep(0.01 * random.random())
+        params.update()
+        edits += 1
+thread = threading.Thread(target=edit)
+thread.start()
+rendered = 0
+while rendered < 4 or edits < 4:
+    render()
+    rendered += 1
+done = True
+thread.join()
+for key in keys:
+    params[key] = before[key]
+params.update()
+print(len(keys) > 5, np.array_equal(render(), first))
+"""
+
+
+@pytest.mark.parametrize("door", ["mrt", "mi"])
+@pytest.mark.parametrize("attempt", range(ROUNDS))
+def test_a_scene_that_another_thread_edits_is_rendered(run_python, door: str, attempt: int) -> None:
+    done = run_python(EDITED, door)
+    assert (done.returncode, done.stdout) == (0, "True True\n"), done.stdout + done.stderr
+
+
 INTERRUPTED = """
 import os, signal, sys, threading, time
 import mrt_mitsuba as mrt
