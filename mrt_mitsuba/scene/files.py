@@ -57,10 +57,10 @@ def read_text(path: Path) -> bytes:
     first, *others = data.removeprefix(b"\xef\xbb\xbf").split(b"\\\n")
     parts, owed = [first], 0
     for part in others:
-        rest, end, following = part.partition(b"\n")
+        rest, newline, following = part.partition(b"\n")
         owed += 1
         parts += [b" ", rest]
-        if end:
+        if newline:
             parts += [b"\n" * (owed + 1), following]
             owed = 0
     data = b"".join([*parts, b"\n" * owed])

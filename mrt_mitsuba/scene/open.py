@@ -115,7 +115,8 @@ def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
 def opened(name: str, scene: Any, sensor: Any, integrator: Any) -> Source:
     """Return the source of a loaded scene of one's own, seen by one of its sensors."""
     _check_sensor(name, sensor)
-    return Source(name, scene, sensor, integrator, *map(int, sensor.film().crop_size()), own=True)
+    width, height = map(int, sensor.film().crop_size())
+    return Source(name, scene, sensor, integrator, width, height, own=True)
 
 
 @contextmanager
