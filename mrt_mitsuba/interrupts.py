@@ -55,7 +55,8 @@ def heed() -> None:
 
 def _heed(handlers: dict[int, Callable[..., Any]]) -> None:
     while _waiting:
-        number, _ = _waiting.pop(0)
+        number = _waiting[0][0]
+        _waiting[:] = [each for each in _waiting if each[0] != number]  # twice counts once
         if number in handlers:
             handlers[number](number, None)
 
