@@ -52,13 +52,13 @@ def components(law: Law, case: Case) -> None:
             params[key] = type(value)(value)
         params.update()
         more = abs(copy.component_count() - len(flags))
-        show = case.snippet(UPDATED, keys=keys)
+        updated = case.snippet(UPDATED, keys=keys)
         law.at_most(
             "components more or fewer after params.update()",
             more,
             0,
             "an update says nothing about lobes",
-            show,
+            updated,
         )
     parts = [case.probe.eval(p.wi, p.wo, p.uv, context(i)) for i in range(len(flags))]
     error = excess(np.sum(parts, axis=0), p.value, case.spread(case.probe.eval, p.wi, p.wo, p.uv))

@@ -126,10 +126,10 @@ def surface(law: Law, case: Case) -> None:
     what = f"rays from the surface, of {count}, that meet it where they start"
     law.none(what, bad, "self-intersections are dark spots; grazing rays are left out", case.at(start, away))
     before = met.p - 1e-3 * case.size * d
-    close = trace(case.target, before.astype(np.float32), d)
+    from_near = trace(case.target, before.astype(np.float32), d)
     law.share(
         "share of rays from a thousandth of the size before the surface that do not meet it there",
-        ~(close.found & (np.linalg.norm(close.p - met.p, axis=1) < 1e-3 * case.size)),
+        ~(from_near.found & (np.linalg.norm(from_near.p - met.p, axis=1) < 1e-3 * case.size)),
         2e-3,
         "no absolute limits; outlines hang on roundings",
         case.at(before.astype(np.float32), d),

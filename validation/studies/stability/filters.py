@@ -23,7 +23,9 @@ Edges = Callable[[np.ndarray, np.ndarray], Any]
 EDGES: dict[str, Edges] = {
     "luma": lambda image, depth: filters.luma_edges(image),
     "sobel": lambda image, depth: filters.sobel_edges(image),
-    "geometry": lambda image, depth: filters.geometry_edges(image * 0 + np.float32([0, 0, 1]), depth),
+    "geometry": lambda image, depth: filters.geometry_edges(
+        image * 0 + np.array([0, 0, 1], np.float32), depth
+    ),
 }
 
 

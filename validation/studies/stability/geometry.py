@@ -82,7 +82,7 @@ class Solid:
     name: str
     to_dict: Callable[[float], dict[str, Any]]  # of this size
     exact: Callable[[float], Any]  # of this size, for the float64 tracer
-    normal: float  # what its normals may be off by, in roundings: four times what was measured
+    normal: float  # what its normals may be off by, in roundings
     alone: bool = False  # else another shape is in the scene, out of the way
 
 
