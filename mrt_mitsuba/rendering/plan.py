@@ -19,7 +19,7 @@ from mrt_mitsuba.rays.region import Region
 from mrt_mitsuba.rendering.settings import DETECTORS, NOISE, Focus, RenderSettings
 
 # Float32 channels of a pixel that its statistics take while rounds are shared out
-ROUND_CHANNELS = 122
+ROUND_CHANNELS = 240
 
 # Passes over the picture, in the order in which they may occur
 FIRST_HITS, RENDERING, EDGES = "first hits", "rendering", "edges"
