@@ -25,6 +25,7 @@ from mrt_mitsuba.errors import MrtError, OutputError, UsageError
 from mrt_mitsuba.output.files import read_exr
 
 pytest.importorskip("distributed")
+pytestmark = pytest.mark.attack
 
 SMALL = {"width": 64, "height": 48, "aa": 1}
 PATIENCE = 120  # seconds for anything that processes do; a busy machine is no failure
