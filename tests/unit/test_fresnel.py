@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from itertools import product
 
 import drjit as dr
@@ -105,16 +104,6 @@ def test_float64_is_that_of_fifty_digits(cos_theta: float, n1: float, n2: float)
 
 
 # ------------------------------------------------ Beyond it ------------------------------------------------
-
-
-@given(n1=INDICES, ratio=st.floats(0.05, 0.999), beyond=st.floats(1e-6, 1))
-def test_total_reflection_begins_at_the_critical_angle(n1: float, ratio: float, beyond: float) -> None:
-    n2 = n1 * ratio
-    sin_critical = ratio
-    sin_theta = sin_critical + beyond * (1 - sin_critical)
-    assert fresnel_dielectric(math.sqrt((1 - sin_theta) * (1 + sin_theta)), n1, n2) == 1
-    sin_theta = sin_critical * (1 - beyond)
-    assert fresnel_dielectric(math.sqrt((1 - sin_theta) * (1 + sin_theta)), n1, n2) < 1
 
 
 @needs_llvm
