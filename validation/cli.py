@@ -64,7 +64,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:
-            return _validate(options)
+            names = [name for name in STUDIES if name in options.study or "all" in options.study]
+            missing = [name.replace("_", "-") for name in EXTRAS if util.find_spec(name) is None]
+            if missing:
+                packages = " ".join(missing)
+                raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
+            report.prepare(options.out)
+            seconds = sum(STUDIES[name][2 if options.quick else 3] for name in names)
+            print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
+            # With a cache of their own, studies of speed see how long compilation takes
+            with nullcontext() if options.quick or not set(names) & set(TIMED) else own_cache():
+                import matplotlib
+
+                matplotlib.use("Agg")  # no window, whatever the user's settings say
+                progress = TerminalProgress(unit="step")
+                studies = [run_study(name, quick=options.quick, progress=progress) for name in names]
+            print(report.terminal_table(studies), flush=True)
+            report.save(options.out, *studies, quick=options.quick)
+            print(f"\nReport: {options.out / 'index.html'}")
+            return 0 if all(study.passed for study in studies) else 1
         except MrtError as error:
             return _fail(str(error), error.exit_code)
         except KeyboardInterrupt:
@@ -83,28 +101,6 @@ def listing() -> str:
 
 def _spoken(seconds: int) -> str:
     return f"{seconds} s" if seconds < 100 else f"{round(seconds / 60)} min"
-
-
-def _validate(options: argparse.Namespace) -> int:
-    names = [name for name in STUDIES if name in options.study or "all" in options.study]
-    missing = [name.replace("_", "-") for name in EXTRAS if util.find_spec(name) is None]
-    if missing:
-        packages = " ".join(missing)
-        raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
-    report.prepare(options.out)
-    seconds = sum(STUDIES[name][2] if options.quick else STUDIES[name][3] for name in names)
-    print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
-    # With a cache of their own, studies of speed see how long compilation takes
-    with nullcontext() if options.quick or not set(names) & set(TIMED) else own_cache():
-        import matplotlib
-
-        matplotlib.use("Agg")  # no window, whatever the user's settings say
-        progress = TerminalProgress(unit="step")
-        studies = [run_study(name, quick=options.quick, progress=progress) for name in names]
-    print(report.terminal_table(studies), flush=True)
-    report.save(options.out, *studies, quick=options.quick)
-    print(f"\nReport: {options.out / 'index.html'}")
-    return 0 if all(study.passed for study in studies) else 1
 
 
 def run_study(name: str, *, quick: bool, progress: Progress | None = None) -> Study:

@@ -42,17 +42,19 @@ GREY = Material(1.5, 0.3, (0.4, 0.4, 0.4), (0.3, 0.4, 0.5))
 SHINY = Material(1.5, 0.1, (0.9, 0.8, 0.7), (0.1, 0.1, 0.1))
 
 
-def _hovering() -> Scene:
-    """Return cones and cylinders in the air, seen level with the base of one and from below the others."""
-    cones = (Cone((0, 1.2, 0), (0, 0.5, 0), 0.5, GREY), Cone((1.3, 0.6, -0.3), (1.0, 1.5, 0.2), 0.4, SHINY))
-    cylinders = (
+# Cones and cylinders in the air, seen level with the base of one and from below the others
+HOVERING = Scene(
+    Camera((0, 0.5, 4.5), (0, 0.5, 0), hfov=45),
+    (0.2, 0.3, 0.4),
+    lights=(Light((2, 4, 3), (0.8, 0.8, 0.8)), Light((-1, -3, 4), (0.5, 0.5, 0.6))),
+    spheres=(Sphere((0.8, 0.3, 0.8), 0.3, SHINY),),
+    planes=(Plane((0, 1, 0), 0.6, GREY),),
+    cones=(Cone((0, 1.2, 0), (0, 0.5, 0), 0.5, GREY), Cone((1.3, 0.6, -0.3), (1.0, 1.5, 0.2), 0.4, SHINY)),
+    cylinders=(
         Cylinder((-1.2, 0.9, 0), (-1.2, 1.6, 0.1), 0.35, SHINY),
         Cylinder((0.1, 0, 0.9), (0.1, 0.3, 0.9), 0.3, GREY),
-    )
-    lights = (Light((2, 4, 3), (0.8, 0.8, 0.8)), Light((-1, -3, 4), (0.5, 0.5, 0.6)))
-    ball, floor = Sphere((0.8, 0.3, 0.8), 0.3, SHINY), Plane((0, 1, 0), 0.6, GREY)
-    camera = Camera((0, 0.5, 4.5), (0, 0.5, 0), hfov=45)
-    return Scene(camera, (0.2, 0.3, 0.4), lights, (ball,), (floor,), cones, cylinders)
+    ),
+)
 
 
 def _crowded(lights: int) -> Scene:
@@ -99,7 +101,7 @@ CASES = {
     "7": Case(report_scene(7), 5e-7, (160, 120), (48, 36)),
     "8": Case(report_scene(8), 3e-7),
     "9": Case(report_scene(9), 9e-7),
-    "hovering": Case(_hovering(), 6e-7, fresnel="schlick"),
+    "hovering": Case(HOVERING, 6e-7, fresnel="schlick"),
     "crowded": Case(_crowded(12), 1e-5, (160, 120), (80, 60), "schlick"),
     "crowded, unrolled": Case(_crowded(4), 7e-6, (160, 120), (80, 60), "schlick"),
 }
