@@ -11,7 +11,7 @@ from nodes import rgb, sensor
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
-from mrt_mitsuba.validation.tools.precision import Point, WorkPrecision, estimate
+from mrt_mitsuba.validation.tools.precision import Findings, Point, estimate
 from mrt_mitsuba.validation.tools.precision_page import front
 
 for needed in ("matplotlib", "jinja2", "scipy", "flip_evaluator"):
@@ -151,9 +151,9 @@ def point(name: str, times: list[float], rmse: float) -> Point:
     return Point(name, {}, np.array(times), gram, 1.0, 0.5, {}, image, mrt.compare(image, image), 0.0)
 
 
-def found_of(*points: Point, errors: tuple[float, ...] = (0.1,)) -> WorkPrecision:
+def found_of(*points: Point, errors: tuple[float, ...] = (0.1,)) -> Findings:
     repeats = len(points[0].times)
-    return WorkPrecision("test", {p.name: p for p in points}, {}, np.zeros((2, 2, 3)), 0.0, repeats, errors)
+    return Findings("test", {p.name: p for p in points}, {}, np.zeros((2, 2, 3)), 0.0, repeats, errors)
 
 
 def test_time_to_an_error_is_read_off_the_curve():

@@ -168,17 +168,9 @@ def read_layer(source: Any, layer: str = "", name: str = "the picture") -> Layer
         values = np.atleast_3d(values)
     window = variance = None
     if channels:
-        chosen = _channels_of(channels, layer)
-        if not chosen:
-            named = sorted({key.rpartition(".")[0] or key for key in channels})
-            raise UsageError(f"{name} has no layer {layer or 'R, G, B'!r}; it has {', '.join(named)}")
-        values = np.stack([channels[key] for key in chosen], axis=-1)
+        chosen, values, variance = _stacked(channels, layer, name)
         if headers:
-            window = tuple(int(n) for corner in headers[chosen[0]]["dataWindow"] for n in corner)
-        for spread, power in () if layer else SPREADS.items():
-            known = _channels_of(channels, spread)
-            if known and variance is None:
-                variance = np.stack([channels[key] for key in known], axis=-1).astype(np.float64) ** power
+            window = tuple(int(n) for corner in headers[chosen]["dataWindow"] for n in corner)
     bad = np.isnan(values).any(axis=-1)
     if bad.any():
         row, column = np.argwhere(bad)[0]
@@ -186,6 +178,22 @@ def read_layer(source: Any, layer: str = "", name: str = "the picture") -> Layer
             f"{name} is NaN in {bad.sum()} pixels, the first at row {row}, column {column}: mend it first"
         )
     return Layer(values, variance, window)
+
+
+def _stacked(
+    channels: Mapping[str, np.ndarray], layer: str, name: str
+) -> tuple[str, np.ndarray, np.ndarray | None]:
+    """Return the first channel of a layer, its values, and their variance where it is known."""
+    chosen = _channels_of(channels, layer)
+    if not chosen:
+        named = sorted({key.rpartition(".")[0] or key for key in channels})
+        raise UsageError(f"{name} has no layer {layer or 'R, G, B'!r}; it has {', '.join(named)}")
+    values, variance = np.stack([channels[key] for key in chosen], axis=-1), None
+    for spread, power in () if layer else SPREADS.items():
+        known = _channels_of(channels, spread)
+        if known and variance is None:
+            variance = np.stack([channels[key] for key in known], axis=-1).astype(np.float64) ** power
+    return chosen[0], values, variance
 
 
 def _channels_of(channels: Mapping[str, np.ndarray], layer: str) -> list[str]:

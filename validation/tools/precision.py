@@ -7,7 +7,6 @@ error, that of the rest the squared bias; the difference is the variance.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -175,8 +174,8 @@ class Point:
 
 
 @dataclass(frozen=True)
-class WorkPrecision:
-    """The findings of ``error_vs_time``."""
+class Findings:
+    """The findings about several cases."""
 
     scene: str
     points: Mapping[str, Point]
@@ -245,17 +244,6 @@ class WorkPrecision:
                 verdict += f"{reached[1][0] / reached[0][0]:.2g} times as long"
             sentences.append(f"RMSE of {error:g}: {verdict}.")
         return sentences
-
-    def save(self, folder: str | os.PathLike[str]) -> None:
-        """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""
-        from mrt_mitsuba.validation.tools import precision_page, report
-
-        report.save(folder, precision_page.study(self), title=precision_page.TITLE)
-
-    def _repr_html_(self) -> str:
-        from mrt_mitsuba.validation.tools import precision_page, report
-
-        return report.notebook(precision_page.study(self), title=precision_page.TITLE)
 
     def __str__(self) -> str:
         width = max(map(len, [*self.points, *self.failed]), default=0)

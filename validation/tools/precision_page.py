@@ -10,7 +10,7 @@ import numpy as np
 
 from mrt_mitsuba.output.files import to_8bit
 from mrt_mitsuba.validation.tools.gallery import panels
-from mrt_mitsuba.validation.tools.precision import Interval, Panel, Point, WorkPrecision
+from mrt_mitsuba.validation.tools.precision import Findings, Interval, Panel, Point
 from mrt_mitsuba.validation.tools.study import Study
 
 TITLE = "Error against time"
@@ -20,7 +20,7 @@ PANEL = (160, 120)  # pixels of a larger picture that a strip shows
 SAME = 0.02  # errors closer than this are the same: no reason to wait longer
 
 
-def study(found: WorkPrecision) -> Study:
+def study(found: Findings) -> Study:
     """Return the findings in the form that pages are made of."""
     scene = f"scene {found.scene}" if found.scene.isdigit() else found.scene
     made = Study("error-vs-time", f"{TITLE}: {scene}", seconds=found.took)
@@ -28,44 +28,29 @@ def study(found: WorkPrecision) -> Study:
     return made
 
 
-def describe(study: Study, found: WorkPrecision, name: str, title: str, truth: str = "") -> None:
+def describe(study: Study, found: Findings, name: str, title: str, truth: str = "") -> None:
     """Add the diagram, the answers and the tables to a study; ``truth`` says what the reference is."""
     prefix, where = (f"{name}-", f"{name}: ") if name else ("", "")
     study.at_most(f"{where}cases that failed", len(found.failed), 0, "each of them could be rendered")
     if not found.points:
         return
     numbered = list(enumerate((point for points in found.families.values() for point in points), 1))
-    caption = ["Down and to the left is better. Bars are 95 % intervals, numbers those of the table."]
-    if found.repeats > 1 and (ahead := front([p for p in found.points.values() if p.resolved])):
-        names = "; ".join(f"{p.name} ({p.seconds:.2g} s, RMSE {p.rmse:.2g})" for p in ahead)
-        caption.append(f"Ahead of the others: {names}.")
-    caption += [f"Reference: {truth}."] if truth else []
-    own = f"about {found.reference_error:.2g}; no claim is made below twice that."
-    unknown = "not known: every RMSE has it in it."
-    caption.append(f"The RMSE of the reference itself is {own if found.reference_error else unknown}")
-    text = " ".join(caption + found.verdicts)
-    study.plot(f"{prefix}diagram", f"{title}: work and precision", diagram(found, numbered), text)
+    study.plot(
+        f"{prefix}diagram", f"{title}: work and precision", diagram(found, numbered), caption(found, truth)
+    )
     for number, (seconds, shown) in enumerate(found.strips, 1):
         text = "In sRGB; where a picture is cut, it is where the cases differ most."
         figure = strip_figure(found, shown)
         study.plot(f"{prefix}strip-{number}", f"{title}: what {seconds:.2g} s buy", figure, text)
     if found.errors:
-        rows = [
-            [
-                curve,
-                *(
-                    str(t[curve]) if np.isfinite(t[curve].value) else "not reached"
-                    for t in found.times.values()
-                ),
-            ]
-            for curve in found.families
-        ]
         columns = ["curve", *(f"RMSE {error:g}" for error in found.errors)]
         note = (
             "With 95 % intervals. Between measured cases a curve is straight in logarithms; beyond them "
             "nothing is assumed."
         )
-        study.table(f"{prefix}times", f"{title}: seconds to an error", columns, rows, note, first=not name)
+        study.table(
+            f"{prefix}times", f"{title}: seconds to an error", columns, times(found), note, first=not name
+        )
     best = {p.name for p in front(list(found.points.values())) if found.repeats > 1}
     note = (
         "Seconds: medians of warm renders without loading the scene; cold: a first run. Errors in units of "
@@ -76,6 +61,28 @@ def describe(study: Study, found: WorkPrecision, name: str, title: str, truth: s
     if found.failed:
         reasons = [list(item) for item in found.failed.items()]
         study.table(f"{prefix}failed", f"{title}: cases that failed", ["case", "why"], reasons)
+
+
+def times(found: Findings) -> list[list[str]]:
+    """Return the seconds in which each curve comes down to each error."""
+    rows = []
+    for curve in found.families:
+        reached = [by_curve[curve] for by_curve in found.times.values()]
+        rows.append([curve, *(str(t) if np.isfinite(t.value) else "not reached" for t in reached)])
+    return rows
+
+
+def caption(found: Findings, truth: str) -> str:
+    """Return what the diagram shows, who is ahead, how good the reference is, and the verdicts."""
+    parts = ["Down and to the left is better. Bars are 95 % intervals, numbers those of the table."]
+    if found.repeats > 1 and (ahead := front([p for p in found.points.values() if p.resolved])):
+        names = "; ".join(f"{p.name} ({p.seconds:.2g} s, RMSE {p.rmse:.2g})" for p in ahead)
+        parts.append(f"Ahead of the others: {names}.")
+    parts += [f"Reference: {truth}."] if truth else []
+    own = f"about {found.reference_error:.2g}; no claim is made below twice that."
+    unknown = "not known: every RMSE has it in it."
+    parts.append(f"The RMSE of the reference itself is {own if found.reference_error else unknown}")
+    return " ".join(parts + found.verdicts)
 
 
 def front(points: Sequence[Point]) -> list[Point]:
@@ -111,7 +118,7 @@ def _row(number: int, p: Point, ahead: bool) -> dict[str, Any]:
     }
 
 
-def diagram(found: WorkPrecision, numbered: Sequence[tuple[int, Point]]) -> Any:
+def diagram(found: Findings, numbered: Sequence[tuple[int, Point]]) -> Any:
     """Return the work-precision diagram: RMSE against seconds, both with intervals, and the floor.
 
     Points have the numbers of the table next to them; of many points, only those ahead.
@@ -143,7 +150,7 @@ def diagram(found: WorkPrecision, numbered: Sequence[tuple[int, Point]]) -> Any:
     return figure
 
 
-def strip_figure(found: WorkPrecision, strip: Sequence[Panel]) -> Any:
+def strip_figure(found: Findings, strip: Sequence[Panel]) -> Any:
     """Return the pictures of a strip side by side, the reference last, each with its seconds and error.
 
     Of larger pictures it shows the window of ``PANEL`` pixels where they differ most from the reference.

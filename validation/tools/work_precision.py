@@ -5,10 +5,11 @@ Each case is repeated with other seeds; ``precision`` says what is made of the p
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,24 @@ from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.rendering.result import Result
 from mrt_mitsuba.scene.open import open_scene
-from mrt_mitsuba.validation.tools import compare, timing
-from mrt_mitsuba.validation.tools.precision import RESOLVED, Options, Panel, Point, Strip, WorkPrecision
+from mrt_mitsuba.validation.tools import compare, precision_page, report, timing
+from mrt_mitsuba.validation.tools.precision import RESOLVED, Findings, Options, Panel, Point, Strip
 
 REFERENCE_SEEDS = (2**20 + 1, 2**20 + 2)  # far from those of the repeats
 STEPS = (1, 2, 5)  # of the errors that the time is asked for, times powers of ten
 MOST_ERRORS = 4
+
+
+@dataclass(frozen=True)
+class WorkPrecision(Findings):
+    """The findings of ``error_vs_time``."""
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""
+        report.save(folder, precision_page.study(self), title=precision_page.TITLE)
+
+    def _repr_html_(self) -> str:
+        return report.notebook(precision_page.study(self), title=precision_page.TITLE)
 
 
 def error_vs_time(
@@ -177,24 +190,37 @@ def _measure(
                     continue
                 cold.setdefault(name, result)
                 runs[name] += [result] if turn >= 0 else []
-    points = {}
-    for name in (name for name in cases if name not in failed):
-        results = runs[name]
-        errors = [np.stack([r.image.ravel() - half.ravel() for r in results]) for half in halves]
-        gram = errors[0] @ errors[1].T / errors[0].shape[1]
-        points[name] = Point(
-            name=name,
-            options=cases[name],
-            times=np.array([_seconds(r) for r in results]),
-            gram=(gram + gram.T) / 2,
-            cold=_seconds(cold[name]),
-            compile=cold[name].timings.compile,
-            rays=dict(results[0].rays),
-            image=results[0].image,
-            difference=compare.compare(results[0].image, (halves[0] + halves[1]) / 2),
-            reference_error=own_error,
-        )
+    points = {
+        name: _point(name, cases[name], cold[name], runs[name], halves, own_error)
+        for name in cases
+        if name not in failed
+    }
     return points, failed
+
+
+def _point(
+    name: str,
+    options: Options,
+    cold: Result,
+    runs: Sequence[Result],
+    halves: tuple[np.ndarray, np.ndarray],
+    own_error: float,
+) -> Point:
+    """Return the figures of a case."""
+    errors = [np.stack([r.image.ravel() - half.ravel() for r in runs]) for half in halves]
+    gram = errors[0] @ errors[1].T / errors[0].shape[1]
+    return Point(
+        name=name,
+        options=options,
+        times=np.array([_seconds(r) for r in runs]),
+        gram=(gram + gram.T) / 2,
+        cold=_seconds(cold),
+        compile=cold.timings.compile,
+        rays=dict(runs[0].rays),
+        image=runs[0].image,
+        difference=compare.compare(runs[0].image, (halves[0] + halves[1]) / 2),
+        reference_error=own_error,
+    )
 
 
 def _round_errors(points: Any, floor: float) -> list[float]:
