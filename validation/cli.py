@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 packages = " ".join(missing)
                 raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
             report.prepare(options.out)
-            seconds = sum(STUDIES[name][2 if options.quick else 3] for name in names)
+            seconds = sum(STUDIES[name][2] if options.quick else STUDIES[name][3] for name in names)
             print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
             # With a cache of their own, studies of speed see how long compilation takes
             with nullcontext() if options.quick or not set(names) & set(TIMED) else own_cache():
