@@ -130,8 +130,9 @@ def has_mirror(bsdf: Any) -> bool:
 
 def is_textured(bsdf: Any) -> bool:
     """Return whether a BSDF varies over its surface; the flags of Mitsuba's own do not say so."""
+    flags = bsdf.flags()
     if isinstance(bsdf, MirrorBSDF):
-        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
+        return mi.has_flag(flags, mi.BSDFFlags.SpatiallyVarying)
     return any(isinstance(node, mi.Texture) and varies(node) for node in mi.traverse(bsdf).hierarchy)
 
 

@@ -104,9 +104,9 @@ class Snapshot:
         for emitter in self.emitters:
             lights.add(emitter, (mi.Shape, mi.Medium), emitter.flags())
         lights.add(self.environment, (mi.Shape, mi.Medium))
-        self.shape_part = shapes.close(before and before.shape_part)
-        self.material_part = materials.close(before and before.material_part)
-        self.light_part = lights.close(before and before.light_part)
+        self.shape_part: Part = shapes.close(before.shape_part if before else None)
+        self.material_part: Part = materials.close(before.material_part if before else None)
+        self.light_part: Part = lights.close(before.light_part if before else None)
 
     @property
     def bsdfs(self) -> list[Any]:
@@ -126,7 +126,7 @@ class Kept:
         if known is None or known[0] != key:
             # Key and value come together or, where ``make`` is interrupted, not at all
             known = self._values[name] = key, make()
-        return known[1]  # type: ignore[no-any-return]
+        return known[1]
 
 
 def once(things: Iterable[Any]) -> list[Any]:

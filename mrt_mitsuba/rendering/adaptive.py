@@ -102,12 +102,14 @@ class MrtAdaptive(mi.SamplingIntegrator):
             warnings.warn(f"mrt_adaptive takes {FEWEST} rays a pixel at least, not spp={spp}", stacklevel=2)
         number = sensor if isinstance(sensor, int) else 0
         view = _sensor(scene, sensor)
-        seed = int(seed[0] if dr.is_array_v(seed) else seed) % 2**32
+        given: Any = seed
+        seed = int(given[0] if dr.is_array_v(given) else given) % 2**32
         settings = RenderSettings(seed=seed, sensor=number).but(**self.options(spp))
         with one_at_a_time, held(), dr.suspend_grad():
             source = opened("a Mitsuba scene", scene, view, self.nested)
             result = render_with(scene, settings, Progress(), opener=lambda *_, **__: source)
-            film, layers, bands = view.film(), result.layers, result.plan.film.bands
+            film, layers = view.film(), result.layers
+            bands = result.plan.film.bands if result.plan.film else ()
             names = self.aov_names() if _further(film) else []
             colors = [layers[name] for name in bands] or list(np.moveaxis(result.image, -1, 0))
             alpha = [layers["A"]] if "A" in layers else []

@@ -94,7 +94,9 @@ class Groups:
     @property
     def places(self) -> np.ndarray:
         """The place in ``pixels`` of each group."""
-        return np.repeat(np.arange(len(self.pixels), dtype=np.uint32), self.counts)
+        return np.repeat(
+            np.arange(len(self.pixels), dtype=np.uint32), 1 if self.counts is None else self.counts
+        )
 
     @property
     def offsets(self) -> np.ndarray:
@@ -360,7 +362,7 @@ class Exposer:
         for lane in range(len(groups) * groups.size):
             group, rest = divmod(lane, groups.size)
             pixel, number = groups.pixels[group if at is None else at[group]], rest
-            if at is not None:
+            if at is not None and offsets is not None:
                 number = (lane + int(offsets[at[group]])) % 2**32
             place, values = self._ray(int(pixel), rest, number, start, moments)
             heed()

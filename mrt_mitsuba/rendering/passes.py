@@ -155,7 +155,7 @@ class Passes:
         exposer = self._exposer(step)
         blurred = self._blurred if self._plan.blur else None
         whole = self._plan.whole
-        halves = Wholes(exposer, self._seed) if whole else Halves(exposer, self._seed, blurred)
+        halves: Any = Wholes(exposer, self._seed) if whole else Halves(exposer, self._seed, blurred)
         self.rounds = run_rounds(halves, self._film.pixels, goal, self._job.stage)
         self.error = halves.error()
         self._develop(exposer, halves)

@@ -1,8 +1,4 @@
-"""Rendering one scene again and again by kernels that Dr.Jit recorded once (``dr.freeze``).
-
-What was recorded must equal the picture of ``mrt.render`` to the bit; all else is rendered as ``mrt.render``
-does it.
-"""
+"""Rendering one scene again and again by kernels that Dr.Jit recorded once (``dr.freeze``)."""
 
 from __future__ import annotations
 
@@ -24,7 +20,7 @@ from mrt_mitsuba.rendering.progress import default
 from mrt_mitsuba.rendering.result import Result
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.view import View
-from mrt_mitsuba.scene.open import Source, open_scene
+from mrt_mitsuba.scene.open import open_scene
 
 
 class Prepared:
@@ -34,11 +30,13 @@ class Prepared:
     shapes the code of the kernels is fixed; a change of that, such as the first mirror, makes them anew.
     """
 
+    _source: Any = None  # the open scene
+    _data: Any = None  # of its kernels
+    _state: Part | None = None  # of camera and integrator, for which the kernels were recorded
+    _launch: Any = None  # what launches them; None where nothing is recorded
+
     def __init__(self, scene: Any, options: dict[str, Any]) -> None:
         self._scene, self._settings = scene, RenderSettings.of(**options)
-        self._source: Source | None = None
-        self._state: Part | None = None  # of camera and integrator, for which the kernels were recorded
-        self._launch: Any = None  # what launches them; None where nothing is recorded
         with runtime.one_at_a_time, held():
             self._made = self._render(self._settings.seed)  # result from which others differ by the picture
             self._integrator, self.params = self._source.integrator, mi.traverse(self._source.scene)
@@ -61,7 +59,7 @@ class Prepared:
             return replace(self._made, image=self._picture(seed), plan=plan, options=options)
 
     def _render(self, seed: int) -> Result:
-        def opened(scene: Any, **how: Any) -> Source:
+        def opened(scene: Any, **how: Any) -> Any:
             self._source = self._source or open_scene(scene, **how)
             return self._source
 

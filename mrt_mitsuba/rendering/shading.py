@@ -261,7 +261,7 @@ def shader_for(scene: Any, integrator: Any) -> Shader:
     """Return the shader that an integrator is capable of."""
     import mitsuba as mi
 
-    kind = WholeShader
+    kind: type[Shader] = WholeShader
     if isinstance(integrator, LayeredIntegrator):
         kind = LayeredShader
     elif isinstance(integrator, mi.CppADIntegrator):

@@ -33,6 +33,7 @@ def changed_bsdf(changes: Mapping[str, tuple[dict[str, Any], str, Any]]) -> type
         def __init__(self, props: Any) -> None:
             mi.BSDF.__init__(self, props)
             self.nested, name = props["nested"], props["change"]
+            self.change: Any
             self.kind, self.change = changes[name][1:3] if name else ("", None)
             more = self.change if self.kind == "flags" else 0
             count = self.nested.component_count()
