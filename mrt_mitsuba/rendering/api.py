@@ -151,7 +151,7 @@ def render_with(
             params=settings.params,
             model=settings.model(),
         )
-        if hasattr(source.integrator, "nested"):  # mrt_adaptive, which says where to stop
+        if getattr(source.integrator, "plugin_name", "") == "mrt_adaptive":  # it says where to stop
             if settings.rmse is None and settings.aamode is None and settings.spp is None:
                 given = {k: v for k, v in source.integrator.options().items() if getattr(settings, k) is None}
                 settings = settings.but(**given)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ SCENE = """<scene version="3.0.0">
     <transform name="to_world"><rotate x="1" angle="90"/><translate y="3" z="3"/></transform>
   </shape>
 </scene>"""
-PATH = '<integrator type="path"/>'
+PATH, PRB = '<integrator type="path"/>', '<integrator type="prb"/>'
 AOV = '<integrator type="aov"><string name="aovs" value="far:depth"/><integrator type="path"/></integrator>'
 CROP = '<integer name="crop_width" value="9"/><integer name="crop_offset_x" value="7"/>'
 RGBA = '<string name="pixel_format" value="rgba"/><rfilter type="box"/>'
@@ -50,7 +49,7 @@ def rms(values: Any) -> float:
         (PATH, "", ["R", "G", "B", "error.Y", "samples.Y"]),
         (PATH, CROP + GREY, ["Y", "error.Y", "samples.Y"]),
         (PATH, RGBA, ["R", "G", "B", "A", "error.Y", "samples.Y"]),
-        ('<integrator type="prb"/>', "", ["R", "G", "B", "error.Y", "samples.Y"]),
+        (PRB, "", ["R", "G", "B", "error.Y", "samples.Y"]),
         ('<integrator type="ptracer"/>', "", ["R", "G", "B", "error.Y", "samples.Y"]),
         (AOV, CROP + RGBA, None),
     ],
@@ -89,7 +88,8 @@ def test_rays_are_bounded_and_seeds_matter() -> None:
         assert np.array(mi.render(scene, spp=4))[..., -1].mean() == 8
 
 
-@pytest.mark.parametrize("nested", [PATH, '<integrator type="prb"/>'])
+@pytest.mark.filterwarnings("ignore::mrt_mitsuba.MrtWarning")
+@pytest.mark.parametrize("nested", [PATH, PRB])
 def test_derivatives_are_those_of_the_nested_integrator(nested: str) -> None:
     scene, key = scene_with(nested), "ball.bsdf.reflectance.value"
     params = mi.traverse(scene)
@@ -97,9 +97,7 @@ def test_derivatives_are_those_of_the_nested_integrator(nested: str) -> None:
     for integrator in (scene.integrator(), scene.integrator().nested):
         dr.enable_grad(params[key])
         params.update()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", mrt.MrtWarning)
-            picture = mi.render(scene, params, integrator=integrator, spp=16, seed=2)
+        picture = mi.render(scene, params, integrator=integrator, spp=16, seed=2)
         dr.backward(dr.mean(picture[..., :3]))
         found.append(np.array(dr.grad(params[key])).ravel())
         dr.set_grad(params[key], 0)
@@ -133,9 +131,10 @@ def test_files_and_the_command_know_it(tmp_path: Path, monkeypatch: pytest.Monke
     assert list(mi.Bitmap("out.exr").size()) == [24, 16]
 
 
-@pytest.mark.parametrize(
-    "name", ["prb", "prb_basic", "prbvolpath", "direct_projective", "prb_projective", "ptracer"]
-)
+NAMES = ["prb", "prb_basic", "prbvolpath", "direct_projective", "prb_projective", "ptracer"]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_every_integrator_gives_pictures_with_their_error(name: str) -> None:
     scene, integrator = scene_with(), mi.load_dict({"type": name})
     stock = np.array(mi.render(scene, integrator=integrator, spp=1024))[..., :3]
