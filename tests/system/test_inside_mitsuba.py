@@ -19,14 +19,10 @@ SCENE = """<scene version="3.0.0">
   <sensor type="perspective">
     <film type="hdrfilm"><integer name="width" value="24"/><integer name="height" value="16"/>{film}</film>
   </sensor>
-  <shape type="sphere" id="ball">
-    <bsdf type="diffuse"><rgb name="reflectance" value="0.7 0.5 0.3"/></bsdf>
-    <transform name="to_world"><translate z="4"/></transform>
-  </shape>
-  <shape type="rectangle">
-    <emitter type="area"><rgb name="radiance" value="9"/></emitter>
-    <transform name="to_world"><rotate x="1" angle="90"/><translate y="3" z="3"/></transform>
-  </shape>
+  <shape type="sphere" id="ball"><transform name="to_world"><translate z="4"/></transform>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.7 0.5 0.3"/></bsdf></shape>
+  <shape type="rectangle"><emitter type="area"><rgb name="radiance" value="9"/></emitter>
+    <transform name="to_world"><rotate x="1" angle="90"/><translate y="3" z="3"/></transform></shape>
 </scene>"""
 PATH, PRB = '<integrator type="path"/>', '<integrator type="prb"/>'
 AOV = '<integrator type="aov"><string name="aovs" value="far:depth"/><integrator type="path"/></integrator>'
@@ -145,10 +141,8 @@ def test_every_integrator_gives_pictures_with_their_error(name: str) -> None:
 
 
 def test_scalar_variants_follow_the_film() -> None:
-    scene = {
-        "type": "scene",
-        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 6, "height": 4}},
-    }
+    film = {"type": "hdrfilm", "width": 6, "height": 4}
+    scene = {"type": "scene", "sensor": {"type": "perspective", "film": film}}
     scene |= {"light": {"type": "constant"}, "ball": {"type": "sphere", "center": [0, 0, 4]}}
     result = mrt.render(scene, integrator="path", variant="scalar_rgb", target=0.1, maxspp=32)
     assert result.image.shape == (4, 6, 3) and result.error.rmse < 0.1
