@@ -55,6 +55,14 @@ _SETUP["each"] = "\nfor variant in {variants}:\n    mi.set_variant(variant)\n   
 )
 
 
+def _written(value: Any) -> str:
+    """Return a value as Python text; float32 in the fewest digits that give it back."""
+    if isinstance(value, np.ndarray):
+        inner = ", ".join(str(x) for x in value.astype(np.float32))
+        return inner if value.dtype == np.float32 and len(value) in (2, 3) else f"[{inner}]"
+    return value if isinstance(value, str) else repr(value.item() if isinstance(value, np.generic) else value)
+
+
 def program(name: str, subject: Subject, body: str, **names: Any) -> str:
     """Return a program that loads a plugin under ``name``, a "bsdf" or a "shape", and runs ``body``."""
     setup, _, rest = body.partition("\n")
@@ -62,14 +70,7 @@ def program(name: str, subject: Subject, body: str, **names: Any) -> str:
     variant = mi.variant()
     if "PCG32(n)" in text:
         variant = variant.replace("scalar_", "llvm_ad_")
-    shown = dict(names)
-    for key, value in names.items():
-        if isinstance(value, np.ndarray):  # float32 in the fewest digits that give it back
-            inner = ", ".join(str(x) for x in value.astype(np.float32))
-            vector = value.dtype == np.float32 and len(value) in (2, 3)
-            shown[key] = inner if vector else f"[{inner}]"
-        elif not isinstance(value, str):
-            shown[key] = repr(value.item() if isinstance(value, np.generic) else value)
+    shown = {key: _written(value) for key, value in names.items()}
     given = source(subject.description) if subject.description is not None else None
     ours = given is not None and "'mrt_" in given
     lines = ["import mrt_mitsuba as mrt  # before mitsuba"] if ours else []
