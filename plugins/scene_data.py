@@ -240,12 +240,12 @@ def _trace(reading: Reading, plan: KernelPlan) -> Traced:
     bvh = None
     if own and others:
         # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the others only.
-        # Mitsuba names an object after its key, and these belong to another scene: they keep their names
+        # Mitsuba names an object after its key, and these belong to another scene: they get their names back
         things = [*others, *reading.snapshot.groups]
-        names = [s.id() or f"shape_{i}" for i, s in enumerate(things)]
-        if len(set(names)) < len(names):
-            names = [f"shape_{i}" for i in range(len(things))]
-        bvh = mi.load_dict({"type": "scene", **dict(zip(names, things, strict=True))})
+        names = [thing.id() for thing in things]
+        bvh = mi.load_dict({"type": "scene", **{f"shape_{i}": thing for i, thing in enumerate(things)}})
+        for thing, name in zip(things, names, strict=True):
+            thing.set_id(name)
     spheres = Spheres(others) if plan.spheres != "none" else None
     quadrics = Quadrics(exact) if exact else None
     return Traced(bvh, Planes(planes), quadrics, HitErrors(others), spheres)

@@ -59,6 +59,18 @@ def _material(rng: random.Random) -> dict[str, Any]:
         {"type": "roughconductor", "alpha": rng.uniform(0.1, 0.5)},
         {"type": "twosided", "nested": {"type": "plastic", "diffuse_reflectance": _color(rng)}},
         {"type": "conductor"},
+        {"type": "roughplastic", "alpha": rng.uniform(0.1, 0.5)},
+        {"type": "principled", "roughness": rng.uniform(0.2, 0.8), "metallic": rng.uniform(0, 1)},
+        {
+            "type": "blendbsdf",
+            "weight": rng.uniform(0, 1),
+            "a": {"type": "diffuse"},
+            "b": {"type": "conductor"},
+        },
+        {"type": "mask", "opacity": rng.uniform(0, 1), "nested": {"type": "diffuse"}},
+        {"type": "bumpmap", "bump": _texture(rng, "bitmap"), "nested": {"type": "diffuse"}},
+        {"type": "normalmap", "normalmap": _texture(rng, "bitmap"), "nested": {"type": "diffuse"}},
+        {"type": "dielectric"},
     ]
     return ours if rng.random() < 0.6 else rng.choice(stock)
 
@@ -69,21 +81,21 @@ def _place(rng: random.Random) -> Any:
     return turned.scale(rng.uniform(0.3, 0.8))
 
 
+SHAPES = (
+    "cube",
+    "rectangle",
+    "disk",
+    "cylinder",
+    "sdfgrid",
+    "mrt_cone",
+    "mrt_cylinder",
+    "mrt_mesh",
+    "group",
+)
+
+
 def _shape(rng: random.Random) -> dict[str, Any]:
-    kind = rng.choice(
-        [
-            "sphere",
-            "sphere",
-            "cube",
-            "rectangle",
-            "disk",
-            "cylinder",
-            "mrt_cone",
-            "mrt_cylinder",
-            "mrt_mesh",
-            "group",
-        ]
-    )
+    kind = rng.choice([*["sphere"] * 3, *SHAPES])
     if kind == "mrt_mesh":
         points = np.array([[rng.uniform(-1, 1) for _ in range(3)] for _ in range(6)], np.float32)
         faces = np.array([[0, 1, 2], [3, 4, 5], [0, 2, 4]], np.uint32)
@@ -95,6 +107,9 @@ def _shape(rng: random.Random) -> dict[str, Any]:
         ends = {"mrt_cone": ("apex", "base_center"), "mrt_cylinder": ("p0", "p1")}[kind]
         form = {ends[0]: [0, 1, 0], ends[1]: [0, 0, 0], "radius": 0.5, "segments": 16}
         return {"type": kind, **form, "to_world": _place(rng)}
+    if kind == "sdfgrid":
+        grid = np.linalg.norm(np.indices((6, 6, 6)) - 2.5, axis=0)[..., None] / 5 - rng.uniform(0.2, 0.4)
+        return {"type": kind, "grid": mi.TensorXf(grid.astype(np.float32)), "to_world": _place(rng)}
     return {"type": kind, "to_world": _place(rng)}
 
 
@@ -121,10 +136,15 @@ def scene_of(rng: random.Random) -> dict[str, Any]:
             "ball": {"type": "sphere", "radius": 0.4, "bsdf": _material(rng)},
         }
         scene["child"] = {"type": "instance", "to_world": _place(rng), "of": {"type": "ref", "id": "family"}}
+    sky = {"type": "constant", "radiance": _color(rng)}
+    if rng.random() < 0.5:
+        sky = {"type": "envmap", "bitmap": _texture(rng, "bitmap")["bitmap"]}
     more = [
         {"type": "point", "position": [-2, 3, 2], "intensity": _color(rng)},
         {"type": "directional", "direction": [0, -1, -0.3], "irradiance": _color(rng)},
-        {"type": "constant", "radiance": _color(rng)},
+        {"type": "spot", "to_world": look, "intensity": _color(rng)},
+        {"type": "projector", "to_world": look, "irradiance": _texture(rng, "bitmap")},
+        sky,
         {
             "type": "sphere",
             "center": [0, 3, 0],

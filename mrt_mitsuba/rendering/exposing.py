@@ -6,6 +6,7 @@ in wavefronts, split where they would not fit into memory; in scalar variants by
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +27,8 @@ from mrt_mitsuba.rendering.job import Job
 from mrt_mitsuba.rendering.shading import Shader, components
 from mrt_mitsuba.rendering.view import View
 from mrt_mitsuba.rendering.windows import dilated
+
+log = logging.getLogger(__name__)
 
 # From the number of a pixel, that of a ray in its group and that among all rays of the pixel: the place on
 # the film, in pixels, that in the picture, [0, 1]², the time, and the sampler of what else is random
@@ -200,6 +203,7 @@ class Exposer:
         workspace, channels = self.job.workspace, channel_count(self.layers)
         most, width = workspace.rays_at_once(channels), self.view.width
         start = self._on_lattice(places, seed)
+        log.debug("tracing %d rays, at most %d at once", len(pixels) * places.size, most)
         for first, part in Groups(places.size, pixels).parts(max(1, most // places.size), width):
             sums = self._wavefront(part, start)
             share = np.float32(1 / places.size)
@@ -251,6 +255,7 @@ class Exposer:
         canvas = Canvas(film, rays, kept, moments=moments) if film.reach or progressive else None
         total = np.zeros((0 if canvas else kept + 3 * moments, rays.size))
         most = max(1, self.job.workspace.rays_at_once(2 * kept) // groups.size)
+        log.debug("tracing %d rays, at most %d at once", len(groups) * groups.size, most * groups.size)
         for before, part in groups.parts(most, film.width):
             start = self._on_film(part, seed, before, progressive)
             planes = self._wavefront(part, start, canvas, moments and canvas is None)
