@@ -41,15 +41,18 @@ class Reading:
         )
         of_shapes, convex = kept("shape facts", shapes, self._read_shapes)
         self.lights, self.numbers, of_lights = kept("light facts", lights, lambda: _read_lights(snapshot))
-        places = [place(light) for light in self.lights[:MOST_EMITTERS]]
-        points = [point for point in places if point is not None]
         self.facts = SceneFacts(
             **of_lights,
             **of_materials,
             **of_shapes,
             alone=convex and all(isinstance(b, MirrorBSDF) for b in snapshot.bsdfs),
-            touching=kept("touching", (shapes, lights), lambda: any_touching(snapshot.shapes, points)),
+            touching=kept("touching", (shapes, lights), self._touching),
         )
+
+    def _touching(self) -> bool:
+        """Return whether a point light is on a surface."""
+        places = [place(light) for light in self.lights[:MOST_EMITTERS]]
+        return any_touching(self.snapshot.shapes, [point for point in places if point is not None])
 
     def _read_shapes(self) -> tuple[dict[str, Any], bool]:
         """Return the facts about the shapes, and whether there is one only, which is convex."""

@@ -169,7 +169,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         """Decide what the kernels for such a scene hold."""
         own_sky = None if self.sky is None else largest(self.sky)
         settings = Settings(self.max_depth, self.min_contribution, self.bounce_budget, self.clamp, own_sky)
-        return make_plan(facts, settings)
+        return self._made("plan", (facts, settings), lambda: make_plan(facts, settings))
 
     def prepare(
         self, scene: mi.Scene, plan: KernelPlan | None = None, reading: Reading | None = None
