@@ -9,6 +9,7 @@ from __future__ import annotations
 import random
 import sys
 from collections.abc import Callable, Iterator
+from inspect import CO_GENERATOR
 from typing import Any
 
 import drjit as dr
@@ -221,9 +222,11 @@ def _interrupted(run: Callable[[], object], calls: int) -> None:
 
     def count(frame: Any, event: str, argument: Any) -> None:
         nonlocal left
-        left -= event == "call" and "mrt_mitsuba" in frame.f_code.co_filename + frame.f_globals.get(
-            "__name__", ""
+        # Python ignores what is raised while it closes a generator
+        ours = (
+            "mrt_mitsuba" in frame.f_globals.get("__name__", "") and not frame.f_code.co_flags & CO_GENERATOR
         )
+        left -= event == "call" and ours
         if left == 0:
             sys.setprofile(None)
             raise KeyboardInterrupt
