@@ -52,7 +52,7 @@ def picture(scene: mi.Scene, integrator: Any) -> np.ndarray:
 def test_edited_scenes_are_drawn_as_scenes_made_anew(part: int, variant: str, tmp_path: Path) -> None:
     """To the bit, and those made anew in another process."""
     mi.set_log_level(mi.LogLevel.Error)
-    first, count = 1000 * part, 20 if part < 2 else 72 * ROUNDS
+    first, count = 20 + 1000 * part, 20 if part < 2 else 72 * ROUNDS
     path = tmp_path / "anew.npz"
     words = [sys.executable, edits.__file__, str(first), str(count), str(path)]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as other:
