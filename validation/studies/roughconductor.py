@@ -214,7 +214,7 @@ def compare_roughconductor(
     pair = [bsdf(alpha, visible=sample_visible) for bsdf in (ours, theirs)]
     stacks, seconds = _render_both(pair, size=size, spp=spp, renders=renders, seed=seed)
     first, second = (stack.mean(axis=0) for stack in stacks)
-    test = image_tests.compare(*map(image_tests.estimate, stacks), level=LEVEL)
+    test = image_tests.compare(*stacks, level=LEVEL)
     errors = {
         **points,
         "relRMSE of the pictures": test.rel_rmse,
@@ -280,7 +280,7 @@ def rendered(study: Study, *, quick: bool) -> None:
     for name, change in study.each("mistakes", MUTATIONS.items()):
         broken = {**ours(POWER_ALPHA), **change}
         stacks, _ = _render_both([broken, theirs(POWER_ALPHA)], seed=100, **settings)
-        test = image_tests.compare(*map(image_tests.estimate, stacks), level=LEVEL)
+        test = image_tests.compare(*stacks, level=LEVEL)
         why = "the test of pictures must see this error"
         study.at_most(f"p of the difference with {name}", test.p, LEVEL, why)
 

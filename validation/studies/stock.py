@@ -14,7 +14,7 @@ from mrt_mitsuba.scene.model import Cone, Material, Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.scene.shapes import torus
 from mrt_mitsuba.validation.oracles.reference import Axial, camera_directions, reference_render, sensitivity
-from mrt_mitsuba.validation.tools.image_tests import Estimate, compare, estimate
+from mrt_mitsuba.validation.tools.image_tests import compare
 from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, camera, rays, with_materials
 from mrt_mitsuba.validation.tools.study import Study
 
@@ -315,13 +315,13 @@ def whole_scenes(study: Study, *, quick: bool) -> None:
     spp = 16 if quick else 64
     rows = []
 
-    def mean(nodes: Nodes, integrator: Nodes, seed: int, **places: str) -> Estimate:
-        """Return that of RENDERS independent renders, by default through the pixels' centres."""
+    def renders(nodes: Nodes, integrator: Nodes, seed: int, **places: str) -> np.ndarray:
+        """Return RENDERS independent renders, by default through the pixels' centres."""
         scene, seeds = mi.load_dict(nodes), range(seed, seed + RENDERS)
         options: dict[str, Any] = {"integrator": integrator, "spp": spp, **AT_CENTRES, **places}
-        return estimate([mrt.render(scene, **options, seed=s).image for s in seeds])
+        return np.array([mrt.render(scene, **options, seed=s).image for s in seeds])
 
-    def add(what: str, ours: Estimate, theirs: Estimate, right: bool = False) -> None:
+    def add(what: str, ours: np.ndarray, theirs: np.ndarray, right: bool = False) -> None:
         found = compare(ours, theirs, level=LEVEL)
         if right:
             why = "least fault: the mistakes below, 2 % of the light and 5 % of alpha among them"
@@ -337,15 +337,15 @@ def whole_scenes(study: Study, *, quick: bool) -> None:
         # Ours, but for the lights and finite planes of the other
         kept = {name: node for name, node in stock.items() if name.startswith(("light_", "plane_"))}
         ours = mrt.scene_dict(scene, fresnel="dielectric", **size) | kept
-        theirs = mean(stock, PATH, 1000)
-        add(f"scene {number}", mean(ours, PATH, 0), theirs, right=True)
+        theirs = renders(stock, PATH, 1000)
+        add(f"scene {number}", renders(ours, PATH, 0), theirs, right=True)
         if number == 0:
             for name, change in MISTAKES.items():
-                add(name, mean(change(ours), PATH, 0), theirs)
+                add(name, renders(change(ours), PATH, 0), theirs)
     # The clamp has no counterpart among Mitsuba's plugins: our own render loses it
     scene_1 = mrt.scene_dict(1, fresnel="dielectric", **size)
     unclamped, clamped = (
-        mean(scene_1, {"type": "mrt_whitted", "clamp": clamp}, seed, lattice="film")
+        renders(scene_1, {"type": "mrt_whitted", "clamp": clamp}, seed, lattice="film")
         for clamp, seed in ((False, 0), (True, 1000))
     )
     add("dropped clamp", unclamped, clamped)

@@ -6,8 +6,9 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from mrt_mitsuba.output.error import exceedance
 from mrt_mitsuba.output.files import read_channels, write_exr, write_png
 from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.result import Result
-from mrt_mitsuba.validation.tools import image_tests
+from mrt_mitsuba.validation.tools.image_tests import EPSILON, ROUNDING, cell_sums, sidak
 
 ORDER = {letter: index for index, letter in enumerate("RGBXYZUVA")}  # of channels within a layer
 # What may stand next to a picture and says how well it is known: the layer, and its power of the deviation
@@ -48,11 +49,17 @@ class Difference:
 
     @cached_property
     def flip(self) -> float | None:
-        """Mean of FLIP, the difference that a viewer sees, from 0 to 1; None where it is not defined."""
-        try:
-            return image_tests.flip(*reversed(self.pictures))
-        except (UsageError, ImportError):
+        """Mean of HDR-FLIP (Andersson et al. 2021), the difference that a viewer sees, from 0 to 1.
+
+        It takes its exposures from the reference. None where it is not defined.
+        """
+        a, b = (np.ascontiguousarray(picture, np.float32) for picture in self.pictures)
+        defined = a.shape[2] == 3 and all(np.isfinite(p).all() and (p >= 0).all() for p in (a, b)) and b.any()
+        if not defined or find_spec("flip_evaluator") is None:
             return None
+        import flip_evaluator
+
+        return float(flip_evaluator.evaluate(b, a, "HDR", applyMagma=False, parameters={})[1])
 
     def measures(self) -> dict[str, float | None]:
         """Return all measures by name."""
@@ -71,22 +78,22 @@ class Difference:
         values = self.difference
         shown = values if values.shape[2] == 3 else np.repeat(values[..., :1], 3, axis=2)
         write_exr(f"{stem}.exr", shown, header={k: str(v) for k, v in self.measures().items()})
-        size = np.nan_to_num(np.abs(values).max(axis=2), posinf=np.inf)
+        size = np.abs(values).max(axis=2)
         scale = np.max(size, initial=0, where=np.isfinite(size)) or 1
-        colours = colormaps["inferno"](np.minimum(size / scale, 1))[..., :3]
-        write_png(f"{stem}.png", colours.astype(np.float32))
+        write_png(
+            f"{stem}.png", colormaps["inferno"](np.minimum(size / scale, 1))[..., :3].astype(np.float32)
+        )
+
+    def _shown(self) -> dict[str, str]:
+        return {k: "-" if v is None else f"{v:.4g}" for k, v in self.measures().items()}
 
     def __str__(self) -> str:
-        lines = [f"{name:<8} {_shown(value)}" for name, value in self.measures().items()]
+        lines = [f"{name:<8} {value}" for name, value in self._shown().items()]
         return "\n".join([*lines, f"the largest is at row {self.place[0]}, column {self.place[1]}"])
 
     def _repr_html_(self) -> str:
-        cells = "".join(f"<tr><td>{k}</td><td>{_shown(v)}</td></tr>" for k, v in self.measures().items())
+        cells = "".join(f"<tr><td>{k}</td><td>{v}</td></tr>" for k, v in self._shown().items())
         return f"<table>{cells}</table>"
-
-
-def _shown(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
 
 
 def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference:
@@ -108,28 +115,28 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
     if first.shape != second.shape:
         sizes = " and ".join(f"{s.shape[1]}x{s.shape[0]} with {s.shape[2]} channels" for s in (first, second))
         raise UsageError(f"cannot compare pictures of {sizes}: their sizes must be the same")
-    windows = [side.window for side in sides if side.window is not None]
-    if len(windows) == 2 and windows[0] != windows[1]:
+    windows = [side.window for side in sides if side.window]
+    if len(set(windows)) == 2:
         raise UsageError(
             f"cannot compare the data windows {windows[0]} and {windows[1]}, of first column and row to last "
             "column and row: the pictures show other places"
         )
-    with np.errstate(invalid="ignore", over="ignore"):
+    with np.errstate(all="ignore"):
         difference = np.where(first == second, 0, first.astype(np.float64) - second)  # inf where both are
         square = difference**2
-        relative = np.divide(square, np.square(second, dtype=np.float64) + image_tests.EPSILON)
-    relative[np.isinf(square)] = np.inf
-    mse = float(square.mean())
-    with np.errstate(divide="ignore"):
-        psnr = float(20 * np.log10(peak) - 10 * np.log10(mse))
-    index = np.unravel_index(np.argmax(np.abs(difference)), difference.shape)
+        relative = np.where(
+            np.isinf(square), np.inf, square / (np.square(second, dtype=np.float64) + EPSILON)
+        )
+        mse = square.mean()
+        psnr = 20 * np.log10(peak) - 10 * np.log10(mse)
+    row, column, channel = np.unravel_index(np.argmax(np.abs(difference)), difference.shape)
     return Difference(
         mae=float(np.abs(difference).mean()),
-        rmse=mse**0.5,
+        rmse=float(mse**0.5),
         rel_mse=float(relative.mean()),
-        psnr=psnr,
-        largest=float(np.abs(difference[index])),
-        place=(int(index[0]), int(index[1])),
+        psnr=float(psnr),
+        largest=float(np.abs(difference[row, column, channel])),
+        place=(int(row), int(column)),
         p_value=_p_value(sides),
         difference=difference.astype(np.float32),
         pictures=(first, second),
@@ -137,71 +144,63 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
     )
 
 
-@dataclass(frozen=True)
-class Layer:
+class Layer(NamedTuple):
     """A picture or layer [H, W, C], and the variance of its mean [H, W, C] or [H, W, 1], if it is known."""
 
     values: np.ndarray
     variance: np.ndarray | None = None
-    window: tuple[int, ...] | None = None  #: of an EXR: first column and row, last column and row
+    window: tuple[int, ...] = ()  # of an EXR: first column and row, last column and row
 
 
 def read_layer(source: Any, layer: str = "", name: str = "the picture") -> Layer:
     """Return the picture, or a layer of it, of whatever ``compare`` takes. Raises ``UsageError``."""
-    channels: Mapping[str, np.ndarray] = {}
-    headers: Mapping[str, Any] = {}
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)
         try:
-            channels, headers = read_channels(source)
+            found = _layer_of(*read_channels(source), layer, name)
         except OutputError as error:
             raise UsageError(f"{error}; only EXR files can be compared") from error
     elif isinstance(source, Result):
-        name = f"result {name}"
-        channels = {**{letter: source.image[..., i] for i, letter in enumerate("RGB")}, **source.layers}
+        picture = {letter: source.image[..., i] for i, letter in enumerate("RGB")}
+        found = _layer_of({**picture, **source.layers}, {}, layer, f"result {name}")
     elif layer:
         raise UsageError(f"{name} is an array, which has no layer {layer!r}: give a result or an EXR")
     else:
         values = np.asarray(source, np.float32)
         if values.ndim not in (2, 3) or not values.size:
             raise UsageError(f"{name} has the shape {values.shape}: a picture is [H, W] or [H, W, C]")
-        values = np.atleast_3d(values)
-    window = variance = None
-    if channels:
-        chosen, values, variance = _stacked(channels, layer, name)
-        if headers:
-            window = tuple(int(n) for corner in headers[chosen]["dataWindow"] for n in corner)
-    bad = np.isnan(values).any(axis=-1)
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
-        raise UsageError(
-            f"{name} is NaN in {bad.sum()} pixels, the first at row {row}, column {column}: mend it first"
-        )
-    return Layer(values, variance, window)
+        found = Layer(np.atleast_3d(values))
+    bad = np.argwhere(np.isnan(found.values).any(axis=-1))
+    if len(bad):
+        place = f"row {bad[0][0]}, column {bad[0][1]}"
+        raise UsageError(f"{name} is NaN in {len(bad)} pixels, the first at {place}: mend it first")
+    return found
 
 
-def _stacked(
-    channels: Mapping[str, np.ndarray], layer: str, name: str
-) -> tuple[str, np.ndarray, np.ndarray | None]:
-    """Return the first channel of a layer, its values, and their variance where it is known."""
-    chosen = _channels_of(channels, layer)
-    if not chosen:
+def _layer_of(channels: Mapping[str, np.ndarray], headers: Mapping[str, Any], layer: str, name: str) -> Layer:
+    """Return a layer of channels by name, with what is known of its variance and window."""
+
+    def chosen(layer: str) -> list[str]:
+        """Return the channels of a layer, or the one of that name, in order."""
+        found = [key for key in channels if layer in (key, key.rpartition(".")[0])]
+        return sorted(found, key=lambda key: (ORDER.get(key.rpartition(".")[2], len(ORDER)), key))
+
+    def stacked(keys: Sequence[str]) -> np.ndarray:
+        return np.stack([channels[key] for key in keys], axis=-1)
+
+    keys = (
+        chosen(layer) if layer else [c for c in "RGB" if c in channels] or [c for c in "Y" if c in channels]
+    )
+    if not keys:
         named = sorted({key.rpartition(".")[0] or key for key in channels})
         raise UsageError(f"{name} has no layer {layer or 'R, G, B'!r}; it has {', '.join(named)}")
-    values, variance = np.stack([channels[key] for key in chosen], axis=-1), None
-    for spread, power in () if layer else SPREADS.items():
-        known = _channels_of(channels, spread)
-        if known and variance is None:
-            variance = np.stack([channels[key] for key in known], axis=-1).astype(np.float64) ** power
-    return chosen[0], values, variance
-
-
-def _channels_of(channels: Mapping[str, np.ndarray], layer: str) -> list[str]:
-    """Return the channels of a layer, or the one of that name, in the order in which they belong together."""
-    if not layer:
-        return [c for c in "RGB" if c in channels] or [c for c in "Y" if c in channels]
-    found = [key for key in channels if key == layer or key.rpartition(".")[0] == layer]
-    return sorted(found, key=lambda key: (ORDER.get(key.rpartition(".")[2], len(ORDER)), key))
+    spreads = [(spread, power) for spread, power in SPREADS.items() if not layer and chosen(spread)]
+    variance = None
+    if spreads:
+        spread, power = spreads[0]
+        variance = stacked(chosen(spread)).astype(np.float64) ** power
+    corners = headers[keys[0]]["dataWindow"] if headers else ()
+    return Layer(stacked(keys), variance, tuple(int(n) for corner in corners for n in corner))
 
 
 def _p_value(sides: Sequence[Layer]) -> float | None:
@@ -216,9 +215,22 @@ def _p_value(sides: Sequence[Layer]) -> float | None:
     values = [side.values.astype(np.float64).mean(axis=2) for side in sides]
     variance = sum(side.variance.mean(axis=2) for side in sides if side.variance is not None)
     brightness = np.maximum(*np.abs(values))
-    rounding = image_tests.ROUNDING * (brightness + brightness.mean())
+    rounding = ROUNDING * (brightness + brightness.mean())
     difference = values[0] - values[1]
     difference -= np.clip(difference, -rounding, rounding)
-    cells = [image_tests.p_of_means(difference, size) for size in (CELL, max(difference.shape))]
+    cells = [_p_of_means(difference, size) for size in (CELL, max(difference.shape))]
     pixels = exceedance(np.abs(difference) / np.sqrt(variance + rounding**2 + 1e-300))
-    return image_tests.sidak(min(*cells, pixels), 3)
+    return sidak(min(*cells, pixels), 3)
+
+
+def _p_of_means(difference: np.ndarray, size: int) -> float:
+    """Return the probability of the differences [H, W] between equal pictures, by Student's test of the means
+    over cells of ``size`` × ``size`` pixels, whose noise is independent and as often positive as negative."""
+    from scipy import stats
+
+    values = np.stack([np.ones_like(difference), difference, difference**2], axis=-1)
+    count, total, square = np.moveaxis(cell_sums(values, size), -1, 0)
+    spread = np.sqrt(np.maximum(count * square - total**2, 0) / np.maximum(count - 1, 1))
+    t = np.divide(total, spread, out=np.where(total == 0, 0, np.inf), where=spread > 0)
+    p = 2 * stats.t.sf(np.abs(t), count - 1)[(count > 1) & (square > 0)]
+    return sidak(float(p.min(initial=1)), p.size)
