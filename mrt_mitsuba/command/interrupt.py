@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 GRACE = 1.0  # seconds; more than an orderly end takes without a kernel, and well under the two promised
@@ -31,41 +31,37 @@ if hasattr(signal, "SIGHUP"):
 def ending_soon(clean_up: Callable[[], object]) -> Iterator[None]:
     """Raise ``Terminated`` on SIGTERM and SIGHUP in the block; the process ends within ``GRACE`` seconds.
 
-    ``clean_up`` is called before the process is ended by force; its exit code is 128 + the number of the
-    signal. Without effect outside the main thread, where Python sets no handlers, and without POSIX signals.
-    A signal that is ignored, as in the background of a shell or under nohup, stays so.
+    The block raises it at last, whatever Mitsuba and Dr.Jit make of it on the way. ``clean_up`` is called
+    before the process is ended by force; its exit code is 128 + the number of the signal. Without effect
+    outside the main thread, where Python sets no handlers, and without POSIX signals. A signal that is
+    ignored, as in the background of a shell or under nohup, stays so.
     """
     if os.name != "posix" or threading.current_thread() is not threading.main_thread():
         yield
         return
+    raised: list[KeyboardInterrupt] = []
     read_end, write_end = os.pipe()
     os.set_blocking(write_end, False)
     ended = threading.Event()
-    watcher = threading.Thread(target=_watch, args=(read_end, ended, clean_up), daemon=True)
-    watcher.start()
-    heeded = {number: kind for number, kind in SIGNALS.items() if signal.getsignal(number) in _DEFAULTS}
-    wakeup = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
-    try:
-        with _surfacing(heeded):
-            yield
-    finally:
-        signal.set_wakeup_fd(wakeup)
-        ended.set()
-        os.close(write_end)  # ends the thread
-        watcher.join(GRACE)
-
-
-@contextlib.contextmanager
-def _surfacing(kinds: Mapping[int, type[KeyboardInterrupt]]) -> Iterator[None]:
-    """Raise exceptions on signals in the block; the first of them is what the block raises at last, whatever
-    Mitsuba and Dr.Jit make of it on the way."""
-    raised: list[KeyboardInterrupt] = []
 
     def handle(number: int, frame: FrameType | None) -> None:
-        raised.append(kinds[number]())
+        raised.append(SIGNALS[number]())
         raise raised[-1]
 
-    before = {number: signal.signal(number, handle) for number in kinds}
+    def watch() -> None:  # for numbers, which Python's low-level handler writes at once, kernel or not
+        with open(read_end, "rb", buffering=0) as numbers:
+            while byte := numbers.read(1):
+                if byte[0] in SIGNALS and not ended.wait(GRACE):
+                    clean_up()
+                    leave_now(128 + byte[0])
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    defaults = (signal.SIG_DFL, signal.default_int_handler)
+    wakeup = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+    before = {
+        number: signal.signal(number, handle) for number in SIGNALS if signal.getsignal(number) in defaults
+    }
     try:
         yield
     except Exception as error:
@@ -75,21 +71,12 @@ def _surfacing(kinds: Mapping[int, type[KeyboardInterrupt]]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        signal.set_wakeup_fd(wakeup)
+        ended.set()
+        os.close(write_end)  # ends the thread
+        watcher.join(GRACE)
     if raised:
         raise raised[0]
-
-
-_DEFAULTS = (signal.SIG_DFL, signal.default_int_handler)
-
-
-def _watch(read_end: int, ended: threading.Event, clean_up: Callable[[], object]) -> None:
-    """Wait for the number of a signal, which Python's low-level handler writes at once, kernel or not."""
-    with open(read_end, "rb", buffering=0) as numbers:
-        while byte := numbers.read(1):
-            number = byte[0]
-            if number in SIGNALS and not ended.wait(GRACE):
-                clean_up()
-                leave_now(128 + number)
 
 
 def leave_now(code: int) -> None:

@@ -16,8 +16,8 @@ from mrt_mitsuba.errors import MrtError, UsageError, one_line
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
-# What printing fails with where the output goes to a full disk; pictures have errors of their own
-FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
+# What printing fails with where nobody reads, or the disk is full; pictures have errors of their own
+UNPRINTED = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 # An environment variable; set to anything, unexpected errors show where they came from
 TRACEBACK = "MRT_TRACEBACK"
 
@@ -28,26 +28,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Without arguments, those of the process are taken, and a picture or an interrupt ends it at once.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    _open_closed_streams()
+    # A file that is opened later must not get the number of a stream that the caller closed
+    while (lowest := os.open(os.devnull, os.O_RDWR)) <= 2:
+        setattr(sys, ("stdin", "stdout", "stderr")[lowest], os.fdopen(lowest, "w" if lowest else "r"))
+    os.close(lowest)
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         code = _guarded(words)
-    picture = bool(words) and registry.find(words[0]) is None
+    picture = bool(words) and words[0] not in registry.ALL
     if arguments is None and (picture or code in (INTERRUPTED, TERMINATED)):
         # the interpreter would wait for kernels that run, and take apart all that it has loaded
         leave_now(code)
     return code
-
-
-def _open_closed_streams() -> None:
-    """Let nothing that is opened later be taken for standard output or error, where a caller closed these."""
-    for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
-        if getattr(sys, name) is None:
-            mode = "r" if name == "stdin" else "w"
-            stream = open(os.devnull, mode)  # noqa: SIM115 - it stays open
-            if stream.fileno() != descriptor:
-                os.dup2(stream.fileno(), descriptor)
-            setattr(sys, name, stream)
 
 
 def _guarded(words: list[str]) -> int:
@@ -63,15 +55,14 @@ def _guarded(words: list[str]) -> int:
         return _fail("terminated", TERMINATED)
     except KeyboardInterrupt:
         return _fail("interrupted", INTERRUPTED)
-    except BrokenPipeError:
-        # whoever read the output has gone; keep Python from complaining about it once more at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
     except MemoryError:
         return _fail("out of memory: choose a smaller width, height or aa", 1)
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in FULL and error.filename is None:
-            sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - or Python complains once more at exit
+        if isinstance(error, OSError) and error.errno in UNPRINTED and error.filename is None:
+            # or Python complains once more at exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            if isinstance(error, BrokenPipeError):
+                return 1
             return _fail(f"cannot print: {error.strerror}; send the output elsewhere", 1)
         if os.environ.get(TRACEBACK):
             raise
@@ -80,18 +71,16 @@ def _guarded(words: list[str]) -> int:
 
 def _dispatch(words: list[str]) -> int:
     if not words:
-        from mrt_mitsuba.command.listings import usage
+        from mrt_mitsuba.command.tools import usage
 
         sys.stderr.write(usage())
         return UsageError.exit_code
     name = words[0]
-    command = registry.find(name)
-    if command is not None:
-        return command.run(name, words[1:])
+    if name in registry.ALL:
+        return registry.run(name, words[1:])
     if name.isdecimal() and all("=" in word for word in words[1:]):
         raise UsageError(f"FILENAME is missing: write mrt FILENAME {name}, or mrt ./{name} for that name")
-    meant = registry.near_miss(words)
-    if meant:
+    if meant := registry.near_miss(words):
         raise UsageError(
             f"there is no command {name!r}: did you mean mrt {meant}? For a picture of that name, write "
             f"mrt ./{name}"
@@ -115,7 +104,7 @@ def _end_by_force() -> None:
     print(f"{newline}mrt: interrupted", file=sys.stderr)
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
+def _show_warning(message: Warning | str, *place: object, **more: object) -> None:
     print(f"mrt: warning: {one_line(str(message))}", file=sys.stderr)
 
 

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mrt_mitsuba.command.logs import LEVELS
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import choice, either, from_text, option, path, switch
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
-from mrt_mitsuba.scene.model import check_model_options, is_obj
+from mrt_mitsuba.scene.model import check_model_options
 from mrt_mitsuba.scene.report import NUMBERS
+
+# What ``log`` shows, from the fewest records to the most, as Python, Mitsuba and Dr.Jit call them
+LEVELS = {
+    "error": (logging.ERROR, "Error", "Error"),
+    "warn": (logging.WARNING, "Warn", "Warn"),
+    "info": (logging.INFO, "Info", "Warn"),
+    "debug": (logging.DEBUG, "Debug", "Info"),  # with every kernel that is launched
+}
+FORM = "mrt FILENAME [SCENE] [name=value ...]"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,10 +42,8 @@ class Options(RenderSettings):
     log: str = option("warn", choice(*LEVELS), "what to print: warnings; times; every kernel")
 
     def render_arguments(self) -> dict[str, Any]:
-        """Return the options that say how to render, by name, without those about files and messages, and
-        without those of ``model`` where there is one."""
-        of_model = self.model().keys() if is_obj(self.scene) else set()
-        return {name: getattr(self, name) for name in sorted({*settings.TABLE, "params"} - of_model)}
+        """Return the options that say how to render, without those about files and messages."""
+        return {name: getattr(self, name) for name in (*settings.TABLE, "params")}
 
     def outputs(self) -> tuple[str, ...]:
         """Return the paths of the pictures to write."""
@@ -50,52 +57,46 @@ TABLE = {field.name: field for field in dataclasses.fields(Options) if field.met
 def parse(arguments: Sequence[str]) -> Options:
     """Turn ``FILENAME [SCENE] [name=value ...]`` into options; raise ``UsageError`` naming what is wrong."""
     if not arguments:
-        raise UsageError("FILENAME is missing: mrt FILENAME [SCENE] [name=value ...]")
+        raise UsageError(f"FILENAME is missing: {FORM}")
     values: dict[str, Any] = {"filename": _filename(arguments[0])}
-    params: dict[str, str] = {}
-    rest = list(arguments[1:])
-    if rest and "=" not in rest[0]:
-        values["scene_number"] = _scene_number(rest.pop(0))
-    for argument in rest:
+    given: dict[str, str] = {}
+    for place, argument in enumerate(arguments[1:]):
         name, equals, text = argument.partition("=")
-        if not equals:
-            raise UsageError(f"unexpected argument {argument!r}: options are written name=value")
-        if name in params or (name in values and name in TABLE):
+        if name in given:
             raise UsageError(f"{name} is given twice")
-        if name in TABLE:
-            values[name] = from_text(TABLE[name], text)
+        if equals:
+            given[name] = text
+        elif place > 0:
+            raise UsageError(f"unexpected argument {argument!r}: options are written name=value")
         else:
-            params[name] = text
-    if "scene" in values and "scene_number" in values:
-        raise UsageError(f"both SCENE {values['scene_number']} and scene={values['scene']}: give one of them")
+            values["scene_number"] = _scene_number(argument)
+    if "scene" in given and "scene_number" in values:
+        raise UsageError(f"both SCENE {values['scene_number']} and scene={given['scene']}: give one of them")
     for name in ("motionsamples", "motionmode"):
-        if name in values and "motion" not in values:
+        if name in given and "motion" not in given:
             raise UsageError(f"{name} is of use only with motion=dx,dy,dz")
-    if params:
-        _check_declared(params, values.get("scene", ""))
+    values |= {name: from_text(TABLE[name], text) for name, text in given.items() if name in TABLE}
+    params = {name: text for name, text in given.items() if name not in TABLE}
+    if params:  # which an XML file must declare
+        from difflib import get_close_matches
+
+        from mrt_mitsuba.scene.loading import declared
+
+        scene = values.get("scene", "")
+        known = declared(scene) if scene.lower().endswith(".xml") else {}
+        for strange in (name for name in params if name not in known):
+            close = get_close_matches(strange.lstrip("-").lower(), [*TABLE, *known], n=1)
+            hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
+            raise UsageError(f"unknown option {strange!r}.{hint}")
     options = Options(**values, params=params or None)
     check_model_options(options.scene, options.model())
     return options
 
 
-def _check_declared(params: Iterable[str], scene: str) -> None:
-    """Raise ``UsageError`` for names that are neither options nor parameters of an XML file."""
-    from difflib import get_close_matches
-
-    from mrt_mitsuba.scene.loading import declared
-
-    known = declared(scene) if scene.lower().endswith(".xml") else {}
-    strange = next((name for name in params if name not in known), None)
-    if strange is not None:
-        close = get_close_matches(strange.lstrip("-").lower(), [*TABLE, *known], n=1)
-        hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
-        raise UsageError(f"unknown option {strange!r}.{hint}")
-
-
 def _filename(text: str) -> str:
     stem, ending = os.path.splitext(text)
     if "=" in text and text.partition("=")[0] in TABLE:
-        raise UsageError(f"FILENAME is missing before {text}: mrt FILENAME [SCENE] [name=value ...]")
+        raise UsageError(f"FILENAME is missing before {text}: {FORM}")
     if text.startswith("-"):
         raise UsageError(f"unknown option {text}: options are written name=value; 'mrt help' lists them")
     if ending.lower() in (".png", ".exr"):

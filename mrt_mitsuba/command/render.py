@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
+import logging
 import os
 import sys
 import time
 import warnings
-from collections.abc import Iterator
-from typing import Any
 
-from mrt_mitsuba.command.options import Options
+from mrt_mitsuba.command.options import LEVELS, Options
 from mrt_mitsuba.errors import MrtWarning, printable
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.rendering.settings import NOISE
@@ -26,30 +24,30 @@ def run(options: Options) -> int:
     check_start()
     for path in options.outputs():
         check_target(path, [] if options.scene is None else [options.scene])
-    with _loading():
-        with held():  # it imports Dr.Jit
-            from mrt_mitsuba.rendering.api import render
-        from mrt_mitsuba import runtime
-        from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
+    # A tenth of the start is a search for garbage among what is loaded to stay, and threads for NumPy's
+    # linear algebra wait busily for work
+    spared = "mitsuba" not in sys.modules and gc.isenabled()
+    if spared:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        gc.disable()
+    with held():  # it imports Dr.Jit
+        from mrt_mitsuba.rendering.api import render
+    from mrt_mitsuba import runtime
+    from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
 
-        if options.quiet:
-            warnings.simplefilter("ignore", MrtWarning)
-        else:
-            print(banner(options), flush=True)
-        runtime.use(options.variant)
+    if options.quiet:
+        warnings.simplefilter("ignore", MrtWarning)
+    else:
+        print(banner(options), flush=True)
+    runtime.use(options.variant)
+    if spared:
+        gc.freeze()
+        gc.enable()
     if options.log != "warn":
-        from mrt_mitsuba.command import logs
-
-        logs.show(options.log)
+        show_log(options.log)
     progress = Progress() if options.quiet else TerminalProgress(show_plan=options.plan == "show")
     start = time.perf_counter()
-    scene: Any = options.scene if options.scene is not None else options.scene_number
-    if is_obj(scene):
-        from mrt_mitsuba.scene.placement import model_scene
-
-        scene = model_scene(scene, **options.model())
-        for path in options.outputs():  # at once, not after the render
-            check_target(path, scene.files)
+    scene = options.scene_number if options.scene is None else options.scene
     result = render(scene, progress=progress, **options.render_arguments())
     seconds = time.perf_counter() - start
     result.save(*options.outputs(), tonemap=options.tonemap)
@@ -61,20 +59,22 @@ def run(options: Options) -> int:
     return 0
 
 
-@contextlib.contextmanager
-def _loading() -> Iterator[None]:
-    """Spare the start what it does not need: a tenth of it is a search for garbage among what is loaded to
-    stay, and threads for NumPy's linear algebra wait busily for work."""
-    if "mitsuba" in sys.modules or not gc.isenabled():
-        yield
-        return
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()
-        gc.enable()
+def show_log(level: str) -> None:
+    """Show records from ``level`` on, of this package, of Mitsuba (on standard output) and of Dr.Jit."""
+    import drjit as dr
+    import mitsuba as mi
+
+    ours, mitsubas, drjits = LEVELS[level]
+    logger = logging.getLogger("mrt_mitsuba")
+    logger.setLevel(ours)
+    if not logger.handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        logger.addHandler(handler)
+    mi.set_log_level(getattr(mi.LogLevel, mitsubas))
+    dr.set_log_level(getattr(dr.LogLevel, drjits))
+    if level == "error":
+        warnings.simplefilter("ignore", MrtWarning)
 
 
 def banner(options: Options) -> str:
@@ -85,15 +85,14 @@ def banner(options: Options) -> str:
 
         scene = report_scene(options.scene_number)
         focus = options.focus(scene.focal_distance, scene.focal_range)
-    own_film = options.scene is not None and not is_obj(options.scene)
-    width, height = ("from the file", "from the file") if own_film else SIZE
+    film = "from the file" if options.scene is not None and not is_obj(options.scene) else ""
     aamode = options.aamode or (NOISE if options.rmse else None)
     lines = {
         "Scene": options.scene_number if options.scene is None else printable(options.scene),
-        "Width": options.width or width,
-        "Height": options.height or height,
-        "AA": options.aa or ("as noise needs" if aamode == NOISE else "from the file" if own_film else 4),
-        "AA mode": aamode or ("from the file" if own_film else "sobel"),
+        "Width": options.width or film or SIZE[0],
+        "Height": options.height or film or SIZE[1],
+        "AA": options.aa or ("as noise needs" if aamode == NOISE else film or 4),
+        "AA mode": aamode or film or "sobel",
         "F distance": focus.distance or "off",
         "F range": focus.range if focus.distance else "off",
     }

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mrt_mitsuba.command.logs import LEVELS
-from mrt_mitsuba.command.options import Options, parse
+from mrt_mitsuba.command.options import LEVELS, Options, parse
 
 
 def test_levels_log_more_and_more(mrt_command) -> None:

@@ -68,11 +68,11 @@ WRONG = """
 out width=0 -> width must be a whole number; out 17 -> SCENE 17: must be; 3 -> FILENAME is missing
 doctr -> did you mean mrt doctor; exprot --xml a.xml -> mrt export
 doctor now -> unexpected argument 'now' after mrt doctor; scenes all -> unexpected argument
-help me -> unexpected; export -> give a scene; export 3 -> --xml PATH; export 3 --xml -> --xml PATH
-export --xml a.xml -> give a scene; export 17 --xml a.xml -> SCENE 17; export 3 --obj a.xml -> --xml PATH
+help me -> unexpected; export -> PATH is missing; export 3 -> --xml PATH; export 3 --xml -> --xml PATH
+export --xml a.xml -> PATH is missing; export 17 --xml a.xml -> SCENE 17; export 3 --obj a.xml -> --xml PATH
 export 3 --xml a.xml b.xml -> unexpected argument
 export 0 --xml a.xml --stock --stock -> --stock is given twice; export 3 --xml a.xml aa=2 -> aa is of no use
-export 3 --xml a.xml fov=30 -> only with an OBJ file; export 3 scene=a.xml --xml b.xml -> give one of them
+export 3 --xml a.xml fov=30 -> only with an OBJ file; export 3 scene=a.xml --xml b.xml -> unexpected argument
 check -> SCENE|scene=PATH is missing; check 0 1 -> unexpected argument '1'
 check 0 quick=2 -> must be 0 or 1; check 0 scene=1 -> unexpected argument
 error-vs-time 0 -> cases is missing; diff a.exr -> B.exr is missing; diff a.exr b.exr rsme=1 -> meant rmse?

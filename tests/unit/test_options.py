@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mrt_mitsuba.command import listings, options
+from mrt_mitsuba.command import options, tools
 from mrt_mitsuba.command.options import Options, parse
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import checked
@@ -239,8 +239,8 @@ def test_values_from_python_refused(name: str, values: list[object]) -> None:
 
 
 def test_usage_names_every_option_with_its_default() -> None:
-    text = listings.usage()
-    assert max(map(len, text.splitlines())) <= listings.WIDTH
+    text = tools.usage()
+    assert max(map(len, text.splitlines())) <= tools.WIDTH
     entries = re.split(r"\n  (?=\w+=)", text.partition("\n\ncommands:")[0])[1:]
     assert [entry.partition("=")[0] for entry in entries] == list(options.TABLE)
     assert all(re.search(r"\(default:\s+[^)]+\)$", entry) for entry in entries)

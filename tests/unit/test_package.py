@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import mrt_mitsuba
-from mrt_mitsuba.command.toml import read_toml
+from mrt_mitsuba.command.tools import read_toml
 
 ROOT = Path(__file__).parents[2]
 

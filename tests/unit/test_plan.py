@@ -136,7 +136,7 @@ for integrator in ("mrt_whitted", "path"):
     result.save("a.exr")
     assert {"tangent.X", "tangent.Y", "tangent.Z"} <= read_exr("a.exr").layers.keys()
     assert "with tangent" in str(result.plan)
-from mrt_mitsuba.command.listings import usage
+from mrt_mitsuba.command.tools import usage
 assert "tangent" in usage()
 """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from mrt_mitsuba.command.toml import read_toml
+from mrt_mitsuba.command.tools import read_toml
 from mrt_mitsuba.errors import MrtError, SceneError, UsageError
 from mrt_mitsuba.validation.tools.study import Bound
 
