@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,20 +77,25 @@ def parse(arguments: Sequence[str]) -> Options:
             raise UsageError(f"{name} is of use only with motion=dx,dy,dz")
     values |= {name: from_text(TABLE[name], text) for name, text in given.items() if name in TABLE}
     params = {name: text for name, text in given.items() if name not in TABLE}
-    if params:  # which an XML file must declare
-        from difflib import get_close_matches
-
-        from mrt_mitsuba.scene.loading import declared
-
-        scene = values.get("scene", "")
-        known = declared(scene) if scene.lower().endswith(".xml") else {}
-        for strange in (name for name in params if name not in known):
-            close = get_close_matches(strange.lstrip("-").lower(), [*TABLE, *known], n=1)
-            hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
-            raise UsageError(f"unknown option {strange!r}.{hint}")
+    if params:
+        _check_declared(params, values.get("scene", ""))
     options = Options(**values, params=params or None)
     check_model_options(options.scene, options.model())
     return options
+
+
+def _check_declared(params: Iterable[str], scene: str) -> None:
+    """Raise ``UsageError`` for names that are neither options nor parameters of an XML file."""
+    from difflib import get_close_matches
+
+    from mrt_mitsuba.scene.loading import declared
+
+    known = declared(scene) if scene.lower().endswith(".xml") else {}
+    for strange in params:
+        if strange not in known:
+            close = get_close_matches(strange.lstrip("-").lower(), [*TABLE, *known], n=1)
+            hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
+            raise UsageError(f"unknown option {strange!r}.{hint}")
 
 
 def _filename(text: str) -> str:

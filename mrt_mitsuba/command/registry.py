@@ -60,24 +60,7 @@ def run(name: str, words: Sequence[str]) -> int:
     """
     form, _, home = ALL[name]
     usage = f"Usage: mrt {name} {form}".strip()
-    names = names_in(form)
-    plain: list[str] = []
-    given: dict[str, str] = {}
-    rest = iter(words)
-    for word in rest:
-        key, equals, value = word.partition("=")
-        if not equals and not (key.startswith("--") and key[2:] in names):
-            plain.append(word)
-            continue
-        if not equals:
-            value = next(rest, "") if f"{key} PATH" in form else "1"
-        option = key if equals else key[2:]
-        if option not in names and "name" not in names:
-            close = difflib.get_close_matches(option, names, n=1)
-            raise UsageError(f"unknown option {option!r}{f', meant {close[0]}?' if close else '.'} {usage}")
-        if option in given:
-            raise UsageError(f"{key} is given twice. {usage}")
-        given[option] = value
+    plain, given = _read(words, form, usage)
     if "scene" in given:  # in place of SCENE
         plain.append(given.pop("scene"))
     needed = _FLAG_WITH_VALUE.sub(r"\1=\2", form).split()
@@ -91,6 +74,28 @@ def run(name: str, words: Sequence[str]) -> int:
     module, _, function = home.partition(":")
     code: int = getattr(import_module(module), function)(*plain, **given)
     return code
+
+
+def _read(words: Sequence[str], form: str, usage: str) -> tuple[list[str], dict[str, str]]:
+    """Return plain words, and the others by name."""
+    names = names_in(form)
+    plain: list[str] = []
+    given: dict[str, str] = {}
+    rest = iter(words)
+    for word in rest:
+        name, equals, value = word.partition("=")
+        if not equals and not (name.startswith("--") and name[2:] in names):
+            plain.append(word)
+            continue
+        if not equals:
+            name, value = name[2:], next(rest, "") if f"{word} PATH" in form else "1"
+        if name not in names and "name" not in names:
+            close = difflib.get_close_matches(name, names, n=1)
+            raise UsageError(f"unknown option {name!r}{f', meant {close[0]}?' if close else '.'} {usage}")
+        if name in given:
+            raise UsageError(f"{word.partition('=')[0]} is given twice. {usage}")
+        given[name] = value
+    return plain, given
 
 
 _FLAG_WITH_VALUE = re.compile(r"--(\w+) (\w+)")
