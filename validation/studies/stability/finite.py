@@ -1,23 +1,115 @@
-"""Nothing that is not finite, and nothing negative: plugins in bulk, and whole renders."""
+"""Extreme input: filters on pictures that are constant, damaged or of huge range; plugins in bulk."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from itertools import product
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.rendering.api import render
+from mrt_mitsuba import filters, runtime
 from mrt_mitsuba.scene.model import Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.validation.checks.probe import not_finite
-from mrt_mitsuba.validation.studies.stability.cases import Cases
-from mrt_mitsuba.validation.studies.stability.transport import BASE, not_a_colour
+from mrt_mitsuba.validation.studies.stability.cases import Case
+from mrt_mitsuba.validation.studies.stability.transport import BASE
 from mrt_mitsuba.validation.tools.scenery import traced
-from mrt_mitsuba.validation.tools.study import Study
+
+# ------------------------------------------------- Filters -------------------------------------------------
+
+SHAPES = ((1, 1), (1, 17), (17, 1), (2, 2), (3, 3), (1, 2), (40, 30))
+MODES = ("report", "corrected")
+# A blurred pixel is a weighted mean of at most 16² others: sums of as many float32 products
+MEAN = 64 * 2.0**-24
+UP = np.array([0, 0, 1], np.float32)
+EDGES: dict[str, Callable[[np.ndarray, np.ndarray], Any]] = {
+    "luma": lambda image, depth: filters.luma_edges(image),
+    "sobel": lambda image, depth: filters.sobel_edges(image),
+    "geometry": lambda image, depth: filters.geometry_edges(image * 0 + UP, depth),
+}
+
+
+def of_filters(quick: bool) -> Iterator[Case]:
+    """Yield the cases of the filters, in both kinds of variants."""
+    for variant in (runtime.FAST, runtime.SLOW):
+        runtime.use(variant)
+        try:
+            for case in (*_blurs(), *_detectors()):
+                yield case._replace(name=f"{case.name} ({variant})")
+        finally:
+            runtime.use(runtime.FAST)
+
+
+def _blurred(image: np.ndarray, depth: np.ndarray, mode: str, **focus: Any) -> np.ndarray:
+    chosen = {"focal_distance": 2.0, "focal_range": 0.5, **focus}
+    return np.asarray(filters.gaussian_dof(image, depth, mode=mode, **chosen))
+
+
+def _example(shape: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return a picture of noise, and distances on both sides of the focus, with some misses."""
+    rng = np.random.default_rng(1)
+    depth = rng.uniform(0.1, 12, shape).astype(np.float32)
+    depth[rng.random(shape) < 0.1] = np.inf
+    return rng.random((*shape, 3)).astype(np.float32), depth
+
+
+def _blurs() -> Iterator[Case]:
+    tiny, excess = 0.0, 0.0
+    for shape, mode in product(SHAPES, MODES):
+        image, depth = _example(shape)
+        tiny = max(tiny, np.abs(_blurred(np.full_like(image, 1e-30), depth, mode) / 1e-30 - 1).max())
+        for picture in (
+            np.full_like(image, 1e-25),
+            np.full_like(image, 0.3),
+            1e20 * image - np.float32(3e19),
+        ):
+            out, low, high = _blurred(picture, depth, mode), picture.min(), picture.max()
+            excess = max(excess, np.maximum(low - out, out - high).max() / max(abs(low), abs(high)))
+    what = "1×1 … 40×30, constant pictures and noise to 1e20: how far means leave the range of values"
+    yield Case("range of a blur", what, "not at all", excess, MEAN)
+    why = "the smallest weights are 2⁻³⁰: their products are below the least normal float32 and become 0"
+    yield Case("constant pictures of 1e-30, blur", "relative change", why, tiny)
+    for value in (np.nan, np.inf):
+        image, depth = _example((40, 30))
+        image[20, 15, 1] = value
+        bad = [~np.isfinite(_blurred(image, depth, mode)).all(axis=-1) for mode in MODES]
+        what = "other pixels that are not finite afterwards, and this one where it is hidden"
+        figure = sum(int(b.sum()) + 1 - 2 * b[20, 15] for b in bad)
+        yield Case(f"{value} in a picture, blur", what, "damage stays local, and to be seen", figure, 0)
+    image = (10 ** np.random.default_rng(5).uniform(-38, 34, (20, 20, 3))).astype(np.float32)
+    depth = (10 ** np.random.default_rng(6).uniform(-30, 30, (20, 20))).astype(np.float32)
+    settings = product(MODES, (1e-30, 1.0, 1e30), (0.0, 1e-30, 1e30, np.inf))
+    found = [_blurred(image, depth, mode, focal_distance=f, focal_range=r) for mode, f, r in settings]
+    what = "values that are not finite, pictures 1e-38 … 1e34, depths 1e-30 … 1e30"
+    yield Case("huge ranges, blur", what, "means are finite", np.sum(~np.isfinite(found)), 0)
+
+
+def _detectors() -> Iterator[Case]:
+    expected = np.zeros((12, 10), bool)
+    expected[5:8, 4:7] = True
+    rng = np.random.default_rng(7)
+    huge = (10 ** rng.uniform(-38, 34, (20, 20, 3)) * rng.choice([-1, 1], (20, 20, 3))).astype(np.float32)
+    far = (10 ** rng.uniform(-37, 37, (20, 20))).astype(np.float32)
+    for name, find in EDGES.items():
+        for value in (np.nan, np.inf):
+            image, depth = np.full((12, 10, 3), 0.5, np.float32), np.full((12, 10), 3, np.float32)
+            if name == "geometry":
+                depth[6, 5] = np.nan  # infinite is a miss
+            else:
+                image[6, 5, 2] = value
+            found = find(image, depth)
+            wrong = (np.isinf(np.asarray(found.value)) != expected) | (~np.asarray(found.mask) & expected)
+            what = "pixels not marked in its 3×3, or marked elsewhere"
+            yield Case(f"{value} in a picture, {name}", what, "reported, and local", wrong.sum(), 0)
+        bad = np.isnan(np.asarray(find(huge, far).value)).sum()
+        what = "NaN among the values, pictures to ±1e34"
+        yield Case(f"huge ranges, {name}", what, "there is none", bad, 0)
+
+
+# ------------------------------------------------- Plugins -------------------------------------------------
 
 AT_ONCE = 2_500_000
 TINY, NORMAL = 1e-45, 1.2e-38  # the least float32 of all, and the least with all its digits
@@ -26,90 +118,61 @@ ALPHAS: tuple[float, ...] = (*_ZERO_UP, *(-a for a in _ZERO_UP[1:-1]))
 IORS = (1, 1 + 1.2e-7, 1 - 6e-8, TINY, NORMAL, 1e-3, 1e6, 1e9, 3e38, np.inf, np.nan, 0, -1)
 COSINES = (1, 1 - 6e-8, 0.5, 1e-3, 1e-7, 1e-12, 1e-20, NORMAL, TINY, 0, -TINY, -1e-7, -0.5, -1)
 NUMBERS = (0, 1, -1, TINY, -TINY, NORMAL, 1e-20, 1e-7, -1e-7, 0.5, 2, 1e3, -1e6)
-UNIFORM = (0, 6e-8, 0.5, 1 - 6e-8)
-FRESNEL = ("schlick", "dielectric", "unity")
+NOTE = (
+    "A negative alpha is allowed: D sees its square, G₁ its sign, and where the BSDF would be negative it is "
+    "0. |alpha| below 1e-8, 0 included, acts as 1e-8, above 1e6 as 1e6; an update with NaN acts as 1e-8."
+)
 
 
-def run(study: Study, *, quick: bool) -> None:
-    """Check bulk evaluations with one in three numbers an extreme one; random scenes."""
-    cases = Cases(study, "finite", "Finite and not negative")
+def in_bulk(quick: bool) -> Iterator[Case]:
+    """Yield bulk evaluations with one in three numbers an extreme one."""
     count = 10**6 if quick else 10**8
+    parts = range(-(-count // AT_ONCE))  # one trace serves all
     for name, what, evaluate in BULK:
-        # in kernels of ``AT_ONCE``; one trace serves all
-        parts = range(-(-count // AT_ONCE))
-        bad = sum(int(np.sum(evaluate(_Draw(min(AT_ONCE, count), part)))) for part in parts)
-        cases.at_most(name, f"{count:.0e} random and adversarial evaluations: {what}", "none", bad, 0)
-    bad, scenes = 0, 3 if quick else 40
-    for seed in range(scenes):
-        scene = random_scene(np.random.default_rng(seed))
-        described = scene.to_dict(width=64, height=48, fresnel=FRESNEL[seed % 3])
-        described["integrator"] = {"type": "mrt_whitted", "clamp": bool(seed % 2)}
-        bad += not_a_colour(render(described, aa=1, lattice="report").image)
-    what = f"{scenes} pictures of extreme objects, materials and lights"
-    cases.at_most("random scenes", what, "none", bad, 0)
-    cases.close(
-        "A negative alpha is allowed: D sees its square, G₁ its sign, and where the BSDF "
-        "would be negative it is 0. "
-        "|alpha| below 1e-8, 0 included, acts as 1e-8, above 1e6 as 1e6; an update with NaN acts as 1e-8."
-    )
+        bad = sum(int(np.sum(evaluate(Draw(min(AT_ONCE, count), part)))) for part in parts)
+        yield Case(name, f"{count:.0e} random and adversarial evaluations: {what}", "none is bad", bad, 0)
 
 
-class _Draw:
+class Draw:
     """Random numbers of N lanes; every third is an extreme one."""
 
     def __init__(self, count: int, seed: int) -> None:
         self.count, self.seed = count, seed
-        self._generator = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))
+        self.generator = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))
+
+    def mixed(self, ordinary: Callable[[Any], Any], extremes: Sequence[float]) -> Any:
+        """Return a function of uniform numbers, or an extreme."""
+        found, table = ordinary(self.generator.next_float32()), mi.Float(np.array(extremes, np.float32))
+        index = mi.UInt32(self.generator.next_float32() * 3 * len(extremes))
+        extreme = index < len(extremes)
+        return dr.select(extreme, dr.gather(mi.Float, table, index, extreme), found)
 
     def uniform(self) -> Any:
-        return self._or(UNIFORM, self._generator.next_float32())
+        return self.mixed(lambda u: u, (0, 6e-8, 0.5, 1 - 6e-8))
 
     def log(self, least: float, most: float, extremes: Sequence[float]) -> Any:
         """Spread over decades."""
-        u = self._generator.next_float32()
-        return self._or(extremes, dr.exp(dr.lerp(float(np.log(least)), float(np.log(most)), u)))
+        return self.mixed(lambda u: least * dr.exp(u * float(np.log(most / least))), extremes)
 
-    def coordinate(self, size: float = 1.0) -> Any:
-        return size * self._or(NUMBERS, 4 * self._generator.next_float32() - 2)
-
-    def vector(self, kind: Any, size: float = 1.0) -> Any:
-        return kind(self.coordinate(size), self.coordinate(size), self.coordinate(size))
-
-    def unit(self) -> Any:
-        """Return a unit vector, often with components that are 0 or tiny."""
-        v = self.vector(mi.Vector3f)
-        length = dr.norm(v)
-        usable = (length > 1e-15) & (length < 1e15)
-        return dr.select(usable, v / dr.select(usable, length, 1), mi.Vector3f(0, 0, 1))
+    def vector(self, kind: Any) -> Any:
+        return kind(*(self.mixed(lambda u: 4 * u - 2, NUMBERS) for _ in range(3)))
 
     def local(self) -> Any:
         """Return a direction by its cosine to +z."""
-        z = self._or(COSINES, 2 * self._generator.next_float32() - 1)
+        z = self.mixed(lambda u: 2 * u - 1, COSINES)
         sine, cosine = dr.sincos(2 * dr.pi * self.uniform())
         r = dr.sqrt(dr.maximum((1 - z) * (1 + z), 0))
         return mi.Vector3f(r * cosine, r * sine, z)
-
-    def _or(self, extremes: Sequence[float], ordinary: Any) -> Any:
-        table = mi.Float(np.array(extremes, np.float32))
-        index = mi.UInt32(self._generator.next_float32() * 3 * len(extremes))
-        extreme = index < len(extremes)
-        return dr.select(extreme, dr.gather(mi.Float, table, index, extreme), ordinary)
-
-
-_bad = partial(not_finite, least=0)
 
 
 def _not_unit(v: Any) -> Any:
     return ~(dr.abs(dr.norm(v) - 1) < 1e-5)
 
 
-# ------------------------------------------------ Plugins --------------------------------------------------
+def bsdf_lanes(form: str, visible: bool) -> Callable[[Draw], Any]:
+    """Return bad values, densities, samples and mirror reflectances; each lane has its alpha and indices."""
 
-
-def bsdf_lanes(form: str, visible: bool) -> Callable[[_Draw], Any]:
-    """Return value, density, sample and mirror reflectance, with an alpha and indices for each lane."""
-
-    def evaluate(draw: _Draw) -> Any:
+    def evaluate(draw: Draw) -> Any:
         bright = {"specular_reflectance": 100.0, "diffuse_reflectance": 2.0}
         bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": form, "sample_visible": visible, **bright})
         parameters = mi.traverse(bsdf)
@@ -126,72 +189,38 @@ def bsdf_lanes(form: str, visible: bool) -> Callable[[_Draw], Any]:
         value, pdf = bsdf.eval_pdf(context, si, wo)
         drawn, weight = bsdf.sample(context, si, draw.uniform(), mi.Point2f(draw.uniform(), draw.uniform()))
         mirror = bsdf.eval_attribute("mirror_reflectance", si)
-        return _bad(value, pdf, weight, drawn.pdf, mirror) | _not_unit(drawn.wo)
+        return not_finite(value, pdf, weight, drawn.pdf, mirror, least=0) | _not_unit(drawn.wo)
 
     return evaluate
 
 
-def light_lanes(draw: _Draw) -> Any:
-    light = mi.load_dict({"type": "mrt_light", "intensity": 1e3})
-    parameters = mi.traverse(light)
-    parameters["position"] = draw.vector(mi.Point3f)
-    parameters.update()
-    si = dr.zeros(mi.SurfaceInteraction3f, draw.count)
-    si.p = draw.vector(mi.Point3f)
-    ds, weight = light.sample_direction(si, mi.Point2f(0.5))
-    # Between points that are no further apart than the square root of the least float32, no direction is left
-    far = dr.max(dr.abs(ds.p - si.p)) > 1e-15
-    return _bad(weight, ds.dist, ds.pdf) | (far & _not_unit(ds.d)) | ~dr.all(dr.isfinite(ds.d))
-
-
-def texture_lanes(draw: _Draw) -> Any:
-    texels = np.random.default_rng(9).random((5, 7, 3)).astype(np.float32)
-    texture = mi.load_dict({"type": "mrt_texture", "bitmap": mi.Bitmap(texels)})
-    si = dr.zeros(mi.SurfaceInteraction3f, draw.count)
-    si.uv = mi.Point2f(draw.coordinate(1e3), draw.coordinate(1e3))
-    color = texture.eval(si)
-    return _bad(color) | (dr.max(color) > 1)
-
-
-def whitted_lanes(draw: _Draw) -> Any:
+def whitted_lanes(draw: Draw) -> Any:
     """Return bad results of random rays through a scene of every kind of shape, some from inside."""
     scene = mi.load_dict(random_scene(np.random.default_rng(draw.seed)).to_dict())
-    ray = mi.Ray3f(draw.vector(mi.Point3f), draw.unit())
-    trace = traced(scene, ray, clamp=False, min_contribution=0.0)
+    v = draw.vector(mi.Vector3f)  # often with components that are 0 or tiny
+    length = dr.norm(v)
+    usable = (length > 1e-15) & (length < 1e15)
+    d = dr.select(usable, v / dr.select(usable, length, 1), mi.Vector3f(0, 0, 1))
+    trace = traced(scene, mi.Ray3f(draw.vector(mi.Point3f), d), clamp=False, min_contribution=0.0)
     si = trace.hit.si
-    lost = trace.hit.found & (~dr.isfinite(si.t) | _not_unit(si.n))
-    bad = _bad(trace.radiance, trace.direct) | lost
+    bad = not_finite(trace.radiance, trace.direct, least=0)
+    bad |= trace.hit.found & (~dr.isfinite(si.t) | _not_unit(si.n))
     dr.eval(bad)  # while the scene lives
     return bad
 
 
-# What is evaluated in bulk: plugin, results that are looked at, and the function of the lanes
-BULK: Sequence[tuple[str, str, Callable[[_Draw], Any]]] = (
-    *((f"mrt_bsdf, {form}", "values, densities, samples and reflectances", bsdf_lanes(form, True))
-      for form in FRESNEL),
-    ("mrt_bsdf, normals drawn from D", "the same", bsdf_lanes("dielectric", False)),
-    ("mrt_light", "directions, distances and weights", light_lanes),
-    ("mrt_texture", "colours, which are of [0, 1]", texture_lanes),
-    ("mrt_whitted", "radiance, distances and normals", whitted_lanes),
-)  # fmt: skip
-
-
-# --------------------------------------------- Whole renders -----------------------------------------------
-
-
 def random_scene(rng: np.random.Generator) -> Scene:
-    def color() -> tuple[float, float, float]:
-        r, g, b = map(float, rng.choice([0, 1e-30, 0.5, 1, 10], 3))
-        return (r, g, b)
+    """Return a scene of extreme sizes, materials and lights."""
 
     def material() -> Material:
         alpha = float(rng.choice([0, 1e-8, 1e-4, -0.04, 0.1, 1, 100, 1e20]))
         ior = float(rng.choice([1e-8, 0.5, 1, 1.0000001, 1.5, 1e6, 1e30]))
-        return Material(ior, alpha, color(), color())
+        diffuse, specular = (tuple(color) for color in rng.choice([0, 1e-30, 0.5, 1, 10], (2, 3)).tolist())
+        return Material(ior, alpha, diffuse, specular)
 
     def point() -> tuple[float, float, float]:
-        x, y, z = rng.uniform(-2, 2, 3)
-        return (float(x), float(y), float(z))
+        x, y, z = rng.uniform(-2, 2, 3).tolist()
+        return (x, y, z)
 
     def radius() -> float:
         return float(10 ** rng.uniform(-4, 0.5))
@@ -204,3 +233,12 @@ def random_scene(rng: np.random.Generator) -> Scene:
         cones=tuple(Cone(point(), point(), radius(), material()) for _ in range(3)),
         cylinders=tuple(Cylinder(point(), point(), radius(), material()) for _ in range(3)),
     )
+
+
+# What is evaluated in bulk: plugin, results that are looked at, and the function of the lanes
+BULK: Sequence[tuple[str, str, Callable[[Draw], Any]]] = (
+    *((f"mrt_bsdf, {form}", "values, densities, samples and reflectances", bsdf_lanes(form, True))
+      for form in ("schlick", "dielectric", "unity")),
+    ("mrt_bsdf, normals drawn from D", "the same", bsdf_lanes("dielectric", False)),
+    ("mrt_whitted", "radiance, distances and normals", whitted_lanes),
+)  # fmt: skip

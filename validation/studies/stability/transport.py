@@ -6,21 +6,17 @@ must exceed the bound of the case by a factor of two: so each states, by measure
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
-from itertools import product
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
-import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Light, Material, Plane, Scene, Sphere
-from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.oracles.reference import reference_render, specular_lobe
-from mrt_mitsuba.validation.studies.stability.cases import Cases, both_variants
-from mrt_mitsuba.validation.tools.scenery import traced
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.oracles.reference import reference_render
+from mrt_mitsuba.validation.studies.stability.cases import Case
 
 WIDTH, HEIGHT = 64, 48
 
@@ -29,7 +25,6 @@ WIDTH, HEIGHT = 64, 48
 SMALL, SHARE = 1e-3, 0.95
 # For plain cases: some float32 roundings, three times what was measured
 PLAIN = 3e-6
-CUT_OFF = 1 / 16 / 255  # the default of ``min_contribution``
 
 GREY = Material(1.3, 0.1, (0.5, 0.5, 0.5), (0.3, 0.2, 0.1))
 MIRROR = Material(1.5, 0.3, (0.95, 0.9, 0.85), (0.2, 0.2, 0.2))
@@ -42,8 +37,7 @@ BASE = Scene(CAMERA, (0.2, 0.3, 0.4), LIGHTS, (BALL,), (FLOOR,))
 CLOSE = Camera(CAMERA.position, (0.033259, 0.5, 0.498893), hfov=0.1)
 
 
-@dataclass(frozen=True)
-class Path:
+class Path(NamedTuple):
     """A scene that is hard on a path tracer, and one that must not pass for it.
 
     ``settings`` go to both tracers; ``truth`` is given where the exact picture is defined as that of another
@@ -55,7 +49,7 @@ class Path:
     scene: Scene
     fault: Scene | dict[str, Any]
     limit: float = PLAIN
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = MappingProxyType({})
     truth: Scene | None = None
 
 
@@ -95,7 +89,6 @@ def _hall(specular: float, light: float = 1.0, ior: float = 1.5) -> Scene:
     return Scene(Camera((0.0, 0.1, 1.0), (0.05, 0.0, -2.0)), (0.2, 0.3, 0.4), (lamp,), (ball,), walls)
 
 
-FORMS = ("dielectric", "schlick")
 FULL, OPEN = {"fresnel": "unity"}, {"clamp": False}
 
 # One line for each case
@@ -133,117 +126,32 @@ PATHS: Sequence[Path] = (
 )  # fmt: skip
 
 
-def run(study: Study, *, quick: bool) -> None:
-    """Check every case against the float64 tracer, sums over bounces in closed form, whole renders."""
-    cases = Cases(study, "transport", "Light transport")
+NOTE = "Differences to the float64 tracer, relative to the value plus a thousandth, of 95 % of the pixels."
+
+
+def cases(quick: bool) -> Iterator[Case]:
+    """Yield every case, held to the float64 tracer."""
     for path in PATHS:
-        _path(cases, path)
-    _cut_offs(cases)
-    for suffix in both_variants():
-        for reflectance, clamp in product((0.999,) if suffix else (0.5, 0.999, 1.0, 1.5), (True, False)):
-            name = f"one to ten bounces, Ks {reflectance:g}, clamp {'on' if clamp else 'off'}{suffix}"
-            what = "relative error of the light of a ray between facing mirrors, for every number of bounces"
-            error = _to_and_fro(reflectance, clamp, (1, 3, 10) if quick else range(1, 11))
-            # ten additions and products, and the reflectance itself
-            cases.at_most(name, what, "the geometric sum, ever growing", error, 2e-6)
-    every = (2, 3) if quick else range(5), FORMS[: 1 if quick else 2], (False,) if quick else (True, False)
-    for number, fresnel, clamp in product(*every):
-        bad = not_a_colour(_render(report_scene(number), fresnel=fresnel, clamp=clamp))
-        name = f"scene {number}, {fresnel}, clamp {'on' if clamp else 'off'}"
-        cases.at_most(name, "values that are not finite, or negative", "none", bad, 0)
-    cases.close(
-        "Differences to the float64 tracer, relative to the value plus a thousandth, of 95 % of the pixels."
-    )
-
-
-def _path(cases: Cases, path: Path) -> None:
-    settings = {"fresnel": "dielectric", "clamp": True, **path.settings}
-    image = _render(path.scene, **settings)
-    right = path.truth or path.scene
-    truth = reference_render(right, width=WIDTH, height=HEIGHT, **settings).image
-    scene, changed = (path.scene, path.fault) if isinstance(path.fault, dict) else (path.fault, {})
-    wrong = reference_render(scene, width=WIDTH, height=HEIGHT, **{**settings, **changed}).image
-    if isinstance(path.fault, dict):
-        alike = ", ".join(f"{name} = {value}" for name, value in path.fault.items())
-    else:
-        had, has = dict(_numbers(right)), dict(_numbers(scene))
-        alike = "; ".join(
-            f"{n} {has.get(n)} for {had.get(n)}" for n in {**had, **has} if had.get(n) != has.get(n)
+        settings: dict[str, Any] = {"fresnel": "dielectric", "clamp": True, **path.settings}
+        image = draw(path.scene, settings)
+        scene, changed = (path.scene, path.fault) if isinstance(path.fault, dict) else (path.fault, {})
+        truth, wrong = (
+            reference_render(drawn, width=WIDTH, height=HEIGHT, **options).image
+            for drawn, options in ((path.truth or path.scene, settings), (scene, {**settings, **changed}))
         )
-    what = f"{path.what}: difference of 95 % of the pixels"
-    fault = (alike, _difference(wrong, truth))
-    cases.at_most(path.name, what, "roundings", _difference(image, truth), path.limit, fault=fault)
-    what = "values that are not finite, or negative"
-    cases.at_most(f"{path.name}, bad", what, "none", not_a_colour(image), 0)
+        fault = ("a scene or setting almost the same", difference(wrong, truth))
+        yield Case(path.name, path.what, "roundings", difference(image, truth), path.limit, fault)
 
 
-def _numbers(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the parts of a scene by their names, such as ``spheres[0].material.alpha``."""
-    if is_dataclass(value):
-        for f in fields(value):
-            yield from _numbers(getattr(value, f.name), f"{name}.{f.name}".strip("."))
-    elif isinstance(value, tuple) and value and is_dataclass(value[0]):
-        for k, entry in enumerate(value):
-            yield from _numbers(entry, f"{name}[{k}]")
-    else:
-        yield name, value
-
-
-def _difference(image: np.ndarray, truth: np.ndarray) -> float:
-    """Return the largest difference in a channel that 95 % of the pixels stay below."""
-    relative = (np.abs(image - truth) / (truth + SMALL)).max(axis=-1)
-    return float(np.quantile(np.nan_to_num(relative, nan=np.inf), SHARE))
-
-
-def not_a_colour(image: np.ndarray) -> int:
-    """Return how many values are not finite, or negative."""
-    return int((~(image >= 0) | np.isinf(image)).sum())
-
-
-def _render(scene: Scene, *, fresnel: str, clamp: bool, least: float = 0.0) -> np.ndarray:
-    described = scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=fresnel)
-    described["integrator"] = {"type": "mrt_whitted", "clamp": clamp, "min_contribution": least}
+def draw(scene: Scene, settings: dict[str, Any]) -> np.ndarray:
+    """Return the picture of ``mrt_whitted``, with no path cut short."""
+    described = scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=settings["fresnel"])
+    described["integrator"] = {"type": "mrt_whitted", "clamp": settings["clamp"], "min_contribution": 0.0}
     return render(described, aa=1, lattice="report").image
 
 
-def _cut_offs(cases: Cases) -> None:
-    """What cutting dim paths changes where something very bright may end them."""
-    glass = Material(1.5, 0.1, (0.2, 0.2, 0.2), (0.1, 0.1, 0.1))
-    pair = Sphere((-0.51, 0.5, 0), 0.5, glass), Sphere((0.51, 0.5, 0), 0.5, glass)
-    balls = replace(BASE, camera=Camera((0.2, 1.0, 4.0), (0.0, 0.5, 0.0)), spheres=pair, planes=())
-    bright = (
-        ("a sky of 1000", replace(balls, sky=(1000, 1000, 1000)), True),
-        ("a light of 1e4", replace(balls, lights=(Light((2, 3, 4), (1e4, 1e4, 1e4)),)), False),
-    )
-    for name, scene, clamp in bright:
-        whole, cut, more = (
-            _render(scene, fresnel="dielectric", clamp=clamp, least=least)
-            for least in (0.0, CUT_OFF, 1e3 * CUT_OFF)
-        )
-        what = f"largest change by it{'' if clamp else ', without clamp'}"
-        expected, change = "a sixteenth of an 8-bit step, as promised", np.abs(cut - whole).max()
-        fault = ("paths cut at 1000 times as much", np.abs(more - whole).max())
-        cases.at_most(f"cut-off under {name}", what, expected, change, CUT_OFF, fault=fault)
-
-
-def _to_and_fro(reflectance: float, clamp: bool, depths: Sequence[int]) -> float:
-    """Return the error of a ray between two mirrors, at some depths, to the sum of what both send back."""
-    form = {"type": "mrt_bsdf", "fresnel": "unity", "alpha": 0.5, "diffuse_reflectance": 0.25}
-    wall = {"type": "mrt_plane", "distance": 1.0, "bsdf": {**form, "specular_reflectance": reflectance}}
-    walls = {f"wall_{k}": {**wall, "normal": [0, 0, k]} for k in (1, -1)}
-    light = {"type": "mrt_light", "position": [1, 0, 0], "intensity": 3.0}
-    scene = mi.load_dict({"type": "scene", **walls, "light": light})
-    # what one wall sends back along its normal: the light is seen at 45° from both
-    half = np.sqrt(0.5)
-    with np.errstate(divide="ignore"):
-        up, to_light = np.array([[0, 0, 1.0]]), np.array([[half, 0, half]])
-        lobe = specular_lobe(up, to_light, up, np.array([0.5]))[0]
-    direct = 3.0 * half * (0.25 / np.pi + reflectance * lobe)
-    truth = np.cumsum((min(direct, 1.0) if clamp else direct) * reflectance ** np.arange(10))
-    ray = mi.Ray3f(mi.Point3f(0, 0, 0.5), mi.Vector3f(0, 0, -1))
-    settings: dict[str, Any] = {"clamp": clamp, "bounce_budget": "plain", "min_contribution": 0.0}
-    errors = []
-    for depth in depths:
-        value = traced(scene, ray, max_depth=depth, **settings).radiance[0]
-        errors.append(abs(float(np.ravel(value)[0]) / float(truth[depth - 1]) - 1))
-    return max(errors)
+def difference(image: np.ndarray, truth: np.ndarray) -> float:
+    """Return the largest difference in a channel that 95 % of the pixels stay below; inf for bad values."""
+    if not (np.isfinite(image) & (image >= 0)).all():
+        return np.inf
+    return float(np.quantile((np.abs(image - truth) / (truth + SMALL)).max(axis=-1), SHARE))
