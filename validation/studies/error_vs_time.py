@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.tools.precision import Point
-from mrt_mitsuba.validation.tools.precision_page import describe
+from mrt_mitsuba.validation.tools.precision import Point, describe
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.work_precision import error_vs_time
 
@@ -69,11 +68,11 @@ def run(study: Study, *, quick: bool) -> None:
     samplings: dict[Any, Points] = {}
     for name, number in study.each("Error against time", jobs):
         trade = TRADES[name](number, extent)
-        strips = trade.strips and not quick
-        options: Options = {"reference": trade.reference, "shared": trade.shared, "strips": strips}
+        options: Options = {"reference": trade.reference, "shared": trade.shared}
         found = error_vs_time(trade.scene, trade.cases, repeats=extent.repeats, **options)
         where = f"scene {number}, {name}"
-        describe(study, found, where, f"Scene {number}: {trade.title}", trade.truth)
+        strip = trade.strips and not quick
+        describe(study, found, where, f"Scene {number}: {trade.title}", trade.truth, strip=strip)
         least = None if found.failed else trade.hold(study, where, found.points)
         if least is not None:
             what = f"{where}: error of the reference / least error it judges"

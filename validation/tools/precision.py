@@ -1,4 +1,4 @@
-"""Findings about error against time: the figures of each case, what they answer, and how sure it is.
+"""Findings about error against time: the figures of each case, what they answer, how sure it is; the page.
 
 The pictures x₁ … x_R of a case and two independent halves h₁, h₂ of the reference give the matrix G[r, s] =
 mean (x_r − h₁)(x_s − h₂), in which the reference's own noise cancels. The mean of its diagonal is the squared
@@ -7,31 +7,33 @@ error, that of the rest the squared bias; the difference is the variance.
 
 from __future__ import annotations
 
+import math
+import os
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, partial
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import cycle
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from mrt_mitsuba.output.files import to_8bit
+from mrt_mitsuba.validation.tools import report
 from mrt_mitsuba.validation.tools.compare import Difference
+from mrt_mitsuba.validation.tools.study import Study
 
+TITLE = "Error against time"
 RESOLVED = 2.0  # times the reference's own error from which on an error can be distinguished from it
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?"
 NOTHING = 1e-15  # an RMSE of 0, as logarithms have it
-LEVEL = 0.95
-RESAMPLES = 999
-FAR = 1e100  # stands for infinity and NaN in resamples: scipy takes their mean
-
-Options = Mapping[str, Any]
-Interval = tuple[float, float]
-Panel = tuple[str, float, np.ndarray]  # name, seconds and picture of what a curve reaches in some time
-Strip = tuple[float, Sequence[Panel]]  # that time, and a panel of each curve
+LEVEL = 0.95  # of all intervals
+LABELLED = 30  # points up to which each has its number in the diagram; of more only those ahead
+PANEL = (120, 160)  # rows and columns of a larger picture that are shown
+SAME = 0.02  # errors closer than this are the same: no reason to wait longer
 
 
-@dataclass(frozen=True)
-class Estimate:
+class Estimate(NamedTuple):
     """A value with its interval; NaN where nothing is known, infinite where it is never reached."""
 
     value: float
@@ -48,49 +50,22 @@ class Estimate:
         return f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
 
 
-def estimate(count: int, statistic: Callable[[np.ndarray], np.ndarray], *, log: bool = True) -> Estimate:
-    """Return a statistic of ``count`` repeats with its 95 % interval.
-
-    ``statistic`` gets indices [..., repeats] and returns one value for each row of them. Its standard error
-    is that of a bootstrap over repeats, times √(n/(n−1)), for resamples of so few spread too little; the
-    interval is Student's, so for a mean it is the classical one. ``log``: of a positive quantity, taken in
-    logarithms. NaN for a single repeat. Where some resamples never reach a value, the interval is open.
-    """
+def reach(values: np.ndarray) -> float:
+    """Return how far Student's interval goes to each side of the mean of values; NaN of a single one."""
     from scipy import stats
 
-    value = float(statistic(np.arange(count)[None])[0])
+    count = len(values)
     if count < 2:
-        return Estimate(value, np.nan, np.nan)
-    found = stats.bootstrap(
-        (np.arange(count),),
-        lambda index, axis=-1: np.nan_to_num(statistic(index), nan=FAR, posinf=FAR),
-        n_resamples=RESAMPLES,
-        method="percentile",
-        vectorized=True,
-        random_state=np.random.default_rng(count),
-    ).bootstrap_distribution
-    finite = found[found < FAR]
-    reach = stats.t.ppf((1 + LEVEL) / 2, count - 1) * np.sqrt(count / (count - 1))
-    if not log:
-        low, high = value - reach * finite.std(), value + reach * finite.std()
-    elif not len(finite):
-        low, high = np.inf, np.inf
-    elif not (finite > 0).all():
-        low, high = 0.0, finite.max()
-    else:  # around the value, or where that is infinite around the finite resamples
-        logs = np.log(finite)
-        centre = np.log(value) if np.isfinite(value) else logs.mean()
-        low, high = np.exp(centre - reach * logs.std()), np.exp(centre + reach * logs.std())
-    never = log and len(finite) < (1 + LEVEL) / 2 * len(found)
-    return Estimate(value, float(low), np.inf if never else float(high))
+        return math.nan
+    return float(stats.t.ppf((1 + LEVEL) / 2, count - 1) * values.std(ddof=1) / math.sqrt(count))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Point:
     """One case: what it costs and how far off it is."""
 
     name: str
-    options: Options
+    options: Mapping[str, Any]
     times: np.ndarray  #: seconds of each repeat, warm, without loading the scene
     gram: np.ndarray  #: G[r, s], see above
     cold: float  #: seconds of a first run, its kernels compiled or read from a cache
@@ -108,34 +83,34 @@ class Point:
 
     @cached_property
     def time(self) -> Estimate:
-        return estimate(len(self.times), lambda index: np.median(self.times[index], axis=-1))
+        """The median; its standard error is at most √(π/2) times that of the mean."""
+        middle, width = float(np.median(self.times)), math.sqrt(np.pi / 2) * reach(np.log(self.times))
+        return Estimate(middle, middle * math.exp(-width), middle * math.exp(width))
 
     @cached_property
     def error(self) -> Estimate:
-        return estimate(len(self.times), self.rmse_of)
+        """The RMSE over all repeats."""
+        squares = np.diag(self.gram)
+        mean = max(float(squares.mean()), NOTHING**2)
+        width, rmse = min(reach(squares) / mean / 2, 99), math.sqrt(mean)  # in logarithms
+        return Estimate(rmse, rmse * math.exp(-width), rmse * math.exp(width))
 
     @cached_property
     def bias_squared(self) -> Estimate:
-        """By pairs of different repeats; of one repeat, or resamples of the same one, NaN."""
-
-        def of(index: np.ndarray) -> np.ndarray:
-            other = index[..., :, None] != index[..., None, :]
-            total = np.where(other, self.gram[index[..., :, None], index[..., None, :]], 0).sum(axis=(-2, -1))
-            count = other.sum(axis=(-2, -1))
-            return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
-
-        return estimate(len(self.times), of, log=False)
-
-    def rmse_of(self, index: np.ndarray) -> np.ndarray:
-        """Return the RMSE over some repeats, [..., repeats] of them."""
-        return np.sqrt(np.maximum(np.diag(self.gram)[index].mean(axis=-1), NOTHING**2))
+        """By pairs of different repeats, whose mean varies as twice that of what they have in common."""
+        count = len(self.times)
+        if count < 2:
+            return Estimate(math.nan, math.nan, math.nan)
+        of_each = (self.gram.sum(axis=1) - np.diag(self.gram)) / (count - 1)
+        value, width = float(of_each.mean()), 2 * reach(of_each) if count > 2 else math.inf
+        return Estimate(value, value - width, value + width)
 
     @property
     def seconds(self) -> float:
         return self.time.value
 
     @property
-    def seconds_interval(self) -> Interval:
+    def seconds_interval(self) -> tuple[float, float]:
         return self.time.low, self.time.high
 
     @property
@@ -143,7 +118,7 @@ class Point:
         return self.error.value if self.error.value > NOTHING else 0.0
 
     @property
-    def rmse_interval(self) -> Interval:
+    def rmse_interval(self) -> tuple[float, float]:
         return self.error.low, self.error.high
 
     @property
@@ -157,15 +132,15 @@ class Point:
         return float(np.sqrt(np.maximum(self.bias_squared.value, 0)))
 
     @property
-    def bias_interval(self) -> Interval:
-        low, high = np.sqrt(np.maximum((self.bias_squared.low, self.bias_squared.high), 0))
+    def bias_interval(self) -> tuple[float, float]:
+        low, high = np.sqrt(np.maximum(self.bias_squared[1:], 0))
         return float(low), float(high)
 
     @property
     def efficiency(self) -> float:
         """1 / (variance × seconds); NaN where nothing is random or there is one repeat."""
         product = self.variance * self.seconds
-        return 1 / product if product > 1e-12 * self.rmse**2 * self.seconds else float("nan")
+        return 1 / product if product > 1e-12 * self.rmse**2 * self.seconds else math.nan
 
     @property
     def resolved(self) -> bool:
@@ -175,7 +150,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Findings:
-    """The findings about several cases."""
+    """The findings of ``error_vs_time`` about several cases."""
 
     scene: str
     points: Mapping[str, Point]
@@ -184,44 +159,30 @@ class Findings:
     reference_error: float  #: RMSE of the reference itself, below which nothing is claimed; 0: exact
     repeats: int
     errors: Sequence[float]  #: for which the time is given
-    strips: Sequence[Strip] = field(default_factory=list)
     took: float = 0.0
 
     @property
     def families(self) -> dict[str, list[Point]]:
         """The points of each curve, fastest first."""
-        groups: dict[str, list[Point]] = {}
+        groups: dict[str, list[Point]] = {point.family: [] for point in self.points.values()}
         for point in sorted(self.points.values(), key=lambda p: p.seconds):
-            groups.setdefault(point.family, []).append(point)
-        return {name: groups[name] for name in dict.fromkeys(p.family for p in self.points.values())}
+            groups[point.family].append(point)
+        return groups
+
+    @property
+    def ordered(self) -> list[Point]:
+        """The points, curve after curve."""
+        return [point for points in self.families.values() for point in points]
 
     def time_to(self, error: float) -> dict[str, Estimate]:
         """Return the seconds in which each curve comes down to an RMSE; infinite where it never does.
 
-        Between measured cases the curve is a straight line in logarithms; beyond them nothing is assumed.
+        The interval is from where the lower ends of all intervals come so low to where the upper ends do.
         """
-        error *= 1 + 1e-9  # an error that is met to rounding is met
-
-        def crossing(points: Sequence[Point], index: np.ndarray) -> np.ndarray:
-            seconds = np.stack([np.median(p.times[index], axis=-1) for p in points])  # [points, ...]
-            rmse = np.stack([p.rmse_of(index) for p in points])
-            found = np.where(rmse[0] <= error, seconds[0], np.inf)
-            for i in range(1, len(points)):
-                ends = np.log([rmse[i - 1], rmse[i]])
-                steps = np.where(ends[0] > ends[1], ends[0] - ends[1], 1)
-                share = np.clip((ends[0] - np.log(error)) / steps, 0, 1)
-                between = seconds[i - 1] ** (1 - share) * seconds[i] ** share
-                found = np.where(np.isinf(found) & (rmse[i] <= error), between, found)
-            return found
-
         return {
-            name: estimate(self.repeats, partial(crossing, points)) for name, points in self.families.items()
+            name: Estimate(*(_crossing([(p.time[i], p.error[i]) for p in points], error) for i in range(3)))
+            for name, points in self.families.items()
         }
-
-    @cached_property
-    def times(self) -> dict[float, dict[str, Estimate]]:
-        """``time_to`` of each of ``errors``."""
-        return {error: self.time_to(error) for error in self.errors}
 
     @cached_property
     def verdicts(self) -> list[str]:
@@ -229,7 +190,8 @@ class Findings:
         if self.repeats < 2:
             return ["No verdict on time: a single repeat has no interval."]
         sentences = []
-        for error, times in self.times.items():
+        for error in self.errors:
+            times = self.time_to(error)
             reached = sorted((time.value, name) for name, time in times.items() if np.isfinite(time.value))
             best = reached[0][1] if reached else ""
             like = [name for _, name in reached[1:] if times[name].overlaps(times[best])]
@@ -251,3 +213,198 @@ class Findings:
         lines += [f"{name:<{width}}  FAILED {why}" for name, why in self.failed.items()]
         own = f"{self.reference_error:.2g}" if self.reference_error else "not known"
         return "\n".join([*lines, f"the reference's own error: {own}", *self.verdicts])
+
+    def _study(self) -> Study:
+        scene = f"scene {self.scene}" if self.scene.isdigit() else self.scene
+        study = Study("error-vs-time", f"{TITLE}: {scene}", seconds=self.took)
+        describe(study, self, "", "All cases")
+        return study
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""
+        report.save(folder, self._study(), title=TITLE)
+
+    def _repr_html_(self) -> str:
+        return report.notebook(self._study(), title=TITLE)
+
+
+def _crossing(curve: Iterable[tuple[float, float]], error: float) -> float:
+    """Return when a curve of (seconds, RMSE) comes down to an error, infinity if it does not.
+
+    Between its points it is straight in logarithms; beyond them nothing is assumed.
+    """
+    error *= 1 + 1e-9  # an error that is met to rounding is met
+    before = (math.nan, math.inf)
+    for seconds, rmse in curve:
+        if math.isnan(rmse):
+            return math.nan
+        if rmse <= error:
+            if math.isinf(before[1]):
+                return seconds
+            share = math.log(before[1] / error) / math.log(before[1] / rmse)
+            return float(before[0] ** (1 - share) * seconds**share)
+        before = seconds, rmse
+    return math.inf
+
+
+# ------------------------------------------------ The page ------------------------------------------------
+
+
+def describe(
+    study: Study, found: Findings, name: str, title: str, truth: str = "", *, strip: bool = True
+) -> None:
+    """Add the diagram, the answers and the tables to a study; ``truth`` says what the reference is.
+
+    ``strip``: also pictures of what each curve reaches in the same time.
+    """
+    prefix, where = (f"{name}-", f"{name}: ") if name else ("", "")
+    study.at_most(f"{where}cases that failed", len(found.failed), 0, "each of them could be rendered")
+    if not found.points:
+        return
+    figure, caption = _diagram(found), _caption(found, truth)
+    study.plot(f"{prefix}diagram", f"{title}: work and precision", figure, caption)
+    curves = [points for points in found.families.values() if len(points) > 1]
+    if strip and len(curves) > 1:
+        slowest_start, first_end = (max(c[0].seconds for c in curves), min(c[-1].seconds for c in curves))
+        middle = math.sqrt(slowest_start * first_end)
+        nearest = [min(points, key=lambda p: abs(math.log(p.seconds / middle))) for points in curves]
+        text = "In sRGB; where a picture is cut, it is where the cases differ most."
+        study.plot(f"{prefix}strip", f"{title}: what {middle:.2g} s buy", _strip(found, nearest), text)
+    if found.errors:
+        note = "With 95 % intervals. Between measured cases a curve is straight in logarithms; beyond them "
+        note += "nothing is assumed."
+        study.records(f"{prefix}times", f"{title}: seconds to an error", _times(found), note, first=not name)
+    note = (
+        "Seconds: medians of warm renders without loading the scene; cold: a first run. Errors in units of "
+    )
+    note += "linear light. Ahead: no other case has less error in less time."
+    study.records(f"{prefix}points", f"{title}: every case", _rows(found), note)
+    if found.failed:
+        reasons = [list(item) for item in found.failed.items()]
+        study.table(f"{prefix}failed", f"{title}: cases that failed", ["case", "why"], reasons)
+
+
+def _times(found: Findings) -> list[dict[str, str]]:
+    """Return the seconds in which each curve comes down to each error."""
+    rows: dict[str, dict[str, str]] = {name: {"curve": name} for name in found.families}
+    for error in found.errors:
+        for name, t in found.time_to(error).items():
+            rows[name][f"RMSE {error:g}"] = str(t) if np.isfinite(t.value) else "not reached"
+    return list(rows.values())
+
+
+def _caption(found: Findings, truth: str) -> str:
+    """Return what the diagram shows, who is ahead, how good the reference is, and the verdicts."""
+    parts = ["Down and to the left is better. Bars are 95 % intervals, numbers those of the table."]
+    if found.repeats > 1 and (ahead := front(p for p in found.points.values() if p.resolved)):
+        names = "; ".join(f"{p.name} ({p.seconds:.2g} s, RMSE {p.rmse:.2g})" for p in ahead)
+        parts.append(f"Ahead of the others: {names}.")
+    parts += [f"Reference: {truth}."] if truth else []
+    own = f"about {found.reference_error:.2g}; no claim is made below twice that."
+    unknown = "not known: every RMSE has it in it."
+    parts.append(f"The RMSE of the reference itself is {own if found.reference_error else unknown}")
+    return " ".join(parts + found.verdicts)
+
+
+def front(points: Iterable[Point]) -> list[Point]:
+    """Return the points that gain error over all faster ones, fastest first."""
+    best: list[Point] = []
+    for point in sorted(points, key=lambda p: (p.seconds, p.rmse)):
+        if not best or point.rmse < (1 - SAME) * best[-1].rmse:
+            best.append(point)
+    return best
+
+
+def _rows(found: Findings) -> list[dict[str, Any]]:
+    """Return the table of all cases."""
+    ahead = front(found.ordered) if found.repeats > 1 else []
+
+    def interval(ends: tuple[float, float]) -> str:
+        return f"{ends[0]:.3g} to {ends[1]:.3g}" if np.isfinite(ends[0]) else "one repeat"
+
+    def known(value: float | None) -> float | str:
+        return "–" if value is None or np.isnan(value) else value
+
+    return [
+        {
+            "#": number,
+            "case": p.name,
+            "seconds": p.seconds,
+            "interval, s": interval(p.seconds_interval),
+            "cold, s": p.cold,
+            "of it compiling, s": p.compile,
+            "RMSE": p.rmse if p.resolved else "at the floor",
+            "interval": interval(p.rmse_interval) if p.resolved else "",
+            "|bias|": known(p.bias),
+            "interval of it": interval(p.bias_interval),
+            "1 / (variance × s)": known(p.efficiency),
+            "relMSE": p.difference.rel_mse,
+            "largest": p.difference.largest,
+            "FLIP": known(p.difference.flip),
+            "rays": sum(p.rays.values()),
+            "ahead": "yes" if p in ahead else "",
+        }
+        for number, p in enumerate(found.ordered, 1)
+    ]
+
+
+def _diagram(found: Findings) -> Any:
+    """Return the work-precision diagram: RMSE against seconds, both with intervals, and the floor.
+
+    Points have the numbers of the table next to them; of many points, only those ahead.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    axes, floor, ordered = figure.subplots(), found.reference_error, found.ordered
+    errors = [p.rmse for p in ordered if p.rmse > 0] + ([floor] if floor else [])
+    bottom = 0.4 * min(errors, default=1e-6)  # where cases without error are drawn
+    for (name, curve), marker in zip(found.families.items(), cycle("osD^vP*X<>hp"), strict=False):
+        places = np.array([[p.seconds, max(p.rmse, bottom)] for p in curve]).T
+        ends = np.array([[p.seconds_interval, p.rmse_interval] for p in curve]).transpose(1, 2, 0)
+        x, y = np.nan_to_num(np.maximum(np.stack([places - ends[:, 0], ends[:, 1] - places], axis=1), 0))
+        axes.errorbar(
+            *places, xerr=x, yerr=y, label=name, marker=marker, markersize=5, linewidth=1, capsize=2
+        )
+    ahead = front(ordered)
+    for number, point in enumerate(ordered, 1):
+        if len(ordered) <= LABELLED or point in ahead:
+            place = point.seconds, max(point.rmse, bottom)
+            axes.annotate(str(number), place, textcoords="offset points", xytext=(4, 4), fontsize=8)
+    if floor:
+        axes.axhspan(bottom / 10, floor, color="0.9", zorder=0, label="within the reference's error")
+    if any(p.rmse == 0 for p in ordered):
+        axes.axhline(bottom, color="0.9", linewidth=8, zorder=0, label="no error")
+    axes.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="RMSE")
+    axes.set_ylim(bottom=0.8 * bottom)
+    axes.margins(x=0.08, y=0.08)
+    axes.grid(alpha=0.3)
+    figure.legend(fontsize=8, ncols=4, loc="outside lower center")
+    return figure
+
+
+def _strip(found: Findings, points: Sequence[Point]) -> Any:
+    """Return pictures side by side, the reference last, each with its seconds and error.
+
+    Of larger ones it shows the window of ``PANEL`` pixels where they differ most from the reference.
+    """
+    from matplotlib.figure import Figure
+    from scipy.ndimage import uniform_filter
+
+    size = np.minimum(PANEL, found.reference.shape[:2])
+    errors = sum(np.square(p.image - found.reference).sum(axis=2) for p in points)
+    middle = np.unravel_index(np.argmax(uniform_filter(errors, size, mode="constant")), errors.shape)
+    row, column = np.clip(middle - size // 2, 0, errors.shape - size)
+    shown = [(f"{p.name}\n{p.seconds:.3g} s, RMSE {p.rmse:.2g}", p.image) for p in points]
+    shown.append(("reference", found.reference))
+    columns = min(4, len(shown))
+    rows = -(-len(shown) // columns)
+    height = rows * (10 / columns * size[0] / size[1] + 0.6)
+    axes = Figure(figsize=(10, height), layout="constrained").subplots(rows, columns, squeeze=False).ravel()
+    for axis in axes:
+        axis.set_axis_off()
+    for axis, (title, image) in zip(axes, shown, strict=False):
+        cut = np.asarray(image[row : row + size[0], column : column + size[1]], np.float32)
+        axis.imshow(to_8bit(cut, "srgb"), interpolation="nearest")
+        axis.set_title(title, fontsize="small")
+    return axes[0].figure
