@@ -61,24 +61,7 @@ def cases(quick: bool) -> Iterator[Case]:
             yield Case(f"{kind}, {figure}", what, why, max(f[figure] for f in found), most)
         what, why = "rays that meet it", "else the other figures mean nothing"
         yield Case(f"{kind}, seen", what, why, min(f["seen"] for f in found), 100, at_most=False)
-    what = "share of pixels that differ by more than 2/255"
-    for number in (
-        (0, 2, 3) if quick else range(5)
-    ):  # scene 2 shows the horizon, which a far plane can cut off
-        scene = report_scene(number)
-        base = picture(scene)
-        for factor in SCALES[::5] if quick else SCALES:
-            share = _differing(picture(placed(scene, factor)), base)
-            yield Case(f"scene {number} times {factor:g}", what, "the same picture", share, SHARE_SCALED)
-        for n in MOVES:
-            share, limit = (
-                _differing(picture(placed(scene, sizes=n)), base),
-                max(SHARE_MOVED * n, SHARE_SCALED),
-            )
-            why = f"coordinates have steps of {n * 2**-23:.0e} scene sizes there: normals and outlines move"
-            yield Case(
-                f"scene {number} moved by {n:g} sizes", what, why, share, limit if n <= HOLDS_TO else None
-            )
+    yield from of_scenes(quick)
 
 
 # --------------------------------------------- Single objects ----------------------------------------------
@@ -172,6 +155,28 @@ def _hit(shape: Any, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 # ---------------------------------------------- Whole scenes -----------------------------------------------
+
+
+def of_scenes(quick: bool) -> Iterator[Case]:
+    """Yield the report's scenes, scaled and moved."""
+    what = "share of pixels that differ by more than 2/255"
+    for number in (
+        (0, 2, 3) if quick else range(5)
+    ):  # scene 2 shows the horizon, which a far plane can cut off
+        scene = report_scene(number)
+        base = picture(scene)
+        for factor in SCALES[::5] if quick else SCALES:
+            share = _differing(picture(placed(scene, factor)), base)
+            yield Case(f"scene {number} times {factor:g}", what, "the same picture", share, SHARE_SCALED)
+        for n in MOVES:
+            share, limit = (
+                _differing(picture(placed(scene, sizes=n)), base),
+                max(SHARE_MOVED * n, SHARE_SCALED),
+            )
+            why = f"coordinates have steps of {n * 2**-23:.0e} scene sizes there: normals and outlines move"
+            yield Case(
+                f"scene {number} moved by {n:g} sizes", what, why, share, limit if n <= HOLDS_TO else None
+            )
 
 
 def placed(scene: Scene, factor: float = 1.0, sizes: float = 0.0) -> Scene:
