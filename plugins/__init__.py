@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from types import ModuleType
 
-MODULES = ("bsdf", "cone", "cylinder", "group", "light", "mesh", "plane", "texture", "whitted")
+MODULES = ("axial", "bsdf", "group", "light", "mesh", "plane", "texture", "whitted")
 
 _packages: dict[str, tuple[str, ...]] = {}  # the plugin modules of each package
 _loaded: dict[tuple[str, str, str], ModuleType] = {}  # by variant, package and name

@@ -11,13 +11,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .emission import largest
 from .fresnel import f0_from_ior
 from .kernel_plan import GRADIENTS, VARYING, Mirror
 from .lobes import LOBES, TABLED, Lobes, Pair
 from .parameters import ParameterError, choice, flag, number, spectrum
-from .protocols import MergeableBSDF
-from .variants import first, is_jit, updatable, varies, varies_by_face
+from .variants import first, is_jit, largest, updatable, varies, varies_by_face
 
 FRESNEL_FORMS = ("schlick", "dielectric", "unity")
 
@@ -211,10 +209,9 @@ class MrtBSDF(mi.BSDF):
 
     def mirror_bound(self) -> Mirror:
         """Return upper bounds of ``mirror_reflectance``, and ``int_ior``; inf for what varies."""
-        reflectance, f0 = largest(self.parameters["specular_reflectance"]), self._f0_bound()
-        int_ior = self.parameters["int_ior"]
-        index = math.inf if isinstance(int_ior, mi.Texture) else first(int_ior)
-        return Mirror(reflectance * max(1, f0), index, reflectance * f0)
+        bound, int_ior = largest(self.parameters["specular_reflectance"]), self.parameters["int_ior"]
+        f0, index = self._f0_bound(), math.inf if isinstance(int_ior, mi.Texture) else first(int_ior)
+        return Mirror(bound * max(1, f0), index, bound * f0)
 
     def value_bound(self) -> float:
         """Return an upper bound of f cos θ; inf where a parameter varies."""
@@ -239,5 +236,4 @@ class MrtBSDF(mi.BSDF):
         return f"MrtBSDF[fresnel={self.fresnel}, {text}]"
 
 
-MergeableBSDF.register(MrtBSDF)
 mi.register_bsdf("mrt_bsdf", MrtBSDF)

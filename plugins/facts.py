@@ -9,85 +9,88 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from .emission import MOST_EMITTERS, arriving, brightness, place
+from .hit_errors import any_touching
 from .kernel_plan import Mirror, SceneFacts
+from .lights import brightness, numbers_of, place
 from .materials import lobes_in, material_rows
 from .parameters import ParameterError
-from .point_lights import numbers_of
-from .protocols import MirrorBSDF, PlaneShape, QuadricShape
 from .quadric_kinds import KINDS
 from .snapshot import Kept, Snapshot
 from .spheres import is_plain_sphere, is_sphere
-from .touching import any_touching
 from .variants import is_jit, varies
 
 # Beyond these sizes, Embree's products of three lengths leave float32
 SMALLEST_MESH, LARGEST_MESH = 1e-8, 1e10
 
+# Lights beyond this number are not looked at one by one where one could be on a surface
+MOST_LIGHTS = 64
+
 
 class Reading:
-    """A snapshot of a scene and what is read of it, by part; ``kept`` spares reading a part again."""
+    """A snapshot of a scene and what is read of it, by part; ``kept`` spares reading a part again.
 
-    facts: SceneFacts
+    Plugins declare by methods what ``mrt_whitted`` may do in place of calling them: a plane by
+    ``unit_normal``, ``distance`` and ``tangents``; a mesh that stands for exact quadrics by ``quadrics()``
+    (a ``QuadricTable``) and ``moving_frame()``; a light of a table by ``numbers()``; a BSDF with the
+    attributes ``mirror_reflectance`` and ``int_ior`` by ``mirror_bound()`` and ``value_bound()``, one of a
+    table by ``rows()``, too.
+    """
 
     def __init__(self, snapshot: Snapshot, kept: Kept) -> None:
         self.snapshot = snapshot
         shapes, materials, lights = snapshot.shape_part, snapshot.material_part, snapshot.light_part
-        self.planes = [s for s in snapshot.shapes if isinstance(s, PlaneShape)]
-        self.quadrics = [s for s in snapshot.shapes if isinstance(s, QuadricShape)]
-        self.native = [s for s in snapshot.shapes if not isinstance(s, (PlaneShape, QuadricShape))]
+        self.planes = [s for s in snapshot.shapes if hasattr(s, "unit_normal")]
+        self.quadrics = [s for s in snapshot.shapes if hasattr(s, "quadrics")]
+        own = {id(s) for s in (*self.planes, *self.quadrics)}
+        self.native = [s for s in snapshot.shapes if id(s) not in own]
         self.materials, of_materials = kept(
-            "material facts", (shapes, materials), lambda: _read_materials(snapshot)
+            "material facts", (shapes, materials), lambda: _materials(snapshot)
         )
         of_shapes, convex = kept("shape facts", shapes, self._read_shapes)
-        self.lights, self.numbers, of_lights = kept("light facts", lights, lambda: _read_lights(snapshot))
+        self.lights, self.numbers, of_lights = kept("light facts", lights, lambda: _lights(snapshot))
+
+        def touching() -> bool:
+            places = [place(light) for light in self.lights[:MOST_LIGHTS]]
+            return any_touching(snapshot.shapes, [point for point in places if point is not None])
+
         self.facts = SceneFacts(
             **of_lights,
             **of_materials,
             **of_shapes,
-            alone=convex and all(isinstance(b, MirrorBSDF) for b in snapshot.bsdfs),
-            touching=kept("touching", (shapes, lights), self._touching),
+            alone=convex and all(hasattr(b, "mirror_bound") for b in snapshot.bsdfs),
+            touching=kept("touching", (shapes, lights), touching),
         )
-
-    def _touching(self) -> bool:
-        """Return whether a point light is on a surface."""
-        places = [place(light) for light in self.lights[:MOST_EMITTERS]]
-        return any_touching(self.snapshot.shapes, [point for point in places if point is not None])
 
     def _read_shapes(self) -> tuple[dict[str, Any], bool]:
         """Return the facts about the shapes, and whether there is one only, which is convex."""
-        native, quadrics = [*self.native, *self.snapshot.inner], Counter[str]()
-        for shape in native:
-            if shape.is_mesh():
-                _check_size(shape)
-        tables = [s.quadrics() for s in self.quadrics]
+        meshes = [s for s in (*self.native, *self.snapshot.inner) if s.is_mesh()]
+        for mesh in meshes:
+            low, high = (np.array(corner, float).ravel() for corner in (mesh.bbox().min, mesh.bbox().max))
+            extent, farthest = (high - low).max(), np.abs([low, high]).max()
+            fits = extent >= SMALLEST_MESH and farthest <= LARGEST_MESH
+            if np.isfinite(farthest) and extent > 0 and not fits:
+                raise ParameterError(
+                    f'mrt_whitted: the mesh "{mesh.id()}" is {extent:.3g} across and reaches to '
+                    f"{farthest:.3g}; rays meet meshes from {SMALLEST_MESH:g} to {LARGEST_MESH:g}: scale the "
+                    "scene"
+                )
+        tables, quadrics = [s.quadrics() for s in self.quadrics], Counter[str]()
         for table in tables:
             quadrics[table.kind] += len(table.rows)
         plain = sum(map(is_plain_sphere, self.native))
-        convex = [t for t in tables if KINDS[t.kind].closed and len(t.rows) == 1 and not t.flipped]
+        convex = sum(KINDS[t.kind].closed and len(t.rows) == 1 and not t.flipped for t in tables)
         return {
             "vectorised": is_jit(),
             "native_shapes": len(self.native),
-            "meshes": sum(s.is_mesh() for s in native),
+            "meshes": len(meshes),
             "spheres": sum(map(is_sphere, self.native)),
             "plain_spheres": plain,
             "planes": len(self.planes),
             "quadrics": tuple(sorted(quadrics.items())),
-        }, len(self.snapshot.shapes) == 1 and plain + len(convex) + len(self.planes) == 1
+        }, len(self.snapshot.shapes) == 1 and plain + convex + len(self.planes) == 1
 
 
-def _check_size(mesh: mi.Shape) -> None:
-    """Refuse a mesh that float32 cannot trace."""
-    low, high = (np.array(corner, float).ravel() for corner in (mesh.bbox().min, mesh.bbox().max))
-    extent, farthest = (high - low).max(), np.abs([low, high]).max()
-    if np.isfinite(farthest) and extent > 0 and not (extent >= SMALLEST_MESH and farthest <= LARGEST_MESH):
-        raise ParameterError(
-            f'mrt_whitted: the mesh "{mesh.id()}" is {extent:.3g} across and reaches to {farthest:.3g}; '
-            f"rays meet meshes from {SMALLEST_MESH:g} to {LARGEST_MESH:g}: scale the scene"
-        )
-
-
-def _read_lights(snapshot: Snapshot) -> tuple[list[Any], list[Any] | None, dict[str, Any]]:
+def _lights(snapshot: Snapshot) -> tuple[list[Any], list[Any] | None, dict[str, Any]]:
     """Return the lights, their numbers where all have some, and the facts about them."""
     largest = {id(e): brightness(e) for e in snapshot.emitters}
     lights = [e for e in snapshot.emitters if not e.is_environment() and largest[id(e)] != 0]
@@ -100,30 +103,37 @@ def _read_lights(snapshot: Snapshot) -> tuple[list[Any], list[Any] | None, dict[
         "surface_emitters": len(surfaces),
         "environment": environment is not None,
         "sky": 0.0 if environment is None else largest[id(environment)],
-        "arriving": sum(arriving(e, largest[id(e)]) for e in lights),
+        # Falloff has no limit
+        "arriving": sum(largest[id(e)] if is_steady(e) else math.inf for e in lights),
         "emission": max(surfaces, default=0.0),
         "tabled": numbers is not None,
     }  # fmt: skip
 
 
-def _read_materials(snapshot: Snapshot) -> tuple[list[Any], dict[str, Any]]:
+def _materials(snapshot: Snapshot) -> tuple[list[Any], dict[str, Any]]:
     """Return the materials as rows of a table, none where they have no place in one, and the facts."""
     bsdfs, found = snapshot.bsdfs, material_rows(snapshot.shapes)
     rows, unmergeable = ([], found) if isinstance(found, str) else (found, "")
-    values = [b.value_bound() if isinstance(b, MirrorBSDF) else math.inf for b in bsdfs]
-    reflecting = [b for b in bsdfs if has_mirror(b)]
+    values = [b.value_bound() if hasattr(b, "value_bound") else math.inf for b in bsdfs]
     return rows, {
         "value": max(values, default=0.0),
         # Those outside the table may have any lobe
         "lobes": tuple((name, bool(unmergeable) or there) for name, there in lobes_in(rows)),
         "mirrors": tuple(
-            b.mirror_bound() if isinstance(b, MirrorBSDF) else Mirror(1.0, 1.0) for b in reflecting
+            b.mirror_bound() if hasattr(b, "mirror_bound") else Mirror(1.0, 1.0)
+            for b in bsdfs
+            if has_mirror(b)
         ),
         "oriented": any(map(is_oriented, bsdfs)),
         "textured": bool(unmergeable) and any(map(is_textured, bsdfs)),
         "two_sided": any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in bsdfs),
         "unmergeable": unmergeable,
     }  # fmt: skip
+
+
+def is_steady(emitter: Any) -> bool:
+    """Return whether a light is as bright far away as near by."""
+    return hasattr(emitter, "numbers") or emitter.class_name() == "DirectionalEmitter"
 
 
 def has_mirror(bsdf: Any) -> bool:
@@ -133,15 +143,14 @@ def has_mirror(bsdf: Any) -> bool:
 
 def is_textured(bsdf: Any) -> bool:
     """Return whether a BSDF varies over its surface; the flags of Mitsuba's own do not say so."""
-    flags = bsdf.flags()
-    if isinstance(bsdf, MirrorBSDF):
-        return mi.has_flag(flags, mi.BSDFFlags.SpatiallyVarying)
+    if hasattr(bsdf, "mirror_bound"):
+        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
     return any(isinstance(node, mi.Texture) and varies(node) for node in mi.traverse(bsdf).hierarchy)
 
 
 def is_oriented(bsdf: Any) -> bool:
     """Return whether a BSDF depends on how the surface is turned about its normal."""
-    if isinstance(bsdf, MirrorBSDF):
+    if hasattr(bsdf, "mirror_bound"):
         return False
     names = {node.class_name() for node in mi.traverse(bsdf).hierarchy}
     if names & {"BumpMap", "NormalMap"} or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Anisotropic):

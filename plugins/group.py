@@ -5,10 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .mesh_api import construct, keep_apart, write_buffers
+from .mesh_api import Placement, construct, keep_apart, write_buffers
 from .parameters import ParameterError, choice, segments
-from .placement import Placement
-from .protocols import QuadricShape
 from .quadric_kinds import KINDS, QuadricTable
 
 # Kinds that a group may hold
@@ -106,5 +104,4 @@ def _check(numbers: np.ndarray) -> None:
             raise ParameterError(f'mrt_group: row {row} of "numbers" is {fault}: {numbers[row].tolist()}')
 
 
-QuadricShape.register(MrtGroup)
 mi.register_shape("mrt_group", MrtGroup)

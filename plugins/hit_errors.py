@@ -1,5 +1,8 @@
 """How far off its surface a hit may be: secondary rays start that much away from it.
 
+A light is on a surface if it is no further off; shadow rays must end short of it, or some would meet the
+surface just before it, and others not.
+
 With u = 2⁻²⁴, every bound has the form δ = k u (size of the numbers that are added):
 
 - Curved surfaces, analytic planes: k = 32, the largest coordinate of the shape's box or of the hit. A few
@@ -12,14 +15,19 @@ With u = 2⁻²⁴, every bound has the form δ = k u (size of the numbers that 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
+import drjit.scalar
 import mitsuba as mi
 import numpy as np
 
+from .intersect import Frame
 from .lookup import ByShape
 from .mesh_api import triangles
+from .quadric_kinds import KINDS, QuadricTable
+from .spheres import center_and_radius, is_sphere
 
 # What a curved surface's hit, projection and ray test lose, in roundings of the largest coordinate
 CURVED = 32 * 2.0**-24
@@ -31,6 +39,9 @@ FLAT = 16 * 2.0**-24
 # A level triangle at height zero has no error at all, but a ray that starts on it exactly may meet it
 LEAST = 2.0**-12
 
+# Objects of a group that are looked at for a light: of those whose boxes hold it, which are few
+MOST_LOOKED_AT = 64
+
 
 class HitErrors:
     """The bounds for hits on Mitsuba's own shapes, by the shape that was hit.
@@ -39,13 +50,15 @@ class HitErrors:
     """
 
     def __init__(self, shapes: list[mi.Shape]) -> None:
-        sizes = [_size(s) for s in shapes]
+        corners = [np.array([s.bbox().min, s.bbox().max], float).ravel() for s in shapes]
+        sizes = [float(np.abs(c).max()) for c in corners]
         self.sizes = ByShape(mi.Float, shapes, sizes, max(sizes)) if shapes else None
-        rows = [_flat_row(s) for s in shapes]
-        curved = [0.0, 0.0, 0.0, dr.inf]
-        self.flat = (
-            ByShape(mi.Vector4f, shapes, [row or curved for row in rows], curved) if any(rows) else None
-        )
+        triangles = [flat_triangles(s) for s in shapes]
+        self.flat: ByShape | None = None
+        if any(t is not None for t in triangles):
+            curved = [0.0, 0.0, 0.0, dr.inf]
+            rows = [curved if t is None else _sizes_across(t) for t in triangles]
+            self.flat = ByShape(mi.Vector4f, shapes, rows, curved)
 
     def size(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Float:
         """Return the largest coordinate of the shape."""
@@ -60,16 +73,8 @@ class HitErrors:
         return FLAT * (dr.dot(dr.abs(si.n), dr.abs(si.p) + width) + row.w)
 
 
-def _size(shape: Any) -> float:
-    """Return the largest coordinate of a shape's bounding box."""
-    return max(abs(float(x)) for corner in (shape.bbox().min, shape.bbox().max) for x in corner)
-
-
-def _flat_row(shape: Any) -> list[float] | None:
-    """Return w and c of a flat shape."""
-    corners = flat_triangles(shape)
-    if corners is None:
-        return None
+def _sizes_across(corners: np.ndarray) -> list[float]:
+    """Return w and c of triangles."""
     edges = np.stack([corners[:, k] - corners[:, k - 1] for k in range(3)], axis=1)  # [n, 3, 3]
     width = np.abs(edges).max(axis=1, initial=0.0)  # [n, 3]
     a, b = edges[:, 0], edges[:, 1]
@@ -91,3 +96,73 @@ def flat_triangles(shape: Any) -> np.ndarray | None:
         square = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) @ matrix[:3, :3].T + matrix[:3, 3]
         return square[[(0, 1, 2), (0, 2, 3)]]
     return triangles(shape) if shape.is_mesh() else None
+
+
+def any_touching(shapes: Sequence[Any], points: Sequence[tuple[float, ...]]) -> bool:
+    """Return whether one of the points is on a plane, sphere, quadric, rectangle or mesh."""
+    if not points:
+        return False
+    p = np.array(points)  # [n, 3]
+    balls = np.array([center_and_radius(s) for s in shapes if is_sphere(s)]).reshape(-1, 4)
+    return any(_on_spheres(balls, q) for q in p) or any(_touches(s, p) for s in shapes if not is_sphere(s))
+
+
+def _touches(shape: Any, points: np.ndarray) -> bool:
+    if hasattr(shape, "unit_normal"):
+        heights = np.abs(points @ shape.unit_normal + shape.distance)
+        return bool((heights <= CURVED * np.maximum(abs(shape.distance), _sizes(points))).any())
+    if hasattr(shape, "quadrics"):
+        table = shape.quadrics()
+        boxes = table.boxes()
+        return any(_on_quadrics(table, boxes, p) for p in points)
+    box = np.array([[list(shape.bbox().min), list(shape.bbox().max)]], float).reshape(1, 2, 3)
+    known = np.isfinite(box).all()  # merged rectangles have none
+    inside = [p for p in points if not known or _holding(box, p)[0].any()]
+    corners = flat_triangles(shape) if inside else None
+    return corners is not None and any(_on_triangles(corners, p) for p in inside)
+
+
+def _sizes(values: np.ndarray) -> np.ndarray:
+    """Return the largest coordinates [n] of values [n, ...]."""
+    return np.asarray(np.abs(values).reshape(len(values), -1).max(axis=1))
+
+
+def _on_spheres(balls: np.ndarray, p: np.ndarray) -> bool:
+    heights = np.abs(np.linalg.norm(balls[:, :3] - p, axis=1) - balls[:, 3])
+    sizes = np.abs(balls[:, :3]).max(axis=1, initial=0) + balls[:, 3]
+    return bool((heights <= CURVED * np.maximum(sizes, np.abs(p).max())).any())
+
+
+def _holding(boxes: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which boxes [n, 2, 3] hold a point, and the slack [n] that they have for it."""
+    slack = CURVED * np.maximum(_sizes(boxes), np.abs(p).max())
+    low, high = boxes[:, 0] - slack[:, None], boxes[:, 1] + slack[:, None]
+    return ((p >= low) & (p <= high)).all(axis=1), slack
+
+
+def _on_quadrics(table: QuadricTable, boxes: np.ndarray, p: np.ndarray) -> bool:
+    near, slack = _holding(boxes, p)
+    kind, vector = KINDS[table.kind], drjit.scalar.Array3f64
+    for k in np.flatnonzero(near)[:MOST_LOOKED_AT]:
+        origin, x, y, z = (vector(row.tolist()) for row in (table.origins[k], *table.rows[k]))
+        frame = Frame(origin, x, y, z)
+        feet = np.array([kind.surface(vector(p.tolist()), part, frame).p for part in kind.parts])
+        # A part goes on beyond the object, but not within its box, or nearly so
+        there = [_holding(boxes[k : k + 1], foot)[0][0] for foot in feet]
+        if (there & (np.linalg.norm(feet - p, axis=1) <= slack[k])).any():
+            return True
+    return False
+
+
+def _on_triangles(corners: np.ndarray, p: np.ndarray) -> bool:
+    """Return whether a point is on one of the triangles [n, 3, 3]; what counts is rounding across them."""
+    a, b, c = corners.swapaxes(0, 1)
+    normal, off = np.cross(b - a, c - a), p - a
+    area = np.linalg.norm(normal, axis=1)
+    normal /= np.where(area == 0, 1, area)[:, None]
+    height = np.abs((off * normal).sum(axis=1))
+    size = (np.abs(normal) * (np.abs(p) + np.abs(corners).max(axis=1))).sum(axis=1)
+    u, v = ((np.cross(*pair) * normal).sum(axis=1) for pair in ((off, c - a), (b - a, off)))
+    least = -1e-6 * area
+    inside = (u >= least) & (v >= least) & (u + v <= area - least)
+    return bool(((area > 0) & inside & (height <= CURVED * size)).any())

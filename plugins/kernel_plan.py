@@ -1,14 +1,15 @@
 """Facts about a scene, and the plan of the kernels that ``mrt_whitted`` makes for them.
 
 Plain data and one table, ``RULES``: nothing here knows Mitsuba. The integrator reads the facts, the rules
-decide, the integrator obeys. A plan may be edited (``dataclasses.replace``) before it is obeyed.
+decide, and the integrator obeys. A plan may be edited (``dataclasses.replace``) first.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -85,14 +86,6 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class CutOff:
-    """The quantities that are compared with ``min_contribution``, by their factors."""
-
-    paths: float  #: a path's throughput; inf: it never ends for being too dim
-    lights: float  #: a light's share at a hit, below which it is taken for visible
-
-
-@dataclass(frozen=True)
 class KernelPlan:
     """Every decision that changes a kernel. ``reason(name)`` says why one left something out."""
 
@@ -100,7 +93,10 @@ class KernelPlan:
     lights: str  #: "none", "unrolled", "loop" that calls each, or "table": a loop over their numbers
     mirrors: bool  #: mirror reflections
     lobes: tuple[str, ...]  #: of the materials: "diffuse", "specular"
-    cut_off: CutOff  #: what is too little to be traced
+    cut_off: tuple[
+        float, float
+    ]  #: what multiplies a path's throughput (inf: it never ends for being too dim),
+    #: and a light's share at a hit, before they are compared with ``min_contribution``
     bvh: bool  #: Mitsuba's ray queries
     coherent: bool  #: Embree's treatment of packets of like rays
     quadrics: tuple[str, ...]  #: kinds of exact quadrics; others are traced as meshes
@@ -124,80 +120,45 @@ class KernelPlan:
         return dict(self.reasons).get(name)
 
 
-@dataclass(frozen=True)
-class Case:
-    """What a rule goes by."""
+def _case(facts: SceneFacts, settings: Settings, made: Mapping[str, Any]) -> SimpleNamespace:
+    """Return what the rules go by: the facts, the decisions ``made`` so far, and what follows from them.
 
-    facts: SceneFacts
-    settings: Settings
-    made: Mapping[str, Any]  #: the decisions of the rules before it
+    ``arriving`` bounds the radiance from anywhere, but for what mirrors add: inf where there is no bound.
+    Each light counts for one where its share is clamped to that, and the sky for one at least.
+    """
+    sky = facts.sky if settings.own_sky is None else settings.own_sky
+    clamped = settings.clamp or facts.lights == 0
+    lights = facts.lights if clamped else facts.arriving * facts.value
+    arriving = lights + max(1, sky) + facts.emission
+    affordable = [m for m in facts.mirrors if settings.cost(m.int_ior) < settings.max_depth]
+    growth = max((m.reflectance for m in affordable), default=0.0)
+    return SimpleNamespace(
+        facts=facts,
+        settings=settings,
+        made=made,
+        arriving=arriving,
+        affordable=affordable,  # mirrors that the bounce budget admits
+        visible=any(m.reflectance * arriving > settings.min_contribution for m in affordable),
+        bounded=growth <= 1 or (settings.max_depth - 1) * math.log10(growth) < 30,  # in float32
+        sky="parameter" if settings.own_sky is not None else "environment" if facts.environment else "none",
+        lobes=tuple(name for name, there in facts.lobes if there),
+        objects=facts.native_shapes + sum(count for _, count in facts.quadrics),
+    )
 
-    @property
-    def affordable(self) -> Sequence[Mirror]:
-        """The mirrors that the bounce budget admits."""
-        return [m for m in self.facts.mirrors if self.settings.cost(m.int_ior) < self.settings.max_depth]
 
-    @property
-    def arriving(self) -> float:
-        """A bound of the radiance from anywhere, but for what mirrors add: inf where there is none.
+def _cut_off(case: SimpleNamespace) -> tuple[float, float]:
+    """Return the bound of what may still arrive along a path, and that of what lights bring.
 
-        Each light counts for one where its share is clamped to that, and the sky for one at least.
-        """
-        facts = self.facts
-        clamped = self.settings.clamp or facts.lights == 0
-        lights = facts.lights if clamped else facts.arriving * facts.value
-        sky = facts.sky if self.settings.own_sky is None else self.settings.own_sky
-        return lights + max(1, sky) + facts.emission
-
-    @property
-    def hits(self) -> float:
-        """The number of hits of a path, weighted by its throughput at normal incidence.
-
-        It is one where materials reflect less than a half there: what is left out at further hits adds less
-        than as much again. Where mirrors face each other, it adds up.
-        """
-        mirrors = self.affordable if self.made["mirrors"] else []
-        reflectance = max((m.at_normal for m in mirrors if m.at_normal < math.inf), default=0.0)
-        if reflectance <= 0.5:
-            return 1.0
-        cost = min(self.settings.cost(m.int_ior) for m in mirrors)
-        bounces = (self.settings.max_depth - 2) // cost + 1
-        return sum(min(reflectance, 1.0) ** k for k in range(max(bounces, 0) + 1))
-
-    @property
-    def cut_off(self) -> CutOff:
-        """What is too little to be traced."""
-        return CutOff(
-            self.arriving * self.hits if self.made["mirrors"] else 0.0, self.facts.lights * self.hits
-        )
-
-    @property
-    def bounded(self) -> bool:
-        """Do throughputs stay below 1e30."""
-        growth = max((m.reflectance for m in self.affordable), default=0.0)
-        return growth <= 1 or (self.settings.max_depth - 1) * math.log10(growth) < 30
-
-    @property
-    def visible(self) -> bool:
-        """Does a mirror reflect so much that it can be seen."""
-        bounds = [m.reflectance * self.arriving for m in self.affordable]
-        return any(bound > self.settings.min_contribution for bound in bounds)
-
-    @property
-    def sky(self) -> str:
-        """Where the sky comes from."""
-        given = self.settings.own_sky is not None
-        return "parameter" if given else "environment" if self.facts.environment else "none"
-
-    @property
-    def lobes(self) -> tuple[str, ...]:
-        """The lobes that materials have."""
-        return tuple(name for name, there in self.facts.lobes if there)
-
-    @property
-    def objects(self) -> int:
-        """The number of objects that may be in the way of a light."""
-        return self.facts.native_shapes + sum(count for _, count in self.facts.quadrics)
+    Both count the hits of a path, weighted by its throughput at normal incidence. It is one where materials
+    reflect less than a half there: what is left out at further hits adds less than as much again. Where
+    mirrors face each other, it adds up.
+    """
+    mirrors, settings = case.affordable if case.made["mirrors"] else [], case.settings
+    reflectance, hits = max((m.at_normal for m in mirrors if m.at_normal < math.inf), default=0.0), 1.0
+    if reflectance > 0.5:
+        bounces = (settings.max_depth - 2) // min(settings.cost(m.int_ior) for m in mirrors) + 1
+        hits = sum(min(reflectance, 1.0) ** k for k in range(max(bounces, 0) + 1))
+    return case.arriving * hits if case.made["mirrors"] else 0.0, case.facts.lights * hits
 
 
 @dataclass(frozen=True)
@@ -207,10 +168,8 @@ class Rule:
     name: str  #: of the field of the plan
     what: str  #: that is decided about, in words
     held: Callable[[SceneFacts, KernelPlan], str]  #: what the kernels hold then; "" for nothing to be told
-    against: Callable[
-        [Case], Mapping[str, bool]
-    ]  #: reasons, and whether they hold: the first that does is it
-    value: Callable[[Case, bool], Any] = lambda case, free: free  #: by whether there is none
+    against: Callable[[Any], Mapping[str, bool]]  #: reasons, and whether they hold; the first that does is it
+    value: Callable[[Any, bool], Any] = lambda case, free: free  #: by whether there is none
 
 
 _SPHERES = {"table": "spheres from a table of centres and radii", "corrected": "hits moved onto spheres"}
@@ -218,12 +177,6 @@ _LIGHTS = {"unrolled": "unrolled", "loop": "in a loop of calls", "table": "in a 
 _SKY = {"parameter": "the integrator's sky", "environment": "the scene's sky"}
 _OTHERS = "other shapes, or spheres that emit or face inwards"
 _ALONE = "a ray that leaves the only object meets nothing"
-
-
-def _lights(case: Case, free: bool) -> str:
-    facts = case.facts
-    unrolled = facts.lights <= UNROLLED_LIGHTS or not facts.vectorised
-    return "none" if not free else "unrolled" if unrolled else "table" if facts.tabled else "loop"
 
 
 # In the order in which they are taken: later ones may ask for earlier decisions
@@ -244,7 +197,9 @@ RULES = (
         "lights", "shadow rays",
         lambda facts, plan: f"{facts.lights} lights, {_LIGHTS[plan.lights]}",
         lambda case: {"no light": case.facts.lights == 0, "every material is black": not case.lobes},
-        _lights,
+        lambda case, free: "none" if not free
+        else "unrolled" if case.facts.lights <= UNROLLED_LIGHTS or not case.facts.vectorised
+        else "table" if case.facts.tabled else "loop",
     ),
     Rule(
         "mirrors", "bounce loop",
@@ -266,11 +221,11 @@ RULES = (
     ),
     Rule(
         "cut_off", "cut-off",
-        lambda facts, plan: "an end of paths too dim to be seen" if 0 < plan.cut_off.paths < math.inf else "",
+        lambda facts, plan: "an end of paths too dim to be seen" if 0 < plan.cut_off[0] < math.inf else "",
         lambda case: {
             "what may still arrive has no known bound": case.made["mirrors"] and case.arriving == math.inf
         },
-        lambda case, free: case.cut_off,
+        lambda case, free: _cut_off(case),
     ),
     Rule(
         "bvh", "BVH",
@@ -375,7 +330,7 @@ WHAT = {rule.name: rule.what for rule in RULES}
 def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
     """Decide what the kernels for a scene hold."""
     made, reasons = dict[str, Any](), list[tuple[str, str]]()
-    case = Case(facts, settings, made)
+    case = _case(facts, settings, made)
     for rule in RULES:
         found = [why for why, holds in rule.against(case).items() if holds]
         reasons += [(rule.name, why) for why in found[:1]]

@@ -8,9 +8,8 @@ from typing import NoReturn
 import drjit as dr
 import mitsuba as mi
 
+from .lights import PointLight
 from .parameters import spectrum, vector
-from .point_lights import direction_to
-from .protocols import TabledLight
 from .variants import first, is_jit, pointer, varies
 
 
@@ -47,9 +46,6 @@ class MrtLight(mi.Emitter):
         self.position = mi.Point3f(vector(props, "position", (0, 0, 0)))
         self.intensity = spectrum(props, "intensity", 1.0, emissive=True)
         self.m_flags = +mi.EmitterFlags.DeltaPosition
-        self._update()
-
-    def _update(self) -> None:
         dr.make_opaque(self.position)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -57,29 +53,31 @@ class MrtLight(mi.Emitter):
         callback.put("intensity", self.intensity, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        self._update()
+        dr.make_opaque(self.position)
+
+    def row(self, it: mi.Interaction3f, active: mi.Bool = True) -> PointLight:
+        """Return the light for points with the wavelengths of ``it``."""
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wavelengths = it.wavelengths
+        return PointLight(self.position, self.intensity.eval(si, active))
+
+    def numbers(self) -> tuple[type[PointLight], list[list[float]]] | None:
+        """Return class and numbers of the row; None where they vary, or where derivatives are wanted."""
+        if varies(self.intensity):
+            return None
+        row = self.row(dr.zeros(mi.Interaction3f))
+        parts = [row.position, row.intensity, *row.more]
+        if dr.grad_enabled(parts):
+            return None
+        # Of a single channel, three
+        return type(row), [(3 * [first(x) for x in part])[:3] for part in parts]
 
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-        ds = direction_to(self.position, it)
+        ds, arriving = self.row(it, active).sample_direction(it, sample, active)
         ds.emitter = pointer("Emitter", self)
-        return ds, mi.depolarizer(self.irradiance(it, active))
-
-    def irradiance(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
-        """Return the light's colour at the wavelengths of ``it``, as an unpolarised spectrum."""
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        si.wavelengths = it.wavelengths
-        return self.intensity.eval(si, active)
-
-    def numbers(self) -> tuple[list[float], list[float]] | None:
-        """Return position and intensity; None where that varies, or where derivatives are wanted."""
-        if varies(self.intensity):
-            return None
-        intensity = self.intensity.eval(dr.zeros(mi.SurfaceInteraction3f))
-        if dr.grad_enabled(self.position, intensity):
-            return None
-        return list(map(first, self.position)), list(map(first, intensity))
+        return ds, mi.depolarizer(arriving)
 
     def pdf_direction(
         self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
@@ -89,7 +87,7 @@ class MrtLight(mi.Emitter):
     def eval_direction(
         self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
     ) -> mi.Spectrum:
-        return mi.depolarizer(dr.select(active, self.irradiance(it, active), 0))
+        return mi.depolarizer(dr.select(active, self.row(it, active).arriving(ds.d), 0))
 
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
         return mi.Spectrum(0)
@@ -115,5 +113,4 @@ class MrtLight(mi.Emitter):
         return f"MrtLight[position={self.position}, intensity={self.intensity}]"
 
 
-TabledLight.register(MrtLight)
 mi.register_emitter("mrt_light", MrtLight)

@@ -16,7 +16,6 @@ import numpy as np
 from .kernel_plan import SCALAR_VARIANT, VARYING
 from .lobes import LOBES, TABLED, Lobes
 from .lookup import ByShape, aligned
-from .protocols import MergeableBSDF, QuadricShape
 from .variants import is_jit
 
 # Objects of a group are told apart by the faces of their stand-ins, up to so many in float32
@@ -26,7 +25,7 @@ MOST_FACES = 2**20
 def material_rows(shapes: Sequence[mi.Shape]) -> list[np.ndarray] | str:
     """Return the ``rows`` of the materials of the shapes, or why they have no place in one table."""
     bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
-    mergeable = bool(bsdfs) and all(isinstance(b, MergeableBSDF) for b in bsdfs.values())
+    mergeable = bool(bsdfs) and all(hasattr(b, "rows") for b in bsdfs.values())
     obstacles = {
         SCALAR_VARIANT: not is_jit(),
         "a spectral variant": mi.is_spectral,
@@ -55,8 +54,7 @@ def lobes_in(rows: Sequence[np.ndarray]) -> tuple[tuple[str, bool], ...]:
 
 def varies_by_object(shape: Any) -> bool:
     """Return whether a shape is of quadrics whose materials differ, or vary in another way."""
-    exact = isinstance(shape, QuadricShape)
-    return exact and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.SpatiallyVarying)
+    return hasattr(shape, "quadrics") and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.SpatiallyVarying)
 
 
 def _of_objects(shape: Any) -> np.ndarray | str:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .mesh_api import construct, write_buffers
+from .mesh_api import Placement, construct, write_buffers
 from .parameters import ParameterError
-from .placement import Placement
 
 # What vertices may have, and numbers for each in the bitmap
 _EXTRAS = {"texcoords": (2, 3), "normals": (3,)}

@@ -7,7 +7,6 @@ import numpy as np
 
 from .mesh_api import construct, keep_apart, write_buffers
 from .parameters import ParameterError, number, vector
-from .protocols import PlaneShape
 
 
 class MrtPlane(mi.Mesh):
@@ -79,5 +78,4 @@ def _tangents(n: np.ndarray) -> np.ndarray:
     return np.array([s, np.cross(n, s)])
 
 
-PlaneShape.register(MrtPlane)
 mi.register_shape("mrt_plane", MrtPlane)

@@ -10,13 +10,12 @@ import mitsuba as mi
 
 from .intersect import intersect_plane
 from .lookup import Table
-from .protocols import PlaneShape
 
 
 class Planes:
     """Equations and tangents of all planes, as kernel data."""
 
-    def __init__(self, shapes: Sequence[PlaneShape]) -> None:
+    def __init__(self, shapes: Sequence[Any]) -> None:
         sides = [-1 if s.has_flipped_normals() else 1 for s in shapes]
         self.equations = [
             (mi.Vector3f((side * s.unit_normal).tolist()), mi.Float(side * s.distance))

@@ -1,7 +1,7 @@
-"""Declarations of plugins about themselves, so that nobody has to guess from attributes.
+"""What ``mrt.render`` asks of an integrator that plans its kernels.
 
-Mitsuba's classes take no mix-in; a class joins a protocol by registration: after
-``QuadricShape.register(MrtCone)``, ``isinstance(shape, QuadricShape)`` holds. Others' plugins may join.
+Mitsuba's classes take no mix-in; a class joins by ``LayeredIntegrator.register(MyIntegrator)``. What shapes,
+lights and materials declare about themselves is told in ``facts.Reading``.
 """
 
 from __future__ import annotations
@@ -10,11 +10,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from .intersect import Frame
-    from .kernel_plan import KernelPlan, Mirror, SceneFacts
-    from .quadric_kinds import QuadricTable
+    from .kernel_plan import KernelPlan, SceneFacts
 
 
 class LayeredIntegrator(ABC):
@@ -42,64 +38,3 @@ class LayeredIntegrator(ABC):
     @abstractmethod
     def trace(self, scene: Any, sampler: Any, ray: Any, active: Any = True, data: Any = None) -> Any:
         """Return the radiance along rays, and what the layers are made of. ``data``: from ``prepare``."""
-
-
-class PlaneShape(ABC):
-    """A shape that stands for an infinite plane."""
-
-    unit_normal: np.ndarray  # float64 [3]
-    distance: float  # unit_normal · P + distance = 0
-    tangents: np.ndarray  # float64 [2, 3]
-
-    @abstractmethod
-    def has_flipped_normals(self) -> bool:
-        """Return whether the plane faces the other side; every shape of Mitsuba says so."""
-
-
-class QuadricShape(ABC):
-    """A mesh that stands for exact quadrics."""
-
-    @abstractmethod
-    def quadrics(self) -> QuadricTable:
-        """Return the quadrics."""
-
-    @abstractmethod
-    def moving_frame(self) -> Frame | None:
-        """Return the unit frame of the only quadric with its derivatives; None where none are wanted."""
-
-
-class SteadyLight(ABC):  # noqa: B024 - lights join by register()
-    """A light that is as bright far away as near by."""
-
-
-class TabledLight(SteadyLight):
-    """A steady point light whose numbers may be looked up in a table."""
-
-    @abstractmethod
-    def numbers(self) -> tuple[list[float], list[float]] | None:
-        """Return position and intensity; None where that varies, or where derivatives are wanted."""
-
-
-class MirrorBSDF(ABC):
-    """A BSDF with the attributes ``mirror_reflectance`` and ``int_ior``, which drive the mirror rays."""
-
-    @abstractmethod
-    def mirror_bound(self) -> Mirror:
-        """Return upper bounds of them."""
-
-    @abstractmethod
-    def value_bound(self) -> float:
-        """Return an upper bound of f cos θ; inf where there is none."""
-
-
-class MergeableBSDF(MirrorBSDF):
-    """A ``MirrorBSDF`` with the lobes of ``mrt_bsdf``, which may be looked up in a table of materials."""
-
-    fresnel: str  # one of the forms of mrt_bsdf
-
-    @abstractmethod
-    def rows(self, points: Any = None) -> np.ndarray | str:
-        """Return the parameters as plain numbers [n, 1 + lobes, 4], or why they are none.
-
-        ``points``: one surface point on each object of a shape, for textures that vary from face to face.
-        """

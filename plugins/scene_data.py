@@ -14,11 +14,11 @@ import numpy as np
 from .facts import Reading, has_mirror
 from .hit_errors import CURVED, HitErrors
 from .kernel_plan import KernelPlan
+from .lights import Lights
 from .lobes import LOBES, Pair
 from .materials import MaterialTable
 from .planes import Planes
 from .point_buffer import PointBuffer, point_buffer
-from .point_lights import Lights
 from .quadrics import Quadrics
 from .snapshot import Kept
 from .spheres import SphereBlockers, Spheres
@@ -82,7 +82,7 @@ class SceneData:
             lambda: MaterialTable(now.shapes, reading.materials) if plan.merged else None,
         )
         self._traced = traced
-        self.path_limit: Any = plan.cut_off.paths
+        self.path_limit: Any = plan.cut_off[0]
         if is_jit() and self.path_limit not in (0, math.inf, self.facts.lights + 1):
             self.path_limit = dr.opaque(mi.Float, self.path_limit)  # a brighter sky needs no new kernel
         self.ray_flags = +mi.RayFlags.dPdUV if plan.tangents else +mi.RayFlags.Minimal
@@ -94,7 +94,7 @@ class SceneData:
         things = [] if self.quadrics is None else [self.quadrics]
         if self.plan.bvh:
             things.append(SphereBlockers(reading.native))
-        places = np.array([position for position, _ in reading.numbers or ()])
+        places = np.array([row[0] for _, row in reading.numbers or ()])
         pairs = [(point_buffer(places, *thing.hulls()), thing) for thing in things]
         buffers = [(buffer, thing) for buffer, thing in pairs if buffer is not None]
         return buffers if len(buffers) == len(pairs) else []

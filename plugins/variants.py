@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
-import drjit.scalar
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 
 def is_jit() -> bool:
@@ -25,7 +27,7 @@ def first(value: Any) -> float:
 
 def updatable(number: float) -> mi.Float:
     """Return a parameter in a form that ``mi.traverse`` can update, which Python floats are not."""
-    return mi.Float(number) if is_jit() else drjit.scalar.Array1f64(number)
+    return mi.Float(number) if is_jit() else dr.scalar.Array1f64(number)
 
 
 def but_not(mask: mi.Bool, excluded: mi.Bool) -> mi.Bool:
@@ -41,6 +43,24 @@ def varies(texture: mi.Texture) -> bool:
 def varies_by_face(texture: mi.Texture) -> bool:
     """Return whether a texture is the same all over each face of a mesh."""
     return texture.class_name() == "MeshAttribute" and 'name = "face_' in str(texture)
+
+
+def largest(texture: mi.Texture) -> float:
+    """Return the largest value of a texture; inf where it is not known."""
+    if varies(texture) or (mi.is_spectral and not is_jit()):
+        return math.inf
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    if mi.is_spectral:  # each nanometre
+        count = int(mi.MI_CIE_MAX - mi.MI_CIE_MIN) + 1
+        si = dr.zeros(mi.SurfaceInteraction3f, count)
+        si.wavelengths[0] = dr.linspace(mi.Float, mi.MI_CIE_MIN, mi.MI_CIE_MAX, count)
+    value = texture.eval(si)
+    if dr.grad_enabled(value):
+        return math.inf
+    if mi.is_spectral:
+        return float(np.max(np.abs(np.array(value))))
+    # Channel by channel: reads the numbers where they are, while an array of all would take a kernel
+    return max(abs(first(channel)) for channel in value)
 
 
 def construct_quietly(integrator: mi.SamplingIntegrator, props: mi.Properties) -> None:

@@ -9,14 +9,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .emission import largest
 from .facts import Reading
 from .kernel_plan import BUDGETS, KernelPlan, SceneFacts, Settings, make_plan
 from .parameters import LARGEST, choice, flag, integer, number, spectrum
 from .protocols import LayeredIntegrator
 from .scene_data import Hit, SceneData
 from .snapshot import Kept, Snapshot
-from .variants import but_not, construct_quietly
+from .variants import but_not, construct_quietly, largest
 
 # A sixteenth of a step of an 8-bit picture: what many cut paths add up to stays below half a step, and on
 # average over the report's scenes below 1e-5
@@ -35,27 +34,6 @@ class Trace:
     hit: Hit  # of the camera ray
     bounces: mi.UInt32  # mirror rays traced
     shadow_rays: mi.UInt32  # shadow rays traced
-
-
-@dataclass
-class LightSample:
-    """One light as seen from a hit."""
-
-    number: Any  # of the light
-    ds: mi.DirectionSample3f
-    wo: mi.Vector3f  # local direction to it
-    weight: mi.UnpolarizedSpectrum  # what arrives from there, over the density of the direction
-    facing: mi.Bool  # is it on the lit side
-
-
-@dataclass
-class Shading:
-    """The contribution of a surface to a path."""
-
-    radiance: mi.UnpolarizedSpectrum
-    shadow_rays: mi.UInt32
-    reflectance: mi.UnpolarizedSpectrum  # of the mirror ray
-    cost: mi.UInt32  # of the mirror ray, to the bounce budget
 
 
 class MrtWhitted(mi.SamplingIntegrator):
@@ -199,59 +177,63 @@ class MrtWhitted(mi.SamplingIntegrator):
         data = self.prepare(scene) if data is None else data
 
         # ------------------------------ The camera ray, first of a peeled loop ------------------------------
-        active = mi.Bool(active)
+        active, none = mi.Bool(active), mi.UInt32(0)
         hit = data.intersect(scene, ray, active)
-        shading = self._shade(data, scene, sampler, ray, hit, mi.UnpolarizedSpectrum(1), active)
+        one = mi.UnpolarizedSpectrum(1)
+        direct, shadow_rays, reflectance, depth = self._shade(data, scene, sampler, ray, hit, one, active)
         if not data.plan.mirrors:
-            return Trace(shading.radiance, shading.radiance, hit, mi.UInt32(0), shading.shadow_rays)
-        throughput, depth = self._kept(data, shading.reflectance), shading.cost
+            return Trace(direct, direct, hit, none, shadow_rays)
+        throughput = self._finite(data, reflectance)
         goes_on = hit.found & self._continues(data, throughput, depth)
         if not data.plan.mirror_rays:
             reflected = self._sky(data, data.mirror_ray(ray, hit), goes_on)
-            radiance = shading.radiance + dr.select(goes_on, throughput * reflected, 0)
-            return Trace(radiance, shading.radiance, hit, mi.UInt32(0), shading.shadow_rays)
+            radiance = direct + dr.select(goes_on, throughput * reflected, 0)
+            return Trace(radiance, direct, hit, none, shadow_rays)
         state = {
-            "radiance": shading.radiance,  # light found so far
+            "radiance": direct,  # light found so far
             "throughput": throughput,  # product of the mirror reflectances along the path
             "ray": data.mirror_ray(ray, hit),  # the next to be traced
             "depth": depth,  # what the bounces have cost so far
-            "bounces": mi.UInt32(0),  # mirror rays traced
-            "shadow_rays": shading.shadow_rays,  # shadow rays traced
+            "bounces": none,  # mirror rays traced
+            "shadow_rays": shadow_rays,  # shadow rays traced
             "active": goes_on,  # paths that go on
             "sampler": sampler if data.plan.random else None,  # for lights that are no points
         }
 
         # ------------------------------------------ Mirror bounces ------------------------------------------
         def bounce(s: dict) -> tuple[dict]:
-            ray, active = s["ray"], s["active"]
+            ray, active, throughput = s["ray"], s["active"], s["throughput"]
             hit = data.intersect(scene, ray, active)
-            shading = self._shade(data, scene, s["sampler"], ray, hit, s["throughput"], active)
-            throughput = self._kept(data, s["throughput"] * shading.reflectance)
-            depth = s["depth"] + shading.cost
+            radiance, shadow_rays, reflectance, cost = self._shade(
+                data, scene, s["sampler"], ray, hit, throughput, active
+            )
+            radiance = s["radiance"] + dr.select(active, throughput * radiance, 0)
+            throughput, depth = self._finite(data, throughput * reflectance), s["depth"] + cost
             return (
                 {
-                    "radiance": s["radiance"] + dr.select(active, s["throughput"] * shading.radiance, 0),
+                    "radiance": radiance,
                     "throughput": throughput,
                     "ray": data.mirror_ray(ray, hit),
                     "depth": depth,
                     "bounces": s["bounces"] + 1,
-                    "shadow_rays": s["shadow_rays"] + shading.shadow_rays,
+                    "shadow_rays": s["shadow_rays"] + shadow_rays,
                     "active": active & hit.found & self._continues(data, throughput, depth),
                     "sampler": s["sampler"],
                 },
             )
 
         (final,) = dr.while_loop((state,), lambda s: s["active"], bounce, label="mirror bounces")
-        return Trace(final["radiance"], shading.radiance, hit, final["bounces"], final["shadow_rays"])
+        return Trace(final["radiance"], direct, hit, final["bounces"], final["shadow_rays"])
 
     def _continues(self, data: SceneData, throughput: mi.UnpolarizedSpectrum, depth: mi.UInt32) -> mi.Bool:
         """Return whether a path of this throughput and depth may still change the picture."""
         affordable, brightest = depth < self.max_depth, dr.max(throughput)
-        if data.plan.cut_off.paths == math.inf:
+        if data.plan.cut_off[0] == math.inf:
             return affordable & (brightest > 0)
         return affordable & (brightest * data.path_limit > self.min_contribution)
 
-    def _kept(self, data: SceneData, throughput: mi.UnpolarizedSpectrum) -> mi.UnpolarizedSpectrum:
+    @staticmethod
+    def _finite(data: SceneData, throughput: mi.UnpolarizedSpectrum) -> mi.UnpolarizedSpectrum:
         """Keep a throughput finite: an infinite one times no light would be NaN."""
         return dr.minimum(throughput, LARGEST) if data.plan.guarded else throughput
 
@@ -266,8 +248,9 @@ class MrtWhitted(mi.SamplingIntegrator):
         hit: Hit,
         throughput: mi.UnpolarizedSpectrum,
         active: mi.Bool,
-    ) -> Shading:
-        """Return the light that leaves ``hit`` back along ``ray``, and its mirror reflection; or the sky.
+    ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32]:
+        """Return the light that leaves ``hit`` back along ``ray``, or the sky; the number of shadow rays; and
+        of the mirror ray, the reflectance and what it takes from the bounce budget.
 
         ``throughput`` is that of the path up to ``hit``.
         """
@@ -277,13 +260,12 @@ class MrtWhitted(mi.SamplingIntegrator):
 
         def nowhere(hit: Hit, throughput: mi.UnpolarizedSpectrum, sampler: mi.Sampler) -> tuple:
             black = mi.UnpolarizedSpectrum(0)
-            return Shading(black, mi.UInt32(0), black, mi.UInt32(0)), sampler
+            return (black, mi.UInt32(0), black, mi.UInt32(0)), sampler
 
         # A branch, because packets whose rays all miss are many
         state = hit, throughput, sampler if data.plan.random else None
-        shading, _ = dr.if_stmt(state, hit.found, at_surface, nowhere, label="surface")
-        shading.radiance += self._sky(data, ray, but_not(active, hit.found))
-        return shading
+        (radiance, *others), _ = dr.if_stmt(state, hit.found, at_surface, nowhere, label="surface")
+        return radiance + self._sky(data, ray, but_not(active, hit.found)), *others
 
     def _shade_surface(
         self,
@@ -292,92 +274,62 @@ class MrtWhitted(mi.SamplingIntegrator):
         sampler: mi.Sampler,
         hit: Hit,
         throughput: mi.UnpolarizedSpectrum,
-    ) -> Shading:
-        si, radiance = hit.si, mi.UnpolarizedSpectrum(0)
-        if data.plan.emission:
+    ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32]:
+        plan, si, radiance, shadow_rays = data.plan, hit.si, mi.UnpolarizedSpectrum(0), mi.UInt32(0)
+        if plan.emission:
             radiance += mi.unpolarized_spectrum(si.emitter(scene, hit.found).eval(si, hit.found))
-        samples = [
-            self._light_sample(data, k, light, sampler, hit) for k, light in enumerate(data.lights.each)
-        ]
+
+        def sampled(light: Any, sampler: mi.Sampler) -> tuple:
+            """Return direction to a light, locally too, what may arrive from it, and if on the lit side."""
+            u = sampler.next_2d(hit.found) if plan.random else mi.Point2f(0.5)
+            ds, arriving = data.lights.sample(light, si, u, hit.found)
+            wo, facing = si.to_local(ds.d), hit.found & (ds.pdf > 0)
+            if not plan.two_sided:
+                facing &= mi.Frame3f.cos_theta(wo) > 0
+            return ds, wo, mi.unpolarized_spectrum(arriving), facing
+
+        def lit(light: Any, sample: tuple, bsdf_value: mi.UnpolarizedSpectrum) -> tuple:
+            """Return a light's contribution where nothing blocks it, and the shadow rays traced for it."""
+            ds, _, arriving, facing = sample
+            value = arriving * bsdf_value
+            if self.clamp:
+                value = dr.clip(value, 0, 1)
+            share = dr.max(dr.abs(throughput * value))
+            traced = facing & (share * plan.cut_off[1] > self.min_contribution)
+            visible = but_not(facing, data.occluded(scene, hit, light, ds, traced))
+            return dr.select(visible, value, 0), dr.select(traced, mi.UInt32(1), mi.UInt32(0))
+
+        samples = [sampled(light, sampler) for light in range(len(data.lights.each))]
         values, reflectance, int_ior = data.eval_bsdf(
-            hit, [s.wo for s in samples], [s.facing for s in samples], data.plan.mirrors
+            hit, [wo for _, wo, _, _ in samples], [facing for *_, facing in samples], plan.mirrors
         )
-        shadow_rays = mi.UInt32(0)
-        for sample, value in zip(samples, values, strict=True):
-            lit, traced = self._visible_part(data, scene, hit, throughput, sample, value)
-            radiance += lit
-            shadow_rays += traced
-        if data.plan.lights in ("loop", "table"):
-            radiance, shadow_rays = self._loop_over_lights(data, scene, sampler, hit, throughput, radiance)
-        return Shading(radiance, shadow_rays, reflectance, self._cost(int_ior))
+        for light, (sample, value) in enumerate(zip(samples, values, strict=True)):
+            light_here, traced = lit(light, sample, value)
+            radiance, shadow_rays = radiance + light_here, shadow_rays + traced
 
-    def _cost(self, int_ior: mi.Float) -> mi.UInt32:
-        """Return what a bounce off a material of this index takes from the bounce budget."""
-        if self.bounce_budget == "plain":
-            return mi.UInt32(1)
-        return mi.UInt32(dr.maximum(10 - mi.Int32(dr.minimum(10 * int_ior, 10)), 1))
+        def step(light: mi.UInt32, radiance: Any, shadow_rays: Any, sampler: mi.Sampler) -> tuple:
+            sample = sampled(light, sampler)
+            (value,), _, _ = data.eval_bsdf(hit, [sample[1]], [sample[3]], mirror=False)
+            light_here, traced = lit(light, sample, value)
+            return light + 1, radiance + light_here, shadow_rays + traced, sampler
 
-    def _loop_over_lights(
-        self,
-        data: SceneData,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        hit: Hit,
-        throughput: mi.UnpolarizedSpectrum,
-        radiance: mi.UnpolarizedSpectrum,
-    ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32]:
-        def step(
-            i: mi.UInt32, radiance: mi.UnpolarizedSpectrum, shadow_rays: mi.UInt32, sampler: mi.Sampler
-        ) -> tuple:
-            sample = self._light_sample(data, i, data.lights.at(i, hit.found), sampler, hit)
-            (value,), _, _ = data.eval_bsdf(hit, [sample.wo], [sample.facing], mirror=False)
-            lit, traced = self._visible_part(data, scene, hit, throughput, sample, value)
-            return i + 1, radiance + lit, shadow_rays + traced, sampler
-
-        state = (mi.UInt32(0), radiance, mi.UInt32(0), sampler if data.plan.random else None)
-        state = dr.while_loop(state, lambda i, *_: hit.found & (i < data.lights.count), step, label="lights")
-        return state[1], state[2]
-
-    def _light_sample(
-        self, data: SceneData, number: Any, light: mi.Emitter, sampler: mi.Sampler, hit: Hit
-    ) -> LightSample:
-        """Return the direction to a light and what arrives from it, if nothing is in between."""
-        u = sampler.next_2d(hit.found) if data.plan.random else mi.Point2f(0.5)
-        ds, weight = light.sample_direction(hit.si, u, hit.found)
-        wo = hit.si.to_local(ds.d)
-        facing = hit.found & (ds.pdf > 0)
-        if not data.plan.two_sided:
-            facing &= mi.Frame3f.cos_theta(wo) > 0
-        return LightSample(number, ds, wo, mi.unpolarized_spectrum(weight), facing)
-
-    def _visible_part(
-        self,
-        data: SceneData,
-        scene: mi.Scene,
-        hit: Hit,
-        throughput: mi.UnpolarizedSpectrum,
-        sample: LightSample,
-        bsdf_value: mi.UnpolarizedSpectrum,
-    ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32]:
-        """Return a light's contribution where nothing blocks it, and the shadow rays traced for it."""
-        value = sample.weight * bsdf_value
-        if self.clamp:
-            value = dr.clip(value, 0, 1)
-        share = dr.max(dr.abs(throughput * value))
-        matters = share * data.plan.cut_off.lights > self.min_contribution
-        traced = sample.facing & matters
-        visible = but_not(sample.facing, data.occluded(scene, hit, sample.number, sample.ds, traced))
-        return dr.select(visible, value, 0), dr.select(traced, mi.UInt32(1), mi.UInt32(0))
+        if plan.lights in ("loop", "table"):
+            state = mi.UInt32(0), radiance, shadow_rays, sampler if plan.random else None
+            _, radiance, shadow_rays, _ = dr.while_loop(
+                state, lambda light, *_: hit.found & (light < data.lights.count), step, label="lights"
+            )
+        cost = mi.UInt32(1)
+        if self.bounce_budget == "report":
+            cost = mi.UInt32(dr.maximum(10 - mi.Int32(dr.minimum(10 * int_ior, 10)), 1))
+        return radiance, shadow_rays, reflectance, cost
 
     def _sky(self, data: SceneData, ray: mi.Ray3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        si.wi = -ray.d
-        si.wavelengths = ray.wavelengths
         if data.plan.sky == "none":
             return mi.UnpolarizedSpectrum(0)
-        if data.plan.sky == "parameter":
-            return dr.select(active, self.sky.eval(si, active), 0)
-        return dr.select(active, mi.unpolarized_spectrum(data.environment.eval(si, active)), 0)
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi, si.wavelengths = -ray.d, ray.wavelengths
+        sky = self.sky if data.plan.sky == "parameter" else data.environment
+        return dr.select(active, mi.unpolarized_spectrum(sky.eval(si, active)), 0)
 
 
 LayeredIntegrator.register(MrtWhitted)

@@ -108,7 +108,7 @@ def test_every_plugin_is_in_the_reference() -> None:
     from mrt_mitsuba import plugins
 
     named = re.findall(r"mrt_mitsuba\.plugins\.(\w+)\.", (DOCS / "plugins.rst").read_text())
-    assert sorted(named) == sorted(plugins.MODULES)
+    assert set(named) == set(plugins.MODULES)
 
 
 @pytest.fixture

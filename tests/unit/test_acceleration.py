@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba.plugins.point_buffer as lists_module
-from mrt_mitsuba.plugins.placement import Placement
+from mrt_mitsuba.plugins.mesh_api import Placement
 from mrt_mitsuba.plugins.point_buffer import point_buffer
 from mrt_mitsuba.plugins.quadric_kinds import KINDS, QuadricTable
 from mrt_mitsuba.plugins.quadrics import Quadrics

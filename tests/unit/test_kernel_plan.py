@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from nodes import sensor
 
-from mrt_mitsuba.plugins.kernel_plan import RULES, CutOff, KernelPlan, held
+from mrt_mitsuba.plugins.kernel_plan import RULES, KernelPlan, held
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -87,7 +87,7 @@ CHOICES = {
     "sky": ({"a": SPHERE, "sky": {"type": "constant"}, "light": LIGHT}, "none", False),
     "mirrors": ({"a": SPHERE, "sky": {"type": "constant"}, "light": LIGHT}, False, False),
     "mirror_rays": ({"a": SPHERE, "sky": {"type": "constant"}}, True, True),
-    "cut_off": ({"a": SPHERE, "b": CONE, "sky": {"type": "constant"}}, CutOff(math.inf, 9.0), True),
+    "cut_off": ({"a": SPHERE, "b": CONE, "sky": {"type": "constant"}}, (math.inf, 9.0), True),
     "guarded": ({"a": BRIGHT, "b": CONE, "light": LIGHT}, False, True),
     "lobes": ({"a": SPHERE, "light": LIGHT}, ("diffuse",), False),
     "textures": ({"a": {**SPHERE, "bsdf": CHECKED}, "light": LIGHT}, False, False),

@@ -11,7 +11,6 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from mpmath import mp
 
-from mrt_mitsuba.plugins.columns import Columns
 from mrt_mitsuba.plugins.microfacet import (
     TAN2_MAX,
     beckmann_d,
@@ -22,6 +21,7 @@ from mrt_mitsuba.plugins.microfacet import (
     smith_g1_over_cos,
     tan2_theta,
 )
+from mrt_mitsuba.plugins.quadric_kinds import Columns
 from mrt_mitsuba.validation.oracles import exact
 
 Vector = drjit.scalar.Array3f64

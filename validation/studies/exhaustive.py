@@ -15,9 +15,9 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import VariantError
-from mrt_mitsuba.plugins.columns import Columns
 from mrt_mitsuba.plugins.fresnel import fresnel_dielectric, fresnel_schlick
 from mrt_mitsuba.plugins.microfacet import smith_g1
+from mrt_mitsuba.plugins.quadric_kinds import Columns
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.tools.study import Study
 
