@@ -61,42 +61,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--out", type=Path, default=Path("validation-report"), metavar="DIR",
         help="folder of the report, made if need be (default: validation-report)")  # fmt: skip
     options = parser.parse_args(arguments)
+    names = [name for name in STUDIES if name in options.study or "all" in options.study]
     with warnings.catch_warnings():
-        warnings.showwarning = _show_warning
+        warnings.showwarning = lambda message, *more, **_: _say(f"warning: {message}")
         try:
-            names = [name for name in STUDIES if name in options.study or "all" in options.study]
-            missing = [name.replace("_", "-") for name in EXTRAS if util.find_spec(name) is None]
-            if missing:
-                packages = " ".join(missing)
-                raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
-            report.prepare(options.out)
-            seconds = sum(STUDIES[name][2] if options.quick else STUDIES[name][3] for name in names)
-            print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
-            # With a cache of their own, studies of speed see how long compilation takes
-            with nullcontext() if options.quick or not set(names) & set(TIMED) else own_cache():
-                import matplotlib
-
-                matplotlib.use("Agg")  # no window, whatever the user's settings say
-                progress = TerminalProgress(unit="step")
-                studies = [run_study(name, quick=options.quick, progress=progress) for name in names]
-            print(report.terminal_table(studies), flush=True)
-            report.save(options.out, *studies, quick=options.quick)
-            print(f"\nReport: {options.out / 'index.html'}")
-            return 0 if all(study.passed for study in studies) else 1
+            studies = run_studies(names, options.out, quick=options.quick)
         except MrtError as error:
-            return _fail(str(error), error.exit_code)
+            _say(error)
+            return error.exit_code
         except KeyboardInterrupt:
-            return _fail("interrupted; no report was written", INTERRUPTED)
+            _say("interrupted; no report was written")
+            return INTERRUPTED
+    return 0 if all(study.passed for study in studies) else 1
+
+
+def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> list[Study]:
+    """Run studies by name, print their bounds and write the report. Raises ``MrtError``."""
+    missing = [name.replace("_", "-") for name in EXTRAS if util.find_spec(name) is None]
+    if missing:
+        packages = " ".join(missing)
+        raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
+    report.prepare(out)
+    seconds = sum(STUDIES[name][2 if quick else 3] for name in names)
+    print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
+    # With a cache of their own, studies of speed see how long compilation takes
+    with nullcontext() if quick or not set(names) & set(TIMED) else own_cache():
+        progress = TerminalProgress(unit="step")
+        studies = [run_study(name, quick=quick, progress=progress) for name in names]
+    print(report.terminal_table(studies), flush=True)
+    report.save(out, *studies, quick=quick)
+    print(f"\nReport: {out / 'index.html'}")
+    return studies
 
 
 def listing() -> str:
     """Return a line on each study, with how long it takes on two idle cores."""
-    in_all = [sum(seconds) for seconds in zip(*(entry[2:] for entry in STUDIES.values()), strict=True)]
-    lines = [f"  {'':<15}{'quick':>7}{'full':>8}"]
-    rows = [(name, *entry[1:]) for name, entry in STUDIES.items()]
-    for name, about, quick, full in [*rows, ("all", "all of these", in_all[0], in_all[1])]:
-        lines.append(f"  {name:<15}{_spoken(quick):>7}{_spoken(full):>8}  {about}")
-    return "\n".join(lines)
+    total = ("all of these", *(sum(entry[i] for entry in STUDIES.values()) for i in (2, 3)))
+    rows = [(name, *entry[1:]) for name, entry in STUDIES.items()] + [("all", *total)]
+    lines = [f"  {n:<15}{_spoken(quick):>7}{_spoken(full):>8}  {about}" for n, about, quick, full in rows]
+    return "\n".join([f"  {'':<15}{'quick':>7}{'full':>8}", *lines])
 
 
 def _spoken(seconds: int) -> str:
@@ -122,13 +125,8 @@ def run_study(name: str, *, quick: bool, progress: Progress | None = None) -> St
     return study
 
 
-def _fail(message: str, code: int) -> int:
-    print(f"mrt-validate: {' '.join(message.split())}", file=sys.stderr)
-    return code
-
-
-def _show_warning(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
-    print(f"mrt-validate: warning: {' '.join(str(message).split())}", file=sys.stderr)
+def _say(message: object) -> None:
+    print(f"mrt-validate: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 if __name__ == "__main__":

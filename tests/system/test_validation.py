@@ -426,7 +426,7 @@ def test_advice_is_the_fastest_that_is_good_enough() -> None:
 def test_repeats_give_advice_and_strips() -> None:
     study = findings(error_vs_time.run, quick=False)
     assert study.tables["choose"].first and study.tables["choose"].rows[0][0] == 0
-    assert any("strip" in name for name in study.plots)
+    assert any("strip" in name for name in study.images)
 
 
 def test_runs_are_timed_in_turns() -> None:

@@ -85,7 +85,7 @@ def compare(study: Study, number: int, *, size: tuple[int, int], aa: int, spp: i
     study.record(f"{name}: focus distance", lens["focus_distance"])
     sheet = np.concatenate(list(pictures.values()), axis=1)
     caption = f"Left to right: {', '.join(pictures)}."
-    study.picture(f"pictures-{number}", f"Scene {number}", sheet, caption, exr=True)
+    study.picture(f"pictures-{number}", f"Scene {number}", sheet, caption)
     return [
         {
             "scene": number,

@@ -276,7 +276,7 @@ def rendered(study: Study, *, quick: bool) -> None:
         sheet = np.concatenate([one, other, 20 * np.abs(difference)], axis=1)
         caption = f"{found.samples} samples per pixel each, independent: the difference is noise."
         title = f"Ours, Mitsuba's, |difference| × 20; {at}"
-        study.picture(f"pictures-{alpha:g}", title, sheet, caption, exr=True)
+        study.picture(f"pictures-{alpha:g}", title, sheet, caption)
     for name, change in study.each("mistakes", MUTATIONS.items()):
         broken = {**ours(POWER_ALPHA), **change}
         stacks, _ = _render_both([broken, theirs(POWER_ALPHA)], seed=100, **settings)

@@ -7,25 +7,24 @@ import csv
 import html
 import io
 import json
-import numbers
 import os
 import platform
 import re
-import sys
 import tempfile
 from collections.abc import Sequence
 from datetime import datetime, timezone
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import OutputError
-from mrt_mitsuba.output.files import to_8bit, write_exr
+from mrt_mitsuba.output.files import to_8bit
 from mrt_mitsuba.output.replacing import check_target, replacing
-from mrt_mitsuba.validation.tools.study import Study, Table
+from mrt_mitsuba.validation.tools.study import Image, Study, Table
 
-LONG_TABLE = 12  # rows from which on a table of the page is folded
-LONG_LIST = 30  # bounds from which on they are folded if all hold
 DOTS_PER_INCH = 110
 COLUMN = 6.5  # inches from which on a plot has a row of the page to itself, too
 BROAD = 2  # width over height from which on a picture has a row of the page to itself
@@ -89,13 +88,25 @@ def save(
 
     A figure is drawn once: the file and the page hold the same bytes. Raises ``OutputError``.
     """
-    from importlib.resources import files
-
     import jinja2
 
     place = Path(folder)
     prepare(place)
-    sections = [_section(place, study) for study in studies]
+    images: dict[int, dict[str, Any]] = {}  # as the page shows them, by the id of the part
+    for study in studies:
+        for part in study.parts:
+            if isinstance(part, str):
+                continue
+            stem = "-".join(
+                re.sub(r"[^A-Za-z0-9.]+", "-", n).strip("-.").lower() for n in (study.name, part.name)
+            )
+            if isinstance(part, Table):
+                text = io.StringIO()
+                csv.writer(text, lineterminator="\n").writerows([part.columns, *part.rows])
+                _write(place / f"{stem}.csv", text.getvalue().encode())
+            else:
+                images[id(part)] = _drawn(part)
+                _write(place / f"{stem}.png", images[id(part)]["data"])
     result = {
         **versions(),
         **machine(),
@@ -107,11 +118,9 @@ def save(
     _write(place / "summary.json", json.dumps(result, indent=2, allow_nan=False).encode() + b"\n")
     template = (files("mrt_mitsuba.validation.tools") / "templates" / "report.html").read_text("utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    environment.filters["cell"] = cell
-    page = environment.from_string(template).render(
-        sections=sections, long_list=LONG_LIST, title=title, explain=title == VALIDATION, **result
-    )
-    _write(place / "index.html", page.encode())
+    environment.filters |= {"cell": cell, "id": id, "base64": lambda data: base64.b64encode(data).decode()}
+    shown = {**result, "studies": studies, "images": images, "title": title, "explain": title == VALIDATION}
+    _write(place / "index.html", environment.from_string(template).render(shown).encode())
 
 
 def notebook(study: Study, *, title: str) -> str:
@@ -122,61 +131,29 @@ def notebook(study: Study, *, title: str) -> str:
     return f'<iframe srcdoc="{html.escape(page)}" style="width: 100%; height: 40rem; border: 0"></iframe>'
 
 
-def _section(folder: Path, study: Study) -> dict[str, Any]:
-    """Write the files of one study and return what the page shows of it."""
+def _drawn(image: Image) -> dict[str, Any]:
+    """Return the bytes of a PNG, the class of the picture, and whether it has a row of the page to itself."""
     import PIL.Image
 
-    section: dict[str, Any] = {"study": study, "texts": [], "images": [], "tables": []}
-    for part in study.parts:
-        if isinstance(part, str):
-            section["texts"].append(part)
-            continue
-        stem = f"{_slug(study.name)}-{_slug(part.name)}"
-        if isinstance(part, Table):
-            text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows([part.columns, *part.rows])
-            _write(folder / f"{stem}.csv", text.getvalue().encode())
-            columns = zip(*part.rows, strict=True) if part.rows else [[]] * len(part.columns)
-            numeric = [all(isinstance(value, numbers.Number) for value in column) for column in columns]
-            folded = len(part.rows) >= LONG_TABLE
-            section["tables"].append({"part": part, "numeric": numeric, "folded": folded})
-            continue
-        buffer = io.BytesIO()
-        if part.is_plot:
-            kind, broad = "plot", part.content.get_figwidth() > COLUMN
-            part.content.savefig(
-                buffer, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight", facecolor="white"
-            )
-            if "matplotlib.pyplot" in sys.modules:  # which keeps every figure that it made
-                sys.modules["matplotlib.pyplot"].close(part.content)
-        else:
-            kind, broad = "picture", part.content.shape[1] > BROAD * part.content.shape[0]
-            PIL.Image.fromarray(to_8bit(part.content, "srgb")).save(buffer, format="PNG")
-        _write(folder / f"{stem}.png", buffer.getvalue())
-        if part.exr:
-            write_exr(folder / f"{stem}.exr", part.content)
-        data = base64.b64encode(buffer.getvalue()).decode()
-        section["images"].append({"part": part, "data": data, "kind": kind, "broad": bool(broad)})
-    return section
+    buffer, content = io.BytesIO(), image.content
+    if isinstance(content, np.ndarray):
+        PIL.Image.fromarray(to_8bit(content, "srgb")).save(buffer, format="PNG")
+        return {
+            "data": buffer.getvalue(),
+            "kind": "picture",
+            "broad": content.shape[1] > BROAD * len(content),
+        }
+    content.savefig(buffer, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight", facecolor="white")
+    return {"data": buffer.getvalue(), "kind": "plot", "broad": content.get_figwidth() > COLUMN}
 
 
 def cell(value: Any) -> str:
     """Return a value as people read it: floats to four digits, the rest as it is."""
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, (int, str)):
-        return str(value)
-    try:
-        return f"{float(value):.4g}"
-    except (TypeError, ValueError):
-        return str(value)
+    return f"{value:.4g}" if isinstance(value, float | np.floating) else str(value)
 
 
 def _write(path: Path, data: bytes) -> None:
     with replacing(path) as file:
         file.write(data)
-
-
-def _slug(name: str) -> str:
-    """Return a name that is safe in file names."""
-    return re.sub(r"[^A-Za-z0-9.]+", "-", name).strip("-.").lower()

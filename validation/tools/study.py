@@ -7,6 +7,7 @@ it is given; ``report`` turns the result into a table on the terminal, ``summary
 from __future__ import annotations
 
 import gc
+import json
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ import numpy as np
 from mrt_mitsuba.rendering.progress import Progress
 
 Item = TypeVar("Item")
+Rows = Sequence[Sequence[Any]]
 
 
 @dataclass(frozen=True)
@@ -46,9 +48,9 @@ class Bound:
         return f"{self.verdict:<6} {self.name}: {self.measured:.4g} {self.sign} {self.limit:.4g}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return JSON-ready values."""
-        figures = {"measured": _plain(self.measured), "limit": _plain(self.limit)}
-        return {"name": self.name, **figures, "sense": self.sign, "holds": self.holds, "note": self.note}
+        """Return the values of ``summary.json``."""
+        figures = {"measured": self.measured, "limit": self.limit, "sense": self.sign}
+        return {"name": self.name, **figures, "holds": self.holds, "verdict": self.verdict, "note": self.note}
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class Table:
     name: str
     title: str
     columns: Sequence[str]
-    rows: Sequence[Sequence[Any]]
+    rows: Rows
     note: str = ""
     first: bool = False  # an answer: shown before the pictures
 
@@ -84,11 +86,6 @@ class Image:
     title: str
     content: Any
     caption: str = ""
-    exr: bool = False  # whether a picture, which is shown in sRGB, is written as EXR as well
-
-    @property
-    def is_plot(self) -> bool:
-        return not isinstance(self.content, np.ndarray)
 
 
 @dataclass
@@ -126,9 +123,9 @@ class Study:
         return {part.name: part for part in self.parts if isinstance(part, Table)}
 
     @property
-    def plots(self) -> dict[str, Any]:
-        """Return the figures."""
-        return {part.name: part.content for part in self.parts if isinstance(part, Image) and part.is_plot}
+    def images(self) -> dict[str, Image]:
+        """Return plots and pictures."""
+        return {part.name: part for part in self.parts if isinstance(part, Image)}
 
     def at_most(self, name: str, measured: float, limit: float, note: str) -> None:
         """Hold a figure to an upper bound; ``note``: why it is this one."""
@@ -153,15 +150,12 @@ class Study:
         name: str,
         title: str,
         columns: Sequence[str],
-        rows: Sequence[Sequence[Any]],
+        rows: Rows,
         note: str = "",
         *,
         first: bool = False,
     ) -> None:
         """Add a table; ``first``: before the pictures."""
-        wrong = [row for row in rows if len(row) != len(columns)]
-        if wrong:
-            raise ValueError(f"table {name}: {wrong[0]} does not fit the columns {columns}")
         self.parts.append(Table(name, title, columns, rows, note, first))
 
     def records(
@@ -174,11 +168,9 @@ class Study:
         """Add a matplotlib figure."""
         self.parts.append(Image(name, title, figure, caption))
 
-    def picture(
-        self, name: str, title: str, image: np.ndarray, caption: str = "", *, exr: bool = False
-    ) -> None:
+    def picture(self, name: str, title: str, image: np.ndarray, caption: str = "") -> None:
         """Add a linear picture [H, W, 3]."""
-        self.parts.append(Image(name, title, np.asarray(image, np.float32), caption, exr))
+        self.parts.append(Image(name, title, np.asarray(image, np.float32), caption))
 
     def text(self, paragraph: str) -> None:
         """Add a paragraph."""
@@ -192,27 +184,25 @@ class Study:
                 gc.collect()
                 advance(1)
 
-    def summary(self) -> Mapping[str, Any]:
-        """Return the study as JSON-ready values; numbers that JSON cannot hold become text."""
+    def summary(self) -> dict[str, Any]:
+        """Return the study as values that JSON can hold; infinite and undefined numbers become text."""
         tables = {
-            name: {
-                "title": table.title,
-                "columns": list(table.columns),
-                "rows": [[_plain(value) for value in row] for row in table.rows],
-            }
-            for name, table in self.tables.items()
+            t.name: {"title": t.title, "columns": t.columns, "rows": t.rows} for t in self.tables.values()
         }
-        return {
+        found = {
             "title": self.title,
             "bounds": [bound.as_dict() for bound in self.bounds],
-            "goals": [goal.as_dict() | {"verdict": goal.verdict} for goal in self.goals],
-            "figures": {name: _plain(value) for name, value in self.figures.items()},
+            "goals": [goal.as_dict() for goal in self.goals],
+            "figures": self.figures,
             "tables": tables,
             "passed": self.passed,
             "verdict": self.verdict,
             "failure": self.failure,
             "seconds": round(self.seconds, 2),
         }
+        text = json.dumps(found, default=lambda v: v.item() if isinstance(v, np.generic) else str(v))
+        values: dict[str, Any] = json.loads(text, parse_constant=str)
+        return values
 
 
 def findings(part: Callable[..., None], **options: Any) -> Study:
@@ -220,12 +210,3 @@ def findings(part: Callable[..., None], **options: Any) -> Study:
     study = Study("", "")
     part(study, **options)
     return study
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON holds it."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float):
-        return value if math.isfinite(value) else str(value)
-    return value if isinstance(value, (bool, int, str)) else str(value)
