@@ -162,7 +162,7 @@ def seams() -> str:
     steps = [mrt.render(3, **options, dof=dof).image for dof in ("report", "corrected")]
     return (
         f"scene 3, focus at 3, range 0.5: the two differ by {_rms(*steps):.1e} RMSE; against a real lens, "
-        "see the study `depth-of-field` of [validation](validation.md)"
+        "see the study `filters` of [validation](validation.md)"
     )
 
 

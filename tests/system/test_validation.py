@@ -24,14 +24,13 @@ from mrt_mitsuba.validation import cli
 from mrt_mitsuba.validation.oracles import filters as loops
 from mrt_mitsuba.validation.oracles.reference import reference_render
 from mrt_mitsuba.validation.studies import (
-    antialiasing,
-    depth_of_field,
     error_vs_time,
     roughconductor,
     scenes,
     speed,
     stock,
 )
+from mrt_mitsuba.validation.studies import filters as filter_study
 from mrt_mitsuba.validation.tools.precision import Point
 from mrt_mitsuba.validation.tools.scenery import with_materials
 from mrt_mitsuba.validation.tools.study import Study, findings
@@ -50,9 +49,9 @@ Fault = Callable[[Patch], None]
 def tiny(monkeypatch: Patch, variant: str, tmp_path: Path) -> None:
     """Let studies measure as little as shows whether their bounds hold."""
     monkeypatch.setattr(
-        antialiasing,
+        filter_study,
         "QUICK",
-        antialiasing.Extent((0,), (2, 4), 8, (80, 60), (64, 48, 1024), (60, 45), 8, (4, 16)),
+        filter_study.Extent((0,), (2, 4), 8, (80, 60), (64, 48, 1024), (60, 45, 8), (4, 16), (96, 72, 2, 12)),
     )
     trades = {"sampling": (0,), "whitted": (0,), "path": (0,)}
     tiny = error_vs_time.Extent((40, 30), (1, 4), 24, (1, 16), 256, trades, 1)
@@ -69,11 +68,13 @@ def quick(name: str) -> Study:
     """What a study, or a part of it as "study:part", finds."""
     module, _, part = name.partition(":")
     study = import_module(f"mrt_mitsuba.validation.studies.{module}")
+    if module == "filters" and part:
+        return findings(getattr(study, part), extent=study.QUICK)
     return findings(getattr(study, part or "run"), quick=True)
 
 
 # Laws, stability and adaptive have tests of their own; the pictures of roughconductor, see below
-PASSING = "roughconductor:pointwise roughconductor:metals stock scenes antialiasing depth_of_field exhaustive"
+PASSING = "roughconductor:pointwise roughconductor:metals stock scenes filters exhaustive"
 
 
 @pytest.mark.parametrize("name", [*PASSING.split(), "error_vs_time", "speed"])
@@ -234,14 +235,14 @@ def other_conductor(patch: Patch) -> None:
 
 
 FAULTS: list[tuple[str, Fault, str]] = [
-    ("antialiasing:modes", wrapped(mrt, "render", one_ray_too_many), "camera rays"),
-    ("antialiasing:modes", wrapped(mrt, "render", no_refinement), "error of sobel"),
+    ("filters:modes", wrapped(mrt, "render", one_ray_too_many), "camera rays"),
+    ("filters:modes", wrapped(mrt, "render", no_refinement), "error of sobel"),
     (
-        "antialiasing:noise",
+        "filters:noise",
         wrapped(filters, "sobel_edges", lambda sobel, image, variance=None: sobel(image)),
         "noise: share of",
     ),
-    ("depth_of_field", wrapped(filters, "gaussian_dof", moved_blur), "corrected / report"),
+    ("filters:depth_of_field", wrapped(filters, "gaussian_dof", moved_blur), "corrected / report"),
     (
         "error_vs_time",
         wrong_cases("sampling", lambda o: o | {"aa": 1} if o["aa"] == 4 else o),
@@ -367,7 +368,7 @@ def test_modes_are_those_of_the_tracer(number: int, aamodes: str) -> None:
             edges = getattr(loops, f"{aamode}_edges")(every[0]).mask
             assert 0.01 < edges.mean() < 0.95
         # grey levels are truncated: a picture off by one rounding may refine a few pixels more or less
-        same = antialiasing.refined_pixels(result) == edges
+        same = filter_study.refined_pixels(result) == edges
         assert np.mean(~same) <= 0.002
         truth = np.where(edges[..., None], every.mean(axis=0), every[0])
         error = np.abs(result.image - truth).max(axis=-1)[same]
@@ -390,8 +391,8 @@ def test_disc_has_the_variance_of_the_pascal_line() -> None:
         line = np.array([math.comb(2 * k - 1, j) for j in range(2 * k)], float)
         mean = np.average(np.arange(2 * k), weights=line)
         variance = np.average((np.arange(2 * k) - mean) ** 2, weights=line)
-        assert depth_of_field.disc_radius(np.array(float(k))) ** 2 / 4 == pytest.approx(variance)
-    assert depth_of_field.disc_radius(np.array(0.0)) == 0
+        assert filter_study.disc_radius(np.array(float(k))) ** 2 / 4 == pytest.approx(variance)
+    assert filter_study.disc_radius(np.array(0.0)) == 0
 
 
 def test_fit_finds_a_lens_that_is_there(monkeypatch: Patch) -> None:
@@ -400,8 +401,8 @@ def test_fit_finds_a_lens_that_is_there(monkeypatch: Patch) -> None:
     depth = np.linspace(1, 9, 200 * 150, dtype=np.float32).reshape(150, 200)
     scale = radius * 200 / (2 * math.tan(math.radians(scene.camera.hfov) / 2))
     discs = np.abs(scale * (1 / focus - 1 / depth.astype(float)))
-    monkeypatch.setattr(depth_of_field, "disc_radius", lambda amount: discs)
-    lens = depth_of_field.fit_lens(dataclasses.replace(scene, focal_distance=focus), depth)
+    monkeypatch.setattr(filter_study, "disc_radius", lambda amount: discs)
+    lens = filter_study.fit_lens(dataclasses.replace(scene, focal_distance=focus), depth)
     assert (lens["aperture_radius"], lens["focus_distance"]) == pytest.approx((radius, focus), rel=1e-6)
 
 
