@@ -43,36 +43,43 @@ def check_engine(cluster: Any, **numbers: Any) -> None:
 @contextmanager
 def connected(
     cluster: Any, jobs: int, workers: int | None, dashboard: int | None, variant: str
-) -> Iterator[tuple[Client, int]]:
-    """Give a client, and how many workers to wait for; see ``sweep``.
+) -> Iterator[Client]:
+    """Give a client whose workers are there; see ``sweep``.
 
     Workers of this machine, as many as there are jobs at most, end with the block. Raises ``ClusterError``
-    where no scheduler answers.
+    where no scheduler answers, or it has no worker.
     """
     from distributed import Client
 
-    if isinstance(cluster, Client):
-        yield cluster, 1
-        return
     with ExitStack() as stack:
         # Whoever asked for connections that break says so once
         for name in ("distributed", "distributed.client", "tornado.application"):
             logger = logging.getLogger(name)
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
-        count = 1
+        count, patience = 1, CONNECTING
         if cluster is None:
             devices = gpus() if variant.startswith("cuda") else []
-            count = workers or min(len(devices) or usable_cores(), jobs)
+            count, patience = workers or min(len(devices) or usable_cores(), jobs), STARTING
             cluster = stack.enter_context(_local(count, dashboard, devices))
+        client = cluster
+        if not isinstance(client, Client):
+            try:
+                client = stack.enter_context(Client(cluster, timeout=CONNECTING, set_as_default=False))
+            except (OSError, ValueError, TypeError) as error:
+                raise ClusterError(
+                    f"no scheduler answers at {cluster}: start one with 'dask scheduler' and give its "
+                    "address, such as tcp://host:8786"
+                ) from error
+        address = client.scheduler.address
         try:
-            client = stack.enter_context(Client(cluster, timeout=CONNECTING, set_as_default=False))
-        except (OSError, ValueError, TypeError) as error:
+            client.wait_for_workers(count, timeout=patience)
+        except TimeoutError as error:
             raise ClusterError(
-                f"no scheduler answers at {cluster}: start one with 'dask scheduler' and give its address, "
-                "such as tcp://host:8786"
+                f"the scheduler at {address} has no worker: start some with 'dask worker {address} "
+                "--nthreads 1'"
             ) from error
-        yield client, count
+        yield client
 
 
 def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
@@ -92,12 +99,14 @@ def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
         "silence_logs": logging.CRITICAL,
         "config": {"distributed.worker.profile.enabled": False},  # it stops a job 100 times a second
     }
+    kernels = {"DRJIT_CACHE_DIR": os.environ.get("DRJIT_CACHE_DIR", os.path.expanduser("~/.drjit"))}
     workers = {}
     for number in range(count):
         pinned = {"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]} if devices else {}
-        workers[number] = {"cls": SubprocessWorker, "options": {"worker_kwargs": options | {"env": pinned}}}
+        settings = {"worker_kwargs": options | {"env": kernels | pinned}}
+        workers[number] = {"cls": SubprocessWorker, "options": settings}
     scheduler = {
-        "allowed_failures": 0,  # jobs are handed over again by whoever knows which had begun
+        "allowed_failures": 0,  # a job that lost its worker is handed over again by ``sweep``
         "host": "127.0.0.1",
         "dashboard": dashboard is not None,
         "dashboard_address": f":{dashboard or 0}",
@@ -117,32 +126,24 @@ def gpus() -> list[str]:
     return [str(number) for number, _ in enumerate(listed.stdout.splitlines())]
 
 
-def inspect(client: Client, scratch: str, count: int, local: bool) -> dict[str, int]:
-    """Wait for so many workers and check them; return how many share cores, by ``worker.cores``.
+def inspect(client: Client, scratch: str) -> dict[str, int]:
+    """Check all workers; return how many share cores.
 
     Raises ``ClusterError`` or ``OutputError`` if they cannot be used.
     """
-    address = client.scheduler.address
-    try:
-        client.wait_for_workers(count, timeout=STARTING if local else CONNECTING)
-    except TimeoutError as error:
-        raise ClusterError(
-            f"the scheduler at {address} has no worker: start some with 'dask worker {address} --nthreads 1'"
-        ) from error
     here = worker.software()
     try:
-        found = client.run(worker.describe, scratch, local)
+        found = client.run(worker.describe, scratch)
     except Exception as error:  # whatever another Python or another version makes of it
         raise ClusterError(
-            f"the workers cannot run this mrt-mitsuba ({type(error).__name__}: {error}): install "
-            f"{worker.named(here)} there"
+            f"the workers cannot run this mrt-mitsuba ({type(error).__name__}: {error}): install {here} there"
         ) from error
     for name, facts in found.items():
         if not facts["sees"]:
             raise OutputError(f"the worker {name} cannot write to {scratch}: choose a folder that all share")
         if facts["software"] != here:
             raise ClusterError(
-                f"the worker {name} has {worker.named(facts['software'])} and this process "
-                f"{worker.named(here)}: install the same everywhere"
+                f"the worker {name} has {facts['software']} and this process {here}: install the same "
+                "everywhere"
             )
     return dict(Counter(facts["cores"] for facts in found.values()))

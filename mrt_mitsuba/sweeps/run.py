@@ -10,24 +10,13 @@ from concurrent.futures import CancelledError
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.errors import OutputError, one_line
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
-from mrt_mitsuba.runtime import versions
 from mrt_mitsuba.sweeps.cluster import ClusterError, check_engine, connected, inspect
-from mrt_mitsuba.sweeps.jobs import Job, jobs
-from mrt_mitsuba.sweeps.scenes import check_parameters, sent
+from mrt_mitsuba.sweeps.jobs import Job, check_parameters, jobs, sent
+from mrt_mitsuba.sweeps.pictures import check_tiles, cut, is_fresh, join, refuse_to_replace
 from mrt_mitsuba.sweeps.table import Table
-from mrt_mitsuba.sweeps.tiles import assemble, check_tiles, cut
-from mrt_mitsuba.sweeps.worker import (
-    Setting,
-    attempts,
-    endings,
-    is_fresh,
-    made_with,
-    named,
-    render_job,
-    software,
-)
+from mrt_mitsuba.sweeps.worker import Setting, attempts, render_job, software
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -93,54 +82,34 @@ def sweep(
     with TemporaryDirectory(prefix=".mrt-", dir=folder, ignore_cleanup_errors=True) as scratch:
         pictures = sent(planned, scratch)
         for job in pictures:
-            _refuse_to_replace(folder, job.name, job.file in table.earlier, png)
-        fresh = {job.name for job in pictures if resume and is_fresh(job, folder, png)}
-        rest = [job for job in pictures if job.name not in fresh]
+            refuse_to_replace(job, folder, job.file in table.earlier, png)
+        rest = [job for job in pictures if not (resume and is_fresh(job, folder, png))]
         parts = {job.name: cut(job, tiles) if tiles else [job] for job in rest}
         new = list(itertools.chain(*parts.values()))
         if tiles:
             for tile in new:
-                _refuse_to_replace(folder, tile.name, False, False)
+                refuse_to_replace(tile, folder)
             new = [tile for tile in new if not (resume and is_fresh(tile, folder))]
-        here = {"error": "", "versions": named(versions())}
         for job in pictures:
-            if job.name in fresh:
-                table.add(job.name, table.earlier.get(job.file, {}) | {"file": job.file} | here)
-        if not rest:
-            table.write()
-            return table
-        from distributed.client import ClosedClientError
+            if job.name not in parts:
+                known = table.earlier.get(job.file, {})
+                table.add(job.name, known | {"file": job.file, "error": "", "versions": software()})
+        if rest:
+            from distributed.client import ClosedClientError
 
-        variant, most = options.get("variant") or "", max(1, len(new))
-        with connected(cluster, most, workers, dashboard, variant) as (client, count):
-            check_parameters(planned)  # while workers start
-            local = cluster is None
-            sharing = inspect(client, scratch, count, local)
-            setting = Setting(folder, scratch, png, software(), local, sharing)
-            table.write()
-            try:
-                _render(client, setting, retries, parts, rest, new, table, shown)
-            except (CancelledError, ClosedClientError, OSError) as error:
-                raise ClusterError(
-                    "the scheduler is gone: start it and its workers, then run the same sweep again; "
-                    "it continues"
-                ) from error
+            check_parameters(planned)
+            variant, most = options.get("variant") or "", max(1, len(new))
+            with connected(cluster, most, workers, dashboard, variant) as client:
+                setting = Setting(folder, scratch, png, software(), inspect(client, scratch))
+                try:
+                    _render(client, setting, retries, parts, rest, new, table, shown)
+                except (CancelledError, ClosedClientError, OSError) as error:
+                    raise ClusterError(
+                        "the scheduler is gone: start it and its workers, then run the same sweep again; "
+                        "it continues"
+                    ) from error
+        table.write()
     return table
-
-
-def _refuse_to_replace(folder: str, name: str, listed: bool, png: bool) -> None:
-    """Raise ``OutputError`` for a file of the user's own under the name of a picture.
-
-    A sweep's own has a mark in its header or, where that is broken, a row in the table (``listed``).
-    """
-    for ending in endings(png):
-        path = os.path.join(folder, f"{name}.{ending}")
-        found = made_with(path)
-        if os.path.lexists(path) and not (found or (found is None and listed and os.path.isfile(path))):
-            raise OutputError(
-                f"{path} was not made by a sweep, which would replace it: move it away, or choose "
-                "another folder"
-            )
 
 
 def _render(
@@ -153,66 +122,82 @@ def _render(
     table: Table,
     shown: Progress,
 ) -> None:
-    """Let workers render pictures, or their tiles (``parts``, by the picture's name) and put these together;
-    each picture's row goes into the table as it ends. ``new``: parts that no earlier sweep left."""
+    """Let workers render pictures, or their tiles (``parts``, by the picture's name), which are put together
+    here; each picture's row goes into the table as it ends. ``new``: parts that no earlier sweep left."""
     from distributed import KilledWorker, as_completed
 
-    calls: dict[Future, tuple[Any, ...]] = {}
-    deaths: Counter[str] = Counter()
+    calls: dict[Future, Job] = {}
+    handed: Counter[str] = Counter()
     coming = as_completed(loop=client.loop)
     made: dict[str, dict[str, Any]] = {}
-    whole = {part.name: job for job in rest for part in parts[job.name]}
-    left = Counter(whole[part.name].name for part in new)
 
-    def hand_over(function: Any, job: Job, *more: Any) -> None:
-        key = (os.path.basename(setting.scratch), f"{job.name} {function.__name__} {deaths[job.name]}")
-        spare = max(0, retries - attempts(job.name, setting))
-        future = client.submit(function, job, *more, setting, key=key, retries=spare, pure=False)
-        calls[future] = function, job, *more
+    def hand_over(part: Job) -> None:
+        handed[part.name] += 1
+        key = f"{os.path.basename(setting.scratch)} {part.name} {handed[part.name]}"
+        future = client.submit(render_job, part, setting, key=key, pure=False)
+        calls[future] = part
         coming.add(future)
 
-    def outcome(future: Future) -> tuple[Job, dict[str, Any] | None]:
-        """Facts by the job's own account or the engine's. This holds a worker's death against all jobs that
-        the worker had been given: those not begun too often are handed over again, and have no facts."""
-        function, job, *more = calls.pop(future)
-        error = future.exception() if future.status == "error" else None
-        if error is None:
-            return job, dict(future.result())
-        if not isinstance(error, KilledWorker):
-            return job, {"error": " ".join(f"{type(error).__name__}: {error}".split())}
-        deaths[job.name] += 1
-        if attempts(job.name, setting) <= retries and deaths[job.name] < MOST_DEATHS:
-            hand_over(function, job, *more)
-            return job, None
-        text = "every worker that rendered it died, perhaps for want of memory: give each worker more"
-        return job, {"error": text}
+    def ended(job: Job) -> None:
+        own = parts[job.name]
+        facts = (
+            made[job.name]
+            if own == [job]
+            else _join(job, own, [made.get(tile.name) for tile in own], setting)
+        )
+        begun = max(1, *(attempts(part, setting) for part in own))
+        table.add(job.name, facts | {"attempts": begun, "versions": setting.software})
 
-    def ended(job: Job, facts: dict[str, Any]) -> None:
-        picture = whole.get(job.name, job)
-        if picture is job:
-            begun = max(1, *(attempts(part.name, setting) for part in parts[job.name]))
-            table.add(job.name, facts | {"attempts": begun, "versions": named(versions())})
-            return
-        made[job.name] = facts
-        left[picture.name] -= 1
-        if not left[picture.name]:
-            tiles = parts[picture.name]
-            hand_over(assemble, picture, tiles, [made.get(tile.name) for tile in tiles])
-
+    picture = {part.name: job for job in rest for part in parts[job.name]}
+    left = Counter(picture[part.name].name for part in new)
     try:
-        with shown.stage("Sweep", len(new) + sum(job.name not in whole for job in rest)) as advance:
+        with shown.stage("Sweep", len(new)) as advance:
             for part in new:
-                hand_over(render_job, part)
+                hand_over(part)
             for job in rest:
                 if not left[job.name]:
-                    hand_over(assemble, job, parts[job.name], [None])
+                    ended(job)
             for future in coming:
-                job, facts = outcome(future)
-                if facts is not None:
-                    ended(job, facts)
-                    advance(1)
-                    future.release()  # what no one needs is not computed again when its worker goes
+                part = calls.pop(future)
+                if future.status == "error":
+                    # The engine holds a worker's death against all jobs that the worker had been given
+                    if attempts(part, setting) <= retries and handed[part.name] < retries + MOST_DEATHS:
+                        hand_over(part)
+                        continue
+                    error = future.exception()
+                    text = one_line(f"{type(error).__name__}: {error}")
+                    if isinstance(error, KilledWorker):
+                        text = (
+                            "every worker that rendered it died, perhaps for want of memory: give each more"
+                        )
+                    made[part.name] = {"error": text}
+                else:
+                    made[part.name] = future.result()
+                future.release()  # what no one needs is not computed again when its worker goes
+                job = picture[part.name]
+                left[job.name] -= 1
+                if not left[job.name]:
+                    ended(job)
+                advance(1)
     finally:
         table.write()
         if client.status == "running":
             client.cancel(list(calls))
+
+
+def _join(
+    job: Job, tiles: Sequence[Job], found: Sequence[Mapping[str, Any] | None], setting: Setting
+) -> dict[str, Any]:
+    """Put a picture together from its tiles; return its facts, given those of new tiles."""
+    errors = [facts["error"] for facts in found if facts and "error" in facts]
+    if not errors:
+        try:
+            join(job, tiles, setting.folder, setting.scratch)
+        except OutputError as error:
+            errors = [str(error)]
+    if errors:
+        return {"error": errors[0]}
+    facts: dict[str, Any] = {"file": job.file}
+    for name in ("seconds", "rays"):  # unknown of tiles that an earlier sweep made
+        facts[name] = sum(tile[name] for tile in found if tile) if all(found) else None
+    return facts

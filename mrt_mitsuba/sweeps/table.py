@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mrt_mitsuba.errors import OutputError
@@ -36,7 +37,7 @@ class Table:
     Raises ``OutputError`` for a ``table.csv`` that no sweep made, or that cannot be written.
     """
 
-    def __init__(self, folder: str, keys: tuple[str, ...], jobs: list[Job]) -> None:
+    def __init__(self, folder: str, keys: tuple[str, ...], jobs: Sequence[Job]) -> None:
         self.folder, self.keys = folder, keys
         self._parameters = {job.name: job.parameters for job in jobs}
         self._ended: dict[str, dict[str, Any]] = {}
@@ -68,8 +69,13 @@ class Table:
 
     def add(self, name: str, facts: Mapping[str, Any]) -> None:
         """Add the row of a job that ended; the file follows once in a while."""
-        row = dict.fromkeys(FACTS) | {"file": "", "error": ""} | dict(facts)
-        self._ended[name] = {**self._parameters[name], **row}
+        self._ended[name] = {
+            **self._parameters[name],
+            **dict.fromkeys(FACTS),
+            "file": "",
+            "error": "",
+            **facts,
+        }
         if time.monotonic() > self._written + PAUSE:
             self.write()
 
@@ -78,7 +84,14 @@ class Table:
         text = io.StringIO()
         writer = csv.DictWriter(text, (*self.keys, *FACTS), lineterminator="\n")
         writer.writeheader()
-        writer.writerows({key: _cell(value) for key, value in row.items()} for row in self.rows)
+        for row in self.rows:
+            cells = {key: value for key, value in row.items() if isinstance(value, str | float | int | None)}
+            for key in row.keys() - cells.keys():
+                value = row[key]
+                cells[key] = (
+                    json.dumps(value, default=word) if isinstance(value, list | tuple) else word(value)
+                )
+            writer.writerow(cells)
         with replacing(self._path) as file:
             file.write(text.getvalue().encode())
         self._written = time.monotonic()
@@ -86,30 +99,22 @@ class Table:
 
 def _read(path: str) -> dict[str, dict[str, Any]]:
     """Return the facts of an earlier table by the name of the file."""
-    rows: list[Mapping[str, str]] = []
-    columns: list[str] = list(FACTS)
-    try:
-        with open(path, encoding="utf-8", newline="") as file:
-            reader = csv.DictReader(file)
-            rows, columns = list(reader), list(reader.fieldnames or [])
-    except FileNotFoundError:
+    if not os.path.exists(path):
         return {}
-    except (OSError, UnicodeDecodeError, csv.Error):
-        columns = []
-    if columns[-len(FACTS) :] != list(FACTS):
+    rows: list[dict[str, str]] = []
+    columns: Sequence[str] = ()
+    with (
+        contextlib.suppress(OSError, UnicodeDecodeError, csv.Error),
+        open(path, encoding="utf-8", newline="") as file,
+    ):
+        reader = csv.DictReader(file)
+        rows, columns = list(reader), reader.fieldnames or ()
+    if tuple(columns[-len(FACTS) :]) != tuple(FACTS):
         raise OutputError(f"{path} is not the table of a sweep: move it away, or choose another folder")
     found: dict[str, dict[str, Any]] = {}
     for row in rows:
         facts = found.setdefault(row["file"], {})
         for name, kind in FACTS.items():
-            try:
+            with contextlib.suppress(ValueError, TypeError):
                 facts[name] = kind(row[name])
-            except (ValueError, TypeError):
-                facts[name] = None
     return found
-
-
-def _cell(value: Any) -> Any:
-    if isinstance(value, list | tuple):
-        return json.dumps(value, default=word)
-    return value if isinstance(value, str | float | int | None) else word(value)

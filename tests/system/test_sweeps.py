@@ -306,11 +306,11 @@ def test_frames_are_numbered_for_films(address: str, tmp_path: Path) -> None:
         ({"material_0.alpa": [0.1]}, {}, "no parameter material_0.alpa: did you mean material_0.alpha?"),
         ({"material_0.alpha": ["rough"]}, {}, "material_0.alpha='rough': must be a Float"),
         ({"material_0.alpha": [0.1, float("nan")]}, {}, "material_0.alpha=nan: give finite numbers"),
-        ({"scene": [1]}, {"scene": 3}, "the scene is given twice"),
+        ({"scene": [1]}, {"scene": 3}, "scene is given twice"),
         ({"scene": [99]}, {"scene": None}, "99"),
         ({"scene": ["none.xml"]}, {"scene": None}, "cannot read none.xml"),
         ({"aa": [1, 2], "seed": [1]}, {"zipped": True}, "zipped axes must be of one length"),
-        ({"integrator": [object()]}, {}, "cannot be sent"),
+        ({"integrator": [lambda: 0]}, {}, "cannot be sent"),
         ({}, {"progres": 1}, "progres is not an option of render"),
         ({}, {"width": 0}, "width=0: must be"),
         ({}, {"tiles": (2, 2), "png": True}, "leave out png"),
@@ -334,7 +334,7 @@ def test_a_broken_grid_is_refused_before_anything_is_rendered(
 def test_a_loaded_scene_cannot_leave_its_process(tmp_path: Path, variant: str) -> None:
     import mitsuba as mi
 
-    with pytest.raises(UsageError, match="the scene cannot be sent to other processes"):
+    with pytest.raises(UsageError, match=r"cannot be sent to others.*: give the scene as a number"):
         mrt.sweep(mi.load_dict(mrt.scene_dict(0)), tmp_path)
 
 
@@ -488,8 +488,7 @@ def test_a_gpu_is_pinned_to_each_worker(tmp_path: Path, monkeypatch: pytest.Monk
     from mrt_mitsuba.sweeps.cluster import connected
 
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,GPU-7")
-    with connected(None, 9, None, None, "cuda_ad_rgb") as (client, count):
-        client.wait_for_workers(count, timeout=PATIENCE)
+    with connected(None, 9, None, None, "cuda_ad_rgb") as client:
         found = client.run(os.getenv, "CUDA_VISIBLE_DEVICES")
     assert sorted(found.values()) == ["5", "GPU-7"]
 

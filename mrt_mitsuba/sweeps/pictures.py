@@ -1,0 +1,172 @@
+"""The pictures of a sweep: which are its own and whole, and how those cut into tiles become one file.
+
+A tile is a region of the picture in a file of its own, with the pixels that the whole picture has there. The
+picture is written some rows at a time, so that no process ever holds it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+from mrt_mitsuba.errors import OutputError, UsageError
+from mrt_mitsuba.sweeps.jobs import Job, fingerprint
+
+MADE_WITH = "mrt:sweep"  # in the header of each picture: fingerprint of scene, settings and versions
+ROWS = 64  # of a picture, read at a time; a multiple of the 16 that are compressed together
+# Memory for a tile, unless the caller says: what is kept of a pixel is 84 bytes at most
+BYTES_PER_PIXEL = 128
+LEAST_MEMORY = 2**27
+
+
+def endings(png: bool) -> tuple[str, ...]:
+    """Return the kinds of files that a job leaves."""
+    return ("exr", "png") if png else ("exr",)
+
+
+def made_with(path: str, whole: bool = False) -> str | None:
+    """Return the fingerprint in a picture that a sweep made, "" in any other; None for what is no picture,
+    or, if that is asked for, no ``whole`` one."""
+    import OpenEXR
+    from PIL import Image
+
+    from mrt_mitsuba.output.files import silenced
+
+    if not os.path.isfile(path):
+        return None
+    try:
+        if path.endswith(".png"):
+            with Image.open(path) as picture:
+                if whole:
+                    picture.load()
+                return str(picture.info.get(MADE_WITH, ""))
+        with silenced():
+            found = str(OpenEXR.File(path, header_only=True).header().get(MADE_WITH, ""))
+            if whole and found:
+                for _ in _strips(OpenEXR.InputFile(path)):
+                    pass
+            return found
+    except (OSError, RuntimeError, ValueError, TypeError, SyntaxError):  # what libraries raise for files
+        return None
+
+
+def is_fresh(job: Job, folder: str, png: bool = False) -> bool:
+    """Return whether a picture is there, whole, and made with the same scene, settings and versions."""
+    path = os.path.join(folder, job.name)
+    return all(made_with(f"{path}.{ending}", whole=True) == job.made_with for ending in endings(png))
+
+
+def refuse_to_replace(job: Job, folder: str, listed: bool = False, png: bool = False) -> None:
+    """Raise ``OutputError`` for a file of the user's own under the name of a picture.
+
+    A sweep's own has a mark in its header or, where that is broken, a row in the table (``listed``).
+    """
+    for ending in endings(png):
+        path = os.path.join(folder, f"{job.name}.{ending}")
+        found = made_with(path)
+        if os.path.lexists(path) and not (found or (found is None and listed and os.path.isfile(path))):
+            raise OutputError(
+                f"{path} was not made by a sweep, which would replace it: move it away, or choose "
+                "another folder"
+            )
+
+
+def check_tiles(tiles: Any, png: bool, jobs: Sequence[Job]) -> None:
+    """Raise ``UsageError`` for numbers of rows and columns, or for jobs, that cannot be cut into tiles."""
+    pair = isinstance(tiles, list | tuple) and [type(number) for number in tiles] == [int, int]
+    if not (pair and min(tiles) > 0):
+        raise UsageError(f"tiles={tiles!r}: give rows and columns, such as (4, 4)")
+    if png:
+        raise UsageError("tiles: pictures in tiles are written as EXR only; leave out png")
+    if any(job.arguments.get("target") or job.arguments.get("aamode") == "noise" for job in jobs):
+        raise UsageError("tiles: target and aamode=noise share the rays out over the whole picture")
+
+
+def cut(job: Job, tiles: tuple[int, int]) -> list[Job]:
+    """Return the jobs of a picture's tiles, row by row, each with a file in a folder named after the picture.
+
+    Raises ``UsageError`` if the picture has too few pixels.
+    """
+    width, height = job.arguments.get("width"), job.arguments.get("height")
+    if not (width and height):  # only the scene knows
+        from mrt_mitsuba import runtime
+        from mrt_mitsuba.scene.open import open_scene
+        from mrt_mitsuba.sweeps.jobs import receive
+
+        runtime.use()
+        source = open_scene(receive(job.scene), size=(width, height))
+        width, height = source.width, source.height
+    rows, columns = tiles
+    if rows > height or columns > width:
+        raise UsageError(f"tiles={tiles}: a picture of {width}x{height} pixels has fewer rows or columns")
+    found = []
+    for row, column in itertools.product(range(rows), range(columns)):
+        left, right = (width * number // columns for number in (column, column + 1))
+        top, bottom = (height * number // rows for number in (row, row + 1))
+        region = (left, top, right - left, bottom - top)
+        memory = max(LEAST_MEMORY, BYTES_PER_PIXEL * region[2] * region[3])
+        arguments = {"memory": memory, **job.arguments, "region": region}
+        name, made = f"{job.name}.tiles/{row},{column}", fingerprint(job.made_with, region)
+        found.append(replace(job, name=name, arguments=arguments, made_with=made))
+    return found
+
+
+def join(job: Job, tiles: Sequence[Job], folder: str, scratch: str) -> None:
+    """Write a picture from its tiles, and remove these; raise ``OutputError`` where that fails."""
+    own, path = os.path.join(folder, f"{job.name}.tiles"), os.path.join(scratch, job.file)
+    try:
+        _write_rows(job, tiles, folder, path)
+        os.replace(path, os.path.join(folder, job.file))
+        for tile in (os.path.join(own, name) for name in os.listdir(own)):
+            if made_with(tile):  # also those of another number of tiles
+                os.unlink(tile)
+        with contextlib.suppress(OSError):  # something of the user's own is in there
+            os.rmdir(own)
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"cannot put {job.name} together: {error}") from error
+
+
+def _write_rows(job: Job, tiles: Sequence[Job], folder: str, path: str) -> None:
+    import numpy as np
+    import OpenEXR
+
+    from mrt_mitsuba.output.files import compressing, compression
+
+    files = [OpenEXR.InputFile(os.path.join(folder, tile.file)) for tile in tiles]
+    regions = [tile.arguments["region"] for tile in tiles]
+    own, (left, top, wide, high) = files[0].header(), regions[-1]
+    header: dict[str, Any] = OpenEXR.Header(left + wide, top + high)
+    kind = compression((left + wide) * (top + high))
+    header["compression"] = type(header["compression"])(int(kind))  # an older type of the library
+    header |= {name: value for name, value in own.items() if name not in header and name != "type"}
+    options = {name: value for name, value in json.loads(own["mrt:options"]).items() if name != "region"}
+    header["channels"] = own["channels"]
+    header["mrt:options"] = json.dumps(options).encode()
+    header[MADE_WITH] = job.made_with.encode()
+    columns = [region[1] for region in regions].count(0)  # those in the first row
+    with compressing(), contextlib.closing(OpenEXR.OutputFile(path, header)) as picture:
+        for first in range(0, len(files), columns):
+            for parts in zip(*map(_strips, files[first : first + columns]), strict=True):
+                planes, rows = {}, 0
+                for name in header["channels"]:
+                    blocks = [np.frombuffer(part[name], np.float32) for part in parts]
+                    rows = len(blocks[0]) // regions[first][2]
+                    planes[name] = np.hstack([block.reshape(rows, -1) for block in blocks]).tobytes()
+                picture.writePixels(planes, rows)
+    # The library does not report a full disk: read the last row, and let the file reach the disk
+    OpenEXR.InputFile(path).channel("R", scanLine1=top + high - 1, scanLine2=top + high - 1)
+    with open(path, "rb") as file:
+        os.fsync(file.fileno())
+
+
+def _strips(file: Any) -> Iterator[dict[str, bytes]]:
+    """Yield the channels of an EXR, ``ROWS`` rows at a time."""
+    channels, height = list(file.header()["channels"]), file.header()["dataWindow"].max.y + 1
+    for top in range(0, height, ROWS):
+        bottom = min(top + ROWS, height) - 1
+        yield dict(zip(channels, file.channels(channels, scanLine1=top, scanLine2=bottom), strict=True))
