@@ -78,21 +78,27 @@ def tail_shape(values: np.ndarray, counts: np.ndarray) -> float:
 
 
 def exceedance(values: np.ndarray) -> float:
-    """Return the probability that the largest of some values is as large as it is, given their tail."""
-    ordered = np.sort(values[values > 0], axis=None)
+    """Return the probability that the largest of some values is as far above the others as it is.
+
+    Over a threshold, a Pareto law that all but the largest decide makes their squares exponential, and gaps
+    between ordered exponential values, each times its rank, are independent and alike (A. Rényi, 1953).
+    """
+    ordered = np.sort(np.square(values[values > 0]), axis=None)[::-1]
     size = int(min(0.2 * ordered.size, 3 * math.sqrt(ordered.size)))
-    if size < FEWEST or ordered[-size - 1] == ordered[-1]:
+    if size < FEWEST or ordered[0] == ordered[size]:
         return 1.0
-    excess = ordered[-size:] - ordered[-size - 1]
-    shape, scale = _pareto(excess)
-    beyond = max(1 + shape * excess[-1] / scale, 0) ** (-1 / shape)
-    return float(-np.expm1(-size * beyond))
+    excess = ordered[:size] - ordered[size]
+    shape, scale = _pareto(excess[:0:-1], 0)
+    shape = max(shape, 1e-3)
+    level = np.append(np.log1p(shape * excess / scale) / shape, 0)
+    gaps = -np.diff(level) * np.arange(1, size + 1)
+    return float((1 + gaps[0] / gaps[1:].sum()) ** (1 - size))
 
 
-def _pareto(excess: np.ndarray) -> tuple[float, float]:
+def _pareto(excess: np.ndarray, usual: float = 0.5) -> tuple[float, float]:
     """Return shape and scale of a generalised Pareto distribution, given what exceeds a threshold.
 
-    The fit of J. Zhang and M. Stephens (Technometrics 2009), drawn to a shape of 1/2 as by ten values.
+    The fit of J. Zhang and M. Stephens (Technometrics 2009), drawn to the usual shape as by ten values.
     """
     size, most = len(excess), excess[-1]
     grid = 30 + math.isqrt(size)
@@ -102,4 +108,4 @@ def _pareto(excess: np.ndarray) -> tuple[float, float]:
     likelihood = size * (np.log(-slope / shape) - shape - 1)
     best = float(np.average(slope, weights=np.exp(likelihood - likelihood.max())))
     total = float(np.log1p(-best * excess).sum())
-    return (total + 10 * 0.5) / (size + 10), -total / size / best
+    return (total + 10 * usual) / (size + 10), -total / size / best

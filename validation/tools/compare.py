@@ -17,12 +17,14 @@ from mrt_mitsuba.output.error import exceedance
 from mrt_mitsuba.output.files import read_channels, write_exr, write_png
 from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.result import Result
-from mrt_mitsuba.validation.tools.image_tests import EPSILON, ROUNDING, cell_sums, sidak
+from mrt_mitsuba.validation.tools.image_tests import EPSILON, ROUNDING, cell_sums
 
 ORDER = {letter: index for index, letter in enumerate("RGBXYZUVA")}  # of channels within a layer
 # What may stand next to a picture and says how well it is known: the layer, and its power of the deviation
 SPREADS = {"error": 2, "variance": 1}
 CELL = 16  # pixels, a side of the cells whose means are compared
+BLOCKS = 64  # at most, along a side of the picture, whose signs are changed at a time
+FLIPS, TAIL = 500, 25  # changes of the signs, and how many of the largest results tell an exponential law
 MEASURES = ("mae", "rmse", "rel_mse", "psnr", "largest", "flip", "p_value")
 # Why a measure may be None
 UNDEFINED = {
@@ -206,9 +208,9 @@ def _layer_of(channels: Mapping[str, np.ndarray], headers: Mapping[str, Any], la
 def _p_value(sides: Sequence[Layer]) -> float | None:
     """Return the probability of so much difference by noise, of the mean of channels.
 
-    Cells and the whole picture by Student's test, which takes the noise from the differences themselves:
-    that of a few very bright rays makes it careful, not wrong. Single pixels by how the largest difference
-    over its deviation continues the tail of the others.
+    Uniform for equal pictures of equal noise. Means over cells are tested by the signs of differences alone,
+    which is exact; how the largest difference over its deviation continues the tail of the others is nearly
+    so, depends on sizes alone, and has a tenth of the level.
     """
     if all(side.variance is None for side in sides):
         return None
@@ -218,19 +220,35 @@ def _p_value(sides: Sequence[Layer]) -> float | None:
     rounding = ROUNDING * (brightness + brightness.mean())
     difference = values[0] - values[1]
     difference -= np.clip(difference, -rounding, rounding)
-    cells = [_p_of_means(difference, size) for size in (CELL, max(difference.shape))]
     pixels = exceedance(np.abs(difference) / np.sqrt(variance + rounding**2 + 1e-300))
-    return sidak(min(*cells, pixels), 3)
+    least = min(_p_of_means(difference) / 0.9, pixels / 0.1)
+    return float(-np.expm1(np.log1p(-min(0.9 * least, 1 - 1e-15)) + np.log1p(-0.1 * least)))
 
 
-def _p_of_means(difference: np.ndarray, size: int) -> float:
-    """Return the probability of the differences [H, W] between equal pictures, by Student's test of the means
-    over cells of ``size`` × ``size`` pixels, whose noise is independent and as often positive as negative."""
+def _p_of_means(difference: np.ndarray) -> float:
+    """Return the probability of the means of differences [H, W] between equal pictures, over cells and all.
+
+    Their noise is as often positive as negative, whatever its law. So the least p value of Student's test is
+    compared with those after random changes of sign of blocks of pixels; where it is among the least of
+    these, with the exponential law that their logarithms continue.
+    """
     from scipy import stats
 
-    values = np.stack([np.ones_like(difference), difference, difference**2], axis=-1)
-    count, total, square = np.moveaxis(cell_sums(values, size), -1, 0)
-    spread = np.sqrt(np.maximum(count * square - total**2, 0) / np.maximum(count - 1, 1))
-    t = np.divide(total, spread, out=np.where(total == 0, 0, np.inf), where=spread > 0)
-    p = 2 * stats.t.sf(np.abs(t), count - 1)[(count > 1) & (square > 0)]
-    return sidak(float(p.min(initial=1)), p.size)
+    side = -(-max(difference.shape) // BLOCKS)
+    count, square, blocks = (
+        cell_sums(v[None, ..., None], side) for v in (np.ones_like(difference), difference**2, difference)
+    )
+    signs = np.random.default_rng(0).integers(2, size=(FLIPS, *blocks.shape[1:])) * 2.0 - 1
+    blocks, least = np.concatenate([blocks, signs * blocks]), np.inf
+    for size in (max(CELL // side, CELL // 2), BLOCKS):
+        pixels, squares, totals = (cell_sums(v, size) for v in (count, square, blocks))
+        share = np.minimum(totals**2 / np.maximum(squares * pixels, 1e-300), 1 - 1e-15)
+        t = np.sqrt((pixels - 1) * share / (1 - share)).max((1, 2, 3))
+        p = 2 * stats.t.sf(t, max(pixels.max() - 1, 1))
+        least = np.minimum(least, p * max(np.count_nonzero(squares), 1))
+    surprise = -np.log(least + 1e-300)
+    others = np.sort(surprise[1:])[::-1]
+    tail = others[:TAIL] - others[TAIL]
+    if surprise[0] > others[TAIL] and tail.any():
+        return float(TAIL / FLIPS * np.exp((others[TAIL] - surprise[0]) / tail.mean()))
+    return float(np.mean(others >= surprise[0]))
