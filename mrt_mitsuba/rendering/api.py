@@ -98,7 +98,7 @@ def render(
             whose rays are spread over the time while the shutter is open, ``motionsamples`` or more in a
             pixel.
         convention: meaning of MTL files, "report" or "standard".
-        texturing, camera, up, fov, light: of an OBJ file, see ``scene.placement.model_scene``.
+        texturing, camera, up, fov, light: of an OBJ file, see ``scene.obj.model_scene``.
         sensor: number of the sensor in a scene that has several.
         variant: Mitsuba variant; by default the current one, else ``llvm_ad_rgb``.
         memory: bytes (or text such as "4G") to stay within.

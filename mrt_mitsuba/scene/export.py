@@ -67,7 +67,7 @@ def write_xml(
     from mrt_mitsuba.memory import Budget
     from mrt_mitsuba.output.replacing import replacing_together
     from mrt_mitsuba.scene.loading import rewrite_file
-    from mrt_mitsuba.scene.placement import model_scene
+    from mrt_mitsuba.scene.obj import model_scene
 
     check_model_options(scene, model)
     files: dict[str, bytes] = {}  # of shapes, by their paths

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import io
 import math
 import os
+import re
 import stat
 import warnings
 from collections.abc import Mapping
@@ -19,14 +21,15 @@ MISSING = "is missing or may not be read in"  # what messages say about a file t
 def require_file(path: str | os.PathLike[str]) -> None:
     """Raise ``SceneError`` unless ``path`` is a file that may be read. Pipes and devices have no end to wait
     for."""
-    name, problem = os.fspath(path), ""
+    name = os.fspath(path)
     try:
         mode = os.stat(path).st_mode
+        if stat.S_ISREG(mode) and os.access(path, os.R_OK):
+            return
+        problem = "it is not a regular file; copy its content into one"
         if stat.S_ISDIR(mode):
             problem = "it is a folder; name a file in it"
-        elif not stat.S_ISREG(mode):
-            problem = "it is not a regular file; copy its content into one"
-        elif not os.access(path, os.R_OK):
+        elif stat.S_ISREG(mode):
             problem = f"permission denied; try chmod +r {name}"
     except (FileNotFoundError, NotADirectoryError):
         problem = f"there is no such file in {os.path.dirname(os.path.abspath(name))}"
@@ -35,8 +38,7 @@ def require_file(path: str | os.PathLike[str]) -> None:
     except OSError as error:
         circle = error.errno == errno.ELOOP
         problem = "its symbolic links lead in a circle" if circle else error.strerror or str(error)
-    if problem:
-        raise SceneError(f"cannot read {name or repr(name)}: {problem}")
+    raise SceneError(f"cannot read {name or repr(name)}: {problem}")
 
 
 def read_text(path: Path) -> bytes:
@@ -52,9 +54,8 @@ def read_text(path: Path) -> bytes:
         raise SceneError(f"cannot read {path}: {error.strerror or error}") from None
     if b"\0" in data:
         raise SceneError(f"{path}: is not a text file (it holds a zero byte); export it as OBJ or MTL text")
-    if b"\r" in data:
-        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    first, *others = data.removeprefix(b"\xef\xbb\xbf").split(b"\\\n")
+    data = re.sub(rb"\r\n?", b"\n", data).removeprefix(b"\xef\xbb\xbf")
+    first, *others = data.split(b"\\\n")
     parts, owed = [first], 0
     for part in others:
         rest, newline, following = part.partition(b"\n")
@@ -63,17 +64,11 @@ def read_text(path: Path) -> bytes:
         if newline:
             parts += [b"\n" * (owed + 1), following]
             owed = 0
-    data = b"".join([*parts, b"\n" * owed])
-    if not data.endswith(b"\n"):
-        data += b"\n"
-    step = LONGEST_LINE // 2
-    for middle in range(0, len(data), step):
-        if data.find(b"\n", middle, middle + step) < 0:  # only long lines hold a whole step
-            start, end = data.rfind(b"\n", 0, middle) + 1, data.find(b"\n", middle)
-            if end - start > LONGEST_LINE:
-                number = data.count(b"\n", 0, start) + 1
-                text = f"a line of {end - start} bytes; at most {LONGEST_LINE} are read"
-                raise SceneError(f"{path}:{number}: {text}")
+    data = b"".join([*parts, b"\n" * (owed + 1)])
+    longest = max(io.BytesIO(data), key=len).removesuffix(b"\n")
+    if len(longest) > LONGEST_LINE:
+        number = data.count(b"\n", 0, data.find(longest)) + 1
+        raise SceneError(f"{path}:{number}: a line of {len(longest)} bytes; at most {LONGEST_LINE} are read")
     return data
 
 
@@ -108,14 +103,12 @@ def picture_size(path: str) -> tuple[int, int] | None:
             if file.read(4) == b"\x76\x2f\x31\x01":
                 low, high = OpenEXR.File(path, header_only=True).header()["dataWindow"]
                 return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-            try:
-                with Image.open(path) as picture:
-                    return picture.size
-            finally:
-                Image.MAX_IMAGE_PIXELS = limit
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            with Image.open(path) as picture:
+                return picture.size
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
     except Exception:  # whatever libraries raise on broken files; reading the pixels reports it
         return None
 

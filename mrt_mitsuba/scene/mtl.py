@@ -20,18 +20,8 @@ DEFAULT_MATERIAL = Material(
     ior=1.1022, alpha=0.0579, specular=(0.286, 0.235, 0.128), diffuse=(1.0, 0.766, 0.762)
 )
 
-# What exporters write of statements that are not used, where it changes nothing
-_OPAQUE, _NOTHING = ("1", "1.0", "1.000000"), ("0", "0.0", "0.000000")
-_WITHOUT_EFFECT = {"d": _OPAQUE, "Tr": _NOTHING, "illum": ("0", "1", "2"), "sharpness": ("60",)}
-_WITHOUT_EFFECT |= {
-    name: tuple(" ".join([value] * 3) for value in values)
-    for name, values in (("Ke", _NOTHING), ("Tf", _OPAQUE))
-}
-
-_REAL = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
-# Options of a map_Kd statement, with the least and the largest number of values that follow each
-_MAP_OPTIONS = {f"-{name}": (1, 1) for name in ("blendu", "blendv", "cc", "clamp", "boost", "texres", "bm")}
-_MAP_OPTIONS |= {"-imfchan": (1, 1), "-mm": (2, 2), "-o": (1, 3), "-s": (1, 3), "-t": (1, 3)}
+# What exporters write of statements that are not used, where it changes nothing; numbers without their zeros
+_WITHOUT_EFFECT = {"d 1", "Tr 0", "illum 0", "illum 1", "illum 2", "sharpness 60", "Ke 0 0 0", "Tf 1 1 1"}
 
 
 def read_mtl(
@@ -69,7 +59,11 @@ def read_mtl(
                 raise SceneError(f"{where}: {statement} comes before any newmtl; write newmtl NAME before it")
             block[statement] = _value(statement, text, where, folder or path.parent, path.parent, findings)
         # the report's reading defines itself; from the standard's, statements may be missing
-        elif statement and convention == "standard" and text not in _WITHOUT_EFFECT.get(statement, ()):
+        elif (
+            statement
+            and convention == "standard"
+            and re.sub(r"\.0+\b", "", f"{statement} {text}") not in _WITHOUT_EFFECT
+        ):
             findings.setdefault("statements", []).append(f"{where}: {statement} {text[:40]} is not used")
     warn(findings)
     materials = {}
@@ -78,11 +72,8 @@ def read_mtl(
             alpha = math.sqrt(2 / (block.get("Ns", 0.0) + 2))
             found = Material(block.get("Ni", 1.0), alpha, (0.0, 0.0, 0.0), (0.8, 0.8, 0.8))
         else:
-            (ior, *_), alpha = (
-                block.get("Ka", (DEFAULT_MATERIAL.ior,)),
-                block.get("Ni", DEFAULT_MATERIAL.alpha),
-            )
-            found = replace(DEFAULT_MATERIAL, ior=ior, alpha=alpha)
+            ior = block["Ka"][0] if "Ka" in block else DEFAULT_MATERIAL.ior
+            found = replace(DEFAULT_MATERIAL, ior=ior, alpha=block.get("Ni", DEFAULT_MATERIAL.alpha))
         colours = {"specular": block.get("Ks", found.specular), "diffuse": block.get("Kd", found.diffuse)}
         materials[name] = replace(found, **colours, texture=block.get("map_Kd"))
     return materials
@@ -99,10 +90,11 @@ def _value(
     if statement == "map_Kd":
         if not text:
             raise SceneError(f"{where}: map_Kd names no file")
-        name = _without_options(words)
-        found = find(text, [folder, library]) or (find(name, [folder, library]) if name else None)
+        # options of any number of words may stand before the name, which may hold blanks
+        names = [text] + [" ".join(words[k:]) for k in range(1, min(len(words), 32)) if text[0] == "-"]
+        found = next(filter(None, (find(name, [folder, library]) for name in names)), None)
         if found is None:
-            missing = f"{where}: the texture {name or text} {MISSING} {folder}; Kd is used in its place"
+            missing = f"{where}: the texture {text} {MISSING} {folder}; Kd is used in its place"
             findings.setdefault("textures", []).append(missing)
         return None if found is None else str(found)
     colored = statement.startswith("K")
@@ -114,18 +106,6 @@ def _value(
         raise SceneError(f"{where}: {statement} is {text}, but {what} be negative")
     if len(values) == 2:
         raise SceneError(f"{where}: {statement} has 2 numbers, but must have 1 or 3")
-    return (
-        values[0] if not colored else (values[0], values[-1] if len(values) == 1 else values[1], values[-1])
-    )
-
-
-def _without_options(words: list[str]) -> str:
-    """Return the file name of a map statement, which follows its options."""
-    while words and words[0] in _MAP_OPTIONS:
-        least, most = _MAP_OPTIONS[words[0]]
-        words = words[1:]
-        for taken in range(most):
-            if taken >= least and not re.fullmatch(_REAL, words[0] if words else ""):
-                break
-            words = words[1:]
-    return " ".join(words)
+    if not colored:
+        return values[0]
+    return values[0], values[len(values) // 2], values[-1]

@@ -1,4 +1,4 @@
-"""OBJ files: meshes with shared materials, and errors that name file and line.
+"""OBJ files: meshes with shared materials, errors that name file and line, and a camera and lights for them.
 
 Mitsuba's own ``obj`` plugin makes one mesh with one material of a whole file, so the reader is the project's
 own. Runs of lines of the usual forms are recognised by one regular expression and turned into arrays at once,
@@ -11,16 +11,30 @@ from __future__ import annotations
 import itertools
 import os
 import re
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.scene.files import MISSING, decode, find, numbers, read_text, warn
-from mrt_mitsuba.scene.model import Material, Mesh
+from mrt_mitsuba.scene.model import (
+    BLUE_SKY,
+    Camera,
+    Color,
+    Light,
+    Material,
+    Mesh,
+    Scene,
+    Vector,
+    view_problem,
+)
 from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, read_mtl
 
+# Numbers of numbers, least, most and used: positions may have a weight, a colour or both behind them
+_VALUES = {"v": (3, 7, 3), "vt": (1, 3, 2), "vn": (3, 3, 3)}
 # Names, groups, smoothing, curves and display: nothing that is rendered here
 _UNUSED = """g s o mg l p vp deg bmat step cstype curv curv2 surf parm trim hole scrv sp end con bevel
     c_interp d_interp lod shadow_obj trace_obj ctech stech call csh maplib usemap"""
@@ -39,19 +53,16 @@ _CORNERS = {
 }
 
 
-def _run(keyword: bytes, word: bytes, count: int) -> bytes:
-    """Return the pattern of up to some thousand lines of a keyword and ``count`` words."""
-    return b"(?:%s%s%s){1,%d}" % (keyword, (_GAP + word) * count, _END, _LINES_AT_ONCE)
+def _run(name: str, word: bytes) -> bytes:
+    """Return the pattern of up to some thousand lines: "f_3_tn" has the keyword f and three words."""
+    keyword, count, *_ = name.split("_")
+    words = (_GAP + word) * int(count)
+    return b"(?P<%s>(?:%s%s%s){1,%d})" % (name.encode(), keyword.encode(), words, _END, _LINES_AT_ONCE)
 
 
-# The usual numbers of numbers: positions may have a weight, a colour or both behind them, which are not used
-_RUNS = {f"v_{n}": _run(b"v", _REAL, n) for n in (3, 4, 6, 7)}
-_RUNS |= {f"vt_{n}": _run(b"vt", _REAL, n) for n in (2, 3)} | {"vn_3": _run(b"vn", _REAL, 3)}
-_RUNS |= {f"f_{n}_{form}": _run(b"f", word, n) for n in range(3, 7) for form, (word, _) in _CORNERS.items()}
-_USED = {"v": 3, "vt": 2, "vn": 3}
-_BLOCKS = re.compile(
-    b"|".join(b"(?P<%s>%s)" % (k.encode(), v) for k, v in _RUNS.items()) + rb"|(?P<line>[^\n]*\n)"
-)
+_RUNS = [_run(name, _REAL) for name in ("v_3", "v_4", "v_6", "v_7", "vt_2", "vt_3", "vn_3")]
+_RUNS += [_run(f"f_{n}_{form}", word) for n in range(3, 7) for form, (word, _) in _CORNERS.items()]
+_BLOCKS = re.compile(b"|".join(_RUNS) + rb"|(?P<line>[^\n]*\n)")
 
 # Letters of keywords, slashes and line ends as blanks: what is left are the numbers
 _NUMBERS_ONLY = bytes(32 if chr(i) in "vtnf/\n" else i for i in range(256))
@@ -85,15 +96,13 @@ def read_model(
     return reader.meshes(), frozenset({os.fspath(path), *reader.libraries, *textures})
 
 
-@dataclass
 class _Reader:
-    path: Path
-    convention: str
-    materials: dict[str, Material] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.arrays: dict[str, list[np.ndarray]] = {"v": [], "vt": [], "vn": []}
-        self.counts = {"v": 0, "vt": 0, "vn": 0}
+    def __init__(self, path: Path, convention: str) -> None:
+        self.path = path
+        self.convention = convention
+        self.materials: dict[str, Material] = {}
+        self.arrays: dict[str, list[np.ndarray]] = {kind: [] for kind in _VALUES}
+        self.counts = dict.fromkeys(_VALUES, 0)
         # Of faces of as many corners, one on each line: indices from 0, int64 [F, corners], −1 for none, of
         # "v", "vt" and "vn"; the material; the first line
         self.faces: list[tuple[dict[str, np.ndarray], str | None, int]] = []
@@ -106,69 +115,63 @@ class _Reader:
     def fail(self, text: str, line: int | None = None) -> None:
         raise SceneError(f"{self.path}:{self.line if line is None else line}: {text}")
 
-    # ------------------------------------------ Statements ---------------------------------------------
-
     def read(self) -> None:
-        data = read_text(self.path)
-        for match in _BLOCKS.finditer(data):
+        for match in _BLOCKS.finditer(read_text(self.path)):
             kind, *form = str(match.lastgroup).split("_")
-            if kind == "line":
-                self._statement(match[0])
-                self.line += 1
-                continue
             lines = match[0].count(b"\n")
             words = match[0].translate(_NUMBERS_ONLY)
-            if kind == "f":
+            if kind == "line":
+                self._statement(match[0])
+            elif kind == "f":
                 indices = np.fromstring(words, np.int64, sep=" ").reshape(lines, int(form[0]), -1)
                 self._add_faces(indices, _CORNERS[form[1]][1])
             else:
-                values = np.fromstring(words, np.float64, sep=" ").reshape(lines, -1)
-                self._add_values(kind, values[:, : _USED[kind]])
+                self._add_values(kind, np.fromstring(words, np.float64, sep=" ").reshape(lines, -1))
             self.line += lines
 
     def _statement(self, text: bytes) -> None:
         """Read one line of a form that is not covered by the runs."""
-        words = decode(text.split(b"#", 1)[0]).split()
-        if not words:
-            return
-        keyword = words.pop(0)
-        where = f"{self.path}:{self.line}"
-        if keyword == "v":
-            if len(words) == 5:
-                self.fail("v has 5 numbers, but must have 3, 4 (with w), 6 or 7 (with a colour)")
-            self._add_values("v", np.array([numbers(where, "v", words, 3, 7)[:3]]))
-        elif keyword == "vt":
-            self._add_values("vt", np.array([[*numbers(where, "vt", words, 1, 3), 0.0][:2]]))
-        elif keyword == "vn":
-            self._add_values("vn", np.array([numbers(where, "vn", words, 3, 3)]))
+        keyword, *words = decode(text.split(b"#", 1)[0]).split() or [""]
+        name, where = decode(text).strip()[len(keyword) :].strip(), f"{self.path}:{self.line}"
+        if keyword in _VALUES:
+            least, most, used = _VALUES[keyword]
+            self._add_values(keyword, np.array([[*numbers(where, keyword, words, least, most), 0.0][:used]]))
         elif keyword == "f":
             self._face(words)
+        elif keyword in ("usemtl", "mtllib") and not name:
+            self.fail(f"{keyword} has no name; write {keyword} {'NAME' if keyword == 'usemtl' else 'FILE'}")
         elif keyword == "usemtl":
-            name = self.material = _rest(text, "usemtl")
-            if not name:
-                self.fail("usemtl has no name; write usemtl NAME")
+            self.material = name
             if name not in self.materials and name not in self.unknown_materials:
                 self.unknown_materials.add(name)
-                self.findings.setdefault("materials", []).append(
-                    f"{where}: no library has the material {name!r}; it gets the default"
-                )
+                unknown = f"{where}: no library has the material {name!r}; it gets the default"
+                self.findings.setdefault("materials", []).append(unknown)
         elif keyword == "mtllib":
-            self._library(_rest(text, "mtllib"))
-        elif keyword not in _IGNORED:
+            folder = self.path.parent
+            for each in [name] if find(name, [folder]) else words:
+                if found := find(each, [folder]):
+                    self.libraries.add(str(found))
+                    self.materials |= read_mtl(found, convention=self.convention, folder=folder)
+                else:
+                    missing = f"{where}: the material library {each} {MISSING} {folder}"
+                    self.findings.setdefault("libraries", []).append(
+                        f"{missing}; its materials get the default"
+                    )
+        elif keyword and keyword not in _IGNORED:
             self.fail(
                 f"unknown statement {keyword[:40]!r}; expected v, vt, vn, f, usemtl, mtllib or the like"
             )
 
     def _add_values(self, kind: str, values: np.ndarray) -> None:
         with np.errstate(over="ignore"):
-            narrow = values.astype(np.float32)
-        if not np.isfinite(narrow).all():
-            row = int(np.argmin(np.isfinite(narrow).all(axis=1)))
-            self.fail(f"{kind} holds a number that is too large for a float32", self.line + row)
+            narrow = values[:, : _VALUES[kind][2]].astype(np.float32)
+        finite = np.isfinite(narrow).all(axis=1)
+        if not finite.all():
+            self.fail(
+                f"{kind} holds a number that is too large for a float32", self.line + int(finite.argmin())
+            )
         self.arrays[kind].append(narrow)
         self.counts[kind] += len(values)
-
-    # ------------------------------------------ Faces --------------------------------------------------
 
     def _face(self, words: list[str]) -> None:
         """Read a face of any number of corners, in any of the four forms."""
@@ -177,10 +180,9 @@ class _Reader:
         corners, forms = [], set()
         for word in words:
             parts = word.split("/")
-            well = len(parts) <= 3 and all(re.fullmatch(r"([-+]?[0-9]{1,18})?", part) for part in parts)
-            if not well or not parts[0]:
+            if not re.fullmatch(r"[-+]?[0-9]{1,18}(/([-+]?[0-9]{1,18})?){0,2}", word):
                 self.fail(f"f has the corner {word[:40]!r}, but must have v, v/vt, v//vn or v/vt/vn")
-            forms.add(tuple(kind for kind, part in zip(("v", "vt", "vn"), parts, strict=False) if part))
+            forms.add(tuple(kind for kind, part in zip(_VALUES, parts, strict=False) if part))
             corners.append([int(part) for part in parts if part])
         if len(forms) > 1:
             self.fail(f"f has corners of different forms: {' '.join(words)[:80]}; give all the same indices")
@@ -188,51 +190,29 @@ class _Reader:
 
     def _add_faces(self, indices: np.ndarray, kinds: tuple[str, ...]) -> None:
         """Add faces [F, corners, kinds of index], their indices counted from 0."""
-        resolved = {}
+        added = {kind: np.full(indices.shape[:2], -1) for kind in _VALUES}
         for k, kind in enumerate(kinds):
-            index = indices[:, :, k]
-            resolved[kind] = np.where(index > 0, index - 1, index + self.counts[kind])
-            wrong = (index == 0) | (resolved[kind] < 0)
-            if wrong.any():
-                row = int(np.argmax(wrong.any(axis=1)))
-                bad = int(index[row][wrong[row]][0])
-                reason = (
-                    f"only {self.counts[kind]} came before"
-                    if bad
-                    else "indices count from 1, or back from -1"
-                )
-                self.fail(f"f has the {kind} index {bad}: {reason}", self.line + row)
-        missing = dict.fromkeys(("vt", "vn"), np.full_like(resolved["v"], -1))
-        self.faces.append((missing | resolved, self.material, self.line))
+            index, count = indices[:, :, k], self.counts[kind]
+            added[kind] = np.where(index > 0, index - 1, index + count)
+            self._check(kind, index, index == 0, ": indices count from 1, or back from -1", self.line)
+            self._check(kind, index, added[kind] < 0, f": only {count} came before", self.line)
+        self.faces.append((added, self.material, self.line))
 
-    # ---------------------------------------- Materials ------------------------------------------------
-
-    def _library(self, rest: str) -> None:
-        if not rest:
-            self.fail("mtllib has no name; write mtllib FILE")
-        folder = self.path.parent
-        for name in [rest] if find(rest, [folder]) else rest.split():
-            found = find(name, [folder])
-            if found is None:
-                text = f"{self.path}:{self.line}: the material library {name} {MISSING} {folder}"
-                self.findings.setdefault("libraries", []).append(f"{text}; its materials get the default")
-            else:
-                self.libraries.add(str(found))
-                self.materials |= read_mtl(found, convention=self.convention, folder=folder)
-
-    # ------------------------------------------ Result -------------------------------------------------
+    def _check(self, kind: str, index: np.ndarray, wrong: np.ndarray, reason: str, line: int) -> None:
+        """Refuse the first of the indices [F, corners] that are wrong."""
+        if wrong.any():
+            row, corner = np.argwhere(wrong)[0]
+            self.fail(f"f has the {kind} index {index[row, corner]}{reason}", line + int(row))
 
     def meshes(self) -> tuple[Mesh, ...]:
         """Return one mesh for each material, in the order of their first use."""
         warn(self.findings)
-        for kind, (index, _, line) in itertools.product(_USED, self.faces):
-            beyond = index[kind] >= self.counts[kind]
-            if beyond.any():
-                row = int(np.argmax(beyond.any(axis=1)))
-                bad = int(index[kind][row][beyond[row]][0]) + 1
-                self.fail(f"f has the {kind} index {bad}, but the file has {self.counts[kind]}", line + row)
+        for kind, (index, _, line) in itertools.product(_VALUES, self.faces):
+            count = self.counts[kind]
+            self._check(kind, index[kind] + 1, index[kind] >= count, f", but the file has {count}", line)
         points, uvs, normals = (
-            np.concatenate(self.arrays[kind] or [np.empty((0, _USED[kind]), np.float32)]) for kind in _USED
+            np.concatenate(self.arrays[kind] or [np.empty((0, used), np.float32)])
+            for kind, (_, _, used) in _VALUES.items()
         )
         by_material: dict[tuple[Material, bool], list[dict[str, np.ndarray]]] = {}
         for index, name, _ in self.faces:
@@ -256,8 +236,18 @@ def _mesh(
     faces: list[dict[str, np.ndarray]],
     material: Material,
 ) -> Mesh:
-    """Return the mesh of some faces, with the vertices that they use."""
-    v, vt, vn = (np.concatenate([_triangles(f[kind]) for f in faces]) for kind in _USED)
+    """Return the mesh of some faces, with the vertices that they use; each face is a fan of triangles."""
+    v, vt, vn = (
+        np.concatenate(
+            [
+                np.stack([f[kind][:, [0, k, k + 1]] for k in range(1, f[kind].shape[1] - 1)], 1).reshape(
+                    -1, 3
+                )
+                for f in faces
+            ]
+        )
+        for kind in _VALUES
+    )
     if material.texture is None and normals is None:
         used = np.zeros(len(points), bool)
         used[v] = True
@@ -270,15 +260,67 @@ def _mesh(
     return Mesh(points[v.ravel()], index, material, textured, smooth)
 
 
-def _triangles(index: np.ndarray) -> np.ndarray:
-    """Return fans [F (n − 2), 3] around the first corners of faces [F, n]."""
-    corners = index.shape[1]
-    if corners == 3:
-        return index
-    fan = [index[:, [0, k, k + 1]] for k in range(1, corners - 1)]
-    return np.stack(fan, axis=1).reshape(-1, 3)
+# ------------------------------------------- Camera and lights -----------------------------------------
 
 
-def _rest(text: bytes, keyword: str) -> str:
-    """Return what follows a keyword, blanks inside it included."""
-    return decode(text).strip()[len(keyword) :].strip()
+def obj_scene(
+    path: str | os.PathLike[str],
+    *,
+    convention: str = "report",
+    texturing: str | None = None,
+    camera: Camera | None = None,
+    lights: Sequence[Light] | None = None,
+    sky: Color = BLUE_SKY,
+) -> Scene:
+    """Return a scene of an OBJ file; camera and lights that are not given are placed by the model's size.
+
+    The camera stands in front, towards +z, a little above and to the right, and sees all of it; a light is up
+    on each side, the right one brighter. ``texturing`` follows ``convention`` unless given. Raises as
+    ``read_obj`` does.
+    """
+    meshes, files = read_model(path, convention=convention)
+    low = np.min([m.vertices.min(axis=0) for m in meshes], axis=0).astype(float)
+    high = np.max([m.vertices.max(axis=0) for m in meshes], axis=0).astype(float)
+    center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
+
+    def place(x: float, y: float, z: float) -> Vector:
+        """Return a point in radii from the centre."""
+        px, py, pz = (center + radius * np.array([x, y, z])).tolist()
+        return px, py, pz
+
+    if lights is None:
+        lights = Light(place(4, 5, 4), (2.5, 2.5, 2.5)), Light(place(-4, 3, 5), (1.0, 1.0, 1.2))
+    return Scene(
+        title=os.path.basename(path),
+        # a ball of radius 1 fills a view of 45° height, that of 60° width in a 4:3 picture, from 2.6 away
+        camera=camera or Camera(place(1.0, 0.8, 2.4), place(0, 0, 0)),
+        sky=sky,
+        lights=tuple(lights),
+        meshes=meshes,
+        texturing=texturing or convention,
+        files=files,
+    )
+
+
+def model_scene(
+    path: str | os.PathLike[str],
+    *,
+    light: Vector | None = None,
+    convention: str = "report",
+    texturing: str | None = None,
+    **view: Any,
+) -> Scene:
+    """Return the scene of an OBJ file as the options of ``render`` show it; ``obj_scene`` places the rest.
+
+    ``light`` is the place of a white light; ``view``: ``camera``, ``target`` and ``up``, vectors, and
+    ``fov``, horizontal, in degrees. Raises ``UsageError`` for a camera that sees nothing, and what
+    ``obj_scene`` raises.
+    """
+    lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
+    scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)
+    names = {"camera": "position", "target": "target", "up": "up", "fov": "hfov"}
+    given = {names[name]: value for name, value in view.items() if value is not None}
+    camera = replace(scene.camera, **given)
+    if problem := view_problem(camera):
+        raise UsageError(problem)
+    return replace(scene, camera=camera)

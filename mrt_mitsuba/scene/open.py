@@ -56,7 +56,7 @@ def open_scene(
     if hasattr(scene, "__index__"):
         terms = report_scene(operator.index(scene))
     elif is_obj(scene):
-        from mrt_mitsuba.scene.placement import model_scene
+        from mrt_mitsuba.scene.obj import model_scene
 
         terms = model_scene(scene, **(model or {}))
     # a key of mi.traverse has a dot, the name of a parameter of an XML file has none

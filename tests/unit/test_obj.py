@@ -15,9 +15,8 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtWarning, SceneError
 from mrt_mitsuba.scene.model import Camera, Mesh
 from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, read_mtl
-from mrt_mitsuba.scene.obj import read_obj
-from mrt_mitsuba.scene.placement import model_scene as model_view
-from mrt_mitsuba.scene.placement import obj_scene
+from mrt_mitsuba.scene.obj import model_scene as model_view
+from mrt_mitsuba.scene.obj import obj_scene, read_obj
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 UVS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"

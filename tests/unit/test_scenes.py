@@ -13,7 +13,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.scene import shapes as models
 from mrt_mitsuba.scene.model import Material, Mesh, Scene
 from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL
-from mrt_mitsuba.scene.placement import obj_scene
+from mrt_mitsuba.scene.obj import obj_scene
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
 REPORT = (0, 1, 2, 3, 4, 9)
