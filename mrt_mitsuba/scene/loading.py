@@ -75,9 +75,7 @@ def rewrite_file(path: str, budget: Budget, **parameters: Any) -> tuple[str, Map
 
 def declared(path: str) -> dict[str, str]:
     """Return the parameters that an XML file declares, with their defaults. Raises ``SceneError``."""
-    require_file(path)
-    with open(path, "rb") as stream:
-        found = [_attributes(tag) for tag in _tags(stream.read()) if tag.startswith(b"<default")]
+    found = [attributes for tag, attributes in _elements(path) if tag == "default"]
     return {each.get("name", ""): each.get("value", "") for each in found}
 
 
@@ -206,11 +204,6 @@ def _check_dict(scene: Mapping[str, Any], name: str) -> None:
                 _check_data(value)
 
 
-_ATTRIBUTE = re.compile(rb"""\b(\w+)\s*=\s*("[^"]*"|'[^']*')""")
-_TAG_MARK = re.compile(rb"""[>"']""")
-_NO_TAGS = ((b"<!--", b"-->"), (b"<![CDATA[", b"]]>"), (b"<?", b"?>"), (b"<!", b">"))
-
-
 def _check_xml(path: str, parameters: Mapping[str, str]) -> tuple[Mapping[str, str], set[str]]:
     """Look at an XML file and those that it includes before Mitsuba opens them.
 
@@ -222,58 +215,45 @@ def _check_xml(path: str, parameters: Mapping[str, str]) -> tuple[Mapping[str, s
         if file in seen:
             continue
         seen.add(file)
-        require_file(file)
-        with open(file, "rb") as stream:
-            data = stream.read()
-        if b"\0" in data:
-            raise SceneError(f"cannot load {file}: it holds zero bytes; save it as text in UTF-8")
-        depth = 0
-        for tag in _tags(data):
-            depth += -1 if tag.startswith(b"</") else not tag.endswith(b"/>")
-            if depth > DEEPEST:
-                raise SceneError(f"cannot load {file}: it is nested more than {DEEPEST} levels deep")
-            if tag.startswith(b"<default"):
-                attributes = _attributes(tag)
+        for tag, attributes in _elements(file):
+            if tag == "default":
                 values.setdefault(attributes.get("name", ""), attributes.get("value", ""))
-            elif b"filename" in tag and "filename" in (attributes := _attributes(tag)):
-                filename = attributes["filename"]
+            elif filename := attributes.get("filename"):
                 for name in sorted(values, key=len, reverse=True):  # the longest first, as Mitsuba does
                     filename = filename.replace(f"${name}", values[name]) if name else filename
                 _check_data(filename)
-                if tag.startswith(b"<include") and os.path.isfile(_resolved(filename)):
+                if tag == "include" and os.path.isfile(_resolved(filename)):
                     waiting.append(_resolved(filename))
     return values, seen
 
 
-def _tags(data: bytes) -> Iterator[bytes]:
-    """Yield opening and closing tags of XML, up to the first that has no end."""
-    start = data.find(b"<")
-    while start >= 0:
-        closing = next((end for begin, end in _NO_TAGS if data.startswith(begin, start)), None)
-        end = _end_of_tag(data, start) if closing is None else data.find(closing, start + 2)
-        if end < 0:
-            return
-        if closing is None:
-            yield data[start : end + 1]
-        start = data.find(b"<", end)
+def _elements(file: str) -> list[tuple[str, dict[str, str]]]:
+    """Return tag and attributes of each element of an XML file, in order."""
+    from xml.parsers import expat
 
+    require_file(file)
+    found: list[tuple[str, dict[str, str]]] = []
+    depth = 0
 
-def _end_of_tag(data: bytes, position: int) -> int:
-    """Return the place of the next ``>`` outside quotes, or -1."""
-    while mark := _TAG_MARK.search(data, position):
-        if mark[0] == b">":
-            return mark.start()
-        position = data.find(mark[0], mark.end()) + 1
-        if position == 0:
-            break
-    return -1
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > DEEPEST:
+            raise SceneError(f"cannot load {file}: it is nested more than {DEEPEST} levels deep")
+        found.append((tag, attributes))
 
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
 
-def _attributes(tag: bytes) -> dict[str, str]:
-    """Return the attributes of a tag."""
-    import html
+    def entity(name: str, *declaration: object) -> None:  # which Mitsuba's parser reads in another way
+        raise SceneError(f"cannot load {file}: it declares the entity {name}; write the text in its place")
 
-    return {
-        name.decode(): html.unescape(quoted[1:-1].decode(errors="replace"))
-        for name, quoted in _ATTRIBUTE.findall(tag)
-    }
+    parser = expat.ParserCreate("utf-8")
+    parser.StartElementHandler, parser.EndElementHandler, parser.EntityDeclHandler = start, end, entity
+    try:
+        with open(file, "rb") as stream:
+            parser.ParseFile(stream)
+    except expat.ExpatError as error:
+        raise SceneError(f"cannot load {file}: it must be XML in UTF-8, but has {error}") from None
+    return found
