@@ -1,13 +1,19 @@
-"""The report's scenes 0 to 4 and 9 as data, and all numbered scenes by number."""
+"""The numbered scenes as data: 0 to 4 and 9 are the report's.
+
+Scenes 5 to 8 stand in for the original's, whose models are not free; theirs are OBJ files in ``assets``.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cache
 from itertools import product
+from pathlib import Path
+from typing import Any
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Cone, Light, Material, Plane, Scene, Sphere
+from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 
 # The ten materials that scene 4 draws from, in the order of its random numbers
 SCENE_4_MATERIALS = (
@@ -147,6 +153,80 @@ def scene_of_spheres(count: int = 600) -> Scene:
     )
 
 
+def _with_model(name: str, **parts: Any) -> Scene:
+    """Return a scene with the meshes of an OBJ file, in the report's reading."""
+    from mrt_mitsuba.scene.obj import read_obj  # with numpy, which the other scenes do without
+
+    return Scene(meshes=read_obj(Path(__file__).parent / "assets" / name), **parts)
+
+
+def _matte(r: float, g: float, b: float) -> Material:
+    """Return a rough surface without mirror reflection: index of refraction 0, as in the report's files."""
+    return Material(0.0, 0.6, (0.0, 0.0, 0.0), (r, g, b))
+
+
+def scene_5() -> Scene:
+    return _with_model(
+        "ring.obj",
+        title="a ring, stones and two glossy spheres",
+        camera=Camera((2.8, 1.5, 3.2), (0.1, 0.45, 0)),
+        sky=(0.25, 0.35, 0.6),
+        lights=(Light((4, 6, 3), (3.2, 3.2, 3.0)), Light((-3, 4, 5), (1.5, 1.5, 1.9))),
+        spheres=(
+            Sphere((-1.05, 0.45, 0.35), 0.45, Material(6.0, 0.02, (0.9, 0.9, 0.9), (0.02, 0.02, 0.02))),
+            Sphere((1.25, 0.3, 0.75), 0.3, Material(2.0, 0.03, (0.9, 0.85, 0.6), (0.5, 0.06, 0.05))),
+        ),
+        planes=(Plane((0, 1, 0), 0, Material(1.3, 0.1, (0.25, 0.25, 0.25), (0.55, 0.52, 0.5))),),
+    )
+
+
+def scene_6() -> Scene:
+    bark, flame = _matte(0.3, 0.18, 0.1), Material(0.0, 0.5, (0.0, 0.0, 0.0), (1.6, 0.7, 0.15))
+    turns = [(math.cos(a), math.sin(a)) for a in (2 * math.pi * k / 9 for k in range(0, 9, 2))]
+    logs = [
+        Cylinder((0.28 * x, 0.05, 0.28 * z), (0.03 * x, 0.3, 0.03 * z), 0.045, bark) for x, z in turns
+    ]  # that lean against each other
+    seats = (
+        Cylinder((-1.0, 0.1, 0.5), (-0.55, 0.1, 1.15), 0.1, bark),
+        Cylinder((1.15, 0.1, 0.1), (0.9, 0.1, 0.85), 0.1, bark),
+    )
+    return _with_model(
+        "camp.obj",
+        title="a camp: tents, firs and a fire",
+        camera=Camera((1.6, 1.5, 4.2), (-0.1, 0.5, -0.3)),
+        sky=(0.75, 0.45, 0.3),
+        lights=(Light((6, 5, 4), (3.4, 2.7, 2.1)), Light((0.0, 0.75, 0.0), (2.2, 1.1, 0.4))),
+        planes=(Plane((0, 1, 0), 0, _matte(0.22, 0.36, 0.12)),),
+        cones=(
+            Cone((0, 0.62, 0), (0, 0.12, 0), 0.13, flame),
+            Cone((0.07, 0.45, 0.06), (0.07, 0.12, 0.06), 0.09, flame),
+        ),
+        cylinders=(*logs, *seats),
+    )
+
+
+def scene_7() -> Scene:
+    return _with_model(
+        "lake.obj",
+        title="a lake between hills",
+        camera=Camera((0.4, 0.9, 5.6), (0, 0.35, 0)),
+        sky=(0.45, 0.65, 0.9),
+        lights=(Light((8, 9, 6), (2.6, 2.5, 2.2)), Light((-6, 7, 3), (0.7, 0.75, 0.9))),
+        planes=(Plane((0, 1, 0), 0, Material(1.33, 0.03, (0.7, 0.75, 0.8), (0.02, 0.08, 0.12))),),
+    )
+
+
+def scene_8() -> Scene:
+    return _with_model(
+        "block.obj",
+        title="a textured block on a glossy plane",
+        camera=Camera((1.6, 1.25, 2.2), (0, 0.42, 0)),
+        sky=(0.2, 0.25, 0.35),
+        lights=(Light((3, 4, 2), (3.2, 3.2, 3.0)), Light((-2, 3, 4), (2.4, 2.4, 2.6))),
+        planes=(Plane((0, 1, 0), 0, Material(2.2, 0.05, (0.6, 0.6, 0.62), (0.12, 0.12, 0.13))),),
+    )
+
+
 def scene_9() -> Scene:
     wood = Material(1.0771, 0.0589, (0.26, 0.036, 0.014), (1, 0.852, 1.172))
     return Scene(
@@ -180,18 +260,24 @@ def c_rand(seed: int = 1) -> Iterator[int]:
         yield words[-1] >> 1
 
 
-_BUILDERS = {0: scene_0, 1: scene_1, 2: scene_2, 3: scene_3, 4: scene_of_spheres, 9: scene_9}
-_DEMOS = (5, 6, 7, 8)
-NUMBERS = tuple(sorted({*_BUILDERS, *_DEMOS}))
+_BUILDERS = (
+    scene_0,
+    scene_1,
+    scene_2,
+    scene_3,
+    scene_of_spheres,
+    scene_5,
+    scene_6,
+    scene_7,
+    scene_8,
+    scene_9,
+)
+NUMBERS = tuple(range(len(_BUILDERS)))
 
 
 @cache
 def report_scene(number: int) -> Scene:
-    """Return a scene by its number; 5 to 8 are of our own models. Raises ``UsageError`` for any other."""
-    if number in _DEMOS:
-        from mrt_mitsuba.scene import demos  # models in numpy, which the other scenes do without
-
-        return getattr(demos, f"scene_{number}")()
-    if number not in _BUILDERS:
+    """Return a scene by its number. Raises ``UsageError`` for one that there is not."""
+    if number not in NUMBERS:
         raise UsageError(f"there is no scene {number!r}: choose one of {', '.join(map(str, NUMBERS))}")
     return _BUILDERS[number]()

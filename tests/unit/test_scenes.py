@@ -1,4 +1,4 @@
-"""The report's scenes as numbers; scenes 5 to 8 and the models in them; scenes from OBJ files."""
+"""The numbered scenes as numbers and pictures; scenes from OBJ files."""
 
 from __future__ import annotations
 
@@ -7,20 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.scene import shapes as models
-from mrt_mitsuba.scene.model import Material, Mesh, Scene
-from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL
-from mrt_mitsuba.scene.obj import obj_scene
+from mrt_mitsuba.scene.model import Material, Scene
+from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
-REPORT = (0, 1, 2, 3, 4, 9)
 SIZE = {"width": 96, "height": 72, "aa": 1}
-
-
-# ---- the report's scenes ----
 
 
 def numbers_of(scene: Scene) -> list[float]:
@@ -66,60 +59,6 @@ def test_there_are_ten_scenes_each_read_once_and_no_others() -> None:
         report_scene(77)
 
 
-# ---- models ----
-
-
-def volume(mesh: Mesh) -> float:
-    """Return the volume by the divergence theorem: negative inside out, wrong where there is a hole."""
-    corners = mesh.vertices[mesh.faces].astype(float) - mesh.vertices.mean(axis=0)
-    return float(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
-
-
-def is_closed(mesh: Mesh) -> bool:
-    """Does every edge between two places belong to two triangles, once in each direction?"""
-    _, place = np.unique(mesh.vertices.round(5), axis=0, return_inverse=True)
-    faces = place.reshape(-1)[mesh.faces]
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    return sorted(map(tuple, edges.tolist())) == sorted(map(tuple, edges[:, ::-1].tolist()))
-
-
-PINES = models.pines([(0, 0, 0), (3, 0, 1)], 1.0, DEFAULT_MATERIAL, DEFAULT_MATERIAL)
-
-
-@pytest.mark.parametrize(
-    ("mesh", "low", "high"),
-    [
-        # a torus of 200 × 100 faces, a little smaller than 2π² 0.09
-        (models.torus((1, 2, 3), 1, 0.3, DEFAULT_MATERIAL, rings=200, sides=100), 1.773, 1.7766),
-        (models.block((1, 2, 3), (1, 2, 3), DEFAULT_MATERIAL, turn=30), 5.9999, 6.0001),
-        (models.tent((1, 0, 3), 1, 1.5, 2, DEFAULT_MATERIAL, turn=30), 1.49999, 1.50001),
-        (models.rock((1, 0, 3), 1, DEFAULT_MATERIAL, seed=1), 1.33, 2.22),  # an icosahedron's, moved about
-        (PINES[0], 0, np.inf),
-        (PINES[1], 0, np.inf),
-    ],
-)
-def test_models_are_closed_and_face_outwards(mesh: Mesh, low: float, high: float) -> None:
-    assert is_closed(mesh) and low < volume(mesh) < high
-
-
-def test_terrain_is_whole_faces_up_and_is_split_by_height() -> None:
-    other = report_scene(0).spheres[0].material
-    pieces = models.terrain(lambda x, z: x, 2, 10, [(0.0, DEFAULT_MATERIAL), (9, other)])
-    assert [m.material for m in pieces] == [DEFAULT_MATERIAL, other]
-    assert sum(len(m.faces) for m in pieces) == 200
-    assert pieces[0].vertices[pieces[0].faces].mean(axis=1)[:, 1].max() <= 0
-    for piece in pieces:
-        a, b, c = piece.vertices[piece.faces].transpose(1, 0, 2)
-        assert (np.cross(b - a, c - a)[:, 1] > 0).all()
-
-
-def test_picture_of_the_block_is_the_one_that_is_shipped() -> None:
-    np.testing.assert_array_equal(np.array(Image.open(models.BLOCK_PICTURE)), models.block_picture())
-
-
-# ---- the project's own scenes ----
-
-
 @pytest.mark.parametrize("number", range(10))
 def test_watertight_triangles_are_asked_for_where_there_are_any(number: int) -> None:
     """The report's own scenes hold none, and their pictures shall not change by a bit."""
@@ -127,23 +66,17 @@ def test_watertight_triangles_are_asked_for_where_there_are_any(number: int) -> 
     assert flag is (number in (5, 6, 7, 8))
 
 
-@pytest.mark.parametrize("number", [5, 6, 7, 8])
-def test_scenes_render_and_repeat(number: int) -> None:
+@pytest.mark.parametrize(("number", "triangles"), [(5, 1588), (6, 646), (7, 7620), (8, 12)])
+def test_scenes_of_models_render_and_repeat(number: int, triangles: int) -> None:
+    """Mitsuba leaves merged meshes in another order every time, and with it their numbers in layers; these
+    keep that of the scene."""
+    assert sum(len(mesh.faces) for mesh in report_scene(number).meshes) == triangles
     image = mrt.render(number, **SIZE).image
-    assert np.isfinite(image).all()
-    assert 0.1 < image.mean() < 0.8 and image.std() > 0.1
+    assert np.isfinite(image).all() and 0.1 < image.mean() < 0.8 and image.std() > 0.1
     assert np.array_equal(image, mrt.render(number, **SIZE).image)
-
-
-@pytest.mark.parametrize("number", [5, 7])
-def test_shapes_are_in_the_order_of_the_scene(number: int) -> None:
-    """Mitsuba leaves merged meshes in another order every time, and with it their numbers in layers."""
-    from mrt_mitsuba.scene.open import open_scene
-
-    nodes = mrt.scene_dict(number)  # which chooses a variant where there is none
+    nodes = mrt.scene_dict(number)
     names = [shape.id() for shape in open_scene(number).scene.shapes()]
-    assert names == [name for name in nodes if name in names]
-    assert sum(name.startswith("mesh") for name in names) > 3
+    assert names == [name for name in nodes if name in names] and "mesh_0" in names
 
 
 def test_arrow_on_the_block_points_up() -> None:
@@ -156,7 +89,7 @@ def test_arrow_on_the_block_points_up() -> None:
     assert np.argmax(widths) < len(widths) / 2  # the head is above the shaft
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1, 1e3])
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_scene_of_an_obj_file(tmp_path: Path, scale: float) -> None:
     """All of the model is in view, from in front, whatever its size and place."""
     corners = np.indices((2, 2, 2)).reshape(3, -1).T
@@ -168,4 +101,3 @@ def test_scene_of_an_obj_file(tmp_path: Path, scale: float) -> None:
     assert 0.1 < hit.mean() < 0.6
     assert not (hit[0].any() or hit[-1].any() or hit[:, 0].any() or hit[:, -1].any())
     assert result.image[hit].mean() > 0.1
-    assert obj_scene(tmp_path / "cube.obj").title == "cube.obj"

@@ -12,7 +12,6 @@ import numpy as np
 import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Cone, Material, Scene
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.scene.shapes import torus
 from mrt_mitsuba.validation.oracles.reference import Axial, camera_directions, reference_render, sensitivity
 from mrt_mitsuba.validation.tools.image_tests import compare
 from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, camera, rays, with_materials
@@ -194,11 +193,12 @@ def _stock_scenes() -> dict[str, tuple[Nodes, Nodes, int, float]]:
     lit = {"ball": {"type": "sphere", "center": [1, 0, 0]}, "lamp": lamp}
     height = {"type": "bitmap", "bitmap": mi.Bitmap(0.5 * _waves())}
     bumps = {"type": "bumpmap", "texture": height, "scale": 0.4}
-    # A coarse ball whose corners have the normals of a sphere
-    mesh = torus((0, 0, 0), 0.9, 0.5, report_scene(0).spheres[0].material, rings=16, sides=8)
-    around = mesh.vertices * [1, 1, 0]
-    middle = 0.9 * around / np.linalg.norm(around, axis=1, keepdims=True)
-    arrays = {"positions": mesh.vertices, "faces": mesh.faces, "normals": mesh.vertices - middle}
+    # The ring of scene 5, whose corners have the normals of a torus
+    mesh = report_scene(5).meshes[0]
+    points = (mesh.vertices - np.float32([0.2, 0.75, -0.2])) * np.float32(1.6)
+    around = points * [1, 1, 0]
+    middle = 0.88 * around / np.linalg.norm(around, axis=1, keepdims=True)
+    arrays = {"positions": points, "faces": mesh.faces, "normals": points - middle}
     smooth: Nodes = {name: mi.Bitmap(np.ascontiguousarray(a[np.newaxis])) for name, a in arrays.items()}
     mirror = {"type": "mrt_mesh", **smooth, "bsdf": {"type": "conductor"}}
     return {
