@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from PIL import Image
 
 from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Mesh, Plane, Scene, Sphere
@@ -23,71 +23,51 @@ from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Mesh, Plane, Scene, 
 # Robust secondary rays start this far off the surface, relative to the coordinates and distances that led to
 # the point: far above the rounding of float64, far below anything a float32 picture can show
 OFFSET = 1e-10
-
 # That of Mitsuba's integrators, relative to 1 + the largest coordinate: 1500 half roundings of float32
 MITSUBA_OFFSET = 1500 * 2.0**-24
-
 # The original's absolute constants
 ORIGINAL_SHADOW_START, ORIGINAL_MIRROR_START, ORIGINAL_REACH = 1e-4, 1e-3, 1e5
-
 BATCH = 2**20  # pairs of a ray and an object at a time
+HASH = np.uint64(0x9E3779B97F4A7C15)  # odd, so that no step of the hash loses information
 
-_HASH = np.uint64(0x9E3779B97F4A7C15)  # odd, so that no step of the hash loses information
 
-
-@dataclass(frozen=True)
-class ReferenceResult:
+class ReferenceResult(NamedTuple):
     """A picture in linear RGB, top row first, and what the ray through each pixel met.
 
     ``path`` and ``lights`` are hashes of decisions. Two renders of a scene have the same ``path`` in a pixel
     if all rays met the same objects in the same order, and the same ``lights`` if at each of them the same
-    lights were in front, and of these the same in sight. ``terminator`` is the smallest |cos| of the angle
-    between a normal and a light, over all that the ray met: near 0, whether the light reaches the surface
-    hangs on rounding.
+    lights were in front, and of these the same in sight.
     """
 
     image: np.ndarray  # float64 [H, W, 3]
     depth: np.ndarray  # float64 [H, W], distance from the camera; inf where nothing was hit
     object_id: np.ndarray  # int [H, W], in (*spheres, *planes, *cones, *cylinders, *meshes); -1: nothing
     normal: np.ndarray  # float64 [H, W, 3], unit; 0 where nothing was hit
-    bounces: np.ndarray  # int [H, W], mirror rays that met something
     path: np.ndarray  # uint64 [H, W]
     lights: np.ndarray  # uint64 [H, W]
-    terminator: np.ndarray  # float64 [H, W], in [0, 1]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """The arguments of ``reference_render`` but for the scene and the picture's size."""
-
-    fresnel: str = "dielectric"  # or "schlick", "unity"
-    clamp: bool = True  # each light's part to [0, 1]
-    max_depth: int = 10
-    bounce_budget: str = "report"  # or "plain"
-    start: str = (
-        "robust"  # of secondary rays, or "mitsuba", or "original": that program's distances and reach
-    )
-    displacement: tuple[float, float] = (0.0, 0.0)  # of the rays, in pixels, y upwards
-
-
-def reference_render(scene: Scene, *, width: int, height: int, **settings: Any) -> ReferenceResult:
+def reference_render(
+    scene: Scene, *, width: int, height: int, displacement: tuple[float, float] = (0, 0), **settings: Any
+) -> ReferenceResult:
     """Render a scene with one ray through each pixel, exactly but for the rounding of float64.
 
-    ``settings`` are those of ``Settings``. Raises ``SceneError`` for a texture on anything but
-    triangles, and for one that is not looked up as in the report.
+    ``displacement``: of the rays, in pixels, y upwards. ``settings``: ``fresnel`` ("dielectric", "schlick" or
+    "unity"), ``clamp``, ``max_depth``, ``bounce_budget`` ("report" or "plain"), and ``start`` of secondary
+    rays ("robust", "mitsuba", or "original": that program's distances and reach). Raises ``SceneError`` for a
+    texture on anything but triangles, and for one that is not looked up as in the report.
     """
-    chosen = Settings(**settings)
     pixel = np.arange(width * height)
-    x, y = pixel % width + 0.5 + chosen.displacement[0], pixel // width + 0.5 + chosen.displacement[1]
+    x, y = pixel % width + 0.5 + displacement[0], pixel // width + 0.5 + displacement[1]
     d = camera_directions(scene.camera, width, height, x, y)
+    o = np.broadcast_to(np.array(scene.camera.position, float), d.shape)
     with np.errstate(all="ignore"):
-        film = _Tracer(scene, chosen).film(np.tile(np.array(scene.camera.position, float), (len(d), 1)), d)
+        layers = _Tracer(scene, **settings).film(o, d)
     # The first row is the lowest
-    return ReferenceResult(**{k: v.reshape(height, width, *v.shape[1:])[::-1] for k, v in film.items()})
+    return ReferenceResult(*(layer.reshape(height, width, *layer.shape[1:])[::-1] for layer in layers))
 
 
-@dataclass(frozen=True)
-class Sensitivity:
+class Sensitivity(NamedTuple):
     """The changes in a pixel when its ray is moved by a small part of a pixel; all [H, W].
 
     Every pixel is of at most one kind: ``silhouette`` where the rays meet other objects, else ``shadow``
@@ -101,16 +81,14 @@ class Sensitivity:
     spread: np.ndarray  # float64
 
 
-def sensitivity(
-    scene: Scene, *, width: int, height: int, displacement: float = 1e-2, **settings: Any
-) -> Sensitivity:
+def sensitivity(scene: Scene, *, displacement: float = 1e-2, **settings: Any) -> Sensitivity:
     """Compare the reference with four displaced by ``displacement`` pixels, left, right, down and up.
 
-    ``settings`` are those of ``reference_render``, with ``aa`` = 1.
+    ``settings`` are those of ``reference_render``.
     """
-    steps = [(displacement, 0.0), (-displacement, 0.0), (0.0, displacement), (0.0, -displacement)]
-    reference = reference_render(scene, width=width, height=height, **settings)
-    others = [reference_render(scene, width=width, height=height, displacement=s, **settings) for s in steps]
+    steps = [(displacement, 0), (-displacement, 0), (0, displacement), (0, -displacement)]
+    reference = reference_render(scene, **settings)
+    others = [reference_render(scene, displacement=step, **settings) for step in steps]
     silhouette = np.any([other.path != reference.path for other in others], axis=0)
     shadow = np.any([other.lights != reference.lights for other in others], axis=0) & ~silhouette
     spread = np.max([np.abs(other.image - reference.image).max(axis=-1) for other in others], axis=0)
@@ -159,20 +137,19 @@ def specular_lobe(n: np.ndarray, to_light: np.ndarray, to_eye: np.ndarray, alpha
     """Return D G / (4 cos cos) for unit vectors above the surface."""
     h = unit(to_light + to_eye)
     cos2, sin2 = dot(n, h) ** 2, np.square(np.cross(n, h)).sum(axis=-1)
-    spread = np.exp(-sin2 / cos2 / alpha**2) / (math.pi * alpha**2 * cos2**2)
-    shadowing: Any = 1.0
+    lobe = np.exp(-sin2 / cos2 / alpha**2) / (math.pi * alpha**2 * cos2**2)
     for way in (to_light, to_eye):
         a = np.minimum(dot(n, way) / (alpha * np.linalg.norm(np.cross(n, way), axis=-1)), 1.6)
         fit = a * (3.535 + 2.181 * a) / (1 + a * (2.276 + 2.577 * a))
-        shadowing = shadowing * np.where(a < 1.6, fit, 1.0)
-    return spread * shadowing / (4 * dot(n, to_light) * dot(n, to_eye))
+        lobe = lobe * np.where(a < 1.6, fit, 1.0)
+    return lobe / (4 * dot(n, to_light) * dot(n, to_eye))
 
 
 # ------------------------------------------------- Objects -------------------------------------------------
 
 
 class Spheres:
-    """Spheres as rows of numbers, and where rays meet them."""
+    """Spheres as rows of numbers, and where rays meet them; ``extent``: the largest of their numbers."""
 
     def __init__(self, things: Sequence[Sphere]) -> None:
         self.center = np.array([s.center for s in things], float)
@@ -212,15 +189,15 @@ class Axial:
     """
 
     def __init__(self, things: Sequence[Cone | Cylinder]) -> None:
-        cone = np.array([isinstance(t, Cone) for t in things])
+        self.cone = np.array([isinstance(t, Cone) for t in things])
         ends = [(t.apex, t.base_center) if isinstance(t, Cone) else (t.p0, t.p1) for t in things]
         self.end, other = np.array(ends, float).swapaxes(0, 1)
         self.length = np.linalg.norm(other - self.end, axis=1)
         self.axis = unit(other - self.end)
         self.radius = np.array([t.radius for t in things], float)
-        self.start, self.slope = np.where(cone, 0, self.radius), np.where(cone, self.radius / self.length, 0)
-        self.extent = np.abs(np.concatenate([self.end, other], axis=1)).max(axis=1) + self.radius
-        self.cone = cone
+        self.start = np.where(self.cone, 0, self.radius)
+        self.slope = (self.radius - self.start) / self.length
+        self.extent = np.abs([self.end, other]).max(axis=(0, 2)) + self.radius
 
     def distances(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         off = o[:, None] - self.end
@@ -250,8 +227,8 @@ class Axial:
         side = across / radius[:, None] - self.slope[k][:, None] * axis
         off = [np.abs(radius - self.start[k] - self.slope[k] * height), np.abs(height - length)]
         off.append(np.where(self.cone[k], np.inf, np.abs(height)))
-        part = np.argmin(off, axis=0)[:, None]
-        return unit(np.where(part == 0, side, np.where(part == 1, axis, -axis)))
+        part = np.argmin(off, axis=0)
+        return unit(np.choose(part[:, None], [side, axis, -axis]))
 
 
 class Triangles:
@@ -262,7 +239,11 @@ class Triangles:
         self.corner, self.edges = corners[:, 0], (corners[:, 1:] - corners[:, :1]).swapaxes(0, 1)
         self.normal = unit(np.cross(*self.edges))
         self.extent = np.abs(corners).max(axis=(1, 2))
-        self.uv: Any = None if mesh.uvs is None else np.asarray(mesh.uvs, float)[mesh.faces]
+        self.picture: Any = None  # [rows, columns, 3], as stored
+        if mesh.material.texture:
+            with Image.open(str(mesh.material.texture)) as picture:
+                self.picture = np.asarray(picture.convert("RGB")) / 255
+            self.uv = np.asarray(mesh.uvs, float)[mesh.faces]
 
     def distances(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         first, second = self.edges
@@ -276,7 +257,7 @@ class Triangles:
     def normals(self, p: np.ndarray, k: np.ndarray) -> np.ndarray:
         return self.normal[k]
 
-    def texels(self, picture: np.ndarray, p: np.ndarray, k: np.ndarray) -> np.ndarray:
+    def texels(self, p: np.ndarray, k: np.ndarray) -> np.ndarray:
         """Return the colours [N, 3] of the texels nearest to points on the triangles k."""
         first, second = self.edges[:, k]
         off, whole = p - self.corner[k], np.cross(first, second)
@@ -284,9 +265,9 @@ class Triangles:
         weights = [dot(np.cross(off, second), whole) / area, dot(np.cross(first, off), whole) / area]
         shares = np.stack([1 - sum(weights), *weights], axis=1)
         u, v = np.clip(np.einsum("nc,nci->in", shares, self.uv[k]), 0, 1)
-        rows, columns = picture.shape[:2]
+        rows, columns = self.picture.shape[:2]
         row, column = (v * (rows - 1) + 0.5).astype(int), (u * (columns - 1) + 0.5).astype(int)
-        return picture[row % rows, column % columns]
+        return self.picture[row % rows, column % columns]
 
 
 def _first_ahead(*distances: np.ndarray) -> np.ndarray:
@@ -296,80 +277,78 @@ def _first_ahead(*distances: np.ndarray) -> np.ndarray:
 # ------------------------------------------------- Tracing -------------------------------------------------
 
 
-@dataclass
-class _Hits:
+class _Hits(NamedTuple):
     """N rays that met something: where, on what, and from where."""
 
     pixel: np.ndarray  # [N]
     d: np.ndarray  # [N, 3], of the ray
     throughput: np.ndarray  # [N, 3]
-    depth: np.ndarray  # [N], bounce budget spent
+    budget: np.ndarray  # [N], of bounces, spent
     t: np.ndarray  # [N]
-    thing: np.ndarray  # [N], index of the object
+    thing: np.ndarray  # [N], number of the object
     p: np.ndarray  # [N, 3]
     n: np.ndarray  # [N, 3]
     scale: np.ndarray  # [N], size of the numbers that p was computed from
     diffuse: np.ndarray  # [N, 3]
 
     def only(self, keep: np.ndarray) -> _Hits:
-        return _Hits(*(getattr(self, f.name)[keep] for f in fields(self)))
+        return _Hits(*(values[keep] for values in self))
 
 
 class _Tracer:
-    def __init__(self, scene: Scene, settings: Settings) -> None:
-        self.scene, self.settings = scene, settings
-        self.reach = ORIGINAL_REACH if settings.start == "original" else np.inf
-        # Each with the numbers of its objects; all triangles of a mesh are one object
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        fresnel: str = "dielectric",
+        clamp: bool = True,
+        max_depth: int = 10,
+        bounce_budget: str = "report",
+        start: str = "robust",
+    ) -> None:
+        self.scene, self.fresnel, self.clamp, self.start = scene, fresnel, clamp, start
+        self.max_depth, self.bounce_budget = max_depth, bounce_budget
         axial = (*scene.cones, *scene.cylinders)
+        self.things: list[Any] = [*scene.spheres, *scene.planes, *axial, *scene.meshes]
+        for thing in self.things:
+            drawn = isinstance(thing, Mesh) and thing.uvs is not None and scene.texturing == "report"
+            if thing.material.texture and not drawn:
+                raise SceneError("float64 draws textures on triangles only, looked up as in the report")
+        # Objects of a kind, each with its number; all triangles of a mesh are one object
         self.groups: list[tuple[Any, np.ndarray]] = []
         first = 0
         for kind, members in ((Spheres, scene.spheres), (Planes, scene.planes), (Axial, axial)):
             if members:
                 self.groups.append((kind(members), first + np.arange(len(members))))  # type: ignore[arg-type]
             first += len(members)
-        for number, mesh in enumerate(scene.meshes, first):
-            self.groups.append((Triangles(mesh), np.full(len(mesh.faces), number)))
-        things: list[Any] = [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
-        materials = [thing.material for thing in things]
-        self.ior, self.alpha = (np.array([getattr(m, name) for m in materials]) for name in ("ior", "alpha"))
-        self.specular, self.diffuse = (
-            np.array([getattr(m, name) for m in materials], float).reshape(-1, 3)
-            for name in ("specular", "diffuse")
-        )
-        self.pictures = {i: _picture(scene, things[i]) for i, m in enumerate(materials) if m.texture}
-        plain = settings.bounce_budget == "plain"
-        self.cost = np.array([1 if plain else max(1, 10 - int(10 * m.ior)) for m in materials], int)
+        self.groups += [(Triangles(m), np.full(len(m.faces), i)) for i, m in enumerate(scene.meshes, first)]
 
-    def film(self, o: np.ndarray, d: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the layers of ``ReferenceResult`` for rays, one each, in their order."""
-        count, scene = len(o), self.scene
-        layers = {
-            "image": np.zeros((count, 3)),
-            "depth": np.full(count, np.inf),
-            "object_id": np.full(count, -1),
-            "normal": np.zeros((count, 3)),
-            "bounces": np.zeros(count, int),
-            "path": np.ones(count, np.uint64),
-            "lights": np.ones(count, np.uint64),
-            "terminator": np.ones(count),
-        }
-        pixel, throughput, depth = np.arange(count), np.ones((count, 3)), np.zeros(count, int)
-        for bounce in range(self.settings.max_depth):
-            hits, missed, met = self.hits(pixel, o, d, throughput, depth)
-            layers["path"][pixel] = _mix(layers["path"][pixel], met)
-            layers["image"][pixel[missed]] += throughput[missed] * np.array(scene.sky)
-            if bounce == 0:
-                for name, values in (("depth", hits.t), ("object_id", hits.thing), ("normal", hits.n)):
-                    layers[name][hits.pixel] = values
-            layers["bounces"][hits.pixel] = bounce
-            radiance, seen, grazing = self.direct(hits)
-            layers["image"][hits.pixel] += hits.throughput * radiance
-            layers["lights"][hits.pixel] = _mix(layers["lights"][hits.pixel], seen)
-            layers["terminator"][hits.pixel] = np.minimum(layers["terminator"][hits.pixel], grazing)
-            pixel, o, d, throughput, depth = self.reflected(hits)
-            if not len(pixel):
+    def of_material(self, name: str, things: np.ndarray) -> np.ndarray:
+        """Return a parameter of the materials of objects [N]."""
+        return np.array([getattr(thing.material, name) for thing in self.things], float)[things]
+
+    def film(self, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the layers of ``ReferenceResult`` for rays, in their order."""
+        count = len(o)
+        image, normal = np.zeros((2, count, 3))
+        depth, object_id = np.full(count, np.inf), np.full(count, -1)
+        path, lights = np.ones((2, count), np.uint64)
+        pixel, throughput, budget = np.arange(count), np.ones((count, 3)), np.zeros(count, int)
+        for bounce in range(self.max_depth):
+            met = self.hits(pixel, o, d, throughput, budget)
+            path[pixel] = _mix(path[pixel], met.thing)
+            missed = met.thing < 0
+            image[pixel[missed]] += throughput[missed] * np.array(self.scene.sky)
+            hits = met.only(~missed)
+            if missed.all():
                 break
-        return layers
+            if bounce == 0:
+                depth[hits.pixel], object_id[hits.pixel], normal[hits.pixel] = hits.t, hits.thing, hits.n
+            radiance, seen = self.direct(hits)
+            image[hits.pixel] += hits.throughput * radiance
+            lights[hits.pixel] = _mix(lights[hits.pixel], seen)
+            pixel, o, d, throughput, budget = self.reflected(hits)
+        return image, depth, object_id, normal, path, lights
 
     def nearest(self, o: np.ndarray, d: np.ndarray, reach: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return of each ray's first object within reach: distance, group (-1 for none), and row in it."""
@@ -386,89 +365,75 @@ class _Tracer:
                 t[closer], group[closer], row[closer] = closest[closer - start], g, k[closer - start]
         return t, group, row
 
-    def hits(self, pixel: Any, o: Any, d: Any, throughput: Any, depth: Any) -> tuple[_Hits, Any, np.ndarray]:
-        """Return what rays meet, which [N] meet nothing, and the number [N] of the object, or -1."""
-        t, group, row = self.nearest(o, d, self.reach)
+    def hits(self, pixel: Any, o: Any, d: Any, throughput: Any, budget: Any) -> _Hits:
+        """Return what rays meet; the number of the object is -1 where that is nothing."""
+        t, group, row = self.nearest(o, d, ORIGINAL_REACH if self.start == "original" else np.inf)
         p = o + np.where(group >= 0, t, 0)[:, None] * d
         n, thing, extent = np.zeros_like(p), np.full(len(p), -1), np.zeros(len(p))
         diffuse = np.zeros_like(p)
         for g, (shapes, numbers) in enumerate(self.groups):
             here = np.flatnonzero(group == g)
-            if not len(here):
-                continue
-            thing[here], extent[here] = numbers[row[here]], np.abs(shapes.extent[row[here]])
-            n[here] = shapes.normals(p[here], row[here])
-            diffuse[here] = self.diffuse[thing[here]]
-            picture = self.pictures.get(int(numbers[0]))
-            if picture is not None:
-                diffuse[here] = shapes.texels(picture, p[here], row[here])
+            k = row[here]
+            thing[here], extent[here], n[here] = (
+                numbers[k],
+                np.abs(shapes.extent[k]),
+                shapes.normals(p[here], k),
+            )
+            textured = isinstance(shapes, Triangles) and shapes.picture is not None
+            diffuse[here] = (
+                shapes.texels(p[here], k) if textured else self.of_material("diffuse", thing[here])
+            )
         scale = np.abs(o).max(axis=1) + t + extent
-        found = group >= 0
-        everything = _Hits(pixel, d, throughput, depth, t, thing, p, n, scale, diffuse)
-        return everything.only(found), ~found, thing
+        return _Hits(pixel, d, throughput, budget, t, thing, p, n, scale, diffuse)
 
-    def direct(self, hits: _Hits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the light sent back along the rays, a code of which lights are seen, and the least |cos|."""
-        count = len(hits.p)
-        radiance, seen, grazing = np.zeros((count, 3)), np.zeros(count, int), np.ones(count)
+    def direct(self, hits: _Hits) -> tuple[np.ndarray, np.ndarray]:
+        """Return the light sent back along the rays, and a code of which lights are seen."""
+        radiance, seen = np.zeros_like(hits.p), np.zeros(len(hits.p), int)
         for light in self.scene.lights:
-            to_light = np.array(light.position) - hits.p
-            cos = dot(hits.n, unit(to_light))
-            grazing = np.minimum(grazing, np.abs(cos))
+            position = np.array(light.position)
+            cos = dot(hits.n, unit(position - hits.p))
             facing = np.flatnonzero((cos > 0) & (dot(hits.n, hits.d) < 0))
-            lit = facing[~self.blocked(hits.only(facing), np.array(light.position))]
+            before = hits.only(facing)
+            o = self.lifted(before, unit(position - before.p), ORIGINAL_SHADOW_START)
+            way = position - o
+            lit = facing[self.nearest(o, unit(way), np.linalg.norm(way, axis=1))[1] < 0]
             seen *= 3
             seen[facing] += 1
             seen[lit] += 1
-            value = self.reflectance(hits.only(lit), unit(to_light[lit])) * cos[lit, None] * light.color
-            radiance[lit] += np.clip(value, 0, 1) if self.settings.clamp else value
-        return radiance, seen, grazing
-
-    def blocked(self, hits: _Hits, light: np.ndarray) -> np.ndarray:
-        o = self.lifted(hits, unit(light - hits.p), ORIGINAL_SHADOW_START)
-        way = light - o
-        return self.nearest(o, unit(way), np.linalg.norm(way, axis=1))[1] >= 0
+            value = self.reflectance(hits.only(lit), position) * cos[lit, None] * light.color
+            radiance[lit] += np.clip(value, 0, 1) if self.clamp else value
+        return radiance, seen
 
     def lifted(self, hits: _Hits, d: np.ndarray, original: float) -> np.ndarray:
         """Return where rays that leave in the directions d start."""
-        if self.settings.start == "original":
+        if self.start == "original":
             return hits.p + original * d
-        size = OFFSET * hits.scale
-        if self.settings.start == "mitsuba":
-            size = MITSUBA_OFFSET * (1 + np.abs(hits.p).max(axis=1))
-        return hits.p + size[:, None] * hits.n
+        robust, mitsuba = OFFSET * hits.scale, MITSUBA_OFFSET * (1 + np.abs(hits.p).max(axis=1))
+        return hits.p + (mitsuba if self.start == "mitsuba" else robust)[:, None] * hits.n
 
-    def reflectance(self, hits: _Hits, to_light: np.ndarray) -> np.ndarray:
-        """Return the BSDF [N, 3]; both directions are above the surface."""
-        k = hits.thing
+    def reflectance(self, hits: _Hits, light: np.ndarray) -> np.ndarray:
+        """Return the BSDF [N, 3] for light from a point; both directions are above the surface."""
+        to_light = unit(light - hits.p)
+        lobe = specular_lobe(hits.n, to_light, -hits.d, self.of_material("alpha", hits.thing))
         cos = dot(unit(to_light - hits.d), to_light)
-        lobe = specular_lobe(hits.n, to_light, -hits.d, self.alpha[k])
-        lobe = lobe * fresnel(self.settings.fresnel, cos, self.ior[k])
+        lobe = lobe * fresnel(self.fresnel, cos, self.of_material("ior", hits.thing))
         # The G₁ of a negative roughness can be negative; light cannot
-        return np.maximum(hits.diffuse / math.pi + self.specular[k] * lobe[:, None], 0)
+        specular = self.of_material("specular", hits.thing) * lobe[:, None]
+        return np.maximum(hits.diffuse / math.pi + specular, 0)
 
     def reflected(self, hits: _Hits) -> tuple[np.ndarray, ...]:
-        """Return the mirror rays that go on: pixel, o, d, throughput, depth."""
-        cos = -dot(hits.n, hits.d)
+        """Return the mirror rays that go on: pixel, o, d, throughput, budget spent."""
+        ior, cos = self.of_material("ior", hits.thing), -dot(hits.n, hits.d)
         d = unit(hits.d + 2 * cos[:, None] * hits.n)
         o = self.lifted(hits, d, ORIGINAL_MIRROR_START)
-        mirrored = fresnel(self.settings.fresnel, cos, self.ior[hits.thing])
-        throughput = hits.throughput * self.specular[hits.thing] * mirrored[:, None]
-        depth = hits.depth + self.cost[hits.thing]
-        on = (cos > 0) & (depth < self.settings.max_depth) & (throughput != 0).any(axis=1)
-        return hits.pixel[on], o[on], d[on], throughput[on], depth[on]
-
-
-def _picture(scene: Scene, thing: Any) -> np.ndarray:
-    """Return the texels [rows, columns, 3] of a mesh's material, as they are stored."""
-    from PIL import Image
-
-    if not isinstance(thing, Mesh) or thing.uvs is None or scene.texturing != "report":
-        raise SceneError("the float64 reference draws textures on triangles only, looked up as in the report")
-    with Image.open(str(thing.material.texture)) as picture:
-        return np.asarray(picture.convert("RGB")) / 255
+        mirrored = self.of_material("specular", hits.thing) * fresnel(self.fresnel, cos, ior)[:, None]
+        throughput = hits.throughput * mirrored
+        cost = 1 if self.bounce_budget == "plain" else np.maximum(1, 10 - (10 * ior).astype(int))
+        budget = hits.budget + cost
+        on = (cos > 0) & (budget < self.max_depth) & (throughput != 0).any(axis=1)
+        return hits.pixel[on], o[on], d[on], throughput[on], budget[on]
 
 
 def _mix(hashed: np.ndarray, value: np.ndarray) -> np.ndarray:
     """Continue a hash by one more number."""
-    return (hashed ^ (value + 2).astype(np.uint64)) * _HASH
+    return (hashed ^ (value + 2).astype(np.uint64)) * HASH
