@@ -151,6 +151,12 @@ def one_ray_too_many(render: Any, scene: Any, **options: Any) -> Any:
     return dataclasses.replace(result, rays=more)
 
 
+def mirrors_too(render: Any, scene: Any, *, integrator: Any, **options: Any) -> Any:
+    if integrator != "direct":
+        integrator = integrator | {"max_depth": 2}
+    return render(scene, integrator=integrator, **options)
+
+
 def no_refinement(render: Any, scene: Any, **options: Any) -> Any:
     result = render(scene, **options)
     if options["aamode"] != "sobel" or options.get("spp"):
@@ -248,7 +254,7 @@ FAULTS: list[tuple[str, Fault, str]] = [
     ("stock:mesh_cones", of_type("mrt_cone", radius=lambda r: 1.001 * r), "slope"),
     ("stock:mesh_cones", of_type("mrt_cone", segments=lambda n: n // 2), "mean error"),
     ("stock:mesh_cones", of_type("mrt_cone", capped=lambda _: False), "another part"),
-    ("stock:direct", of_type("mrt_whitted", max_depth=lambda _: 2), "share of pixels off"),
+    ("stock:direct", wrapped(mrt, "render", mirrors_too), "share of pixels off"),
     ("stock:whole_scenes", SCHLICK, "scene 0"),
     ("roughconductor:pointwise", BRIGHT, "value"),
     ("roughconductor:pointwise", ROUGH, "value"),
