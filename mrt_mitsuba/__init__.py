@@ -78,11 +78,9 @@ def __dir__() -> list[str]:
 
 
 if not _os.path.isdir(_os.path.join(_os.path.dirname(__file__), "plugins")):
-    # A source checkout: plugins and other sub-packages are folders next to this one.
-    from mrt_mitsuba import _checkout
+    # A source checkout: the sub-packages ``plugins``, ``validation`` and ``scenes_xml`` lie next to this one
+    __path__.append(_os.path.dirname(_os.path.dirname(_os.path.abspath(__file__))))
 
-    _checkout.install()
-
-from mrt_mitsuba import llvm as _llvm  # noqa: E402 - after the finder, and the last thing: it may warn
+from mrt_mitsuba import llvm as _llvm  # noqa: E402 - the last thing: it may warn
 
 _llvm.prepare()

@@ -6,18 +6,16 @@ the first kernel with a minimum, maximum or clip in it. If there is none, the va
 does not exist, so that Dr.Jit reports a missing library and never picks up an old one by itself.
 
 Dr.Jit loads the library when it is first imported, so the choice is made by ``import mrt_mitsuba``. It takes
-well under a millisecond and loads nothing: versions are read from file names. Hence also the sparing use of
-imports here.
+a few milliseconds and loads nothing: versions are read from file names.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import sys
-
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 OLDEST = 17
@@ -31,45 +29,24 @@ HELP = (
 Version = tuple[int, ...]
 
 
-class Choice:
+class Choice(NamedTuple):
     """The chosen library, and the reason.
 
     ``path``: the library, or None. ``version``: its version, or None where it is unknown before it is loaded.
-    ``source``: "user", "wheel", "system", "none", or "drjit" where Dr.Jit is left to search by itself (macOS
-    and Windows). ``rejected``: one line for each library that was passed over.
+    ``source``: where it is from, or "none". ``rejected``: one line for each library that was passed over.
     """
 
-    __slots__ = ("path", "rejected", "source", "version")
-
-    def __init__(
-        self, path: str | None, version: Version | None, source: str, rejected: Sequence[str] = ()
-    ) -> None:
-        self.path = path
-        self.version = version
-        self.source = source
-        self.rejected = tuple(rejected)
-
-    def __repr__(self) -> str:
-        return f"Choice({self.path!r}, {self.version!r}, {self.source!r}, rejected={self.rejected!r})"
-
-    @property
-    def usable(self) -> bool:
-        """Return whether LLVM variants can be expected to work."""
-        return self.source != "none"
+    path: str | None
+    version: Version | None
+    source: str
+    rejected: list[str]
 
     def describe(self) -> str:
         """Return one sentence for people."""
-        if self.source == "none":
+        if self.path is None:
             but = f", but {'; '.join(self.rejected)}" if self.rejected else ""
             return f"no usable LLVM {OLDEST} or newer was found{but}. {HELP}"
-        if self.source == "drjit":
-            return "LLVM: left to Dr.Jit's own search"
-        origin = {
-            "user": f"named by {VARIABLE}",
-            "wheel": f"from the package {WHEEL}",
-            "system": "the newest of the system",
-        }
-        return f"LLVM {version_text(self.version)}, {origin[self.source]}: {self.path}"
+        return f"LLVM {version_text(self.version)}, {self.source}: {self.path}"
 
 
 def version_text(version: Version | None) -> str:
@@ -95,22 +72,20 @@ def choose(
     if named and named not in (BLOCKED, wheel):
         version = version_of(named)
         if version and version[0] >= OLDEST:
-            return Choice(named, version, "user")
+            return Choice(named, version, f"named by {VARIABLE}", rejected)
         what = f"is LLVM {version_text(version)}" if version else "cannot be loaded"
         rejected.append(f"{VARIABLE}={named} {what}")
-    if not sys.platform.startswith("linux"):
-        return Choice(None, None, "drjit", rejected)
-    if wheel and not problem:
-        return Choice(wheel, version_of(wheel), "wheel", rejected)
-    if problem:
-        rejected.append(problem)
-    libraries = set(system_libraries(system_folders(environ) if system is None else system))
-    candidates = sorted(
-        (found for found in libraries if found[1] != os.path.realpath(wheel or "")), reverse=True
-    )
-    rejected += [f"{path} is LLVM {version_text(found)}" for found, path in candidates if found[0] < OLDEST]
-    if candidates and candidates[0][0][0] >= OLDEST:
-        return Choice(candidates[0][1], candidates[0][0], "system", rejected)
+    if wheel:
+        version = version_of(wheel)
+        if version and version[0] >= OLDEST and not problem:
+            return Choice(wheel, version, f"from the package {WHEEL}", rejected)
+        rejected.append(problem or f"{wheel} of {WHEEL} is LLVM {version_text(version)}")
+    folders = system_folders(environ) if system is None else system
+    for version, path in sorted(set(_libraries(folders)), reverse=True):
+        if path != os.path.realpath(wheel or ""):
+            if version[0] >= OLDEST:
+                return Choice(path, version, "the newest of the system", rejected)
+            rejected.append(f"{path} is LLVM {version_text(version)}")
     return Choice(None, None, "none", rejected)
 
 
@@ -121,35 +96,24 @@ def wheel_library(search_path: Iterable[str]) -> tuple[str | None, str | None]:
     the same, but importing it takes 30 ms.
     """
     prefix = WHEEL.replace("-", "_") + "-"
-    for folder in search_path:
-        for name in _list(folder):
-            if not (name.startswith(prefix) and name.endswith(".dist-info")):
-                continue
-            info = os.path.join(folder, name)
-            try:
-                with open(os.path.join(info, "RECORD"), encoding="utf-8") as lines:
-                    files = [line.split(",", 1)[0] for line in lines if "/libLLVM.so." in line]
-            except (OSError, UnicodeDecodeError):
-                continue
-            paths = (os.path.normpath(os.path.join(folder, file)) for file in files)
-            library = next(filter(os.path.isfile, paths), None)
-            if library:
-                return library, _wheel_problem(library, info)
+    found = ((folder, name) for folder in search_path for name in _list(folder) if name.startswith(prefix))
+    for folder, name in found:
+        info = os.path.join(folder, name)
+        try:
+            with open(os.path.join(info, "RECORD"), encoding="utf-8") as lines:
+                files = [line.split(",", 1)[0] for line in lines if "/libLLVM.so." in line]
+        except (OSError, UnicodeDecodeError):
+            continue
+        paths = (os.path.normpath(os.path.join(folder, file)) for file in files)
+        library = next(filter(os.path.isfile, paths), None)
+        # Symbolic links are made at the next start of Python; without them, libraries it needs are missing
+        unfinished = "symlinks.txt" in _list(info) and "axle.done" not in _list(info)
+        if library:
+            return library, unfinished * (
+                f"the installation of {WHEEL} is unfinished: whoever may write to {info} has to start Python "
+                f"once ({sys.executable} -c '')"
+            )
     return None, None
-
-
-def _wheel_problem(library: str, info: str) -> str | None:
-    version = version_of(library)
-    if not version or version[0] < OLDEST:
-        return f"{library} of {WHEEL} is LLVM {version_text(version)}"
-    # Its symbolic links are made at the next start of Python; without them, libraries it needs are not found.
-    files = _list(info)
-    if "symlinks.txt" in files and "axle.done" not in files:
-        return (
-            f"the installation of {WHEEL} is unfinished: whoever may write to {info} has to start Python "
-            f"once ({sys.executable} -c '')"
-        )
-    return None
 
 
 def system_folders(environ: Mapping[str, str] = os.environ) -> list[str]:
@@ -158,21 +122,16 @@ def system_folders(environ: Mapping[str, str] = os.environ) -> list[str]:
     folders.append(os.path.join(sys.prefix, "lib"))  # conda
     machine = os.uname().machine
     folders += ["/usr/local/lib", f"/usr/lib/{machine}-linux-gnu", "/usr/lib64", "/usr/lib"]
-    folders += [f"/usr/lib/{name}/lib" for name in _list("/usr/lib") if name.startswith("llvm")]
-    return folders
+    return folders + [f"/usr/lib/{name}/lib" for name in _list("/usr/lib") if name.startswith("llvm")]
 
 
-def system_libraries(folders: Iterable[str]) -> Iterator[tuple[Version, str]]:
-    """Yield version and path of every libLLVM in ``folders``, each file once."""
-    seen = set()
+def _libraries(folders: Iterable[str]) -> Iterator[tuple[Version, str]]:
+    """Yield version and path of every libLLVM in ``folders``."""
     for folder in folders:
         for name in _list(folder):
-            if not (name.startswith("libLLVM") and ".so" in name):
-                continue
             path = os.path.realpath(os.path.join(folder, name))
-            version = version_in_name(path)
-            if version and path not in seen and os.path.isfile(path):
-                seen.add(path)
+            version = version_in_name(path) if name.startswith("libLLVM") else None
+            if version and os.path.isfile(path):
                 yield version, path
 
 
@@ -185,14 +144,9 @@ def _list(folder: str) -> list[str]:
 
 def version_in_name(path: str) -> Version | None:
     """Return the version in a file name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1, or None."""
-    name = os.path.basename(path)
-    if not name.startswith("libLLVM"):
-        return None
-    before, _, after = name[len("libLLVM") :].partition(".so")
-    numbers = (before.lstrip("-") or after.lstrip(".")).split(".")
-    if not all(number.isdecimal() for number in numbers):
-        return None
-    return tuple(int(number) for number in numbers)
+    found = re.fullmatch(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.so(?:\.(\d+(?:\.\d+)*))?", os.path.basename(path))
+    numbers = found and (found[1] or found[2])
+    return tuple(map(int, numbers.split("."))) if numbers else None
 
 
 def version_of(library: str) -> Version | None:
@@ -201,29 +155,23 @@ def version_of(library: str) -> Version | None:
     Where neither the name nor the target of a symbolic link holds it, the library is asked, in a process of
     its own.
     """
+    path = os.path.realpath(library)
     if os.path.dirname(library):
-        path = os.path.realpath(library)
         if not os.path.isfile(path):
             return None
-        version = version_in_name(path)
-        if version:
+        if version := version_in_name(path):
             return version
     import subprocess
 
+    words = [sys.executable, "-I", "-c", _ASK, library]
     try:
-        answer = subprocess.run(
-            [sys.executable, "-I", "-c", _ASK, library],
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=True,
-        )
-        return tuple(int(number) for number in answer.stdout.split())
+        answer = subprocess.run(words, capture_output=True, text=True, timeout=60, check=True)
+        return tuple(map(int, answer.stdout.split()))
     except (OSError, ValueError, subprocess.SubprocessError):
         return None
 
 
-# Prints (0, 0, 0) for what is older than LLVM 16
+# Prints 0 0 0 for what is older than LLVM 16
 _ASK = """
 import ctypes, sys
 numbers = [ctypes.c_uint(0) for _ in range(3)]
@@ -246,28 +194,25 @@ def prepare() -> Choice:
     """
     global _prepared, _drjit_came_first
     if _prepared is None:
-        _prepared = choose()
+        _prepared = choice = choose()
         _drjit_came_first = "drjit" in sys.modules
-        if _prepared.path:
-            os.environ[VARIABLE] = _prepared.path
-        elif _prepared.source == "none":
-            os.environ[VARIABLE] = BLOCKED
-        elif _prepared.rejected:
-            os.environ.pop(VARIABLE, None)
-        if not _drjit_came_first and _prepared.rejected and _prepared.rejected[0].startswith(VARIABLE):
-            _warn(
-                f"{_prepared.rejected[0]}, which Dr.Jit cannot use; it needs {OLDEST} or newer. "
-                f"Instead: {_prepared.describe()}"
-            )
+        os.environ[VARIABLE] = choice.path or BLOCKED
         problem = too_early()
+        if not _drjit_came_first and choice.rejected and choice.rejected[0].startswith(VARIABLE):
+            problem = f"{choice.rejected[0]}, which Dr.Jit cannot use; it needs {OLDEST} or newer. "
+            problem += f"Instead: {choice.describe()}"
         if problem:
-            _warn(problem)
+            import warnings
+
+            from mrt_mitsuba.errors import MrtWarning
+
+            warnings.warn(problem, MrtWarning, stacklevel=3)
     return _prepared
 
 
 def too_early() -> str | None:
     """Return what is wrong if Dr.Jit was imported before the choice was made and has no good LLVM."""
-    if not _drjit_came_first or _prepared is None or _prepared.source in ("none", "drjit"):
+    if not _drjit_came_first or _prepared is None or _prepared.path is None:
         return None
     loaded = sys.modules["drjit"].detail.llvm_version()[0]
     if loaded >= OLDEST:
@@ -277,11 +222,3 @@ def too_early() -> str | None:
         f"Dr.Jit was imported before mrt_mitsuba and {found}. Import mrt_mitsuba before mitsuba and drjit, "
         f"or set {VARIABLE}={_prepared.path}"
     )
-
-
-def _warn(text: str) -> None:
-    import warnings
-
-    from mrt_mitsuba.errors import MrtWarning
-
-    warnings.warn(text, MrtWarning, stacklevel=4)

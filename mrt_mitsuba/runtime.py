@@ -51,8 +51,7 @@ def use(variant: str | None = None) -> str:
             hint = f" Did you mean {close[0]}?" if close else ""
             known = ", ".join(mi.variants())
             raise UnknownVariantError(f"unknown variant {variant!r}.{hint} This Mitsuba has {known}.")
-        problem = obstacle(variant)
-        if problem:
+        if problem := obstacle(variant):
             raise VariantError(f"the variant {variant} cannot be used: {problem}")
         if mi.variant() != variant:
             try:
@@ -114,20 +113,15 @@ def obstacle(variant: str) -> str | None:
     import drjit as dr
 
     if variant.startswith("cuda"):
-        found = dr.has_backend(dr.JitBackend.CUDA)
-        return (
-            None
-            if found
-            else f"it needs an NVIDIA GPU with its driver, and none was found. Use {FAST} or {SLOW}."
-        )
-    early = llvm.too_early()
-    if early:
+        none = f"it needs an NVIDIA GPU with its driver, and none was found. Use {FAST} or {SLOW}."
+        return None if dr.has_backend(dr.JitBackend.CUDA) else none
+    if early := llvm.too_early():
         return early
-    if not choice.usable:
+    if choice.path is None:
         return choice.describe()
-    loaded = dr.detail.llvm_version()
     if not dr.has_backend(dr.JitBackend.LLVM):
-        return f"Dr.Jit could not load {choice.path or 'any LLVM'}. {llvm.HELP}"
+        return f"Dr.Jit could not load {choice.path}. {llvm.HELP}"
+    loaded = dr.detail.llvm_version()
     if loaded[0] < llvm.OLDEST:
         return f"Dr.Jit loaded LLVM {llvm.version_text(loaded)}, with which it would abort. {llvm.HELP}"
     return None
@@ -160,10 +154,5 @@ def versions() -> dict[str, str]:
 
     from mrt_mitsuba import __version__
 
-    llvm_version = llvm.version_text(llvm.prepare().version)
-    return {
-        "mrt-mitsuba": __version__,
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
-        "llvm": llvm_version,
-    }
+    found = {"mrt-mitsuba": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__}
+    return found | {"llvm": llvm.version_text(llvm.prepare().version)}
