@@ -15,7 +15,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -52,12 +52,10 @@ def rows(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
         for pair in speed.on_device(given.device, sizes, triangles):
             yield pair.name, _row(speed.compare(pair, repeats)[0])
         return
-    yield "mrt out 0 / a bare start of Mitsuba", _start(repeats)
-    yield from _cases(given, repeats)
-    if not given.small:
-        extent = speed.QUICK if given.quick else speed.FULL
-        for pair in speed.against_mitsuba(extent):
-            yield pair.name, _row(speed.compare(pair, repeats)[0], pair.goal)
+    yield "mrt out 0 / a bare start of Mitsuba", start(repeats)
+    yield from cases(given, repeats)
+    for pair in () if given.small else speed.against_mitsuba(speed.QUICK if given.quick else speed.FULL):
+        yield pair.name, _row(speed.compare(pair, repeats)[0], pair.goal)
 
 
 def _row(time: Ratio, goal: float | None = None) -> Row:
@@ -65,74 +63,64 @@ def _row(time: Ratio, goal: float | None = None) -> Row:
     return {"ratio": found.pop("median"), **found, "goal": goal}
 
 
-def _start(turns: int) -> Row:
+def start(turns: int) -> Row:
     """Return the seconds of the command against those of a bare start, as after installation."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-
-    def seconds(*command: str) -> float:
-        silent: dict[str, Any] = {"check": True, "stdout": subprocess.DEVNULL, "timeout": 600}
-        return timed(lambda: subprocess.run([sys.executable, *command], env=environment, **silent))[1]
-
+    silent: dict[str, Any] = {"check": True, "stdout": subprocess.DEVNULL, "timeout": 600, "env": environment}
     with tempfile.TemporaryDirectory() as folder:
-        sides = [("-m", "mrt_mitsuba.command.main", f"{folder}/out", "0", "quiet=1"), ("-c", BARE)]
+        commands = [("-m", "mrt_mitsuba.command.main", f"{folder}/out", "0", "quiet=1"), ("-c", BARE)]
+        sides = [
+            lambda _, c=command: timed(lambda: subprocess.run([sys.executable, *c], **silent))[1]
+            for command in commands
+        ]
         for side in sides:
-            seconds(*side)  # Python compiles modules once
-        times = in_turns([lambda _, side=side: seconds(*side) for side in sides], turns)  # type: ignore[misc]
-    return _row(Ratio.of(*times), START_GOAL)
+            side(0)  # Python compiles modules once
+        return _row(Ratio.of(*in_turns(sides, turns)), START_GOAL)
 
 
-def _cases(given: argparse.Namespace, turns: int) -> Iterator[tuple[str, Row]]:
+def cases(given: argparse.Namespace, turns: int) -> Iterator[tuple[str, Row]]:
     """Yield the cases of ``renders``, each side in a process of its own, in turns."""
     from mrt_mitsuba.validation.tools import renders
 
     names = [name for name in renders.CASES if "small" in name or not (given.small or given.quick)]
-    pythons = [sys.executable, *([given.before] if given.before else [])]
 
-    def measure(python: str) -> Mapping[str, float]:
+    def measure(python: str) -> dict[str, float]:
         command = [python, str(renders.__file__), *names]
         ran = subprocess.run(command, check=True, stdout=subprocess.PIPE, timeout=3600)
-        found: Mapping[str, float] = json.loads(ran.stdout.splitlines()[-1])
+        found: dict[str, float] = json.loads(ran.stdout.splitlines()[-1])
         return found
 
-    sides = in_turns([lambda _, python=python: measure(python) for python in pythons], turns)  # type: ignore[misc]
+    pythons = [sys.executable, *([given.before] if given.before else [])]
+    found = in_turns([lambda _, python=python: measure(python) for python in pythons], turns)
     for name in names:
-        times = [[run[name] for run in side] for side in sides]
+        times = [[run[name] for run in side] for side in found]
         yield name, _row(Ratio.of(*times)) if given.before else {"seconds": statistics.median(times[0])}
 
 
 def line(name: str, row: Row, before: Row | None = None) -> str:
     """Return a row as text; with an earlier one, its figure is followed by the ratio to then."""
-    earlier = ""
-    if before and before.get("ratio"):
-        earlier = f" ({row['ratio'] / before['ratio']:.2f}x)"
-    elif before:
-        earlier = f" ({row['seconds'] / before['seconds']:.2f}x)"
+    key = "seconds" if row.get("ratio") is None else "ratio"
+    earlier = f" ({row[key] / before[key]:.2f}x)" if before and before.get(key) else ""
     text = f"{name:<62}{1000 * row['seconds']:>10.2f}"
-    if row.get("ratio") is None:
+    if key == "seconds":
         return text + earlier
     text += f"{1000 * row['other_seconds']:>10.2f}{row['ratio']:>8.2f}{earlier}"
     text += f"  {row['low']:.2f} to {row['high']:.2f}"
     if row["goal"] is None:
         return text
-    return (
-        f"{text}  {row['goal']:g} "
-        + Goal(name, row["ratio"], row["goal"], low=row["low"], high=row["high"]).verdict
-    )
+    goal = Goal(name, row["ratio"], row["goal"], low=row["low"], high=row["high"])
+    return f"{text}  {row['goal']:g} {goal.verdict}"
 
 
 def read(path: Path) -> dict[str, Any]:
     """Return an earlier run. Raises ``UsageError`` for a file that is none."""
     try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UsageError(f"cannot compare with {path}: {error}") from error
-    if (
-        not isinstance(found, dict)
-        or found.get("schema") != SCHEMA
-        or not isinstance(found.get("rows"), dict)
-    ):
-        raise UsageError(f"cannot compare with {path}: it is not a file of this benchmark (schema {SCHEMA})")
-    return found
+        found: dict[str, Any] = json.loads(path.read_text())
+        if found["schema"] == SCHEMA and isinstance(found["rows"], dict):
+            return found
+    except (OSError, ValueError, TypeError, KeyError):
+        pass
+    raise UsageError(f"cannot compare with {path}: it is not a file of this benchmark (schema {SCHEMA})")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -148,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--device", metavar="VARIANT", help="against Mitsuba's integrators in a variant, such as cuda_ad_rgb")
     given = parser.parse_args(arguments)
     try:
-        before = read(given.compare) if given.compare else {"rows": {}, "options": None}
+        before = read(given.compare) if given.compare else {"rows": {}}
         prepare(given.out.parent, given.out.name)
         print(f"{'milliseconds':<62}{'now':>10}{'other':>10}{'ratio':>8}  quartiles")
         found: dict[str, Row] = {}
@@ -164,7 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     now = {"schema": SCHEMA, "machine": machine(), "versions": versions(), "options": options, "rows": found}
     with replacing(given.out) as file:
         file.write(json.dumps(now, indent=2).encode() + b"\n")
-    if given.compare and before["options"] != options:
+    if given.compare and before.get("options") != options:
         print("The earlier file was measured with other options: its ratios mean little.")
     return 0
 

@@ -19,8 +19,8 @@ def found(tmp_path_factory):
     """A quick run of two renders in turns with this same version, and of the scene's pairs."""
     path = tmp_path_factory.mktemp("bench") / "new" / "bench.json"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(speed, "QUICK", speed.Extent((40, 30), 1, (0,), 1, 4))
-        patch.setattr(bench, "_cases", lambda given, turns: iter([("small, loaded", {"seconds": 0.5})]))
+        patch.setattr(speed, "QUICK", speed.Extent(40, 30, 1, (0,), 1, 4))
+        patch.setattr(bench, "cases", lambda given, turns: iter([("small, loaded", {"seconds": 0.5})]))
         assert bench.main(["--quick", "--out", str(path)]) == 0
     return path
 
@@ -28,7 +28,7 @@ def found(tmp_path_factory):
 def test_file_has_a_row_for_each_figure(found):
     run = bench.read(found)
     assert run["schema"] == bench.SCHEMA and {"mitsuba", "llvm", "python"} <= run["versions"].keys()
-    assert len(run["rows"]) == 2 + 4
+    assert len(run["rows"]) == 2 + 3
     start, *_ = run["rows"].values()
     assert start["goal"] == bench.START_GOAL and start["low"] <= start["ratio"] <= start["high"]
 
@@ -52,7 +52,7 @@ def test_both_sides_take_turns(monkeypatch, tmp_path):
     script.write_text("import sys; print('{\"%s\": %s}' % (sys.argv[1], sys.argv[0].count('/')))")
     monkeypatch.setattr(renders, "__file__", str(script))
     arguments = ["--small", "--turns", "2", "--before", sys.executable, "--out", str(tmp_path / "b.json")]
-    monkeypatch.setattr(bench, "_start", lambda turns: {"seconds": float(turns)})
+    monkeypatch.setattr(bench, "start", lambda turns: {"seconds": float(turns)})
     assert bench.main(arguments) == 0
     rows = json.loads((tmp_path / "b.json").read_text())["rows"]
     assert rows["small"]["ratio"] == 1 and rows["small"]["other_seconds"] == rows["small"]["seconds"] > 0

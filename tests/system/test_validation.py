@@ -58,7 +58,7 @@ def tiny(monkeypatch: Patch, variant: str, tmp_path: Path) -> None:
     monkeypatch.setattr(
         error_vs_time, "FULL", dataclasses.replace(tiny, repeats=2, scenes=trades | {"whitted": ()})
     )
-    monkeypatch.setattr(speed, "QUICK", speed.Extent((48, 36), 16, (0,), 1, 16))
+    monkeypatch.setattr(speed, "QUICK", speed.Extent(48, 36, 16, (0,), 1, 16))
     monkeypatch.setattr(roughconductor.runtime, "usable_variants", lambda: ["llvm_ad_rgb"])
     monkeypatch.setenv("MRT_REFERENCE", str(tmp_path))  # none of the original's renders
 
@@ -208,9 +208,9 @@ def growing_code(patch: Patch) -> None:
 
 def lamp_left_out(patch: Patch) -> None:
     """What a plan leaves out is seen."""
-    make = speed._left_out
+    make = speed.left_out
     lamp = {"lamp": {"type": "mrt_light", "position": [0, 9, 0], "intensity": 1.0}}
-    patch.setattr(speed, "_left_out", lambda scene, change, more: make(scene, lamp, more))
+    patch.setattr(speed, "left_out", lambda nodes, change, more: make(nodes, lamp, more))
     only(patch, "without cone code")
 
 
