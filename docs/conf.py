@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
 import mrt_mitsuba  # before mitsuba: it chooses the LLVM library
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE))
 os.environ["PYTHONPATH"] = os.pathsep.join(  # of the pages' kernels, which import the worked example
     path for path in (str(HERE / "examples"), os.environ.get("PYTHONPATH")) if path
 )
@@ -37,17 +35,12 @@ nb_merge_streams = True
 
 
 def generate(app: object) -> None:
-    """Make the pages that hold computed things."""
-    import gallery
-    import ledger
-
+    """Make the tables of pages from those of the program."""
     mrt_mitsuba.register()  # plugin classes derive from a variant's classes, so autodoc needs one
     folder = HERE / "_generated"
     folder.mkdir(exist_ok=True)
     (folder / "options.inc.md").write_text(options_list())
     (folder / "layers.inc.md").write_text(layers_table())
-    gallery.build(folder)
-    ledger.build(folder)
 
 
 def layers_table() -> str:
