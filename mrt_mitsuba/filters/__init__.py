@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from mrt_mitsuba.filters.contours import contours, save_contours
 from mrt_mitsuba.filters.dof import blur_amount, gaussian_dof
-from mrt_mitsuba.filters.edges import EdgeMap, edges_image, geometry_edges, luma_edges, sobel_edges
+from mrt_mitsuba.filters.edges import (
+    EdgeMap,
+    contours,
+    edges_image,
+    geometry_edges,
+    luma_edges,
+    save_contours,
+    sobel_edges,
+)
 
 __all__ = [
     "EdgeMap",

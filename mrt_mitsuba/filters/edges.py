@@ -22,7 +22,9 @@ estimate came out too small does no harm.
 
 from __future__ import annotations
 
+import functools
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -35,6 +37,7 @@ from mrt_mitsuba.filters.grid import Grid, finite
 
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 GREY_WEIGHTS = (0.07, 0.72, 0.21)
+GAP, GREY = 4, 0.5  # between two pictures of contours: pixels; so that a contour at the border still shows
 REACH = 1  # rows and columns of neighbours that a pixel depends on, either way
 
 
@@ -85,25 +88,23 @@ def luma_edges(
     )
     grid = Grid(image)
     planes = grid.planes(image, "image")
-    sum_ = _weighted(planes, LUMA_WEIGHTS)
+    sum_ = _sum(planes, LUMA_WEIGHTS)
     luma = dr.select(dr.isfinite(sum_), dr.sqrt(dr.maximum(sum_, 0)), math.inf)
-    near = _Neighbourhood(grid, luma)
-    high, low = near.window[0], near.window[0]
-    for value in near.window[1:]:
-        high, low = dr.maximum(high, value), dr.minimum(low, value)
+    window = _window(grid, luma)
+    high, low = functools.reduce(dr.maximum, window), functools.reduce(dr.minimum, window)
     offset = grid.opaque(contrast_offset)
     value = high - low + offset
     if variance is not None:
         deviation = _deviation(grid, variance, LUMA_WEIGHTS)
         # the last term keeps 0/0 out where the pixel is black and free of noise
         luma_variance = dr.square(deviation) / dr.maximum(dr.maximum(4 * sum_, deviation), 1e-30)
-        noise = dr.sqrt(near.weighted_sum(luma_variance, [1 / 9] * 9))
+        noise = dr.sqrt(_sum(_window(grid, luma_variance), [1 / 9] * 9))
         # not above zero where the variance is NaN
         excess = high - low - 2 * _sigmas(grid, noise_sigmas) * noise
         value = dr.select(excess > 0, excess + offset, 0)
     value = dr.select(dr.isfinite(high), value, math.inf)
     threshold = dr.maximum(grid.opaque(absolute_threshold), grid.opaque(relative_threshold) * high)
-    return near.edge_map(~(value < threshold), value)
+    return _edge_map(grid, ~(value < threshold), value)
 
 
 def sobel_edges(
@@ -128,20 +129,20 @@ def sobel_edges(
     """
     _check_numbers(threshold=threshold)
     grid = Grid(image)
-    grey = 255 * _weighted(grid.planes(image, "image"), GREY_WEIGHTS)
-    near = _Neighbourhood(grid, grey if variance is not None else dr.trunc(grey))
-    w = near.window  # both sides of a difference are summed alike, so equal sides give 0
+    grey = 255 * _sum(grid.planes(image, "image"), GREY_WEIGHTS)
+    # both sides of a difference are summed alike, so equal sides give 0
+    w = _window(grid, grey if variance is not None else dr.trunc(grey))
     gx = (w[2] + 2 * w[5] + w[8]) - (w[0] + 2 * w[3] + w[6])
     gy = (w[6] + 2 * w[7] + w[8]) - (w[0] + 2 * w[1] + w[2])
     value = dr.abs(gx) + dr.abs(gy)
     if variance is not None:
         grey_variance = dr.square(255 * _deviation(grid, variance, GREY_WEIGHTS))
         squares = [2, 4, 2, 4, 0, 4, 2, 4, 2]  # of Gx's and Gy's weights, summed
-        noise = dr.sqrt(near.weighted_sum(grey_variance, squares))
+        noise = dr.sqrt(_sum(_window(grid, grey_variance), squares))
         excess = value - _sigmas(grid, noise_sigmas) * noise
         value = dr.select(excess > 0, dr.trunc(excess), 0)
-    value = dr.select(finite(near.window), value, math.inf)
-    return near.edge_map(value > grid.opaque(threshold), value)
+    value = dr.select(finite(w), value, math.inf)
+    return _edge_map(grid, value > grid.opaque(threshold), value)
 
 
 def geometry_edges(
@@ -179,22 +180,21 @@ def geometry_edges(
     bad = dr.isnan(distance) | (hit & ~finite(normals))
     inverse = dr.select(bad, math.inf, dr.select(hit, 1 / distance, 0))
     dr.eval(inverse, normals)  # in one kernel
-    near = _Neighbourhood(grid, inverse)
-    windows = [near.of(plane) for plane in normals]
-    step, crease, centre = 0, 0, near.window[4]
+    near, windows = _window(grid, inverse), [_window(grid, plane) for plane in normals]
+    step, crease, centre = 0, 0, near[4]
     for k in range(4):  # pairs of opposite neighbours
-        one, other = near.window[k], near.window[8 - k]
+        one, other = near[k], near[8 - k]
         largest = dr.maximum(dr.maximum(one, other), centre)
         difference = dr.abs((one - centre) + (other - centre))
         step = dr.maximum(step, dr.select(largest > 0, difference / largest, 0))
     for k in (0, 1, 2, 3, 5, 6, 7, 8):
         dot = sum(window[4] * window[k] for window in windows)
-        both = (centre > 0) & (near.window[k] > 0)
+        both = (centre > 0) & (near[k] > 0)
         crease = dr.maximum(crease, dr.select(both, 1 - dot, 0))
     step /= grid.opaque(depth_step)
     crease /= grid.opaque(1 - math.cos(math.radians(crease_angle)))
-    value = dr.select(finite(near.window), dr.maximum(step, crease), math.inf)
-    return near.edge_map(value > 1, value)
+    value = dr.select(finite(near), dr.maximum(step, crease), math.inf)
+    return _edge_map(grid, value > 1, value)
 
 
 def edges_image(edges: EdgeMap) -> np.ndarray:
@@ -202,40 +202,59 @@ def edges_image(edges: EdgeMap) -> np.ndarray:
     return np.array(edges.mask).astype(np.float32)
 
 
-class _Neighbourhood:
-    """The 3×3 window of a plane around every pixel, row by row; zeros on the picture's border."""
+def contours(*edges: EdgeMap) -> np.ndarray:
+    """Return the contours of one or several detectors as one picture, [H, W', 3] float32, from left to right.
 
-    def __init__(self, grid: Grid, plane: Any) -> None:
-        self._grid = grid
-        column, row = grid.coordinates(grid.index)
-        self._inner = (column > 0) & (row > 0) & (column < grid.width - 1) & (row < grid.height - 1)
-        self.window = self.of(plane)
-
-    def of(self, plane: Any) -> list[Any]:
-        """Return the nine values of another plane."""
-        dr.eval(plane)  # computed once for each pixel, not once for each of the nine that read it
-        grid, active = self._grid, self._inner
-        indices = [grid.index + dx + dy * grid.width for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
-        return [dr.gather(grid.Float, plane, index, active=active) for index in indices]
-
-    def weighted_sum(self, plane: Any, weights: Sequence[float]) -> Any:
-        """Return the sum of nine weights times another plane's values."""
-        return sum(weight * value for weight, value in zip(weights, self.of(plane), strict=True) if weight)
-
-    def edge_map(self, mask: Any, value: Any) -> EdgeMap:
-        """Return the result, with the border left out."""
-        mask, value = mask & self._inner, dr.select(self._inner, value, 0)
-        dr.eval(mask, value)  # both in one kernel
-        return EdgeMap(mask=self._grid.output([mask]), value=self._grid.output([value]))
+    Raises:
+        UsageError: for no detector, or pictures of different heights.
+    """
+    if not edges:
+        raise UsageError("contours needs at least one EdgeMap, such as sobel_edges(image)")
+    pictures = [edges_image(found) for found in edges]
+    heights = {picture.shape[0] for picture in pictures}
+    if len(heights) > 1:
+        raise UsageError(
+            f"contours of pictures with different heights {sorted(heights)}: give those of one render"
+        )
+    gap = np.full((heights.pop(), GAP), GREY, np.float32)
+    parts = [part for picture in pictures for part in (gap, picture)][1:]
+    return np.repeat(np.concatenate(parts, axis=1)[..., None], 3, axis=-1)
 
 
-def _weighted(planes: Sequence[Any], weights: Sequence[float]) -> Any:
-    return weights[0] * planes[0] + weights[1] * planes[1] + weights[2] * planes[2]
+def save_contours(path: str | os.PathLike[str], *edges: EdgeMap) -> None:
+    """Write ``contours(*edges)`` as .png or .exr; raise ``OutputError`` where that fails."""
+    from mrt_mitsuba.output import save
+
+    save(path, contours(*edges))
+
+
+def _inner(grid: Grid) -> Any:
+    """Return where a pixel is not on the picture's border."""
+    column, row = grid.coordinates(grid.index)
+    return (column > 0) & (row > 0) & (column < grid.width - 1) & (row < grid.height - 1)
+
+
+def _window(grid: Grid, plane: Any) -> list[Any]:
+    """Return the 3×3 values around every pixel, row by row; zeros on the picture's border."""
+    dr.eval(plane)  # computed once for each pixel, not once for each of the nine that read it
+    indices = [grid.index + dx + dy * grid.width for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    return [dr.gather(grid.Float, plane, index, active=_inner(grid)) for index in indices]
+
+
+def _edge_map(grid: Grid, mask: Any, value: Any) -> EdgeMap:
+    """Return the result, with the border left out."""
+    mask, value = mask & _inner(grid), dr.select(_inner(grid), value, 0)
+    dr.eval(mask, value)  # both in one kernel
+    return EdgeMap(mask=grid.output([mask]), value=grid.output([value]))
+
+
+def _sum(values: Sequence[Any], weights: Sequence[float]) -> Any:
+    return sum(weight * value for weight, value in zip(weights, values, strict=True) if weight)
 
 
 def _deviation(grid: Grid, variance: Any, weights: Sequence[float]) -> Any:
     """Return the standard deviation of a weighted sum of fully correlated channels."""
-    return _weighted([dr.sqrt(plane) for plane in grid.planes(variance, "variance")], weights)
+    return _sum([dr.sqrt(plane) for plane in grid.planes(variance, "variance")], weights)
 
 
 def _sigmas(grid: Grid, noise_sigmas: float) -> Any:

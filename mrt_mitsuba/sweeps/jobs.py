@@ -60,27 +60,17 @@ def jobs(scene: Any, grid: Any, zipped: bool, fixed: Mapping[str, Any]) -> list[
     if not isinstance(grid, Mapping):
         raise UsageError(f'grid={grid!r}: give a dict of lists, such as {{"aa": [1, 2]}}')
     axes = {key: _axis(key, values) for key, values in grid.items()}
-    for key in axes:
-        if key in fixed or (key == "scene" and scene is not None):
-            raise UsageError(f"{key} is given twice: as an axis of the grid and for all jobs; drop one")
+    twice = axes.keys() & {*fixed, "" if scene is None else "scene"}
+    if twice:
+        raise UsageError(f"{min(twice)} is given twice: as an axis of the grid and for all jobs; drop one")
     shared = {key: _check(key, value) for key, value in fixed.items() if value is not None}
-    lengths = {key: len(values) for key, values in axes.items()}
-    if zipped and len(set(lengths.values())) > 1:
-        raise UsageError(f"zipped axes must be of one length, and are {lengths}")
+    lengths = list(map(len, axes.values()))
+    if zipped and len(set(lengths)) > 1:
+        raise UsageError(f"zipped axes must be of one length, and those of {', '.join(axes)} are {lengths}")
     rows = zip(*axes.values(), strict=True) if zipped else itertools.product(*axes.values())
     points = [dict(zip(axes, row, strict=True)) for row in rows]
-    if zipped:
-        names = [f"frame_{number:04}" for number in range(len(points))]  # as programs for films expect them
-    else:
-        names = [",".join(f"{word(k)}={word(v)}" for k, v in point.items()) or "picture" for point in points]
-    counts = Counter(name.casefold() for name in names)  # some file systems ignore case
     found = []
-    for name, point in zip(names, points, strict=True):
-        if counts[name.casefold()] > 1 or len(name.encode()) > LONGEST_NAME:
-            problem = f"{counts[name.casefold()]} jobs would write the same file {name[:LONGEST_NAME]}"
-            if counts[name.casefold()] == 1:
-                problem = f"the file {name[:60]}... would have a name of {len(name)} characters"
-            raise UsageError(f"{problem}: take values out, or use zipped=True, which numbers the files")
+    for name, point in zip(_names(points, zipped), points, strict=True):
         dotted = {key: value for key, value in point.items() if "." in key}
         arguments = shared | {key: value for key, value in point.items() if key not in dotted}
         params = {**shared.get("params", {}), **point.get("params", {}), **dotted}
@@ -88,6 +78,23 @@ def jobs(scene: Any, grid: Any, zipped: bool, fixed: Mapping[str, Any]) -> list[
             arguments["params"] = params
         found.append(Job(name, arguments.pop("scene", scene), arguments, point))
     return found
+
+
+def _names(points: Sequence[Mapping[str, Any]], zipped: bool) -> list[str]:
+    """Return the name of each job's file; raise ``UsageError`` where two are the same or one is too long."""
+    if zipped:
+        return [f"frame_{number:04}" for number in range(len(points))]  # as programs for films expect them
+    names = [",".join(f"{word(k)}={word(v)}" for k, v in point.items()) or "picture" for point in points]
+    counts = Counter(name.casefold() for name in names)  # some file systems ignore case
+    for name in names:
+        problem, count = "", counts[name.casefold()]
+        if len(name.encode()) > LONGEST_NAME:
+            problem = f"the file {name[:60]}... would have a name of {len(name)} characters"
+        elif count > 1:
+            problem = f"{count} jobs would write the same file {name}"
+        if problem:
+            raise UsageError(f"{problem}: take values out, or use zipped=True, which numbers the files")
+    return names
 
 
 def _axis(key: Any, values: Any) -> list[Any]:

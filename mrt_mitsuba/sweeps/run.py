@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -84,25 +83,26 @@ def sweep(
         for job in pictures:
             refuse_to_replace(job, folder, job.file in table.earlier, png)
         rest = [job for job in pictures if not (resume and is_fresh(job, folder, png))]
-        parts = {job.name: cut(job, tiles) if tiles else [job] for job in rest}
-        new = list(itertools.chain(*parts.values()))
-        if tiles:
-            for tile in new:
-                refuse_to_replace(tile, folder)
-            new = [tile for tile in new if not (resume and is_fresh(tile, folder))]
+        work = [(job, cut(job, tiles) if tiles else [job]) for job in rest]
+        made: dict[str, dict[str, Any]] = {}  # facts of tiles that an earlier sweep left, which has kept none
+        for tile in (tile for _, own in work for tile in own if tiles):
+            refuse_to_replace(tile, folder)
+            if resume and is_fresh(tile, folder):
+                made[tile.name] = {}
+        left = {job.name for job in rest}
         for job in pictures:
-            if job.name not in parts:
+            if job.name not in left:
                 known = table.earlier.get(job.file, {})
                 table.add(job.name, known | {"file": job.file, "error": "", "versions": software()})
         if rest:
             from distributed.client import ClosedClientError
 
             check_parameters(planned)
-            variant, most = options.get("variant") or "", max(1, len(new))
+            variant, most = options.get("variant") or "", sum(len(own) for _, own in work)
             with connected(cluster, most, workers, dashboard, variant) as client:
                 setting = Setting(folder, scratch, png, software(), inspect(client, scratch))
                 try:
-                    _render(client, setting, retries, parts, rest, new, table, shown)
+                    _render(client, setting, retries, work, made, table, shown)
                 except (CancelledError, ClosedClientError, OSError) as error:
                     raise ClusterError(
                         "the scheduler is gone: start it and its workers, then run the same sweep again; "
@@ -116,55 +116,49 @@ def _render(
     client: Client,
     setting: Setting,
     retries: int,
-    parts: Mapping[str, Sequence[Job]],
-    rest: Sequence[Job],
-    new: Sequence[Job],
+    work: Sequence[tuple[Job, list[Job]]],
+    made: dict[str, dict[str, Any]],
     table: Table,
     shown: Progress,
 ) -> None:
-    """Let workers render pictures, or their tiles (``parts``, by the picture's name), which are put together
-    here; each picture's row goes into the table as it ends. ``new``: parts that no earlier sweep left."""
+    """Let workers render pictures in their parts, tiles or the whole; put tiles together here.
+
+    Each picture's row goes into the table as its last part ends. ``made``: facts of parts that are there.
+    """
     from distributed import KilledWorker, as_completed
 
-    calls: dict[Future, Job] = {}
+    calls: dict[Future, tuple[Job, list[Job], Job]] = {}
     handed: Counter[str] = Counter()
     coming = as_completed(loop=client.loop)
-    made: dict[str, dict[str, Any]] = {}
 
-    def hand_over(part: Job) -> None:
+    def hand_over(job: Job, parts: list[Job], part: Job) -> None:
         handed[part.name] += 1
         key = f"{os.path.basename(setting.scratch)} {part.name} {handed[part.name]}"
         future = client.submit(render_job, part, setting, key=key, pure=False)
-        calls[future] = part
+        calls[future] = job, parts, part
         coming.add(future)
 
-    def ended(job: Job) -> None:
-        own = parts[job.name]
-        facts = (
-            made[job.name]
-            if own == [job]
-            else _join(job, own, [made.get(tile.name) for tile in own], setting)
-        )
-        begun = max(1, *(attempts(part, setting) for part in own))
-        table.add(job.name, facts | {"attempts": begun, "versions": setting.software})
+    def finish(job: Job, parts: list[Job]) -> None:
+        if all(part.name in made for part in parts):
+            facts = made[job.name] if parts == [job] else _join(job, parts, made, setting)
+            begun = max(1, *(attempts(part, setting) for part in parts))
+            table.add(job.name, facts | {"attempts": begun, "versions": setting.software})
 
-    picture = {part.name: job for job in rest for part in parts[job.name]}
-    left = Counter(picture[part.name].name for part in new)
     try:
-        with shown.stage("Sweep", len(new)) as advance:
-            for part in new:
-                hand_over(part)
-            for job in rest:
-                if not left[job.name]:
-                    ended(job)
+        for job, parts in work:
+            for part in parts:
+                if part.name not in made:
+                    hand_over(job, parts, part)
+            finish(job, parts)
+        with shown.stage("Sweep", len(calls)) as advance:
             for future in coming:
-                part = calls.pop(future)
-                if future.status == "error":
-                    # The engine holds a worker's death against all jobs that the worker had been given
-                    if attempts(part, setting) <= retries and handed[part.name] < retries + MOST_DEATHS:
-                        hand_over(part)
-                        continue
-                    error = future.exception()
+                job, parts, part = calls.pop(future)
+                error = future.exception() if future.status == "error" else None
+                # The engine holds a worker's death against all jobs that the worker had been given
+                if error and attempts(part, setting) <= retries and handed[part.name] < retries + MOST_DEATHS:
+                    hand_over(job, parts, part)
+                    continue
+                if error:
                     text = one_line(f"{type(error).__name__}: {error}")
                     if isinstance(error, KilledWorker):
                         text = (
@@ -174,10 +168,7 @@ def _render(
                 else:
                     made[part.name] = future.result()
                 future.release()  # what no one needs is not computed again when its worker goes
-                job = picture[part.name]
-                left[job.name] -= 1
-                if not left[job.name]:
-                    ended(job)
+                finish(job, parts)
                 advance(1)
     finally:
         table.write()
@@ -186,18 +177,16 @@ def _render(
 
 
 def _join(
-    job: Job, tiles: Sequence[Job], found: Sequence[Mapping[str, Any] | None], setting: Setting
+    job: Job, tiles: Sequence[Job], made: Mapping[str, Mapping[str, Any]], setting: Setting
 ) -> dict[str, Any]:
-    """Put a picture together from its tiles; return its facts, given those of new tiles."""
-    errors = [facts["error"] for facts in found if facts and "error" in facts]
-    if not errors:
-        try:
-            join(job, tiles, setting.folder, setting.scratch)
-        except OutputError as error:
-            errors = [str(error)]
-    if errors:
-        return {"error": errors[0]}
-    facts: dict[str, Any] = {"file": job.file}
-    for name in ("seconds", "rays"):  # unknown of tiles that an earlier sweep made
-        facts[name] = sum(tile[name] for tile in found if tile) if all(found) else None
-    return facts
+    """Put a picture together from its tiles; return its facts, given theirs."""
+    found = [made[tile.name] for tile in tiles]
+    for facts in found:
+        if "error" in facts:
+            return {"error": facts["error"]}
+    try:
+        join(job, tiles, setting.folder, setting.scratch)
+    except OutputError as error:
+        return {"error": str(error)}
+    sums = {name: sum(facts[name] for facts in found) if all(found) else None for name in ("seconds", "rays")}
+    return {"file": job.file, **sums}

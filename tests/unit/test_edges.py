@@ -112,30 +112,15 @@ def noisy(mean: np.ndarray, samples: int, rng: np.random.Generator) -> tuple[np.
 
 
 @pytest.mark.parametrize("detector", DETECTORS)
-@pytest.mark.parametrize("level", [0.05, 0.3, 0.8])
-@pytest.mark.parametrize("samples", [4, 16, 64])
+@pytest.mark.parametrize(("level", "samples"), [(0.05, 16), (0.3, 64), (0.8, 4)])
 def test_noise_is_no_edge(detector: Any, level: float, samples: int) -> None:
     image, variance = noisy(np.full((150, 200), level), samples, np.random.default_rng(samples))
     inner = (slice(1, -1), slice(1, -1))
-    assert (
-        detector(image).mask[inner].mean() > 0.95
-    )  # which it takes for edges as long as it does not know the noise
+    assert detector(image).mask[inner].mean() > 0.95  # as long as it does not know the noise
     # three deviations leave 0.5 % for normal noise (|Gx| + |Gy|: 4 × 0.135 %); 4 skewed samples reach 1.3 %
     assert detector(image, variance=variance).mask[inner].mean() < (0.02 if samples == 4 else 0.008)
     # the limit is not that far because the detector is blind: at one deviation it still fires
     assert detector(image, variance=variance, noise_sigmas=1).mask[inner].mean() > 0.2
-
-
-@pytest.mark.parametrize("detector", DETECTORS)
-def test_an_edge_above_the_noise_is_found(detector: Any) -> None:
-    rng = np.random.default_rng(5)
-    deviation = 0.01
-    mean = np.full((100, 60), 0.3)
-    mean[:, 30:] += 12 * deviation
-    image = mean[..., None] + deviation * rng.standard_normal((100, 60, 1)) * np.ones(3)
-    edges = detector(image, variance=np.full((100, 60, 3), deviation**2))
-    assert edges.mask[1:-1, 29:31].mean() > 0.99
-    assert edges.mask[1:-1, 1:28].mean() < 0.008
 
 
 def test_noise_of_the_channels_adds_up_as_if_it_were_one() -> None:
@@ -173,41 +158,14 @@ def test_noise_of_unknown_size_leaves_its_neighbourhood_alone(detector: Any) -> 
 # ---- geometry ----
 
 
-def ball_over_a_floor(height: int = 90, width: int = 120) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Normals, distances and the thing hit (-1: nothing), for a camera at (0, 1, 0) looking along +z."""
-    x, y = np.meshgrid((np.arange(width) + 0.5) / width * 2 - 1, 1 - (np.arange(height) + 0.5) / height * 2)
-    ray = np.stack([x * 0.6, y * 0.6 * height / width, np.ones_like(x)], axis=-1)
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    with np.errstate(divide="ignore"):
-        floor = np.where(ray[..., 1] < 0, -1 / ray[..., 1], np.inf)
-    to_ball = np.array([0.2, 0.1, 5.0])
-    along = ray @ to_ball
-    inside = along**2 - to_ball @ to_ball + 0.8**2
-    ball = np.where(inside > 0, along - np.sqrt(np.maximum(inside, 0)), np.inf)
-    depth = np.minimum(floor, ball)
-    thing = np.where(np.isinf(depth), -1, np.where(ball < floor, 1, 0))
-    on_ball = (ray * np.where(thing == 1, ball, 0)[..., None] - to_ball) / 0.8
-    normal = np.where((thing == 1)[..., None], on_ball, [0.0, 1.0, 0.0])
-    return normal, depth, thing
-
-
-def test_geometry_finds_the_outlines_and_leaves_surfaces_alone() -> None:
-    normal, depth, thing = ball_over_a_floor()
-    edges = geometry_edges(normal, depth)
-    changes = np.zeros(thing.shape, dtype=bool)
-    for dy in (-1, 0, 1):
-        for dx in (-1, 0, 1):
-            changes[1:-1, 1:-1] |= np.roll(thing, (dy, dx), (0, 1))[1:-1, 1:-1] != thing[1:-1, 1:-1]
-    assert changes.sum() > 300
-    assert edges.mask[changes].all()
-    floor = (thing == 0) & ~changes
-    assert floor.sum() > 3000
-    assert not edges.mask[floor].any()  # up to the horizon, where the distance grows without limit
-    sky = (thing == -1) & ~changes
-    assert not edges.mask[sky].any()
-    facing = (thing == 1) & ~changes & (normal[..., 2] < -0.6)  # what is not seen edge-on
-    assert facing.sum() > 300
-    assert not edges.mask[facing].any()
+def test_geometry_leaves_a_floor_alone_up_to_its_horizon() -> None:
+    """However steeply it is seen; the camera looks along +z, one unit above it."""
+    x, y = np.meshgrid(np.linspace(-0.6, 0.6, 40), np.linspace(0.45, -0.45, 30))
+    slope = y / np.sqrt(x**2 + y**2 + 1)
+    depth = np.where(slope < 0, 1 / np.maximum(-slope, 1e-9), np.inf)
+    edges = geometry_edges(np.tile([0.0, 1.0, 0.0], (30, 40, 1)), depth)
+    assert edges.mask[14:16, 1:-1].all()  # the rows on both sides of the horizon
+    assert edges.mask.sum() == 2 * 38
 
 
 def face(columns: slice = slice(0, 0), normal: Any = (0, 0, 1), depth: float = 3.0) -> tuple[np.ndarray, ...]:
@@ -248,12 +206,12 @@ def test_geometry_sees_a_step_in_every_direction() -> None:
     np.testing.assert_array_equal(geometry_edges(normal, depth).mask, around)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 9), (3, 2)])
-def test_geometry_has_no_edges_on_the_border(size: tuple[int, int]) -> None:
-    image = np.random.default_rng(0).random((*size, 3))
-    edges = geometry_edges(image, image[..., 0])
-    assert edges.mask.shape == edges.value.shape == size
-    assert not edges.mask.any() and not edges.value.any()
+def test_geometry_has_no_edges_on_the_border() -> None:
+    for size in ((1, 1), (1, 7), (2, 9), (3, 2)):
+        image = np.random.default_rng(0).random((*size, 3))
+        edges = geometry_edges(image, image[..., 0])
+        assert edges.mask.shape == edges.value.shape == size
+        assert not edges.mask.any() and not edges.value.any()
 
 
 # ---- kinds of arrays, pictures of edges, errors ----

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import fcntl
 import os
+import pickle
 import resource
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 import mrt_mitsuba as mrt
@@ -22,6 +22,8 @@ from mrt_mitsuba import interrupts
 from mrt_mitsuba.errors import MrtWarning, OutputError
 from mrt_mitsuba.output import files as output
 from mrt_mitsuba.output.replacing import check_target
+from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.scene.report import report_scene
 
 
 @pytest.fixture
@@ -49,11 +51,10 @@ def test_srgb_levels() -> None:
     assert levels(values, "srgb") == [0, 0, 10, 118, 127, 188, 255, 255]
 
 
-@given(st.integers(0, 255))
-def test_srgb_inverts_the_decoding_of_every_level(level: int) -> None:
-    encoded = level / 255
-    linear = encoded / 12.92 if encoded <= 0.04045 else ((encoded + 0.055) / 1.055) ** 2.4
-    assert levels(grey(linear), "srgb") == [level]
+def test_srgb_inverts_the_decoding_of_every_level() -> None:
+    encoded = np.arange(256) / 255
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    assert levels(grey(*linear), "srgb") == list(range(256))
 
 
 def test_nan_is_black_with_a_warning() -> None:
@@ -111,69 +112,34 @@ def test_reading_what_is_no_exr(tmp_path: Path, content: bytes | None) -> None:
         output.read_exr(path)
 
 
-def make_bad_target(kind: str, folder: Path) -> Path:
-    path = folder / "a.png"
-    if kind == "missing folder":
-        path = folder / "none" / "a.png"
-    elif kind == "file as folder":
-        (folder / "none").touch()
-        path = folder / "none" / "a.png"
-    elif kind == "folder":
-        path.mkdir()
-    elif kind == "link loop":
-        path.symlink_to(path)
-    elif kind == "read-only":
-        path.write_bytes(b"precious")
-        path.chmod(0o444)
-    elif kind == "device":
-        path = Path("/dev/full")
-    elif kind == "long name":
-        path = folder / ("a" * 300 + ".png")
-    return path
-
-
 @pytest.mark.parametrize(
-    ("kind", "reason"),
+    ("make", "name", "reason"),
     [
-        ("missing folder", "does not exist; create it first"),
-        ("file as folder", "is a file, not a folder"),
-        ("folder", "is a folder"),
-        ("link loop", "in a circle"),
-        ("read-only", "is read-only"),
-        ("device", "not a regular file"),
-        ("long name", "name too long"),
+        (None, "none/a.png", "does not exist; create it first"),
+        (Path.touch, "a.png/b.png", "is a file, not a folder"),
+        (Path.mkdir, "a.png", "is a folder"),
+        (lambda path: path.symlink_to(path), "a.png", "in a circle"),
+        (lambda path: path.touch(0o444), "a.png", "is read-only"),
+        (None, "/dev/full", "not a regular file"),
+        (None, "a" * 300 + ".png", "name too long"),
     ],
 )
-def test_target_that_cannot_be_written(tmp_path: Path, image: np.ndarray, kind: str, reason: str) -> None:
-    path = make_bad_target(kind, tmp_path)
-    before = sorted(tmp_path.rglob("*"))
+def test_target_that_cannot_be_written(
+    tmp_path: Path, image: np.ndarray, make, name: str, reason: str
+) -> None:
+    if make:
+        make(tmp_path / "a.png")
+    before, path = sorted(tmp_path.rglob("*")), tmp_path / name
     for attempt in (check_target, lambda p: output.write_png(p, image), lambda p: output.write_exr(p, image)):
         with pytest.raises(OutputError, match=f"(?i)cannot write .*{reason}"):
             attempt(path)
     assert sorted(tmp_path.rglob("*")) == before
-    if kind == "read-only":
-        assert path.read_bytes() == b"precious"
-
-
-@pytest.mark.skipif(
-    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may write anywhere"
-)
-def test_folder_without_write_permission(tmp_path: Path, image: np.ndarray) -> None:
-    tmp_path.chmod(0o555)
-    try:
-        with pytest.raises(OutputError, match="Permission denied"):
-            output.write_png(tmp_path / "a.png", image)
-    finally:
-        tmp_path.chmod(0o755)
 
 
 @pytest.mark.parametrize("name", ["a", "a.jpg", "a.b/c"])
 def test_extension_says_the_format(tmp_path: Path, image: np.ndarray, name: str) -> None:
     with pytest.raises(OutputError, match=r"must end in \.png or \.exr"):
         output.save(tmp_path / name, image)
-
-
-ENDINGS = (["png"], ["exr"], ["png", "exr"])
 
 
 @pytest.fixture
@@ -191,8 +157,8 @@ def old(tmp_path: Path) -> Callable[..., list[Path]]:
 
 @pytest.mark.parametrize(
     ("endings", "room"),
-    [(endings, room) for endings in ENDINGS for room in (0, 100, 2000)] + [(["png", "exr"], 6000)],
-)  # the last is enough for one of two
+    [(["png"], 100), (["exr"], 0), (["exr"], 2000), (["png", "exr"], 6000)],  # the last is enough for one
+)
 def test_full_disk_leaves_the_old_files(tmp_path: Path, old, endings: list[str], room: int) -> None:
     paths = old(endings)
     noise = np.random.default_rng(0).random((40, 40, 3), np.float32)  # does not compress
@@ -207,7 +173,7 @@ def test_full_disk_leaves_the_old_files(tmp_path: Path, old, endings: list[str],
     assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
-@pytest.mark.parametrize("endings", ENDINGS)
+@pytest.mark.parametrize("endings", [["exr"], ["png", "exr"]])
 @pytest.mark.parametrize("step", ["fsync", "fchmod", "replace"])
 def test_interrupt_leaves_all_files_old_or_makes_all_new(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image: np.ndarray, old, endings: list[str], step: str
@@ -336,6 +302,19 @@ def test_matrices_of_the_header_lead_from_rays_to_the_picture(variant: str, name
         x, y, _, w = point @ header["mrt:worldToNDC"]
         np.testing.assert_allclose((x / w, y / w), place, atol=1e-5)  # float32
         assert (point @ header["mrt:worldToCamera"])[2] < 0
+
+
+def test_what_a_user_keeps_can_be_pickled() -> None:
+    """Results, with plan and error, settings, scenes, comparisons, checks, edges, and errors."""
+    size: dict[str, Any] = {"width": 16, "height": 12}
+    result = mrt.render(3, integrator="path", spp=16, aamode="noise", layers=["depth"], **size)
+    kept = [result.plan, RenderSettings(aa=2), report_scene(3), mrt.compare(result, result)]
+    kept += [mrt.check_bsdf({"type": "diffuse"}, quick=True, only=["finite"]), mrt.UsageError("a\nb")]
+    for each in kept:
+        again = pickle.loads(pickle.dumps(each))
+        assert str(again) == str(each) or again == each
+    again = pickle.loads(pickle.dumps(result))
+    assert again.image.tobytes() == result.image.tobytes() and again.header() == result.header()
 
 
 def test_only_large_pictures_are_compressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -87,7 +87,7 @@ def disc_radius(amount: np.ndarray) -> np.ndarray:
 
 
 def corrected_dof(image: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Blur with discs of signed radii, negative before the focus; see ``mrt_mitsuba.filters.lens``.
+    """Blur with discs of signed radii, negative before the focus; see ``mrt_mitsuba.filters.dof``.
 
     A neighbour is in front, in the same layer and behind by parts that add up to one. What is in front, or
     level, spreads over its own disc; what is behind is seen through the pixel's, and in the same layer only
