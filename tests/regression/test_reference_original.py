@@ -17,9 +17,12 @@ RESIDUE = {0: (1e-6, 0.0002), 1: (4e-5, 0.003), 2: (4e-5, 0.003), 3: (1e-5, 0.00
 
 
 def difference(original_data: Path, number: int) -> tuple[ReferenceResult, np.ndarray]:
-    image = read_exr(original_data / "renders" / f"s{number}_none_aa1.exr").image
+    """Return the reference in every other row and column, and how far the original is off there."""
+    image = read_exr(original_data / "renders" / f"s{number}_none_aa1.exr").image[1::2, ::2]
     height, width, _ = image.shape
-    result = reference_render(report_scene(number), width=width, height=height, start="original")
+    quarter = (-0.25, -0.25)  # from the centre of four pixels to that of the lower left one
+    scene = report_scene(number)
+    result = reference_render(scene, width=width, height=height, displacement=quarter, start="original")
     return result, np.abs(result.image - image)
 
 
@@ -37,6 +40,6 @@ def test_the_original_drew_the_same(original_data: Path, number: int) -> None:
 def test_the_original_drew_the_same_plane_below_its_cone(original_data: Path) -> None:
     """Its cone is broken; the floor far from it, cone and shadow is not."""
     result, error = difference(original_data, 9)
-    rows = slice(-40, None)
+    rows = slice(-20, None)
     assert (result.object_id[rows] == 0).mean() > 0.5
     assert np.median(error[rows]) <= 1e-6
