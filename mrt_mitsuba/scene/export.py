@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import operator
 import os
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.options import check
+from mrt_mitsuba.output.replacing import replacing_together
+from mrt_mitsuba.scene.loading import rewrite_file
 from mrt_mitsuba.scene.model import FRESNEL, OBJECTS, SIDE, SIZE, Scene, check_model_options, is_obj
 from mrt_mitsuba.scene.report import report_scene
 
@@ -64,15 +69,10 @@ def write_xml(
     for groups of objects (``mrt_group``), which have neither an XML form nor a stock counterpart; and what
     ``render`` raises for a scene or an option.
     """
-    from mrt_mitsuba.memory import Budget
-    from mrt_mitsuba.output.replacing import replacing_together
-    from mrt_mitsuba.scene.loading import rewrite_file
-    from mrt_mitsuba.scene.obj import model_scene
+    from mrt_mitsuba.scene.obj import model_scene  # with numpy
 
     check_model_options(scene, model)
     files: dict[str, bytes] = {}  # of shapes, by their paths
-    inputs: Iterable[str] = ()
-    focus: dict[str, Any] = {}
     if isinstance(scene, str | os.PathLike) and not is_obj(scene):
         given = {"fresnel": fresnel, "width": width, "height": height, "flavor=stock": flavor != "mrt"}
         useless = [name for name, value in given.items() if value]
@@ -82,26 +82,26 @@ def write_xml(
         budget = Budget.of(None)
         text, values = rewrite_file(os.fspath(scene), budget, **params or {})
         focus = {name: values[name] for name in ("focaldist", "focalrange") if name in values}
-        inputs = budget.inputs
+        inputs: Iterable[str] = budget.inputs
     else:
         if params:
             raise UsageError(f"params: only an XML file declares names, such as {next(iter(params))}")
         if not isinstance(scene, Scene):
             scene = model_scene(scene, **model) if is_obj(scene) else report_scene(scene)  # type: ignore[arg-type]
-        width, height = width or SIZE[0], height or SIZE[1]
-        mine = scene_dict(scene, fresnel=fresnel or "schlick", width=width, height=height)
+        mine = scene_dict(
+            scene, fresnel=fresnel or "schlick", width=width or SIZE[0], height=height or SIZE[1]
+        )
         for name, node in mine.items():
             if isinstance(node, dict) and node["type"] in _IN_FILES[flavor]:
                 file = f"{os.path.splitext(os.fspath(path))[0]}_{name}.ply"
                 mine[name], files[file] = _in_file(node, os.path.basename(file))
         text = _text_of(mine, scene, flavor)
-        if scene.focal_distance is not None:
-            focus = {"focaldist": scene.focal_distance, "focalrange": scene.focal_range}
+        focus = {"focaldist": scene.focal_distance, "focalrange": scene.focal_range}
+        focus = focus if scene.focal_distance is not None else {}
         inputs = scene.files
     # What Mitsuba's cameras have no parameters for, and ``render`` reads
-    lines = [f'\n    <default name="{name}" value="{value}"/>' for name, value in focus.items()]
-    start = text.index(">", text.index("<scene")) + 1
-    text = f"{text[:start]}{''.join(lines)}{text[start:]}\n"
+    lines = "".join(f'\n    <default name="{name}" value="{value}"/>' for name, value in focus.items())
+    text = re.sub("<scene[^>]*>", lambda tag: tag[0] + lines, text, count=1) + "\n"
     with replacing_together([*files, path], inputs) as opened:
         for stream, content in zip(opened, (*files.values(), text.encode()), strict=True):
             stream.write(content)
@@ -113,22 +113,23 @@ def _text_of(mine: dict[str, Any], model: Scene, flavor: str) -> str:
     import mitsuba as mi
 
     for name, node in mine.items():
-        if isinstance(node, dict) and node["type"] == "mrt_group":
+        if not isinstance(node, dict):
+            continue
+        if node["type"] == "mrt_group":
             raise SceneError(
                 f"{name} cannot be written as XML: mrt_group is made of arrays; render it from Python, or "
                 "write at most 1000 spheres or 100 objects of another kind"
             )
-        picture = node.get("diffuse_reflectance", {}) if isinstance(node, dict) else {}
+        picture = node.get("diffuse_reflectance", {})
         if "filename" in picture:  # found from wherever the XML lies
             whole = {**picture, "filename": os.path.abspath(picture["filename"])}
             mine[name] = {**node, "diffuse_reflectance": whole}
-    if flavor == "stock":
-        mine = _stock(mine, model)
     variant = runtime.use()
+    nodes = _stock(mine, model) if flavor == "stock" else mine
     # The writer looks plugins up in scalar_rgb, whatever the current variant
     runtime.use("scalar_rgb")
     runtime.use(variant)
-    return str(mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(variant), mine)))
+    return str(mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(variant), nodes)))
 
 
 def _in_file(node: dict[str, Any], filename: str) -> tuple[dict[str, Any], bytes]:
@@ -140,8 +141,8 @@ def _in_file(node: dict[str, Any], filename: str) -> tuple[dict[str, Any], bytes
     stream = mi.MemoryStream()
     mi.load_dict({name: value for name, value in node.items() if name != "bsdf"}).write_ply(stream)
     stream.seek(0)
-    content = bytes(stream.read(stream.size()))
-    return {"type": "ply", "filename": filename, **flat, "bsdf": node["bsdf"]}, content
+    shape = {"type": "ply", "filename": filename, **flat, "bsdf": node["bsdf"]}
+    return shape, bytes(stream.read(stream.size()))
 
 
 def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
@@ -165,14 +166,18 @@ def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
             normal = _unit(node["normal"])
             square = _facing([-node["distance"] * c for c in normal], normal, STOCK_EXTENT / 2)
             result[name] = {"type": "rectangle", "to_world": square, "bsdf": node["bsdf"]}
-        elif kind == "mrt_cylinder":
-            result |= _stock_cylinder(name, result.pop(name))
+        elif kind == "mrt_cylinder":  # an open tube, and at each end a disc that faces away from the other
+            result[f"{name}_tube"] = {**result.pop(name), "type": "cylinder"}
+            ends = node["p0"], node["p1"]
+            for number, (center, opposite) in enumerate((ends, ends[::-1])):
+                away = list(map(operator.sub, center, opposite))
+                place = {"to_world": _facing(center, away, node["radius"]), "bsdf": node["bsdf"]}
+                result[f"{name}_disc{number}"] = {"type": "disk", **place}
     return result
 
 
 def _stock_bsdf(node: dict[str, Any]) -> dict[str, Any]:
-    """Return the same lobes over a diffuse base; colours above one and negative roughness have no stock
-    counterpart."""
+    """Return ``roughplastic``, or ``diffuse`` where nothing is reflected; no colour exceeds 1."""
     colors = {}
     for name in ("diffuse_reflectance", "specular_reflectance"):
         color = node[name]
@@ -186,26 +191,8 @@ def _stock_bsdf(node: dict[str, Any]) -> dict[str, Any]:
         colors[name] = color
     if node["specular_reflectance"].get("value") == [0.0, 0.0, 0.0]:
         return {"type": "diffuse", "reflectance": colors["diffuse_reflectance"]}
-    alpha, ior = max(abs(node["alpha"]), 1e-4), node["int_ior"]
-    base = {
-        "type": "roughplastic",
-        "distribution": "beckmann",
-        "alpha": alpha,
-        "int_ior": ior,
-        "ext_ior": 1.0,
-    }
-    return base | colors
-
-
-def _stock_cylinder(name: str, node: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return an open tube, and at each end a disc that faces away from the other."""
-    nodes = {f"{name}_tube": {**node, "type": "cylinder"}}
-    ends = node["p0"], node["p1"]
-    for number, (center, opposite) in enumerate((ends, ends[::-1])):
-        away = [c - o for c, o in zip(center, opposite, strict=True)]
-        place = _facing(center, away, node["radius"])
-        nodes[f"{name}_disc{number}"] = {"type": "disk", "to_world": place, "bsdf": node["bsdf"]}
-    return nodes
+    rough = {"alpha": max(abs(node["alpha"]), 1e-4), "int_ior": node["int_ior"], "ext_ior": 1.0}
+    return {"type": "roughplastic", "distribution": "beckmann", **rough, **colors}
 
 
 def _unit(vector: list[float]) -> list[float]:
@@ -219,7 +206,7 @@ def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
 
     normal = _unit(normal)
     up = [0, 0, 1] if abs(normal[2]) < 0.9 else [1, 0, 0]
-    target = [c + n for c, n in zip(center, normal, strict=True)]
+    target = list(map(operator.add, center, normal))
     to_world = mi.ScalarTransform4f().look_at(center, target, up)
     return to_world @ mi.ScalarTransform4f().scale([half_size, half_size, 1])
 

@@ -159,11 +159,11 @@ class Scene:
         for kind, plugin in OBJECTS.items():
             things = getattr(self, f"{kind}s")
             many = bool(things) and len(things) > MOST_SINGLE[plugin]
+            grouped = [thing for thing in things if many and thing.material.texture is None]
             single = [thing for thing in things if not many or thing.material.texture is not None]
             for i, thing in enumerate(single):
                 shapes[f"{kind}_{i}"] = {**_shape(kind, thing), "bsdf": bsdf(thing.material)}
-            if len(single) < len(things):
-                grouped = [thing for thing in things if thing.material.texture is None]
+            if grouped:
                 shape, own = _group(kind, grouped, fresnel)
                 shapes[f"{kind}s"] = {**shape, "bsdf": own or bsdf(grouped[0].material)}
         for i, p in enumerate(self.planes):
@@ -172,12 +172,8 @@ class Scene:
         for i, m in enumerate(self.meshes):
             shapes[f"mesh_{i}"] = {**_mesh(m, self.texturing), "bsdf": bsdf(m.material)}
         lights = {
-            f"light_{i}": {
-                "type": "mrt_light",
-                "position": list(each.position),
-                "intensity": _rgb(each.color),
-            }
-            for i, each in enumerate(self.lights)
+            f"light_{i}": {"type": "mrt_light", "position": list(p.position), "intensity": _rgb(p.color)}
+            for i, p in enumerate(self.lights)
         }
         return {
             "type": "scene",
@@ -199,14 +195,7 @@ class Scene:
         # The original's picture is mirrored left to right against a right-handed camera
         to_world = mi.ScalarTransform4f().look_at(list(camera.position), list(camera.target), list(camera.up))
         to_world = to_world @ mi.ScalarTransform4f().scale([-1, 1, 1])
-        film = {
-            "type": "hdrfilm",
-            "width": width,
-            "height": height,
-            "pixel_format": "rgb",
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-        }
+        film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb"}
         return {
             "type": "perspective",
             "fov": camera.hfov,
@@ -214,9 +203,30 @@ class Scene:
             "near_clip": 0.01 * min(1.0, reach),
             "far_clip": 1e5 * max(1.0, reach / 10),
             "to_world": to_world,
-            "film": film,
+            "film": {**film, "component_format": "float32", "rfilter": {"type": "box"}},
             "sampler": {"type": "independent", "sample_count": 16},
         }
+
+
+# What the plugins of the same names draw; the fields but for the material are their parameters
+OBJECTS: dict[str, type] = {"sphere": Sphere, "cone": Cone, "cylinder": Cylinder}
+# More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape
+# and more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of
+# recursion
+MOST_SINGLE = dict.fromkeys(OBJECTS.values(), 100) | {Sphere: 1000}
+
+
+def _shape(kind: str, thing: Any) -> dict[str, Any]:
+    """Return an object's points and its radius, by the names that its plugin has for them, too."""
+    values = {f.name: getattr(thing, f.name) for f in fields(thing) if f.name != "material"}
+    listed = {name: float(value) if name == "radius" else list(value) for name, value in values.items()}
+    return {"type": "sphere" if kind == "sphere" else f"mrt_{kind}", **listed}
+
+
+def _numbers(thing: Any) -> list[float]:
+    """Return the coordinates of an object's points, and its radius."""
+    *points, radius = (getattr(thing, f.name) for f in fields(thing) if f.name != "material")
+    return [*(x for point in points for x in point), radius]
 
 
 def _check(scene: Scene) -> None:
@@ -224,8 +234,7 @@ def _check(scene: Scene) -> None:
     meshes are checked by their plugins."""
     from mrt_mitsuba.plugins.quadric_kinds import KINDS  # which brings Dr.Jit
 
-    problem = view_problem(scene.camera)
-    if problem:
+    if problem := view_problem(scene.camera):
         raise SceneError(problem)
     if not _all_finite(scene.sky, 3):
         raise SceneError(f"sky is {scene.sky!r}, but must be three finite numbers: red, green and blue")
@@ -233,7 +242,7 @@ def _check(scene: Scene) -> None:
         raise SceneError(f"texturing is {scene.texturing!r}, but must be report or standard")
     for kind in OBJECTS:
         for i, thing in enumerate(getattr(scene, f"{kind}s")):
-            numbers = _numbers(thing)  # the radius last
+            numbers = _numbers(thing)
             if not _all_finite(numbers, KINDS[kind].width) or not numbers[-1] > 0:
                 raise SceneError(f"{kind}s[{i}] is {thing!r}, but must have finite places and a radius > 0")
 
@@ -270,50 +279,27 @@ def _rgb(color: Color) -> dict[str, Any]:
     return {"type": "rgb", "value": list(color)}
 
 
-# What the plugins of the same names draw; the fields but for the material are their parameters
-OBJECTS: dict[str, type] = {"sphere": Sphere, "cone": Cone, "cylinder": Cylinder}
-
-
-def _shape(kind: str, thing: Any) -> dict[str, Any]:
-    *points, radius = (f.name for f in fields(thing) if f.name != "material")
-    places = {name: list(getattr(thing, name)) for name in points}
-    plugin = "sphere" if kind == "sphere" else f"mrt_{kind}"
-    return {"type": plugin, **places, radius: float(getattr(thing, radius))}
-
-
-def _numbers(thing: Any) -> tuple[float, ...]:
-    """Return the coordinates of an object's points, and its radius."""
-    *points, radius = (getattr(thing, f.name) for f in fields(thing) if f.name != "material")
-    return (*(x for point in points for x in point), radius)
-
-
-# More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape
-# and more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of
-# recursion
-MOST_SINGLE = dict.fromkeys(OBJECTS.values(), 100) | {Sphere: 1000}
-
-
 def _group(kind: str, objects: list, fresnel: str) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """Return one shape of many objects, and a BSDF that looks up values by object if they differ."""
     import mitsuba as mi
     import numpy as np
 
-    numbers = mi.Bitmap(np.array([_numbers(o) for o in objects], np.float32))
-    shape = {"type": "mrt_group", "kind": kind, "numbers": numbers}
+    def bitmap(rows: list) -> Any:
+        return mi.Bitmap(np.array(rows, np.float32))
+
+    shape = {"type": "mrt_group", "kind": kind, "numbers": bitmap([_numbers(o) for o in objects])}
     own = [o.material for o in objects]
     if len(set(own)) == 1:
         return shape, None
     columns = {
-        "alpha": [(m.alpha,) for m in own],
-        "int_ior": [(max(m.ior, _SMALLEST_IOR),) for m in own],
-        "diffuse_reflectance": [m.diffuse for m in own],
-        "specular_reflectance": [m.specular for m in own],
+        "alpha": bitmap([(m.alpha,) for m in own]),
+        "int_ior": bitmap([(max(m.ior, _SMALLEST_IOR),) for m in own]),
+        "diffuse_reflectance": bitmap([m.diffuse for m in own]),
+        "specular_reflectance": bitmap([m.specular for m in own]),
     }
-    bsdf: dict[str, Any] = {"type": "mrt_bsdf", "fresnel": fresnel}
-    for name, values in columns.items():
-        shape[f"face_{name}"] = mi.Bitmap(np.array(values, np.float32))
-        bsdf[name] = {"type": "mesh_attribute", "name": f"face_{name}"}
-    return shape, bsdf
+    attributes = {name: {"type": "mesh_attribute", "name": f"face_{name}"} for name in columns}
+    shape |= {f"face_{name}": values for name, values in columns.items()}
+    return shape, {"type": "mrt_bsdf", "fresnel": fresnel, **attributes}
 
 
 def _mesh(m: Mesh, texturing: str) -> dict[str, Any]:
