@@ -6,9 +6,8 @@ import dataclasses
 import math
 import operator
 import os
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from mrt_mitsuba.errors import UsageError
 
@@ -16,12 +15,11 @@ UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 SMALLEST_MEMORY = 64 * 2**20  # bytes; about what one tile with all layers takes
 
 
-@dataclass(frozen=True)
-class Kind:
+class Kind(NamedTuple):
     """A kind of value. ``form`` is the help's "name=form", ``allowed`` completes "must be ...".
 
     ``from_text`` turns text into a value, ``check`` returns an allowed value; both raise ValueError or
-    TypeError.
+    TypeError. A kind without a form is for Python only.
     """
 
     form: str
@@ -30,56 +28,35 @@ class Kind:
     check: Callable[[Any], Any]
 
 
+def require(holds: bool, value: Any) -> Any:
+    """Return a value for which something holds; raise ``ValueError`` where it does not."""
+    if not holds:
+        raise ValueError
+    return value
+
+
 def integer(low: int, high: int) -> Kind:
     """Return the kind of whole numbers in [low, high]."""
-    allowed = f"a whole number from {low} to {high}"
-    return _numeric("N", allowed, int, operator.index, lambda value: low <= value <= high)
+
+    def check(value: Any) -> int:
+        number = operator.index(require(not isinstance(value, bool), value))
+        return int(require(low <= number <= high, number))
+
+    return Kind("N", f"a whole number from {low} to {high}", lambda text: int(plain(text)), check)
 
 
-def number(low: float) -> Kind:
-    """Return the kind of finite numbers from ``low`` on."""
-    allowed = f"a finite number, {low:g} or more"
-    return _numeric("X", allowed, float, float, lambda value: low <= value < math.inf)
+def real(form: str, allowed: str, fits: Callable[[float], bool]) -> Kind:
+    """Return the kind of numbers that fit."""
 
+    def check(value: Any) -> float:
+        return float(require(not isinstance(value, bool | str) and fits(value), value))
 
-def angle() -> Kind:
-    """Return the kind of degrees between 0 and 180, excluding both."""
-    allowed = "degrees, more than 0 and less than 180"
-    return _numeric("DEGREES", allowed, float, float, lambda value: 0 < value < 180)
-
-
-def _numeric(
-    form: str,
-    allowed: str,
-    read: Callable[[str], Any],
-    convert: Callable[[Any], Any],
-    within: Callable[[Any], bool],
-) -> Kind:
-    check = _such(lambda value: not isinstance(value, bool | str) and within(value), convert)
-    return Kind(form, allowed, lambda text: read(plain(text)), check)
-
-
-def _such(allowed: Callable[[Any], Any], convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return the check that takes what is ``allowed``, and converts it."""
-
-    def check(value: Any) -> Any:
-        if not allowed(value):
-            raise ValueError
-        return convert(value)
-
-    return check
+    return Kind(form, allowed, lambda text: float(plain(text)), check)
 
 
 def choice(*names: str) -> Kind:
     """Return the kind of a choice among names."""
-    return Kind("|".join(names), either(names), str, _such(names.__contains__, str))
-
-
-def switch() -> Kind:
-    """Return the kind of yes or no."""
-    words = {"1": True, "0": False, "yes": True, "no": False, "true": True, "false": False}
-    check = _such((False, True).__contains__, bool)
-    return Kind("1|0", "1 or 0", lambda text: words.get(text.lower()), check)
+    return Kind("|".join(names), either(names), str, lambda value: str(require(value in names, value)))
 
 
 def subset(known: Iterable[str]) -> Kind:
@@ -90,97 +67,21 @@ def subset(known: Iterable[str]) -> Kind:
         return known if text == "all" else tuple(text.split(","))
 
     def check(value: Any) -> tuple[str, ...]:
-        if isinstance(value, str):
-            value = parse(value)
-        if len(set(value)) != len(value) or not set(value) <= set(known):
-            raise ValueError
-        return tuple(value)
+        names = parse(value) if isinstance(value, str) else tuple(value)
+        require(len(set(names)) == len(names) and set(names) <= set(known), names)
+        return names
 
     return Kind("A,B,..", f"a comma list out of {', '.join(known)}, each once, or all", parse, check)
 
 
-def vector(form: str = "X,Y,Z") -> Kind:
-    """Return the kind of three finite numbers."""
+def switch(form: str = "1|0") -> Kind:
+    """Return the kind of yes or no."""
+    words = {"1": True, "0": False, "yes": True, "no": False, "true": True, "false": False}
 
-    def check(value: Any) -> tuple[float, float, float]:
-        x, y, z = (float(coordinate) for coordinate in value)
-        if not all(map(math.isfinite, (x, y, z))):
-            raise ValueError
-        return x, y, z
+    def check(value: Any) -> bool:
+        return bool(require(value in (False, True), value))
 
-    def parse(text: str) -> list[float]:
-        return [float(plain(part)) for part in text.split(",")]
-
-    return Kind(form, "three finite numbers separated by commas", parse, check)
-
-
-def error_or_place() -> Kind:
-    """Return the kind of one positive number, or three finite ones."""
-    place = vector()
-
-    def check(value: Any) -> Any:
-        if isinstance(value, Iterable):
-            return place.check(value)
-        if isinstance(value, bool) or not 0 < value < math.inf:
-            raise ValueError
-        return float(value)
-
-    def parse(text: str) -> Any:
-        return place.from_text(text) if "," in text else float(plain(text))
-
-    return Kind("X|X,Y,Z", "a positive number, or three separated by commas", parse, check)
-
-
-def size() -> Kind:
-    """Return the kind of numbers of bytes, in text with a unit: 4G, 512M."""
-
-    def parse(text: str) -> int:
-        upper = plain(text).upper().removesuffix("B").removesuffix("I")
-        unit = upper[-1:] if upper[-1:] in UNITS else ""
-        return int(float(upper.removesuffix(unit)) * UNITS[unit])
-
-    def check(value: Any) -> int:
-        value = parse(value) if isinstance(value, str) else operator.index(value)
-        if value < SMALLEST_MEMORY:
-            raise ValueError
-        return value
-
-    return Kind("BYTES", "bytes with an optional unit K, M, G or T, at least 64M, such as 4G", parse, check)
-
-
-def word() -> Kind:
-    """Return the kind of names made of letters, digits and underscores, such as variants."""
-    check = _such(lambda value: isinstance(value, str) and value.isidentifier(), str)
-    return Kind("NAME", "a name such as llvm_ad_rgb or scalar_rgb", str, check)
-
-
-def anything() -> Kind:
-    """Return the kind of what Python gives, checked where it is used."""
-    return Kind("", "anything", str, lambda value: value)
-
-
-def function() -> Kind:
-    """Return the kind of what can be called."""
-    return Kind("", "a function", str, _such(callable, lambda value: value))
-
-
-def rectangle() -> Kind:
-    """Return the kind of rectangles: column and row of the first pixel, width and height."""
-
-    def check(value: Any) -> tuple[int, int, int, int]:
-        x, y, width, height = (operator.index(number) for number in value)
-        if x < 0 or y < 0 or width < 1 or height < 1:
-            raise ValueError
-        return x, y, width, height
-
-    return Kind("", "four whole numbers: column, row, width and height in pixels", str, check)
-
-
-def parameters() -> Kind:
-    """Return the kind of dicts of values by names of an XML file or keys of ``mi.traverse``."""
-    allowed = "a dict of values by names of an XML file or keys of mi.traverse, such as material_0.alpha"
-    check = _such(lambda value: all(isinstance(key, str) and key for key in value), lambda value: value)
-    return Kind("", allowed, str, lambda value: check(dict(value)))
+    return Kind(form, "1 or 0", lambda text: words.get(text.lower()), check)
 
 
 def path() -> Kind:
@@ -188,18 +89,73 @@ def path() -> Kind:
 
     def check(value: Any) -> str:
         value = os.fspath(value)
-        if not value or "\0" in value:
-            raise ValueError
-        return str(value)
+        return str(require(bool(value) and "\0" not in value, value))
 
     return Kind("PATH", "the path of a file", str, check)
 
 
+def _vector(value: Any) -> tuple[float, float, float]:
+    x, y, z = (float(coordinate) for coordinate in value)
+    require(math.isfinite(x + y + z), value)
+    return x, y, z
+
+
+def _target(value: Any) -> Any:
+    if isinstance(value, Iterable):
+        return _vector(value)
+    return float(require(not isinstance(value, bool) and 0 < value < math.inf, value))
+
+
+def _bytes(value: Any) -> int:
+    if isinstance(value, str):
+        upper = plain(value).upper().removesuffix("B").removesuffix("I")
+        unit = upper[-1:] if upper[-1:] in UNITS else ""
+        value = int(float(upper.removesuffix(unit)) * UNITS[unit])
+    return operator.index(require(operator.index(value) >= SMALLEST_MEMORY, value))
+
+
+def _rectangle(value: Any) -> tuple[int, int, int, int]:
+    x, y, width, height = (operator.index(number) for number in value)
+    require(x >= 0 and y >= 0 and width >= 1 and height >= 1, value)
+    return x, y, width, height
+
+
+def _numbers(text: str) -> Any:
+    parts = [float(plain(part)) for part in text.split(",")]
+    return parts if len(parts) > 1 else parts[0]
+
+
+def _parameters(value: Any) -> Mapping[str, Any]:
+    value = dict(value)
+    require(all(isinstance(key, str) and key for key in value), value)
+    return value
+
+
+NUMBER = real("X", "a finite number, 0 or more", lambda value: 0 <= value < math.inf)
+ANGLE = real("DEGREES", "degrees, more than 0 and less than 180", lambda value: 0 < value < 180)
+VECTOR = Kind("X,Y,Z", "three finite numbers separated by commas", _numbers, _vector)
+TARGET = Kind("X|X,Y,Z", "a positive number, or three separated by commas", _numbers, _target)
+BYTES = Kind("BYTES", "bytes with an optional unit K, M, G or T, at least 64M, such as 4G", str, _bytes)
+NAME = Kind(
+    "NAME",
+    "a name such as llvm_ad_rgb or scalar_rgb",
+    str,
+    lambda value: require(isinstance(value, str) and value.isidentifier(), value),
+)
+ANYTHING = Kind("", "anything", str, lambda value: value)  # checked where it is used
+FUNCTION = Kind("", "a function", str, lambda value: require(callable(value), value))
+RECTANGLE = Kind("", "four whole numbers: column, row, width and height in pixels", str, _rectangle)
+PARAMETERS = Kind(
+    "",
+    "a dict of values by names of an XML file or keys of mi.traverse, such as material_0.alpha",
+    str,
+    _parameters,
+)
+
+
 def plain(text: str) -> str:
     """Return text that may be a number; raise ``ValueError`` for spaces and underscores, which int takes."""
-    if not text.isascii() or "_" in text or text != text.strip():
-        raise ValueError
-    return text
+    return str(require(text.isascii() and "_" not in text and text == text.strip(), text))
 
 
 def either(names: Sequence[str]) -> str:
@@ -208,11 +164,13 @@ def either(names: Sequence[str]) -> str:
 
 
 def option(default: Any, kind: Kind, text: str = "", shown: str | None = None) -> Any:
-    """Declare a field of a table of options; ``shown`` is the default as the help names it.
-
-    A field without ``text`` is no option of the command.
-    """
+    """Declare a field of a table of options; ``shown`` is the default as the help names it."""
     return dataclasses.field(default=default, metadata={"kind": kind, "help": text, "shown": shown})
+
+
+def table(kind: Any) -> dict[str, dataclasses.Field[Any]]:
+    """Return the fields that are options of the command, by name."""
+    return {f.name: f for f in dataclasses.fields(kind) if f.metadata and f.metadata["kind"].form}
 
 
 def checked(field: dataclasses.Field[Any], value: Any) -> Any:
@@ -220,9 +178,7 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
 
     The default passes as it is.
     """
-    if value is field.default:
-        return value
-    return check(field.name, field.metadata["kind"], value)
+    return value if value is field.default else check(field.name, field.metadata["kind"], value)
 
 
 def check(name: str, kind: Kind, value: Any) -> Any:

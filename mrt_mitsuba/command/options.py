@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import os
 from collections.abc import Iterable, Sequence
@@ -10,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.options import choice, either, from_text, option, path, switch
+from mrt_mitsuba.options import choice, either, from_text, option, path, switch, table
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.model import check_model_options
@@ -51,7 +50,7 @@ class Options(RenderSettings):
         return tuple(f"{self.filename}.{ending}" for ending in endings)
 
 
-TABLE = {field.name: field for field in dataclasses.fields(Options) if field.metadata.get("help")}
+TABLE = table(Options)
 
 
 def parse(arguments: Sequence[str]) -> Options:

@@ -5,6 +5,7 @@ A new layer takes one row. What its ``value`` is computed from along camera rays
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -35,12 +36,17 @@ class Layer:
 
 _ROWS = (
     Layer(
-        "depth", "Z", FIRST_HIT, "distance of the hit", lambda r: r.distance, free_with=("depth of field",)
+        "depth",
+        "Z",
+        FIRST_HIT,
+        "distance of the hit",
+        lambda r: r.at_hit("Float", r.view.distance(r.si), math.inf),
+        free_with=("depth of field",),
     ),
-    Layer("normal", "XYZ", FIRST_HIT, "geometric normal", lambda r: r.normal),
+    Layer("normal", "XYZ", FIRST_HIT, "geometric normal", lambda r: r.at_hit("Vector3f", r.si.n)),
     Layer("albedo", "RGB", FIRST_HIT, "diffuse reflectance", lambda r: r.albedo),
-    Layer("position", "XYZ", FIRST_HIT, "place of the hit", lambda r: r.position),
-    Layer("uv", "UV", FIRST_HIT, "texture coordinates", lambda r: r.uv),
+    Layer("position", "XYZ", FIRST_HIT, "place of the hit", lambda r: r.at_hit("Vector3f", r.si.p)),
+    Layer("uv", "UV", FIRST_HIT, "texture coordinates", lambda r: r.at_hit("Vector2f", r.si.uv)),
     Layer("shape", "I", FIRST_HIT, "shape, from 1; 0 for none", lambda r: r.shape),
     Layer("material", "I", FIRST_HIT, "material, from 1; 0 for none", lambda r: r.material),
     Layer("edges", "Y", DERIVED, "what the edge detector measured", free_with=("edges",)),
@@ -49,11 +55,23 @@ _ROWS = (
     Layer("variance", "RGB", DERIVED, "variance of the pixel", free_with=("rounds",)),
     Layer("blur", "Y", DERIVED, "amount of blur in pixels"),
     Layer("image", "RGB", AVERAGED, "the picture", lambda r: r.image, internal=True),
-    Layer("direct", "RGB", AVERAGED, "light without mirror rays", lambda r: r.direct),
-    Layer("reflection", "RGB", AVERAGED, "light that mirror rays add", lambda r: r.reflection),
-    Layer("bounces", "Y", AVERAGED, "number of mirror rays", lambda r: r.bounces, counts="mirror"),
+    Layer("direct", "RGB", AVERAGED, "light without mirror rays", lambda r: r.rgb(r.trace.direct)),
     Layer(
-        "shadow_rays", "Y", AVERAGED, "shadow rays", lambda r: r.shadow_rays, counts="shadow", internal=True
+        "reflection",
+        "RGB",
+        AVERAGED,
+        "light that mirror rays add",
+        lambda r: r.rgb(r.trace.radiance - r.trace.direct),
+    ),
+    Layer("bounces", "Y", AVERAGED, "number of mirror rays", lambda r: r.trace.bounces, counts="mirror"),
+    Layer(
+        "shadow_rays",
+        "Y",
+        AVERAGED,
+        "shadow rays",
+        lambda r: r.trace.shadow_rays,
+        counts="shadow",
+        internal=True,
     ),
     Layer("square", "RGB", AVERAGED, "square of the picture", lambda r: r.image * r.image, internal=True),
 )

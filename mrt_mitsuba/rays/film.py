@@ -1,17 +1,46 @@
-"""A film's rules: where the rays through its pixels start, and how their values become a picture."""
+"""A film's rules: where the rays through its pixels start, and how their values become a picture; and the
+part of a picture that is rendered."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from mrt_mitsuba.rays.divisor import constants
+from mrt_mitsuba.rays.lattice import divide, opaque
 
 STEPS = 32  # of a pixel, where integrals over a filter are summed
+
+
+class Region(NamedTuple):
+    """The pixels in columns from ``x`` on and rows from ``y`` on, counted from the top."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+    def grown(self, reach: int, width: int, height: int) -> Region:
+        """Return the region with so many pixels around it, as far as the picture goes."""
+        left, top = max(self.x - reach, 0), max(self.y - reach, 0)
+        right, bottom = min(self.x + self.width + reach, width), min(self.y + self.height + reach, height)
+        return Region(left, top, right - left, bottom - top)
+
+    def pixels(self, width: int) -> Any:
+        """Return the numbers of its pixels in a picture so wide, as a range where that is possible."""
+        if self.width == width:
+            return range(self.y * width, (self.y + self.height) * width)
+        rows, columns = np.arange(self.height)[:, None] + self.y, np.arange(self.width) + self.x
+        return (rows * width + columns).ravel().astype(np.uint32)
+
+    def inside(self, other: Region) -> tuple[slice, slice]:
+        """Return its rows and columns in an array of another region's pixels."""
+        top, left = self.y - other.y, self.x - other.x
+        return slice(top, top + self.height), slice(left, left + self.width)
 
 
 @dataclass(frozen=True)
@@ -52,24 +81,9 @@ class Film:
         return self.height, self.width
 
     def picture(self, sampled: np.ndarray) -> np.ndarray:
-        """Return what lies in the picture, of an array [..., pixels or rows × columns, channels]."""
+        """Return what lies in the picture, of an array [..., rows, columns, channels]."""
         rows, columns = (slice(self.border, n - self.border) for n in self.shape)
         return sampled[..., rows, columns, :]
-
-    def framed(self, picture: np.ndarray, value: float) -> np.ndarray:
-        """Return a picture [H, W] with the film's border around it, of one value."""
-        return np.pad(picture, self.border, constant_values=value) if self.border else picture
-
-    def toned(self, color: Any) -> Any:
-        """Return linear sRGB as the film keeps it."""
-        import mitsuba as mi
-
-        return mi.Color3f(mi.luminance(mi.Color3f(color))) if self.grey else color
-
-    def banded(self, spectrum: Any, wavelengths: Any) -> list[Any]:
-        """Return what each spectral band measures of a radiance."""
-        measured = self.sensor.film().prepare_sample(spectrum, wavelengths, len(self.bands) + 1)
-        return list(measured[: len(self.bands)])  # without the weight
 
     def rays_near(self, count: int) -> int:
         """Return the number of rays a pixel that the scene's sampler makes of a number."""
@@ -82,11 +96,10 @@ class Film:
         import mitsuba as mi
 
         border = float(self.border)
-        across, down = self.width - 2 * border, self.height - 2 * border
-        numbers = constants(width=self.width, border=border, across=across, down=down)
-        row, column = numbers["width"].divide(pixel)
+        size = mi.Vector2f(opaque(self.width - 2 * border), opaque(self.height - 2 * border))
+        row, column = divide(pixel, self.width)
         place = mi.Point2f(mi.Float(column), mi.Float(row)) + sampler.next_2d()
-        return place, (place - numbers["border"]) / mi.Vector2f(numbers["across"], numbers["down"])
+        return place, (place - opaque(border)) / size
 
     @cached_property
     def weights(self) -> np.ndarray:
@@ -100,12 +113,6 @@ class Film:
         else:  # a list is copied; for NumPy's memory, Dr.Jit would compile a kernel for every alignment
             values = rfilter.eval(mi.Float(flat))
         return np.asarray(values, np.float64).reshape(places.shape)
-
-    @cached_property
-    def spread(self) -> np.ndarray:
-        """Share that the rays of the pixels −reach to reach along an axis have in the variance of pixel 0."""
-        share = np.square(self.weights).sum(axis=1)
-        return np.float32(share / share.sum())
 
     @property
     def correlation(self) -> float:
@@ -122,18 +129,150 @@ class Film:
 
     def spread_out(self, variance: np.ndarray) -> np.ndarray:
         """Return the variance [..., H, W] of pixels, up to a factor, given that of the rays in each."""
+        share = np.square(self.weights).sum(axis=1)
+        share = np.float32(share / share.sum())
         for axis in (-2, -1) if self.reach else ():
             padding = [(0, 0)] * variance.ndim
             padding[axis] = (self.reach, self.reach)
             wide = np.moveaxis(np.pad(variance, padding, mode="edge"), axis, 0)
             count = variance.shape[axis]
-            total = self.spread[self.reach] * wide[self.reach : self.reach + count]
+            total = share[self.reach] * wide[self.reach : self.reach + count]
             for step in range(self.reach):  # filters are symmetric
-                pair = wide[step : step + count] + wide[2 * self.reach - step :][:count]
-                pair *= self.spread[step]
-                total += pair
+                total += (wide[step : step + count] + wide[2 * self.reach - step :][:count]) * share[step]
             variance = np.moveaxis(total, 0, axis)
         return variance
+
+
+class Canvas:
+    """Sums of filtered values over the pixels of some pictures; the rays of a pixel weigh 1 in all.
+
+    Rays lie in memory by the pixel in which they start, so those that reach a pixel from one row are
+    neighbours there: each pixel adds them up by itself, in the same order every time. Sums along a row are
+    formed in single precision, those of rows in double, so that pictures are the same wherever wavefronts are
+    cut between rows.
+    """
+
+    def __init__(self, film: Film, rays: np.ndarray, channels: int, *, moments: bool) -> None:
+        """Take up values of so many channels of so many rays in each pixel, [pictures, pixels].
+
+        Args:
+            moments: add up the colours of the rays of each pixel and their squares as well, unfiltered, and
+                note the brightest.
+        """
+        self._film, self._share = film, np.float32(1 / np.maximum(rays, 1)).ravel()
+        self._shape = len(rays), film.height, film.width
+        self._sums = np.zeros((channels + 1, rays.size))
+        self._moments = np.zeros((7 * moments, rays.size))
+
+    @property
+    def sums(self) -> np.ndarray:
+        """The sums of values and, last, of weights, [pictures, H, W, channels + 1]."""
+        return np.moveaxis(self._sums.reshape(-1, *self._shape), 0, -1)
+
+    @property
+    def moments(self) -> np.ndarray:
+        """The sums of colours and of squared colours, and the mean colour of the brightest ray,
+        [pictures, H, W, 7]; empty where not asked for."""
+        return np.moveaxis(self._moments.reshape(-1, *self._shape), 0, -1)
+
+    def put(self, place: Any, values: Sequence[Any], pixels: np.ndarray) -> None:
+        """Add the values of rays, [channels] each, colours first, at their places on the film.
+
+        ``pixels``: where each starts, ascending; those of the second picture follow on those of the first.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        if isinstance(place, np.ndarray):
+            self._put_one_by_one(place, np.asarray(values), pixels)
+            return
+        counts = np.bincount(pixels + 1, minlength=len(self._share) + 1)
+        first = mi.UInt32(np.cumsum(counts, dtype=np.uint32))  # of each pixel, the number of its first ray
+        reach, width = self._film.reach, self._film.width
+        low = max(pixels[0] // width - reach, 0) * width
+        high = min((pixels[-1] // width + reach + 1) * width, len(self._share))
+        pixel = dr.arange(mi.UInt32, high - low) + dr.opaque(mi.UInt32, low)
+        if len(self._moments):
+            more = _moments(
+                values[:3], dr.gather(mi.UInt32, first, pixel), dr.gather(mi.UInt32, first, pixel + 1)
+            )
+            dr.eval(more)
+            for index, found in enumerate(more):
+                known = self._moments[index, low:high]
+                (np.add if index < 6 else np.maximum)(known, np.asarray(found), out=known)
+        share = mi.Float(self._share[pixels])
+        sums = self._near(place, values, share, first, pixel)
+        dr.eval(sums)
+        for total, found in zip(self._sums, sums, strict=True):
+            total[low:high] += np.asarray(found)
+
+    def _near(self, place: Any, values: Sequence[Any], share: Any, first: Any, pixel: Any) -> list[Any]:
+        """Return what rays with a share in their pixel give to these pixels."""
+        import drjit as dr
+        import mitsuba as mi
+
+        film, rfilter, reach = self._film, self._film.sensor.film().rfilter(), opaque(self._film.reach)
+        line, column = divide(pixel, film.width)
+        row = divide(line, film.height)[1]
+        left, right = dr.maximum(column, reach) - reach, dr.minimum(column + reach + 1, opaque(film.width))
+        top, bottom = dr.maximum(row, reach) - reach, dr.minimum(row + reach + 1, opaque(film.height))
+        centre = mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5
+
+        def add_ray(ray: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            weight = dr.gather(mi.Float, share, ray)
+            if film.reach:
+                weight *= rfilter.eval(centre.x - dr.gather(mi.Float, place.x, ray))
+                weight *= rfilter.eval(centre.y - dr.gather(mi.Float, place.y, ray))
+            found = [*(dr.gather(mi.Float, value, ray) for value in values), 1]
+            return ray + 1, [a + weight * b for a, b in zip(sums, found, strict=True)]
+
+        def add_row(at: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            begin = (line + at - row) * opaque(film.width)
+            last = dr.gather(mi.UInt32, first, begin + right)
+            state = dr.gather(mi.UInt32, first, begin + left), [mi.Float(0)] * (len(values) + 1)
+            _, found = dr.while_loop(state, lambda ray, _: ray < last, add_ray)
+            return at + 1, [a + mi.Float64(b) for a, b in zip(sums, found, strict=True)]
+
+        state = top, [mi.Float64(0)] * (len(values) + 1)
+        return list(dr.while_loop(state, lambda at, _: at < bottom, add_row)[1])
+
+    def _put_one_by_one(self, place: np.ndarray, values: np.ndarray, pixels: np.ndarray) -> None:
+        """Add values [channels, rays] at places [2, rays], of rays that start in these pixels."""
+        film, evaluate = self._film, self._film.sensor.film().rfilter().eval
+        if len(self._moments):
+            colors = values[:3]
+            for plane, value in zip(self._moments, [*colors, *colors**2], strict=False):
+                np.add.at(plane, pixels, value)
+            np.maximum.at(self._moments[6], pixels, colors.mean(0))
+        line, column = np.divmod(pixels, film.width)
+        away = (place - np.stack([column, line % film.height]) - 0.5).T.tolist()
+        given = np.stack([*values, np.ones(len(pixels))]) * self._share[pixels]
+        for down in range(-film.reach, film.reach + 1):
+            for across in range(-film.reach, film.reach + 1):
+                weight = np.array(
+                    [evaluate(across - x) * evaluate(down - y) if film.reach else 1.0 for x, y in away]
+                )
+                row, there = line % film.height + down, column + across
+                inside = (row >= 0) & (row < film.height) & (there >= 0) & (there < film.width)
+                at = (pixels + down * film.width + across)[inside]
+                for plane, value in zip(self._sums, given, strict=True):
+                    np.add.at(plane, at, (value * weight)[inside])
+
+
+def _moments(values: Sequence[Any], first: Any, last: Any) -> list[Any]:
+    """Return sums over runs of rays of their values, those of their squares, and the largest mean of a ray's
+    values, or 0."""
+    import drjit as dr
+    import mitsuba as mi
+
+    def add(ray: Any, sums: list[Any], most: Any) -> tuple[Any, list[Any], Any]:
+        found = [dr.gather(mi.Float, value, ray) for value in values]
+        sums = [a + b for a, b in zip(sums, [*found, *(value * value for value in found)], strict=True)]
+        return ray + 1, sums, dr.maximum(most, sum(found) / len(found))
+
+    state = first, [mi.Float(0)] * (2 * len(values)), mi.Float(0)
+    _, sums, most = dr.while_loop(state, lambda ray, *_: ray < last, add)
+    return [*sums, most]
 
 
 def spectral_bands(film: Any) -> tuple[str, ...]:

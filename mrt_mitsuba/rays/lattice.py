@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Any
-
-from mrt_mitsuba.rays.divisor import constants
 
 FILM = "film"
 LATTICES = ("report", "centered", FILM)
@@ -37,9 +35,6 @@ class Lattice:
         return self.kind == "report" or (self.kind == "centered" and self.aa % 2 == 1)
 
 
-CENTRE = Lattice("report", 1)  # the pixel's centre alone
-
-
 @dataclass(frozen=True)
 class Places:
     """Samples ``first`` to ``first + count − 1`` of a lattice in each pixel, each traced ``repeats`` times.
@@ -50,7 +45,7 @@ class Places:
     another for the next pixel, which turns steps into noise.
     """
 
-    lattice: Lattice
+    lattice: Lattice = Lattice("report", 1)  # the pixel's centre alone
     first: int = 0
     count: int = 1
     repeats: int = 1
@@ -63,44 +58,66 @@ class Places:
         """Number of rays of a pixel."""
         return self.count * self.repeats
 
-    def numbers(self, width: int, height: int) -> dict[str, Any]:
-        """Return what ``at`` needs to know of the places, in a picture of this size."""
-        # parts of the time from one ray to the next: coprime to their number, near its golden section
-        golden = round(self.moments * (math.sqrt(5) - 1) / 2)
-        stride = next(s for s in range(max(golden, 1), self.moments + 2) if math.gcd(s, self.moments) <= 1)
-        numbers = {"width": width, "height": height, "repeats": self.repeats, "first": self.first}
-        time = {"moments": self.moments, "stride": stride, "seed": self.seed, "phase": self.phase or 0.0}
-        return constants(aa=self.lattice.aa, **numbers, **(time if self.moments else {}))
+    @cached_property
+    def _stride(self) -> int:
+        """Parts of the time from one ray to the next: coprime to their number, near its golden section."""
+        golden = max(round(self.moments * (math.sqrt(5) - 1) / 2), 1)
+        return next(s for s in range(golden, self.moments + 2) if math.gcd(s, self.moments) <= 1)
 
-    def at(self, pixel: Any, ray: Any, numbers: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return where and when a ray of a pixel starts: its place in the picture, [0, 1]², x to the right
-        and y down, and its time."""
-        import mitsuba as mi
-
-        row, column = numbers["width"].divide(pixel)
-        x, y = self._offset(numbers["repeats"].divide(ray)[0] + numbers["first"].number, numbers["aa"])
-        place = mi.Point2f(
-            (mi.Float(column) + x) / mi.Float(numbers["width"].number),
-            (mi.Float(row) + y) / mi.Float(numbers["height"].number),
-        )
-        if not self.moments:
-            return place, mi.Float(0)
-        moments, stride = (mi.UInt64(numbers[name].number) for name in ("moments", "stride"))
-        phase = numbers["phase"]
-        if self.phase is None:
-            phase = mi.sample_tea_float32(pixel, numbers["seed"].number)
-        return place, (mi.Float(mi.UInt64(ray) * stride % moments) + phase) / mi.Float(moments)
-
-    def _offset(self, sample: Any, aa: Any) -> tuple[Any, Any]:
-        """Return the place of a sample, given by its number, in its pixel: (x, y), y downwards."""
+    def at(self, pixel: Any, ray: Any, width: int, height: int) -> tuple[Any, Any]:
+        """Return where and when a ray of a pixel starts: its place in a picture of this size, [0, 1]², x to
+        the right and y down, and its time."""
         import mitsuba as mi
 
         lattice = self.lattice
+        row, column = divide(pixel, width)
+        sample = divide(ray, self.repeats)[0] + opaque(self.first)
         if lattice.kind == "centered" and lattice.holds_centre:
             # start from the middle one, so that sample 0 is the centre
             sample = (sample + lattice.count // 2) % lattice.count
-        i, j = aa.divide(sample)
-        n = mi.Float(aa.number)
-        if lattice.kind == "report":
-            return 0.5 + mi.Float(i) / n, 0.5 - mi.Float(j) / n
-        return (mi.Float(i) + 0.5) / n, (mi.Float(j) + 0.5) / n
+        i, j = (mi.Float(number) for number in divide(sample, lattice.aa))
+        n = mi.Float(opaque(lattice.aa))
+        x, y = (0.5 + i / n, 0.5 - j / n) if lattice.kind == "report" else ((i + 0.5) / n, (j + 0.5) / n)
+        size = mi.Float(opaque(width)), mi.Float(opaque(height))
+        place = mi.Point2f((mi.Float(column) + x) / size[0], (mi.Float(row) + y) / size[1])
+        if not self.moments:
+            return place, mi.Float(0)
+        if self.phase is None:
+            phase = mi.sample_tea_float32(pixel, opaque(self.seed))
+        else:
+            phase = opaque(float(self.phase))
+        moments, stride = mi.UInt64(opaque(self.moments)), mi.UInt64(opaque(self._stride))
+        return place, (mi.Float(mi.UInt64(ray) * stride % moments) + phase) / mi.Float(moments)
+
+
+def opaque(number: float) -> Any:
+    """Return a number as data of a kernel, so that another needs no other kernel."""
+    import mitsuba as mi
+
+    return number if mi.variant().startswith("scalar") else _opaque(mi.variant(), number, type(number))[0]
+
+
+def divide(n: Any, divisor: int) -> tuple[Any, Any]:
+    """Return quotient and remainder of whole numbers below 2³².
+
+    A processor divides the integers of a packet one after the other, which takes as long as tracing the ray;
+    so vectorised variants multiply by the inverse in double precision. The half added keeps n/d away from
+    whole numbers by 1/(2 d), and rounding moves it by less than n/d / 2⁵² < 1/(2 d).
+    """
+    import mitsuba as mi
+
+    if mi.variant().startswith("scalar"):
+        return divmod(n, divisor)
+    number, inverse = _opaque(mi.variant(), divisor, int)
+    quotient = mi.UInt32((mi.Float64(n) + 0.5) * inverse)
+    return quotient, n - quotient * number
+
+
+@lru_cache(maxsize=64)
+def _opaque(variant: str, number: float, kind: type) -> tuple[Any, Any]:
+    import drjit as dr
+    import mitsuba as mi
+
+    if kind is float:
+        return dr.opaque(mi.Float, number), None
+    return dr.opaque(mi.UInt32, number), dr.opaque(mi.Float64, 1 / number if number else 0)

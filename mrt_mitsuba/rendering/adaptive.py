@@ -104,10 +104,10 @@ class MrtAdaptive(mi.SamplingIntegrator):
         view = _sensor(scene, sensor)
         given: Any = seed
         seed = int(given[0] if dr.is_array_v(given) else given) % 2**32
-        settings = RenderSettings(seed=seed, sensor=number).but(**self.options(spp))
+        settings = RenderSettings(seed=seed, sensor=number, progress=Progress()).but(**self.options(spp))
         with one_at_a_time, held(), dr.suspend_grad():
             source = opened("a Mitsuba scene", scene, view, self.nested)
-            result = render_with(scene, settings, Progress(), opener=lambda *_, **__: source)
+            result = render_with(scene, settings, opener=lambda *_, **__: source)
             film, layers = view.film(), result.layers
             bands = result.plan.film.bands if result.plan.film else ()
             names = self.aov_names() if _further(film) else []

@@ -16,10 +16,9 @@ from mrt_mitsuba.plugins.protocols import LayeredIntegrator
 from mrt_mitsuba.plugins.snapshot import Part
 from mrt_mitsuba.rays.lattice import FILM
 from mrt_mitsuba.rendering.api import render_with
-from mrt_mitsuba.rendering.progress import default
 from mrt_mitsuba.rendering.result import Result
 from mrt_mitsuba.rendering.settings import RenderSettings
-from mrt_mitsuba.rendering.view import View
+from mrt_mitsuba.rendering.shading import View
 from mrt_mitsuba.scene.open import open_scene
 
 
@@ -36,7 +35,7 @@ class Prepared:
     _launch: Any = None  # what launches them; None where nothing is recorded
 
     def __init__(self, scene: Any, options: dict[str, Any]) -> None:
-        self._scene, self._settings = scene, RenderSettings.of(**options)
+        self._scene, self._settings = scene, RenderSettings(**options)
         with runtime.one_at_a_time, held():
             self._made = self._render(self._settings.seed)  # result from which others differ by the picture
             self._integrator, self.params = self._source.integrator, mi.traverse(self._source.scene)
@@ -63,7 +62,7 @@ class Prepared:
             self._source = self._source or open_scene(scene, **how)
             return self._source
 
-        return render_with(self._scene, replace(self._settings, seed=seed), default(), opener=opened)
+        return render_with(self._scene, replace(self._settings, seed=seed), opener=opened)
 
     def _look(self) -> Part:
         """Return the state of the camera and the integrator, the same object if it is the same."""

@@ -3,9 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import sys
+import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, TextIO
+
+from mrt_mitsuba.interrupts import heed
+from mrt_mitsuba.memory import Workspace
+
+log = logging.getLogger(__name__)
+
+SECONDS = 0.1  # between two looks at what kernels took
 
 Advance = Callable[[int], object]
 
@@ -26,11 +37,6 @@ class Progress:
         ``title`` names the stage on the bar, ``message`` is printed on a line of its own.
         """
         yield lambda steps: None
-
-
-def default() -> Progress:
-    """Return a progress that shows a bar in a notebook, and is silent elsewhere."""
-    return TerminalProgress() if "ipykernel" in sys.modules else Progress()
 
 
 class TerminalProgress(Progress):
@@ -76,3 +82,51 @@ class TerminalProgress(Progress):
             file=self.bar_file,
         ) as bar:
             yield bar.update
+
+
+@dataclass
+class Job:
+    """A render under way: where it reports, how much it does at once, and what it has cost so far."""
+
+    progress: Progress
+    workspace: Workspace
+    passes: dict[str, float] = field(default_factory=dict)  #: seconds by name
+    rays: Counter[str] = field(default_factory=lambda: Counter(primary=0))  #: traced, by kind
+    launches: int = 0  #: of kernels
+    compiling: float = 0.0  #: seconds
+    running: float = 0.0  #: seconds that kernels ran
+    collected: float = 0.0  #: when Dr.Jit's records were read last
+
+    def collect(self) -> None:
+        """Add up what Dr.Jit recorded since the last call. Records hold the kernels' text: many take room."""
+        import drjit as dr
+
+        self.collected, records = time.perf_counter(), dr.kernel_history()
+        self.progress.kernels(records)
+        own = [record for record in records if record["type"] == dr.KernelType.JIT]
+        self.launches += len(own)
+        self.compiling += sum(record["codegen_time"] + record["backend_time"] for record in own) / 1000
+        self.running += sum(record["execution_time"] for record in own) / 1000
+
+    @contextlib.contextmanager
+    def stage(self, name: str, total: int, message: str = "") -> Iterator[Advance]:
+        """Open a stage of the progress, and measure its time."""
+        # does the progress want to know which kernels ran in a stage?
+        asked = type(self.progress).kernels is not Progress.kernels
+        if asked:
+            self.collect()
+        start = time.perf_counter()
+        with self.progress.stage(name.capitalize(), total, message) as advance:
+
+            def advance_and_collect(steps: int) -> None:
+                advance(steps)
+                heed()
+                if time.perf_counter() - self.collected > SECONDS:
+                    self.collect()
+
+            yield advance_and_collect
+            if asked:
+                self.collect()
+        seconds = time.perf_counter() - start
+        self.passes[name] = self.passes.get(name, 0.0) + seconds
+        log.info("%s: %d pixels in %.3f s", name, total, seconds)

@@ -1,35 +1,42 @@
-"""The options of ``mrt.render``, checked; the command adds its own to them."""
+"""The options of ``mrt.render``, each declared once: its type, default, check and help are read from here by
+Python, by editors and by the command, which adds its own."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import (
-    angle,
-    anything,
+    ANGLE,
+    ANYTHING,
+    BYTES,
+    FUNCTION,
+    NAME,
+    NUMBER,
+    PARAMETERS,
+    RECTANGLE,
+    TARGET,
+    VECTOR,
+    Kind,
     checked,
     choice,
-    error_or_place,
-    function,
     integer,
-    number,
     option,
-    parameters,
-    rectangle,
-    size,
+    require,
     subset,
     switch,
-    vector,
-    word,
+    table,
 )
 from mrt_mitsuba.output.layers import LAYERS
 from mrt_mitsuba.rays.lattice import LATTICES
+from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE
+
+if TYPE_CHECKING:
+    from mrt_mitsuba.output.error import RoundPicture
 
 #: The edge detectors as ``aamode`` names them: ``filters.<name>_edges``, and the layers that each reads, in
 #: the order of its arguments; those of the picture can distinguish noise from edges
@@ -40,8 +47,7 @@ MAX_SPP = 4096  # of a pixel on average, where a target alone would ask for more
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
 
 
-@dataclass(frozen=True)
-class Focus:
+class Focus(NamedTuple):
     """The range of sharp distances, in scene units."""
 
     distance: float | None  #: from the camera; None for no depth of field
@@ -66,16 +72,16 @@ class RenderSettings:
         "refine all pixels, only edges in brightness (luma, sobel) or shape (geometry), or where noise is",
         "sobel",
     )
-    target: float | tuple[float, float, float] | None = option(
+    target: float | Sequence[float] | None = option(
         None,
-        error_or_place(),
+        TARGET,
         "error to render to (RMSE, linear); OBJ file: what the camera looks at",
         "none",
     )
     maxspp: int | None = option(
         None, integer(MIN_SPP, 2**24), "rays of a pixel at most, with a target, on average", str(MAX_SPP)
     )
-    maxseconds: float | None = option(None, number(0), "seconds to spend at most, with a target", "none")
+    maxseconds: float | None = option(None, NUMBER, "seconds to spend at most, with a target", "none")
     lattice: str | None = option(
         None,
         choice(*LATTICES),
@@ -84,19 +90,19 @@ class RenderSettings:
     )
     fresnel: str | None = option(None, FRESNEL, "reflectance formula", "schlick")
     focaldist: float | None = option(
-        None, number(0), "distance in focus, from the camera; 0: no depth of field", "from the scene"
+        None, NUMBER, "distance in focus, from the camera; 0: no depth of field", "from the scene"
     )
     focalrange: float | None = option(
-        None, number(0), "half-width of the sharp zone around it", "from the scene"
+        None, NUMBER, "half-width of the sharp zone around it", "from the scene"
     )
     dof: str = option(
         "report", choice("report", "corrected"), "depth of field as in the report, or without its flaws"
     )
-    layers: tuple[str, ...] = option(
+    layers: Sequence[str] = option(
         (), subset(LAYERS), f"further EXR layers: all, or some of {', '.join(LAYERS)}", "none"
     )
-    motion: tuple[float, float, float] | None = option(
-        None, vector("DX,DY,DZ"), "motion blur: how far the camera moves", "none"
+    motion: Sequence[float] | None = option(
+        None, VECTOR._replace(form="DX,DY,DZ"), "motion blur: how far the camera moves", "none"
     )
     motionsamples: int = option(16, integer(1, 65536), "moments at which motion blur sees the scene")
     motionmode: str = option(
@@ -111,44 +117,60 @@ class RenderSettings:
         "textures of an OBJ file: nearest texel, or bilinear from sRGB",
         "as convention",
     )
-    camera: tuple[float, float, float] | None = option(
-        None, vector(), "OBJ file: where the camera is", "by the model's size"
+    camera: Sequence[float] | None = option(
+        None, VECTOR, "OBJ file: where the camera is", "by the model's size"
     )
-    up: tuple[float, float, float] | None = option(None, vector(), "OBJ file: what is up", "0,1,0")
-    fov: float | None = option(None, angle(), "OBJ file: horizontal field of view", "60")
-    light: tuple[float, float, float] | None = option(
-        None, vector(), "OBJ file: where a white light is, in place of the two", "two, by the model's size"
+    up: Sequence[float] | None = option(None, VECTOR, "OBJ file: what is up", "0,1,0")
+    fov: float | None = option(None, ANGLE, "OBJ file: horizontal field of view", "60")
+    light: Sequence[float] | None = option(
+        None, VECTOR, "OBJ file: where a white light is, in place of the two", "two, by the model's size"
     )
-    variant: str | None = option(None, word(), "Mitsuba variant", "llvm_ad_rgb, without LLVM scalar_rgb")
-    memory: int | None = option(
-        None, size(), "memory to stay within: a number, with K, M, G or T for a unit", "half of what is free"
+    variant: str | None = option(None, NAME, "Mitsuba variant", "llvm_ad_rgb, without LLVM scalar_rgb")
+    memory: int | str | None = option(
+        None, BYTES, "memory to stay within: a number, with K, M, G or T for a unit", "half of what is free"
     )
     seed: int = option(0, integer(0, 2**32 - 1), "seed where anything is random")
-    integrator: object = option(None, anything())
+    integrator: Any = option(
+        None,
+        ANYTHING,
+        "name, dict or instance of an integrator; one that gives whole pictures only, such as ptracer, knows "
+        "no layers, edges, motion or depth of field",
+        "the scene's own",
+    )
     sensor: int = option(0, integer(0, 65535), "number of the sensor, in a scene that has several")
-    on_round: object = option(None, function())  # a function
+    on_round: Callable[[RoundPicture], object] | None = option(
+        None, FUNCTION, "called after each round of rays with a RoundPicture; stops by returning False"
+    )
     spp: int | None = option(
         None,
         integer(1, 65536),
         "rays for each sample, where the integrator is random; aamode=noise: mean of a pixel",
         "1",
     )
-    count_rays: bool = option(False, switch())
-    params: Mapping[str, Any] | None = option(None, parameters())
-    region: tuple[int, int, int, int] | None = option(None, rectangle())
+    count_rays: bool = option(False, switch(form=""), "count mirror and shadow rays")
+    params: Mapping[str, Any] | None = option(
+        None, PARAMETERS, "values for the $names that an XML file declares, and by keys of mi.traverse"
+    )
+    region: Sequence[int] | None = option(
+        None, RECTANGLE, "column, row, width and height of the pixels to return, as in the whole picture"
+    )
+    progress: Progress | None = option(
+        None,
+        Kind(
+            "",
+            "a rendering.progress.Progress",
+            str,
+            lambda value: require(isinstance(value, Progress), value),
+        ),
+        "receives the plan, the stages and their progress",
+    )
 
     def __post_init__(self) -> None:
-        kind: Any = type(self)
         values = vars(self)
-        for field in _fields(kind):
-            if values[field.name] is not field.default:
+        for field in dataclasses.fields(self):
+            if field.metadata and values[field.name] is not field.default:
                 values[field.name] = checked(field, values[field.name])
         self.model()  # checks what shows nothing
-
-    @classmethod
-    def of(cls, **options: Any) -> RenderSettings:
-        """Return the settings for options as Python gives them: a list for a tuple, "4G" for bytes."""
-        return cls(**options)
 
     def but(self, **values: Any) -> RenderSettings:
         """Return the settings with other values, which are known to be right."""
@@ -179,21 +201,9 @@ class RenderSettings:
         distance = distance if self.focaldist is None else self.focaldist
         return Focus(distance or None, reach if self.focalrange is None else self.focalrange)
 
-    def in_force(self, **decided: Any) -> dict[str, Any]:
-        """Return the options that shape the picture, by name, with those that the scene ``decided``."""
-        names = (*(name for name in TABLE if name != "memory"), "params", "region")
-        values = {name: getattr(self, name) for name in names} | decided
-        return {name: value for name, value in values.items() if value is not None}
-
-
-@cache
-def _fields(kind: Any) -> list[dataclasses.Field[Any]]:
-    """Return the fields that are options."""
-    return [field for field in dataclasses.fields(kind) if "kind" in field.metadata]
-
 
 #: The options of a render by name, without those that only Python can give
-TABLE = {field.name: field for field in dataclasses.fields(RenderSettings) if field.metadata["help"]}
+TABLE = table(RenderSettings)
 
 
 def check(name: str, value: Any) -> Any:

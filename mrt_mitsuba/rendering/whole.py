@@ -56,7 +56,7 @@ class Wholes:
                 self._sums[picture] += count * self._rendered(count)
                 self._rays[picture] += count
                 advance(count * self.film.pixels)
-                job.count("primary", count * self.film.pixels)
+                job.rays["primary"] += count * self.film.pixels
 
     def _rendered(self, rays: int) -> np.ndarray:
         """Return the channels of a picture, [H, W, channels], by seeds of its own."""

@@ -32,11 +32,11 @@ def _times(pixels: int = 64, aa: int = 4, repeats: int = 1, **shutter) -> np.nda
     """Times of all rays, [pixels, rays of a pixel]."""
     places = Places(Lattice("report", aa), 0, aa**2, repeats, **shutter)
     pixel, ray = np.divmod(np.arange(pixels * places.size, dtype=np.uint32), places.size)
-    numbers = places.numbers(8, pixels // 8)
+    size = 8, pixels // 8
     if mi.variant().startswith("scalar"):
-        times = [places.at(int(p), int(r), numbers)[1] for p, r in zip(pixel, ray, strict=True)]
+        times = [places.at(int(p), int(r), *size)[1] for p, r in zip(pixel, ray, strict=True)]
     else:
-        times = places.at(mi.UInt32(pixel), mi.UInt32(ray), numbers)[1]
+        times = places.at(mi.UInt32(pixel), mi.UInt32(ray), *size)[1]
     return np.array(times).reshape(pixels, -1)
 
 

@@ -38,9 +38,9 @@ class Draws:
 
     def expose(self, groups: Any, seed: int, *, pictures: int, **_: Any) -> Exposed:
         shape, rays = (pictures, SIDE, SIDE), np.zeros((pictures, PIXELS), np.int64)
-        rays.ravel()[groups.pixels] = groups.rays
+        np.add.at(rays.ravel(), groups.pixels, groups.size)
         before = np.zeros((pictures, PIXELS), np.int64)
-        before.ravel()[groups.pixels] = groups.first
+        before.ravel()[groups.pixels[::-1]] = groups.first[::-1]
         total, square, peak = np.zeros((3, pictures, PIXELS))
         for picture, draw in enumerate(self.draws):
             rng = np.random.default_rng((seed, picture, int(before[picture].sum())))

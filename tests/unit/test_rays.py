@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rays.divisor import Divisor, constants
+from mrt_mitsuba.rays.lattice import divide
 from mrt_mitsuba.rendering.windows import dilated, window_means
 
 LARGEST = 2**32 - 1
@@ -23,13 +23,9 @@ def test_division_is_exact(number: int) -> None:
     multiples = rng.integers(0, LARGEST // number + 1, 10_000) * number
     near = np.concatenate([multiples + k for k in (-1, 0, 1)] + [rng.integers(0, LARGEST, 10_000)])
     n = np.clip(np.append(near, [0, LARGEST]), 0, LARGEST).astype(np.uint32)
-    quotient, remainder = constants(number=number)["number"].divide(mi.UInt32(n))
+    quotient, remainder = divide(mi.UInt32(n), number)
     assert np.array_equal(quotient, n // np.uint32(number))
     assert np.array_equal(remainder, n % np.uint32(number))
-
-
-def test_division_in_scalar_variants() -> None:
-    assert Divisor(7).divide(23) == (3, 2)
 
 
 @pytest.mark.parametrize("reach", [1, 2, 8])
