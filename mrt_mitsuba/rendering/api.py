@@ -81,7 +81,6 @@ def render(scene: Any = 0, **options: Any) -> Result:
         SceneError: for a scene that cannot be read.
         VariantError: for a variant that cannot run here.
     """
-    cast(Any, render).__signature__.bind(scene, **options)
     with runtime.one_at_a_time, held():
         return render_with(scene, RenderSettings(**options))
 

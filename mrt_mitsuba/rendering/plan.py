@@ -349,8 +349,8 @@ def _passes(
 def _left_out(
     traced: Any, made: set[str], film: FilmFacts | None, shader: Shader, settings: RenderSettings
 ) -> tuple[Omission, ...]:
-    """Return what kernels and passes leave out, and what a film or a sampler asks for and does not get; with why."""
-    reasons = {
+    """Return what kernels and passes leave out, and what a film or a sampler asks for in vain; with why."""
+    aamodes = {
         "none": "aamode=none gives every pixel all its samples",
         NOISE: "rounds go where the variance is",
     }
