@@ -57,7 +57,7 @@ def test_errors_fall_as_theory_says_and_a_bias_is_found(scene, tmp_path):
     assert few.cold > 0 and few.rays["primary"] == 4 * SIZE[0] * SIZE[1]
     found.save(tmp_path)
     names = {file.stem.removeprefix("error-vs-time-") for file in tmp_path.iterdir()}
-    assert {"index", "summary", "diagram", "strip", "times", "points"} <= names
+    assert {"index", "summary", "diagram", "times", "points"} <= names
     assert "<iframe" in found._repr_html_()
 
 

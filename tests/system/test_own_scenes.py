@@ -12,7 +12,7 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba.memory import Workspace
 from mrt_mitsuba.validation.studies import adaptive, honest
-from mrt_mitsuba.validation.tools.own_scenes import SCENES, SPP, load, sensor
+from mrt_mitsuba.validation.tools.scenery import SCENES, SPP, load, sensor
 from mrt_mitsuba.validation.tools.study import findings
 
 WIDTH, HEIGHT = 32, 24

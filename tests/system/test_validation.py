@@ -410,10 +410,9 @@ def test_advice_is_the_fastest_that_is_good_enough() -> None:
     assert answers == ["rough: 2e+03 ms", "slow: 1.4e+04 ms", "none of these"]
 
 
-def test_repeats_give_advice_and_strips() -> None:
+def test_repeats_give_advice() -> None:
     study = findings(error_vs_time.run, quick=False)
     assert study.tables["choose"].first and study.tables["choose"].rows[0][0] == 0
-    assert any("strip" in name for name in study.images)
 
 
 def test_runs_are_timed_in_turns() -> None:

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.tools.own_scenes import LOCAL, SCENES, SPP, load
+from mrt_mitsuba.validation.tools.scenery import LOCAL, SCENES, SPP, load
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.timing import in_turns, timed
 

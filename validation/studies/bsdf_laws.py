@@ -21,7 +21,6 @@ from mrt_mitsuba.validation.tools.bsdf_probe import (
     relative_error,
     rgb,
 )
-from mrt_mitsuba.validation.tools.gallery import curves
 from mrt_mitsuba.validation.tools.study import Bound, Study
 
 TITLE = "Laws of the BSDF: sampling, energy, reciprocity, gradients, known numbers"
@@ -107,12 +106,12 @@ def furnace(study: Study, *, quick: bool) -> None:
     lines = {}
     for alpha in (0.1, 0.3, 0.7, 1.0):
         bsdf = load(alpha=alpha, fresnel="unity", diffuse_reflectance=0.0)
-        lines[f"α = {alpha}"] = angles, np.array([albedo(bsdf, at_angle(a)).max() for a in angles])
-    albedos_found = [found for _, found in lines.values()]
+        lines[f"α = {alpha}"] = np.array([albedo(bsdf, at_angle(a)).max() for a in angles])
+    albedos_found = [*lines.values()]
     title = "White furnace: albedo of the lobe with F = 1, Ks = 1, Kd = 0"
-    figure = curves(lines, "angle of incidence [°]", "albedo", level=1)
-    caption = "Light that a second bounce between facets would bring back is missing, the more the rougher."
-    study.plot("furnace", title, figure, caption)
+    note = "Light that a second bounce between facets would bring back is missing, the more the rougher."
+    rows = np.column_stack([angles, *albedos_found]).tolist()
+    study.table("furnace", title, ["angle of incidence, °", *lines], rows, note)
     what = "largest albedo of a lobe with F = 1, Ks = 1"
     study.at_most(what, np.max(albedos_found), 1 + G1_FIT, "the error of G₁'s rational fit")
     what = "albedo of a lobe with F = 1, Ks = 1, alpha = 0.1, head on"

@@ -58,7 +58,6 @@ class Trade:
     reference: Any
     shared: Options
     hold: Callable[[Study, str, Points], float | None]  # states bounds; returns the least error to be judged
-    strips: bool = False  # whether cases look different in the same time
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -71,8 +70,7 @@ def run(study: Study, *, quick: bool) -> None:
         options: Options = {"reference": trade.reference, "shared": trade.shared}
         found = error_vs_time(trade.scene, trade.cases, repeats=extent.repeats, **options)
         where = f"scene {number}, {name}"
-        strip = trade.strips and not quick
-        describe(study, found, where, f"Scene {number}: {trade.title}", trade.truth, strip=strip)
+        describe(study, found, where, f"Scene {number}: {trade.title}", trade.truth)
         least = None if found.failed else trade.hold(study, where, found.points)
         if least is not None:
             what = f"{where}: error of the reference / least error it judges"
@@ -187,7 +185,6 @@ def path(number: int, extent: Extent) -> Trade:
         {"integrator": "path", "spp": extent.reference_spp},
         {"aa": 1, "aamode": "none"},
         hold,
-        strips=True,
     )
 
 

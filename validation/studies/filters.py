@@ -28,7 +28,7 @@ from mrt_mitsuba import filters
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.tools.renders import load
-from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, camera
+from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, sensor
 from mrt_mitsuba.validation.tools.study import Study
 
 TITLE = "Filters: adaptive anti-aliasing against full, blur against a lens"
@@ -157,7 +157,7 @@ def variance_error(*, spp: int, lattice: str) -> float:
     black = {"type": "diffuse", "reflectance": 0.0}
     scene = {
         "type": "scene",
-        "sensor": camera([0, 0, 0], [0, 0, 1], [0, 1, 0], 40, 30),
+        "sensor": sensor([0, 0, 0], [0, 0, 1], "box", film={"width": 40, "height": 30}),
         "integrator": {"type": "path", "rr_depth": 100},
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}},
         "veil": {"type": "sphere", "radius": 2, "bsdf": {"type": "mask", "opacity": 0.5, "nested": black}},

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.tools.own_scenes import sensor
+from mrt_mitsuba.validation.tools.scenery import sensor
 from mrt_mitsuba.validation.tools.study import Study
 
 TITLE = "Errors that can be trusted"

@@ -16,9 +16,9 @@ from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.probe import Array, unit
 
 
-def rgb(values: Sequence[float]) -> dict[str, Any]:
-    """Return a colour as a Mitsuba dict."""
-    return {"type": "rgb", "value": list(values)}
+def rgb(value: float | Sequence[float]) -> dict[str, Any]:
+    """Return a colour, or a grey, as a Mitsuba dict."""
+    return {"type": "rgb", "value": value if isinstance(value, float | int) else list(value)}
 
 
 def at_angle(degrees: float) -> Array:

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mrt_mitsuba.output.files import to_8bit
 from mrt_mitsuba.validation.tools import report
 from mrt_mitsuba.validation.tools.compare import Difference
 from mrt_mitsuba.validation.tools.study import Study
@@ -29,7 +28,6 @@ NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?"
 NOTHING = 1e-15  # an RMSE of 0, as logarithms have it
 LEVEL = 0.95  # of all intervals
 LABELLED = 30  # points up to which each has its number in the diagram; of more only those ahead
-PANEL = (120, 160)  # rows and columns of a larger picture that are shown
 SAME = 0.02  # errors closer than this are the same: no reason to wait longer
 
 
@@ -214,7 +212,8 @@ class Findings:
         own = f"{self.reference_error:.2g}" if self.reference_error else "not known"
         return "\n".join([*lines, f"the reference's own error: {own}", *self.verdicts])
 
-    def _study(self) -> Study:
+    def study(self) -> Study:
+        """Return what the page shows."""
         scene = f"scene {self.scene}" if self.scene.isdigit() else self.scene
         study = Study("error-vs-time", f"{TITLE}: {scene}", seconds=self.took)
         describe(study, self, "", "All cases")
@@ -222,10 +221,10 @@ class Findings:
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""
-        report.save(folder, self._study(), title=TITLE)
+        report.save(folder, self.study(), title=TITLE)
 
     def _repr_html_(self) -> str:
-        return report.notebook(self._study(), title=TITLE)
+        return report.notebook(self.study(), title=TITLE)
 
 
 def _crossing(curve: Iterable[tuple[float, float]], error: float) -> float:
@@ -250,26 +249,14 @@ def _crossing(curve: Iterable[tuple[float, float]], error: float) -> float:
 # ------------------------------------------------ The page ------------------------------------------------
 
 
-def describe(
-    study: Study, found: Findings, name: str, title: str, truth: str = "", *, strip: bool = True
-) -> None:
-    """Add the diagram, the answers and the tables to a study; ``truth`` says what the reference is.
-
-    ``strip``: also pictures of what each curve reaches in the same time.
-    """
+def describe(study: Study, found: Findings, name: str, title: str, truth: str = "") -> None:
+    """Add the diagram, the answers and the tables to a study; ``truth`` says what the reference is."""
     prefix, where = (f"{name}-", f"{name}: ") if name else ("", "")
     study.at_most(f"{where}cases that failed", len(found.failed), 0, "each of them could be rendered")
     if not found.points:
         return
     figure, caption = _diagram(found), _caption(found, truth)
     study.plot(f"{prefix}diagram", f"{title}: work and precision", figure, caption)
-    curves = [points for points in found.families.values() if len(points) > 1]
-    if strip and len(curves) > 1:
-        slowest_start, first_end = (max(c[0].seconds for c in curves), min(c[-1].seconds for c in curves))
-        middle = math.sqrt(slowest_start * first_end)
-        nearest = [min(points, key=lambda p: abs(math.log(p.seconds / middle))) for points in curves]
-        text = "In sRGB; where a picture is cut, it is where the cases differ most."
-        study.plot(f"{prefix}strip", f"{title}: what {middle:.2g} s buy", _strip(found, nearest), text)
     if found.errors:
         note = "With 95 % intervals. Between measured cases a curve is straight in logarithms; beyond them "
         note += "nothing is assumed."
@@ -381,30 +368,3 @@ def _diagram(found: Findings) -> Any:
     axes.grid(alpha=0.3)
     figure.legend(fontsize=8, ncols=4, loc="outside lower center")
     return figure
-
-
-def _strip(found: Findings, points: Sequence[Point]) -> Any:
-    """Return pictures side by side, the reference last, each with its seconds and error.
-
-    Of larger ones it shows the window of ``PANEL`` pixels where they differ most from the reference.
-    """
-    from matplotlib.figure import Figure
-    from scipy.ndimage import uniform_filter
-
-    size = np.minimum(PANEL, found.reference.shape[:2])
-    errors = sum(np.square(p.image - found.reference).sum(axis=2) for p in points)
-    middle = np.unravel_index(np.argmax(uniform_filter(errors, size, mode="constant")), errors.shape)
-    row, column = np.clip(middle - size // 2, 0, errors.shape - size)
-    shown = [(f"{p.name}\n{p.seconds:.3g} s, RMSE {p.rmse:.2g}", p.image) for p in points]
-    shown.append(("reference", found.reference))
-    columns = min(4, len(shown))
-    rows = -(-len(shown) // columns)
-    height = rows * (10 / columns * size[0] / size[1] + 0.6)
-    axes = Figure(figsize=(10, height), layout="constrained").subplots(rows, columns, squeeze=False).ravel()
-    for axis in axes:
-        axis.set_axis_off()
-    for axis, (title, image) in zip(axes, shown, strict=False):
-        cut = np.asarray(image[row : row + size[0], column : column + size[1]], np.float32)
-        axis.imshow(to_8bit(cut, "srgb"), interpolation="nearest")
-        axis.set_title(title, fontsize="small")
-    return axes[0].figure

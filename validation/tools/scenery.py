@@ -1,4 +1,7 @@
-"""Parts of the scenes that studies render: cameras, rays, other materials, a ball to compare these on."""
+"""Parts of the scenes that studies render: cameras, rays, other materials; and ten whole ones.
+
+These are of Mitsuba's own making, such as people bring: lights, lenses, materials, filters, samplers.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +15,21 @@ import numpy as np
 from mrt_mitsuba.scene.model import Material, Scene
 from mrt_mitsuba.validation.tools.bsdf_probe import rgb
 
+Node = dict[str, Any]
+
 # One ray at a time through the pixel's centre, as the report's lattice has it
 AT_CENTRES: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}
+SPP = 64  # of the samplers of ``SCENES``
 
 
-def camera(
-    origin: Sequence[float],
-    target: Sequence[float],
-    up: Sequence[float],
-    width: int,
-    height: int,
-    **more: Any,
-) -> dict[str, Any]:
-    """Return a perspective camera whose film has a box filter, as a Mitsuba dict."""
-    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
-    film |= {"pixel_format": "rgb", "component_format": "float32"}
-    look = mi.ScalarTransform4f().look_at(origin, target, up)
-    return {"type": "perspective", "to_world": look, "film": film, **more}
+def rays(o: np.ndarray, d: np.ndarray) -> Any:
+    """Return rays from points [N, 3] in directions [N, 3]."""
+    return mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T))
+
+
+def traced(scene: Any, ray: Any, **parameters: Any) -> Any:
+    """Return what ``mrt_whitted`` with these parameters finds along rays."""
+    return mi.load_dict({"type": "mrt_whitted", **parameters}).trace(scene, None, ray)
 
 
 def with_materials(scene: Scene, change: Callable[[Material], Material]) -> Scene:
@@ -40,15 +41,16 @@ def with_materials(scene: Scene, change: Callable[[Material], Material]) -> Scen
     return dataclasses.replace(scene, spheres=changed(scene.spheres), planes=changed(scene.planes))
 
 
-def rays(o: np.ndarray, d: np.ndarray) -> Any:
-    """Return rays from points [N, 3] in directions [N, 3]."""
-    return mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T))
-
-
-def traced(scene: Any, ray: Any, **parameters: Any) -> Any:
-    """Return what ``mrt_whitted`` with these parameters finds along rays."""
-    integrator = mi.load_dict({"type": "mrt_whitted", **parameters})
-    return integrator.trace(scene, None, ray)
+def sensor(origin: list[float], target: list[float], rfilter: str = "gaussian", **more: Any) -> Node:
+    """Return a camera with a film."""
+    film = {"type": "hdrfilm", "rfilter": {"type": rfilter}, "component_format": "float32"}
+    return {
+        "type": "perspective",
+        "fov": 40,
+        "to_world": mi.ScalarTransform4f().look_at(origin, target, more.pop("up", [0, 1, 0])),
+        "film": film | more.pop("film", {}),
+        "sampler": {"type": more.pop("sampler", "independent"), "sample_count": SPP},
+    } | more
 
 
 def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96, studio: bool = False) -> Any:
@@ -57,28 +59,165 @@ def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96, studio: bool = False)
     In the ``studio`` it is alone under a sky of bright and dark fields: all noise is then that of its
     samples, and no light comes back from a floor in rare bright ones.
     """
-    ground = {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().scale(4),
-        "bsdf": {"type": "diffuse", "reflectance": rgb((0.5, 0.4, 0.3))},
-    }
     around = {
-        "sky": {"type": "constant", "radiance": rgb((0.3, 0.4, 0.6))},
+        "sky": _sky((0.3, 0.4, 0.6)),
         "lamp": {"type": "point", "position": [1.5, -2, 3], "intensity": rgb((12, 10, 8))},
-        "floor": ground,
+        "floor": _rectangle(_to().scale(4), bsdf=_diffuse(rgb((0.5, 0.4, 0.3)))),
     }
+    # 16 × 8 fields of random brightness, a decade from the median to the brighter ones
+    fields = 10 ** np.random.default_rng(0).normal(-0.5, 0.5, (8, 16, 1)) * np.ones(3)
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(fields.astype(np.float32))}
+    film = {"width": size, "height": size * 3 // 4, "pixel_format": "rgb"}
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": 5},
-            "sensor": camera([0, -4, 1.6], [0, 0, 0.6], [0, 0, 1], size, size * 3 // 4, fov=32),
-            "ball": {"type": "sphere", "center": [0, 0, 0.7], "radius": 0.7, "bsdf": dict(bsdf)},
-            **({"sky": _fields()} if studio else around),
+            "sensor": sensor([0, -4, 1.6], [0, 0, 0.6], "box", up=[0, 0, 1], fov=32, film=film),
+            "ball": _ball([0, 0, 0.7], 0.7, dict(bsdf)),
+            **({"sky": sky} if studio else around),
         }
     )
 
 
-def _fields() -> dict[str, Any]:
-    """Return a sky of 16 × 8 fields with random brightness, a decade from the median to the brighter ones."""
-    fields = 10 ** np.random.default_rng(0).normal(-0.5, 0.5, (8, 16, 1)) * np.ones(3)
-    return {"type": "envmap", "bitmap": mi.Bitmap(fields.astype(np.float32))}
+# ----------------------------------------------- Whole scenes -----------------------------------------------
+
+
+# Where most of the noise is in a part of the picture
+LOCAL = ("thin_lens", "gloss", "texture_and_sky", "rough_glass")
+
+
+def load(name: str, width: int, height: int, *, film: Node | None = None, **more: Any) -> Any:
+    """Return a scene by name, at a size; ``film`` and further nodes replace its own."""
+    nodes = SCENES[name]()
+    size: Node = {"width": width, "height": height}
+    if name == "crop":
+        window = {"crop_offset_x": width // 4, "crop_offset_y": height // 4}
+        size = {"width": 3 * width // 2, "height": 3 * height // 2, "crop_width": width} | window
+        size["crop_height"] = height
+    nodes["sensor"] |= {"film": size | nodes["sensor"]["film"] | (film or {})}
+    path = {"type": "path", "max_depth": 4}
+    return mi.load_dict({"type": "scene", "integrator": path, **nodes} | more)
+
+
+def _to() -> Any:
+    return mi.ScalarTransform4f()
+
+
+def _checks(count: int) -> Node:
+    colors = {"color0": rgb(0.1), "color1": rgb(0.9)}
+    return {"type": "checkerboard", "to_uv": _to().scale([count, count, 1]), **colors}
+
+
+def _diffuse(reflectance: Any) -> Node:
+    return {"type": "diffuse", "reflectance": reflectance}
+
+
+def _rectangle(place: Any, **more: Node) -> Node:
+    return {"type": "rectangle", "to_world": place, **more}
+
+
+def _floor(bsdf: Node) -> Node:
+    return _rectangle(_to().rotate([1, 0, 0], -90).scale(10), bsdf=bsdf)
+
+
+def _ball(center: list[float], radius: float, bsdf: Node) -> Node:
+    return {"type": "sphere", "center": center, "radius": radius, "bsdf": bsdf}
+
+
+def _box() -> Node:
+    return {"type": "cube", "to_world": _to().translate([0, 0.5, 0]).rotate([0, 1, 0], 30).scale(0.5)}
+
+
+def _lamp(center: list[float], radius: float, radiance: float) -> Node:
+    emitter = {"type": "area", "radiance": rgb(radiance)}
+    return {"type": "sphere", "center": center, "radius": radius, "emitter": emitter}
+
+
+def _sky(color: Any) -> Node:
+    return {"type": "constant", "radiance": rgb(color)}
+
+
+def _sun() -> np.ndarray:
+    """Return an environment with a bright place."""
+    pixels = np.full((16, 32, 3), 0.4, np.float32)
+    pixels[3:5, 10:12] = 30
+    return pixels
+
+
+MEMBER = {"type": "instance", "g": {"type": "ref", "id": "group"}}
+
+SCENES: dict[str, Callable[[], Node]] = {
+    "envmap": lambda: {
+        "sensor": sensor([0, 2, 6], [0, 0.5, 0]),
+        "around": {"type": "envmap", "bitmap": mi.Bitmap(_sun())},
+        "floor": _floor(_diffuse(rgb(0.6))),
+        "ball": _ball([0, 1, 0], 1, {"type": "roughconductor", "alpha": 0.2}),
+    },
+    "instances": lambda: {
+        "sensor": sensor([0, 3, 6], [0, 0.5, 0], "box"),
+        "group": {"type": "shapegroup", "a": _ball([0, 0, 0], 0.4, _diffuse(rgb(0.7)))},
+        **{f"at{i}": MEMBER | {"to_world": _to().translate([i % 3 - 1, 0.4, i // 3 - 1])} for i in range(9)},
+        "floor": _floor(_diffuse(_checks(8))),
+        "sky": _sky((0.3, 0.4, 0.5)),
+        "lamp": _lamp([3, 5, 3], 0.7, 20),
+    },
+    "thin_lens": lambda: {
+        "sensor": sensor([0, 1.5, 6], [0, 0.6, 0], type="thinlens", aperture_radius=0.2, focus_distance=6.0),
+        "floor": _floor(_diffuse(_checks(20))),
+        "near": _ball([-1, 0.5, 3], 0.5, _diffuse(rgb((0.7, 0.2, 0.2)))),
+        "far": _ball([1, 0.5, -2], 0.5, _diffuse(rgb((0.2, 0.2, 0.7)))),
+        "sky": _sky((0.6, 0.7, 0.9)),
+    },
+    "gloss": lambda: {
+        "sensor": sensor([0, 1.5, 5], [0, 0.7, 0], "box"),
+        "floor": _floor({"type": "roughconductor", "alpha": 0.1}),
+        "ball": _ball([0, 0.7, 0], 0.7, {"type": "roughplastic", "alpha": 0.1}),
+        "sky": _sky(0.2),
+        "lamp": _lamp([1.2, 3, -1], 0.1, 200),
+    },
+    "rough_glass": lambda: {
+        "sensor": sensor([0, 1.2, 5], [0, 0.8, 0]),
+        "floor": _floor(_diffuse(_checks(8))),
+        "ball": _ball([0, 0.9, 0], 0.8, {"type": "roughdielectric", "alpha": 0.3}),
+        "lamp": _lamp([0, 4, 0], 1.0, 6),
+        "sky": _sky(0.2),
+    },
+    "area_light": lambda: {
+        "sensor": sensor([0, 1.5, 6], [0, 1, 0], "mitchell"),
+        "floor": _floor(_diffuse(rgb((0.8, 0.4, 0.3)))),
+        "wall": _rectangle(_to().translate([0, 2, -2]).scale(4), bsdf=_diffuse(rgb(0.5))),
+        "box": _box(),
+        "light": _rectangle(
+            _to().translate([0, 4, 0]).rotate([1, 0, 0], 90), emitter={"type": "area", "radiance": rgb(6)}
+        ),
+    },
+    "spot": lambda: {
+        "sensor": sensor([0, 3, 6], [0, 0.5, 0], "tent"),
+        "floor": _floor(_diffuse(rgb(0.7))),
+        "box": {"type": "cube", "to_world": _to().translate([0, 0.5, 0]).scale(0.5)},
+        "light": {
+            "type": "spot",
+            "intensity": rgb((40, 36, 30)),
+            "cutoff_angle": 25,
+            "to_world": _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0]),
+        },
+    },
+    "crop": lambda: {
+        "sensor": sensor([0, 2, 6], [0, 0.5, 0], film={"sample_border": True}),
+        "floor": _floor(_diffuse(_checks(8))),
+        "ball": _ball([0, 1, 0], 1, {"type": "plastic"}),
+        "lamp": _lamp([2, 4, 2], 0.5, 15),
+    },
+    "texture_and_sky": lambda: {
+        "sensor": sensor([0, 1.5, 6], [0, 2.5, 0], fov=60),
+        "floor": _floor(_diffuse(_checks(30))),
+        "ball": _ball([-1, 0.6, 1], 0.6, _diffuse(_checks(12))),
+        "sky": _sky((0.5, 0.7, 1.0)),
+    },
+    "stratified": lambda: {
+        "sensor": sensor([0, 2, 6], [0, 0.5, 0], "box", sampler="stratified"),
+        "floor": _floor(_diffuse(_checks(8))),
+        "box": _box(),
+        "lamp": _lamp([0, 4, 1], 1.0, 5),
+    },
+}
