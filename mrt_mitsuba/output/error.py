@@ -66,8 +66,8 @@ def tail_shape(values: np.ndarray, counts: np.ndarray) -> float:
     """
     count, total = int(counts.sum()), float((counts * values**2).sum())
     size = max(int(min(0.2 * count, 3 * math.sqrt(count))), 1)
-    order = np.argsort(values)[::-1]
-    order = order[: np.searchsorted(np.cumsum(counts[order]), size + 1) + 1]
+    order = np.argpartition(-values, min(size, len(values) - 1))[: size + 1]
+    order = order[np.argsort(-values[order])]
     largest = np.repeat(values[order], counts[order].astype(np.int64))[: size + 1]
     half = int(np.searchsorted(np.cumsum(np.square(largest)), total / 2)) + 1
     size = min(max(2 * half, FEWEST), len(largest) - 1)

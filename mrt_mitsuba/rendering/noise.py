@@ -46,6 +46,7 @@ class Halves(Stack):
     What to trace in a round: the numbers of groups that each pixel gets in each picture.
     """
 
+    least = 256  #: mean rays of a pixel that a target takes at least, in a small picture
     last = False  #: was the last round decided?
 
     def __init__(
@@ -55,8 +56,8 @@ class Halves(Stack):
         super().__init__(film, 2, len(exposer.names))
         self._exposer, self._seed, self._blurred = exposer, seed, blurred
         self._traced = np.zeros((PICTURES, film.pixels))
-        self._total, self._square = np.zeros((2, PICTURES, *film.shape, 3))
-        self._peak = np.zeros((PICTURES, *film.shape))
+        self._total = np.zeros((PICTURES, *film.shape, 3), np.float32)
+        self._square, self._peak = np.zeros((2, PICTURES, *film.shape), np.float32)  # means of colours
         self._bad, self._unfit = np.zeros(film.shape, bool), 0.0
 
     # ------------------------------------------- Rounds ---------------------------------------------
@@ -83,7 +84,7 @@ class Halves(Stack):
             self._unfit = float(exposed.peak[bad].max() if np.isfinite(worst) else worst)
         self._traced += exposed.rays
         self._total += np.where(bad[..., None], 0, exposed.total)
-        self._square += np.where(bad[..., None], 0, exposed.square)
+        self._square += np.where(bad, 0, exposed.square.mean(-1))
         np.maximum(self._peak, np.where(bad, 0, exposed.peak[..., 0]), out=self._peak)
         sums, weights, rays = (v[:2] for v in (exposed.sums, exposed.weights, exposed.rays))
         with np.errstate(invalid="ignore"):
@@ -109,18 +110,26 @@ class Halves(Stack):
 
     # ------------------------------------------- Errors ---------------------------------------------
 
+    def rmse(self) -> float:
+        """Return the estimated RMSE of the picture, without the border, by its halves alone."""
+        return math.sqrt(float(self._squares().mean()))
+
+    def _squares(self) -> np.ndarray:
+        """Return the estimated squared error of each pixel, [H, W], without the border."""
+        halves = self.film.picture(self.pictures()[..., :3])
+        if self._blurred is not None:
+            halves = np.stack([self._blurred(half) for half in halves])
+        return np.where(self._inside(self._unknown), 0, _quarter_squares(*halves))
+
     def error(self) -> ErrorEstimate:
-        """Return the estimated RMSE of the picture, without the border, by its halves alone.
+        """Return the estimated RMSE with its interval, and the tail of what single rays contribute.
 
         The mean of squares of which each is as uncertain as it is large, correlated as the filter has it; the
         true error is a mean of as many squares, and as uncertain. The interval is that of a log-normal law,
         wider upwards the fewer squares make up the mean. Where the largest contributions of single rays have
         so heavy a tail that rays not met yet may rule the error, there is no upper end.
         """
-        halves, correlation = self.film.picture(self.pictures()[..., :3]), self.film.correlation
-        if self._blurred is not None:
-            halves = np.stack([self._blurred(half) for half in halves])
-        squares = np.where(self._inside(self._unknown), 0, _quarter_squares(*halves))
+        squares, correlation = self._squares(), self.film.correlation
         mean = float(squares.mean())
         if mean == 0:
             return ErrorEstimate(0.0, 0.0, 0.0, 0.0)
@@ -131,20 +140,26 @@ class Halves(Stack):
 
     def forecast(self) -> tuple[float, float]:
         """Return the RMSE of the picture, and the shape of its tail, as the scouts have them."""
-        left = self._inside(self._decisive([2], [3]) / self.rows(self.rays).sum(0))
-        return math.sqrt(float(left.mean())), self._tail(SCOUTS)
+        self._scouted, self._shape = self._decisive([2], [3]), self._tail(SCOUTS)
+        left = self._inside(self._scouted / self.rows(self.rays).sum(0))
+        return math.sqrt(float(left.mean())), self._shape
 
     def variance(self) -> np.ndarray:
         """Return the estimated variance of each channel in the picture, [H, W, 3], without the border."""
-        each = np.moveaxis(self._smooth([0, 2], [1, 3]), -1, 0)
-        both = np.stack([self._moments(which)[0].mean(-1) for which in ([0, 2], [1, 3])])
+        each = self._smooth([0, 2], [1, 3])
+        both = np.stack([self._moments(which)[0] for which in ([0, 2], [1, 3])])
         quiet = window_means(both, 1) == 0
         if not both[::-1][quiet].any():  # where one half of the rays met no noise at all, the other met none
-            each[:, quiet.all(0)] = 0
+            each[quiet.all(0)] = 0
         each = self.film.spread_out(each * (1 / self.rows(self.rays)).sum(0) / 4)
-        found = np.where(self._unknown, 0, _quarter_squares(*self.pictures()[..., :3]))
+        first, second = self.pictures()[..., :3]
+        each = each * _gain(np.where(self._unknown, 0, _quarter_squares(first, second)), each)
+        with np.errstate(invalid="ignore", over="ignore"):
+            colors = np.where(self._unknown, 0, np.square(np.moveaxis(first - second, -1, 0)))
+        colors = window_means(colors, 4) + 1e-30
+        variance = np.moveaxis(each * colors / colors.mean(0), 0, -1)
         rounding = np.nan_to_num(np.square(2.0**-24 * self.mean()[..., :3], dtype=np.float64), posinf=0)
-        return self.film.picture(np.moveaxis(each * _gain(found, each.mean(0)), 0, -1)) + rounding
+        return self.film.picture(variance) + rounding
 
     def _decisive(self, first: list[int], second: list[int]) -> np.ndarray:
         """Return the variance of a pixel times its rays, [H, W], as two sets of pictures have it."""
@@ -153,17 +168,17 @@ class Halves(Stack):
             rays = self.rows(self._traced)[which].sum(0)
             means.append(self._total[which].sum(0) / rays[..., None])
             inverse += 1 / rays
-        gain = _gain(_quarter_squares(*means), self._moments(first + second)[0].mean(-1) * inverse / 4)
-        return self._smooth(first, second).mean(-1) * gain * self.film.averaging
+        gain = _gain(_quarter_squares(*means), self._moments(first + second)[0] * inverse / 4)
+        return self._smooth(first, second) * gain * self.film.averaging
 
     def _smooth(self, first: list[int], second: list[int]) -> np.ndarray:
-        """Return the variance of a ray's value in each channel, [H, W, 3], by two sets of pictures.
+        """Return the variance of a ray's value, [H, W], by two sets of pictures.
 
         Pixels that met no rare bright ray look quiet. So each borrows from its neighbours, and from as many
         as make what one set says most likely by what the other says.
         """
         each, counts = zip(*(self._moments(which) for which in (first, second)), strict=True)
-        both, rays = np.stack([v.mean(-1) for v in each]), np.stack(counts)
+        both, rays = np.stack(each), np.stack(counts)
         tiny = 1e-6 * both.mean() + 1e-30
         step = max(1, math.isqrt(both[0].size // _JUDGES))
         some = (..., slice(None, None, step), slice(None, None, step))
@@ -179,18 +194,16 @@ class Halves(Stack):
         windows = [w for w in _WINDOWS if w[0] >= self.film.reach] or _WINDOWS[-1:]
         candidates = [(*w, floor, region) for w in windows for floor in _FLOORS for region in _REGIONS]
         width, worth, floor, region = min(candidates, key=unlikely)
-        moments, total = self._moments(first + second)
-        values = np.moveaxis(moments, -1, 0)
+        values, total = self._moments(first + second)
         smooth = _drawn(values, _around(values, width), total, worth)
-        return np.moveaxis(smooth + floor * (_around(values, region) - smooth), 0, -1)
+        return np.asarray(smooth + floor * (_around(values, region) - smooth))
 
     def _moments(self, which: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the variance of a ray's value in each channel, [H, W, 3], and the rays, [H, W]."""
-        rays = self.rows(self._traced)[which].sum(0)
-        total, square = (v[which].sum(0) for v in (self._total, self._square))
-        variance = (square - total**2 / rays[..., None]) / np.maximum(rays - 1, 1)[..., None]
-        rounding = 1e-6 * square / rays[..., None]
-        return np.where(variance > rounding, variance, 0), rays
+        """Return the variance of a ray's value, mean of colours, and the rays, [H, W]."""
+        rays, total = self.rows(self._traced)[which].sum(0), self._total[which].sum(0)
+        square = self._square[which].sum(0, dtype=np.float64)
+        variance = (square - np.square(total, dtype=np.float64).mean(-1) / rays) / np.maximum(rays - 1, 1)
+        return np.where(variance * rays > 1e-6 * square, variance, 0), rays
 
     def _tail(self, which: list[int]) -> float:
         """Return the Pareto shape of what single rays contribute to the pixels of some pictures.
@@ -198,10 +211,9 @@ class Halves(Stack):
         Of each pixel the brightest ray is known; the others are taken for alike, given all squares.
         """
         rays = self.rows(self._traced)[which]
-        mean = (self._total[which] / rays[..., None]).mean(-1)
-        squares = (self._square[which] - self._total[which] ** 2 / rays[..., None]).mean(-1)
-        most = np.maximum(self._peak[which] - mean, 0)
-        others = np.sqrt(np.maximum(squares - most**2, 0) / np.maximum(rays - 1, 1))
+        variances = np.stack([self._moments([picture])[0] for picture in which])
+        most = np.maximum(self._peak[which] - self._total[which].mean(-1) / rays, 0)
+        others = np.sqrt(np.maximum(variances - most**2 / np.maximum(rays - 1, 1), 0))
         values, counts = np.stack([most, others]) / rays, np.stack([np.ones_like(rays), rays - 1])
         return tail_shape(values.ravel(), counts.ravel())
 
@@ -219,30 +231,28 @@ class Halves(Stack):
         ``rays`` to spend. The next round is the last then, and what a half gets in it is decided by the other
         half, too: that knows more, and what it makes of this half's share cannot come back to it any more.
         """
-        deviation, traced = self._deviation([2], [3]), self._traced.sum()
+        deviation, traced = _root(self._scouted), self._traced.sum()
         room = most * self.film.pixels - traced
         self.last = most >= rays
         if target is not None:
             self.last = self.last or GROUP * self._due(0, deviation, target).sum() <= room / 2
         if not self.last:
-            scouting = SCOUTING if self._tail(SCOUTS) < SUSPECT else WILD
+            scouting = SCOUTING if self._shape < SUSPECT else WILD
             half = self._share(0, deviation, room / 2 / (1 + scouting), None)
             due = scouting * (self.rays[0] + GROUP * half) - self._traced[2]
             return np.stack([half, half, *2 * [self._whole(due)]])
         room = rays * self.film.pixels - traced
-        views = [self._deviation([1 - half], SCOUTS) for half in HALVES]
+        views = [_root(self._decisive([1 - half], SCOUTS)) for half in HALVES]
         halves = [self._share(half, views[half], room / 2, target) for half in HALVES]
         return np.stack([*halves, *np.zeros_like(halves)])
-
-    def _deviation(self, first: list[int], second: list[int]) -> np.ndarray:
-        """Return the deviation by which pixels share rays out, [pixels]; alike, where none was met."""
-        return np.sqrt(self._decisive(first, second).ravel() + 1e-30)
 
     def _due(self, half: int, deviation: np.ndarray, target: float) -> np.ndarray:
         """Return the groups that take the picture to a target, if the other half is like this one."""
         have = self.rays[half]
         now = float(np.mean(np.square(deviation) / (2 * have)))
-        return self._whole(_quiet(have, deviation, min(1, target**2 / now)) - have)
+        if now <= target**2:
+            return np.zeros(self.film.pixels, np.int64)
+        return self._whole(_quiet(have, deviation, target**2 / now) - have)
 
     def _share(self, half: int, deviation: np.ndarray, room: float, target: float | None) -> np.ndarray:
         """Return groups for a half: what a target takes, or as many as make nearly, but no more than, so many
@@ -267,7 +277,7 @@ class Halves(Stack):
 
     def _whole(self, rays: np.ndarray) -> np.ndarray:
         """Return whole numbers of groups for numbers of rays."""
-        return np.asarray(np.floor(np.maximum(rays, 0) / GROUP + self._rounding()), np.int64)
+        return np.asarray(np.floor(np.clip(rays, 0, 2.0**40) / GROUP + self._rounding()), np.int64)
 
     def _rounding(self) -> np.ndarray:
         """Return random numbers to add before rounding down; alike in a tile, where a filter has rays traced
@@ -279,6 +289,11 @@ class Halves(Stack):
 
     def _inside(self, values: np.ndarray) -> np.ndarray:
         return self.film.picture(values[..., None])[..., 0]
+
+
+def _root(variance: np.ndarray) -> np.ndarray:
+    """Return the deviation by which pixels share rays out, [pixels]; alike, where none was met."""
+    return np.sqrt(variance.ravel() + 1e-30)
 
 
 def _gain(found: np.ndarray, expected: np.ndarray) -> np.ndarray:

@@ -155,8 +155,7 @@ class Passes:
         blurred = self._blurred if self._plan.blur else None
         whole = self._plan.whole
         halves: Any = Wholes(exposer, self._seed) if whole else Halves(exposer, self._seed, blurred)
-        self.rounds = run_rounds(halves, self._film.pixels, goal, self._job.stage)
-        self.error = halves.error()
+        self.rounds, self.error = run_rounds(halves, self._film.pixels, goal, self._job.stage)
         self._develop(exposer, halves)
         variance = halves.variance()
         self._set("variance", variance)

@@ -22,8 +22,7 @@ log = logging.getLogger(__name__)
 # doubling of a lattice takes up to 4.2
 GROWTH = 4.25
 MARGIN = 0.95  # of the target to aim at: a forecast is as often too low as too high
-# Rays that a target takes at least, in the whole picture or a pixel: fewer do not show what is rare
-LEAST, LEAST_MEAN = 2**17, 64
+LEAST = 2**18  # rays that a target takes at least: fewer do not show what is rare
 MORE = 2  # times the rays are doubled where the tail of their values is in doubt
 LEAST_GROWTH = 1.05  # fewer rays, and a round costs more than it brings
 
@@ -48,6 +47,7 @@ class Refinable(Protocol[Chosen]):
     def first(self) -> Chosen:
         """Return what to trace in the first round."""
 
+    least: int  #: mean rays of a pixel that a target takes at least, in a small picture
     last: bool  #: was the last round decided?
 
     def next(self, most: float, rays: float, target: float | None) -> Chosen:
@@ -63,10 +63,14 @@ class Refinable(Protocol[Chosen]):
         """Trace and add rays."""
 
     def forecast(self) -> tuple[float, float]:
-        """Return the expected error and the shape of its tail, by rays that are not in the picture."""
+        """Return the expected error and the shape of its tail, by rays that are not in the picture; called
+        once before ``next``."""
+
+    def rmse(self) -> float:
+        """Return the estimated error of the picture."""
 
     def error(self) -> ErrorEstimate:
-        """Return the estimated error of the picture."""
+        """Return the same with its interval."""
 
     def unfit(self) -> str:
         """Return what makes values unfit to estimate an error from, and where; nothing if none does."""
@@ -75,32 +79,34 @@ class Refinable(Protocol[Chosen]):
         """Return the picture [H, W, 3], and the standard error and the rays of each pixel, [H, W]."""
 
 
-def run_rounds(picture: Refinable[Chosen], pixels: int, goal: Goal, stage: Stage) -> list[Round]:
-    """Trace rounds until the goal is reached or ``on_round`` returns False; return what each has found.
+def run_rounds(
+    picture: Refinable[Chosen], pixels: int, goal: Goal, stage: Stage
+) -> tuple[list[Round], ErrorEstimate]:
+    """Trace rounds until the goal is reached or ``on_round`` returns False; return what each has found, and
+    the error in the end.
 
     Warns of a target that is not reached, and of an error that cannot be trusted.
     """
     start, done, rays = time.perf_counter(), list[Round](), 0
-    least, doubled = min(goal.rays, LEAST_MEAN, LEAST / pixels) if goal.target else 0, 0
+    least, doubled = min(goal.rays, picture.least, LEAST / pixels) if goal.target else 0, 0
     chosen = picture.first()
     while cost := picture.cost(chosen):
         rays += cost
         with stage("rounds", cost, _message(done, goal, cost / pixels)) as advance:
             picture.trace(chosen, advance)
-        error = picture.error()
-        now = Round(time.perf_counter() - start, rays / pixels, error.rmse)
+        now = Round(time.perf_counter() - start, rays / pixels, picture.rmse())
         done.append(now)
         log.info("round %d: %.1f rays a pixel, error %.3g", len(done), now.spp, now.rmse)
         if goal.on_round is not None:
             maps = (np.array(values, np.float32) for values in picture.maps())  # its own, to write into
             if goal.on_round(RoundPicture(now.seconds, now.spp, now.rmse, *maps)) is False:
-                return done
+                return done, picture.error()
         most = min(goal.rays, GROWTH * now.spp)
         if goal.seconds is not None:
             most = min(most, now.spp * goal.seconds / now.seconds)
-        forecast, tail = picture.forecast()
         if picture.last or most < LEAST_GROWTH * now.spp:
             break
+        forecast, tail = picture.forecast()
         if now.spp < least / LEAST_GROWTH:
             chosen = picture.next(min(most, least), goal.rays, None)
         elif goal.target is None or forecast > goal.target:
@@ -109,8 +115,9 @@ def run_rounds(picture: Refinable[Chosen], pixels: int, goal: Goal, stage: Stage
             chosen, doubled = picture.next(min(most, 2 * now.spp), goal.rays, None), doubled + 1
         else:
             break
+    error = picture.error()
     _warn(goal, done[-1], error, picture.unfit())
-    return done
+    return done, error
 
 
 def _warn(goal: Goal, now: Round, error: ErrorEstimate, unfit: str) -> None:

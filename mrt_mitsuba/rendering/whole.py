@@ -24,6 +24,7 @@ class Wholes:
     What to trace in a round: the rays of a pixel in each picture.
     """
 
+    least = 64  #: mean rays of a pixel that a target takes at least, in a small picture
     last = False  #: was the last round decided?
 
     def __init__(self, exposer: Exposer, seed: int) -> None:
@@ -98,6 +99,10 @@ class Wholes:
     def variance(self) -> np.ndarray:
         """Return the estimated variance of each channel in the picture, [H, W, 3]."""
         return np.moveaxis(window_means(np.moveaxis(self._squares(0), -1, 0), REACH), 0, -1)
+
+    def rmse(self) -> float:
+        """Return the estimated RMSE of the picture."""
+        return math.sqrt(float(self._squares(0).mean()))
 
     def error(self) -> ErrorEstimate:
         """Return the estimated RMSE of the picture, by the difference of its halves; see ``Halves.error``.

@@ -59,10 +59,10 @@ def _render(exposer: Draws, seed: int = 0, **goal: Any) -> Any:
     """Return what a render of drawn values has."""
     aim = Goal(goal.pop("target", None), goal.pop("rays", 64), **goal)
     halves = Halves(exposer, seed)  # type: ignore[arg-type]
-    rounds = run_rounds(halves, PIXELS, aim, lambda *_: nullcontext(lambda rays: None))
+    rounds, error = run_rounds(halves, PIXELS, aim, lambda *_: nullcontext(lambda rays: None))
     image, error_map, samples = halves.maps()
     return SimpleNamespace(
-        rounds=rounds, error=halves.error(), rays=halves.rays, image=image, map=error_map, samples=samples
+        rounds=rounds, error=error, rays=halves.rays, image=image, map=error_map, samples=samples
     )
 
 
