@@ -31,8 +31,7 @@ STUDIES: dict[str, tuple[str, str, int, int]] = {
     "filters": ("filters", "is refining edges as good as all, and the blur like a lens", 9, 120),
     "adaptive": ("adaptive", "are own scenes Mitsuba's, and errors cheap", 6, 60),
     "honest": ("honest", "is the mean right and the error as stated, calm to wild", 20, 1200),
-    "stability": ("stability", "where must float32 give out, and where does it not", 8, 60),
-    "exhaustive": ("exhaustive", "how far off are formulas, over every float32 cosine", 2, 120),
+    "stability": ("stability", "where must float32 give out, and where does it not", 8, 180),
     "error-vs-time": ("error_vs_time", "what does each setting buy for its time", 9, 480),
     "speed": ("speed", "how fast against Mitsuba's plugins, other ways, smaller tasks", 20, 300),
 }

@@ -33,6 +33,11 @@ def test_every_case_holds_and_is_a_row_with_a_mark() -> None:
 # ------------------------------------ What must not go unnoticed ------------------------------------------
 
 beckmann_d, blur, density = microfacet.beckmann_d, filters.gaussian_dof, lobes.Lobes.density
+schlick = fresnel.fresnel_schlick
+
+
+def rounded(cos_theta: Any, f0: Any) -> Any:
+    return schlick(cos_theta + 8 - 8, f0)
 
 
 def steep_gradient(tan2_theta: Any, alpha: Any) -> Any:
@@ -58,13 +63,15 @@ def dense(self: Any, context: Any, pair: Any) -> Any:
         ("bsdf", [(lobes, "tan2_theta", reflectance.report_tan2_theta)],
          ["BSDF cos, p99.9", "pdf, p99.9", "BSDF cos, largest"]),
         ("bsdf", [(fresnel, "fresnel_dielectric", reflectance.report_fresnel)], ["F, largest"]),
+        ("bsdf", [(fresnel, "fresnel_schlick", rounded)], ["Schlick, F0 = 0.04"]),
         ("bsdf", [(microfacet, "beckmann_d", steep_gradient)], ["gradient in alpha, p99.9"]),
         ("geometry", [(scene_data, "CURVED", 0.0)], ["sphere, shadow rays", "cone, shadow rays"]),
         ("filters", [(filters, "gaussian_dof", spreading)],
          ["nan in a picture, blur (llvm_ad_rgb)", "nan in a picture, blur (scalar_rgb)"]),
-        ("finite", [(lobes.Lobes, "density", dense), (lobes, "COS_MIN", 1e-13)], ["mrt_bsdf, schlick"]),
+        ("finite", [(lobes.Lobes, "density", dense), (lobes, "COS_MIN", 1e-13)],
+         ["mrt_bsdf, schlick, visible normals"]),
     ],
-    ids=["tan θ", "tan θ in the plugin", "Fresnel", "gradient", "offset", "damage", "one in a million"],
+    ids=["tan θ", "tan θ in the plugin", "Fresnel", "Schlick", "gradient", "offset", "damage", "negative"],
 )  # fmt: skip
 def test_a_loss_of_care_misses_its_bounds(
     monkeypatch: pytest.MonkeyPatch, part: str, changes: list[tuple[Any, str, Any]], expected: list[str]

@@ -1,4 +1,4 @@
-"""``mrt_bsdf`` against Mitsuba's ``roughconductor``: values, densities, pictures and metals."""
+"""``mrt_bsdf`` against Mitsuba's ``roughconductor``: values, densities and pictures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -23,11 +22,9 @@ from mrt_mitsuba.validation.tools import image_tests
 from mrt_mitsuba.validation.tools.bsdf_probe import (
     Array,
     evaluate,
-    interaction,
     largest,
     lobe_pairs,
     relative_error,
-    rgb,
 )
 from mrt_mitsuba.validation.tools.scenery import ball_scene
 from mrt_mitsuba.validation.tools.study import Study
@@ -53,10 +50,9 @@ def run(study: Study, *, quick: bool) -> None:
     """Run all parts; ``compare_roughconductor`` does the pictures of one roughness."""
     study.text(
         "With F = 1 and no diffuse part, mrt_bsdf and roughconductor are the same function: their values are "
-        "compared point by point and in pictures, with equal random numbers and with independent ones. Real "
-        "metals then show what Schlick's Fresnel term costs."
+        "compared point by point and in pictures, with equal random numbers and with independent ones."
     )
-    for part in (pointwise, rendered, metals):
+    for part in (pointwise, rendered):
         part(study, quick=quick)
 
 
@@ -242,42 +238,3 @@ def rendered(study: Study, *, quick: bool) -> None:
         study.at_most(
             f"p of the difference with {name}", p, LEVEL, "the test of pictures must see this error"
         )
-
-
-# ---------------------------------------------- Metals ----------------------------------------------
-
-
-def metals(study: Study, *, quick: bool) -> None:
-    """Hold Schlick's term with the F₀ of every metal that Mitsuba brings to the exact Fresnel term."""
-    theta = np.radians(np.arange(0.0, 90.0))
-    wi = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], axis=-1)
-    weight = np.sin(2 * theta)[:, None] / np.sin(2 * theta).sum()  # cos θ dω / π: even light
-    rows: list[dict[str, Any]] = []
-    level = mi.log_level()
-    mi.set_log_level(mi.LogLevel.Error)  # of spectra without a colour in RGB Mitsuba takes the nearest
-    for path in sorted((Path(mi.__file__).parent / "data" / "ior").glob("*.eta.spd")):
-        name = path.name.removesuffix(".eta.spd")
-        parameters = mi.traverse(mi.load_dict({"type": "roughconductor", "material": name}))
-        eta, k = (np.ravel(parameters[f"{key}.value"]).astype(float) for key in ("eta", "k"))
-        f0 = ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)  # from air
-        bsdf = mi.load_dict({"type": "mrt_bsdf", "f0": rgb(f0.tolist())})
-        schlick = np.array(bsdf.eval_attribute("mirror_reflectance", interaction(wi))).T
-        indices = [mi.Complex2f(float(n), float(x)) for n, x in zip(eta, k, strict=True)]
-        exact = np.stack([mi.fresnel_conductor(mi.Float(wi[:, 2]), index) for index in indices], axis=-1)
-        # Some channels of two compounds have neither index nor extinction: 0/0 along the normal
-        exact = np.where(((eta == 0) & (k == 0))[None] & (wi[:, 2:] == 1), 1, exact)
-        even = np.abs(((schlick - exact) * weight).sum(axis=0)).max()
-        head_on, worst = np.abs(schlick / exact - 1)[0].max(), np.abs(schlick - exact).max()
-        rows.append({"material": name, "largest error": worst, "under even light": even, "at 0°": head_on})
-    mi.set_log_level(level)
-    what, why = (
-        f"F₀ of {len(rows)} metals against the exact value, relative",
-        "the same number by two formulas",
-    )
-    study.at_most(what, largest(row["at 0°"] for row in rows), 1e-5, why)
-    why = "what its missing dip towards grazing angles costs, there where least light comes from"
-    most = largest(row["under even light"] for row in rows)
-    study.at_most("Schlick against exact under even light, worst metal", most, 0.05, why)
-    rows.sort(key=lambda row: -row["largest error"])
-    note = "Differences of reflectance, of the worst channel."
-    study.records("metals", "Schlick against exact, by material", rows, note)

@@ -18,6 +18,7 @@ import numpy as np
 from mpmath import mp, mpf
 
 from mrt_mitsuba.plugins import fresnel, microfacet
+from mrt_mitsuba.plugins.quadric_kinds import Columns
 from mrt_mitsuba.validation.checks.probe import Lanes
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies.stability.cases import Case
@@ -104,6 +105,10 @@ def cases(quick: bool) -> Iterator[Case]:
         what = "largest relative change of D at 60° when x and y of one direction move by one float32 step"
         why = "directions are float32: neighbouring ones, equal to a renderer, have values this far apart"
         yield Case(f"D of a neighbouring direction, alpha {alpha:g}", what, why, change[here].max())
+    yield from _of_one_variable(quick)
+
+
+def _of_one_variable(quick: bool) -> Iterator[Case]:
     # where total reflection begins, F ends in a square root: errors are those of g = 0
     iors = np.repeat(np.array([0.5, 0.9, 0.99, 0.9999], np.float32), 81)
     critical = np.float32(np.sqrt((1 - np.float64(iors)) * (1 + np.float64(iors))))
@@ -113,6 +118,11 @@ def cases(quick: bool) -> Iterator[Case]:
     why = "√ of a rounding: 1 - F is 4 g / (η² cos θ) there, and g² is known to a rounding of cos²"
     off = np.abs(found / _fresnel(cosines, iors) - 1).max()
     yield Case("F at the critical angle", what, why, off, 16 * 2.0**-12)
+    stride = 2**12 if quick else 1
+    what = f"largest error in steps of float32, over float32 cosines in [0, 1], 1 in {stride}"
+    why = "some dozen roundings, of which squares double some"
+    for name, formula in OF_COSINE.items():
+        yield Case(name, what, why, largest_error(formula, stride), 16)
 
 
 def errors(
@@ -194,6 +204,44 @@ def mrt_bsdf(wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
     return {"d": d, "g": g, "value": value[0], "pdf": pdf}
 
 
+# --------------------------------------------- Every cosine -----------------------------------------------
+
+OF_COSINE: dict[str, Callable[[Any], Any]] = {
+    "Schlick, F0 = 0.04": lambda c: fresnel.fresnel_schlick(c, float(np.float32(0.04))),
+    "exact Fresnel, into n = 1.5": lambda c: fresnel.fresnel_dielectric(c, 1.0, 1.5),
+    **{
+        f"Smith's G1, alpha = {alpha:g}": lambda c, alpha=float(alpha): microfacet.smith_g1(
+            Columns((dr.sqrt((1 - c) * (1 + c)), c * 0, c)), alpha
+        )
+        for alpha in np.float32([0.05, 0.2, 1])
+    },
+}
+ONE, LEAST = 0x3F800000, 0x00800000  # the bits of 1, and of the least number with all its digits
+CHUNK = 2**24
+
+
+def largest_error(formula: Callable[[Any], Any], stride: int) -> float:
+    """Return the largest |float32 − float64| over the step of float32 there, for every ``stride``-th cosine.
+
+    In float64, its own error is below 1e-6 of a float32 step: nothing in these forms cancels but 1 − c, which
+    is exact, and what is small next to its sum. LLVM kernels take what is below the least number with all its
+    digits for 0: that does not count.
+    """
+    from drjit.llvm import Float, Float64, UInt32
+
+    worst = 0.0
+    for start in range(0, ONE + 1, CHUNK * stride):  # all float32 numbers from 0 to 1, by their bits
+        size = min(CHUNK, (ONE - start) // stride + 1)
+        bits = dr.opaque(UInt32, start) + dr.arange(UInt32, size) * stride
+        cosines = dr.reinterpret_array(Float, dr.select(bits < LEAST, 0, bits))
+        found, wide = formula(cosines), formula(Float64(cosines))
+        exponent = dr.reinterpret_array(UInt32, Float(wide)) & 0x7F800000
+        step = Float64(dr.reinterpret_array(Float, dr.maximum(exponent, LEAST))) * 2.0**-23
+        error = dr.select((found == 0) & (wide > 0), 0, dr.abs(Float64(found) - wide) / step)
+        worst = max(worst, float(dr.max(error)[0]))
+    return worst
+
+
 # ------------------------------------------------- The truth -----------------------------------------------
 
 
@@ -245,24 +293,20 @@ def lobes_with_truth(per_cell: int, seed: int = 1) -> tuple[Lobes, dict[str, np.
 
 @mp.workdps(exact.DIGITS)
 def _exact(wi: np.ndarray, wo: np.ndarray, alpha: float, ior: float) -> tuple[float, ...]:
-    a = exact.number(alpha)
+    a, step = exact.number(alpha), exact.number(alpha) * mpf("1e-20")
     x, y, z = (exact.number(p) + exact.number(q) for p, q in zip(wi, wo, strict=True))
     tan2 = (x * x + y * y) / (z * z)
-    d = exact.beckmann_d(1 / mp.sqrt(1 + tan2), a)
-    (g_i, slope_i), (g_o, slope_o) = _g1_and_slope(wi, a), _g1_and_slope(wo, a)
     # Components are not rounded again: the cosine between the directions is that of them made one unit long
     sides = zip(exact.unit(list(wi)), exact.unit(list(wo)), strict=True)
-    cos_d = mp.sqrt(sum((p + q) ** 2 for p, q in sides)) / 2
-    value = d * exact.fresnel_dielectric(cos_d, 1, ior) * g_i * g_o / (4 * exact.number(wi[2]))
-    # d ln D / d alpha = 2 (tan²/alpha² - 1) / alpha, and those of G₁
-    steep = tan2 / a**2
-    logarithmic = 2 * (steep - 1) / a + slope_i / g_i + slope_o / g_o
-    size = 2 * (steep + 1) / a + abs(slope_i) / g_i + abs(slope_o) / g_o
+    f = exact.fresnel_dielectric(mp.sqrt(sum((p + q) ** 2 for p, q in sides)) / 2, 1, ior)
+
+    def terms(a: mpf) -> list[mpf]:
+        return [exact.beckmann_d(1 / mp.sqrt(1 + tan2), a), exact.smith_g1(wi, a), exact.smith_g1(wo, a)]
+
+    (d, g_i, g_o), moved = terms(a), terms(a + step)
+    value = d * f * g_i * g_o / (4 * exact.number(wi[2]))
+    of_d, *of_g = ((after / before - 1) / step for after, before in zip(moved, (d, g_i, g_o), strict=True))
+    # d ln D / d alpha is 2 (tan²/alpha² - 1) / alpha
+    size = 2 * (tan2 / a**2 + 1) / a + sum(map(abs, of_g))
     density = d / (4 * exact.visible_cos(wi, a))
-    return tuple(map(float, (d, g_i * g_o, value, density, value * logarithmic, value * size)))
-
-
-def _g1_and_slope(v: np.ndarray, alpha: mpf) -> tuple[mpf, mpf]:
-    """Return G₁ and its derivative with respect to alpha, by a difference far finer than float64."""
-    g, step = exact.smith_g1(v, alpha), alpha * mpf("1e-20")
-    return g, (exact.smith_g1(v, alpha + step) - g) / step
+    return tuple(map(float, (d, g_i * g_o, value, density, value * (of_d + sum(of_g)), value * size)))
