@@ -13,12 +13,24 @@ __version__ = "0.1.0"
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from mrt_mitsuba import filters as filters
-    from mrt_mitsuba.errors import MrtError as MrtError
-    from mrt_mitsuba.errors import MrtWarning as MrtWarning
-    from mrt_mitsuba.errors import OutputError as OutputError
-    from mrt_mitsuba.errors import SceneError as SceneError
-    from mrt_mitsuba.errors import UsageError as UsageError
-    from mrt_mitsuba.errors import VariantError as VariantError
+    from mrt_mitsuba.errors import (
+        MrtError as MrtError,
+    )
+    from mrt_mitsuba.errors import (
+        MrtWarning as MrtWarning,
+    )
+    from mrt_mitsuba.errors import (
+        OutputError as OutputError,
+    )
+    from mrt_mitsuba.errors import (
+        SceneError as SceneError,
+    )
+    from mrt_mitsuba.errors import (
+        UsageError as UsageError,
+    )
+    from mrt_mitsuba.errors import (
+        VariantError as VariantError,
+    )
     from mrt_mitsuba.rendering.api import Result as Result
     from mrt_mitsuba.rendering.api import render as render
     from mrt_mitsuba.rendering.prepare import prepare as prepare
@@ -63,7 +75,10 @@ def __getattr__(name: str) -> object:
 
     if name in _HOME:
         if not _HOME[name].endswith(".errors"):
-            import_module(f"{__name__}.runtime").check_start()
+            runtime = import_module(f"{__name__}.runtime")
+            runtime.check_start()
+            if ".rendering." in _HOME[name]:
+                runtime.load()
         value = getattr(import_module(_HOME[name]), name)
     elif name in _SUBMODULES:
         value = import_module(f"{__name__}.{name}")

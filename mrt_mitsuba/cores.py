@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
-CGROUPS = Path("/sys/fs/cgroup")
-MEMBERSHIP = Path("/proc/self/cgroup")
 
-
-def usable_cores(membership: Path = MEMBERSHIP, cgroups: Path = CGROUPS) -> int:
+def usable_cores(root: Path = Path("/")) -> int:
     """Return the cores of this process's affinity, or what its control groups grant if that is less.
 
-    A quota of one and a half cores counts as two. ``membership`` and ``cgroups`` are where Linux shows them.
+    A quota of one and a half cores counts as two. ``root``: where the system's ``proc`` and ``sys`` are.
     """
-    quotas = [math.ceil(quota) for quota in _quotas(membership, cgroups)]
-    return min([len(affinity()), *quotas])
+    counts = [len(affinity())]
+    for folder in control_groups("cpu", root):
+        for files in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):  # versions 2 and 1
+            with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
+                quota, period = map(float, " ".join((folder / file).read_text() for file in files).split())
+                counts += [math.ceil(quota / period)] if quota > 0 and period > 0 else []
+    return min(counts)
 
 
 def affinity() -> tuple[int, ...]:
@@ -27,31 +30,17 @@ def affinity() -> tuple[int, ...]:
     return tuple(range(os.cpu_count() or 1))
 
 
-def _quotas(membership: Path, cgroups: Path) -> Iterator[float]:
-    """Yield the quota, in cores, of each control group above this process that has one."""
+def control_groups(controller: str, root: Path = Path("/")) -> Iterator[Path]:
+    """Yield the folders of the control groups that this process is in, and of those above them."""
     try:
-        lines = membership.read_text().splitlines()
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:  # not Linux
         return
     for line in lines:
-        _, controllers, path = line.split(":", 2)
-        if controllers and "cpu" not in controllers.split(","):
+        _, names, path = line.split(":", 2)
+        if names and controller not in names.split(","):
             continue
-        root = cgroups / controllers
-        group = root / path.lstrip("/")
-        for folder in (group, *group.parents):
-            if folder.is_relative_to(root):
-                quota, period = _limits(folder)
-                if quota > 0 and period > 0:
-                    yield quota / period
-
-
-def _limits(folder: Path) -> tuple[float, float]:
-    """Return quota and period by version 2 or 1 of the interface; a quota below 0 is none."""
-    for files in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
-        try:
-            words = " ".join((folder / file).read_text() for file in files).replace("max", "-1").split()
-            return float(words[0]), float(words[1])
-        except (OSError, ValueError, IndexError):
-            continue
-    return -1.0, 0.0
+        group = Path(path.lstrip("/"))
+        for base in {names, controller if names else ""}:  # version 2 of the interface has no names
+            for folder in (group, *group.parents):
+                yield root / "sys/fs/cgroup" / base / folder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import time
@@ -9,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mrt_mitsuba.cores import control_groups
 from mrt_mitsuba.errors import UsageError
 
 # For every pixel: what is kept, by channel, and what Pillow needs to write a PNG
@@ -54,10 +56,7 @@ class Budget:
 
     @classmethod
     def of(cls, memory: int | None) -> Budget:
-        """Return what was asked for, by default half of what is free; never more than the machine has.
-
-        The machine is looked at once a second at most.
-        """
+        """Return what was asked for, by default half of what is free; never more than the machine has."""
         moment = int(time.monotonic())
         wanted = _look(free_memory, moment) // 2 if memory is None else memory
         return cls(min(wanted, _look(all_memory, moment)))
@@ -79,7 +78,7 @@ class Budget:
 
 @functools.lru_cache(maxsize=2)
 def _look(function: Callable[[], int], moment: int) -> int:
-    """Return what a function does, looked up once in a moment."""
+    """Return what a function does, looked up once a second: that takes milliseconds."""
     return function()
 
 
@@ -127,16 +126,8 @@ class Workspace:
         """Return the rows of a picture that a filter works on at once."""
         return max(1, min(self.size // BYTES_PER_PIXEL_OF_FILTER, MOST_PIXELS) // width)
 
-    def after_rays(self, rays: int, channels: int) -> None:
-        """Give memory back after a pass that traced so many rays at once."""
-        self._give_back(rays * channels * BYTES_PER_CHANNEL_OF_RAY)
-
-    def after_filter(self, pixels: int) -> None:
-        """Give memory back after a pass that filtered so many pixels at once."""
-        self._give_back(pixels * BYTES_PER_PIXEL_OF_FILTER)
-
-    def _give_back(self, used: int) -> None:
-        """Give the system what Dr.Jit keeps for reuse, after a pass that used much.
+    def give_back(self, used: int) -> None:
+        """Give the system what Dr.Jit keeps for reuse, after a pass that used so many bytes, if many.
 
         A picture takes up to four passes, which seldom reuse each other's arrays: they differ in size.
         """
@@ -164,12 +155,9 @@ def free_memory(root: Path = Path("/")) -> int:
     ``root``: where the system's folders ``proc`` and ``sys`` are.
     """
     free = [all_memory(root), *(limit - used for limit, used in _group_limits(root))]
-    try:
-        with open("/proc/meminfo") as file:
-            fields = dict(line.split(":", 1) for line in file)
+    with contextlib.suppress(OSError, KeyError, ValueError):
+        fields = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
         free.append(int(fields["MemAvailable"].split()[0]) * 1024)
-    except (OSError, KeyError, ValueError):
-        pass
     return max(0, min(free))
 
 
@@ -201,36 +189,19 @@ def _free_addresses() -> int | None:
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit == resource.RLIM_INFINITY:
             return None
-        with open("/proc/self/statm") as file:
-            return limit - int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+        return limit - int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     except (ImportError, OSError, ValueError):
         return None
 
 
 def _group_limits(root: Path) -> Iterator[tuple[int, int]]:
-    """Yield limit and use, in bytes, of each control group (version 1 or 2) that this process is in."""
-    try:
-        groups = (root / "proc/self/cgroup").read_text().splitlines()
-    except OSError:
-        return
-    mount = root / "sys/fs/cgroup"
-    for line in groups:
-        _, controllers, path = line.split(":", 2)
-        if controllers and "memory" not in controllers.split(","):
-            continue
-        base, limit, used = (
-            (mount / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes")
-            if controllers
-            else (mount, "memory.max", "memory.current")
-        )
-        group = Path(path.lstrip("/"))
-        for folder in (group, *group.parents):
-            try:
-                numbers = [int((base / folder / name).read_text()) for name in (limit, used)]
-                statistics = dict(s.split() for s in (base / folder / "memory.stat").read_text().splitlines())
-            except (OSError, ValueError):  # no such file, or "max"
-                continue
-            yield numbers[0], numbers[1] - int(statistics.get("inactive_file", 0))
+    """Yield limit and use, in bytes, of each control group that this process is in."""
+    for folder in control_groups("memory", root):
+        for names in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
+            with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
+                limit, used = (int((folder / name).read_text()) for name in names)
+                statistics = dict(s.split() for s in (folder / "memory.stat").read_text().splitlines())
+                yield limit, used - int(statistics.get("inactive_file", 0))
 
 
 def _text(count: float) -> str:

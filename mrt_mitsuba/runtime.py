@@ -41,7 +41,8 @@ def use(variant: str | None = None) -> str:
         return _used
     llvm.prepare()
     check_start()
-    with one_at_a_time, held(), rewriting_later():
+    with one_at_a_time, held():
+        load()
         import mitsuba as mi
 
         if variant is None:
@@ -71,6 +72,12 @@ def use(variant: str | None = None) -> str:
         plugins.register_modules("mrt_mitsuba.rendering", ["adaptive"])
         _used = variant
     return variant
+
+
+def load() -> None:
+    """Import Mitsuba, with less to do than by itself."""
+    with held(), rewriting_later():
+        import mitsuba  # noqa: F401
 
 
 def check_start() -> None:

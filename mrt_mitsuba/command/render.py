@@ -30,8 +30,6 @@ def run(options: Options) -> int:
     if spared:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         gc.disable()
-    with held():  # it imports Dr.Jit
-        from mrt_mitsuba.rendering.api import render
     from mrt_mitsuba import runtime
     from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
 
@@ -40,6 +38,8 @@ def run(options: Options) -> int:
     else:
         print(banner(options), flush=True)
     runtime.use(options.variant)
+    with held():
+        from mrt_mitsuba.rendering.api import render
     if spared:
         gc.freeze()
         gc.enable()

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.rays.lattice import divide, opaque
@@ -59,8 +61,6 @@ class Film:
     @classmethod
     def of(cls, sensor: Any) -> Film:
         """Return the film of a sensor as Mitsuba would expose it."""
-        import mitsuba as mi
-
         film = sensor.film()
         rfilter = film.rfilter()
         reach = 0 if rfilter.is_box_filter() else int(rfilter.border_size())
@@ -93,8 +93,6 @@ class Film:
 
     def place(self, pixel: Any, sampler: Any) -> tuple[Any, Any]:
         """Return places in pixels that a sampler draws: on the film, and in the picture, [0, 1]²."""
-        import mitsuba as mi
-
         border = float(self.border)
         size = mi.Vector2f(opaque(self.width - 2 * border), opaque(self.height - 2 * border))
         row, column = divide(pixel, self.width)
@@ -104,8 +102,6 @@ class Film:
     @cached_property
     def weights(self) -> np.ndarray:
         """Values of the filter along an axis, ``STEPS`` to a pixel, [2 reach + 1, STEPS]."""
-        import mitsuba as mi
-
         places = np.arange(-self.reach, self.reach + 1)[:, None] + (np.arange(STEPS) + 0.5) / STEPS - 0.5
         rfilter, flat = self.sensor.film().rfilter(), places.ravel().tolist()
         if mi.variant().startswith("scalar"):
@@ -180,9 +176,6 @@ class Canvas:
 
         ``pixels``: where each starts, ascending; those of the second picture follow on those of the first.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         if isinstance(place, np.ndarray):
             self._put_one_by_one(place, np.asarray(values), pixels)
             return
@@ -208,9 +201,6 @@ class Canvas:
 
     def _near(self, place: Any, values: Sequence[Any], share: Any, first: Any, pixel: Any) -> list[Any]:
         """Return what rays with a share in their pixel give to these pixels."""
-        import drjit as dr
-        import mitsuba as mi
-
         film, rfilter, reach = self._film, self._film.sensor.film().rfilter(), opaque(self._film.reach)
         line, column = divide(pixel, film.width)
         row = divide(line, film.height)[1]
@@ -262,8 +252,6 @@ class Canvas:
 def _moments(values: Sequence[Any], first: Any, last: Any) -> list[Any]:
     """Return sums over runs of rays of their values, those of their squares, and the largest mean of a ray's
     values, or 0."""
-    import drjit as dr
-    import mitsuba as mi
 
     def add(ray: Any, sums: list[Any], most: Any) -> tuple[Any, list[Any], Any]:
         found = [dr.gather(mi.Float, value, ray) for value in values]
@@ -277,8 +265,6 @@ def _moments(values: Sequence[Any], first: Any, last: Any) -> list[Any]:
 
 def spectral_bands(film: Any) -> tuple[str, ...]:
     """Return the names of a film's spectral bands, in its order; nothing for one that keeps colours."""
-    import mitsuba as mi
-
     if not mi.has_flag(film.flags(), mi.FilmFlags.Special):
         return ()
     film.prepare([])  # it knows its channels from then on

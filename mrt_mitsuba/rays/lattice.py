@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
-FILM = "film"
-LATTICES = ("report", "centered", FILM)
+import drjit as dr
+import mitsuba as mi
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,6 @@ class Places:
     def at(self, pixel: Any, ray: Any, width: int, height: int) -> tuple[Any, Any]:
         """Return where and when a ray of a pixel starts: its place in a picture of this size, [0, 1]², x to
         the right and y down, and its time."""
-        import mitsuba as mi
-
         lattice = self.lattice
         row, column = divide(pixel, width)
         sample = divide(ray, self.repeats)[0] + opaque(self.first)
@@ -92,8 +90,6 @@ class Places:
 
 def opaque(number: float) -> Any:
     """Return a number as data of a kernel, so that another needs no other kernel."""
-    import mitsuba as mi
-
     return number if mi.variant().startswith("scalar") else _opaque(mi.variant(), number, type(number))[0]
 
 
@@ -104,8 +100,6 @@ def divide(n: Any, divisor: int) -> tuple[Any, Any]:
     so vectorised variants multiply by the inverse in double precision. The half added keeps n/d away from
     whole numbers by 1/(2 d), and rounding moves it by less than n/d / 2⁵² < 1/(2 d).
     """
-    import mitsuba as mi
-
     if mi.variant().startswith("scalar"):
         return divmod(n, divisor)
     number, inverse = _opaque(mi.variant(), divisor, int)
@@ -115,9 +109,6 @@ def divide(n: Any, divisor: int) -> tuple[Any, Any]:
 
 @lru_cache(maxsize=64)
 def _opaque(variant: str, number: float, kind: type) -> tuple[Any, Any]:
-    import drjit as dr
-    import mitsuba as mi
-
     if kind is float:
         return dr.opaque(mi.Float, number), None
     return dr.opaque(mi.UInt32, number), dr.opaque(mi.Float64, 1 / number if number else 0)

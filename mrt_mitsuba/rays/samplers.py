@@ -6,6 +6,9 @@ from __future__ import annotations
 import functools
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 # The golden ratio in 32 bits: seeds that follow each other must not meet those of later rays
 _STRIDE = 0x9E3779B9
 # Sobol's second coordinate: bit i of the index takes part where Pascal's triangle is odd, in five doublings
@@ -14,16 +17,11 @@ _PASCAL = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (
 
 def ray_sampler() -> Any:
     """Return a Mitsuba sampler for the current variant; call ``start`` for the rays that it is to serve."""
-    import mitsuba as mi
-
     return _sampler_class(mi.variant())(mi.Properties("ray_sampler"))
 
 
 @functools.cache
 def _sampler_class(variant: str) -> type:
-    import drjit as dr
-    import mitsuba as mi
-
     class RaySampler(mi.Sampler):
         """Draws the numbers of Mitsuba's ``independent``, with rays that need not begin with number 0.
 
@@ -65,16 +63,11 @@ def _sampler_class(variant: str) -> type:
 
 def pixel_sequence() -> Any:
     """Return a Mitsuba sampler for the current variant; call ``start`` for the rays that it is to serve."""
-    import mitsuba as mi
-
     return _sequence_class(mi.variant())(mi.Properties("pixel_sequence"))
 
 
 @functools.cache
 def _sequence_class(variant: str) -> type:
-    import drjit as dr
-    import mitsuba as mi
-
     class PixelSequence(mi.Sampler):
         """Sobol's (0, 2)-sequence, shuffled and scrambled anew for each pixel and each pair of dimensions.
 
@@ -135,7 +128,4 @@ def _scrambled(bits: Any, a: Any, b: Any) -> Any:
 
 def _fraction(bits: Any) -> Any:
     """Return the number in [0, 1) whose binary digits are the bits, lowest first."""
-    import drjit as dr
-    import mitsuba as mi
-
     return mi.Float(dr.brev(bits) >> 8) * 2.0**-24

@@ -15,6 +15,7 @@ from dataclasses import replace
 from inspect import Parameter, Signature
 from typing import Any, ParamSpec, Protocol, cast
 
+import drjit as dr
 import numpy as np
 
 from mrt_mitsuba import runtime
@@ -89,8 +90,6 @@ def render_with(
     scene: Any, settings: RenderSettings, *, opener: Callable[..., Source] = open_scene
 ) -> Result:
     """Render a scene as ``render`` does; ``opener`` takes the place of ``open_scene``."""
-    import drjit as dr
-
     start = time.perf_counter()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()

@@ -12,9 +12,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.interrupts import heed
+from mrt_mitsuba.memory import BYTES_PER_CHANNEL_OF_RAY
 from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.output.layers import channels as channel_count
 from mrt_mitsuba.rays.film import Canvas, Film
@@ -140,9 +143,6 @@ class Exposer:
         Yields which of the pixels are in a part, a layer, one of its channels, and its values there: means
         over the rays of each pixel, or what the first ray hit. They do not depend on the parts.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         workspace, channels, size = self.job.workspace, channel_count(self.layers), places.size
         width, height = self.view.width, self.view.height
         random = self.shader.random or mi.is_spectral or self.view.sensor.needs_aperture_sample()
@@ -168,7 +168,7 @@ class Exposer:
                         plane = dr.block_reduce(dr.ReduceOp.Add, plane, size)
                     share = np.float32(1 if first else 1 / size)
                     yield part, name, channel, np.asarray(plane, np.float32) * share
-        workspace.after_rays(min(most, len(pixels) * size), channels)
+        workspace.give_back(min(most, len(pixels) * size) * channels * BYTES_PER_CHANNEL_OF_RAY)
 
     def expose(
         self,
@@ -202,9 +202,6 @@ class Exposer:
 
     def _on_film(self, groups: Groups, seed: int, before: int, progressive: bool) -> Start:
         """Return where rays of groups start, ``before`` of which were traced already."""
-        import drjit as dr
-        import mitsuba as mi
-
         film, size, scalar = self.film, groups.size, mi.variant().startswith("scalar")
         stock = film.sensor.sampler()
         key = seed if scalar else dr.opaque(mi.UInt32, seed)
@@ -232,9 +229,6 @@ class Exposer:
 
     def _trace(self, groups: Groups, start: Start) -> tuple[Any, dict[str, list[Any]]]:
         """Trace a wavefront; return places on the film and values, by layer and channel, of all rays."""
-        import drjit as dr
-        import mitsuba as mi
-
         heed()
         size, pixels, count = groups.size, groups.pixels, len(groups.pixels) * groups.size
         if mi.variant().startswith("scalar"):
@@ -268,9 +262,6 @@ class Exposer:
 
     def _ray(self, pixel: Any, number: Any, start: Start) -> tuple[Any, dict[str, list[Any]]]:
         """Trace a ray, or one in each lane: return its place on the film, and its values."""
-        import drjit as dr
-        import mitsuba as mi
-
         place, inside, time, sampler = start(pixel, number)
         ray, weight = self.view.rays(inside, time, sampler)
         values, film = self.shader.values(self.view, ray, weight, sampler), self.film

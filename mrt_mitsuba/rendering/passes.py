@@ -14,7 +14,7 @@ import numpy as np
 from mrt_mitsuba import filters
 from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.filters.grid import bands
-from mrt_mitsuba.memory import keep_freed_blocks
+from mrt_mitsuba.memory import BYTES_PER_PIXEL_OF_FILTER, keep_freed_blocks
 from mrt_mitsuba.output.error import ErrorEstimate, Round
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.film import Film, Region
@@ -191,7 +191,7 @@ class Passes:
             rays = self._plan.centre(self._frame).size
             square = np.maximum(square - self.layers["image"] ** 2, 0) / (rays - 1)
         with self._job.stage(step.name, len(self._pixels)) as advance:
-            for rows, seen, inner in bands(self._shape[0], self._rows_at_once, edges.REACH):
+            for rows, seen, inner in self._bands(edges.REACH):
                 read = [self.layers[name][seen] for name in DETECTORS[step.mode]]
                 read = [layer if layer.shape[-1] > 1 else layer[..., 0] for layer in read]
                 edge = detect(*read, **({} if square is None else {"variance": square[seen]}))
@@ -200,7 +200,6 @@ class Passes:
                     edge.mask[inner], np.float32(self._plan.lattice.count), np.float32(1)
                 )
                 advance(samples[rows].size)
-        self._job.workspace.after_filter(min(self._rows_at_once, self._shape[0]) * self._shape[1])
 
     def _blur(self, step: Pass) -> None:
         """Blur the picture, and note by how much."""
@@ -219,7 +218,7 @@ class Passes:
         """
         depth, above, focus = self.layers["depth"][..., 0], image[:0], self._plan.focus
         options = {"focal_distance": focus.distance, "focal_range": focus.range, "mode": str(self._plan.blur)}
-        for rows, seen, inner in bands(self._shape[0], self._rows_at_once, dof.REACH):
+        for rows, seen, inner in self._bands(dof.REACH):
             sharp = image[rows.start : seen.stop]
             if len(above):
                 sharp = np.concatenate([above, sharp])
@@ -227,7 +226,6 @@ class Passes:
             above = sharp[: inner.stop][-dof.REACH :].copy()
             image[rows] = blurred[inner]
             yield rows
-        self._job.workspace.after_filter(min(self._rows_at_once, self._shape[0]) * self._shape[1])
 
     def _blurred(self, picture: np.ndarray) -> np.ndarray:
         """Return a picture [H, W, 3] with depth of field."""
@@ -235,6 +233,12 @@ class Passes:
         for _ in self._blurring(picture):
             pass
         return picture
+
+    def _bands(self, halo: int) -> Iterator[tuple[slice, slice, slice]]:
+        """Yield the rows of each band, those that a filter sees, and where the first are among these."""
+        height, width = self._shape
+        yield from bands(height, self._rows_at_once, halo)
+        self._job.workspace.give_back(min(self._rows_at_once, height) * width * BYTES_PER_PIXEL_OF_FILTER)
 
     # -------------------------------------------- Layers --------------------------------------------
 

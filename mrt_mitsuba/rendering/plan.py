@@ -8,6 +8,8 @@ from functools import cached_property
 from itertools import groupby
 from typing import Any, NamedTuple
 
+import mitsuba as mi
+
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.output import layers
@@ -15,8 +17,8 @@ from mrt_mitsuba.output.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.plugins import kernel_plan
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rays.film import Region, pixel_format, spectral_bands
-from mrt_mitsuba.rays.lattice import FILM, Lattice, Places
-from mrt_mitsuba.rendering.settings import DETECTORS, MAX_SPP, MIN_SPP, NOISE, Focus, RenderSettings
+from mrt_mitsuba.rays.lattice import Lattice, Places
+from mrt_mitsuba.rendering.settings import DETECTORS, FILM, MAX_SPP, MIN_SPP, NOISE, Focus, RenderSettings
 from mrt_mitsuba.rendering.shading import Shader
 from mrt_mitsuba.scene.open import Source
 
@@ -172,8 +174,6 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
 
     Raises ``UsageError`` for options that do not go together, and for layers that nothing provides.
     """
-    import mitsuba as mi
-
     film = _film(source, shader)
     focus = settings.focus(source.focal_distance, source.focal_range)
     settings = _decided(settings, film, shader, focus)

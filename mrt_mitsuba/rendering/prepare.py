@@ -14,10 +14,9 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.plugins.protocols import LayeredIntegrator
 from mrt_mitsuba.plugins.snapshot import Part
-from mrt_mitsuba.rays.lattice import FILM
 from mrt_mitsuba.rendering.api import render_with
 from mrt_mitsuba.rendering.result import Result
-from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.rendering.settings import FILM, RenderSettings
 from mrt_mitsuba.rendering.shading import View
 from mrt_mitsuba.scene.open import open_scene
 

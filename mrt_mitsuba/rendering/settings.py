@@ -31,7 +31,6 @@ from mrt_mitsuba.options import (
     table,
 )
 from mrt_mitsuba.output.layers import LAYERS
-from mrt_mitsuba.rays.lattice import LATTICES
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE
 
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
 #: The edge detectors as ``aamode`` names them: ``filters.<name>_edges``, and the layers that each reads, in
 #: the order of its arguments; those of the picture can distinguish noise from edges
 DETECTORS = {"luma": ("image",), "sobel": ("image",), "geometry": ("normal", "depth")}
+FILM = "film"  # the lattice by the rules of a scene's film
 NOISE = "noise"  # the aamode that puts rays where the variance is
 MIN_SPP = 16  # rays of a pixel from which its variance is known
 MAX_SPP = 4096  # of a pixel on average, where a target alone would ask for more
@@ -84,7 +84,7 @@ class RenderSettings:
     maxseconds: float | None = option(None, NUMBER, "seconds to spend at most, with a target", "none")
     lattice: str | None = option(
         None,
-        choice(*LATTICES),
+        choice("report", "centered", FILM),
         "samples from the pixel centre on, around it, or by the rules of a scene's film",
         "report, own scenes: film",
     )

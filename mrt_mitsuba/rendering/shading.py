@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError
@@ -31,8 +33,6 @@ class View:
         ``time``: from 0, when the shutter opens, to 1; None: the sampler draws it, as for Mitsuba's sensors.
         Draws what Mitsuba's integrators draw, in their order.
         """
-        import mitsuba as mi
-
         sensor, moment = self.sensor, time
         aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         if time is None:
@@ -48,9 +48,6 @@ class View:
 
     def distance(self, si: Any) -> Any:
         """Return the distance of a hit from the eye; along the ray where the sensor has no single eye."""
-        import drjit as dr
-        import mitsuba as mi
-
         if self.sensor.class_name() not in ("PerspectiveCamera", "ThinLensCamera"):
             return si.t
         # not si.t: rays start at the near plane
@@ -60,9 +57,6 @@ class View:
         return dr.norm(si.p - eye)
 
     def _shift(self, time: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         if mi.variant().startswith("scalar"):
             return mi.Vector3f(self.motion) * time
         return dr.opaque(mi.Vector3f, self.motion) * time
@@ -74,8 +68,6 @@ class View:
         ``worldToNDC``, of pinhole cameras: to the picture, x from 0 to 1 to the right and y downwards.
         Source: OpenEXR, "Standard Attributes".
         """
-        import mitsuba as mi
-
         to_world = np.array(self.sensor.world_transform().matrix, np.float64).reshape(4, 4)
         if not np.isfinite(to_world).all() or np.linalg.matrix_rank(to_world) < 4:
             return {}
@@ -106,8 +98,6 @@ class RayValues:
     def __init__(
         self, scene: Any, view: View, ray: Any, weight: Any, radiance: Any, trace: Any = None
     ) -> None:
-        import mitsuba as mi
-
         self.scene, self.view, self.ray, self.trace = scene, view, ray, trace
         self.weight = mi.unpolarized_spectrum(weight)
         self.spectrum = radiance * self.weight  #: radiance with the sensor's weight
@@ -118,8 +108,6 @@ class RayValues:
     @cached_property
     def si(self) -> Any:
         """Interaction at the first hit."""
-        import mitsuba as mi
-
         return self.trace.hit.si if self.trace else self.scene.ray_intersect(mi.Ray3f(self.ray))
 
     @property
@@ -129,9 +117,6 @@ class RayValues:
 
     def at_hit(self, kind: str, value: Any, miss: float = 0) -> Any:
         """Return a value, of a type of Mitsuba's, where something is hit, and another elsewhere."""
-        import drjit as dr
-        import mitsuba as mi
-
         return dr.select(self.found, getattr(mi, kind)(value), miss)
 
     def rgb(self, spectrum: Any) -> Any:
@@ -141,9 +126,6 @@ class RayValues:
     @property
     def shape(self) -> Any:
         """Number of the scene's shape that is hit first, from 1; 0 for a miss."""
-        import drjit as dr
-        import mitsuba as mi
-
         hit, shapes = mi.SurfaceInteraction3f(self.si), self.scene.shapes()
         if mi.variant().startswith("scalar"):
             hit.shape = hit.instance or hit.shape
@@ -161,8 +143,6 @@ class RayValues:
         return self._row_of_shape(self.si, rows)
 
     def _row_of_shape(self, hit: Any, rows: Sequence[int]) -> Any:
-        import mitsuba as mi
-
         from mrt_mitsuba.plugins.lookup import ByShape
 
         return ByShape(mi.Float, self.scene.shapes(), rows, 0.0)(hit, self.found)
@@ -170,8 +150,6 @@ class RayValues:
     @property
     def albedo(self) -> Any:
         """Diffuse reflectance at the first hit; 0 for a miss."""
-        import mitsuba as mi
-
         albedo = mi.UnpolarizedSpectrum(0)
         if not mi.variant().startswith("scalar") or self.found:
             bsdf = self.si.bsdf(mi.RayDifferential3f(self.ray))
@@ -192,8 +170,6 @@ class Shader:
     layers = named(FIRST_HIT)  #: names of those that can be traced, but for internal ones
 
     def __init__(self, scene: Any, integrator: Any) -> None:
-        import mitsuba as mi
-
         self.scene, self.integrator, self.name = scene, integrator, integrator.class_name()
         self.layered = isinstance(integrator, LayeredIntegrator)
         self._derivatives = isinstance(integrator, mi.CppADIntegrator)  # such as prb
@@ -220,9 +196,6 @@ class Shader:
 
     def values(self, view: View, ray: Any, weight: Any, sampler: Any) -> RayValues:
         """Return what is known along rays with these weights."""
-        import drjit as dr
-        import mitsuba as mi
-
         if self.layered:
             trace = self.integrator.trace(self.scene, sampler, ray, True, self._data)
             return RayValues(self.scene, view, ray, weight, trace.radiance, trace)
@@ -243,8 +216,6 @@ class Shader:
 
 def to_rgb(spectrum: Any, ray: Any) -> Any:
     """Return the linear sRGB of a spectrum in the current variant."""
-    import mitsuba as mi
-
     if mi.is_spectral:
         xyz = sum(
             mi.cie1931_xyz(wavelength) * value

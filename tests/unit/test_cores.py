@@ -33,17 +33,19 @@ ALL = len(affinity())
     ],
 )
 def test_quotas_of_control_groups(tmp_path: Path, membership: str, files: dict[str, str], cores: int) -> None:
-    (tmp_path / "membership").write_text(membership)
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/self/cgroup").write_text(membership)
     for name, text in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text)
+        file = tmp_path / "sys/fs/cgroup" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
         if name.endswith("quota_us"):
-            (tmp_path / name).with_name("cpu.cfs_period_us").write_text("100000")
-    assert usable_cores(tmp_path / "membership", tmp_path) == cores
+            file.with_name("cpu.cfs_period_us").write_text("100000")
+    assert usable_cores(tmp_path) == cores
 
 
 def test_without_control_groups(tmp_path: Path) -> None:
-    assert usable_cores(tmp_path / "none", tmp_path) == ALL
+    assert usable_cores(tmp_path) == ALL
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity") or ALL < 2, reason="needs two cores and affinity")

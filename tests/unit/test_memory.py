@@ -48,13 +48,13 @@ def test_by_default_half_of_what_is_free(monkeypatch):
     assert Budget.of(None) == Budget(4 * GIB)
 
 
-@pytest.mark.parametrize(("filtered", "flushed"), [(GIB // 1024, False), (GIB // 160, True)])
-def test_what_a_large_pass_used_is_given_back(monkeypatch, filtered, flushed):
+@pytest.mark.parametrize(("used", "flushed"), [(GIB // 4, False), (GIB // 4 + 1, True)])
+def test_what_a_large_pass_used_is_given_back(monkeypatch, used, flushed):
     import drjit as dr
 
     called = []
     monkeypatch.setattr(dr, "flush_malloc_cache", lambda: called.append(True))
-    Workspace(GIB).after_filter(filtered)
+    Workspace(GIB).give_back(used)
     assert bool(called) is flushed
 
 
