@@ -25,6 +25,7 @@ from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.open import open_scene, set_parameters
 from mrt_mitsuba.scene.report import report_scene
 
+MOST_JOBS = 100_000  # all are held in memory
 LONGEST_NAME = 200  # bytes of a file's name without its ending; file systems take 255
 # Arguments of ``render`` that stay in this process, or that are given otherwise
 NOT_SWEPT = frozenset({"scene", "progress", "on_round", "region", "params"})
@@ -63,10 +64,12 @@ def jobs(scene: Any, grid: Any, zipped: bool, fixed: Mapping[str, Any]) -> list[
     twice = axes.keys() & {*fixed, "" if scene is None else "scene"}
     if twice:
         raise UsageError(f"{min(twice)} is given twice: as an axis of the grid and for all jobs; drop one")
-    shared = {key: _check(key, value) for key, value in fixed.items() if value is not None}
+    shared = {key: _checked(key, [value])[0] for key, value in fixed.items() if value is not None}
     lengths = list(map(len, axes.values()))
     if zipped and len(set(lengths)) > 1:
         raise UsageError(f"zipped axes must be of one length, and those of {', '.join(axes)} are {lengths}")
+    if math.prod(lengths[: 1 if zipped else None]) > MOST_JOBS:
+        raise UsageError(f"the grid has more than {MOST_JOBS} jobs: make several sweeps of it")
     rows = zip(*axes.values(), strict=True) if zipped else itertools.product(*axes.values())
     points = [dict(zip(axes, row, strict=True)) for row in rows]
     found = []
@@ -100,31 +103,36 @@ def _names(points: Sequence[Mapping[str, Any]], zipped: bool) -> list[str]:
 def _axis(key: Any, values: Any) -> list[Any]:
     if not (isinstance(key, str) and key.isprintable()):
         raise UsageError(f"grid: the key {key!r} is no name of an option or a parameter")
+    values = values.tolist() if hasattr(values, "tolist") else values
     if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
         raise UsageError(f"grid: {key} is {values!r}; give a list of values, such as [{values!r}]")
-    # NumPy's numbers and arrays become Python's
-    found = [_check(key, value.tolist() if hasattr(value, "tolist") else value) for value in values]
-    if not found:
-        raise UsageError(f"grid: {key} is an empty list; give it values, or leave it out")
-    return found
+    values = list(itertools.islice(values, MOST_JOBS + 1))  # some never end
+    if not 0 < len(values) <= MOST_JOBS:
+        problem = f"has more than {MOST_JOBS} values" if values else "is an empty list"
+        raise UsageError(f"grid: {key} {problem}; give it values, or leave it out")
+    return _checked(key, values)
 
 
-def _check(key: str, value: Any) -> Any:
-    """Return a value as ``render`` takes it; raise ``UsageError`` where it cannot."""
+def _checked(key: str, values: Sequence[Any]) -> list[Any]:
+    """Return values as ``render`` takes them; raise ``UsageError`` where it cannot."""
     from mrt_mitsuba import render
     from mrt_mitsuba.rendering import settings
 
-    numbers = value if isinstance(value, list | tuple) else [value]
-    if not all(math.isfinite(number) for number in numbers if isinstance(number, float)):
-        raise UsageError(f"{key}={value!r}: give finite numbers")
-    if key in ("scene", "params") or "." in key:
-        return value
     known = inspect.signature(render).parameters.keys() - NOT_SWEPT
-    if key not in known:
+    if key not in {*known, "scene", "params"} and "." not in key:
         close = difflib.get_close_matches(key, known, n=1)
         hint = f"did you mean {close[0]}?" if close else "a parameter of the scene has a dot in its key"
         raise UsageError(f"{key} is not an option of render: {hint}")
-    return settings.check(key, value) if key in settings.TABLE else value
+    found = [value.tolist() if hasattr(value, "tolist") else value for value in values]  # NumPy's
+    for value in found:
+        numbers = value if isinstance(value, list | tuple) else [value]
+        if not all(math.isfinite(number) for number in numbers if isinstance(number, float)):
+            raise UsageError(f"{key}={value!r}: give finite numbers")
+        if key == "params" and not isinstance(value, Mapping):
+            raise UsageError(f"params={value!r}: give a dict of values by name")
+    return (
+        [settings.check(key, value) for value in found] if key in settings.TABLE and key in known else found
+    )
 
 
 def word(value: Any) -> str:

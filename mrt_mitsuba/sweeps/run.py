@@ -71,11 +71,12 @@ def sweep(
     planned = jobs(scene, {} if grid is None else grid, zipped, options)
     if tiles is not None:
         check_tiles(tiles, png, planned)
-    folder = os.path.abspath(out)
     try:
+        folder = os.path.abspath(os.fsdecode(out))
         os.makedirs(folder, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder {folder}: {error.strerror}") from error
+    except (OSError, TypeError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise OutputError(f"cannot make the folder {out!s}: {reason}") from error
     table = Table(folder, tuple(grid or {}), planned)
     shown = TerminalProgress(unit=" pictures") if progress is None else progress
     with TemporaryDirectory(prefix=".mrt-", dir=folder, ignore_cleanup_errors=True) as scratch:

@@ -91,6 +91,7 @@ def _render(job: Job, setting: Setting, scratch: str, worker: Any) -> dict[str, 
     from PIL.PngImagePlugin import PngInfo
 
     from mrt_mitsuba.output.files import save, to_8bit
+    from mrt_mitsuba.output.replacing import check_target
     from mrt_mitsuba.rendering.api import render
     from mrt_mitsuba.rendering.progress import Progress
 
@@ -118,6 +119,7 @@ def _render(job: Job, setting: Setting, scratch: str, worker: Any) -> dict[str, 
     for ending in endings(setting.png):
         target = os.path.join(setting.folder, f"{job.name}.{ending}")
         os.makedirs(os.path.dirname(target), exist_ok=True)
+        check_target(target, result.inputs)  # a scene may read pictures of earlier sweeps
         os.replace(f"{scratch}.{ending}", target)
     return {
         "file": job.file,

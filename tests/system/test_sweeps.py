@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import itertools
 import json
 import os
 import signal
@@ -297,6 +298,10 @@ def test_a_job_that_fails_ends_no_other(address: str, tmp_path: Path) -> None:
         ([1], {}, r'grid=\[1\]: give a dict of lists, such as {"aa": \[1, 2\]}'),
         ({1: [1]}, {}, "grid: the key 1 is no name"),
         ({"a\nb": [1]}, {}, r"grid: the key 'a\\nb' is no name"),
+        ({"seed": itertools.count()}, {}, "seed has more than 100000 values"),
+        ({"seed": range(1000), "aa": range(1, 65), "spp": [1, 2]}, {}, "more than 100000 jobs"),
+        ({"params": [3]}, {}, "params=3: give a dict"),
+        ({}, {"out": "a\0b"}, "cannot make the folder"),
         ({"aa": 3}, {}, r"aa is 3; give a list of values, such as \[3\]"),
         ({"aamode": "luma"}, {}, "aamode is 'luma'; give a list"),
         ({"aa": [0]}, {}, "aa=0: must be a whole number"),
