@@ -65,13 +65,7 @@ def jobs(scene: Any, grid: Any, zipped: bool, fixed: Mapping[str, Any]) -> list[
     if twice:
         raise UsageError(f"{min(twice)} is given twice: as an axis of the grid and for all jobs; drop one")
     shared = {key: _checked(key, [value])[0] for key, value in fixed.items() if value is not None}
-    lengths = list(map(len, axes.values()))
-    if zipped and len(set(lengths)) > 1:
-        raise UsageError(f"zipped axes must be of one length, and those of {', '.join(axes)} are {lengths}")
-    if math.prod(lengths[: 1 if zipped else None]) > MOST_JOBS:
-        raise UsageError(f"the grid has more than {MOST_JOBS} jobs: make several sweeps of it")
-    rows = zip(*axes.values(), strict=True) if zipped else itertools.product(*axes.values())
-    points = [dict(zip(axes, row, strict=True)) for row in rows]
+    points = _points(axes, zipped)
     found = []
     for name, point in zip(_names(points, zipped), points, strict=True):
         dotted = {key: value for key, value in point.items() if "." in key}
@@ -81,6 +75,17 @@ def jobs(scene: Any, grid: Any, zipped: bool, fixed: Mapping[str, Any]) -> list[
             arguments["params"] = params
         found.append(Job(name, arguments.pop("scene", scene), arguments, point))
     return found
+
+
+def _points(axes: Mapping[str, Sequence[Any]], zipped: bool) -> list[dict[str, Any]]:
+    """Return the values of each job by their axes."""
+    lengths = list(map(len, axes.values()))
+    if zipped and len(set(lengths)) > 1:
+        raise UsageError(f"zipped axes must be of one length, and those of {', '.join(axes)} are {lengths}")
+    if not zipped and math.prod(lengths) > MOST_JOBS:
+        raise UsageError(f"the grid has more than {MOST_JOBS} jobs: make several sweeps of it")
+    rows = zip(*axes.values(), strict=True) if zipped else itertools.product(*axes.values())
+    return [dict(zip(axes, row, strict=True)) for row in rows]
 
 
 def _names(points: Sequence[Mapping[str, Any]], zipped: bool) -> list[str]:
