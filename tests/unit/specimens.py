@@ -32,6 +32,15 @@ GLOSS = {"type": "roughconductor"}
 GLOSSY, DELTA = (+flag for flag in (mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DeltaReflection))
 
 
+def _value(change):
+    """A change of values and weights that knows where light comes from and goes to."""
+    return "value", lambda value, ctx, wi, wo: change(value, wi, wo)
+
+
+def _sample(change):
+    return "sample", lambda bs, weight, u, ctx: (bs, change(bs, weight, u, ctx))
+
+
 def _member(name, change):
     """A change of samples: of one of their members."""
 
@@ -39,11 +48,7 @@ def _member(name, change):
         setattr(bs, name, change(getattr(bs, name)))
         return bs, weight
 
-    return apply
-
-
-def _weight(change):
-    return lambda bs, weight, u, ctx: (bs, change(bs, weight, u, ctx))
+    return "sample", apply
 
 
 def _unscaled(bs, weight, u, ctx):
@@ -66,60 +71,52 @@ def _stairs(value, wi, wo):
 
 
 def _stairs_on_a_slope(value, wi, wo):
-    if not is_jit():
-        return value
-    c, large = wi.z * wo.z, dr.opaque(mi.Float, 3e4)
+    c, large = wi.z * wo.z, dr.opaque(mi.Float, 3e4) if is_jit() else 0
     return value * (1 + ((c + large) - large - c))
-
-
-def _attached(bs, weight, u, ctx):
-    """A weight whose density changes with the parameters as the value does."""
-    return bs, dr.detach(weight)
 
 
 def _steep(value, wi, wo):
     return value + dr.sqrt(dr.maximum(0, dr.select(wo.x > 0.7, value - dr.detach(value), 0)))
 
 
-def _other_in_scalar(value, wi, wo):
-    return value if is_jit() else 1.01 * value
-
-
-def _below(pdf, wi, wo):
+def _below(pdf, ctx, wi, wo):
     return pdf + dr.select((wi.z > 0) & (wo.z < 0), -0.1 * wo.z, 0)
 
 
-def _nan_at_the_end(bs, weight, u, ctx):
-    return dr.select(u.x > 0.9999999, dr.nan, weight)
+def _in_importance(value, ctx, wi, wo):
+    return 1.02 * value if ctx.mode == mi.TransportMode.Importance else value
 
 
 # Sound BSDFs whose answers are changed: the BSDF, what is changed and how, and the laws that this breaks
 CHANGES = {
-    "no eta^2 in single directions": (GLASS, "sample", _weight(_unscaled), {"reciprocity"}),
-    "eta inverted": (GLASS, "sample", _member("eta", lambda eta: 1 / eta), {"reciprocity"}),
-    "eta of 0": (GLOSS, "sample", _member("eta", lambda eta: 0 * eta), {"reciprocity"}),
-    "directions not of length 1": (MIRROR, "sample", _member("wo", lambda wo: 1.01 * wo), {"finite"}),
-    "mirror turned": (MIRROR, "sample", _member("wo", _turned), {"reciprocity"}),
+    "no eta^2 in single directions": (GLASS, *_sample(_unscaled), {"reciprocity"}),
+    "eta inverted": (GLASS, *_member("eta", lambda eta: 1 / eta), {"reciprocity"}),
+    "eta of 0": (GLOSS, *_member("eta", lambda eta: 0 * eta), {"reciprocity"}),
+    "directions not of length 1": (MIRROR, *_member("wo", lambda wo: 1.01 * wo), {"finite"}),
+    "mirror turned": (MIRROR, *_member("wo", _turned), {"reciprocity"}),
     "mirror called glossy": (
         MIRROR,
-        "sample",
-        _member("sampled_type", lambda kind: kind - DELTA + GLOSSY),
+        *_member("sampled_type", lambda kind: kind - DELTA + GLOSSY),
         {"weights", "energy", "components"},
     ),
-    "next component": (DIFFUSE, "sample", _member("sampled_component", lambda i: i + 1), {"components"}),
-    "NaN at the end of random numbers": (DIFFUSE, "sample", _weight(_nan_at_the_end), {"finite"}),
-    "albedo 1.02 near the horizon": (DIFFUSE, "value", _brighter, {"energy"}),
-    "stairs": (GLOSS, "value", _stairs, {"roundoff"}),
-    "stairs on a slope": (DIFFUSE, "value", _stairs_on_a_slope, {"roundoff"}),
-    "more light in one mode": (
+    "next component": (DIFFUSE, *_member("sampled_component", lambda i: i + 1), {"components"}),
+    "NaN at the end of random numbers": (
         DIFFUSE,
-        "mode",
-        lambda value, wi, wo: 1.02 * value,
-        {"reciprocity", "energy"},
+        *_sample(lambda bs, weight, u, ctx: dr.select(u.x > 0.9999999, dr.nan, weight)),
+        {"finite"},
     ),
-    "attached sampling": (GLOSS, "sample", _attached, {"gradients"}),
-    "derivatives that are NaN": ({"type": "specimen"}, "value", _steep, {"gradients"}),
-    "other values in scalar variants": (DIFFUSE, "value", _other_in_scalar, {"variants"}),
+    "albedo 1.02 near the horizon": (DIFFUSE, *_value(_brighter), {"energy"}),
+    "stairs": (GLOSS, *_value(_stairs), {"roundoff"}),
+    "stairs on a slope": (DIFFUSE, *_value(_stairs_on_a_slope), {"roundoff"}),
+    "more light in one mode": (DIFFUSE, "value", _in_importance, {"reciprocity", "energy"}),
+    # a weight whose density changes with the parameters as the value does
+    "attached sampling": (GLOSS, *_sample(lambda bs, weight, u, ctx: dr.detach(weight)), {"gradients"}),
+    "derivatives that are NaN": ({"type": "specimen"}, *_value(_steep), {"gradients"}),
+    "other values in scalar variants": (
+        DIFFUSE,
+        *_value(lambda value, wi, wo: value if is_jit() else 1.01 * value),
+        {"variants"},
+    ),
     "black back": (DIFFUSE, "flags", +mi.BSDFFlags.BackSide, {"components"}),
     "active ignored": (DIFFUSE, "active", None, {"eval_pdf"}),
     "density below the horizon": (DIFFUSE, "pdf", _below, {"sampling"}),

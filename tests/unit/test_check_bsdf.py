@@ -47,34 +47,30 @@ def run(snippet: str) -> None:
 # ----------------------------------------------- Mistakes -------------------------------------------------
 
 
-def test_a_sound_bsdf_passes_by_other_seeds(registered) -> None:
-    for seed in range(3):
-        holds(mrt.check_bsdf({"type": "specimen"}, quick=True, seed=seed))
+def test_a_sound_bsdf_passes_as_a_dict_and_loaded(registered) -> None:
+    holds(mrt.check_bsdf({"type": "specimen"}, quick=True))
+    check = mrt.check_bsdf(mi.load_dict({"type": "specimen"}), quick=True, seed=1)
+    holds(check)
+    assert "loaded object" in check.laws["variants"].skipped
+    assert not check.laws["switch"].skipped
 
 
-@pytest.mark.parametrize("mistake", specimens.MISTAKES)
-def test_each_mistake_fails_its_own_laws(mistake: str, registered, capsys) -> None:
-    check = mrt.check_bsdf({"type": "specimen", "mistake": mistake}, quick=True)
-    assert set(check.failed) == specimens.MISTAKES[mistake], str(check)
-    for name in check.failed:
-        law = check.laws[name]
-        assert not law.holds and law.why and law.note and not law.skipped
+@pytest.mark.parametrize("name", [*specimens.MISTAKES, *specimens.CHANGES])
+def test_each_mistake_fails_its_own_laws(name: str, registered, capsys) -> None:
+    if name in specimens.MISTAKES:
+        given, laws = {"type": "specimen", "mistake": name}, specimens.MISTAKES[name]
+    else:
+        nested, _, _, laws = specimens.CHANGES[name]
+        given = {"type": "changed", "change": name, "nested": nested}
+    # reciprocity and components cost least, and fail for many mistakes by mistake
+    check = mrt.check_bsdf(given, quick=True, only={*laws, "reciprocity", "components"})
+    assert set(check.failed) == laws, str(check)
+    for law in (check.laws[name] for name in check.failed):
+        assert law.why and law.note and not law.skipped
         run(law.snippet)
         assert capsys.readouterr().out
-
-
-@pytest.mark.parametrize("name", specimens.CHANGES)
-def test_each_change_of_a_sound_bsdf_fails_its_own_laws(name: str, registered) -> None:
-    nested, _, _, laws = specimens.CHANGES[name]
-    check = mrt.check_bsdf({"type": "changed", "change": name, "nested": nested}, quick=True)
-    assert set(check.failed) == laws, str(check)
-
-
-def test_the_detached_parameter_is_named(registered) -> None:
-    check = mrt.check_bsdf(
-        {"type": "specimen", "mistake": "detached gradient"}, quick=True, only=["gradients"]
-    )
-    assert "detached: alpha" in check.laws["gradients"].note
+    if name == "detached gradient":
+        assert "detached: alpha" in check.laws["gradients"].note
 
 
 # -------------------------------------------- Mitsuba's BSDFs ---------------------------------------------
@@ -118,9 +114,7 @@ BARE = {"diffuse_reflectance": 0.0, "fresnel": "unity"}
 @pytest.mark.parametrize(
     ("name", "alpha", "given"),
     [
-        ("roughdielectric", 1e-4, {}),
         ("roughconductor", 1e-4, {}),
-        ("mrt_bsdf", 1e-5, BARE),
         ("mrt_bsdf", 1e-6, BARE),
         ("mrt_bsdf", 1e-8, BARE),
     ],
@@ -132,22 +126,15 @@ def test_a_lobe_at_the_least_roughness(name: str, alpha: float, given: dict[str,
     holds(mrt.check_bsdf(bsdf, only=["weights"]))  # at 89 degrees, where a lobe is 60 times as narrow
 
 
-def test_a_texture_that_loading_uses_up(registered) -> None:
+def test_a_texture_that_loading_uses_up() -> None:
     bumps = mi.TensorXf(np.random.default_rng(0).random((8, 8, 1)).astype(np.float32))
     bumpy = {"type": "bumpmap", "texture": {"type": "bitmap", "raw": True, "data": bumps}, "scale": 0.02}
-    check = mrt.check_bsdf({**bumpy, "bsdf": {"type": "diffuse"}}, quick=True)
     # shading normals break reciprocity whoever computes them (Veach 1997, § 5.3)
-    assert set(check.failed) <= {"reciprocity"}, str(check)
+    only = ["weights", "components", "variants", "switch"]
+    holds(mrt.check_bsdf({**bumpy, "bsdf": {"type": "diffuse"}}, quick=True, only=only))
 
 
-# ---------------------------------------- Instances and variants ------------------------------------------
-
-
-def test_an_instance_skips_what_has_to_load_it(registered) -> None:
-    check = mrt.check_bsdf(mi.load_dict({"type": "specimen"}), quick=True)
-    holds(check)
-    assert "loaded object" in check.laws["variants"].skipped
-    assert not check.laws["switch"].skipped
+# ---------------------------------------- Variants, time and settings -------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -173,7 +160,7 @@ def test_other_variants(variant: str, bsdf: dict[str, Any]) -> None:
 def test_kernels_do_not_depend_on_numbers() -> None:
     """Of cells, samples or their places in memory: a check by another seed finds every kernel compiled."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        for seed in range(3):
+        for seed in range(2):
             dr.kernel_history_clear()
             mrt.check_bsdf({"type": "roughconductor"}, quick=True, seed=seed)
             launched = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
@@ -252,4 +239,4 @@ def test_noise_is_found_without_a_reference(formula: Any, alpha: float) -> None:
     found = noise.measure(density, np.concatenate([few.wi, few.wo], axis=1))
     error = np.abs(found.value / truth["d"][here] - 1) / noise.ROUNDING
     assert 1 / 3 < np.nanmedian(found.noise) / (1.5 * np.median(error)) < 3
-    assert (np.nanquantile(found.lost(noise.ALLOWANCE), 0.9) > noise.LOST) == (formula is report)
+    assert (np.nanquantile(found.lost, 0.9) > noise.LOST) == (formula is report)

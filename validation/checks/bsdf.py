@@ -1,6 +1,7 @@
 """``check_bsdf``: the laws that any BSDF must obey, stock or in Python, reflecting or transmitting.
 
-A new law is a function of ``Law`` and ``Case``, here or in the module of its kind, and a row of ``LAWS``.
+A new law is a function of ``Law`` and ``Case`` and a row of ``LAWS``. Its docstring states it; ``figures``
+are what it measures, each with its statistic, limit, reason, and the snippet that shows the worst case.
 """
 
 from __future__ import annotations
@@ -10,17 +11,36 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from scipy import stats
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, excess
+from mrt_mitsuba.validation.checks import noise
+from mrt_mitsuba.validation.checks.bsdf_case import (
+    FIT,
+    POINTWISE,
+    Case,
+    View,
+    changed,
+    live,
+    narrow,
+    parameters,
+)
 from mrt_mitsuba.validation.checks.bsdf_gradients import gradients
-from mrt_mitsuba.validation.checks.bsdf_lobes import components
-from mrt_mitsuba.validation.checks.bsdf_samples import energy, sampling, weights
-from mrt_mitsuba.validation.checks.bsdf_values import eval_pdf, finite, reciprocity, roundoff
-from mrt_mitsuba.validation.checks.law import TIMEOUT, Check, Law, Skip, examine, settings_restored
-from mrt_mitsuba.validation.checks.probe import Probe
-from mrt_mitsuba.validation.checks.recipe import elsewhere, other_kind
+from mrt_mitsuba.validation.checks.law import LEVEL, RARE, SIGMAS, TIMEOUT, Check, Law, Skip, examine, figures
+from mrt_mitsuba.validation.checks.probe import (
+    BEYOND,
+    ROUNDED,
+    Array,
+    Probe,
+    context,
+    direction,
+    excess,
+    is_scalar,
+    unit,
+)
+from mrt_mitsuba.validation.checks.sphere import Cells, chi_square, encode, integrate
+from mrt_mitsuba.validation.checks.subject import elsewhere, other_kind
+from mrt_mitsuba.validation.tools.image_tests import sidak
 
 
 def check_bsdf(
@@ -37,25 +57,562 @@ def check_bsdf(
     fails that is not done. A loaded BSDF skips what has to load it again. Raises ``UsageError`` for anything
     else, and ``SceneError`` for a dict that Mitsuba cannot load.
     """
-    runtime.use()
-    with settings_restored():
-        case = Case(bsdf, quick, seed)
-        if not isinstance(case.plugin, mi.BSDF):
-            kind = type(case.plugin).__name__
-            raise UsageError(f"{kind} is not a BSDF of {mi.variant()}: give a dict or a loaded BSDF")
-        return examine(case.name, case, LAWS, only=only, quick=quick, timeout=timeout)
+    return examine(Case, bsdf, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
 
+
+# ---------------------------------------------- Samples --------------------------------------------------
+
+UNRESOLVED = "neither float32 directions nor the samples resolve the lobe"
+SMALL, BROAD = 7, 20.0  # level of cells of a degree; a density per steradian: lobes are then wide against one
+GRAZING = (83, 86, 88, 89.5, 94, 92, 90.5)  # degrees
+
+SAMPLING = """point draw
+r0, r1, phi0, phi1, side = {cell}  # a cell: sqrt(1 - |cos|) and azimuth from ... to, and which hemisphere
+r, phi = dr.sqrt((bs.wo.x**2 + bs.wo.y**2) / (1 + dr.abs(bs.wo.z))), dr.atan2(bs.wo.y, bs.wo.x)
+inside = (r >= r0) & (r < r1) & (phi >= phi0) & (phi < phi1) & (bs.wo.z * side > 0)
+inside &= (bsdf.pdf(ctx, si, bs.wo) > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+r, phi = r0 + (r1 - r0) * rng.next_float32(), phi0 + (phi1 - phi0) * rng.next_float32()
+sin = r * dr.sqrt(2 - r * r)
+wo = mi.Vector3f(sin * dr.cos(phi), sin * dr.sin(phi), side * (1 - r * r))
+density = dr.mean(bsdf.pdf(ctx, si, wo) * 2 * r)[0] * (r1 - r0) * (phi1 - phi0)
+print("share of samples in the cell:", dr.count(inside)[0] / n, "pdf() says:", density)
+"""
+NORMALISED = """point draw
+smooth = (bsdf.pdf(ctx, si, bs.wo) > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+print("share of samples that pdf() stands for:", dr.count(smooth)[0] / n)
+wo = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+print("integral of pdf() by uniform directions:", dr.mean(bsdf.pdf(ctx, si, wo))[0] * 4 * dr.pi)
+"""
+
+
+@figures(
+    cells=("at least", "chance of such counts if samples follow pdf(), the least of {angles} angles, for "
+           "their number", LEVEL, RARE, SAMPLING),
+    integral=("at most", f"integral of pdf() less the share of samples it stands for, beyond {SIGMAS} "
+              "standard errors", FIT, "rational fits of Smith's G1 in use are off by 0.35 %", NORMALISED),
+    small=("at least", "chance of such counts of all angles in cells of a degree, for their number",
+           LEVEL, RARE, SAMPLING),
+)  # fmt: skip
+def sampling(law: Law, case: Case) -> None:
+    """Samples against the density: ∫ pdf dω over a cell is the share of samples in it (Pearson's χ²).
+
+    In whole cells of equal counts over both hemispheres; in a full check also in small ones, for faults
+    in one place at any incidence.
+    """
+    case.need_smooth()
+    tests, sums, beyond = [], np.zeros((6, 2)), []
+    for view, found in case.densities:
+        if found is None:
+            continue
+        (codes, share), count = view.judged, len(view.density) - view.pilot
+        by_width, cell = chi_square(found, codes, count, 0.5 * FIT)
+        sums += by_width
+        tests += [(float(stats.chi2.sf(*test)), view, cell) for test in by_width]
+        off = np.sqrt(share * (1 - share) / count + found.variance.sum())
+        beyond.append((max(abs(share - found.mean.sum()) - SIGMAS * off, 0), view))
+    if not tests:
+        raise Skip(f"{UNRESOLVED} at every angle")
+    p, view, cell = min(tests, key=lambda test: test[0])
+    p = sidak(min(p, *stats.chi2.sf(*sums.T)), len(tests) + len(sums))  # of all angles together, too
+    law.hold("cells", p, wi=view.wi, uv=view.uv, cell=cell, angles=len(beyond))
+    most, view = max(beyond, key=lambda pair: pair[0])
+    law.hold("integral", most, wi=view.wi, uv=view.uv)
+    views = [view for view in case.views if 0 < view.density.max() < BROAD]
+    if views and not case.quick and not is_scalar():
+        _in_small_cells(law, case, views)
+    if len(beyond) < len(case.views):
+        law.notes.append(f"{UNRESOLVED} at {len(case.views) - len(beyond)} angles, which are left out")
+
+
+def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
+    cells = Cells.around(np.zeros(0, np.int64), 0, SMALL)
+    wo, omega = cells.points(case.rng)
+    seen, expected, variance = np.zeros((3, len(omega)))
+    for view in views:
+        seen += np.bincount(cells.find(encode(view.samples.wo[view.density > 0])), minlength=len(omega))
+        pdf = case.pdf(view.wi, wo.reshape(-1, 3), view.uv).reshape(omega.shape) * omega
+        count = len(view.density) * omega.shape[1]
+        expected, variance = expected + count * pdf.mean(axis=1), variance + count**2 * pdf.var(axis=1)
+    known = 3 * np.sqrt(variance / (omega.shape[1] - 1)) + FIT * expected  # is no Poisson's
+    many, few = stats.poisson.sf(seen - 1, expected + known), stats.poisson.cdf(seen, expected - known)
+    p = np.where(np.isfinite(expected), np.minimum(many, np.where(expected > known, few, 1)), 1)
+    view, cell = max(views, key=lambda v: v.wi[2]), cells.bounds(int(p.argmin()))
+    law.hold("small", sidak(float(p.min()), 2 * len(p)), wi=view.wi, uv=view.uv, cell=cell)
+
+
+WEIGHT = """point sample
+pdf = bsdf.pdf(ctx, si, bs.wo)
+print("a sample of density", bs.pdf, "weight", weight, "and index of refraction", bs.eta)
+print("there, pdf():", pdf, "eval() / pdf():", bsdf.eval(ctx, si, bs.wo) / pdf)
+"""
+DISCRETE = """point draw
+component, stated = np.array(bs.sampled_component), np.array(bs.pdf)
+delta = np.array(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta))
+for i in np.unique(component[delta]):
+    here = delta & (component == i)
+    print("component", i, "states a probability of", stated[here].mean(), "and its share is", here.mean())
+"""
+AGAIN = "the same formula, evaluated once more at a rounded direction"
+
+
+@figures(
+    density=("most", f"density of a sample against pdf(), {BEYOND}", POINTWISE, AGAIN, WEIGHT),
+    weight=("most", f"weight of a sample against eval() / pdf(), {BEYOND}", POINTWISE, AGAIN, WEIGHT),
+    discrete=("at most", f"probability of a single direction (delta) less its share, beyond {SIGMAS} "
+              "standard errors", POINTWISE, "a count", DISCRETE),
+)  # fmt: skip
+def weights(law: Law, case: Case) -> None:
+    """Density and weight of a sample are ``pdf`` and ``eval`` / ``pdf`` of its direction.
+
+    Of lobes of one direction, the density is the probability with which they are drawn.
+    """
+    drawn, names = case.drawn
+    at = names["wi"], np.where(np.isfinite(drawn.wo), drawn.wo, 1), names["uv"]
+    counts = live(names["wi"], drawn, *case.both(*at)) | drawn.lit & ~drawn.delta
+    few = slice(0, len(drawn.pdf) // len(case.views))
+    counts &= ~np.concatenate([narrow(v.wi, v.samples.only(few)) for v in case.views])
+
+    def ratio(i: Array, o: Array, t: Array) -> Array:
+        value, pdf = case.both(i, o, t)
+        return value / np.where(pdf > 0, pdf, np.inf)[:, None]
+
+    if not drawn.delta.all():
+        for name, stated, function in (("density", drawn.pdf, case.pdf), ("weight", drawn.weight, ratio)):
+            error = excess(stated, function(*at), case.spread(function, *at))
+            law.hold(name, np.where(counts, error, 0), **names)
+    off = []
+    for view in case.views:
+        s = view.samples
+        for kind in np.unique(s.component[s.delta] * 4096 + s.type[s.delta]):
+            here = s.delta & (s.component * 4096 + s.type == kind)
+            stated = float(np.nan_to_num(s.pdf[here].mean()))
+            error = np.sqrt(max(stated * (1 - stated), 0) / len(here))
+            if s.lit[here].any():
+                off.append((max(abs(here.mean() - stated) - SIGMAS * error, 0), view))
+    if off:
+        most, view = max(off, key=lambda pair: pair[0])
+        law.hold("discrete", most, wi=view.wi, uv=view.uv)
+    if not law.parts:
+        raise Skip("no direction of incidence has samples")
+
+
+ALBEDO = """point importance draw
+print("albedo by samples:", dr.mean(weight, axis=1))
+smooth = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), 0, weight)
+print("without lobes of one direction:", dr.mean(smooth, axis=1))
+wo = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+print("these by uniform directions:", dr.mean(bsdf.eval(ctx, si, wo), axis=1) * 4 * dr.pi)
+"""
+
+
+@figures(
+    largest=("at most", f"largest albedo, less {SIGMAS} standard errors", 1 + FIT,
+             "no more light leaves than arrives; 0.5 % for fits of G1", ALBEDO),
+    apart=("at most", "albedo by quadrature of eval() against mean weight, relative, beyond "
+           f"{SIGMAS} standard errors", 2 * FIT, "0.5 % for fits of G1 in the density", ALBEDO),
+)  # fmt: skip
+def energy(law: Law, case: Case) -> None:
+    """The albedo ∫ f |cos θo| dωo is at most 1, and the same by samples and by quadrature.
+
+    In the mode of importance, in which transmitted energy is not rescaled.
+    """
+    # that surely reached near the horizon, where lobes peak, by samples alone
+    count, brightest, apart = case.count(2**12, 2**14), [], []
+    for angle in GRAZING:
+        wi, uv = direction(np.cos(np.radians(angle)), case.rng.uniform(0, 2 * np.pi)), case.uniform(2)
+        drawn = case.sample(wi, case.uniform(count, 3), uv, context(importance=True))
+        mean, error = _mean(drawn.weight)
+        brightest.append((float((mean - SIGMAS * error).max()), wi, uv))
+    for view, density in case.densities:
+        albedo, off = _albedo(case, view, density)
+        brightest.append((albedo, view.wi, view.uv))
+        if off is not None:
+            apart.append((off, view))
+    albedo, wi, uv = max(brightest, key=lambda found: found[0])
+    law.hold("largest", albedo, wi=wi, uv=uv)
+    if apart:
+        most, view = max(apart, key=lambda found: found[0])
+        law.hold("apart", most, wi=view.wi, uv=view.uv)
+
+
+def _mean(weight: Array) -> tuple[Array, Array]:
+    """Return the mean of finite weights [N, channels], and its standard error."""
+    weight = np.nan_to_num(weight, posinf=0, neginf=0).astype(np.float64)
+    return weight.mean(axis=0), weight.std(axis=0) / np.sqrt(len(weight))
+
+
+def _albedo(case: Case, view: View, cells: Cells | None) -> tuple[float, float | None]:
+    """Return an albedo that is surely reached, and by how much sampling and quadrature differ, if known."""
+    mode, count, drawn, holes = context(importance=True), len(view.density), view.samples, []
+    if (drawn.wo[:, 2] * view.wi[2] < 0).any():
+        drawn = case.sample(view.wi, case.uniform(count, 3), view.uv, mode)
+    mean, error = _mean(drawn.weight)
+    least = float((mean - SIGMAS * error).max())
+    if cells is None:
+        return least, None
+
+    def value(wo: Array) -> Array:
+        values = case.eval(view.wi, wo, view.uv, mode)
+        holes.append(float(np.mean(~np.isfinite(values))))
+        return values
+
+    smooth = np.where(drawn.delta[:, None], 0, np.nan_to_num(drawn.weight, posinf=0, neginf=0))
+    found = integrate(value, cells, case.rng, encode(drawn.wo), smooth[:, 0], count)
+    by_samples, error = _mean(smooth)
+    by_cells, other = found.mean.sum(axis=0), np.sqrt(found.variance.sum(axis=0))
+    least = max(least, float((by_cells + mean - by_samples - SIGMAS * (error + other)).max()))
+    both = np.maximum(np.maximum(by_samples, by_cells), 1e-3)
+    off = np.maximum(np.abs(by_samples - by_cells) - SIGMAS * np.hypot(error, other), 0) / both
+    return least, float(off.max()) if max(holes) < 0.01 else None  # else the law ``finite`` says why
+
+
+# ----------------------------------------------- Values --------------------------------------------------
+
+PAIR = """point wo
+print("eval_pdf():", bsdf.eval_pdf(ctx, si, wo))
+print("eval():", bsdf.eval(ctx, si, wo), "pdf():", bsdf.pdf(ctx, si, wo))
+"""
+INACTIVE = """point wo
+print("a lane switched off:", bsdf.eval(ctx, si, wo, False), "should be 0")
+"""
+TWO_WAYS = "two ways to the same number"
+
+
+@figures(
+    value=("most", f"value of eval_pdf() against that of eval(), {BEYOND}", 1e-4, TWO_WAYS, PAIR),
+    density=("most", f"density of eval_pdf() against that of pdf(), {BEYOND}", 1e-4, TWO_WAYS, PAIR),
+    inactive=("none", "values that are not 0 where active is False", 0,
+              "a sum over lanes must not hold those that are switched off", INACTIVE),
+)  # fmt: skip
+def eval_pdf(law: Law, case: Case) -> None:
+    """``eval_pdf`` is ``eval`` and ``pdf``; both ways to a value are 0 where ``active`` is False.
+
+    Densities need not be: half of Mitsuba's plugins state one in any lane.
+    """
+    case.need_smooth()
+    p, bsdf = case.pairs, case.plugin
+    value, pdf = case.pair(p.wi, p.wo, p.uv)
+    law.hold("value", excess(value, p.value, case.spread(case.eval, p.wi, p.wo, p.uv)), **vars(p))
+    law.hold("density", excess(pdf, p.pdf, case.spread(case.pdf, p.wi, p.wo, p.uv)), **vars(p))
+    if not is_scalar():  # where Mitsuba takes ``active`` out of its plugins
+
+        def inactive(c: Any, si: Any, o: Any) -> list[Any]:
+            off = o.z > 2  # no lane
+            return [bsdf.eval(c, si, o, off), bsdf.eval_pdf(c, si, o, off)[0]]
+
+        values = np.concatenate(case.ask(inactive, p.wi, p.wo, p.uv), axis=1)
+        law.hold("inactive", (values != 0).any(axis=1), **vars(p))
+
+
+RECIPROCITY = """point wo
+eta = {eta}  # index of refraction at wo over that at wi
+forth = bsdf.eval(ctx, si, wo) / dr.abs(wo.z) * eta**2
+si.wi, wo = wo, si.wi
+back = bsdf.eval(ctx, si, wo) / dr.abs(wo.z)
+print(forth, "should be", back)
+"""
+MODES = """point wo
+eta = {eta}  # index of refraction at wo over that at wi
+print("radiance, times eta^2:", bsdf.eval(ctx, si, wo) * eta**2)
+print("importance:", bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), si, wo))
+"""
+DELTA_RECIPROCITY = """point
+# the way back should lead to where it came from, with the same product
+for u in (({u}), ({back})):
+    bs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))
+    print(si.wi, "->", bs.wo, "probability x weight x eta^2:", bs.pdf * weight * bs.eta**2)
+    si.wi = bs.wo
+"""
+EITHER_WAY = "light can be followed either way; transmitted radiance scales by the squared index"
+
+
+@figures(
+    swapped=("most", f"f(wi, wo) against f(wo, wi), {BEYOND}", POINTWISE, EITHER_WAY, RECIPROCITY),
+    modes=("most", f"f in the mode of radiance against that of importance, {BEYOND}", POINTWISE, EITHER_WAY,
+           MODES),
+    medium=("most", "index of refraction of reflected samples, less 1", ROUNDED, "one medium", WEIGHT),
+    returns=("at least", "share of single directions (delta) that the way back returns to", 0.05,
+             "light can be followed either way; of several directions, the way back may draw another",
+             DELTA_RECIPROCITY),
+    single=("most", f"probability x weight x eta^2 of a single direction (delta) against the way "
+            f"back, {BEYOND}", POINTWISE, EITHER_WAY, DELTA_RECIPROCITY),
+    single_modes=("most", "weight of a single direction (delta) x eta^2 against the mode of "
+                  "importance, relative", POINTWISE, EITHER_WAY, DELTA_RECIPROCITY),
+)  # fmt: skip
+def reciprocity(law: Law, case: Case) -> None:
+    """f(ωi, ωo) η_o² = f(ωo, ωi) η_i², with the indices of the media that the directions are in.
+
+    E. Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, § 5.2.
+    """
+    if case.smooth:
+        few = case.pairs.only(np.abs(case.pairs.wi[:, 2] * case.pairs.wo[:, 2]) > 1e-3)
+
+        def forth(i: Array, o: Array, t: Array, eta: Array) -> Array:
+            return case.eval(i, o, t) / np.abs(o[:, 2:]) * eta[:, None] ** 2
+
+        def back(i: Array, o: Array, t: Array, eta: Array) -> Array:
+            return case.eval(o, i, t) / np.abs(i[:, 2:])
+
+        def importance(i: Array, o: Array, t: Array, eta: Array) -> Array:
+            return case.eval(i, o, t, context(importance=True)) / np.abs(o[:, 2:])
+
+        at = few.wi, few.wo, few.uv, few.eta
+        one, allowed = forth(*at), case.spread(forth, *at)
+        for name, other in (("swapped", back), ("modes", importance)):
+            law.hold(name, excess(one, other(*at), allowed + case.spread(other, *at)), **vars(few))
+    _delta_either_way(law, case)
+    # light that is reflected stays in its medium: integrators multiply by ``eta`` as they go
+    s, names = case.drawn
+    reflected = ((s.type & int(mi.BSDFFlags.Reflection)) != 0) & s.lit
+    if reflected.any():
+        law.hold("medium", np.where(reflected, np.nan_to_num(np.abs(s.eta - 1), nan=np.inf), 0), **names)
+    if not law.parts:
+        raise Skip("no light was followed either way")
+
+
+def _delta_either_way(law: Law, case: Case) -> None:
+    """Lobes of one direction: probability × weight × η² of a sample, and of the one that goes back."""
+    count = case.count(2**13, 2**15)
+    wi, uv = case.units(count), case.uniform(count, 2)
+    u, v = case.uniform(count, 3), case.uniform(count, 3)
+    there = case.sample(wi, u, uv)
+    wo = unit(np.where(np.isfinite(there.wo), there.wo, 1))
+    back = case.sample(wo, v, uv)
+    same = there.delta & (there.type == back.type) & (there.component == back.component)
+    same &= np.abs(wi[:, 2] * wo[:, 2]) > 1e-3
+    returned = (np.abs(unit(back.wo) - wi) < 1e-3).all(axis=1)
+    if same.sum() < 20:
+        return
+    names, lost = {"wi": wi, "uv": uv, "u": u, "back": v}, int((same & ~returned).argmax())
+    law.hold("returns", returned[same].mean(), **{name: row[lost] for name, row in names.items()})
+
+    def followed(i: Array, _: Array, t: Array, u: Array) -> Array:
+        s = case.sample(i, u, t)
+        return s.weight * (s.pdf * s.eta.astype(np.float64) ** 2)[:, None]
+
+    ways = (wi, wo, uv, u), (wo, wi, uv, v)
+    # next to total reflection, a rounding of the direction is a percent of what is transmitted
+    allowed = case.spread(followed, *ways[0]) + case.spread(followed, *ways[1])
+    error = excess(followed(*ways[0]), followed(*ways[1]), allowed)
+    law.hold("single", np.where(same & returned, error, 0), **names)
+    other = case.sample(wi, u, uv, context(importance=True))  # by the same random numbers
+    alike = there.delta & (np.abs(other.wo - there.wo) < 1e-3).all(axis=1)
+    error = excess(there.weight * there.eta[:, None] ** 2, other.weight)
+    law.hold("single_modes", np.where(alike, error, 0), **names)
+
+
+# A dot product of float32 vectors is rarely less than 1e-7
+COSINES = (1, 1 - 6e-8, 0.5, 1e-2, 1e-4, 1e-7, 0)
+INDICES = ("eta", "k", "int_ior", "ext_ior")
+UNIFORM = (0, 2.0**-24, 0.5, 1 - 2.0**-24)
+
+FINITE = """point wo setting
+print("eval():", bsdf.eval(ctx, si, wo), "pdf():", bsdf.pdf(ctx, si, wo))
+"""
+FINITE_SAMPLE = """point setting sample
+print("weight:", weight, "density:", bs.pdf, "direction:", bs.wo)
+"""
+WRONG, SPOILS = "results not finite, or negative{where}: {faults}", "one such number spoils a picture"
+
+
+@figures(
+    values=("at most", WRONG, 0, SPOILS, FINITE),
+    samples=("at most", WRONG, 0, SPOILS, FINITE_SAMPLE),
+)  # fmt: skip
+def finite(law: Law, case: Case) -> None:
+    """No NaN, no infinity, nothing negative: extreme directions, random numbers and parameters."""
+    cosines = np.array([s * c for c in COSINES for s in (1, -1)])
+    pool = direction(np.repeat(cosines, 6), np.tile([0, np.pi / 2, np.pi, -np.pi / 2, 0.7, 4], len(cosines)))
+    rng, count = case.rng, case.count(2**14, 2**17)
+    wi, any_ = pool[rng.integers(len(pool), size=(2, count))]
+    wo = np.choose(rng.integers(4, size=count)[:, None], [any_, wi * np.float32([-1, -1, 1]), -wi, wi])
+    u = np.where(rng.random((count, 3)) < 0.6, rng.choice(UNIFORM, (count, 3)), case.uniform(count, 3))
+    uv = np.where(rng.random((count, 2)) < 0.3, rng.integers(0, 2, (count, 2)), rng.random((count, 2)))
+    extremes = wi, wo, u.astype(np.float32), uv.astype(np.float32)
+    known = _finite(law, case, extremes, np.zeros((6, count), bool))
+    for key, value in parameters(case):
+        # the ends of its likely range, one at a time
+        number, name = float(np.mean(np.array(value))), key.removesuffix(".value").removesuffix(".values")
+        if name.split(".")[-1] in INDICES and (number <= 1 or key.endswith(".values")):
+            ends = 0.5 * number, 2.0 * number  # of metals: 0 makes no sense there
+        else:
+            ends = (0.0, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)
+        for end in ends:
+            copy = case.copy()
+            with changed(copy, key, lambda old, end=end: type(old)(old * 0 + end)):
+                _finite(law, copy, extremes, known, (key, end))
+    law.parts = [part for part in law.parts if not part.holds] or law.parts[:1]
+
+
+def _finite(law: Law, case: Case, extremes: tuple, known: Array, setting: tuple | None = None) -> Array:
+    """Count faults that are not known yet; return where they are, by kind. [6, N]"""
+    wi, wo, u, uv = extremes
+    value, pdf = case.both(wi, wo, uv)
+    together, s = case.pair(wi, wo, uv), case.sample(wi, u, uv)
+    length = np.linalg.norm(s.wo.astype(np.float64), axis=1)
+
+    def bad(values: Array) -> Array:
+        return ~(np.isfinite(values) & (values >= 0)).reshape(len(values), -1).all(axis=1)
+
+    kinds = {
+        "eval()": bad(value),
+        "pdf()": bad(pdf),
+        "eval_pdf()": bad(together[0]) | bad(together[1]),
+        "weights of samples": bad(s.weight),
+        "densities of samples": s.lit & bad(s.pdf),  # where the weight is 0, nothing more is read
+        "directions of samples": s.lit & ~(np.abs(length - 1) < 1e-3),
+    }
+    faults = np.array(list(kinds.values()))
+    new = faults & ~known
+    kind, i = np.unravel_index(int(new.argmax()), new.shape)
+    named = [f"{name} {n}" for name, n in zip(kinds, new.sum(axis=1), strict=True) if n]
+    names = {
+        **{"wi": wi[i], "uv": uv[i], "wo": wo[i], "u": u[i], "setting": setting},
+        "where": f" with {setting[0]} = {setting[1]:g}" if setting else "",
+        "faults": ", ".join(named) or "none",
+    }
+    law.hold("samples" if kind > 2 else "values", new.sum(), **names)
+    return faults
+
+
+NOISE = """point wo
+for k in range(9):  # float32 steps in all components: a smooth function would change evenly
+    x = (np.array([{wo}], np.float32).view(np.int32) + {stride} * k).view(np.float32)
+    print(np.ravel(bsdf.{function}(ctx, si, mi.Vector3f(*map(float, x)))))
+"""
+
+
+@figures(lost=(0.9, "noise of {function}() over that of 8 roundings with rounded directions, 9 in 10",
+               noise.LOST, "sound formulas stay below 1.6; beyond, digits are lost", NOISE))  # fmt: skip
+def roundoff(law: Law, case: Case) -> None:
+    """Noise of float32 evaluation beyond what the rounding of the directions explains (``noise``)."""
+    case.need_smooth()
+    lit = case.pairs.only((np.abs(case.pairs.wi[:, 2]) > 0.1) & (np.abs(case.pairs.wo[:, 2]) > 0.1))
+    # far off a lobe, an exponent of 40 makes 40 roundings of one: of nothing
+    lit = lit.only((lit.pdf > 1e-3) & (lit.value.max(axis=1) > 1e-20))
+    few = lit.only(slice(0, case.count(500, 2000)))
+    if len(few.pdf) < 20:
+        raise Skip("too few pairs of directions with a value")
+
+    def on_spheres(x: Array) -> Array:
+        return np.concatenate([unit(x[:, :3].astype(np.float64)), unit(x[:, 3:].astype(np.float64))], axis=1)
+
+    inputs = np.concatenate([few.wi, few.wo], axis=1)
+    for name, function in (("eval", lambda *at: case.eval(*at).max(axis=1)), ("pdf", case.pdf)):
+
+        def at(x: Array, function: Any = function) -> Array:
+            return function(x[:, :3], x[:, 3:], np.tile(few.uv, (len(x) // len(few.uv), 1)))
+
+        found = noise.measure(at, inputs, seed=case.seed, project=on_spheres)
+        if np.isnan(found.noise).mean() > 0.25:
+            raise Skip("values change too fast for float32 steps to tell noise")
+        law.hold("lost", found.lost, function=name, stride=found.stride, **vars(few))
+        if not law.parts[-1].holds:
+            law.notes.append(
+                f"{name}(): noise of {np.nanquantile(found.noise, 0.9):.3g} roundings (2^-24), "
+                f"of which directions explain {np.median(found.explained):.3g}"
+            )
+
+
+# --------------------------------------------- Components ------------------------------------------------
+
+FLAGS = """
+print("flags of the components:", [hex(int(bsdf.flags(i))) for i in range(bsdf.component_count())])
+print("flags of the whole:", hex(int(bsdf.flags())))
+"""
+UPDATED = """
+params = mi.traverse(bsdf)
+print("components before:", bsdf.component_count())
+for key in {keys}:
+    params[key] = 0.9 * params[key]
+params.update()
+print("and after params.update():", bsdf.component_count())
+"""
+PARTS = """point wo
+print("whole:", bsdf.eval(ctx, si, wo))
+for i in range(bsdf.component_count()):
+    ctx.component = i
+    print("component", i, bsdf.eval(ctx, si, wo))
+"""
+SIDE = """point wo component
+print("value:", bsdf.eval(ctx, si, wo), "flags:", hex(int(bsdf.flags(ctx.component))))
+"""
+SAMPLE = """point component sample
+print("flags:", hex(int(bsdf.flags(ctx.component))))
+print("sample:", bs, "weight:", weight)
+"""
+SIDES = "reflection stays on its side, transmission crosses, lobes of one direction have no value"
+
+
+@figures(
+    flags=("at most", "flags of the whole that no component has, or the other way around", 0,
+           "flags() is the union of flags(i)", FLAGS),
+    updated=("at most", "components more or fewer after params.update()", 0,
+             "an update says nothing about lobes", UPDATED),
+    sum=("most", "sum of the components against the whole, relative", 1e-4, "a sum", PARTS),
+    values=("none", "results of eval() that contradict the flags of component {component}", 0, SIDES, SIDE),
+    samples=("none", "results of sample() that contradict the flags of component {component}", 0, SIDES,
+             SAMPLE),
+    dark=("at most", "sides that a component's flags name, and from which it is black", 0,
+          "a flag without a lobe", FLAGS),
+)  # fmt: skip
+def components(law: Law, case: Case) -> None:
+    """Flags of components say what they do; f = Σ fᵢ; ``ctx.component`` selects."""
+    bsdf, p = case.plugin, case.pairs
+    flags = [int(bsdf.flags(i)) for i in range(bsdf.component_count())]
+    law.hold("flags", bin(np.bitwise_or.reduce(flags or [0]) ^ int(bsdf.flags())).count("1"))
+    if case.description is not None:
+        copy, keys = case.load(), [key for key, _ in parameters(case)]
+        params = mi.traverse(copy)
+        for key, value in parameters(case):
+            params[key] = type(value)(value)
+        params.update()
+        law.hold("updated", abs(copy.component_count() - len(flags)), keys=keys)
+    parts, dark = [case.eval(p.wi, p.wo, p.uv, context(i)) for i in range(len(flags))], 0
+    error = excess(np.sum(parts, axis=0), p.value, case.spread(case.eval, p.wi, p.wo, p.uv))
+    law.hold("sum", error, **vars(p))
+    for i, (flag, value) in enumerate(zip(flags, parts, strict=True)):
+        lit = (value != 0).any(axis=1)
+        bad = lit & np.isfinite(value).all(axis=1) & ~_allowed(flag, p.wi, p.wo, smooth=True)
+        law.hold("values", bad, component=i, **vars(p))
+        # samples of one component that go by another name, kind or side
+        count = case.count(2**12, 2**14)
+        wi, u, uv = case.units(count), case.uniform(count, 3), case.uniform(count, 2)
+        s = case.sample(wi, u, uv, context(i))
+        drawn = s.lit & np.isfinite(s.weight).all(axis=1)
+        bad = (s.component != i) | ((s.type & ~flag) != 0) | (s.type == 0)
+        bad |= (np.abs(s.wo[:, 2]) > 1e-6) & ~_allowed(flag, wi, s.wo, smooth=False)
+        law.hold("samples", drawn & bad, component=i, wi=wi, uv=uv, u=u)
+        # sides that flags name and where there is no light, of a component that has some
+        z = np.concatenate([p.wi[lit, 2], wi[drawn, 2]])
+        sides = (mi.BSDFFlags.FrontSide, (z > 0).any()), (mi.BSDFFlags.BackSide, (z < 0).any())
+        dark += sum(bool(flag & int(side)) and len(z) > 0 and not seen for side, seen in sides)
+    law.hold("dark", dark)
+
+
+def _allowed(flags: int, wi: Array, wo: Array, *, smooth: bool) -> Array:
+    """Return where flags allow light; ``smooth``: but for single directions."""
+    f = mi.BSDFFlags
+    allowed = flags & ~int(f.Delta) if smooth else flags
+    same, other = (bool(allowed & int(kind)) for kind in (f.Reflection, f.Transmission))
+    front, back = bool(flags & int(f.FrontSide)), bool(flags & int(f.BackSide))
+    return np.where(wi[:, 2] * wo[:, 2] > 0, same, other) & np.where(wi[:, 2] > 0, front, back)
+
+
+# ---------------------------------------------- Variants -------------------------------------------------
 
 VALUES = "each"  # the snippet: value and density in several variants
 
 
+@figures(same=("most", "value and density in {other} against {here}, relative, beyond rounding", POINTWISE,
+               "the same formula", VALUES))  # fmt: skip
 def variants(law: Law, case: Case) -> None:
     """Values in the scalar variant, and in the spectral one where colours are grey."""
     here = mi.variant()
     case.load()
     few = case.pairs.only(slice(0, case.count(200, 800)))
     few = few.only(np.isfinite(few.value).all(axis=1))
-    of_value, of_pdf = (case.spread(f, few.wi, few.wo, few.uv) for f in (case.probe.eval, case.probe.pdf))
+    of_value, of_pdf = (case.spread(f, few.wi, few.wo, few.uv) for f in (case.eval, case.pdf))
     others = [other_kind()] if other_kind() in mi.variants() else []
     if here.endswith("_rgb"):
         if np.ptp(few.value, axis=1).max() <= 1e-5 * few.value.max():
@@ -68,26 +625,26 @@ def variants(law: Law, case: Case) -> None:
         except Skip as reason:
             law.notes.append(str(reason))
             continue
-        expected, spread = few.value, of_value
+        expected, allowed = few.value, of_value
         if not other.endswith("_rgb"):  # the mean of equal channels, however many there are
-            value, expected, spread = value.mean(axis=1), expected.mean(axis=1), spread.max(axis=1)
-        what = f"value and density in {other} against {here}, relative, beyond rounding"
-        error = np.maximum(excess(value, expected, spread), excess(pdf, few.pdf, of_pdf))
-        law.most(what, error, POINTWISE, "the same formula", case.at(VALUES, few, variants=(here, other)))
+            value, expected, allowed = value.mean(axis=1), expected.mean(axis=1), of_value.max(axis=1)
+        error = np.maximum(excess(value, expected, allowed), excess(pdf, few.pdf, of_pdf))
+        law.hold("same", error, variants=(here, other), other=other, here=here, **vars(few))
     if not law.parts:
         raise Skip("; ".join(law.notes) or "no other variant to compare with")
 
 
+@figures(same=("most", "values of the BSDF {which} after a switch to {other} and back, relative, beyond "
+               "rounding", 1e-4, "the same formula with the same numbers", VALUES))  # fmt: skip
 def switch(law: Law, case: Case) -> None:
     """Values after a switch to another variant and back, of the BSDF as it was and loaded anew."""
     here = mi.variant()
-    others = [v for v in ("scalar_rgb", *runtime.usable_variants()) if v != here]
+    other = next((v for v in ("scalar_rgb", *runtime.usable_variants()) if v != here), None)
     few = case.pairs.only(slice(0, case.count(1000, 1000)))
-    before = case.probe.both(few.wi, few.wo, few.uv)
-    allowed = [case.spread(f, few.wi, few.wo, few.uv) for f in (case.probe.eval, case.probe.pdf)]
-    if not others:
+    at = few.wi, few.wo, few.uv
+    before, allowed = case.both(*at), [case.spread(f, *at) for f in (case.eval, case.pdf)]
+    if other is None:
         raise Skip("there is no other variant to switch to")
-    other = others[0]
     mi.set_variant(other)
     mi.set_variant(here)
     candidates = {"that was loaded before": case.plugin}
@@ -96,11 +653,9 @@ def switch(law: Law, case: Case) -> None:
     else:
         law.notes.append("a loaded BSDF was given: it was not loaded anew")
     for which, bsdf in candidates.items():
-        after = Probe(bsdf).both(few.wi, few.wo, few.uv)
-        what = f"values of the BSDF {which} after a switch to {other} and back, relative, beyond rounding"
+        after = Probe(bsdf).both(*at)
         error = np.maximum(*(excess(*three) for three in zip(before, after, allowed, strict=True)))
-        show = case.at(VALUES, few, variants=(here, other, here))
-        law.most(what, error, 1e-4, "the same formula with the same numbers", show)
+        law.hold("same", error, which=which, other=other, variants=(here, other, here), **vars(few))
 
 
 LAWS = {

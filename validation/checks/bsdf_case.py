@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,19 +12,28 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.validation.checks import snippets
+from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.checks.law import Skip
-from mrt_mitsuba.validation.checks.probe import Array, Lanes, Probe, Samples, direction, is_scalar, unit
-from mrt_mitsuba.validation.checks.recipe import Subject, row
+from mrt_mitsuba.validation.checks.probe import (
+    ROUNDED,
+    Array,
+    Lanes,
+    Probe,
+    Samples,
+    direction,
+    is_scalar,
+    joined,
+    spread,
+    unit,
+)
 from mrt_mitsuba.validation.checks.sphere import DEPTH, POINTS, Cells, Integrals, encode, integrate
+from mrt_mitsuba.validation.checks.subject import Subject
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
 QUICK_ANGLES = (0, 50, 85, 140)
 FIT = 5e-3  # the rational fits of Smith's G₁ in use are off by up to 0.35 %, and the densities with them
 POINTWISE = 2e-3  # relative, beyond what rounding explains
-ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32
 OVERLOOKED = 0.02  # share of samples about which quadrature may know nothing; of lobes it resolves, 0.001
-BEYOND = "relative, beyond 8 times what the rounding of directions explains"  # as ``excess`` has it
 NARROW = 16 * ROUNDED  # width of a lobe that rounded directions do not resolve
 
 
@@ -49,10 +58,6 @@ class View:
         alive = self.density[self.pilot :] > 0
         return encode(self.samples.wo[self.pilot :][alive]), float(alive.mean())
 
-    def around(self, count: int) -> tuple[Array, Array]:
-        """Return ``wi`` and ``uv`` for so many lanes."""
-        return np.broadcast_to(self.wi, (count, 3)), np.broadcast_to(self.uv, (count, 2))
-
 
 @dataclass(frozen=True)
 class Pairs(Lanes):
@@ -66,41 +71,48 @@ class Pairs(Lanes):
     eta: Array  # index of refraction at wo over that at wi
 
 
-class Case(Subject):
+class Case(Subject, Probe):
     """A BSDF under examination, and what several laws need to know of it."""
+
+    word = "bsdf"
 
     def __init__(self, given: Any, quick: bool, seed: int) -> None:
         super().__init__(given, quick, seed)
-        self.probe = Probe(self.plugin)
-
-    def uniform(self, count: int) -> Array:
-        return self.rng.random((count, 3), np.float32)
+        if not isinstance(self.plugin, mi.BSDF):
+            kind = type(self.plugin).__name__
+            raise UsageError(f"{kind} is not a BSDF of {mi.variant()}: give a dict or a loaded BSDF")
 
     @cached_property
     def views(self) -> list[View]:
         """Samples at every angle of incidence, at random azimuths and texture coordinates."""
-        count = self.count(2**16, 2**19)
         found = []
         for angle in QUICK_ANGLES if self.quick else ANGLES:
             wi = direction(np.cos(np.radians(angle)), self.rng.uniform(0, 2 * np.pi))
-            uv, u = self.rng.random(2, np.float32), self.uniform(count)
-            wis, uvs = (np.broadcast_to(x, (count, len(x))) for x in (wi, uv))
-            samples = self.probe.sample(wis, u, uvs)
-            value, pdf = self.probe.both(wis, samples.wo, uvs)
+            uv, u = self.uniform(2), self.uniform(self.count(2**16, 2**19), 3)
+            samples = self.sample(wi, u, uv)
+            value, pdf = self.both(wi, samples.wo, uv)
             found.append(View(wi, uv, u, samples, np.where(live(wi, samples, value, pdf), pdf, 0)))
         return found
 
     @cached_property
+    def drawn(self) -> tuple[Samples, dict[str, Array]]:
+        """The first samples of all views, and what they were drawn with."""
+        few, views = slice(0, self.count(2**12, 2**13)), self.views
+        names = {"u": np.concatenate([view.u[few] for view in views])}
+        for name in ("wi", "uv"):
+            names[name] = np.concatenate([np.tile(getattr(v, name), (len(v.u[few]), 1)) for v in views])
+        return joined([view.samples.only(few) for view in views]), names
+
+    @cached_property
     def densities(self) -> list[tuple[View, Integrals | None]]:
         """The integrals of the density for each view, in cells that resolve it; None where none do."""
-        return [(view, self.integrals(view)) for view in self.views]
+        return [(view, self._integrals(view)) for view in self.views]
 
-    def integrals(self, view: View) -> Integrals | None:
-        """Return the integrals of the density for one view; None where no cells resolve it."""
+    def _integrals(self, view: View) -> Integrals | None:
         pilot = view.samples.wo[: view.pilot][view.density[: view.pilot] > 0]
         # around the mirror direction at all scales, where lobes may be that are not sampled
-        spread = 10 ** self.rng.uniform(-4, 0, (600, 1)) * self.rng.normal(size=(600, 3))
-        seeds = encode(np.concatenate([pilot, unit(view.wi * [-1, -1, 1] + spread)]))
+        around = 10 ** self.rng.uniform(-4, 0, (600, 1)) * self.rng.normal(size=(600, 3))
+        seeds = encode(np.concatenate([pilot, unit(view.wi * [-1, -1, 1] + around)]))
         most = max(view.pilot // 1000, 8)
         cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
         if len(pilot):
@@ -109,20 +121,15 @@ class Case(Subject):
             centre = (np.hypot(*pilot.T[:2]) < np.sqrt(2) * 0.5**DEPTH).sum()
             if max(held[held > 4 * most].sum(), centre) > 0.01 * len(pilot):
                 return None
-
-        def pdf(wo: Array) -> Array:
-            wis, uvs = view.around(len(wo))
-            return np.maximum(self.probe.pdf(wis, wo, uvs), 0)[:, None]
-
-        codes, share = view.judged
-        density = view.density[view.pilot :]
-        found = integrate(pdf, cells, self.rng, codes, np.ones(len(codes)), len(density))
+        (codes, share), density = view.judged, view.density[view.pilot :]
+        found = integrate(
+            lambda wo: np.maximum(self.pdf(view.wi, wo, view.uv), 0),
+            cells, self.rng, codes, np.ones(len(codes)), len(density),
+        )  # fmt: skip
         # samples in cells of whose points less than two are expected where the lobe is
-        cell = found.cells.find(codes)
-        covered = np.bincount(
-            cell, 1 / (len(density) * density[density > 0]), minlength=len(found.cells.start)
-        )
-        overlooked = (covered * POINTS < 2 * found.cells.solid_angle)[cell].sum() / len(density)
+        cell = found.find(codes)
+        covered = np.bincount(cell, 1 / (len(density) * density[density > 0]), minlength=len(found.start))
+        overlooked = (covered * POINTS < 2 * found.solid_angle)[cell].sum() / len(density)
         return found if found.mean.sum() > share or overlooked < OVERLOOKED else None
 
     def copy(self) -> Case:
@@ -144,18 +151,17 @@ class Case(Subject):
     def pairs(self) -> Pairs:
         """Directions of incidence over the sphere with one exitant each: some sampled, some at random."""
         count = self.count(2**13, 2**15)
-        wi, uv = self.units(count), self.rng.random((count, 2), np.float32)
-        samples = self.probe.sample(wi, self.uniform(count), uv)
-        usable = np.isfinite(samples.wo).all(axis=1) & ~samples.delta & (samples.weight != 0).any(axis=1)
+        wi, uv = self.units(count), self.uniform(count, 2)
+        samples = self.sample(wi, self.uniform(count, 3), uv)
+        usable = np.isfinite(samples.wo).all(axis=1) & ~samples.delta & samples.lit
         usable &= (self.rng.random(count) < 0.75) & ~narrow(wi, samples)
         wo = unit(np.where(usable[:, None], samples.wo, self.units(count)))
-        value, pdf = self.probe.both(wi, wo, uv)
-        crosses = wi[:, 2] * wo[:, 2] < 0
-        across, eta = usable & crosses, np.ones(count)
+        crosses, eta = wi[:, 2] * wo[:, 2] < 0, np.ones(count)
+        across = usable & crosses
         for side in (wi[:, 2] > 0, wi[:, 2] < 0):
             known = across & side & np.isfinite(samples.eta)
             eta[side & crosses] = np.median(samples.eta[known]) if known.any() else 1
-        return Pairs(wi, wo, uv, value, pdf, np.where(across, samples.eta, eta))
+        return Pairs(wi, wo, uv, *self.both(wi, wo, uv), np.where(across, samples.eta, eta))
 
     @cached_property
     def lit(self) -> Pairs:
@@ -168,14 +174,6 @@ class Case(Subject):
         """Return the largest change of ``quantity(wi, wo, uv, …)`` as directions move by a rounding."""
         return spread(lambda i, o: quantity(i, o, uv, *others), (wi, wo), self.rng)
 
-    def snippet(self, body: str, **names: Any) -> str:
-        return snippets.program("bsdf", self, body, **names)
-
-    def at(self, body: str, pairs: Pairs, **more: Any) -> Callable[[int], str]:
-        """Return what makes the snippet of one pair; arrays have a row for each."""
-        names = {"wi": pairs.wi, "uv": pairs.uv, "wo": pairs.wo, **more}
-        return lambda i: self.snippet(body, **row(names, i))
-
 
 def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:
     """Return where samples come from lobes with a width and count for the density.
@@ -183,11 +181,11 @@ def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:
     Weight 0 is how ``sample`` refuses: its direction is then any, or on the wrong side. It may also be that
     the value is 0 there, or that the weight is wrong; but then the stated density is that of the direction.
     """
-    across = wi[..., 2] * s.wo[:, 2] < 0
-    astray = (
-        np.where(across, s.type & int(mi.BSDFFlags.Reflection), s.type & int(mi.BSDFFlags.Transmission)) != 0
+    reflection, transmission = (
+        s.type & int(kind) for kind in (mi.BSDFFlags.Reflection, mi.BSDFFlags.Transmission)
     )
-    dark = (s.weight == 0).all(axis=1) & (value != 0).any(axis=1)
+    astray = np.where(wi[..., 2] * s.wo[:, 2] < 0, reflection, transmission) != 0
+    dark = ~s.lit & (value != 0).any(axis=1)
     refused = dark & (astray | ~np.isclose(s.pdf, pdf, rtol=1e-3))
     return ~s.delta & np.isfinite(pdf) & (pdf > 0) & ~refused
 
@@ -203,44 +201,17 @@ def narrow(wi: Array, s: Samples) -> Array:
     return found
 
 
-def spread(
-    quantity: Callable[..., Array], directions: Sequence[Array], rng: np.random.Generator, by: float = ROUNDED
-) -> Array:
-    """Return the largest change of a quantity of directions [N, 3] as they move ``by`` so much."""
-    base = quantity(*directions)
-    largest = np.zeros_like(base)
-    for _ in range(6):
-        moved = [v + by * rng.normal(size=v.shape).astype(np.float32) for v in directions]
-        change = np.abs(quantity(*moved) - base)
-        largest = np.maximum(largest, np.where(np.isnan(change), np.inf, change))
-    return largest
-
-
-def excess(one: Array, other: Array, allowed: Array) -> Array:
-    """Return [N]: how far two arrays [N, …] differ beyond ``8 * allowed``, relative to the larger one.
-
-    The brightest channel counts as the size; below 1e-20, an exponential may have underflowed or not. What is
-    not finite is left to the law ``finite``.
-    """
-    one, other, allowed = (np.reshape(x, (len(one), -1)).astype(np.float64) for x in (one, other, allowed))
-    size = np.maximum(np.abs(one), np.abs(other)).max(axis=1, keepdims=True)
-    beyond = np.maximum(np.abs(one - other) - 8 * allowed, 0) / np.where(size > 1e-20, size, np.inf)
-    return np.where(np.isfinite(beyond), beyond, 0).max(axis=1)
-
-
 def parameters(case: Case) -> list[tuple[str, Any]]:
     """Return the parameters that hold floating-point numbers which are amounts."""
-    params = mi.traverse(case.plugin)
-    found = []
+    params, found = mi.traverse(case.plugin), []
     for key in params.keys():  # noqa: SIM118 - SceneParameters is not a dict
         try:
             value = params[key]
         except TypeError:  # it was left out, and is None, which Dr.Jit cannot read
             continue
-        numeric = isinstance(value, float) or (
-            dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)
-        )
-        if numeric and not key.endswith(("to_uv", ".wavelengths")) and np.size(np.array(value)) > 0:
+        array = dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)
+        amount = (array or isinstance(value, float)) and not key.endswith(("to_uv", ".wavelengths"))
+        if amount and np.size(np.array(value)) > 0:
             found.append((key, value))
     return found
 

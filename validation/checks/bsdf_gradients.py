@@ -8,24 +8,25 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.validation.checks.bsdf_case import (
+from mrt_mitsuba.validation.checks.bsdf_case import Case, changed, copied, live, narrow, parameters
+from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip, figures
+from mrt_mitsuba.validation.checks.probe import (
     ROUNDED,
-    Case,
-    changed,
-    copied,
+    Array,
+    Probe,
+    as_mitsuba,
+    context,
     excess,
-    live,
-    narrow,
-    parameters,
+    interaction,
+    is_scalar,
 )
-from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip
-from mrt_mitsuba.validation.checks.probe import Array, Probe, as_mitsuba, context, interaction, is_scalar
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
 IN_THE_MEAN = 5e-2  # where outlines of lobes move, derivatives of samples miss them
 WIDTHS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  # of differences, over the parameter
+DETACHED = "integrators follow a sample's direction as a constant: its density must not change, either"
 
-GRADIENT_SNIPPET = """point wo
+DERIVATIVE = """point wo
 params, key = mi.traverse(bsdf), {key!r}
 before = type(params[key])(params[key])
 
@@ -64,8 +65,20 @@ print("after an update to {number}:", bsdf.eval(ctx, si, wo), "should be", {valu
 """
 
 
+@figures(
+    values=("at most", "derivative of values by {key}{how}, relative, beyond the error of differences",
+            GRADIENT, "differences of two widths agree better, or the difference is allowed for", DERIVATIVE),
+    broken=("none", "derivatives by {key} that are not finite, of finite values", 0,
+            "one of them spoils a whole gradient", DERIVATIVE),
+    mean=("at most", "mean derivative of weights by {key}, of directions that move with it, against that of "
+          f"values, relative, beyond {SIGMAS} standard errors", IN_THE_MEAN, DETACHED, SAMPLED),
+    weights=("at most", "derivative of weights by {key} against that of eval() over a constant density, "
+             "relative", GRADIENT, DETACHED, SAMPLED),
+    reached=("most", "values that loading with another {key} changes, but params.update() does not, relative",
+             GRADIENT, "parameters_changed() has to compute anew what is made of parameters", UPDATE),
+)  # fmt: skip
 def gradients(law: Law, case: Case) -> None:
-    """Forward derivatives of the mean value by every differentiable parameter, against differences."""
+    """∂/∂π of the mean value, by forward derivatives, against differences, for every parameter π."""
     if is_scalar() or "_ad_" not in mi.variant():
         raise Skip(f"{mi.variant()} has no derivatives")
     case.need_smooth()
@@ -76,32 +89,22 @@ def gradients(law: Law, case: Case) -> None:
     keys = [k for k, _ in parameters(case) if not params.flags(k) & int(mi.ParamFlags.NonDifferentiable)]
     if not keys:
         raise Skip("traverse() marks no parameter as differentiable")
-    detached = []
     for key in keys:
-        if not _holds(law, case, key):
-            detached.append(key)
-        else:
-            with changed(case, key, _inside):
+        with changed(case, key, _inside):
+            if _attached(law, case, key):
                 _sampled(law, case, key)
-    if detached:
-        law.notes.append(f"detached: {', '.join(detached)}")
     if not law.parts:
         raise Skip("; ".join(law.notes))
 
 
-def _holds(law: Law, case: Case, key: str) -> bool:
+def _attached(law: Law, case: Case, key: str) -> bool:
     """Hold the derivative by one parameter to differences; return False where it is detached, and wrong."""
     few, shift = case.lit, mi.Float(0)
     dr.enable_grad(shift)
-    with changed(case, key, _inside):
-        with changed(case, key, lambda old: _moved(old, shift)):
-            values = _values(case)
-            found = np.zeros(dr.width(values))
-            attached = dr.grad_enabled(values)
-            if attached:
-                dr.forward(shift)
-                found = np.array(dr.grad(values), np.float64)
-        broken, found = ~np.isfinite(found), np.nan_to_num(found, posinf=0, neginf=0)
+    with changed(case, key, lambda old: _moved(old, shift)):
+        (found,), (attached,) = _forward(shift, len(few.wi), _values(case))
+    broken, found = ~np.isfinite(found), np.nan_to_num(found, posinf=0, neginf=0)
+    with changed(case, key, lambda old: old):
         slope, error = _differences(case, key)
     if not attached and not slope.any():
         law.notes.append(f"{key} changes no value")
@@ -113,14 +116,24 @@ def _holds(law: Law, case: Case, key: str) -> bool:
     usual = known & (off <= np.quantile(off[known], 0.98))  # where values have a kink, no slope is
     beyond = np.maximum(off - error, 0)[usual].sum()
     measured = beyond / max(np.abs(slope)[usual].sum(), np.abs(found)[usual].sum(), 1e-30)
-    show = case.at(GRADIENT_SNIPPET, few, key=key)
-    what = f"derivative of values by {key}{'' if attached else ' (detached)'}, relative"
-    why = "differences of two widths agree better than that, or the difference is allowed for"
-    worst = show(int(np.where(usual, off, 0).argmax()))
-    law.at_most(f"{what}, beyond the error of differences", measured, GRADIENT, why, worst)
-    why = "one of them spoils a whole gradient"
-    law.none(f"derivatives by {key} that are not finite, of finite values", broken, why, show)
+    i, how = int(np.where(usual, off, 0).argmax()), "" if attached else " (detached)"
+    law.hold("values", measured, wi=few.wi[i], uv=few.uv[i], wo=few.wo[i], key=key, how=how)
+    law.hold("broken", broken, wi=few.wi, uv=few.uv, wo=few.wo, key=key)
+    if not attached and measured > GRADIENT:
+        law.notes.append(f"detached: {key}")
     return attached or measured <= GRADIENT
+
+
+def _forward(shift: Any, count: int, *values: Any) -> tuple[list[Array], list[bool]]:
+    """Return the derivatives [N] of each of several arrays by one number, and which of them have one."""
+    attached = [dr.grad_enabled(value) for value in values]
+    if any(attached):
+        dr.forward(shift)
+    grads = [
+        np.array(dr.grad(value), np.float64) if have else 0.0
+        for value, have in zip(values, attached, strict=True)
+    ]
+    return [np.broadcast_to(grad, count) for grad in grads], attached
 
 
 def _sampled(law: Law, case: Case, key: str) -> None:
@@ -130,49 +143,36 @@ def _sampled(law: Law, case: Case, key: str) -> None:
     change otherwise: only means over smooth light are then the same.
     """
     count = case.count(2**14, 2**16)
-    wi, u, uv = case.units(count), case.uniform(count), case.rng.random((count, 2), np.float32)
+    wi, u, uv = case.units(count), case.uniform(count, 3), case.uniform(count, 2)
     shift = mi.Float(0)
     dr.enable_grad(shift)
     with changed(case, key, lambda old: _moved(old, shift)):
         si = interaction(as_mitsuba("Vector3f", wi), as_mitsuba("Point2f", uv))
-        bs, weight = case.plugin.sample(
-            context(), si, as_mitsuba("Float", u[:, 0]), as_mitsuba("Point2f", u[:, 1:])
-        )
-        wo = dr.detach(bs.wo)
-        value, pdf = case.plugin.eval_pdf(context(), si, wo)
+        first, second = as_mitsuba("Float", u[:, 0]), as_mitsuba("Point2f", u[:, 1:])
+        bs, weight = case.plugin.sample(context(), si, first, second)
+        value, pdf = case.plugin.eval_pdf(context(), si, dr.detach(bs.wo))
         moves, light = dr.grad_enabled(bs.wo), 1 + 0.5 * bs.wo.x + 0.25 * dr.square(bs.wo.z)
         one = _total(weight) * (light if moves else dr.detach(light))
         other = _total(value) / dr.detach(dr.select(pdf > 0, pdf, 1)) * dr.detach(light)
-        if not (dr.grad_enabled(one) or dr.grad_enabled(other)):
-            return
-        dr.forward(shift)
-        grads = [
-            np.array(dr.grad(x), np.float64) if dr.grad_enabled(x) else np.zeros(count) for x in (one, other)
-        ]
-    found, expected = (np.broadcast_to(x, count) for x in grads)
-    samples = case.probe.sample(wi, u, uv)
-    counts = live(wi, samples, *case.probe.both(wi, np.nan_to_num(samples.wo), uv)) & ~narrow(wi, samples)
+        (found, expected), attached = _forward(shift, count, one, other)
+    s = case.sample(wi, u, uv)
+    counts = live(wi, s, *case.both(wi, np.nan_to_num(s.wo), uv)) & ~narrow(wi, s)
     counts &= np.isfinite(found) & np.isfinite(expected) & (np.abs(wi[:, 2]) > 0.05)
-    counts &= (np.abs(samples.wo[:, 2]) > 0.05) & (samples.pdf < (1024 * ROUNDED) ** -2)  # a rounding shows
-    if counts.sum() < 100:
+    counts &= (np.abs(s.wo[:, 2]) > 0.05) & (s.pdf < (1024 * ROUNDED) ** -2)  # a rounding shows
+    if not any(attached) or counts.sum() < 100:
         return
     off = np.where(counts, np.abs(found - expected), 0)
-    size = max(np.abs(expected[counts]).mean(), 1e-3 * np.abs(samples.weight[counts]).mean(), 1e-30)
-    show = case.snippet(SAMPLED, wi=wi[off.argmax()], uv=uv[off.argmax()], u=u[off.argmax()], key=key)
+    size = max(np.abs(expected[counts]).mean(), 1e-3 * np.abs(s.weight[counts]).mean(), 1e-30)
+    i = int(off.argmax())
+    names = {"wi": wi[i], "uv": uv[i], "u": u[i], "key": key}
     if moves:
         apart = (found - expected)[counts]
         apart = np.clip(apart, *np.quantile(apart, (1e-3, 1 - 1e-3)))
         beyond = max(abs(apart.mean()) - SIGMAS * apart.std() / np.sqrt(len(apart)), 0)
-        what = f"mean derivative of weights by {key}, of directions that move with it, against that of values"
-        title = f"{what}, relative, beyond {SIGMAS} standard errors"
-        law.at_most(title, beyond / size, IN_THE_MEAN, DETACHED, show)
-        return
-    usual = counts & (off <= np.quantile(off[counts], 0.98))
-    what = f"derivative of weights by {key} against that of eval() over a constant density, relative"
-    law.at_most(what, off[usual].sum() / (size * usual.sum()), GRADIENT, DETACHED, show)
-
-
-DETACHED = "integrators follow a sample's direction as a constant: its density must not change, either"
+        law.hold("mean", beyond / size, **names)
+    else:
+        usual = counts & (off <= np.quantile(off[counts], 0.98))
+        law.hold("weights", off[usual].sum() / (size * usual.sum()), **names)
 
 
 def _total(spectrum: Any) -> Any:
@@ -192,10 +192,8 @@ def _reached(law: Law, case: Case, key: str) -> None:
     except RuntimeError:  # what is loaded goes by another name, or takes other numbers
         return
     value = other.eval(few.wi, few.wo, few.uv)
-    error = excess(value, few.value, case.spread(case.probe.eval, few.wi, few.wo, few.uv))
-    what = f"values that loading with another {key} changes, but params.update() does not, relative"
-    why = "parameters_changed() has to compute anew what is made of parameters"
-    law.most(what, error, GRADIENT, why, case.at(UPDATE, few, key=key, number=number, value=value))
+    error = excess(value, few.value, case.spread(case.eval, few.wi, few.wo, few.uv))
+    law.hold("reached", error, **{**vars(few), "value": value, "key": key, "number": number})
 
 
 def _inside(value: Any) -> Any:

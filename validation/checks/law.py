@@ -11,19 +11,22 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.tools import report
 from mrt_mitsuba.validation.tools.study import Bound, Study
 
 TITLE = "Laws of plugins"
 LEVEL = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction
+RARE = "one false alarm in a million checks"
 SIGMAS = 6  # the same for a normal distribution: 2e-9
+LawFunction = TypeVar("LawFunction", bound=Callable[..., None])
 TIMEOUT = 120.0  # seconds for each law: sound plugins take a few, those of scalar variants a dozen
 
 
@@ -44,10 +47,34 @@ class Part(Bound):
     @property
     def severity(self) -> float:
         """Return how much of the limit is used: above 1 it is exceeded."""
-        if math.isnan(self.measured):
-            return math.inf
         over, under = (self.measured, self.limit) if self.at_most else (self.limit, self.measured)
-        return over / under if under > 0 else (math.inf if over > under else 0.0)
+        if math.isnan(self.measured) or under <= 0 < over - under:
+            return math.inf
+        return over / under if under > 0 else 0.0
+
+
+class Figure(NamedTuple):
+    """A figure of a law: what is held to which limit, why that, and the body of the snippet that shows it.
+
+    ``how``: a number "at most" or "at least"; or of N errors the "most", "none" or a "share" of those that
+    are bad, or a quantile, NaN left out.
+    """
+
+    how: str | float
+    what: str
+    limit: float
+    why: str
+    snippet: str = ""
+
+
+def figures(**rows: tuple[Any, ...]) -> Callable[[LawFunction], LawFunction]:
+    """Give a law its figures, by name."""
+
+    def mark(law: LawFunction) -> LawFunction:
+        setattr(law, "figures", {name: Figure(*row) for name, row in rows.items()})  # noqa: B010
+        return law
+
+    return mark
 
 
 @dataclass
@@ -58,32 +85,27 @@ class Law:
     parts: list[Part] = field(default_factory=list)
     skipped: str = ""
     notes: list[str] = field(default_factory=list)
+    figures: Mapping[str, Figure] = field(default_factory=dict)
+    program: Callable[..., str] | None = None  # writes snippets, while the law is checked
 
-    def at_most(self, what: str, measured: float, limit: float, why: str, snippet: str = "") -> None:
-        """Hold a figure to an upper bound."""
-        self.parts.append(Part(what, float(measured), float(limit), True, why, snippet))
+    def hold(self, name: str, measured: Any, *, limit: float | None = None, **names: Any) -> None:
+        """Hold a figure, a number or N errors, to its limit.
 
-    def at_least(self, what: str, measured: float, limit: float, why: str, snippet: str = "") -> None:
-        """Hold a figure to a lower bound."""
-        self.parts.append(Part(what, float(measured), float(limit), False, why, snippet))
-
-    def most(self, what: str, errors: Any, limit: float, why: str, show: Callable[[int], str]) -> None:
-        """Hold the largest of N errors to an upper bound; ``show(i)`` is the snippet of one."""
-        i = int(np.where(np.isnan(errors), np.inf, errors).argmax())
-        self.at_most(what, errors[i], limit, why, show(i))
-
-    def none(self, what: str, bad: Any, why: str, show: Callable[[int], str]) -> None:
-        """Count how many of N are bad: there must be none."""
-        self.at_most(what, bad.sum(), 0, why, show(int(bad.argmax())))
-
-    def share(self, what: str, bad: Any, limit: float, why: str, show: Callable[[int], str]) -> None:
-        """Hold the share of N that is bad to an upper bound."""
-        self.at_most(what, bad.mean(), limit, why, show(int(bad.argmax())))
-
-    def quantile(self, what: str, errors: Any, share: float, limit: float, why: str, show: Any) -> None:
-        """Hold what this share of N errors, NaN left out, stays below; the snippet is of one about there."""
-        measured = float(np.nanquantile(errors, share))
-        self.at_most(what, measured, limit, why, show(int(np.nanargmin(np.abs(errors - measured)))))
+        ``names`` fill its words and its snippet: values, or arrays that have a row for each error.
+        """
+        how, what, usual, why, body = self.figures[name]
+        if how not in ("at most", "at least"):
+            errors = np.asarray(measured, np.float64)
+            if isinstance(how, float):
+                measured = np.nanquantile(errors, how)
+                i = int(np.nanargmin(np.abs(errors - measured)))
+            else:
+                i = int(np.where(np.isnan(errors), np.inf, errors).argmax())
+                measured = {"most": errors[i], "none": errors.sum(), "share": errors.mean()}[how]
+            names = {key: x[i] if isinstance(x, np.ndarray) else x for key, x in names.items()}
+        snippet = self.program(body, **names) if self.program and body else ""
+        limit = float(usual if limit is None else limit)
+        self.parts.append(Part(what.format(**names), float(measured), limit, how != "at least", why, snippet))
 
     @property
     def worst(self) -> Part:
@@ -122,10 +144,8 @@ class Law:
         return "skipped" if self.skipped else "holds" if self.holds else "FAILS"
 
     def __str__(self) -> str:
-        if self.skipped:
-            return f"{self.verdict:<7} {self.name}: {self.skipped}"
-        figure = f"{self.measured:.4g} {self.worst.sign} {self.limit:.4g}"
-        return f"{self.verdict:<7} {self.name}: {figure}, {self.note}"
+        figure = f"{self.measured:.4g} {self.worst.sign} {self.limit:.4g}, {self.note}"
+        return f"{self.verdict:<7} {self.name}: {self.skipped or figure}"
 
 
 @dataclass(frozen=True)
@@ -175,50 +195,51 @@ class Check:
         return report.notebook(self.study(), title=TITLE)
 
 
-def class_name(plugin: Any) -> str:
-    """Return the name of a plugin's class: Mitsuba calls all those in Python by that of their base."""
-    python = type(plugin).__module__.split(".")[0] != "mitsuba"
-    return type(plugin).__name__ if python or not hasattr(plugin, "class_name") else plugin.class_name()
-
-
 def examine(
-    subject: str,
-    case: Any,
+    kind: Callable[[Any, bool, int], Any],
+    given: Any,
     laws: Mapping[str, Callable[[Law, Any], None]],
     *,
+    quick: bool,
+    seed: int,
     only: Iterable[str] | None = None,
-    quick: bool = False,
     timeout: float = TIMEOUT,
 ) -> Check:
-    """Check laws one by one; a law fails if the plugin raises while it is checked, or takes too long."""
+    """Check laws one by one; a law fails if the plugin raises while it is checked, or takes too long.
+
+    ``kind(given, quick, seed)`` makes the case that each law is called with.
+    """
+    runtime.use()
     chosen = list(laws if only is None else only)
     unknown = [name for name in chosen if name not in laws]
     if unknown:
         raise UsageError(f"unknown law {unknown[0]!r}: choose from {', '.join(laws)}")
     start, variant, found, late = time.perf_counter(), mi.variant(), {}, ""
-    for name in laws:
-        if name not in chosen:
-            continue
-        law = found[name] = Law(name)
+    with settings_restored():
+        case = kind(given, quick, seed)
+    for name in [name for name in laws if name in chosen]:
+        figures = getattr(laws[name], "figures", {})
+        law = found[name] = Law(name, figures=figures, program=case.program)
         if late:
             law.skipped = f"a law before it {late}"
             continue
-        with settings_restored():
-            try:
-                with _limited(timeout):
-                    laws[name](law, case)
-            except Skip as reason:
-                law.skipped = str(reason)
-            except TimedOut:
-                late = f"took longer than {timeout:g} s"
-                law.at_most(f"it {late}", math.inf, timeout, "a plugin must come to an end")
-            except Exception as error:
-                lines = str(error).strip().splitlines() or [""]
-                # Mitsuba quotes the traceback of an error in a Python plugin, with the error last
-                line = lines[-1] if lines[0].startswith("Traceback") else lines[0]
-                what = f"it raised {type(error).__name__}: {line}"
-                law.at_most(what, math.inf, 0, "a plugin must not raise")
-    return Check(subject, variant, found, time.perf_counter() - start, quick)
+        try:
+            with settings_restored(), _limited(timeout):
+                laws[name](law, case)
+        except Skip as reason:
+            law.skipped = str(reason)
+        except TimedOut:
+            late, why = f"took longer than {timeout:g} s", "a plugin must come to an end"
+            law.parts.append(Part(f"it {late}", math.inf, timeout, note=why))
+        except Exception as error:
+            lines = str(error).strip().splitlines() or [""]
+            # Mitsuba quotes the traceback of an error in a Python plugin, with the error last
+            line = lines[-1] if lines[0].startswith("Traceback") else lines[0]
+            what = f"it raised {type(error).__name__}: {line}"
+            law.parts.append(Part(what, math.inf, 0, note="a plugin must not raise"))
+    for law in found.values():
+        law.program = None
+    return Check(case.name, variant, found, time.perf_counter() - start, quick)
 
 
 @contextmanager
@@ -242,23 +263,15 @@ def settings_restored() -> Iterator[None]:
 @contextmanager
 def _limited(seconds: float) -> Iterator[None]:
     """Raise ``TimedOut`` in this thread's Python code after so many seconds. A kernel is not interrupted."""
-    thread, over, lock = ctypes.c_ulong(threading.get_ident()), threading.Event(), threading.Lock()
-    done = False
-
-    def interrupt() -> None:
-        with lock:
-            if not done:
-                over.set()
-                ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(TimedOut))
-
-    timer = threading.Timer(seconds, interrupt)
+    thread, start = ctypes.c_ulong(threading.get_ident()), time.perf_counter()
+    interrupt = ctypes.pythonapi.PyThreadState_SetAsyncExc
+    timer = threading.Timer(seconds, interrupt, (thread, ctypes.py_object(TimedOut)))
     timer.daemon = True
     timer.start()
     try:
         yield
     except Exception as error:  # Mitsuba passes on what a Python plugin raises as an error of its own
-        raise (TimedOut if over.is_set() else error) from error
+        raise (TimedOut if time.perf_counter() - start > seconds else error) from error
     finally:
         timer.cancel()
-        with lock:
-            done = True
+        timer.join()  # if it is about to interrupt: then it does here, and not later

@@ -36,9 +36,10 @@ class Noise:
     explained: Array  # what rounding of the inputs alone would do
     stride: Array  # the most float32 steps between points of its line
 
-    def lost(self, allowance: float) -> Array:
-        """Return noise over what inputs, rounded twice, and ``allowance`` other roundings explain."""
-        return self.noise / np.hypot(2 * self.explained, allowance)
+    @property
+    def lost(self) -> Array:
+        """Return noise over what inputs, rounded twice, and ``ALLOWANCE`` other roundings explain."""
+        return np.nan_to_num(self.noise / np.hypot(2 * self.explained, ALLOWANCE), posinf=0)
 
 
 def ecnoise(lines: Array, *, coarse: bool = False) -> Array:
@@ -69,10 +70,10 @@ def steps_away(x: Array, count: Array) -> Array:
     """Return the float32 numbers that lie ``count`` steps from ``x``, beyond zero where it is near."""
     ordered = np.ascontiguousarray(x, np.float32).view(np.int32).astype(np.int64)
     ordered = np.where(ordered < 0, -(2**31) - ordered, ordered) + count
-    ordered = np.where(ordered < 0, -(2**31) - ordered, ordered)
-    return ordered.astype(np.int32).view(np.float32)
+    return np.where(ordered < 0, -(2**31) - ordered, ordered).astype(np.int32).view(np.float32)
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def measure(
     function: Callable[[Array], Array],
     inputs: Array,
@@ -92,39 +93,34 @@ def measure(
     as high at any step that is large against them, unlike kinks and what is left of a smooth function: noise
     counts that is ``ALIKE`` at two steps.
     """
-    count, width = inputs.shape
-    inputs = inputs.astype(np.float32)
-    rng = np.random.default_rng(seed)
-    coarse = COARSE if project else ()
-    steps = [
-        np.arange(POINTS)[:, None, None] * rng.integers(-s, s + 1, (count, width))
-        for s in (*strides, *coarse)
-    ]
-    axes = np.eye(width, dtype=int)[:, None, :]
-    sides = np.concatenate([s * reach * axes for reach in REACHES for s in (1, -1)])
-    everything = np.concatenate([*steps, np.broadcast_to(sides, (len(sides), count, width))])
-    moved = steps_away(np.broadcast_to(inputs, everything.shape), everything)
-    fine, far = POINTS * len(strides), POINTS * (len(strides) + len(coarse))
-    if project:
-        moved[fine:far] = project(moved[fine:far].reshape(-1, width)).reshape(-1, count, width)
-    values = function(moved.reshape(-1, width)).reshape(len(everything), count).astype(np.float64)
-    lines = values[:fine].reshape(len(strides), POINTS, count)
-    ends = values[far:].reshape(len(REACHES), 2, width, count)
+    inputs, rng = inputs.astype(np.float32), np.random.default_rng(seed)
+
+    def values(steps: Array, valid: Callable[[Array], Array] = lambda x: x) -> Array:
+        """Return the function that many float32 steps [..., N, K] away. [..., N]"""
+        moved = steps_away(np.broadcast_to(inputs, steps.shape), steps).reshape(-1, inputs.shape[1])
+        return function(valid(moved)).reshape(steps.shape[:-1]).astype(np.float64)
+
+    def along(strides: Sequence[int]) -> Array:
+        """Return steps along a random line for each input and stride. [strides, POINTS, N, K]"""
+        ways = np.array([rng.integers(-s, s + 1, inputs.shape) for s in strides])
+        return np.arange(POINTS)[:, None, None] * ways[:, None]
+
+    lines = values(along(strides))
     flat = (np.diff(lines, axis=1) == 0).mean(axis=1) > 0.5
     chosen = np.where(flat.all(axis=0), len(strides) - 1, flat.argmin(axis=0))
     line = np.take_along_axis(lines, chosen[None, None], axis=0)[0]
-    slope = (ends[:, 0] - ends[:, 1]) / (2 * np.array(REACHES)[:, None, None])  # change per step
-    apart = np.abs(np.diff(slope, axis=0))
-    best = np.take_along_axis(slope[1:], apart.argmin(axis=0)[None], axis=0)[0]
-    # a rounded input is anywhere within half a step: a variance of 1/12
-    explained = np.sqrt((best**2).sum(axis=0) / 12)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        unit = ROUNDING * np.abs(line[0] if size is None else size)
-        noise = ecnoise(line)
-        if project:
-            lines = values[fine:far].reshape(len(coarse), POINTS, count)
-            stairs = np.array([ecnoise(line, coarse=True) for line in lines])
-            small, large = np.minimum(stairs[:-1], stairs[1:]), np.maximum(stairs[:-1], stairs[1:])
-            both = np.where((large <= ALIKE * small) & (small > TABLES * unit), small, 0).max(axis=0)
-            noise = np.where(np.nan_to_num(noise) < both, both, noise)
-        return Noise(line[0], noise / unit, explained / unit, np.take(strides, chosen))
+    reaches = np.array(REACHES)[:, None, None, None, None]
+    steps = np.array([1, -1])[:, None, None, None] * reaches * np.eye(inputs.shape[1], dtype=int)[:, None]
+    forth, back = np.moveaxis(values(np.broadcast_to(steps, (*steps.shape[:3], *inputs.shape))), 1, 0)
+    slope = (forth - back) / (2 * reaches[..., 0, 0])
+    best = np.abs(np.diff(slope, axis=0)).argmin(axis=0)[None]
+    slope = np.take_along_axis(slope[1:], best, axis=0)[0]  # change per step
+    explained = np.sqrt((slope**2).sum(axis=0) / 12)  # a rounded input is within half a step: variance 1/12
+    unit = ROUNDING * np.abs(line[0] if size is None else size)
+    noise = ecnoise(line)
+    if project:
+        stairs = np.array([ecnoise(line, coarse=True) for line in values(along(COARSE), project)])
+        small, large = np.minimum(stairs[:-1], stairs[1:]), np.maximum(stairs[:-1], stairs[1:])
+        both = np.where((large <= ALIKE * small) & (small > TABLES * unit), small, 0).max(axis=0)
+        noise = np.where(np.nan_to_num(noise) < both, both, noise)
+    return Noise(line[0], noise / unit, explained / unit, np.take(strides, chosen))

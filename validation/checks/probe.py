@@ -1,8 +1,8 @@
-"""A BSDF asked in bulk: directions and samples as numpy arrays, whatever the variant."""
+"""Plugins asked in bulk: directions and samples as numpy arrays, whatever the variant."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -13,12 +13,9 @@ import numpy as np
 from mrt_mitsuba.plugins.lookup import aligned
 
 Array = np.ndarray
-SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
-
-
-def is_scalar() -> bool:
-    """Return whether the current variant takes one direction at a time."""
-    return mi.variant().startswith("scalar")
+ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32
+BEYOND = "relative, beyond 8 times what the rounding of directions explains"  # as ``excess`` has it
+Kept = TypeVar("Kept", bound="Lanes")
 
 
 class Lanes:
@@ -29,7 +26,10 @@ class Lanes:
         return type(self)(*(value[keep] for value in vars(self).values()))
 
 
-Kept = TypeVar("Kept", bound=Lanes)
+def joined(parts: Sequence[Kept]) -> Kept:
+    """Return the lanes of several dataclasses, one after the other."""
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return type(parts[0])(*(np.concatenate(column) for column in columns))
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,16 @@ class Samples(Lanes):
     def delta(self) -> Array:
         """Where the sample comes from a lobe that is one direction only. [N]"""
         return (self.type & int(mi.BSDFFlags.Delta)) != 0
+
+    @property
+    def lit(self) -> Array:
+        """Where the weight is not 0. [N]"""
+        return (self.weight != 0).any(axis=1)
+
+
+def is_scalar() -> bool:
+    """Return whether the current variant takes one direction at a time."""
+    return mi.variant().startswith("scalar")
 
 
 def context(component: int | None = None, *, importance: bool = False) -> Any:
@@ -75,64 +85,42 @@ def at_wavelengths(si: Any) -> Any:
 
 
 class Probe:
-    """Calls one BSDF; directions [N, 3] in its frame, texture coordinates [N, 2], random numbers [N, 3]."""
+    """Calls one BSDF: wi [N, 3] or [3] and wo [N, 3] in its frame, uv [N, 2] or [2], u [N, 3]."""
 
     def __init__(self, bsdf: Any) -> None:
-        self.bsdf = bsdf
+        self.plugin = bsdf
+
+    def ask(self, call: Callable[..., Any], wi: Array, wo: Array, uv: Array, ctx: Any = None) -> list[Array]:
+        """Return as arrays what ``call(context, interaction, wo)`` gives."""
+        wi, uv = (np.broadcast_to(x, (len(wo), x.shape[-1])) for x in (wi, uv))
+        columns = ("Vector3f", wi), ("Point2f", uv), ("Vector3f", wo)
+        return lanes(lambda i, t, o: call(ctx or context(), interaction(i, t), o), *columns)
 
     def eval(self, wi: Array, wo: Array, uv: Array, ctx: Any = None) -> Array:
         """Return f |cos θo|. [N, channels]"""
-        return self._directions(lambda c, si, o: [self.bsdf.eval(c, si, o)], wi, wo, uv, ctx)[0]
+        return self.ask(lambda *at: [self.plugin.eval(*at)], wi, wo, uv, ctx)[0]
 
     def pdf(self, wi: Array, wo: Array, uv: Array, ctx: Any = None) -> Array:
         """Return the density per solid angle. [N]"""
-        return self._directions(lambda c, si, o: [self.bsdf.pdf(c, si, o)], wi, wo, uv, ctx)[0][:, 0]
+        return self.ask(lambda *at: [self.plugin.pdf(*at)], wi, wo, uv, ctx)[0]
 
-    def both(self, wi: Array, wo: Array, uv: Array, ctx: Any = None) -> tuple[Array, Array]:
+    def both(self, wi: Array, wo: Array, uv: Array, ctx: Any = None) -> list[Array]:
         """Return what ``eval`` and ``pdf`` give, each by itself."""
-        pair = self._directions(
-            lambda c, si, o: [self.bsdf.eval(c, si, o), self.bsdf.pdf(c, si, o)], wi, wo, uv, ctx
-        )
-        return pair[0], pair[1][:, 0]
+        return self.ask(lambda *at: [self.plugin.eval(*at), self.plugin.pdf(*at)], wi, wo, uv, ctx)
 
-    def pair(self, wi: Array, wo: Array, uv: Array, ctx: Any = None) -> tuple[Array, Array]:
+    def pair(self, wi: Array, wo: Array, uv: Array, ctx: Any = None) -> list[Array]:
         """Return what ``eval_pdf`` gives."""
-        pair = self._directions(lambda c, si, o: self.bsdf.eval_pdf(c, si, o), wi, wo, uv, ctx)
-        return pair[0], pair[1][:, 0]
-
-    def inactive(self, wi: Array, wo: Array, uv: Array) -> list[Array]:
-        """Return the values of ``eval`` and ``eval_pdf`` in lanes that ``active`` switches off."""
-
-        def call(c: Any, si: Any, o: Any) -> list[Any]:
-            off = o.z > 2  # no lane
-            return [self.bsdf.eval(c, si, o, off), self.bsdf.eval_pdf(c, si, o, off)[0]]
-
-        return self._directions(call, wi, wo, uv, None)
+        return self.ask(lambda *at: self.plugin.eval_pdf(*at), wi, wo, uv, ctx)
 
     def sample(self, wi: Array, u: Array, uv: Array, ctx: Any = None) -> Samples:
         """Return what ``sample`` gives."""
-        ctx = ctx or context()
 
-        def call(mi: Any, i: Any, t: Any, first: Any, second: Any) -> list[Any]:
-            bs, weight = self.bsdf.sample(ctx, interaction(i, t), first, second)
-            return [bs.wo, bs.pdf, bs.eta, bs.sampled_type, bs.sampled_component, _unpolarized(weight)]
+        def call(c: Any, si: Any, u: Any) -> list[Any]:
+            bs, weight = self.plugin.sample(c, si, u.x, mi.Point2f(u.y, u.z))
+            return [bs.wo, bs.pdf, bs.eta, bs.sampled_type, bs.sampled_component, weight]
 
-        kinds = ("Vector3f", wi), ("Point2f", uv), ("Float", u[:, 0]), ("Point2f", u[:, 1:])
-        wo, pdf, eta, kind, component, weight = lanes(call, *kinds)
-        kinds_of, components = (x[:, 0].astype(np.int64) for x in (kind, component))
-        return Samples(wo, pdf[:, 0], eta[:, 0], kinds_of, components, weight)
-
-    def _directions(self, call: Callable[..., Any], wi: Array, wo: Array, uv: Array, ctx: Any) -> list[Array]:
-        ctx = ctx or context()
-
-        def evaluate(mi: Any, i: Any, o: Any, t: Any) -> list[Any]:
-            return [_unpolarized(value) for value in call(ctx, interaction(i, t), o)]
-
-        return lanes(evaluate, ("Vector3f", wi), ("Vector3f", wo), ("Point2f", uv))
-
-
-def _unpolarized(value: Any) -> Any:
-    return mi.unpolarized_spectrum(value) if dr.depth_v(value) > 1 else value
+        wo, pdf, eta, kind, component, weight = self.ask(call, wi, u, uv, ctx)
+        return Samples(wo, pdf, eta, kind.astype(np.int64), component.astype(np.int64), weight)
 
 
 def not_finite(*values: Any, least: float = -np.inf) -> Any:
@@ -144,23 +132,31 @@ def not_finite(*values: Any, least: float = -np.inf) -> Any:
     return bad
 
 
-def lanes(call: Callable[..., list[Any]], *columns: tuple[str, Array]) -> list[Array]:
-    """Call ``call(mi, …)`` with columns [N] or [N, k] as Mitsuba types, in scalar variants once for each row.
+def lanes(call: Callable[..., Any], *columns: tuple[str, Array]) -> list[Array]:
+    """Call ``call`` with columns [N] or [N, k] as Mitsuba types, in scalar variants once for each row.
 
-    Return its values as arrays [N, k].
+    Return its values as arrays [N] or [N, k]; of polarized light, the intensity.
     """
+
+    def plain(value: Any) -> Any:
+        return mi.unpolarized_spectrum(value) if dr.is_matrix_v(value) else value
+
     count = len(columns[0][1])
     if is_scalar():
         rows = [
-            call(mi, *(getattr(mi, kind)(*np.atleast_1d(column[i]).tolist()) for kind, column in columns))
+            call(*(getattr(mi, kind)(*np.atleast_1d(column[i]).tolist()) for kind, column in columns))
             for i in range(count)
         ]
-        return [np.array([np.ravel(value) for value in values]) for values in zip(*rows, strict=True)]
+        return [np.array([np.asarray(plain(x)) for x in values]) for values in zip(*rows, strict=True)]
     with dr.suspend_grad():
-        found = call(mi, *(as_mitsuba(kind, column) for kind, column in columns))
+        found = [plain(value) for value in call(*(as_mitsuba(kind, column) for kind, column in columns))]
         dr.eval(found)
-    columns_of = ([value] if dr.depth_v(value) == 1 else value for value in found)
-    return [np.stack([np.broadcast_to(np.array(x), count) for x in value], axis=-1) for value in columns_of]
+    return [
+        np.stack([np.broadcast_to(np.array(x), count) for x in value], axis=-1)
+        if dr.depth_v(value) > 1
+        else np.broadcast_to(np.array(value), count)
+        for value in found
+    ]
 
 
 def as_mitsuba(kind: str, column: Array) -> Any:
@@ -181,3 +177,29 @@ def direction(cos: Any, phi: Any) -> Array:
     cos, phi = np.broadcast_arrays(np.asarray(cos, np.float64), phi)
     sin = np.sqrt((1 - cos) * (1 + cos))
     return np.stack([sin * np.cos(phi), sin * np.sin(phi), cos], axis=-1).astype(np.float32)
+
+
+def spread(
+    quantity: Callable[..., Array], directions: Sequence[Array], rng: np.random.Generator, by: float = ROUNDED
+) -> Array:
+    """Return the largest change of a quantity of directions [N, 3] as they move ``by`` so much."""
+    base = quantity(*directions)
+    largest = np.zeros_like(base)
+    for _ in range(6):
+        moved = [v + by * rng.normal(size=v.shape).astype(np.float32) for v in directions]
+        change = np.abs(quantity(*moved) - base)
+        largest = np.maximum(largest, np.where(np.isnan(change), np.inf, change))
+    return largest
+
+
+def excess(one: Array, other: Array, allowed: Array | float = 0.0) -> Array:
+    """Return [N]: how far two arrays [N, …] differ beyond ``8 * allowed``, relative to the larger one.
+
+    The brightest channel counts as the size; below 1e-20, an exponential may have underflowed or not. What is
+    not finite is left to the law ``finite``.
+    """
+    allowed = np.broadcast_to(allowed, one.shape)
+    one, other, allowed = (np.reshape(x, (len(one), -1)).astype(np.float64) for x in (one, other, allowed))
+    size = np.maximum(np.abs(one), np.abs(other)).max(axis=1, keepdims=True)
+    beyond = np.maximum(np.abs(one - other) - 8 * allowed, 0) / np.where(size > 1e-20, size, np.inf)
+    return np.where(np.isfinite(beyond), beyond, 0).max(axis=1)

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +20,12 @@ from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.validation.checks import emitter
 from mrt_mitsuba.validation.checks.bsdf import check_bsdf
-from mrt_mitsuba.validation.checks.law import TITLE, Check, Law, class_name, examine
+from mrt_mitsuba.validation.checks.law import TITLE, Check, examine
 from mrt_mitsuba.validation.checks.probe import not_finite
 from mrt_mitsuba.validation.checks.shape import check_shape
+from mrt_mitsuba.validation.checks.subject import class_name
 from mrt_mitsuba.validation.tools import report
+from mrt_mitsuba.validation.tools.study import Study
 
 ALIKE = 6  # of one kind of plugin, so many are checked, spread over all
 DEPTH = 12  # bounces that the hunt follows
@@ -71,17 +75,13 @@ class SceneCheck:
 
     def save(self, folder: str | Path) -> None:
         """Write the page (``index.html``), ``summary.json`` and CSV files. Raises ``OutputError``."""
-        law = Law("pixels", notes=[str(self.fault)] if self.fault else [])
-        bad = self.fault.pixels if self.fault else 0
-        law.at_most("pixels that are not finite", bad, 0, "a picture is of numbers")
-        variant = next((check.variant for check in self.checks.values()), "")
-        pixels = Check("picture", variant, {"pixels": law}, 0.0)
-        studies = [check.study() for check in (*self.checks.values(), pixels)]
+        bad, why = self.fault.pixels if self.fault else 0, "a picture is of numbers"
+        picture = Study("picture", "picture")
+        picture.at_most("pixels that are not finite", bad, 0, f"{why}. {self.fault}" if self.fault else why)
+        studies = [*(check.study() for check in self.checks.values()), picture]
         report.save(folder, *studies, title=f"{TITLE}: {self.name}")
 
     def _repr_html_(self) -> str:
-        from html import escape
-
         return f"<pre>{escape(str(self))}</pre>"
 
 
@@ -96,42 +96,34 @@ def check_scene(
     """
     runtime.use()
     source = open_scene(scene, **options)
+    every = source.scene.shapes()
+    shapes = [shape for shape in every if shape.class_name() != "Instance"]
+    bsdfs = {str(id(b)): b for b in (shape.bsdf() for shape in shapes) if b is not None}.values()
+    checks = {"BSDF": check_bsdf, "shape": check_shape, "emitter": partial(_check_emitter, source.scene)}
     kinds: dict[str, list[Any]] = {}
-    for kind, plugin in _all(source.scene):
-        kinds.setdefault(kind, []).append(plugin)
-    plugins: dict[str, tuple[str, Any]] = {}
-    left_out: tuple[str, ...] = ()
-    for kind, alike in kinds.items():
-        step = max(len(alike) // ALIKE, 1)
-        for number, plugin in enumerate(alike[::step]):
-            name = f"{kind} {plugin.id() or number * step}"
-            plugins[name if name not in plugins else f"{name} ({number * step})"] = (kind, plugin)
-        more = len(alike) - len(alike[::step])
-        left_out += (f"{more} more of {kind} are like those that were checked",) if more else ()
-    checks: dict[str, Check] = {}
-    with (progress or Progress()).stage("Laws", len(plugins)) as advance:
-        for name, (kind, plugin) in plugins.items():
-            if kind.startswith("BSDF"):
-                found = check_bsdf(plugin, quick=quick, seed=seed)
-            elif kind.startswith("shape"):
-                found = check_shape(plugin, quick=quick, seed=seed)
-            else:
-                case = emitter.Case.within(source.scene, plugin, np.random.default_rng(seed))
-                found = examine(name, case, emitter.LAWS, quick=quick)
-            checks[name] = replace(found, subject=name)
+    for word, plugins in (("BSDF", bsdfs), ("shape", shapes), ("emitter", source.scene.emitters())):
+        for plugin in plugins:
+            kinds.setdefault(f"{word} {class_name(plugin)}", []).append(plugin)
+    found: dict[str, Check] = {}
+    chosen = {kind: range(0, len(alike), max(len(alike) // ALIKE, 1)) for kind, alike in kinds.items()}
+    with (progress or Progress()).stage("Laws", sum(map(len, chosen.values()))) as advance:
+        for kind, number in ((kind, number) for kind, numbers in chosen.items() for number in numbers):
+            plugin = kinds[kind][number]
+            name = f"{kind} {plugin.id() or number}"
+            name = name if name not in found else f"{name} ({number})"
+            check = checks[kind.split()[0]](plugin, quick=quick, seed=seed)
+            found[name] = replace(check, subject=name)
             advance(1)
-    instances = sum(shape.class_name() == "Instance" for shape in source.scene.shapes())
-    if instances:
-        left_out += (f"{instances} instances are not checked: give a dict of one with its group",)
-    return SceneCheck(source.name, checks, _hunt(source, quick, seed), left_out)
+    more = {kind: len(alike) - len(chosen[kind]) for kind, alike in kinds.items()}
+    left_out = [f"{n} more of {kind} are like those that were checked" for kind, n in more.items() if n]
+    if len(every) > len(shapes):
+        instances = len(every) - len(shapes)
+        left_out.append(f"{instances} instances are not checked: give a dict of one with its group")
+    return SceneCheck(source.name, found, _hunt(source, quick, seed), tuple(left_out))
 
 
-def _all(scene: Any) -> Iterator[tuple[str, Any]]:
-    """Yield each BSDF, shape and emitter once, after its kind."""
-    shapes = [shape for shape in scene.shapes() if shape.class_name() != "Instance"]
-    bsdfs = {str(id(b)): b for b in (shape.bsdf() for shape in shapes) if b is not None}
-    for word, plugins in (("BSDF", bsdfs.values()), ("shape", shapes), ("emitter", scene.emitters())):
-        yield from ((f"{word} {class_name(plugin)}", plugin) for plugin in plugins)
+def _check_emitter(scene: Any, plugin: Any, *, quick: bool, seed: int) -> Check:
+    return examine(partial(emitter.Case, scene), plugin, emitter.LAWS, quick=quick, seed=seed)
 
 
 # ------------------------------------------------- The hunt -----------------------------------------------
@@ -143,22 +135,18 @@ def _hunt(source: Any, quick: bool, seed: int) -> Fault | None:
     bad = _bad(source, spp, seed)
     if not bad.any():
         return None
-    left, top = map(int, np.array(source.sensor.film().crop_offset()))
-    y, x = (int(axis[0]) for axis in np.nonzero(bad))
-    width, height = 1, 1
-    while width < bad.shape[1] or height < bad.shape[0]:
-        crop, count = (left + x // width * width, top + y // height * height, width, height), 16
-        most = max(MOST_SAMPLES // (width * height), 16)
+    (left, top), (y, x) = map(int, np.array(source.sensor.film().crop_offset())), np.argwhere(bad)[0]
+    size, count = 1, 0
+    while not count:
+        height, width = (min(size, extent) for extent in bad.shape)
+        crop = int(left + x // width * width), int(top + y // height * height), width, height
+        counts = [n for n in (16, 128, 1024, 8192) if n * width * height <= MOST_SAMPLES] or [16]
+        if (height, width) == bad.shape:
+            crop, count = (left, top, width, height), spp
         with _cropped(source.sensor, crop):
-            while count <= most and not _bad(source, count, seed).any():
-                count *= 8
-        if count <= most:
-            break
-        width, height = min(2 * width, bad.shape[1]), min(2 * height, bad.shape[0])
-    else:
-        crop, count = (left, top, bad.shape[1], bad.shape[0]), spp
-    with _cropped(source.sensor, crop):
-        culprit = _culprit(source, count, seed)
+            count = count or next((n for n in counts if _bad(source, n, seed).any()), 0)
+            culprit = _culprit(source, count, seed) if count else ""
+        size *= 2
     return Fault(int(bad.sum()), crop, count, culprit)
 
 

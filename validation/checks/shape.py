@@ -1,21 +1,48 @@
-"""``check_shape``: the laws that any shape must obey, stock, mesh or in Python."""
+"""``check_shape``: the laws that any shape must obey, stock, mesh or in Python.
+
+A new law is a function of ``Law`` and ``Case`` and a row of ``LAWS``; see ``bsdf``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
+from scipy import stats
 
-from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.checks.law import TIMEOUT, Check, Law, examine, settings_restored
+from mrt_mitsuba.validation.checks import noise
+from mrt_mitsuba.validation.checks.law import LEVEL, RARE, SIGMAS, TIMEOUT, Check, Law, Skip, examine, figures
 from mrt_mitsuba.validation.checks.noise import ROUNDING
-from mrt_mitsuba.validation.checks.probe import lanes
-from mrt_mitsuba.validation.checks.recipe import elsewhere, other_kind
-from mrt_mitsuba.validation.checks.shape_case import FLAT, HIT_ROUNDINGS, Case, corners, trace
-from mrt_mitsuba.validation.checks.shape_range import far, finite, scale
-from mrt_mitsuba.validation.checks.shape_samples import sampling
-from mrt_mitsuba.validation.checks.shape_surface import hits, normals, surface, watertight
+from mrt_mitsuba.validation.checks.probe import Array, lanes, unit
+from mrt_mitsuba.validation.checks.shape_case import (
+    FLAT,
+    Case,
+    Hits,
+    dot,
+    leave,
+    mesh,
+    near,
+    offset,
+    trace,
+    walk,
+)
+from mrt_mitsuba.validation.checks.subject import Kept, elsewhere, other_kind, reason
+from mrt_mitsuba.validation.tools.image_tests import sidak
+
+HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
+TYPICAL = 16  # roundings: twice the most that was measured of sound shapes
+TILTED = 2e-3
+NORMAL = 1e-5  # a few roundings of a square root and a quotient
+FAR = 1e4  # sizes away
+SMOOTHED = ("SDFGrid", "BSplineCurve", "LinearCurve", "Instance")
+DIGITS = f"over that of {noise.ALLOWANCE:g} roundings with a rounded ray, 9 in 10"
+
+RAY = """ray
+print(scene.ray_intersect(mi.Ray3f(o, d)))
+"""
 
 
 def check_shape(
@@ -32,51 +59,530 @@ def check_shape(
     ``quick``: fewer rays. ``only``: names of ``LAWS``. ``timeout``: seconds after which a law fails that is
     not done. Raises ``UsageError`` for anything else, and ``SceneError`` for a dict that Mitsuba cannot load.
     """
-    runtime.use()
-    with settings_restored():
-        case = Case(shape, quick, seed)
-        return examine(case.name, case, LAWS, only=only, quick=quick, timeout=timeout)
+    return examine(Case, shape, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
 
 
+MAXT = """ray
+ray = mi.Ray3f(o, d)
+print("meets the surface at", scene.ray_intersect(ray).t)
+ray.maxt = float("{maxt}")
+print("up to", ray.maxt, "ray_test():", scene.ray_test(ray), "ray_intersect():", scene.ray_intersect(ray).t)
+"""
+ONE = "one question, one answer; rays that graze are left out, but for those that just miss"
+
+
+@figures(
+    ray_test=("share", "share of rays {rays} on which ray_test() is wrong", 0, ONE, MAXT),
+    ray_intersect=("share", "share of rays {rays} on which ray_intersect() is wrong", 0, ONE, MAXT),
+)  # fmt: skip
+def hits(law: Law, case: Case) -> None:
+    """``ray_test`` and ``ray_intersect`` agree, and heed ``maxt``, from outside and from the surface."""
+    _, _, met = case.met
+    away = case.units(len(met.t))
+    start = leave(met.p, met.n, away)
+    for rays, (o, d, seen), reach in (
+        ("without a limit", case.seen, np.inf),
+        ("up to just before the hit", case.met, 1 - 1e-3),
+        ("up to just behind the hit", case.met, 1 + 1e-3),
+        ("that leave the surface", (start, away, trace(case.target, start, away)), np.inf),
+    ):
+        maxt = (seen.t * reach).astype(np.float32)
+
+        def call(origin: Any, direction: Any, most: Any) -> list[Any]:
+            ray = mi.Ray3f(origin, direction)
+            ray.maxt = most
+            return [case.target.ray_test(ray), case.target.ray_intersect(ray).is_valid()]
+
+        answers = lanes(call, ("Point3f", o), ("Vector3f", d), ("Float", maxt))
+        steep = ~seen.found | (np.abs(dot(seen.n, d)) > FLAT)
+        for name, answer in zip(("ray_test", "ray_intersect"), answers, strict=True):
+            wrong = steep & (answer != (seen.found & (reach > 1)))
+            law.hold(name, wrong, limit=5e-4 if np.isinf(reach) else 0, o=o, d=d, maxt=maxt, rays=rays)
+
+
+@figures(
+    on_ray=("most", "hit point off the ray at its distance, in roundings of the largest number",
+            HIT_ROUNDINGS, "some dozen operations", RAY),
+    near_by=(0.5, "hit point off a ray of a twentieth of the size, in roundings of the largest coordinate, "
+             "median", TYPICAL, "a few operations", RAY),
+    behind=(0.5, "hit points from in front and from behind, across the surface, in roundings of the largest "
+            "coordinate, median", TYPICAL, "a few operations", RAY),
+    again=("none", "rays from the surface, of {count}, that meet it where they start", 0,
+           "self-intersections are dark spots; grazing rays are left out", RAY),
+    missed=("share", "share of rays from a thousandth of the size before the surface that do not meet "
+            "it there", 2e-3, "no absolute limits; outlines hang on roundings", RAY),
+    noise=(0.9, "noise of the {what} " + DIGITS, noise.LOST,
+           "digits are lost inside that could be kept", RAY),
+)  # fmt: skip
+def surface(law: Law, case: Case) -> None:
+    """p = o + t d is on the surface; spawned rays do not meet it where they start; digits are kept."""
+    o, d, met = case.met
+    largest = np.maximum(np.abs(o).max(axis=1), np.abs(met.p).max(axis=1)) + met.t
+    off = np.abs(o.astype(np.float64) + met.t[:, None] * d - met.p).max(axis=1)
+    law.hold("on_ray", off / (ROUNDING * largest), o=o, d=d)
+    _from_near_by(law, case)
+    count = case.count(10**5, 10**6)
+    few, away = met.only(case.rng.integers(len(met.t), size=count)), case.units(count)
+    start = leave(few.p, few.n, away)
+    again = trace(case.target, start, away)
+    # another part may truly be that near, in a hollow edge
+    alike = np.abs(dot(again.n, few.n)) > np.where(again.part == few.part, 0.9, 0.9999)
+    bad = again.found & near(few.p, again.p) & alike & (np.abs(dot(few.n, away)) > FLAT)
+    law.hold("again", bad, o=start, d=away, count=count)
+    before = (met.p - 1e-3 * case.size * d).astype(np.float32)
+    again = trace(case.target, before, d)
+    missed = ~again.found | (np.linalg.norm(again.p - met.p, axis=1) >= 1e-3 * case.size)
+    law.hold("missed", missed, o=before, d=d)
+    few, scale = slice(0, case.count(300, 1000)), np.abs(o).max(axis=1) + met.t
+    for what, pick, size in (
+        ("distance", lambda h: h.t, scale),
+        ("hit point", lambda h: h.p.sum(axis=1), scale),
+        ("normal", lambda h: h.n @ np.array([0.6, 0.48, 0.64]), np.ones_like(scale)),
+    ):
+
+        def function(x: Array, pick: Any = pick) -> Array:
+            return np.asarray(pick(trace(case.target, x[:, :3], x[:, 3:])))
+
+        inputs = np.concatenate([o[few], d[few]], axis=1)
+        found = noise.measure(function, inputs, size=size[few], strides=(64,), seed=case.seed)
+        law.hold("noise", found.lost, o=o, d=d, what=what)
+
+
+def _from_near_by(law: Law, case: Case) -> None:
+    """From near by, and from the other side, numbers are small, and points that are off show."""
+    few = slice(0, case.count(2**12, 2**15))
+    d, met = case.met[1][few], case.met[2].only(few)
+    close = (met.p - 0.05 * case.size * d).astype(np.float32)
+    again = trace(case.target, close, d)
+    same, largest = again.found & near(met.p, again.p), np.abs(met.p).max(axis=1) + 0.05 * case.size
+    off = np.abs(close + again.t[:, None].astype(np.float64) * d - again.p).max(axis=1)
+    # the same line the other way around, from as far behind
+    back = trace(case.target, (met.p + 0.05 * case.size * d).astype(np.float32), -d)
+    apart = np.linalg.norm(back.p.astype(np.float64) - again.p, axis=1) * np.abs(dot(met.n, d))
+    alike = same & back.found & (back.part == met.part) & (apart < 0.01 * case.size)
+    alike &= case.behind.found.mean() > 0.5  # else rays pass it from behind
+    for name, error, known in (("near_by", off, same), ("behind", apart, alike)):
+        if known.sum() > 20:
+            law.hold(name, np.where(known, error / (ROUNDING * largest), np.nan), o=close, d=d)
+
+
+BEHIND = """ray
+si = scene.ray_intersect(mi.Ray3f(o, d))
+back = scene.ray_intersect(mi.Ray3f(si.spawn_ray(d).o, -d))
+print("from the front:", si.n, "and from just behind:", back.n, "at", back.t)
+"""
+NEIGHBOUR = """ray
+aside = mi.Vector3f({aside})
+si = scene.ray_intersect(mi.Ray3f(o, d))
+near = scene.ray_intersect(mi.Ray3f(o + 1e-3 * {size} * aside, d))
+step, uv = near.p - si.p, near.uv - si.uv
+print("slope against the normal:", dr.dot(step, si.n) / dr.norm(step))
+print("step", step, "by partial derivatives:", si.dp_du * uv.x + si.dp_dv * uv.y)
+"""
+PARTED = "extrapolated to no step; edges may part neighbours"
+
+
+@figures(
+    outwards=("share", "share of rays from outside whose normal points the wrong way", 1e-3,
+              "a closed shape has an outside; what edges hide is left room for", RAY),
+    length=("most", "length of a normal less 1", NORMAL, "a square root and a quotient", RAY),
+    side=("none", "shading normals on the other side than the geometric one", 0, "one surface", RAY),
+    shading=(0.9, "shading normal against the geometric one, or the interpolated one of a mesh, 9 in 10",
+             TILTED, "the same, but for some roundings", RAY),
+    turned=("share", "share of normals that turn where the same point is met from behind", 1e-3,
+            "a surface has one normal; thin parts are left room for", BEHIND),
+    slant=("most", "cosine between the normal and a partial derivative of the point", 1e-3,
+           "both are known to a few roundings; near a pole the derivatives are short", RAY),
+    slope=(0.95, "slope of the surface against its normal, by differences, 95 in 100", 1e-2, PARTED,
+           NEIGHBOUR),
+    step=(0.95, "step along the surface less its partial derivatives, 95 in 100", 1e-2, PARTED, NEIGHBOUR),
+)  # fmt: skip
+def normals(law: Law, case: Case) -> None:
+    """n has unit length, points outwards, n · ∂p/∂u = n · ∂p/∂v = 0, and differences of points agree."""
+    if case.closed:
+        o, d, seen = case.seen
+        judged, even = case.lines
+        flipped = isinstance(case.plugin, mi.Shape) and case.plugin.has_flipped_normals()
+        law.hold("outwards", judged & even & ((dot(seen.n, d) > 0) != flipped), o=o, d=d)
+    else:
+        law.notes.append("open: there is no outside for normals to point to")
+    o, d, met = case.met
+    length = np.linalg.norm(np.stack([met.n, met.shading]).astype(np.float64), axis=-1)
+    law.hold("length", np.abs(length - 1).max(axis=0), o=o, d=d)
+    law.hold("side", dot(met.n, met.shading) <= 0, o=o, d=d)
+    expected = _interpolated(case, met)
+    if expected is not None:
+        law.hold("shading", np.linalg.norm(met.shading - expected, axis=1), o=o, d=d)
+    # the normal is the surface's, not the ray's: the same for a ray that comes back from behind
+    back = case.behind
+    same = back.found & near(met.p, back.p) & (back.part == met.part)
+    if same.sum() > 20:
+        law.hold("turned", same & (dot(back.n, met.n) < -0.5), o=o, d=d)
+    usable = (np.linalg.norm(met.du, axis=1) > 0) & (np.linalg.norm(met.dv, axis=1) > 0)
+    if usable.any():
+        slant = np.maximum(*(np.abs(dot(unit(v), met.n)) for v in (met.du, met.dv)))
+        law.hold("slant", np.where(usable & np.isfinite(slant), slant, 0), o=o, d=d)
+    _differences(law, case)
+
+
+def _interpolated(case: Case, met: Hits) -> Array | None:
+    """Return what shading normals should be; None where the shape is smoothed in a way of its own."""
+    shape = case.plugin
+    if isinstance(shape, mi.Shape) and shape.class_name() in SMOOTHED:
+        return None
+    if not isinstance(shape, mi.Mesh) or not shape.has_vertex_normals():
+        return met.n
+    found = mesh(shape, "vertex_normals")
+    if found is None:
+        return None
+    vertex, faces, normal = (x.astype(np.float64) for x in found)
+    faces = faces.astype(int)[met.part.astype(int)]
+    a, b, c = (vertex[faces[:, k]] for k in range(3))
+    across = np.cross(b - a, c - a)
+    v, w = (
+        dot(np.cross(x, y), across) / dot(across, across) for x, y in ((met.p - a, c - a), (b - a, met.p - a))
+    )
+    mixed = np.einsum("kn,nkx->nx", np.stack([1 - v - w, v, w]), normal[faces])
+    return (-1 if shape.has_flipped_normals() else 1) * mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
+
+
+def _differences(law: Law, case: Case) -> None:
+    """Neighbouring hits against normal and partial derivatives; two widths separate curvature from error."""
+    o, d, met = case.met
+    aside = unit(np.cross(d, case.units(len(d))))
+    slopes, partials = [], []
+    for h in (2e-3, 1e-3):
+        other = trace(case.target, (o + h * case.size * aside).astype(np.float32), d)
+        step = (other.p - met.p).astype(np.float64)
+        length = np.linalg.norm(step, axis=1)
+        ok = other.found & (other.part == met.part) & (length < 40 * h * case.size) & (length > 0)
+        ok &= dot(other.n, met.n) > 0.9
+        du, dv = (other.uv - met.uv).T[:, :, None].astype(np.float64)
+        slopes.append(np.where(ok, np.abs(dot(step, met.n)) / length, np.nan))
+        off = np.linalg.norm(step - du * met.du - dv * met.dv, axis=1) / length
+        ok &= (np.abs([du, dv]).max(axis=(0, 2)) < 0.2) & met.du.any()
+        partials.append(np.where(ok, off, np.nan))
+    for name, (wide, narrow) in (("slope", slopes), ("step", partials)):
+        if np.isfinite(wide + narrow).sum() >= 20:
+            law.hold(name, np.maximum(2 * narrow - wide, 0), o=o, d=d, aside=aside, size=case.size)
+
+
+@figures(
+    blind=("share", "share of rays that pass the surface from behind", 1e-2,
+           "it has two sides; edges have room", BEHIND),
+    odd=("share", "share of lines, of {judged}, that cross the surface an odd number of times", 1e-3,
+         "near sharp edges, the offset of a ray that goes on leads out again; grazing lines are left out",
+         RAY),
+    out=("at most", "share of rays from inside, of {count}, that surely meet nothing", 1e-5,
+         "a closed surface; of a million rays at triangles, some pass along an edge", RAY),
+)  # fmt: skip
+def watertight(law: Law, case: Case) -> None:
+    """Lines enter and leave in turn, and no ray from inside gets out without a hit."""
+    o, d, met = case.met
+    # else such a ray may fall off an edge, or its offset be larger than the shape
+    steep = (np.abs(dot(met.n, d)) > 0.5) & (offset(met.p) < 1e-3 * case.size)
+    blind = steep & ~case.behind.found
+    if blind.mean() > 1e-2:
+        law.hold("blind", blind, o=o, d=d)
+        return
+    if not case.closed:
+        raise Skip("the shape is open: lines do not leave it as often as they enter")
+    (o, d, _), (judged, even) = case.seen, case.lines
+    law.hold("odd", judged & ~even, o=o, d=d, judged=judged.sum())
+    inside = np.zeros((0, 3), np.float32)
+    if len(case.crossings) > 1:  # points well inside: middles of the longer first chords
+        (first, enter, _), (second, leaving, _) = case.crossings[:2]
+        _, i, j = np.intersect1d(first, second, return_indices=True)
+        chord = np.linalg.norm(enter.p[i] - leaving.p[j], axis=1)
+        inside = ((enter.p[i] + leaving.p[j]) / 2)[chord >= np.median(chord)].astype(np.float32)
+    if not len(inside):
+        law.notes.append("no room inside to start rays in")
+        return
+    count = case.count(10**5, 10**6)
+    o, d = inside[case.rng.integers(len(inside), size=count)], case.units(count)
+    out = ~trace(case.target, o, d).found
+    surely = (
+        stats.beta.ppf(LEVEL, out.sum(), count - out.sum() + 1) if out.any() else 0
+    )  # Clopper and Pearson
+    law.hold("out", surely, o=o[out.argmax()], d=d[out.argmax()], count=count)
+
+
+SCALED = """ray
+print("as it is, t:", scene.ray_intersect(mi.Ray3f(o, d)).t)
+shape = load(to_world=mi.ScalarTransform4f({matrix}))
+scene = mi.load_dict({{"type": "scene", "shape": shape}})
+print("scaled, t over the scale:", scene.ray_intersect(mi.Ray3f(o * 2.0**{power}, d)).t / 2.0**{power})
+"""
+
+
+@figures(
+    answer=("none", "rays answered otherwise at 2^{power} of the size", 0,
+            "scaling by a power of two rounds nothing; grazing rays are left out", SCALED),
+    off=("most", "distance (relative) or normal at 2^{power} of the size, off", HIT_ROUNDINGS * ROUNDING,
+         "some dozen operations, on scaled numbers", SCALED),
+)  # fmt: skip
+def scale(law: Law, case: Case) -> None:
+    """A millionth and a million times the size: the same, scaled. Powers of two leave no roundings."""
+    given = case.with_().get("to_world")
+    matrix = given.values if isinstance(given, Kept) else np.eye(4)
+    few = slice(0, case.count(2**12, 2**14))
+    o, d, seen = case.seen[0][few], case.seen[1][few], case.seen[2].only(few)
+    steep = ~seen.found | (np.abs(dot(seen.n, d)) > FLAT)
+    for power in (-20, -10, 10, 20):
+        larger = np.diag([2.0**power] * 3 + [1]) @ matrix
+        try:
+            box = case.load(to_world=mi.ScalarTransform4f(larger)).bbox()
+        except RuntimeError as problem:
+            raise Skip(f"to_world is not accepted: {reason(problem)}") from problem
+        grown = np.linalg.norm(np.ravel(np.array(box.max, np.float64) - np.array(box.min, np.float64)))
+        if not np.isclose(grown, 2.0**power * case.size, rtol=1e-3):
+            raise Skip("to_world does not scale all of it (of curves, the radius stays)")
+        scene = case.scene(to_world=mi.ScalarTransform4f(larger))
+        there = trace(scene, (o * 2.0**power).astype(np.float32), d)
+        both = steep & there.found & seen.found
+        apart = np.abs(there.t / 2.0**power - seen.t) / np.where(both, seen.t, 1)
+        error = np.where(both, np.maximum(apart, 1 - dot(there.n, seen.n)), 0)
+        for name, errors in (("answer", steep & (there.found != seen.found)), ("off", error)):
+            law.hold(name, errors, o=o, d=d, power=power, matrix=larger.tolist())
+
+
+TWICE = """ray
+for o in (o, mi.Point3f({other})):
+    dr.make_opaque(o)
+    print("from", o, "it is met at", scene.ray_intersect(mi.Ray3f(o, d)).p)
+"""
+
+
+@figures(missed=("share", "share of rays from afar that miss what is met from nearby, or meet it "
+                 f"{HIT_ROUNDINGS} roundings off", 1e-3, "the origin is rounded, and some dozen operations "
+                 "with it; next to edges, more hangs on them", TWICE))  # fmt: skip
+def far(law: Law, case: Case) -> None:
+    """Hits from ten thousand sizes away are those of the same lines from nearby, to some roundings."""
+    few, distance = slice(0, case.count(2**12, 2**15)), FAR * case.size
+    goal, d = case.met[2].p[few].astype(np.float64), case.met[1][few]
+    origin = (goal - distance * d.astype(np.float64)).astype(np.float32)
+    closer = (origin + (FAR - 1.5) * case.size * d.astype(np.float64)).astype(np.float32)
+    there, here = trace(case.target, origin, d), trace(case.target, closer, d)
+    cos = np.abs(dot(here.n, d))
+    error = np.linalg.norm(there.p.astype(np.float64) - here.p, axis=1) * cos / (ROUNDING * distance)
+    bad = here.found & (cos > 4 * FLAT) & (~there.found | (error > HIT_ROUNDINGS))
+    # a rounded origin moves the line: only what all lines around it meet counts
+    bad &= np.linalg.norm(here.p - goal, axis=1) < 20 * ROUNDING * distance
+    across = unit(np.cross(d, case.units(len(d))))
+    for side in (across, -across, np.cross(d, across), np.cross(across, d)):
+        aside = trace(case.target, (closer + 4 * ROUNDING * distance * side).astype(np.float32), d)
+        bad &= aside.found & (dot(aside.n, here.n) > 0.9)
+    law.hold("missed", bad, o=origin, d=d, other=closer)
+
+
+@figures(bad=("none", "hits with numbers that are not finite", 0, "one NaN spoils a picture", RAY))
+def finite(law: Law, case: Case) -> None:
+    """Rays along axes, from the surface, the middle, corners and very far: all results are finite."""
+    _, _, met = case.met
+    count, pick = case.count(2**12, 2**15), case.rng.integers
+    kinds = [
+        np.where(case.rng.random((count, 3)) < 0.5, case.low, case.high),
+        np.broadcast_to(case.middle, (count, 3)),
+        met.p[pick(len(met.p), size=count)],
+        case.middle + case.size * 10.0 ** case.rng.uniform(0, 5, (count, 1)) * case.units(count),
+    ]
+    if case.corners is not None:
+        kinds.append(case.corners[pick(len(case.corners), size=count)])
+    o = np.choose(pick(len(kinds), size=count)[:, None], kinds).astype(np.float32)
+    d = case.units(count)
+    d[case.rng.random(d.shape) < 0.4] = 0
+    d = unit(d + np.where((d == 0).all(axis=1, keepdims=True), [0, 0, 1], 0))
+    d[(d == 0) & (case.rng.random(d.shape) < 0.3)] = 1e-30
+    towards = unit(np.where(np.abs(case.middle - o) > 0, case.middle - o, 1))
+    d = np.where(case.rng.random((count, 1)) < 0.3, towards, d)
+    found = trace(case.target, o, d)
+    vectors = (found.p, found.n, found.shading, found.uv, found.du, found.dv)
+    sound = np.isfinite(np.concatenate([found.t[:, None], *vectors], axis=1)).all(axis=1) & (found.t >= 0)
+    law.hold("bad", np.where(found.found, ~sound, np.isnan(found.t)), o=o, d=d)  # a miss is infinitely far
+
+
+@figures(outside=("at most", "points outside the bounding box, in sizes", 1e-5, "some roundings", RAY))
 def bbox(law: Law, case: Case) -> None:
     """Whatever is hit or sampled lies in the bounding box."""
     o, d, met = case.met
     points = [met.p]
-    ends = corners(case.plugin)
-    if ends is not None:
-        points.append(ends)
+    if case.corners is not None:
+        points.append(case.corners)
     elif hasattr(case.plugin, "sample_position"):
         try:
-            u = case.rng.random((len(o), 2), np.float32)
-            points += lanes(lambda mi, x: [case.plugin.sample_position(0, x).p], ("Point2f", u))
+            u = case.uniform(len(o), 2)
+            points += lanes(lambda x: [case.plugin.sample_position(0, x).p], ("Point2f", u))
         except RuntimeError:
             law.notes.append("sample_position() is not there")
     p = np.concatenate(points)
     out = np.maximum(case.box[0] - p, p - case.box[1]).max(axis=1) / case.size
-    i = int(out.argmax())
-    what = "points outside the bounding box, in sizes"
-    why = "some roundings"
-    law.at_most(what, max(out[i], 0), 1e-5, why, case.snippet(o[min(i, len(o) - 1)], d[min(i, len(o) - 1)]))
+    i = min(int(out.argmax()), len(o) - 1)
+    law.hold("outside", max(out.max(), 0), o=o[i], d=d[i])
 
 
+@figures(
+    answer=("share", "share of rays answered otherwise in {other}", 2e-3, "outlines hang on roundings", RAY),
+    distance=("most", "distance in {other}, off by roundings of the largest number", 4 * HIT_ROUNDINGS,
+              "some dozen operations each, and another cosine with the surface", RAY),
+)  # fmt: skip
 def variants(law: Law, case: Case) -> None:
     """Hits in the scalar variant against those in the vectorised one."""
     case.with_()
-    other = other_kind()
-    few = slice(0, case.count(500, 2000))
+    few, other = slice(0, case.count(500, 2000)), other_kind()
     o, d, seen = case.seen[0][few], case.seen[1][few], case.seen[2].only(few)
     there = elsewhere(other, lambda: trace(case.scene(), o, d))
-    steep = np.abs((seen.n * d).sum(axis=1)) > FLAT
-    bad = (there.found != seen.found) & (steep | ~seen.found)
-    both = there.found & seen.found & steep
-    scale = np.abs(o).max(axis=1) + seen.t
-    error = np.where(both, np.abs(there.t - seen.t) / (ROUNDING * scale), 0)
-    i = int((bad if bad.any() else error).argmax())
-    what = f"share of rays answered otherwise in {other}"
-    law.at_most(what, bad.mean(), 2e-3, "outlines hang on roundings", case.snippet(o[i], d[i]))
-    what = f"distance in {other}, off by roundings of the largest number"
-    why = "some dozen operations each, and another cosine with the surface"
-    law.at_most(what, error.max(), 4 * HIT_ROUNDINGS, why, case.snippet(o[i], d[i]))
+    steep = np.abs(dot(seen.n, d)) > FLAT
+    law.hold("answer", (there.found != seen.found) & (steep | ~seen.found), o=o, d=d, other=other)
+    error = np.abs(there.t - seen.t) / (ROUNDING * (np.abs(o).max(axis=1) + seen.t))
+    law.hold("distance", np.where(there.found & seen.found & steep, error, 0), o=o, d=d, other=other)
+
+
+# ---------------------------------------------- Samples --------------------------------------------------
+
+POSITIONS = """
+n = 100_000
+rng = mi.PCG32(n)
+ps = shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))
+print("mean of 1 / density:", dr.mean(1 / ps.pdf), "surface_area():", shape.surface_area())
+ratio = shape.pdf_position(ps) / ps.pdf
+print("pdf_position() / density:", dr.min(ratio), "...", dr.max(ratio))
+"""
+SAME = "the same number"
+
+
+@figures(
+    position=("most", "density of a position against pdf_position(), relative", 1e-3, SAME, POSITIONS),
+    area=("at most", "mean of 1 / density against surface_area(), relative", 1e-3, SAME, POSITIONS),
+    off=(0.9, "sampled positions off the surface, 9 in 10, in roundings of the largest coordinate",
+         2 * HIT_ROUNDINGS, "a few roundings", RAY),
+    normal=(0.9, "normals of sampled positions against those of rays, 1 - cosine, 9 in 10", 1e-3,
+            "one surface", RAY),
+    crossings=("at most", "surface_area() against that by crossings of lines, relative, beyond "
+               f"{SIGMAS} standard errors", 3e-3, "lines that graze may cross twice within the offset of a "
+               "spawned ray", POSITIONS),
+    spread=("at least", "chance of such positions if they follow the area, along the worst of some axes",
+            LEVEL, RARE, POSITIONS),
+    direction=(0.99, "density of a direction against pdf_direction(), relative, 99 in 100", 1e-2,
+               "the same number; near outlines the cosine, and the density with it, hangs on roundings", RAY),
+    misses=("share", "share of sampled directions that miss the shape, or reach it behind the sampled point",
+            1e-2, "outlines hang on roundings; small leaks are watertight's business", RAY),
+    angle=("at most", "solid angle of what is visible, or its middle or width, by samples against uniform "
+           f"directions, beyond {SIGMAS} standard errors", 1e-2, "the mean of 1 / density over what is seen; "
+           "lines that graze are left room for", POSITIONS),
+)  # fmt: skip
+def sampling(law: Law, case: Case) -> None:
+    """Positions by area, judged by where lines cross the surface; directions, and the densities of both.
+
+    E[1 / pdf] is the area, and of directions the solid angle of what is seen.
+    """
+    if not hasattr(case.plugin, "sample_position"):
+        raise Skip("there is no sample_position()")
+    u = case.uniform(case.count(2**14, 2**19), 2)
+
+    def positions(second: Any) -> list[Any]:
+        ps = case.plugin.sample_position(0, second)
+        return [ps.p, ps.n, ps.pdf, case.plugin.pdf_position(ps)]
+
+    try:
+        p, n, pdf, again = lanes(positions, ("Point2f", u))
+        area = float(np.ravel(np.array(case.plugin.surface_area()))[0])
+    except RuntimeError as problem:
+        raise Skip(f"positions cannot be sampled: {reason(problem)}") from problem
+    law.hold("position", np.abs(pdf / again - 1))
+    law.hold("area", abs(np.mean(1 / pdf) / area - 1))
+    few = slice(0, case.count(2**14, 2**17))
+    # sampled positions, and their normals, as rays meet them
+    start, inwards = (p + n * 0.01 * case.size).astype(np.float32)[few], -n[few]
+    back = trace(case.target, start, unit(inwards))
+    # another part of the surface may be nearer than a hundredth of the size
+    away = np.where(back.found, np.linalg.norm(back.p - p[few], axis=1), np.inf)
+    scale = np.abs(p[few]).max(axis=1) + 0.01 * case.size
+    law.hold("off", away / (ROUNDING * scale), o=start, d=inwards)
+    if back.found.any():
+        alike = -np.minimum(dot(inwards, back.shading), dot(inwards, back.n))
+        off = np.where(back.found, 1 - alike / np.linalg.norm(inwards, axis=1), np.nan)
+        law.hold("normal", off, o=start, d=inwards)
+    if case.behind.found.mean() > 0.5:
+        _area(law, case, p, n, area)
+    else:
+        law.notes.append("rays pass it from behind: their crossings do not count its area")
+    _directions(law, case, u[few])
+
+
+def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
+    """Random lines cross a surface in proportion to its area, whatever its form (Crofton)."""
+
+    def doubled(p: Array, n: Array) -> Array:
+        """Return where two parts of the surface coincide, of which lines meet one."""
+        n = unit(n)
+        one, other = (trace(case.target, leave(p, n, side * n), -side * n) for side in (1, -1))
+        return one.found & other.found & (one.part != other.part) & near(p, one.p) & near(p, other.p)
+
+    count, radius = case.count(2**16, 2**20), 0.5 * case.size * 1.001
+    d = case.units(count)
+    disk = radius * np.sqrt(case.rng.random((count, 1))) * unit(np.cross(d, case.units(count)))
+    twice, crossed, found = doubled(p, n), np.zeros(count), []
+    for line, hit, _ in walk(case.target, (case.middle + disk - 2 * radius * d).astype(np.float32), d):
+        crossed[line] += 1
+        found.append(hit.p[~doubled(hit.p, hit.n)] if twice.any() else hit.p)
+    estimate, error = 2 * np.pi * radius**2 * np.array([crossed.mean(), crossed.std() / np.sqrt(count)])
+    room = 3e-3 + 20 * float(offset(p).max()) / case.size + twice.mean()
+    law.hold("crossings", max(abs(estimate - area) - SIGMAS * error, 0) / area, limit=room)
+    # both along axes aslant, by Kolmogorov and Smirnov; crossings of a line come together
+    p, points = p[~twice], np.concatenate(found)
+    size = 1 / (1 / len(p) + (crossed**2).sum() / crossed.sum() / len(points))
+    apart = [stats.ks_2samp(p @ axis, points @ axis, method="asymp").statistic for axis in case.units(AXES)]
+    chance = float(stats.kstwobign.sf(max(max(apart) - ROOM, 0) * np.sqrt(size)))
+    law.hold("spread", sidak(chance, AXES))
+
+
+AXES, ROOM = 12, 2e-3  # lines that graze are left room for
+
+
+def _directions(law: Law, case: Case, u: Array) -> None:
+    """``sample_direction`` from outside: meets the shape, and states its own density."""
+    o = case.around(len(u))
+
+    def sample(origin: Any, second: Any) -> list[Any]:
+        it = dr.zeros(mi.Interaction3f)
+        it.p = origin
+        ds = case.plugin.sample_direction(it, second)
+        return [ds.d, ds.dist, ds.pdf, case.plugin.pdf_direction(it, ds)]
+
+    try:
+        d, dist, pdf, again = lanes(sample, ("Point3f", o), ("Point2f", u))
+    except (RuntimeError, AttributeError):
+        law.notes.append("the shape has no sample_direction()")
+        return
+    drawn, met = pdf > 0, trace(case.target, o, d.astype(np.float32))
+    law.hold("direction", np.where(drawn, np.abs(pdf / again - 1), 0), o=o, d=d)
+    steep = np.abs(dot(met.n, d)) > FLAT
+    law.hold("misses", drawn & np.where(met.found, steep & (met.t > dist * (1 + 1e-3)), True), o=o, d=d)
+    visible = drawn & met.found & (met.t > dist * (1 - 1e-3))
+    mean, variance = _moments(case, o, d, met.p, np.where(visible, 1 / np.where(drawn, pdf, 1), 0))
+    # the same by uniform directions into the cone that holds the shape
+    o = case.around(case.count(2**17, 2**19))
+    axis = unit(case.middle - o)
+    across = unit(np.cross(axis, case.units(len(o))))
+    cos = 1 - case.rng.random((len(o), 1)) * CONE / (2 * np.pi)
+    away = unit(cos * axis + np.sqrt(1 - cos**2) * across)
+    met = trace(case.target, o, away)
+    expected, other = _moments(case, o, away, met.p, np.where(met.found, CONE, 0))
+    off = np.abs(mean - expected) - SIGMAS * np.sqrt(variance + other)
+    law.hold("angle", max(off.max(), 0) / expected[0])
+
+
+SINE = 1 / 3  # of the angle between the middle and the rim of the sphere around, from 1.5 sizes away
+CONE = 2 * np.pi * (1 - np.sqrt(1 - SINE**2))  # solid angle
+
+
+def _moments(case: Case, o: Array, d: Array, p: Array, weight: Array) -> tuple[Array, Array]:
+    """Return means [8] of weights, alone and times place, its squares and the angle, and their variances."""
+    place = (p - case.middle) / case.size
+    angle = (1 - dot(d, unit(case.middle - o))[:, None]) * 2 * np.pi / CONE
+    factors = np.concatenate([np.ones_like(angle), place, 4 * place**2, angle], axis=1)
+    found = np.where(weight[:, None] > 0, weight[:, None] * factors, 0)
+    return found.mean(axis=0), found.var(axis=0) / len(found)
 
 
 LAWS = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,20 +11,14 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.checks import snippets
 from mrt_mitsuba.validation.checks.law import Skip
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import Array, Lanes, lanes, unit
-from mrt_mitsuba.validation.checks.recipe import Subject, row
+from mrt_mitsuba.validation.checks.subject import Subject
 
 OFFSET = 1500 * ROUNDING  # of the origin of a spawned ray from its surface, over 1 + max |p|
 FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
-HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
 MOST_HITS = 16  # along a line
-
-RAY = """ray
-print(scene.ray_intersect(mi.Ray3f(o, d)))
-"""
 
 
 @dataclass(frozen=True)
@@ -45,12 +39,16 @@ class Hits(Lanes):
 def trace(target: Any, o: Array, d: Array) -> Hits:
     """Trace rays from float32 points [N, 3] in directions [N, 3]."""
 
-    def call(mi: Any, origin: Any, direction: Any) -> list[Any]:
+    def call(origin: Any, direction: Any) -> list[Any]:
         si = target.ray_intersect(mi.Ray3f(origin, direction))
         return [si.is_valid(), si.t, si.p, si.n, si.sh_frame.n, si.dp_du, si.dp_dv, si.uv, si.prim_index]
 
-    found, t, p, n, shading, du, dv, uv, part = lanes(call, ("Point3f", o), ("Vector3f", d))
-    return Hits(found[:, 0].astype(bool), t[:, 0], p, n, shading, du, dv, uv, part[:, 0])
+    return Hits(*lanes(call, ("Point3f", o), ("Vector3f", d)))
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Return the dot products of vectors [N, 3]."""
+    return (a * b).sum(axis=-1)
 
 
 def walk(target: Any, o: Array, d: Array, first: Hits | None = None) -> Iterator[tuple[Array, Hits, Array]]:
@@ -60,12 +58,14 @@ def walk(target: Any, o: Array, d: Array, first: Hits | None = None) -> Iterator
         line, d, hits = line[hits.found], d[hits.found], hits.only(hits.found)
         if not len(line):
             return
-        yield line, hits, (hits.n * d).sum(axis=1)
+        yield line, hits, dot(hits.n, d)
         hits = trace(target, leave(hits.p, hits.n, d), d)
 
 
 class Case(Subject):
     """A shape under examination, rays towards it and what they meet."""
+
+    word = "shape"
 
     def __init__(self, given: Any, quick: bool, seed: int) -> None:
         super().__init__(given, quick, seed)
@@ -73,48 +73,40 @@ class Case(Subject):
             kind = type(self.plugin).__name__
             raise UsageError(f"{kind} is not a shape of {mi.variant()}: give a dict or a loaded shape")
         self.target = self.plugin
-        if isinstance(self.plugin, mi.Shape):
+        if isinstance(self.plugin, mi.Shape) and self.plugin.class_name() == "Instance":
+            if self.description is None:
+                raise UsageError("a loaded instance does not give its group away: give a dict of both")
+            self.target = self.scene()
+        elif isinstance(self.plugin, mi.Shape):
             name = self.plugin.id()
-            if self.plugin.class_name() == "Instance":
-                if self.description is None:
-                    raise UsageError("a loaded instance does not give its group away: give a dict of both")
-                self.target = self.scene()
-            else:
-                self.target = mi.load_dict({"type": "scene", "shape": self.plugin})
-                self.plugin.set_id(name)  # which the scene has changed
+            self.target = mi.load_dict({"type": "scene", "shape": self.plugin})
+            self.plugin.set_id(name)  # which the scene has changed
         box = self.plugin.bbox()
-        low, high = (np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max))
-        if not (np.isfinite(low).all() and np.isfinite(high).all() and (high >= low).all()):
-            raise UsageError(f"the bounding box of the shape is {low} … {high}: it must be finite")
-        self.box = low, high  # as the shape has it, which may be wrong
-        ends = corners(self.plugin)
-        if ends is not None:
-            low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
-        self.low, self.high, self.middle = low, high, (low + high) / 2
-        self.size = float(np.linalg.norm(high - low))
+        self.box = np.array([np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max)])
+        if not np.isfinite(self.box).all() or (self.box[1] < self.box[0]).any():
+            raise UsageError(f"the bounding box of the shape is {self.box}: it must be finite")
+        self.corners = corners(self.plugin)
+        points = self.box if self.corners is None else np.concatenate([self.box, self.corners])
+        self.low, self.high = points.min(axis=0), points.max(axis=0)  # the box itself may be wrong
+        self.middle, self.size = (self.low + self.high) / 2, float(np.linalg.norm(self.high - self.low))
 
-    def around(self, count: int, distance: float = 1.5) -> Array:
-        """Return points that look at the shape, from so many sizes away."""
-        return (self.middle + distance * self.size * self.units(count)).astype(np.float32)
-
-    def rays(self, count: int, distance: float = 1.5) -> tuple[Array, Array]:
-        """Return rays from all around to points in the box."""
-        o = self.around(count, distance)
-        extent = np.maximum(self.high - self.low, 0.01 * self.size)
-        goal = self.middle + extent * self.rng.uniform(-0.55, 0.55, (count, 3))
-        return o, unit(goal - o)
+    def around(self, count: int) -> Array:
+        """Return points that look at the shape, from 1.5 sizes away."""
+        return (self.middle + 1.5 * self.size * self.units(count)).astype(np.float32)
 
     @cached_property
     def seen(self) -> tuple[Array, Array, Hits]:
-        """Rays from outside and what they meet."""
-        o, d = self.rays(self.count(2**14, 2**17))
+        """Rays from all around to points in the box, and what they meet."""
+        o = self.around(self.count(2**14, 2**17))
+        extent = np.maximum(self.high - self.low, 0.01 * self.size)
+        d = unit(self.middle + extent * self.rng.uniform(-0.55, 0.55, o.shape) - o)
         return o, d, trace(self.target, o, d)
 
     @cached_property
     def met(self) -> tuple[Array, Array, Hits]:
         """Return the rays that meet the surface and do not graze it, and their hits."""
         o, d, hits = self.seen
-        steep = hits.found & (np.abs((hits.n * d).sum(axis=1)) > FLAT)
+        steep = hits.found & (np.abs(dot(hits.n, d)) > FLAT)
         if steep.sum() < 20:
             raise Skip("hardly any ray towards its bounding box meets the shape")
         return o[steep], d[steep], hits.only(steep)
@@ -126,9 +118,9 @@ class Case(Subject):
         return trace(self.target, leave(hits.p, hits.n, d), -d)
 
     @cached_property
-    def crossings(self) -> list[tuple[Array, Array, Array]]:
-        """Whole lines: hit by hit, which line, the point, and the cosine with the normal."""
-        return [(line, hits.p, cos) for line, hits, cos in walk(self.target, *self.seen)]
+    def crossings(self) -> list[tuple[Array, Hits, Array]]:
+        """Whole lines: hit by hit, which line, what it meets, and the cosine with the normal."""
+        return list(walk(self.target, *self.seen))
 
     @cached_property
     def closed(self) -> bool:
@@ -142,22 +134,12 @@ class Case(Subject):
         count = len(self.seen[0])
         met, even, clear = np.zeros(count, bool), np.ones(count, bool), np.ones(count, bool)
         last = np.full((count, 3), np.inf)
-        for line, p, cos in self.crossings:
+        for line, hits, cos in self.crossings:
             met[line] = True
-            clear[line] &= (np.abs(cos) > 4 * FLAT) & ~near(p, last[line])
+            clear[line] &= (np.abs(cos) > 4 * FLAT) & ~near(hits.p, last[line])
             even[line] ^= True
-            last[line] = p
+            last[line] = hits.p
         return met & clear, even
-
-    def program(self, body: str) -> str:
-        return snippets.program("shape", self, body)
-
-    def snippet(self, o: Array, d: Array, body: str = RAY, **names: Any) -> str:
-        return snippets.program("shape", self, body, o=o, d=d, **names)
-
-    def at(self, o: Array, d: Array, body: str = RAY, **names: Any) -> Callable[[int], str]:
-        """Return what makes the snippet of one ray of many; arrays have a row for each."""
-        return lambda i: self.snippet(o[i], d[i], body, **row(names, i))
 
 
 def offset(p: Array) -> Array:
@@ -172,17 +154,21 @@ def near(p: Array, q: Array) -> Array:
 
 def leave(p: Array, n: Array, d: Array) -> Array:
     """Return origins off the surface on the side of ``d``, as ``spawn_ray`` has them."""
-    side = np.sign((n * d).sum(axis=1, keepdims=True))
-    return (p + side * n * offset(p)[:, None]).astype(np.float32)
+    return (p + np.sign(dot(n, d))[:, None] * n * offset(p)[:, None]).astype(np.float32)
+
+
+def mesh(shape: Any, *more: str) -> list[Array] | None:
+    """Return the vertices [V, 3], faces [F, 3] and ``more`` vectors of a mesh; None for other shapes."""
+    names = ("vertex_positions", "faces", *more)
+    if not isinstance(shape, mi.Mesh) or not set(names) <= set(mi.traverse(shape).keys()):
+        return None  # a rectangle hides that it is a mesh
+    return [np.array(mi.traverse(shape)[name]).reshape(-1, 3) for name in names]
 
 
 def corners(shape: Any) -> Array | None:
     """Return the vertices of a mesh and the middles of its edges; None for other shapes."""
-    if not isinstance(shape, mi.Mesh):
+    found = mesh(shape)
+    if found is None:
         return None
-    params = mi.traverse(shape)
-    if not {"vertex_positions", "faces"} <= set(params.keys()):  # a rectangle hides that it is one
-        return None
-    vertex = np.array(params["vertex_positions"]).reshape(-1, 3)
-    face = np.array(params["faces"]).reshape(-1, 3)
+    vertex, face = found
     return np.concatenate([vertex, *((vertex[face[:, k]] + vertex[face[:, k - 1]]) / 2 for k in range(3))])

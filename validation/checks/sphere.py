@@ -9,23 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.validation.checks.probe import Lanes
+from mrt_mitsuba.validation.checks.probe import Array, Lanes, joined
 
-Array = np.ndarray
 DEPTH = 17  # the finest cell is a hundred times what float32 rounding moves a direction by
 SIDE = 6
 POINTS = SIDE**2  # at which a cell is integrated
 HEMISPHERE = 4**DEPTH  # codes of each
-_MASKS = (
-    (16, 0x0000FFFF0000FFFF),
-    (8, 0x00FF00FF00FF00FF),
-    (4, 0x0F0F0F0F0F0F0F0F),
-    (2, 0x3333333333333333),
-    (1, 0x5555555555555555),
-)
+_SPREAD = sum((np.arange(2**DEPTH) >> k & 1) << 2 * k for k in range(DEPTH))  # bits with gaps in between
 
 
 def encode(wo: Array) -> Array:
@@ -33,18 +27,9 @@ def encode(wo: Array) -> Array:
     x, y, z = wo.T.astype(np.float64)
     r = np.sqrt((x * x + y * y) / (1 + np.abs(z)))
     turn = np.arctan2(y, x) / (2 * np.pi) + 0.5
-    a, b = (np.clip(u * 2**DEPTH, 0, 2**DEPTH - 1).astype(np.int64) for u in (r, turn))
-    for shift, mask in _MASKS:
-        a, b = (a | (a << shift)) & mask, (b | (b << shift)) & mask
+    places = (np.clip(np.nan_to_num(u) * 2**DEPTH, 0, 2**DEPTH - 1) for u in (r, turn))
+    a, b = (_SPREAD[place.astype(np.int64)] for place in places)
     return (z < 0) * HEMISPHERE + (a | (b << 1))
-
-
-def _corner(start: Array) -> tuple[Array, Array]:
-    """Return r and turn, in [0, 1), of the corners of cells."""
-    a, b = start & 0x5555555555555555, (start >> 1) & 0x5555555555555555
-    for (shift, _), (_, mask) in zip(_MASKS[::-1], (*_MASKS[-2::-1], (32, 0xFFFFFFFF)), strict=True):
-        a, b = (a | (a >> shift)) & mask, (b | (b >> shift)) & mask
-    return a / 2**DEPTH, b / 2**DEPTH
 
 
 @dataclass(frozen=True)
@@ -57,19 +42,33 @@ class Cells(Lanes):
     @staticmethod
     def around(codes: Array, most: int, coarsest: int = 4) -> Cells:
         """Return cells of which none holds more than ``most`` of the directions, unless it is the finest."""
-        codes, starts, levels = np.sort(codes), [], []
-        start, level = np.arange(2 * 4**coarsest) * 4 ** (DEPTH - coarsest), coarsest
-        while len(start):
-            ends = np.searchsorted(codes, start + 4 ** (DEPTH - level))
-            full = (ends - np.searchsorted(codes, start) > most) & (level < DEPTH)
-            starts.append(start[~full])
-            levels.append(np.full((~full).sum(), level))
-            level += 1
-            start = _quarters(start[full], level) if full.any() else start[:0]
-        return Cells(np.concatenate(starts), np.concatenate(levels)).sorted()
+        codes, done = np.sort(codes), []
+        start = np.arange(2 * 4**coarsest) * 4 ** (DEPTH - coarsest)
+        cells = Cells(start, np.full(len(start), coarsest))
+        while len(cells.start):
+            first, last = np.searchsorted(codes, [cells.start, cells.end])
+            full = (last - first > most) & (cells.level < DEPTH)
+            done.append(cells.only(~full))
+            cells = cells.only(full).quartered()
+        return joined(done).sorted()
 
-    def sorted(self) -> Cells:
+    def sorted(self) -> Any:
         return self.only(np.argsort(self.start))
+
+    @property
+    def end(self) -> Array:
+        return self.start + 4 ** (DEPTH - self.level)
+
+    @property
+    def width(self) -> Array:
+        return 0.5**self.level
+
+    @property
+    def corner(self) -> tuple[Array, Array]:
+        """Return r and turn, in [0, 1), at the corners of cells."""
+        bits = self.start % HEMISPHERE
+        a, b = (np.searchsorted(_SPREAD, x & _SPREAD[-1]) for x in (bits, bits >> 1))
+        return a / 2**DEPTH, b / 2**DEPTH
 
     def find(self, codes: Array) -> Array:
         """Return the index of the cell in which each direction lies."""
@@ -78,54 +77,41 @@ class Cells(Lanes):
     def quartered(self) -> Cells:
         """Return four cells for each, one after the other."""
         level = np.repeat(self.level + 1, 4)
-        return Cells(_quarters(self.start, level.reshape(-1, 4)[:, :1]), level)
+        return Cells(
+            np.repeat(self.start, 4) + np.tile(np.arange(4), len(self.start)) * 4 ** (DEPTH - level), level
+        )
 
     def at(self, i: Array, j: Array) -> tuple[Array, Array]:
         """Return directions [C, P, 3] at places of each cell, from 0 to 1, and r there."""
-        r0, turn0 = (x[:, None] for x in _corner(self.start % HEMISPHERE))
-        width = (0.5**self.level)[:, None]
+        (r0, turn0), width = (x[:, None] for x in self.corner), self.width[:, None]
         r, turn = r0 + width * i, turn0 + width * j
         z = np.where(self.start >= HEMISPHERE, -1, 1)[:, None] * (1 - r * r)
         sin, phi = r * np.sqrt(2 - r * r), 2 * np.pi * (turn - 0.5)
         return np.stack([sin * np.cos(phi), sin * np.sin(phi), z], axis=-1).astype(np.float32), r
-
-    @property
-    def middles(self) -> Array:
-        """The directions of their middles. [C, 3]"""
-        return self.at(np.array([0.5]), np.array([0.5]))[0][:, 0]
 
     def points(self, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return random directions in each cell, one in each part [C, POINTS, 3], and dω [C, POINTS]."""
         i, j = np.divmod(np.arange(POINTS), SIDE)
         shift = rng.random((2, len(self.start), POINTS))
         wo, r = self.at((i + shift[0]) / SIDE, (j + shift[1]) / SIDE)
-        return wo, 4 * np.pi * r * ((0.5**self.level)[:, None] / SIDE) ** 2
+        return wo, 4 * np.pi * r * (self.width[:, None] / SIDE) ** 2
 
     @property
     def solid_angle(self) -> Array:
-        r, _ = _corner(self.start % HEMISPHERE)
-        width = 0.5**self.level
-        return 2 * np.pi * width * ((r + width) ** 2 - r**2)
+        r, _ = self.corner
+        return 2 * np.pi * self.width * ((r + self.width) ** 2 - r**2)
 
     def bounds(self, index: int) -> tuple[float, float, float, float, int]:
         """Return r and φ from … to, and the sign of z, of one cell."""
-        cell = self.only(np.array([index]))
-        r, turn = (float(x[0]) for x in _corner(cell.start % HEMISPHERE))
-        width = 0.5 ** int(cell.level[0])
-        phi = 2 * np.pi * (turn - 0.5)
-        return r, r + width, phi, phi + 2 * np.pi * width, -1 if cell.start[0] >= HEMISPHERE else 1
-
-
-def _quarters(start: Array, level: Array | int) -> Array:
-    step = 4 ** (DEPTH - np.asarray(level))
-    return (np.reshape(start, (-1, 1)) + np.arange(4) * step).ravel()
+        (r, turn), width = (float(x[index]) for x in self.corner), float(self.width[index])
+        phi, sign = 2 * np.pi * (turn - 0.5), -1 if self.start[index] >= HEMISPHERE else 1
+        return r, r + width, phi, phi + 2 * np.pi * width, sign
 
 
 @dataclass(frozen=True)
-class Integrals:
+class Integrals(Cells):
     """Integrals over cells, and the variances of these estimates: both [C, K] of K integrands."""
 
-    cells: Cells
     mean: Array
     variance: Array
 
@@ -143,33 +129,25 @@ def integrate(
     ``codes`` and ``weights`` of ``samples`` samples say what the first integrand gives where; the integrals
     are made as certain as so many samples would be.
     """
-    done: list[Integrals] = []
+    done = []
     order = np.argsort(codes)
     codes, below = codes[order], np.concatenate([[0], np.cumsum(weights[order])]) / samples
     for attempt in range(8):
-        ends = cells.start, cells.start + 4 ** (DEPTH - cells.level)
-        hint = np.diff([below[np.searchsorted(codes, end)] for end in ends], axis=0)[0]
+        first, last = below[np.searchsorted(codes, [cells.start, cells.end])]
         wo, omega = cells.points(rng)
-        values = function(wo.reshape(-1, 3))
-        values = (
-            np.where(np.isfinite(values), values, 0).reshape(*omega.shape, -1) * omega[..., None] * POINTS
-        )
+        values = function(wo.reshape(-1, 3)).reshape(*omega.shape, -1)
+        values = np.where(np.isfinite(values), values, 0) * omega[..., None] * POINTS
         mean, variance = values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
-        share = np.abs(mean) / (np.abs(mean).sum(axis=0) + 1e-12)
-        spread = variance / (np.abs(mean).sum(axis=0) + 1e-12) ** 2
+        total = np.abs(mean).sum(axis=0) + 1e-12
         # half of what chance does to the count of the samples, or one sample, is known well enough
-        bad = (spread > 0.25 * share / samples + 1 / samples**2).any(axis=1)
-        bad |= (hint * samples > 1.5) & (mean[:, 0] < 0.2 * hint)
-        bad &= cells.level < DEPTH
-        if attempt == 7 or not bad.any():
-            done.append(Integrals(cells, mean, variance))
+        bad = (variance / total**2 > 0.25 * np.abs(mean) / total / samples + 1 / samples**2).any(axis=1)
+        bad |= ((last - first) * samples > 1.5) & (mean[:, 0] < 0.2 * (last - first))
+        bad &= (cells.level < DEPTH) & (attempt < 7)
+        done.append(Integrals(cells.start, cells.level, mean, variance).only(~bad))
+        if not bad.any():
             break
-        done.append(Integrals(cells.only(~bad), mean[~bad], variance[~bad]))
         cells = cells.only(bad).quartered()
-    rows = [(d.cells.start, d.cells.level, d.mean, d.variance) for d in done]
-    start, level, mean, variance = (np.concatenate(column) for column in zip(*rows, strict=True))
-    order = np.argsort(start)
-    return Integrals(Cells(start[order], level[order]), mean[order], variance[order])
+    return joined(done).sorted()
 
 
 def chi_square(
@@ -181,15 +159,12 @@ def chi_square(
     neighbours that expect 25 samples or more, a 128th and a 16th of all, and slices along x, y and z of a
     16th; and the cell that is most off. ``known``: to how much the density is known, relative.
     """
-    seen = np.bincount(found.cells.find(codes), minlength=len(found.cells.start))
+    seen = np.bincount(found.find(codes), minlength=len(found.start))
     expected, variance = count * found.mean[:, 0], count**2 * found.variance[:, 0]
     neighbours, tests = np.arange(len(seen)), []
-    slices = [np.argsort(axis) for axis in found.cells.middles.T]
-    for parts, order in (
-        (count / 25, neighbours),
-        (128, neighbours),
-        *((16, o) for o in (neighbours, *slices)),
-    ):
+    middles = found.at(np.array([0.5]), np.array([0.5]))[0][:, 0]
+    ways = [(count / 25, neighbours), (128, neighbours), (16, neighbours)]
+    for parts, order in ways + [(16, np.argsort(axis)) for axis in middles.T]:
         group = np.floor(np.cumsum(expected[order]) / max(count / parts, 25)).astype(int)
         group = np.minimum(group, max(group[-1] - 1, 0))
         seen_in, expected_in, variance_in = (np.bincount(group, x[order]) for x in (seen, expected, variance))
@@ -198,4 +173,4 @@ def chi_square(
         pull = (seen_in - expected_in)[used] ** 2 / np.maximum(variance_in, 1e-6)[used]
         tests.append((float(pull.sum()), max(len(pull), 1)))
     cell = int(np.argmax(np.abs(seen - expected) / np.sqrt(expected + variance + 1)))
-    return tests, found.cells.bounds(cell)
+    return tests, found.bounds(cell)

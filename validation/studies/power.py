@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -20,21 +19,23 @@ TITLE = "The least faults that the laws of plugins find"
 
 DIFFUSE, GLOSS = {"type": "diffuse"}, {"type": "roughconductor", "alpha": 0.2}
 PLACE = (0.48, 0.36, 0.8)  # a direction away from all axes
+DEGREE = 0.01745
+AS_IS = ({}, "", lambda value, *_: value)
 
 
 def changed_bsdf(changes: Mapping[str, tuple[dict[str, Any], str, Any]]) -> type:
     """Return a class of BSDFs whose answers are those of another, changed: for ``register_bsdf``.
 
-    ``changes``: by name, the dict of the BSDF, what is changed, and a function of it: "value" and "mode" of
-    (value, wi, wo), "pdf" of (pdf, wi, wo), "eval", "pair" of the value, "sample" of (bs, weight, u, ctx).
+    ``changes``: by name, the dict of the BSDF, what is changed, and a function: of (value, ctx, wi, wo) for
+    "eval", "pdf", the value of eval_pdf() alone ("pair"), or values and weights ("value"); of (bs, weight, u,
+    ctx) for "sample". "flags" are added; "active" is overlooked.
     """
 
     class Changed(mi.BSDF):
         def __init__(self, props: Any) -> None:
             mi.BSDF.__init__(self, props)
-            self.nested, name = props["nested"], props["change"]
-            self.change: Any
-            self.kind, self.change = changes[name][1:3] if name else ("", None)
+            (self.nested,) = (value for _, value in props.items() if isinstance(value, mi.BSDF))
+            _, self.kind, self.change = changes.get(props["change"], AS_IS)
             more = self.change if self.kind == "flags" else 0
             count = self.nested.component_count()
             self.m_components = [int(self.nested.flags(i)) | more for i in range(count)]
@@ -43,28 +44,23 @@ def changed_bsdf(changes: Mapping[str, tuple[dict[str, Any], str, Any]]) -> type
         def traverse(self, callback: Any) -> None:
             callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
 
-        def changes(self, value: Any, ctx: Any, wi: Any, wo: Any) -> Any:
-            alike = self.kind == "value" or (self.kind == "mode" and ctx.mode == mi.TransportMode.Importance)
-            return self.change(value, wi, wo) if alike else value
+        def changed(self, kinds: Sequence[str], value: Any, *where: Any) -> Any:
+            return self.change(value, *where) if self.kind in kinds else value
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
             value = self.nested.eval(ctx, si, wo, True if self.kind == "active" else active)
-            value = self.change(value) if self.kind == "eval" else value
-            if self.kind == "part" and ctx.component == 0:
-                value = self.change(value)
-            return self.changes(value, ctx, si.wi, wo)
+            return self.changed(("eval", "value"), value, ctx, si.wi, wo)
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            pdf = self.nested.pdf(ctx, si, wo, active)
-            return self.change(pdf, si.wi, wo) if self.kind == "pdf" else pdf
+            return self.changed(("pdf",), self.nested.pdf(ctx, si, wo, active), ctx, si.wi, wo)
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            value = self.eval(ctx, si, wo, active)
-            return self.change(value) if self.kind == "pair" else value, self.pdf(ctx, si, wo, active)
+            value = self.changed(("pair",), self.eval(ctx, si, wo, active), ctx, si.wi, wo)
+            return value, self.pdf(ctx, si, wo, active)
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
             bs, weight = self.nested.sample(ctx, si, sample1, sample2, active)
-            weight = self.changes(weight, ctx, si.wi, bs.wo)
+            weight = self.changed(("value",), weight, ctx, si.wi, bs.wo)
             return self.change(bs, weight, sample2, ctx) if self.kind == "sample" else (bs, weight)
 
         def to_string(self) -> str:
@@ -86,15 +82,17 @@ class ChangedShape:
         self.scene = mi.load_dict({"type": "scene", "shape": self.shape})
         self.area, self.first, self.changes = area, first, changes
 
+    def changed(self, kind: str, value: Any, *more: Any) -> Any:
+        return self.changes[kind](value, *more) if kind in self.changes else value
+
     def ray_intersect(self, ray: Any) -> Any:
-        si = self.scene.ray_intersect(ray)
-        return self.changes["hit"](si, ray) if "hit" in self.changes else si
+        return self.changed("hit", self.scene.ray_intersect(ray), ray)
 
     def ray_test(self, ray: Any) -> Any:
-        return self.changes.get("test", lambda found, ray: found)(self.scene.ray_test(ray), ray)
+        return self.changed("test", self.scene.ray_test(ray), ray)
 
     def bbox(self) -> Any:
-        return self.changes.get("bbox", lambda box: box)(self.scene.bbox())
+        return self.changed("bbox", self.scene.bbox())
 
     def surface_area(self) -> Any:
         return self.area * self.shape.surface_area()
@@ -108,8 +106,24 @@ class ChangedShape:
         return self.shape.pdf_position(ps) / self.area
 
 
-@dataclass(frozen=True)
-class Fault:
+def moved(**values: Callable[..., Any]) -> Callable[[Any, Any], Any]:
+    """Return a change of hits: members are functions of the hit and the ray. ``shading`` is that normal."""
+
+    def change(si: Any, ray: Any) -> Any:
+        for name, value in values.items():
+            place, member = (si.sh_frame, "n") if name == "shading" else (si, name)
+            setattr(place, member, value(si, ray))
+        return si
+
+    return change
+
+
+def tilted(n: Any, size: float) -> Any:
+    """Return normals tilted by an angle."""
+    return dr.normalize(n + size * mi.Normal3f(0.6, 0.48, 0.64))
+
+
+class Fault(NamedTuple):
     """A fault in words, the law that should find it, its sizes from large to small, and what makes it."""
 
     law: str
@@ -120,89 +134,64 @@ class Fault:
     nested: dict[str, Any] | None = None
 
 
-def _cone(wo: Any, sine: float) -> Any:
-    return dr.norm(wo - mi.Vector3f(PLACE)) < sine
+def _stairs(value: Any, cosines: Any, size: float) -> Any:
+    return value * (1 + size * (dr.round(cosines / size) - cosines / size))
 
 
-def _stairs(size: float) -> Any:
-    def change(value: Any, wi: Any, wo: Any) -> Any:
-        return value * (1 + size * (dr.round(wi.z * wo.z / size) - wi.z * wo.z / size))
-
-    return change
-
-
-def _moved(**values: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
-    def change(si: Any, ray: Any) -> Any:
-        for name, value in values.items():
-            setattr(si, name, value(si))
-        return si
-
-    return change
-
-
-def _tilted(n: Any, size: float) -> Any:
-    return dr.normalize(n + size * mi.Normal3f(0.6, 0.48, 0.64))
-
-
-def _shading(size: float) -> Any:
-    def change(si: Any, ray: Any) -> Any:
-        si.sh_frame.n = _tilted(si.sh_frame.n, size)
-        return si
-
-    return change
-
-
+SIZE = 2 * 3**0.5  # of the cube: its diagonal
 PERCENTS = (0.1, 0.05, 0.03, 0.02, 0.01, 0.005, 0.002)
 SMALL = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6)
 FAULTS: Sequence[Fault] = (
     Fault("sampling", "density too large where a tenth of the samples go", PERCENTS, "pdf",
-          lambda s: lambda pdf, wi, wo: pdf * dr.select(wo.x > 0.687, 1 + s, 1)),
+          lambda s: lambda pdf, ctx, wi, wo: pdf * dr.select(wo.x > 0.687, 1 + s, 1)),
     Fault("sampling", "density too small in a cone of 1 degree", (0.9, 0.5, 0.3, 0.2, 0.1), "pdf",
-          lambda s: lambda pdf, wi, wo: pdf * dr.select(_cone(wo, 0.01745), 1 - s, 1)),
+          lambda s: lambda pdf, ctx, wi, wo: pdf * (1 - s * (dr.norm(wo - mi.Vector3f(PLACE)) < DEGREE))),
     Fault("sampling", "density too large everywhere", PERCENTS, "pdf",
-          lambda s: lambda pdf, wi, wo: (1 + s) * pdf),
+          lambda s: lambda pdf, ctx, wi, wo: (1 + s) * pdf),
     Fault("weights", "weight of a sample too large", SMALL, "sample",
           lambda s: lambda bs, weight, u, ctx: (bs, (1 + s) * weight)),
     Fault("eval_pdf", "value of eval_pdf() too large", SMALL, "pair",
-          lambda s: lambda value: (1 + s) * value),
+          lambda s: lambda value, ctx, wi, wo: (1 + s) * value),
     Fault("energy", "albedo above 1", PERCENTS, "value",
-          lambda s: lambda value, wi, wo: 2 * (1 + s) * value),
-    Fault("energy", "value of eval() too large", PERCENTS, "eval", lambda s: lambda value: (1 + s) * value),
+          lambda s: lambda value, ctx, wi, wo: 2 * (1 + s) * value),
+    Fault("energy", "value of eval() too large", PERCENTS, "eval",
+          lambda s: lambda value, ctx, wi, wo: (1 + s) * value),
     Fault("reciprocity", "value that grows with the cosine of wi", SMALL, "value",
-          lambda s: lambda value, wi, wo: value * (1 + s * wi.z)),
-    Fault("reciprocity", "more light in the mode of importance", SMALL, "mode",
-          lambda s: lambda value, wi, wo: (1 + s) * value),
+          lambda s: lambda value, ctx, wi, wo: value * (1 + s * wi.z)),
+    Fault("reciprocity", "more light in the mode of importance", SMALL, "value",
+          lambda s: lambda value, ctx, wi, wo: value * (1 + s * (ctx.mode == mi.TransportMode.Importance))),
     Fault("finite", "NaN for a share of the random numbers, at their end", SMALL, "sample",
           lambda s: lambda bs, weight, u, ctx: (bs, dr.select(u.x > 1 - s, dr.nan, weight))),
-    Fault("roundoff", "stairs on a slope, of this height", SMALL, "value", _stairs),
+    Fault("roundoff", "stairs on a slope, of this height", SMALL, "value",
+          lambda s: lambda value, ctx, wi, wo: _stairs(value, wi.z * wo.z, s)),
     Fault("gradients", "derivative of values too large", PERCENTS, "value",
-          lambda s: lambda value, wi, wo: value + s * (value - dr.detach(value))),
+          lambda s: lambda value, ctx, wi, wo: value + s * (value - dr.detach(value))),
     Fault("gradients", "derivative of weights too large", PERCENTS, "sample",
           lambda s: lambda bs, weight, u, ctx: (bs, weight + s * (weight - dr.detach(weight)))),
-    Fault("components", "a component brighter than its share", SMALL, "part",
-          lambda s: lambda value: (1 + s) * value),
+    Fault("components", "a component brighter than its share", SMALL, "eval",
+          lambda s: lambda value, ctx, wi, wo: value * (1 + s * (ctx.component == 0))),
     Fault("variants", "values larger in scalar variants", SMALL, "value",
-          lambda s: lambda value, wi, wo: value if dr.is_jit_v(value) else (1 + s) * value),
+          lambda s: lambda value, ctx, wi, wo: value if dr.is_jit_v(value) else (1 + s) * value),
     Fault("hits", "ray_test() misses in this share of directions", SMALL, "shape",
           lambda s: {"test": lambda found, ray: found & (ray.d.x < 1 - 2 * s)}),
     Fault("surface", "hit points off, in sizes", SMALL, "shape",
-          lambda s: {"hit": _moved(p=lambda si: si.p + 2 * 3**0.5 * s * si.n)}),
+          lambda s: {"hit": moved(p=lambda si, ray: si.p + SIZE * s * si.n)}),
     Fault("surface", "hits too far away, in sizes", SMALL, "shape",
-          lambda s: {"hit": lambda si, ray: _moved(t=lambda si: si.t + 2 * 3**0.5 * s,
-                                                   p=lambda si: si.p + 2 * 3**0.5 * s * ray.d)(si, ray)}),
+          lambda s: {"hit": moved(t=lambda si, ray: si.t + SIZE * s,
+                                  p=lambda si, ray: si.p + SIZE * s * ray.d)}),
     Fault("normals", "normals tilted, in radians", SMALL, "shape",
-          lambda s: {"hit": _moved(n=lambda si: _tilted(si.n, s))}),
-    Fault("normals", "shading normals tilted, in radians", SMALL, "shape", lambda s: {"hit": _shading(s)}),
+          lambda s: {"hit": moved(n=lambda si, ray: tilted(si.n, s))}),
+    Fault("normals", "shading normals tilted, in radians", SMALL, "shape",
+          lambda s: {"hit": moved(shading=lambda si, ray: tilted(si.sh_frame.n, s))}),
     Fault("normals", "dp_du too long", PERCENTS, "shape",
-          lambda s: {"hit": _moved(dp_du=lambda si: (1 + s) * si.dp_du)}),
+          lambda s: {"hit": moved(dp_du=lambda si, ray: (1 + s) * si.dp_du)}),
     Fault("watertight", "a slit of this width, in sizes", SMALL, "shape",
-          lambda s: {"hit": _moved(t=lambda si: dr.select(dr.abs(si.p.x - 0.3) < 3**0.5 * s, dr.inf, si.t))}),
+          lambda s: {"hit": moved(
+              t=lambda si, ray: dr.select(dr.abs(si.p.x - 0.3) < SIZE * s / 2, dr.inf, si.t))}),
     Fault("far", "hits off by this part of a distance above a thousand", SMALL, "shape",
-          lambda s: {"hit": lambda si, ray: _moved(
-              p=lambda si: dr.select(si.t > 1000, si.p + s * si.t * si.n, si.p))(si, ray)}),
+          lambda s: {"hit": moved(p=lambda si, ray: dr.select(si.t > 1000, si.p + s * si.t * si.n, si.p))}),
     Fault("finite", "NaN where a component of the direction is so small", (*SMALL, 1e-8, 1e-12), "shape",
-          lambda s: {"hit": lambda si, ray: _moved(
-              uv=lambda si: dr.select(dr.abs(ray.d.x) < s, dr.nan, si.uv))(si, ray)}),
+          lambda s: {"hit": moved(uv=lambda si, ray: dr.select(dr.abs(ray.d.x) < s, dr.nan, si.uv))}),
     Fault("sampling", "area too large, and the density of positions too small", PERCENTS, "shape",
           lambda s: {"area": 1 + s}),
     Fault("sampling", "positions crowded to one side: u to the power of 1 and this", PERCENTS, "shape",

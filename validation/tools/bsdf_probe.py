@@ -55,7 +55,7 @@ def interaction(wi: Array, uv: Array | None = None) -> Any:
     return probe.interaction(*(kind(x) for kind, x in zip((mi.Vector3f, mi.Point2f), columns, strict=True)))
 
 
-def evaluate(bsdf: Any, wi: Array, wo: Array, ctx: Any = None) -> tuple[Array, Array]:
+def evaluate(bsdf: Any, wi: Array, wo: Array, ctx: Any = None) -> list[Array]:
     """Return f cos θo [N, channels] and density [N] of pairs of directions [N, 3]."""
     return probe.Probe(bsdf).pair(wi, wo, np.zeros((len(wi), 2)), ctx)
 
@@ -63,7 +63,7 @@ def evaluate(bsdf: Any, wi: Array, wo: Array, ctx: Any = None) -> tuple[Array, A
 def draw(bsdf: Any, wi: Array, count: int, ctx: Any = None, *, seed: int = 0) -> probe.Samples:
     """Return ``count`` samples for one direction [3]."""
     u = np.random.default_rng(seed).random((count, 3), np.float32)
-    return probe.Probe(bsdf).sample(np.broadcast_to(wi, (count, 3)), u, np.zeros((count, 2)), ctx)
+    return probe.Probe(bsdf).sample(np.asarray(wi), u, np.zeros(2), ctx)
 
 
 def albedo(bsdf: Any, wi: Array, ctx: Any = None, *, resolution: int = 700) -> Array:
