@@ -96,14 +96,8 @@ def check_scene(
     """
     runtime.use()
     source = open_scene(scene, **options)
-    every = source.scene.shapes()
-    shapes = [shape for shape in every if shape.class_name() != "Instance"]
-    bsdfs = {str(id(b)): b for b in (shape.bsdf() for shape in shapes) if b is not None}.values()
+    kinds, instances = _plugins(source.scene)
     checks = {"BSDF": check_bsdf, "shape": check_shape, "emitter": partial(_check_emitter, source.scene)}
-    kinds: dict[str, list[Any]] = {}
-    for word, plugins in (("BSDF", bsdfs), ("shape", shapes), ("emitter", source.scene.emitters())):
-        for plugin in plugins:
-            kinds.setdefault(f"{word} {class_name(plugin)}", []).append(plugin)
     found: dict[str, Check] = {}
     chosen = {kind: range(0, len(alike), max(len(alike) // ALIKE, 1)) for kind, alike in kinds.items()}
     with (progress or Progress()).stage("Laws", sum(map(len, chosen.values()))) as advance:
@@ -116,10 +110,21 @@ def check_scene(
             advance(1)
     more = {kind: len(alike) - len(chosen[kind]) for kind, alike in kinds.items()}
     left_out = [f"{n} more of {kind} are like those that were checked" for kind, n in more.items() if n]
-    if len(every) > len(shapes):
-        instances = len(every) - len(shapes)
+    if instances:
         left_out.append(f"{instances} instances are not checked: give a dict of one with its group")
     return SceneCheck(source.name, found, _hunt(source, quick, seed), tuple(left_out))
+
+
+def _plugins(scene: Any) -> tuple[dict[str, list[Any]], int]:
+    """Return the BSDFs, shapes and emitters of a scene, each once, by kind, and how many instances it has."""
+    every = scene.shapes()
+    shapes = [shape for shape in every if shape.class_name() != "Instance"]
+    bsdfs = {str(id(b)): b for b in (shape.bsdf() for shape in shapes) if b is not None}.values()
+    kinds: dict[str, list[Any]] = {}
+    for word, plugins in (("BSDF", bsdfs), ("shape", shapes), ("emitter", scene.emitters())):
+        for plugin in plugins:
+            kinds.setdefault(f"{word} {class_name(plugin)}", []).append(plugin)
+    return kinds, len(every) - len(shapes)
 
 
 def _check_emitter(scene: Any, plugin: Any, *, quick: bool, seed: int) -> Check:
