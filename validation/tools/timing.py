@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,8 +33,9 @@ def in_turns(sides: Sequence[Callable[[int], Any]], turns: int) -> list[list[Any
     """
     results: list[list[Any]] = [[] for _ in sides]
     for turn in range(turns):
-        for index in range(len(sides)) if turn % 2 == 0 else reversed(range(len(sides))):
-            results[index].append(sides[index](turn))
+        both = list(zip(sides, results, strict=True))
+        for side, result in both if turn % 2 == 0 else reversed(both):
+            result.append(side(turn))
     return results
 
 
@@ -53,26 +53,29 @@ class Ratio:
     def of(cls, seconds: Sequence[float], others: Sequence[float]) -> Ratio:
         """Return what pairs of seconds say."""
         low, median, high = np.quantile(np.divide(seconds, others), (0.25, 0.5, 0.75)).tolist()
-        return cls(median, low, high, statistics.median(seconds), statistics.median(others))
+        return cls(median, low, high, float(np.median(seconds)), float(np.median(others)))
 
 
 def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> Ratio:
     """Compare two runs in turns. Both run once before, which compiles their kernels."""
-    run()
-    other()
-    return Ratio.of(*in_turns([lambda _: timed(run)[1], lambda _: timed(other)[1]], repeats))
+    sides = [lambda _, side=side: timed(side)[1] for side in (run, other)]
+    in_turns(sides, 1)
+    return Ratio.of(*in_turns(sides, repeats))
 
 
 @contextmanager
 def own_cache() -> Iterator[None]:
     """Let Dr.Jit keep its kernels in a new folder, for ``forget`` to work; enter before it is imported."""
+    before = os.environ.get(CACHE)
     with tempfile.TemporaryDirectory(prefix=PREFIX, ignore_cleanup_errors=True) as folder:
-        before, os.environ[CACHE] = os.environ.get(CACHE), folder
+        os.environ[CACHE] = folder
         try:
             yield
         finally:
-            del os.environ[CACHE]
-            os.environ |= {} if before is None else {CACHE: before}
+            if before is None:
+                del os.environ[CACHE]
+            else:
+                os.environ[CACHE] = before
 
 
 def forget() -> None:
@@ -86,18 +89,13 @@ def forget() -> None:
             file.unlink(missing_ok=True)
 
 
-class _Kernels(Progress):
-    """Notes the operations of each kernel that a render runs, by the hash of its code."""
-
-    def __init__(self) -> None:
-        self.operations: dict[str, int] = {}
-
-    def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
-        self.operations |= {str(r["hash"]): r["operation_count"] for r in records if r.get("operation_count")}
-
-
 def operations(render: Callable[..., Any]) -> int:
-    """Return the length of the code of all kernels of a ``mrt.render``."""
-    watch = _Kernels()
-    render(progress=watch)
-    return sum(watch.operations.values())
+    """Return the length of the code of all kernels of a ``mrt.render``, each counted once."""
+    lengths: dict[Any, int] = {}  # by the hash of the code
+
+    class Watch(Progress):
+        def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
+            lengths.update({r["hash"]: r["operation_count"] for r in records if r.get("operation_count")})
+
+    render(progress=Watch())
+    return sum(lengths.values())
