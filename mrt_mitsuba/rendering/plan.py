@@ -304,7 +304,7 @@ def _layers(settings: RenderSettings, shader: Shader) -> tuple[frozenset[str], f
         return asked & possible, possible
     wrong = sorted(asked - possible)
     if "edges" in wrong:
-        text = f"aamode={settings.aamode} looks for none; choose luma, sobel or geometry"
+        text = f"aamode={settings.aamode} looks for none; choose one of {', '.join(DETECTORS)}"
         raise UsageError(f"layers=edges: {text}")
     if not made.isdisjoint(wrong):
         raise UsageError("layers=error,variance: only rounds estimate them; give a target= or aamode=noise")

@@ -69,7 +69,7 @@ class RenderSettings:
     aamode: str | None = option(
         None,
         choice("none", *DETECTORS, NOISE),
-        "refine all pixels, only edges in brightness (luma, sobel) or shape (geometry), or where noise is",
+        f"refine all pixels, only edges that a detector finds ({', '.join(DETECTORS)}), or where noise is",
         "sobel",
     )
     target: float | Sequence[float] | None = option(
