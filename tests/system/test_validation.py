@@ -23,12 +23,7 @@ from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation import cli
 from mrt_mitsuba.validation.oracles import filters as loops
 from mrt_mitsuba.validation.oracles.reference import reference_render
-from mrt_mitsuba.validation.studies import (
-    error_vs_time,
-    roughconductor,
-    scenes,
-    speed,
-)
+from mrt_mitsuba.validation.studies import error_vs_time, roughconductor, scenes, speed
 from mrt_mitsuba.validation.studies import filters as filter_study
 from mrt_mitsuba.validation.tools.scenery import with_materials
 from mrt_mitsuba.validation.tools.study import Study, findings
@@ -54,9 +49,10 @@ def tiny(monkeypatch: Patch, variant: str, tmp_path: Path) -> None:
     trades = {"sampling": (0,), "whitted": (0,), "path": (0,)}
     tiny = error_vs_time.Extent((40, 30), (1, 4), 24, (1, 16), 256, trades, 1)
     monkeypatch.setattr(error_vs_time, "QUICK", tiny)
-    monkeypatch.setattr(error_vs_time, "FULL", tiny._replace(repeats=2, scenes=trades | {"whitted": ()}))
     monkeypatch.setattr(speed, "QUICK", speed.Extent(48, 36, 16, (0,), 1, 16))
     monkeypatch.setattr(roughconductor.runtime, "usable_variants", lambda: ["llvm_ad_rgb"])
+    cases = {name: scenes.CASES[name] for name in ("0", "1", "3", "5", "hovering", "crowded")}
+    monkeypatch.setattr(scenes, "CASES", cases)
     monkeypatch.setenv("MRT_REFERENCE", str(tmp_path))  # none of the original's renders
 
 
@@ -70,10 +66,10 @@ def quick(name: str) -> Study:
 
 
 # Laws, stability and adaptive have tests of their own; the pictures of roughconductor, see below
-PASSING = "roughconductor:pointwise stock scenes filters"
+PASSING = "roughconductor:pointwise stock scenes filters error_vs_time speed"
 
 
-@pytest.mark.parametrize("name", [*PASSING.split(), "error_vs_time", "speed"])
+@pytest.mark.parametrize("name", PASSING.split())
 def test_study_passes(name: str) -> None:
     study = quick(name)
     assert study.passed, study.missed
@@ -139,7 +135,6 @@ def below_zero(method: Any, self: Any, ctx: Any, si: Any, wo: Any, active: Any) 
 BRIGHT = of_bsdf(specular_reflectance=lambda _: 1.02)
 ROUGH = of_bsdf(alpha=lambda alpha: 1.05 * alpha if isinstance(alpha, float) else alpha)
 SCHLICK = of_bsdf(fresnel=lambda form: "schlick" if form == "dielectric" else form or "schlick")
-FLIPPED = in_bsdf(turned)
 
 
 def one_ray_too_many(render: Any, scene: Any, **options: Any) -> Any:
@@ -148,27 +143,29 @@ def one_ray_too_many(render: Any, scene: Any, **options: Any) -> Any:
     return dataclasses.replace(result, rays=more)
 
 
-def mirrors_too(render: Any, scene: Any, *, integrator: Any, **options: Any) -> Any:
-    if integrator != "direct":
-        integrator = integrator | {"max_depth": 2}
-    return render(scene, integrator=integrator, **options)
-
-
 def no_refinement(render: Any, scene: Any, **options: Any) -> Any:
     result = render(scene, **options)
-    if options["aamode"] != "sobel" or options.get("spp"):
-        return result
-    one = render(scene, **options | {"aa": 1, "aamode": "none"}).image
-    return dataclasses.replace(result, image=one)
+    if options["aamode"] == "sobel":
+        one = render(scene, **options | {"aa": 1, "aamode": "none"})
+        result = dataclasses.replace(result, image=one.image)
+    return result
 
 
-def moved_blur(blur: Any, image: Any, depth: Any, *, mode: str, **focus: Any) -> Any:
-    blurred = blur(image, depth, mode=mode, **focus)
-    return np.roll(blurred, 1, axis=1) if mode == "corrected" else blurred
+def mirrors_too(render: Any, scene: Any, *, integrator: Any, **options: Any) -> Any:
+    changed = integrator if integrator == "direct" else integrator | {"max_depth": 2}
+    return render(scene, integrator=changed, **options)
 
 
-def wrong_cases(trade: str, wrong: Callable[[dict[str, Any]], dict[str, Any]]) -> Fault:
-    """Change the options of the cases of a trade, and of its reference."""
+def moved_blur(blur: Any, *given: Any, mode: str, **focus: Any) -> Any:
+    return np.roll(blur(*given, mode=mode, **focus), mode == "corrected", axis=1)
+
+
+def wrong_cases(trade: str, where: dict[str, Any], change: dict[str, Any]) -> Fault:
+    """Change options of the cases of a trade that have others, and of its reference."""
+
+    def wrong(options: Any) -> Any:
+        here = isinstance(options, dict) and options.items() >= where.items()
+        return options | change if here and ("scene" not in options or where) else options
 
     def plant(patch: Patch) -> None:
         make = error_vs_time.TRADES[trade]
@@ -176,12 +173,10 @@ def wrong_cases(trade: str, wrong: Callable[[dict[str, Any]], dict[str, Any]]) -
         def broken(number: int, extent: Any) -> Any:
             made = make(number, extent)
             cases = {name: wrong(options) for name, options in made.cases.items()}
-            reference = wrong(made.reference) if isinstance(made.reference, dict) else made.reference
-            return made._replace(cases=cases, reference=reference)
+            return made._replace(cases=cases, reference=wrong(made.reference) if where else made.reference)
 
         patch.setitem(error_vs_time.TRADES, trade, broken)
-        alone = error_vs_time.QUICK._replace(scenes={trade: (0,)})
-        patch.setattr(error_vs_time, "QUICK", alone)
+        patch.setattr(error_vs_time, "QUICK", error_vs_time.QUICK._replace(scenes={trade: (0,)}))
 
     return plant
 
@@ -229,21 +224,14 @@ FAULTS: list[tuple[str, Fault, str]] = [
     ("filters:modes", wrapped(mrt, "render", no_refinement), "error of sobel"),
     (
         "filters:noise",
-        wrapped(filters, "sobel_edges", lambda sobel, image, variance=None: sobel(image)),
+        wrapped(filters, "sobel_edges", lambda sobel, image, **_: sobel(image)),
         "noise: share of",
     ),
     ("filters:depth_of_field", wrapped(filters, "gaussian_dof", moved_blur), "corrected / report"),
-    (
-        "error_vs_time",
-        wrong_cases("sampling", lambda o: o | {"aa": 1} if o["aa"] == 4 else o),
-        "RMSE of none aa=4",
-    ),
-    ("error_vs_time", wrong_cases("path", lambda o: o | {"spp": 8} if o.get("spp") == 16 else o), "theory"),
-    (
-        "error_vs_time",
-        wrong_cases("path", lambda o: o | {"spp": 32} if o.get("spp") == 256 else o),
-        "error of the reference",
-    ),
+    ("error_vs_time", wrong_cases("sampling", {"aa": 4}, {"aa": 1}), "RMSE of none aa=4"),
+    ("error_vs_time", wrong_cases("path", {"spp": 16}, {"spp": 8}), "theory"),
+    ("error_vs_time", wrong_cases("path", {"spp": 256}, {"spp": 32}), "error of the reference"),
+    ("error_vs_time", wrong_cases("whitted", {}, {"integrator": "direct"}), "default cut-off"),
     ("speed", growing_code, "times the lights"),
     ("speed", lamp_left_out, "without cone code"),
     ("speed", object_lost, "in our tree"),
@@ -255,10 +243,9 @@ FAULTS: list[tuple[str, Fault, str]] = [
     ("stock:whole_scenes", SCHLICK, "scene 0"),
     ("roughconductor:pointwise", BRIGHT, "value"),
     ("roughconductor:pointwise", ROUGH, "value"),
-    ("roughconductor:pointwise", FLIPPED, "value"),
+    ("roughconductor:pointwise", in_bsdf(turned), "value"),
     ("bsdf_laws:dielectric_terms", SCHLICK, "reflection against Mitsuba's"),
     ("bsdf_laws:published", SCHLICK, "published albedos"),
-    ("bsdf_laws:published", BRIGHT, "published albedos"),
     ("bsdf_laws:never_negative", in_bsdf(below_zero), "least value"),
 ]
 
@@ -313,10 +300,11 @@ def verdict(number: int, scene: Scene | None = None, **integrator: Any) -> Study
     """Judge a scene, changed or drawn otherwise, by the truth of the unchanged one."""
     right = report_scene(number)
     image = scenes.draw(scene or right, SIZE, **integrator)
-    return findings(scenes.hold, name=str(number), judgement=scenes.judge(image, right), cut=0.0)
+    error, reason = scenes.judge(image, right)
+    return findings(scenes.hold, name=str(number), error=error, reason=reason)
 
 
-@pytest.mark.parametrize("number", [0, 1, 2, 3])
+@pytest.mark.parametrize("number", [1, 3])
 def test_small_mistakes_in_scenes_are_seen(number: int) -> None:
     assert verdict(number).passed
     for name, mistake in MISTAKES.items():
@@ -333,36 +321,27 @@ def test_every_pixel_that_is_off_has_one_reason() -> None:
     """A picture shifted by half a displacement is off at silhouettes and shadows only, and judged so."""
     scene = report_scene(1)
     shifted = reference_render(scene, displacement=(2e-2, 0), **PLACES).image
-    error, reason = scenes.judge(shifted, scene, displacement=2e-2)[2:]
+    error, reason = scenes.judge(shifted, scene, displacement=2e-2)
     counts = {name: int(np.sum(reason == i)) for i, name in enumerate(scenes.REASONS)}
     assert sum(counts.values()) == np.sum(error > scenes.STEP) > 5
     assert counts["silhouette"] > 0 and counts["unexplained"] == 0
 
 
-@pytest.mark.parametrize(
-    ("number", "aamodes"), [(0, "none luma"), (1, "none sobel"), (2, "none"), (3, "none luma sobel")]
-)
-def test_modes_are_those_of_the_tracer(number: int, aamodes: str) -> None:
+@pytest.mark.parametrize(("number", "aamode"), [(0, "luma"), (1, "sobel"), (3, "luma"), (3, "sobel")])
+def test_modes_are_those_of_the_tracer(number: int, aamode: str) -> None:
     """The detector of the truth, too, looks at the picture in float64."""
-    every = np.stack(
-        [
-            reference_render(report_scene(number), displacement=p, **PLACES).image
-            for p in product((0, 0.5), repeat=2)
-        ]
-    )
-    for aamode in aamodes.split():
-        result = mrt.render(number, **PLACES, focaldist=0, fresnel="dielectric", aa=2, aamode=aamode)
-        edges = np.ones(every.shape[1:3], bool)
-        if aamode != "none":
-            edges = getattr(loops, f"{aamode}_edges")(every[0]).mask
-            assert 0.01 < edges.mean() < 0.95
-        # grey levels are truncated: a picture off by one rounding may refine a few pixels more or less
-        same = filter_study.refined_pixels(result) == edges
-        assert np.mean(~same) <= 0.002
-        truth = np.where(edges[..., None], every.mean(axis=0), every[0])
-        error = np.abs(result.image - truth).max(axis=-1)[same]
-        assert np.quantile(error, 0.99) <= scenes.CASES[str(number)].most + scenes.CUT
-        assert np.mean(error > scenes.STEP) <= 4 * scenes.SHARE  # four samples
+    places = product((0, 0.5), repeat=2)
+    every = np.array([reference_render(report_scene(number), displacement=p, **PLACES).image for p in places])
+    result = mrt.render(number, **PLACES, focaldist=0, fresnel="dielectric", aa=2, aamode=aamode)
+    edges = getattr(loops, f"{aamode}_edges")(every[0]).mask
+    assert 0.01 < edges.mean() < 0.95
+    # grey levels are truncated: a picture off by one rounding may refine a few pixels more or less
+    same = filter_study.refined_pixels(result) == edges
+    assert np.mean(~same) <= 0.002
+    truth = np.where(edges[..., None], every.mean(axis=0), every[0])
+    error = np.abs(result.image - truth).max(axis=-1)[same]
+    assert np.quantile(error, 0.99) <= scenes.CASES[str(number)].most + scenes.CUT
+    assert np.mean(error > scenes.STEP) <= 4 * scenes.SHARE  # four samples
 
 
 # -------------------------------------- What studies are made of --------------------------------------

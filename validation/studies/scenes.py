@@ -7,10 +7,9 @@ those as well.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -60,24 +59,23 @@ HOVERING = Scene(
 def _crowded(lights: int) -> Scene:
     """Return a few hundred objects of all kinds, looked up in trees and in light buffers."""
     rng = np.random.default_rng(5)
-    kinds: dict[str, list[Any]] = {"spheres": [], "cones": [], "cylinders": []}
+    things: dict[str, list[Any]] = {"spheres": [], "cones": [], "cylinders": []}
     for i in range(330):
         place, radius = rng.uniform(-2, 2, 3), float(rng.uniform(0.08, 0.2))
-        end, material = tuple((place + 0.5 * rng.normal(size=3)).tolist()), (GREY, SHINY)[i % 5 == 0]
-        first = tuple(place.tolist())
-        if i % 3 == 0:
-            kinds["spheres"].append(Sphere(first, radius, material))
-        else:
-            kind, make = (("cones", Cone), ("cylinders", Cylinder))[i % 3 - 1]
-            kinds[kind].append(make(first, end, radius, material))
+        first, end = (tuple(p.tolist()) for p in (place, place + 0.5 * rng.normal(size=3)))
+        kind, make, ends = (
+            ("spheres", Sphere, (first,)),
+            ("cones", Cone, (first, end)),
+            ("cylinders", Cylinder, (first, end)),
+        )[i % 3]
+        things[kind].append(make(*ends, radius, (GREY, SHINY)[i % 5 == 0]))
     places = 6 * rng.normal(size=(lights, 3)) + [0, 6, 6]
     lamps = tuple(Light(tuple(p.tolist()), (1.2 / lights, 1.2 / lights, 1.44 / lights)) for p in places)
-    things: dict[str, Any] = {name: tuple(found) for name, found in kinds.items()}
-    return Scene(Camera((0, 1, 6), (0, 0, 0)), (0.2, 0.3, 0.4), lamps, **things)
+    kinds: dict[str, Any] = {name: tuple(found) for name, found in things.items()}
+    return Scene(Camera((0, 1, 6), (0, 0, 0)), (0.2, 0.3, 0.4), lamps, **kinds)
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """A scene, its pictures' sizes, and a bound for 99 of 100 pixels: three times what was measured.
 
     What is left there is rounding in mirrors and highlights: of alpha 1e-3 in scene 3, of balls in scene 4.
@@ -107,30 +105,24 @@ CASES = {
 }
 
 
-Judgement = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-
-
 def judge(
     image: np.ndarray, scene: Scene, *, displacement: float = DISPLACEMENT, **settings: Any
-) -> Judgement:
+) -> tuple[np.ndarray, np.ndarray]:
     """Judge a linear picture [H, W, 3], one sample a pixel; ``settings``: those of ``reference_render``.
 
-    Return it and the truth; the error [H, W], the largest difference in a channel; and the reason [H, W], an
-    index in ``REASONS`` where the error exceeds a step of an 8-bit picture, else -1. A pixel
-    that is off by more than a step is on a silhouette or a shadow's edge if a ray moved by ``displacement``
-    pixels meets other things or other lights, on steep shading if that changes its colour by as much, or
-    unexplained.
+    Return the error [H, W], the largest difference in a channel; and the reason [H, W], an index in
+    ``REASONS`` where the error exceeds a step of an 8-bit picture, else -1. Such a pixel is on a silhouette
+    or a shadow's edge if a ray moved by ``displacement`` pixels meets other things or other lights, on steep
+    shading if that changes its colour by as much, or unexplained.
     """
     height, width, _ = image.shape
-    truth = reference_render(scene, width=width, height=height, **settings).image
-    error = np.abs(image - truth).max(axis=-1)
+    error = np.abs(image - reference_render(scene, width=width, height=height, **settings).image).max(axis=-1)
     off = ~(error <= STEP)
     if not off.any():
-        return image, truth, error, np.full(off.shape, -1)
+        return error, np.full(off.shape, -1)
     found = sensitivity(scene, width=width, height=height, displacement=displacement, **settings)
     steep = off & (error <= found.spread)
-    reason = np.select([~off, found.silhouette, found.shadow, steep], [-1, 0, 1, 2], 3)
-    return image, truth, error, reason
+    return error, np.select([~off, found.silhouette, found.shadow, steep], [-1, 0, 1, 2], 3)
 
 
 def draw(
@@ -147,9 +139,9 @@ def draw(
     return mrt.render(scene, **options, fresnel=fresnel, integrator=settings).image
 
 
-def hold(study: Study, name: str, judgement: Judgement, cut: float) -> None:
-    """Hold a scene to its bounds; ``cut``: the largest difference that the cut-off of dim paths makes."""
-    (_, _, error, reason), most = judgement, CASES[name].most
+def hold(study: Study, name: str, error: np.ndarray, reason: np.ndarray) -> None:
+    """Hold a scene that was judged to its bounds."""
+    most = CASES[name].most
     why = f"least fault: 1 % of the pixels off by {most:g}, or half of them by 1e-7"
     study.at_most(f"scene {name}: median difference", np.median(error), MEDIAN, why)
     study.at_most(f"scene {name}: difference of 99 %", np.quantile(error, 0.99), most, why)
@@ -158,7 +150,6 @@ def hold(study: Study, name: str, judgement: Judgement, cut: float) -> None:
     why = "silhouettes, edges of shadows and steep shading are reasons, found by moved rays"
     left = np.sum(reason == REASONS.index("unexplained"))
     study.at_most(f"scene {name}: pixels off without a reason", left, 0, why)
-    study.at_most(f"scene {name}: change by cutting dim paths", cut, CUT, "the promise, of every pixel")
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -169,23 +160,22 @@ def run(study: Study, *, quick: bool) -> None:
 
 def pictures(study: Study, *, quick: bool) -> None:
     """Judge our pictures of all scenes."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, case in study.each("Scenes in float64", CASES.items()):
-        size = case.quick if quick else case.size
-        form: dict[str, Any] = {"fresnel": case.fresnel}
-        found = judge(draw(case.scene, size, **form), case.scene, **form)
-        image, _, error, reason = found
-        cut = np.abs(draw(case.scene, size, **form, cut=True) - image)
-        hold(study, name, found, float(cut.max()))
-        shown = [np.median(error), np.quantile(error, 0.99), error.max(), cut.max()]
-        counts = [int(np.sum(reason == i)) for i in range(len(REASONS))]
-        rows.append([name, "{}x{}".format(*size), *map(float, shown), *counts])
-    columns = ["scene", "size", "median", "99 %", "largest", "cut-off", *REASONS]
+        size, form = case.quick if quick else case.size, {"fresnel": case.fresnel}
+        image = draw(case.scene, size, **form)
+        error, reason = judge(image, case.scene, **form)
+        hold(study, name, error, reason)
+        cut = float(np.abs(draw(case.scene, size, **form, cut=True) - image).max())
+        study.at_most(f"scene {name}: change by cutting dim paths", cut, CUT, "the promise, of every pixel")
+        shown = {"median": np.median(error), "99 %": np.quantile(error, 0.99), "largest": error.max()}
+        counts = {word: int(np.sum(reason == i)) for i, word in enumerate(REASONS)}
+        rows.append({"scene": name, "size": "{}x{}".format(*size), **shown, "cut-off": cut, **counts})
     note = (
         "One sample per pixel, no path cut; then how much cutting dim paths changes. Fresnel is exact, and "
-        "Schlick's in the last two scenes. Pixels off by more than 1/255 are counted by reason."
+        "Schlick's in the last three scenes. Pixels off by more than 1/255 are counted by reason."
     )
-    study.table("scenes", "Our pictures against the float64 tracer", columns, rows, note=note)
+    study.records("scenes", "Our pictures against the float64 tracer", rows, note)
 
 
 def lattices(study: Study, *, quick: bool) -> None:
@@ -209,20 +199,17 @@ def original(study: Study, *, quick: bool) -> None:
     if not folder.is_dir():
         study.text("The original's renders are not at hand (MRT_REFERENCE names their folder): not judged.")
         return
-    rows = []
+    rows: list[dict[str, Any]] = []
     for number in (0, 1, 3) if quick else (0, 1, 2, 3, 4):
         theirs = read_exr(folder / f"s{number}_none_aa1.exr").image
         height, width, _ = theirs.shape
         truth = reference_render(report_scene(number), width=width, height=height).image
-        errors = [np.abs(image - truth) for image in (draw(number, (width, height), cut=True), theirs)]
-        means = [float(e.mean()) for e in errors]
-        shares = [100 * float(np.mean(e.max(axis=-1) > STEP)) for e in errors]
-        rows.append([number, *means, *shares])
-        name, why = f"scene {number}: our mean difference over the original's", "the same task, done better"
-        study.at_most(name, means[0] / means[1], 1.0, why)
-    columns = ["scene", "mean, ours", "mean, original", "% off, ours", "% off, original"]
-    note = (
-        "The truth has no self-intersection; most of what the original is off by is shadow acne near "
-        "terminators."
-    )
-    study.table("original", "The original's renders, judged by the same truth", columns, rows, note=note)
+        row: dict[str, Any] = {"scene": number}
+        for name, image in (("ours", draw(number, (width, height), cut=True)), ("original", theirs)):
+            error = np.abs(image - truth)
+            row |= {f"mean, {name}": error.mean(), f"% off, {name}": 100 * np.mean(error.max(axis=-1) > STEP)}
+        rows.append(row)
+        what, why = f"scene {number}: our mean difference over the original's", "the same task, done better"
+        study.at_most(what, row["mean, ours"] / row["mean, original"], 1.0, why)
+    note = "The truth has no self-intersection; most that the original is off by is shadow acne."
+    study.records("original", "The original's renders, judged by the same truth", rows, note)
