@@ -80,7 +80,7 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> list[Study]:
         packages = " ".join(missing)
         raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
     report.prepare(out)
-    seconds = sum(STUDIES[name][2 if quick else 3] for name in names)
+    seconds = sum(STUDIES[name][2] if quick else STUDIES[name][3] for name in names)
     print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
     # With a cache of their own, studies of speed see how long compilation takes
     with nullcontext() if quick or not set(names) & set(TIMED) else own_cache():
@@ -94,8 +94,8 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> list[Study]:
 
 def listing() -> str:
     """Return a line on each study, with how long it takes on two idle cores."""
-    total = ("all of these", *(sum(entry[i] for entry in STUDIES.values()) for i in (2, 3)))
-    rows = [(name, *entry[1:]) for name, entry in STUDIES.items()] + [("all", *total)]
+    quick, full = (sum(seconds) for seconds in list(zip(*STUDIES.values(), strict=True))[2:])
+    rows = [(name, *entry[1:]) for name, entry in STUDIES.items()] + [("all", "all of these", quick, full)]
     lines = [f"  {n:<15}{_spoken(quick):>7}{_spoken(full):>8}  {about}" for n, about, quick, full in rows]
     return "\n".join([f"  {'':<15}{'quick':>7}{'full':>8}", *lines])
 

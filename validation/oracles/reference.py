@@ -48,7 +48,7 @@ class ReferenceResult(NamedTuple):
 
 
 def reference_render(
-    scene: Scene, *, width: int, height: int, displacement: tuple[float, float] = (0, 0), **settings: Any
+    scene: Scene, *, width: int, height: int, displacement: Sequence[float] = (0, 0), **settings: Any
 ) -> ReferenceResult:
     """Render a scene with one ray through each pixel, exactly but for the rounding of float64.
 

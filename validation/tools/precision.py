@@ -351,7 +351,15 @@ def _diagram(found: Findings) -> Any:
         ends = np.array([[p.seconds_interval, p.rmse_interval] for p in curve]).transpose(1, 2, 0)
         x, y = np.nan_to_num(np.maximum(np.stack([places - ends[:, 0], ends[:, 1] - places], axis=1), 0))
         axes.errorbar(
-            *places, xerr=x, yerr=y, label=name, marker=marker, markersize=5, linewidth=1, capsize=2
+            places[0],
+            places[1],
+            xerr=x,
+            yerr=y,
+            label=name,
+            marker=marker,
+            markersize=5,
+            linewidth=1,
+            capsize=2,
         )
     ahead = front(ordered)
     for number, point in enumerate(ordered, 1):

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -41,12 +42,12 @@ def _without(nodes: Nodes, *kinds: str) -> Nodes:
     return {name: node for name, node in nodes.items() if not name.startswith(kinds)}
 
 
-def with_lights(count: int, **size: Any) -> Nodes:
+def with_lights(number: int, **size: Any) -> Nodes:
     """Return scene 4 with its light from points above, each of its own brightness."""
     nodes = _without(mrt.scene_dict(4, **size), "light_")
-    for i in range(count):
+    for i in range(number):
         a, b, c = i * 0.754877666 % 1, i * 0.569840296 % 1, i * 0.362378 % 1  # evenly in the room
-        value = (6 / count) * (0.5 + a)
+        value = (6 / number) * (0.5 + a)
         nodes[f"light_{i}"] = {
             "type": "mrt_light",
             "position": [10 * a, 4 + 16 * b, 10 * c],
@@ -55,11 +56,11 @@ def with_lights(count: int, **size: Any) -> Nodes:
     return nodes
 
 
-def with_triangles(count: int, **size: Any) -> Nodes:
+def with_triangles(number: int, **size: Any) -> Nodes:
     """Return hills under the camera and the lights of scene 0."""
     import mitsuba as mi
 
-    cells = max(1, round((count / 2) ** 0.5))
+    cells = max(1, round((number / 2) ** 0.5))
     z, x = np.mgrid[-3 : 3 : (cells + 1) * 1j, -3 : 3 : (cells + 1) * 1j]
     positions = np.stack([x, 0.2 * np.sin(5 * x) * np.cos(7 * z), z], axis=-1).reshape(1, -1, 3)
     corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
@@ -75,7 +76,7 @@ def with_triangles(count: int, **size: Any) -> Nodes:
     return _without(mrt.scene_dict(0, **size), "plane_") | {"hills": hills}
 
 
-def crowd(count: int, kind: str, **size: Any) -> Nodes:
+def crowd(number: int, kind: str, **size: Any) -> Nodes:
     """Return the room of scene 4 with so many spheres, or cones as high and wide, in any direction.
 
     Of the kind "group", the spheres are one shape.
@@ -85,13 +86,13 @@ def crowd(count: int, kind: str, **size: Any) -> Nodes:
     nodes = _without(mrt.scene_dict(4, **size), "sphere_", "spheres")
     material = next(name for name in nodes if name.startswith("material_"))
     rng = np.random.default_rng(5)
-    centers, radii = rng.uniform((1, 0, 1), (7.5, 6.5, 7.5), (count, 3)), rng.uniform(0.05, 0.25, count)
+    centers, radii = rng.uniform((1, 0, 1), (7.5, 6.5, 7.5), (number, 3)), rng.uniform(0.05, 0.25, number)
     if kind == "group":
         numbers = np.column_stack([centers, radii]).astype(np.float32)
         bsdf = {"type": "ref", "id": material}
         group = {"type": "mrt_group", "kind": "sphere", "numbers": mi.Bitmap(numbers), "bsdf": bsdf}
         return nodes | {"crowd": group}
-    half = rng.normal(size=(count, 3))
+    half = rng.normal(size=(number, 3))
     half *= (radii / np.linalg.norm(half, axis=1))[:, None]
     for i, (center, radius, up) in enumerate(zip(centers, radii.tolist(), half, strict=True)):
         place: Nodes = {"type": "sphere", "center": center.tolist()}
@@ -110,10 +111,6 @@ def of_scene(nodes: Callable[..., Nodes], size: tuple[int, int], options: dict[s
     return partial(mrt.render, load(nodes(width=size[0], height=size[1])), **options)
 
 
-def _small(**options: Any) -> Render:
-    return partial(mrt.render, load(mrt.scene_dict(3, **SMALL)), **options)
-
-
 def _with_update(**options: Any) -> Render:
     """Return a render of a loaded scene of which a colour changes before."""
     import mitsuba as mi
@@ -121,10 +118,10 @@ def _with_update(**options: Any) -> Render:
     scene = load(mrt.scene_dict(3, **SMALL))
     parameters = mi.traverse(scene)
     key = next(name for name in list(parameters.keys()) if name.endswith("diffuse_reflectance.value"))
-    turn = iter(range(10**9))
+    turns = count()
 
     def render() -> Any:
-        parameters[key] = mi.Color3f(0.3 + 0.001 * (next(turn) % 100), 0.2, 0.1)
+        parameters[key] = mi.Color3f(0.3 + 0.001 * (next(turns) % 100), 0.2, 0.1)
         parameters.update()
         return mrt.render(scene, **options)
 
@@ -134,11 +131,9 @@ def _with_update(**options: Any) -> Render:
 def _prepared() -> Render:
     """Return a prepared render; of versions that have none, the nearest thing: a render of a loaded scene."""
     scene = load(mrt.scene_dict(3, **SMALL))
-    prepare: Any = getattr(mrt, "prepare", None)
-    if prepare is not None:
-        prepared: Render = prepare(scene, **ONE_RAY)
-        return prepared
-    return partial(mrt.render, scene, **ONE_RAY)
+    prepare: Any = getattr(mrt, "prepare", lambda scene, **options: partial(mrt.render, scene, **options))
+    render: Render = prepare(scene, **ONE_RAY)
+    return render
 
 
 def _by_mitsuba() -> Render:
@@ -149,47 +144,47 @@ def _by_mitsuba() -> Render:
     return lambda: np.array(mi.render(scene, spp=1))
 
 
-def _box(**options: Any) -> Render:
+def _box(width: int, height: int) -> Nodes:
     import mitsuba as mi
 
-    box = mi.cornell_box()
-    box["sensor"]["film"] |= {"width": 96, "height": 96, "rfilter": {"type": "box"}}
-    return partial(mrt.render, load(box), integrator="path", **options)
+    box: Nodes = mi.cornell_box()
+    box["sensor"]["film"] |= {"width": width, "height": height, "rfilter": {"type": "box"}}
+    return box
 
 
-LARGE, MIDDLE = (800, 600), (400, 300)
-CASES: dict[str, tuple[Callable[[], Render], int]] = {  # what makes the render, and how many count as one
-    **{
-        f"scene {n}": (partial(of_scene, partial(mrt.scene_dict, n), LARGE, SUPERSAMPLED), 1)
-        for n in range(5)
-    },
-    "a million triangles": (partial(of_scene, partial(with_triangles, 10**6), MIDDLE, SUPERSAMPLED), 2),
-    "200 lights": (partial(of_scene, partial(with_lights, 200), (160, 120), ONE_RAY), 2),
-    "a thousand cones": (partial(of_scene, partial(crowd, 1000, "cone"), MIDDLE, SUPERSAMPLED), 2),
-    "to an error": (partial(_box, target=0.02), 1),
-    "aamode=noise": (partial(_box, aamode="noise", spp=64), 1),
-    "small, prepared": (_prepared, 100),
-    "small, loaded": (partial(_small, **ONE_RAY), 100),
-    "small, with an update": (partial(_with_update, **ONE_RAY), 100),
-    "small, from its number": (lambda: partial(mrt.render, 3, **SMALL, **ONE_RAY), 100),
-    "small, film": (partial(_small, aamode="none", aa=1), 100),
-    "small, filters": (partial(_small, **FILTERS), 50),
-    "small, with an update, filters": (partial(_with_update, **FILTERS), 50),
-    "small, from its number, filters": (lambda: partial(mrt.render, 3, **SMALL), 50),
-    "small, mi.render": (_by_mitsuba, 100),
-}
+REPORT = [partial(mrt.scene_dict, number) for number in range(5)]
+LARGE, MIDDLE, LITTLE, TINY = (800, 600), (400, 300), (160, 120), (64, 48)
+PATH: dict[str, Any] = {"integrator": "path"}
+ROWS: tuple[tuple[str, int, Callable[[], Render]], ...] = (  # how many renders count as one, what makes them
+    *((f"scene {i}", 1, partial(of_scene, nodes, LARGE, SUPERSAMPLED)) for i, nodes in enumerate(REPORT)),
+    ("a million triangles", 2, partial(of_scene, partial(with_triangles, 10**6), MIDDLE, SUPERSAMPLED)),
+    ("200 lights", 2, partial(of_scene, partial(with_lights, 200), LITTLE, ONE_RAY)),
+    ("a thousand cones", 2, partial(of_scene, partial(crowd, 1000, "cone"), MIDDLE, SUPERSAMPLED)),
+    ("to an error", 1, partial(of_scene, _box, (96, 96), PATH | {"target": 0.02})),
+    ("aamode=noise", 1, partial(of_scene, _box, (96, 96), PATH | {"aamode": "noise", "spp": 64})),
+    ("small, prepared", 100, _prepared),
+    ("small, loaded", 100, partial(of_scene, REPORT[3], TINY, ONE_RAY)),
+    ("small, with an update", 100, partial(_with_update, **ONE_RAY)),
+    ("small, from its number", 100, lambda: partial(mrt.render, 3, **SMALL, **ONE_RAY)),
+    ("small, film", 100, partial(of_scene, REPORT[3], TINY, {"aamode": "none", "aa": 1})),
+    ("small, filters", 50, partial(of_scene, REPORT[3], TINY, FILTERS)),
+    ("small, with an update, filters", 50, partial(_with_update, **FILTERS)),
+    ("small, from its number, filters", 50, lambda: partial(mrt.render, 3, **SMALL)),
+    ("small, mi.render", 100, _by_mitsuba),
+)
+CASES = {name: (make, number) for name, number, make in ROWS}
 
 
 def seconds(name: str) -> float:
     """Return the mean seconds of warm renders of a case."""
-    make, count = CASES[name]
+    make, number = CASES[name]
     render = make()
-    for _ in range(1 if count < 10 else 3):
+    for _ in range(1 if number < 10 else 3):
         render()
     start = time.perf_counter()
-    for _ in range(count):
+    for _ in range(number):
         render()
-    return (time.perf_counter() - start) / count
+    return (time.perf_counter() - start) / number
 
 
 if __name__ == "__main__":

@@ -118,7 +118,8 @@ def save(
     _write(place / "summary.json", json.dumps(result, indent=2, allow_nan=False).encode() + b"\n")
     template = (files("mrt_mitsuba.validation.tools") / "templates" / "report.html").read_text("utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    environment.filters |= {"cell": cell, "id": id, "base64": lambda data: base64.b64encode(data).decode()}
+    environment.filters |= {"cell": cell, "id": id}
+    environment.filters["base64"] = lambda data: base64.b64encode(data).decode()
     shown = {**result, "studies": studies, "images": images, "title": title, "explain": title == VALIDATION}
     _write(place / "index.html", environment.from_string(template).render(shown).encode())
 
