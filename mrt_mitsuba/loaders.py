@@ -52,33 +52,21 @@ def mitsuba_home() -> str:
     return os.path.dirname(os.path.abspath(mi.__file__))
 
 
-def one_by_one() -> None:
-    """Let ``mi.load_dict``, ``mi.load_file`` and ``mi.load_string`` make this project's objects one by one.
+def one_by_one(lock: contextlib.AbstractContextManager[Any]) -> None:
+    """Let Mitsuba's loaders make this project's objects one by one, and ``mi.render`` and changes by
+    ``mi.traverse`` hold a lock: done at once, either ends the process.
 
-    Scenes without them, and calls that say ``parallel``, go on as before. Idempotent.
+    Scenes without our plugins, and calls that say ``parallel``, load as before. Idempotent.
     """
     import mitsuba as mi
 
-    def in_turn(loader: Callable[..., Any], mentions: Callable[[Any], bool]) -> Callable[..., Any]:
+    def in_turn(loader: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(loader)
         def load(source: Any, parallel: bool | None = None, optimize: bool = True, **parameters: Any) -> Any:
-            parallel = not mentions(source) if parallel is None else parallel
+            parallel = not _mentions_ours(source) if parallel is None else parallel
             return loader(source, parallel, optimize, **parameters)
 
         return load
-
-    for name, mentions in _MENTIONS.items():
-        loader = getattr(mi, name)
-        if not hasattr(loader, "__wrapped__"):
-            setattr(mi, name, in_turn(loader, mentions))
-
-
-def exclusive(lock: contextlib.AbstractContextManager[Any]) -> None:
-    """Let ``mi.render`` and changes by ``mi.traverse`` hold a lock: done at once, they end the process.
-
-    Idempotent.
-    """
-    import mitsuba as mi
 
     def guarded(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
@@ -88,37 +76,28 @@ def exclusive(lock: contextlib.AbstractContextManager[Any]) -> None:
 
         return call
 
-    parameters = mi.SceneParameters
-    for owner, name in ((mi, "render"), (parameters, "update"), (parameters, "__setitem__")):
+    changes = ((mi, "render"), (mi.SceneParameters, "update"), (mi.SceneParameters, "__setitem__"))
+    loaders = ((mi, name) for name in ("load_dict", "load_file", "load_string"))
+    for (owner, name), wrapped in [*((c, guarded) for c in changes), *((f, in_turn) for f in loaders)]:
         function = getattr(owner, name)
         if not hasattr(function, "__wrapped__"):
-            setattr(owner, name, guarded(function))
+            setattr(owner, name, wrapped(function))
 
 
-def _is_mentioned(scene: Any) -> bool:
-    """Return whether a dict has a plugin of this project; Mitsuba itself refuses anything else."""
-    waiting, seen = [scene], set()
-    while waiting:
-        node = waiting.pop()
-        if isinstance(node, dict) and id(node) not in seen:
-            seen.add(id(node))
-            if str(node.get("type", "")).startswith(_OURS):
-                return True
-            waiting += node.values()
-    return False
-
-
-def _is_mentioned_in(path: Any) -> bool:
-    """Return whether an XML file may have one, or one that it includes; Mitsuba reports unreadable files."""
-    text = b""
-    with contextlib.suppress(OSError, TypeError), open(path, "rb") as file:
+def _mentions_ours(source: Any) -> bool:
+    """Return whether a dict, or a file of XML or its text, may have a plugin of this project; Mitsuba itself
+    refuses anything else, and reports files that cannot be read."""
+    if isinstance(source, dict):
+        waiting, seen = [source], set()
+        while waiting:
+            node = waiting.pop()
+            if isinstance(node, dict) and id(node) not in seen:
+                seen.add(id(node))
+                if str(node.get("type", "")).startswith("mrt_"):
+                    return True
+                waiting += node.values()
+        return False
+    text = str(source).encode()
+    with contextlib.suppress(OSError, ValueError), open(source, "rb") as file:
         text = file.read()
-    return _OURS.encode() in text or b"<include" in text
-
-
-_OURS = "mrt_"
-_MENTIONS: dict[str, Callable[[Any], bool]] = {
-    "load_dict": _is_mentioned,
-    "load_file": _is_mentioned_in,
-    "load_string": lambda text: _OURS in text or "<include" in text,
-}
+    return b"mrt_" in text or b"<include" in text

@@ -13,7 +13,7 @@ from mrt_mitsuba import llvm
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtError, MrtWarning, UnknownVariantError, VariantError
 from mrt_mitsuba.interrupts import held
-from mrt_mitsuba.loaders import exclusive, mitsuba_first, one_by_one, rewriting_later
+from mrt_mitsuba.loaders import mitsuba_first, one_by_one, rewriting_later
 from mrt_mitsuba.memory import check_addresses
 
 FAST = "llvm_ad_rgb"
@@ -66,8 +66,7 @@ def use(variant: str | None = None) -> str:
         from mrt_mitsuba import plugins
 
         mitsuba_first()
-        one_by_one()
-        exclusive(one_at_a_time)
+        one_by_one(one_at_a_time)
         plugins.register()
         plugins.register_modules("mrt_mitsuba.rendering", ["adaptive"])
         _used = variant

@@ -160,16 +160,12 @@ class Canvas:
         self._sums = np.zeros((channels + 1, rays.size))
         self._moments = np.zeros((7 * moments, rays.size))
 
-    @property
-    def sums(self) -> np.ndarray:
-        """The sums of values and, last, of weights, [pictures, H, W, channels + 1]."""
-        return np.moveaxis(self._sums.reshape(-1, *self._shape), 0, -1)
-
-    @property
-    def moments(self) -> np.ndarray:
-        """The sums of colours and of squared colours, and the mean colour of the brightest ray,
-        [pictures, H, W, 7]; empty where not asked for."""
-        return np.moveaxis(self._moments.reshape(-1, *self._shape), 0, -1)
+    def finished(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sums of values and, last, of weights, [pictures, H, W, channels + 1]; those of colours
+        and of their squares, and the mean colour of the brightest ray, [pictures, H, W, 7] or empty."""
+        planes = (planes.reshape(-1, *self._shape) for planes in (self._sums, self._moments))
+        sums, moments = (np.moveaxis(each, 0, -1) for each in planes)
+        return sums, moments
 
     def put(self, place: Any, values: Sequence[Any], pixels: np.ndarray) -> None:
         """Add the values of rays, [channels] each, colours first, at their places on the film.

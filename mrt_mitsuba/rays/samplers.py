@@ -17,11 +17,16 @@ _PASCAL = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (
 
 def ray_sampler() -> Any:
     """Return a Mitsuba sampler for the current variant; call ``start`` for the rays that it is to serve."""
-    return _sampler_class(mi.variant())(mi.Properties("ray_sampler"))
+    return _classes(mi.variant())[0](mi.Properties("ray_sampler"))
+
+
+def pixel_sequence() -> Any:
+    """Return a Mitsuba sampler for the current variant; call ``start`` for the rays that it is to serve."""
+    return _classes(mi.variant())[1](mi.Properties("pixel_sequence"))
 
 
 @functools.cache
-def _sampler_class(variant: str) -> type:
+def _classes(variant: str) -> tuple[type, type]:
     class RaySampler(mi.Sampler):
         """Draws the numbers of Mitsuba's ``independent``, with rays that need not begin with number 0.
 
@@ -55,19 +60,6 @@ def _sampler_class(variant: str) -> type:
             x = self.random.next_float32(active)
             return mi.Point2f(x, self.random.next_float32(active))
 
-        def to_string(self) -> str:
-            return "RaySampler[]"
-
-    return RaySampler
-
-
-def pixel_sequence() -> Any:
-    """Return a Mitsuba sampler for the current variant; call ``start`` for the rays that it is to serve."""
-    return _sequence_class(mi.variant())(mi.Properties("pixel_sequence"))
-
-
-@functools.cache
-def _sequence_class(variant: str) -> type:
     class PixelSequence(mi.Sampler):
         """Sobol's (0, 2)-sequence, shuffled and scrambled anew for each pixel and each pair of dimensions.
 
@@ -105,10 +97,7 @@ def _sequence_class(variant: str) -> type:
             self.dimension = dr.select(active, self.dimension + 1, self.dimension)
             return dr.brev(_scrambled(self.index, a, b)), a, b
 
-        def to_string(self) -> str:
-            return "PixelSequence[]"
-
-    return PixelSequence
+    return RaySampler, PixelSequence
 
 
 def _mixed(bits: Any) -> Any:

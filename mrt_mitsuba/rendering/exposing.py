@@ -137,11 +137,13 @@ class Exposer:
         layers = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
         return ("R", "G", "B", *own, *self.shader.aovs, *layers)
 
-    def means(self, pixels: Any, places: Places, seed: int) -> Iterator[tuple[slice, str, int, np.ndarray]]:
+    def means(
+        self, pixels: Any, places: Places, seed: int
+    ) -> Iterator[tuple[slice, Iterator[tuple[str, int, np.ndarray]]]]:
         """Trace samples of a lattice in pixels, in parts that fit into memory or of one pixel.
 
-        Yields which of the pixels are in a part, a layer, one of its channels, and its values there: means
-        over the rays of each pixel, or what the first ray hit. They do not depend on the parts.
+        Yields which of the pixels are in a part, and layers, their channels, and the values there: means over
+        the rays of each pixel, or what the first ray hit. They do not depend on the parts.
         """
         workspace, channels, size = self.job.workspace, channel_count(self.layers), places.size
         width, height = self.view.width, self.view.height
@@ -156,18 +158,7 @@ class Exposer:
         most = workspace.rays_at_once(channels)
         log.debug("tracing %d rays, at most %d at once", len(pixels) * size, most)
         for part, groups in Groups(size, pixels).parts(max(1, most // size), width):
-            _, values = self._trace(groups, start)
-            for name, planes in values.items():
-                first = TABLE[name].source == FIRST_HIT
-                for channel, plane in enumerate(planes):
-                    if first:
-                        plane = np.asarray(plane)[::size]
-                    elif size > 1 and isinstance(plane, np.ndarray):
-                        plane = plane.reshape(-1, size).sum(1)
-                    elif size > 1:
-                        plane = dr.block_reduce(dr.ReduceOp.Add, plane, size)
-                    share = np.float32(1 if first else 1 / size)
-                    yield part, name, channel, np.asarray(plane, np.float32) * share
+            yield part, _by_pixel(self._trace(groups, start)[1], size)
         workspace.give_back(min(most, len(pixels) * size) * channels * BYTES_PER_CHANNEL_OF_RAY)
 
     def expose(
@@ -197,7 +188,7 @@ class Exposer:
             planes = [plane for channels in values.values() for plane in channels]
             canvas.put(place, planes, np.repeat(some.pixels, size))
             advance(len(some.pixels) * size)
-        sums, colors = canvas.sums, canvas.moments
+        sums, colors = canvas.finished()
         return Exposed(sums[..., :-1], sums[..., -1], rays, *np.split(colors, [3, 6], axis=-1))
 
     def _on_film(self, groups: Groups, seed: int, before: int, progressive: bool) -> Start:
@@ -280,3 +271,17 @@ class Exposer:
         found |= {name: TABLE[name].value(values) for name in self.layers}
         parts = {name: list(value) if dr.size_v(value) > 1 else [value] for name, value in found.items()}
         return place, {name: [mi.Float(c) for c in channels] for name, channels in parts.items()}
+
+
+def _by_pixel(values: dict[str, list[Any]], size: int) -> Iterator[tuple[str, int, np.ndarray]]:
+    """Yield of each layer and channel the means over the rays of each pixel, or what the first ray hit."""
+    for name, planes in values.items():
+        first = TABLE[name].source == FIRST_HIT
+        for channel, plane in enumerate(planes):
+            if first:
+                plane = np.asarray(plane)[::size]
+            elif size > 1 and isinstance(plane, np.ndarray):
+                plane = plane.reshape(-1, size).sum(1)
+            elif size > 1:
+                plane = dr.block_reduce(dr.ReduceOp.Add, plane, size)
+            yield name, channel, np.asarray(plane, np.float32) * np.float32(1 if first else 1 / size)

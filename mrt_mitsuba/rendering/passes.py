@@ -71,7 +71,10 @@ class Passes:
             elif step.name == EDGES:
                 self._detect(step)
             elif step.name == REFINEMENT:
-                (self._expose_edges if plan.on_film else self._refine)(step)
+                if plan.on_film:
+                    self._expose_edges(step)
+                else:
+                    self._trace(step, plan.places(self._seed, self._frame, step.first))
             elif step.name == BLUR:
                 self._blur(step)
             elif step.name == ROUNDS:
@@ -83,34 +86,27 @@ class Passes:
     # ------------------------------------------- Lattices -------------------------------------------
 
     def _trace(self, step: Pass, places: Places) -> None:
-        """Trace all pixels; their layers are new."""
-        flat = {name: self._add(name).reshape(len(self._pixels), -1) for name in step.layers}
-        exposer, done = self._exposer(step), 0
-        with self._job.stage(step.name, len(self._pixels)) as advance:
-            for part, name, channel, plane in exposer.means(self._pixels, places, self._seed):
-                flat[name][part, channel] = plane
-                advance(part.stop - done)
-                done = part.stop
-
-    def _refine(self, step: Pass) -> None:
-        """Add the lattice's other samples in the pixels at edges, some rows at a time."""
-        samples, at_once = self.layers["samples"].ravel(), self._rows_at_once * self._shape[1]
-        places, count = self._plan.places(self._seed, self._frame, step.first), self._plan.lattice.count
-        flat = {name: self.layers[name].reshape(len(samples), -1) for name in step.layers}
-        total = int(np.count_nonzero(samples > 1))
-        with self._job.stage(step.name, total, "Computing Anti aliasing..") as advance:
-            for start in range(0, len(samples), at_once):
-                found = np.flatnonzero(samples[start : start + at_once] > 1).astype(np.uint32)
-                found, done = found + np.uint32(start), 0
-                if isinstance(self._pixels, range):
-                    pixels = found + np.uint32(self._pixels.start)
-                else:
-                    pixels = self._pixels[found]
-                for part, name, channel, plane in self._exposer(step).means(pixels, places, self._seed + 1):
-                    layer, chosen = flat[name], (found[part], channel)
-                    layer[chosen] = (step.first * layer[chosen] + places.count * plane) / np.float32(count)
-                    advance(part.stop - done)
-                    done = part.stop
+        """Trace all pixels, whose layers are new; or of those at edges the lattice's other samples."""
+        seed, pixels, edge = self._seed, self._pixels, np.zeros(0)
+        if step.name == REFINEMENT:
+            edge = np.flatnonzero(self.layers["samples"] > 1).astype(np.uint32)
+            whole = isinstance(pixels, range)
+            seed, pixels = seed + 1, edge + np.uint32(pixels.start) if whole else pixels[edge]
+        else:
+            for name in step.layers:
+                self._add(name)
+        flat = {name: self.layers[name].reshape(len(self._pixels), -1) for name in step.layers}
+        message = "Computing Anti aliasing.." if step.name == REFINEMENT else ""
+        with self._job.stage(step.name, len(pixels), message) as advance:
+            for part, planes in self._exposer(step).means(pixels, places, seed):
+                for name, channel, plane in planes:
+                    if step.name == REFINEMENT:
+                        before = step.first * flat[name][edge[part], channel]
+                        total = before + places.count * plane
+                        flat[name][edge[part], channel] = total / np.float32(self._plan.lattice.count)
+                    else:
+                        flat[name][part, channel] = plane
+                advance(part.stop - part.start)
 
     # --------------------------------------------- Films --------------------------------------------
 
