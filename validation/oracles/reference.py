@@ -23,8 +23,6 @@ from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Mesh, Plane, Scene, 
 # Robust secondary rays start this far off the surface, relative to the coordinates and distances that led to
 # the point: far above the rounding of float64, far below anything a float32 picture can show
 OFFSET = 1e-10
-# That of Mitsuba's integrators, relative to 1 + the largest coordinate: 1500 half roundings of float32
-MITSUBA_OFFSET = 1500 * 2.0**-24
 # The original's absolute constants
 ORIGINAL_SHADOW_START, ORIGINAL_MIRROR_START, ORIGINAL_REACH = 1e-4, 1e-3, 1e5
 BATCH = 2**20  # pairs of a ray and an object at a time
@@ -54,7 +52,7 @@ def reference_render(
 
     ``displacement``: of the rays, in pixels, y upwards. ``settings``: ``fresnel`` ("dielectric", "schlick" or
     "unity"), ``clamp``, ``max_depth``, ``bounce_budget`` ("report" or "plain"), and ``start`` of secondary
-    rays ("robust", "mitsuba", or "original": that program's distances and reach). Raises ``SceneError`` for a
+    rays ("robust", or "original": that program's distances and reach). Raises ``SceneError`` for a
     texture on anything but triangles, and for one that is not looked up as in the report.
     """
     pixel = np.arange(width * height)
@@ -408,8 +406,7 @@ class _Tracer:
         """Return where rays that leave in the directions d start."""
         if self.start == "original":
             return hits.p + original * d
-        robust, mitsuba = OFFSET * hits.scale, MITSUBA_OFFSET * (1 + np.abs(hits.p).max(axis=1))
-        return hits.p + (mitsuba if self.start == "mitsuba" else robust)[:, None] * hits.n
+        return hits.p + (OFFSET * hits.scale)[:, None] * hits.n
 
     def reflectance(self, hits: _Hits, light: np.ndarray) -> np.ndarray:
         """Return the BSDF [N, 3] for light from a point; both directions are above the surface."""

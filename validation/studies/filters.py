@@ -1,17 +1,14 @@
 """Adaptive anti-aliasing against full supersampling, and the Gaussian depth of field against a lens.
 
 The lens is Mitsuba's ``thinlens`` in front of the same ``mrt_whitted``, so that nothing but the lens differs.
-Which lens? The report gives an amount of blur a(d) for a hit at distance d, which no lens has: it knows no
-aperture, and grows with d without end up to 8. With R the radius of the aperture, f the distance in focus,
-W the picture's width and φ its horizontal field of view, a thin lens shows a point at distance d as a disc
-of the radius
+Which lens? The report gives an amount of blur for a hit at distance d, which no lens has: it grows with d
+without end up to 8. With R the radius of the aperture, f the distance in focus, W the picture's width and φ
+its horizontal field of view, a thin lens shows a point at distance d as a disc of the radius
 
     r(d) = B (1/f − 1/d) pixels,  B = R W / (2 tan(φ/2)),
 
-negative in front of the focus. (The aperture seen through the point is R |d − f| / f wide at distance d, and
-a pixel there 2 d tan(φ/2) / W.) That is linear in A = B/f and B, so the lens nearest to the report's blur is
-a least-squares fit of A − B/d to the disc that has the variance of the report's Pascal line, over the
-picture's pixels.
+negative in front of the focus. That is linear in A = B/f and B: the lens nearest to the report's blur is a
+least-squares fit of A − B/d to the disc that has the variance of its Pascal line, over the picture's pixels.
 """
 
 from __future__ import annotations

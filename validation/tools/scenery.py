@@ -53,20 +53,8 @@ def sensor(origin: list[float], target: list[float], rfilter: str = "gaussian", 
     } | more
 
 
-def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96, studio: bool = False) -> Any:
-    """Return a ball of the material on a floor under a sky and a point light, ``size`` × ¾ ``size`` pixels.
-
-    In the ``studio`` it is alone under a sky of bright and dark fields: all noise is then that of its
-    samples, and no light comes back from a floor in rare bright ones.
-    """
-    around = {
-        "sky": _sky((0.3, 0.4, 0.6)),
-        "lamp": {"type": "point", "position": [1.5, -2, 3], "intensity": rgb((12, 10, 8))},
-        "floor": _rectangle(_to().scale(4), bsdf=_diffuse(rgb((0.5, 0.4, 0.3)))),
-    }
-    # 16 × 8 fields of random brightness, a decade from the median to the brighter ones
-    fields = 10 ** np.random.default_rng(0).normal(-0.5, 0.5, (8, 16, 1)) * np.ones(3)
-    sky = {"type": "envmap", "bitmap": mi.Bitmap(fields.astype(np.float32))}
+def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96) -> Any:
+    """Return a ball of the material on a floor under a sky and a point light, ``size`` × ¾ ``size``."""
     film = {"width": size, "height": size * 3 // 4, "pixel_format": "rgb"}
     return mi.load_dict(
         {
@@ -74,7 +62,9 @@ def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96, studio: bool = False)
             "integrator": {"type": "path", "max_depth": 5},
             "sensor": sensor([0, -4, 1.6], [0, 0, 0.6], "box", up=[0, 0, 1], fov=32, film=film),
             "ball": _ball([0, 0, 0.7], 0.7, dict(bsdf)),
-            **({"sky": sky} if studio else around),
+            "sky": _sky((0.3, 0.4, 0.6)),
+            "lamp": {"type": "point", "position": [1.5, -2, 3], "intensity": rgb((12, 10, 8))},
+            "floor": _rectangle(_to().scale(4), bsdf=_diffuse(rgb((0.5, 0.4, 0.3)))),
         }
     )
 
