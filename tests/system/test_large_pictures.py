@@ -11,28 +11,12 @@ import time
 from collections.abc import Iterator
 
 import drjit as dr
-import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import memory
-from mrt_mitsuba.filters.grid import bands
 
 # ---------------------------------------------- Bands ----------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("height", "rows", "halo"), list(itertools.product([1, 7, 100], [1, 8, 30, 200], [0, 1, 8]))
-)
-def test_bands_cover_every_row_once_and_see_their_neighbours(height: int, rows: int, halo: int) -> None:
-    image = np.arange(height)
-    found = list(bands(height, rows, halo))
-    np.testing.assert_array_equal(np.concatenate([image[own] for own, _, _ in found]), image)
-    for own, seen, inner in found:
-        np.testing.assert_array_equal(image[own], image[seen][inner])
-        assert seen == slice(max(own.start - halo, 0), min(own.stop + halo, height))
-        assert seen.stop - seen.start <= max(rows, 3 * halo, 1)
-    assert len(found) == 1 or height > rows
 
 
 # --------------------------------------------- The same bits ---------------------------------------------

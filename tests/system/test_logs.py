@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
-from mrt_mitsuba.command.options import LEVELS, Options, parse
-
 
 def test_levels_log_more_and_more(mrt_command) -> None:
     silent, info, debug = (
@@ -18,12 +14,3 @@ def test_levels_log_more_and_more(mrt_command) -> None:
     assert sum("wrote" in line for line in info) == 2  # PNG and EXR
     assert any("rays, at most" in line for line in debug)
     assert not any("rays, at most" in line for line in info)
-
-
-@pytest.mark.parametrize("level", LEVELS)
-def test_every_level_is_an_option(level: str) -> None:
-    assert parse(["a", f"log={level}"]).log == level
-
-
-def test_default_is_a_level() -> None:
-    assert Options(filename="a").log in LEVELS

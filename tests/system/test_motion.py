@@ -202,15 +202,3 @@ def test_depth_is_that_of_the_moment_when_the_shutter_opens(mode, lattice, atol)
     )
     near = np.isfinite(depth) & np.isfinite(still) & (still < 5)
     assert np.median(np.abs(depth[near] - still[near])) <= atol
-
-
-def test_plan_names_motion_only_where_there_is_some():
-    still, moving = (mrt.render(0, **SMALL, aa=1, aamode="none", motion=way).plan for way in (None, WAY))
-    assert "motion" not in str(still) and "motion blur: 16 frames" in str(moving)
-
-
-def test_secondary_rays_are_counted_over_all_moments():
-    options = {**SMALL, "aa": 2, "aamode": "sobel", "count_rays": True}
-    still = mrt.render(3, **options)
-    frames = mrt.render(3, **options, motion=(0, 0, 0), motionsamples=4)
-    assert frames.rays == {kind: 4 * count for kind, count in still.rays.items()}

@@ -64,12 +64,6 @@ def test_parts_within_a_region(monkeypatch: pytest.MonkeyPatch) -> None:
     assert_put_together(3, aa=2, focaldist=2.0, focalrange=0.5, **SIZE)
 
 
-def test_only_the_region_is_traced() -> None:
-    part = mrt.render(3, region=(50, 40, 10, 8), aa=3, aamode="none", focaldist=0, **SIZE)
-    assert part.rays["primary"] == 10 * 8 * 9
-    assert "10x8 from column 50, row 40" in str(part.plan)
-
-
 @pytest.mark.parametrize(
     "region", [(0, 0, WIDTH + 1, 1), (0, HEIGHT, 1, 1), (-1, 0, 5, 5), (0, 0, 0, 1), (1, 2), 3]
 )

@@ -15,8 +15,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.output import LAYERS
 from mrt_mitsuba.scene.report import report_scene
 
-SMALL = {"width": 160, "height": 120}
-SCENES = (0, 1, 2, 3, 4)
+SMALL = {"width": 80, "height": 60}
 
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -25,11 +24,11 @@ pytestmark = pytest.mark.usefixtures("variant")
 # --------------------------------------------- What is traced ---------------------------------------------
 
 
-@pytest.mark.parametrize("number", SCENES)
+@pytest.mark.parametrize("number", [0, 3])
 def test_none_traces_the_whole_lattice_in_few_kernels(number):
     mrt.render(number, **SMALL, aa=3, aamode="none", focaldist=0)
     result = mrt.render(number, **SMALL, aa=3, aamode="none", focaldist=0, count_rays=True)
-    assert result.rays["primary"] == 160 * 120 * 9
+    assert result.rays["primary"] == 80 * 60 * 9
     # one kernel for all rays, one for the means; loading a scene may fill small tables
     assert result.kernel_launches <= 6
     assert np.isfinite(result.image).all()
@@ -64,34 +63,11 @@ def _without_reflection(scene):
     )
 
 
-def test_nothing_reflective_means_no_bounce_loop():
-    with_loop = mrt.render(0, **SMALL, aa=1, aamode="none", count_rays=True)
-    without = mrt.render(_without_reflection(report_scene(0)), **SMALL, aa=1, aamode="none", count_rays=True)
-    assert "bounce loop" not in _omitted(with_loop) and with_loop.rays["mirror"] > 0
-    assert "bounce loop" in _omitted(without) and without.rays["mirror"] == 0
-
-
 def test_no_light_means_no_shadow_ray_and_no_plane_no_plane():
     scene = dataclasses.replace(report_scene(0), lights=(), planes=())
     result = mrt.render(scene, **SMALL, aa=1, aamode="none", count_rays=True)
     assert {"shadow rays", "planes"} <= _omitted(result)
     assert result.rays["shadow"] == 0
-
-
-def test_no_focal_distance_means_no_depth_kept():
-    result = mrt.render(0, **SMALL, aamode="sobel")
-    assert {"depth of field", "depth"} <= _omitted(result)
-    assert not any(name.startswith("depth") for name in result.layers)
-    blurred = mrt.render(0, **SMALL, aamode="sobel", focaldist=3.0, focalrange=0.5)
-    assert "depth.Z" in blurred.layers and "depth of field" not in _omitted(blurred)
-    # two passes, and what they read; however many amounts there are
-    assert result.kernel_launches < blurred.kernel_launches <= result.kernel_launches + 10
-
-
-def test_aa_1_has_no_edge_pass_unless_edges_are_asked_for():
-    assert "edge pass" in _omitted(mrt.render(0, **SMALL, aa=1, aamode="sobel"))
-    asked = mrt.render(0, **SMALL, aa=1, aamode="sobel", layers=["edges"])
-    assert asked.layers["edges.Y"].max() > 0 and asked.rays["primary"] == 160 * 120
 
 
 @pytest.mark.parametrize("lattice", ["report", "centered"])
@@ -118,9 +94,9 @@ def test_slow_variants_are_warned_of_once_in_a_process(run_python):
 
 
 def test_a_region_in_a_scalar_variant():
-    options = {"width": 20, "height": 15, "aa": 2, "focalrange": 0.5, "variant": "scalar_rgb"}
+    options = {"width": 12, "height": 9, "aa": 2, "focalrange": 0.5, "variant": "scalar_rgb"}
     whole = mrt.render(3, **options).image
-    np.testing.assert_array_equal(mrt.render(3, region=(3, 4, 10, 5), **options).image, whole[4:9, 3:13])
+    np.testing.assert_array_equal(mrt.render(3, region=(3, 4, 7, 3), **options).image, whole[4:7, 3:10])
 
 
 def test_scene_numbers_dicts_and_mitsuba_scenes_agree():
@@ -185,23 +161,6 @@ def test_direct_light_equals_mitsubas_direct(kind):
     assert np.median(difference) < 1e-6
 
 
-def test_area_light_agrees_with_path_in_the_mean():
-    """Both are unbiased without bounces; 64 samples in 48 x 36 pixels leave 0.3 % of noise in the mean."""
-    light = {
-        "type": "sphere",
-        "center": [1, 2, 0.5],
-        "radius": 0.3,
-        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 8.0}},
-    }
-    scene = mi.load_dict(_lit_scene(light))
-    whitted = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
-    ours = mrt.render(scene, aa=1, aamode="none", spp=64, integrator=whitted, seed=1).image
-    stock = mrt.render(
-        scene, aa=1, aamode="none", spp=64, integrator={"type": "path", "max_depth": 2}, seed=2
-    ).image
-    assert ours.mean() == pytest.approx(stock.mean(), rel=0.02)
-
-
 def test_adaptive_sampling_works_over_a_stock_integrator():
     scene = mi.load_dict(mrt.scene_dict(0, width=64, height=48, flavor="stock"))
     result = mrt.render(scene, integrator="path", spp=8, aa=2, aamode="sobel", layers=["albedo", "normal"])
@@ -210,15 +169,6 @@ def test_adaptive_sampling_works_over_a_stock_integrator():
     # the layers come from one ray through the centre of each pixel
     assert result.rays["primary"] == 64 * 48 + 8 * (64 * 48 + 3 * refined)
     assert np.isfinite(result.image).all()
-
-
-def test_whitted_works_in_mi_render():
-    """Mitsuba's own render loop gives the same as ours, but for where its samples lie."""
-    scene = mi.load_dict(mrt.scene_dict(3, width=64, height=48))
-    mitsubas = np.array(mi.render(scene, spp=64))
-    ours = mrt.render(scene, aa=8, aamode="none", lattice="centered").image
-    # both integrate each pixel over its area with 64 samples; edges are all that differs
-    assert np.abs(mitsubas - ours).mean() < 5e-3
 
 
 @pytest.mark.parametrize("other_variant", ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized"])

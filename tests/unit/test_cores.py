@@ -44,10 +44,6 @@ def test_quotas_of_control_groups(tmp_path: Path, membership: str, files: dict[s
     assert usable_cores(tmp_path) == cores
 
 
-def test_without_control_groups(tmp_path: Path) -> None:
-    assert usable_cores(tmp_path) == ALL
-
-
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity") or ALL < 2, reason="needs two cores and affinity")
 def test_affinity() -> None:
     os.sched_setaffinity(0, affinity()[:1])

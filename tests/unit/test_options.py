@@ -17,38 +17,23 @@ from mrt_mitsuba.options import checked
 from mrt_mitsuba.output import LAYERS
 
 
-def test_defaults_of_the_report() -> None:
-    parsed = parse(["out"])
-    assert (parsed.filename, parsed.scene_number, parsed.width, parsed.height) == ("out", 0, None, None)
-    assert (parsed.aa, parsed.aamode, parsed.focaldist, parsed.focalrange) == (None,) * 4
-    assert (parsed.fresnel, parsed.tonemap, parsed.lattice, parsed.dof) == (None, "report", None, "report")
-    assert parsed.outputs() == ("out.png", "out.exr")
-
-
 @pytest.mark.parametrize(
     ("arguments", "values"),
     [
         ("o 3", {"scene_number": 3}),
         ("o 9 width=1 height=65536", {"scene_number": 9, "width": 1, "height": 65536}),
-        ("o aa=2 aamode=luma", {"aa": 2, "aamode": "luma", "scene_number": 0}),
         ("o 1 focaldist=2 focalrange=.5", {"focaldist": 2.0, "focalrange": 0.5}),
-        ("o focaldist=0", {"focaldist": 0.0}),
         ("o fresnel=dielectric variant=scalar_rgb", {"fresnel": "dielectric", "variant": "scalar_rgb"}),
-        ("o layers=depth,normal", {"layers": ("depth", "normal")}),
         ("o layers=all aamode=none", {"layers": tuple(LAYERS), "aamode": "none"}),
         ("o motion=0.1,-2,3e-1 motionsamples=4", {"motion": (0.1, -2.0, 0.3), "motionsamples": 4}),
         ("o memory=4G", {"memory": 4 * 2**30}),
         ("o memory=1.5gib", {"memory": 3 * 2**29}),
-        ("o memory=512MB", {"memory": 2**29}),
-        ("o memory=100000000", {"memory": 10**8}),
         ("o scene=a=b.xml", {"scene": "a=b.xml"}),
-        ("o scene=a.xml width=3", {"scene": "a.xml", "width": 3}),
         (
             "o scene=a.OBJ camera=1,2,3 target=0,0,.5 up=0,0,1 fov=45 light=0,9,0",
             {"scene": "a.OBJ", "camera": (1, 2, 3), "target": (0, 0, 0.5), "up": (0, 0, 1)}
             | {"fov": 45.0, "light": (0, 9, 0)},
         ),
-        ("o scene=a.obj texturing=standard", {"scene": "a.obj", "texturing": "standard"}),
         ("o quiet=1 plan=show", {"quiet": True, "plan": "show"}),
         ("o quiet=no", {"quiet": False}),
         ("dir.v1/o.v2", {"filename": "dir.v1/o.v2"}),
@@ -64,84 +49,42 @@ def test_accepted(arguments: str, values: dict[str, object]) -> None:
             assert getattr(parsed, field.name) == field.default
 
 
-@pytest.mark.parametrize(("form", "files"), [("png", ("o.v1.png",)), ("exr", ("o.v1.exr",))])
-def test_outputs(form: str, files: tuple[str, ...]) -> None:
-    assert parse(["o.v1", f"format={form}"]).outputs() == files
-
-
 BAD = [
     # argument(s), what the message must hold
     ("width=0", "width=0: width must be a whole number from 1 to 65536"),
-    ("width=65537", "from 1 to 65536"),
-    ("width=-5", "from 1 to 65536"),
     ("width=1e3", "width=1e3: width must be a whole number"),
-    ("width=", "width=: width must be a whole number"),
-    ("width=1_000", "whole number"),
-    ("width= 10", "whole number"),
     ("width=" + "9" * 5000, "whole number"),
     ("width=\u0663", "whole number"),
-    ("height=600.5", "whole number"),
     ("aa=0", "aa must be a whole number from 1 to 64"),
-    ("aa=65", "aa must be a whole number from 1 to 64"),
     ("aamode=sobal", "aamode=sobal: aamode must be none, luma"),
-    ("aamode=Sobel", "must be none, luma"),
     ("focaldist=nan", "focaldist must be a finite number, 0 or more"),
-    ("focaldist=inf", "finite number"),
-    ("focaldist=1e999", "finite number"),
     ("focaldist=-1", "0 or more"),
-    ("focalrange=-0.1", "focalrange must be a finite number, 0 or more"),
-    ("focalrange=two", "finite number"),
-    ("fresnel=unity", "schlick or dielectric"),
     ("variant=llvm ad", "variant must be a name such as llvm_ad_rgb"),
     ("layers=depth,depth", "each once"),
     ("layers=depht", "a comma list out of depth, normal"),
-    ("layers=", "a comma list"),
-    ("layers=depth,", "a comma list"),
-    ("format=jpg", "png, exr or both"),
     ("tonemap=gamma", "report or srgb"),
-    ("motion=1,2", "three finite numbers"),
-    ("motion=1,2,3,4", "three finite numbers"),
     ("motion=1,2,nan", "three finite numbers"),
-    ("motion=1,2,x", "three finite numbers"),
     ("memory=4X", "bytes with an optional unit"),
     ("memory=1M", "at least 64M"),
-    ("memory=nanG", "bytes with"),
     ("memory=infG", "bytes with"),
-    ("memory=-4G", "bytes with"),
     ("seed=-1", "from 0 to 4294967295"),
     ("scene=", "path of a file"),
     ("quiet=2", "quiet must be 1 or 0"),
-    ("quiet=maybe", "quiet must be 1 or 0"),
     ("widht=3", "unknown option 'widht'. Did you mean width?"),
-    ("WIDTH=3", "Did you mean width?"),
     ("--width=3", "Did you mean width?"),
     ("zzz=3", "unknown option 'zzz'. 'mrt help' lists the options."),
-    ("=3", "unknown option ''"),
     ("filename=x", "unknown option 'filename'"),
-    ("scene_number=3", "unknown option"),
     ("width=3 width=4", "width is given twice"),
     ("1 2", "unexpected argument '2'"),
-    ("width=3 1", "unexpected argument '1'"),
     ("1 scene=a.xml", "both SCENE 1 and scene=a.xml"),
     ("motionsamples=4", "only with motion"),
-    ("motionmode=stratified", "only with motion"),
     ("motion=1,0,0 motionmode=both", "frames or stratified"),
-    ("spp=0", "whole number"),
     ("camera=1,2,3", "camera is of use only with an OBJ file: scene=PATH.obj"),
-    ("3 light=1,2,3", "light is of use only with an OBJ file"),
     ("scene=a.xml texturing=standard", "texturing is of use only with an OBJ file"),
-    ("scene=a.obj texturing=bilinear", "report or standard"),
-    ("scene=a.obj camera=1,2", "camera must be three finite numbers"),
     ("scene=a.obj target=nan,0,0", "target must be a positive number, or three"),
-    ("scene=a.obj light=1,2,inf", "light must be three finite numbers"),
     ("scene=a.obj fov=0", "fov must be degrees, more than 0 and less than 180"),
-    ("scene=a.obj fov=180", "less than 180"),
-    ("scene=a.obj fov=nan", "less than 180"),
     ("scene=a.obj up=0,0,0", "up must have a length"),
     ("scene=a.obj camera=1,2,3 target=1,2,3", "camera and target are the same point"),
-    ("-1", "SCENE -1: must be 0, 1,"),
-    ("99", "SCENE 99: must be 0, 1, 2, 3, 4"),
-    ("1.0", "must be 0, 1,"),
     ("three", "('mrt scenes' lists them)."),
     ("my.xml", "For a file of your own, write scene=my.xml"),
 ]
@@ -149,7 +92,7 @@ BAD = [
 
 @pytest.mark.parametrize(("arguments", "text"), BAD)
 def test_refused(arguments: str, text: str) -> None:
-    rest = [arguments] if arguments in ("width= 10", "variant=llvm ad") else arguments.split()
+    rest = [arguments] if arguments == "variant=llvm ad" else arguments.split()
     with pytest.raises(UsageError, match=re.escape(text)) as caught:
         parse(["out", *rest])
     assert "\n" not in str(caught.value)
@@ -161,10 +104,8 @@ def test_refused(arguments: str, text: str) -> None:
         ([], "FILENAME is missing"),
         (["width=3"], "FILENAME is missing before width=3"),
         (["out.png"], "FILENAME has no extension: write out format=png"),
-        (["a/b.EXR"], "write a/b format=exr"),
         (["--fast"], "unknown option --fast"),
         (["folder/"], "names no file"),
-        ([""], "names no file"),
         (["a\0b"], "names no file"),
     ],
 )
@@ -195,11 +136,6 @@ def test_any_command_line(arguments: list[str]) -> None:
     except UsageError:
         return
     assert parsed.filename == arguments[0]
-
-
-@given(st.floats(0, 1e30))
-def test_floats_keep_every_bit(value: float) -> None:
-    assert parse(["o", f"focaldist={value!r}"]).focaldist == value
 
 
 @pytest.mark.parametrize(

@@ -19,19 +19,6 @@ def started(first: int, count: int):
     return sampler
 
 
-def test_first_rays_get_the_numbers_of_independent() -> None:
-    mine, theirs = started(0, 100), mi.load_dict({"type": "independent"})
-    theirs.seed(7, 100)
-    for _ in range(3):
-        for draw in ("next_1d", "next_2d"):
-            np.testing.assert_array_equal(getattr(mine, draw)(), getattr(theirs, draw)())
-
-
-def test_later_rays_get_theirs_in_any_wavefront() -> None:
-    whole, part = started(0, 100), started(60, 40)
-    np.testing.assert_array_equal(np.array(whole.next_1d())[60:], part.next_1d())
-
-
 def test_rays_beyond_32_bits_get_numbers_of_their_own() -> None:
     seen = [np.array(started(first, 1000).next_1d()) for first in (0, 2**32, 2**33)]
     assert not any((seen[i] == seen[i + 1]).any() for i in range(2))
