@@ -18,12 +18,12 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba import filters, plugins
 from mrt_mitsuba.output.files import read_exr
-from mrt_mitsuba.scene.model import Material, Scene
+from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation import cli
 from mrt_mitsuba.validation.oracles import filters as loops
 from mrt_mitsuba.validation.oracles.reference import reference_render
-from mrt_mitsuba.validation.studies import error_vs_time, roughconductor, scenes, speed
+from mrt_mitsuba.validation.studies import error_vs_time, roughconductor, scenes, speed, stock
 from mrt_mitsuba.validation.studies import filters as filter_study
 from mrt_mitsuba.validation.tools.scenery import with_materials
 from mrt_mitsuba.validation.tools.study import Study, findings
@@ -44,7 +44,7 @@ def tiny(monkeypatch: Patch, variant: str, tmp_path: Path) -> None:
     monkeypatch.setattr(
         filter_study,
         "QUICK",
-        filter_study.Extent((0,), (2, 4), 8, (80, 60), (64, 48, 1024), (60, 45, 8), (4, 16), (96, 72, 2, 12)),
+        filter_study.Extent((0,), (2, 4), 8, (80, 60), (60, 45, 8), (4, 16), (96, 72, 2, 12)),
     )
     trades = {"sampling": (0,), "whitted": (0,), "path": (0,)}
     tiny = error_vs_time.Extent((40, 30), (1, 4), 24, (1, 16), 256, trades, 1)
@@ -105,30 +105,26 @@ of_bsdf = partial(of_type, "mrt_bsdf")
 
 
 def in_bsdf(change: Callable[..., Any]) -> Fault:
-    """Put ``change(method, self, ctx, si, wo, active)`` in the place of eval, pdf and eval_pdf."""
+    """Put ``change(method, self, ctx, si, wo)`` in the place of eval and eval_pdf."""
 
     def plant(patch: Patch) -> None:
         kind = plugins.plugin("bsdf").MrtBSDF
-        for name in ("eval", "pdf", "eval_pdf"):
+        for name in ("eval", "eval_pdf"):
             method = getattr(kind, name)
-
-            def other(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True, method: Any = method) -> Any:
-                return change(method, self, ctx, si, wo, active)
-
-            patch.setattr(kind, name, other)
+            patch.setattr(kind, name, lambda *given, method=method: change(method, *given[:4]))
 
     return plant
 
 
-def turned(method: Any, self: Any, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+def turned(method: Any, self: Any, ctx: Any, si: Any, wo: Any) -> Any:
     """The normal points to the other side."""
     other = type(si)(si)
     other.wi = -si.wi
-    return method(self, ctx, other, -wo, active)
+    return method(self, ctx, other, -wo)
 
 
-def below_zero(method: Any, self: Any, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
-    found = method(self, ctx, si, wo, active)
+def below_zero(method: Any, *given: Any) -> Any:
+    found = method(*given)
     return (found[0] - 1e-3, found[1]) if isinstance(found, tuple) else found - 1e-3
 
 
@@ -213,6 +209,11 @@ def object_lost(patch: Patch) -> None:
     only(patch, "in our tree")
 
 
+def schlick_alone(patch: Patch) -> None:
+    SCHLICK(patch)
+    patch.setattr(stock, "MISTAKES", {})
+
+
 def other_conductor(patch: Patch) -> None:
     ours = roughconductor.ours
     patch.setattr(roughconductor, "ours", lambda alpha: ours(alpha) | {"fresnel": "schlick"})
@@ -240,7 +241,7 @@ FAULTS: list[tuple[str, Fault, str]] = [
     ("stock:mesh_cones", of_type("mrt_cone", segments=lambda n: n // 2), "mean error"),
     ("stock:mesh_cones", of_type("mrt_cone", capped=lambda _: False), "another part"),
     ("stock:direct", wrapped(mrt, "render", mirrors_too), "share of pixels off"),
-    ("stock:whole_scenes", SCHLICK, "scene 0"),
+    ("stock:whole_scenes", schlick_alone, "scene 0"),
     ("roughconductor:pointwise", BRIGHT, "value"),
     ("roughconductor:pointwise", ROUGH, "value"),
     ("roughconductor:pointwise", in_bsdf(turned), "value"),
@@ -264,13 +265,11 @@ SIZE = (80, 60)
 PLACES = {"width": 80, "height": 60}
 
 
-def altered(scene: Scene, **changes: Any) -> Scene:
-    """A scene with every material changed; a value is a function of the old one."""
-
-    def change(m: Material) -> Material:
-        return dataclasses.replace(m, **{name: value(getattr(m, name)) for name, value in changes.items()})
-
-    return with_materials(scene, change)
+def altered(name: str, change: Callable[[Any], Any]) -> Callable[[Scene], Scene]:
+    """Change a number of every material."""
+    return lambda scene: with_materials(
+        scene, lambda m: dataclasses.replace(m, **{name: change(getattr(m, name))})
+    )
 
 
 def brighter(scene: Scene) -> Scene:
@@ -280,17 +279,17 @@ def brighter(scene: Scene) -> Scene:
 
 def moved(scene: Scene) -> Scene:
     """One sphere by a tenth of a pixel or less."""
-    x, y, z = scene.spheres[1].center
-    sphere = dataclasses.replace(scene.spheres[1], center=(x, y + 1e-3, z))
-    return dataclasses.replace(scene, spheres=(scene.spheres[0], sphere, *scene.spheres[2:]))
+    first, second, *others = scene.spheres
+    up = dataclasses.replace(second, center=tuple(np.add(second.center, (0, 1e-3, 0)).tolist()))
+    return dataclasses.replace(scene, spheres=(first, up, *others))
 
 
 MISTAKES: dict[str, Callable[[Scene], Scene]] = {
     "lights x 1.00001": brighter,
     "sky x 1.001": lambda scene: dataclasses.replace(scene, sky=tuple(1.001 * c for c in scene.sky)),
-    "alpha x 1.0001": lambda scene: altered(scene, alpha=lambda a: 1.0001 * a),
-    "index + 0.00003": lambda scene: altered(scene, ior=lambda n: n + 3e-5),
-    "Ks x 0.9999": lambda scene: altered(scene, specular=lambda c: tuple(0.9999 * x for x in c)),
+    "alpha x 1.0001": altered("alpha", lambda a: 1.0001 * a),
+    "index + 0.00003": altered("ior", lambda n: n + 3e-5),
+    "Ks x 0.9999": altered("specular", lambda color: tuple(0.9999 * c for c in color)),
     "a light less": lambda scene: dataclasses.replace(scene, lights=scene.lights[:-1]),
     "a sphere moved": moved,
 }
@@ -311,10 +310,9 @@ def test_small_mistakes_in_scenes_are_seen(number: int) -> None:
         assert not verdict(number, mistake(report_scene(number))).passed, name
 
 
-@pytest.mark.parametrize("integrator", [{"clamp": False}, {"bounce_budget": "plain", "max_depth": 1}])
-def test_a_wrong_integrator_is_seen(integrator: dict[str, Any]) -> None:
+def test_a_wrong_integrator_is_seen() -> None:
     """Scene 1 has every roughness, and lights that need the clamp."""
-    assert not verdict(1, **integrator).passed
+    assert not verdict(1, clamp=False).passed and not verdict(1, bounce_budget="plain", max_depth=1).passed
 
 
 def test_every_pixel_that_is_off_has_one_reason() -> None:
@@ -405,6 +403,6 @@ def test_comparison_sees_a_broken_bsdf(monkeypatch: Patch) -> None:
 
 
 def test_roughness_out_of_range_is_refused() -> None:
-    for alpha in (0, -0.1, 1.5, float("nan")):
+    for alpha in (0, 1.5, float("nan")):
         with pytest.raises(mrt.UsageError, match="alpha="):
             mrt.compare_roughconductor(alpha)

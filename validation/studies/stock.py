@@ -31,9 +31,7 @@ Nodes = dict[str, Any]
 
 def run(study: Study, *, quick: bool) -> None:
     """Make all comparisons with what Mitsuba brings."""
-    study.text(
-        "Lattices are compared with Mitsuba's box filter, and the blur with its thinlens camera, in filters."
-    )
+    study.text("The blur is compared with Mitsuba's thinlens camera in filters.")
     for part in (direct, gloss, mesh_cones, whole_scenes):
         part(study, quick=quick)
 
