@@ -95,6 +95,7 @@ class Stack:
         near = dilated(self.rows(groups) > 0, self.film.reach)
         return np.maximum(groups, near.reshape(groups.shape))
 
+    @np.errstate(over="ignore")  # of light beyond float32, whose mean is infinite
     def add(self, exposed: Exposed, chosen: np.ndarray) -> None:
         """Add an exposure that was made for the ``chosen`` pixels [pictures, pixels]."""
         each = np.float32(1 / np.maximum(exposed.rays, 1))
