@@ -51,7 +51,7 @@ def test_infinite_depths_are_equal_where_both_are() -> None:
 
 @pytest.mark.parametrize("spread", ["error", "variance"])
 def test_more_than_noise(spread: str, tmp_path: Path) -> None:
-    """The mean of 16 rays: p is small for one picture 2 % brighter, or one pixel off by 10 deviations."""
+    """The mean of 16 rays: p is small for one picture 2 % brighter, or one pixel off by 14 deviations."""
     rng = np.random.default_rng(1)
 
     def noisy(name: str, scale: float, spot: float = 0) -> Path:
@@ -66,7 +66,7 @@ def test_more_than_noise(spread: str, tmp_path: Path) -> None:
 
     assert mrt.compare(noisy("a.exr", 1.02), noisy("b.exr", 1)).p_value < 1e-6
     assert mrt.compare(noisy("a.exr", 1.02), 0.5 * np.ones((24, 32, 3))).p_value < 1e-6  # one side exact
-    assert mrt.compare(noisy("a.exr", 1, 0.125), noisy("b.exr", 1)).p_value < 1e-3
+    assert mrt.compare(noisy("a.exr", 1, 0.25), noisy("b.exr", 1)).p_value < 1e-3
 
 
 @pytest.mark.parametrize("share", [0, 0.01])

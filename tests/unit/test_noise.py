@@ -168,3 +168,12 @@ def test_a_picture_without_noise_ends() -> None:
     result = _render(Draws(lambda rng, pixel: np.ones(len(pixel))), target=0.1)
     assert result.error.rmse == 0 and (result.image == 1).all()
     assert _render(Draws(lambda rng, pixel: np.ones(len(pixel)))).rounds[-1].spp == pytest.approx(64, rel=0.1)
+
+
+def test_noise_of_any_size_ends_without_a_warning_of_numpy() -> None:
+    """Scouts without noise, with halves that have some; and rare rays so bright that counts would overflow."""
+    quiet = _render(Draws(_calm, 2, lambda rng, pixel: np.ones(len(pixel))), target=10, rays=64)
+    assert quiet.error.rmse < 10
+    with pytest.warns(mrt.MrtWarning):
+        bright = _render(Draws(_rare(0.02, bright=1e12)), target=1e-6, rays=64)
+    assert bright.rounds[-1].spp <= 64

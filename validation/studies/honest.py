@@ -7,6 +7,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from scipy import stats
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.tools.scenery import sensor
@@ -65,6 +66,7 @@ def run(study: Study, *, quick: bool) -> None:
             "±",
             "true / stated of pixels: least",
             "largest",
+            "p of pairs: test",
         ),
         rows,
         "Pixels: the root mean squares of tenths sorted by the stated error, where nothing is in doubt.",
@@ -74,6 +76,8 @@ def run(study: Study, *, quick: bool) -> None:
     study.at_least("stated errors that hold, or are doubted: worst scene", min(r[1] for r in rows), 0.9, why)
     calm = [r[2] for r in rows if r[0].startswith(CALM) and "small" not in r[0]]
     study.at_most("calm scenes that are doubted", max(calm), 0.02, "nothing there is rare")
+    pairs = "p-values of pairs are uniform: least p of Kolmogorov and Smirnov's test"
+    study.at_least(pairs, min(r[7] for r in rows), 0.001, "the least of 21 is that small once in 50 times")
     off = max(abs(r[3]) / r[4] for r in rows)
     study.at_most(
         "means off, in standard errors", off, 3.5, "the largest of 21 is 3.5 once in a hundred times"
@@ -87,14 +91,17 @@ def _measured(scene: Any, seeds: int, truth_rays: int) -> tuple[float, ...]:
     own = np.std([p.mean() for p in pictures], ddof=1) / len(pictures) ** 0.5  # of its mean
     noise = np.var(pictures, axis=0, ddof=1).mean(-1) / len(pictures)  # squared error of the truth
     target = float(np.sqrt(noise.mean() * truth_rays / SPP))
-    held, doubted, means, stated, true = 0, 0, [], [], []
+    held, doubted, means, stated, true, p = 0, 0, [], [], [], []
+    last = None
     for seed in range(seeds):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", mrt.MrtWarning)
             result = mrt.render(scene, target=target, maxspp=512, seed=seed)
         error, squares = result.error, np.square(result.image - truth).mean(-1) - noise
         assert error is not None  # there was a target
-        doubt = error.high == np.inf
+        if seed % 2:
+            p.append(mrt.compare(result, last).p_value)
+        last, doubt = result, error.high == np.inf
         held += doubt or error.low**2 <= squares.mean() <= error.high**2
         doubted += doubt
         means.append(result.image.mean(dtype=np.float64))
@@ -109,4 +116,6 @@ def _measured(scene: Any, seeds: int, truth_rays: int) -> tuple[float, ...]:
     mean = truth.mean()
     spread = float(np.hypot(np.std(means, ddof=1) / seeds**0.5, own))
     off = 100 * (np.mean(means) / mean - 1)
-    return held / seeds, doubted / seeds, float(off), 100 * spread / float(mean), min(ratios), max(ratios)
+    uniform = float(stats.kstest(p, "uniform").pvalue)
+    rest = 100 * spread / float(mean), min(ratios), max(ratios), uniform
+    return held / seeds, doubted / seeds, float(off), *rest

@@ -209,8 +209,8 @@ def _p_value(sides: Sequence[Layer]) -> float | None:
     """Return the probability of so much difference by noise, of the mean of channels.
 
     Uniform for equal pictures of equal noise. Means over cells are tested by the signs of differences alone,
-    which is exact; how the largest difference over its deviation continues the tail of the others is nearly
-    so, depends on sizes alone, and has a tenth of the level.
+    which is exact. How the largest difference over its deviation continues the tail of the others depends on
+    sizes alone; it is off where a single ray may make it, and has a hundredth of the level.
     """
     if all(side.variance is None for side in sides):
         return None
@@ -221,8 +221,8 @@ def _p_value(sides: Sequence[Layer]) -> float | None:
     difference = values[0] - values[1]
     difference -= np.clip(difference, -rounding, rounding)
     pixels = exceedance(np.abs(difference) / np.sqrt(variance + rounding**2 + 1e-300))
-    least = min(_p_of_means(difference) / 0.9, pixels / 0.1)
-    return float(-np.expm1(np.log1p(-min(0.9 * least, 1 - 1e-15)) + np.log1p(-0.1 * least)))
+    least = min(_p_of_means(difference) / 0.99, pixels / 0.01)
+    return float(-np.expm1(np.log1p(-min(0.99 * least, 1 - 1e-15)) + np.log1p(-0.01 * least)))
 
 
 def _p_of_means(difference: np.ndarray) -> float:
