@@ -171,7 +171,7 @@ def test_a_picture_without_noise_ends() -> None:
 
 
 def test_noise_of_any_size_ends_without_a_warning_of_numpy() -> None:
-    """Scouts without noise, with halves that have some; and rare rays so bright that counts would overflow."""
+    """Scouts without noise, halves with some; and rare rays so bright that counts would overflow."""
     quiet = _render(Draws(_calm, 2, lambda rng, pixel: np.ones(len(pixel))), target=10, rays=64)
     assert quiet.error.rmse < 10
     with pytest.warns(mrt.MrtWarning):
