@@ -77,9 +77,9 @@ def save(
                 _write_exr(file, image, layers or {}, header or {})
 
 
-def write_png(path: Path, image: Image, *, tonemap: str = "report", inputs: Iterable[Path] = ()) -> None:
+def write_png(path: Path, image: Image, *, tonemap: str = "report") -> None:
     """Write a linear picture [H, W, 3] as PNG, whatever the path's ending; see ``save``."""
-    with replacing(path, inputs) as file:
+    with replacing(path) as file:
         _write_png(file, image, tonemap)
 
 
@@ -88,11 +88,9 @@ def write_exr(
     image: Image,
     layers: Mapping[str, Image] | None = None,
     header: Mapping[str, Any] | None = None,
-    *,
-    inputs: Iterable[Path] = (),
 ) -> None:
     """Write a linear picture [H, W, 3] as float32 EXR, whatever the path's ending; see ``save``."""
-    with replacing(path, inputs) as file:
+    with replacing(path) as file:
         _write_exr(file, image, layers or {}, header or {})
 
 

@@ -40,20 +40,22 @@ def check_target(path: Path, inputs: Iterable[Path] = ()) -> None:
 
 
 @contextlib.contextmanager
-def replacing(path: Path, inputs: Iterable[Path] = ()) -> Iterator[IO[bytes]]:
+def replacing(path: Path) -> Iterator[IO[bytes]]:
     """Give a binary file to write to, which takes the place of ``path`` when all went well.
 
     A symbolic link stays and its target is replaced. Whatever is raised inside, the old file is left as it
-    was and no temporary file remains; an ``OSError`` becomes an ``OutputError``. ``inputs`` as in
-    ``check_target``.
+    was and no temporary file remains; an ``OSError`` becomes an ``OutputError``.
     """
-    with replacing_together([path], inputs) as (file,):
+    with replacing_together([path]) as (file,):
         yield file
 
 
 @contextlib.contextmanager
 def replacing_together(paths: Sequence[Path], inputs: Iterable[Path] = ()) -> Iterator[list[IO[bytes]]]:
-    """Give a file for each of several paths, as ``replacing`` does; all are replaced, or none."""
+    """Give a file for each of several paths, as ``replacing`` does; all are replaced, or none.
+
+    ``inputs`` as in ``check_target``.
+    """
     with contextlib.ExitStack() as stack:
         files, targets = [], []
         for path in paths:

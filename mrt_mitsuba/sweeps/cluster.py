@@ -62,22 +62,15 @@ def connected(
             devices = gpus() if variant.startswith("cuda") else []
             count, patience = workers or min(len(devices) or usable_cores(), jobs), STARTING
             cluster = stack.enter_context(_local(count, dashboard, devices))
-        client = cluster
-        if not isinstance(client, Client):
-            try:
-                client = stack.enter_context(Client(cluster, timeout=CONNECTING, set_as_default=False))
-            except (OSError, ValueError, TypeError) as error:
-                raise ClusterError(
-                    f"no scheduler answers at {cluster}: start one with 'dask scheduler' and give its "
-                    "address, such as tcp://host:8786"
-                ) from error
-        address = client.scheduler.address
         try:
+            client = cluster
+            if not isinstance(cluster, Client):
+                client = stack.enter_context(Client(cluster, timeout=CONNECTING, set_as_default=False))
             client.wait_for_workers(count, timeout=patience)
-        except TimeoutError as error:
+        except Exception as error:  # whatever the engine makes of an address, or of a client that is closed
             raise ClusterError(
-                f"the scheduler at {address} has no worker: start some with 'dask worker {address} "
-                "--nthreads 1'"
+                f"no scheduler with workers answers at {cluster}: start 'dask scheduler' and then "
+                "'dask worker ADDRESS --nthreads 1' with its address, such as tcp://host:8786"
             ) from error
         yield client
 

@@ -225,7 +225,7 @@ def test_a_picture_that_was_cut_is_made_again(
         whole = file.read_bytes()
         for length in range(0, len(whole), 1024):
             file.write_bytes(whole[:length])
-            with pytest.raises(MrtError, match="no scheduler answers"):
+            with pytest.raises(MrtError, match="no scheduler with workers answers"):
                 mrt.sweep(3, tmp_path, **nowhere, **options)
         file.write_bytes(whole)
     assert capfd.readouterr() == ("", "")  # nothing of what libraries print about broken files
@@ -328,8 +328,8 @@ def test_a_job_that_fails_ends_no_other(address: str, tmp_path: Path) -> None:
         ({}, {"workers": 0}, "workers=0: must be a whole number"),
         ({}, {"workers": 2, "cluster": "tcp://127.0.0.1:9"}, "give one of them"),
         ({}, {"retries": -1}, "retries=-1"),
-        ({}, {"cluster": "tcp://127.0.0.1:9"}, "no scheduler answers at tcp://127.0.0.1:9"),
-        ({}, {"cluster": "nonsense://x"}, "no scheduler answers at nonsense://x"),
+        ({}, {"cluster": "tcp://127.0.0.1:9"}, "no scheduler with workers answers at tcp://127.0.0.1:9"),
+        ({}, {"cluster": "nonsense://x"}, "no scheduler with workers answers at nonsense://x"),
     ],
 )
 def test_a_broken_grid_is_refused_before_anything_is_rendered(
