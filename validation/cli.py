@@ -63,6 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *more, **_: _say(f"warning: {message}")
         try:
+            runtime.check_start()
             studies = run_studies(names, options.out, quick=options.quick)
         except MrtError as error:
             _say(error)

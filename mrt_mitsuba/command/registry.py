@@ -71,6 +71,10 @@ def run(name: str, words: Sequence[str]) -> int:
     missing = wanted[len(plain) :] + [key for key in keys if not given.get(key)]
     if missing:
         raise UsageError(f"{missing[0]} is missing. {usage}")
+    if form or name == "doctor":  # the others do without Mitsuba
+        from mrt_mitsuba.runtime import check_start
+
+        check_start()
     module, _, function = home.partition(":")
     code: int = getattr(import_module(module), function)(*plain, **given)
     return code

@@ -265,16 +265,31 @@ def test_no_file_is_replaced_that_the_scene_was_read_from(tmp_path: Path) -> Non
     assert {path: path.read_bytes() for path in before} == before and not (tmp_path / "new.exr").exists()
 
 
-def test_a_deleted_working_folder_is_named(tmp_path: Path) -> None:
-    """Mitsuba itself ends in an ImportError there."""
-    code = (
-        f"import os, shutil; os.chdir({str(tmp_path)!r}); shutil.rmtree({str(tmp_path)!r})\n"
-        "import mrt_mitsuba as mrt\n"
-        "try: mrt.render(0)\n"
-        "except mrt.MrtError as error: print(error)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "the working folder has been deleted" in done.stdout, done.stderr
+LEAVE = "import os, shutil, sys; os.chdir(sys.argv[1]); shutil.rmtree(sys.argv.pop(1))\n"
+WAYS = {
+    "mrt_mitsuba": "import mrt_mitsuba as mrt\ntry: mrt.render(0)\nexcept mrt.MrtError as e: sys.exit(e)",
+    "mrt_mitsuba.command.main": "from mrt_mitsuba.command.main import main\nsys.exit(main())",
+    "mrt_mitsuba.validation.cli": "from mrt_mitsuba.validation.cli import main\nsys.exit(main())",
+}
+
+
+@pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        ("mrt_mitsuba", ""),
+        ("mrt_mitsuba.validation.cli", "scenes --quick"),
+        *(
+            ("mrt_mitsuba.command.main", words)
+            for words in ("out 3", "export 0 --xml a.xml", "diff a.exr b.exr", "check 0", "doctor")
+        ),
+    ],
+)
+def test_a_deleted_working_folder_is_named(tmp_path: Path, module: str, words: str) -> None:
+    """Mitsuba itself ends in an ImportError there, and then by a signal."""
+    command = [sys.executable, "-c", LEAVE + WAYS[module], tmp_path, *words.split()]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
+    assert "the working folder has been deleted" in done.stderr
 
 
 SENSORS = {
