@@ -47,12 +47,24 @@ def register_modules(package: str, names: Sequence[str]) -> None:
 
 
 def plugin(name: str, package: str = __name__) -> ModuleType:
-    """Return the module ``name`` (e.g. "whitted") for the current variant, to which its classes belong."""
+    """Return the module ``name`` (e.g. "whitted") for the current variant, to which its classes belong.
+
+    It is executed once for each variant, as its classes derive from Mitsuba's, of which each variant has its
+    own. Each copy gets a module name of its own; relative imports still resolve, because the package is the
+    same.
+    """
     import mitsuba as mi
 
     key = mi.variant(), package, name
     if key not in _loaded:
-        _loaded[key] = _load(*key)
+        found = importlib.util.find_spec(f"{package}.{name}")
+        source = found.origin if found else None
+        spec = importlib.util.spec_from_file_location(f"{package}.{name}_{key[0]}", source)
+        if spec is None or spec.loader is None:
+            raise ImportError(f"the plugin module {name} is missing in {package}: install the package anew")
+        module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        _loaded[key] = module
     return _loaded[key]
 
 
@@ -60,20 +72,3 @@ def _load_all() -> None:
     for package, names in _packages.items():
         for name in names:
             plugin(name, package)
-
-
-def _load(variant: str, package: str, name: str) -> ModuleType:
-    """Execute a plugin module anew: its class derives from a Mitsuba class, and each variant has its own.
-
-    Mitsuba keeps registrations by variant, so once per variant is enough. Each copy gets a module name of its
-    own; relative imports still resolve, because the package is the same.
-    """
-    found = importlib.util.find_spec(f"{package}.{name}")
-    source = found.origin if found else None
-    spec = importlib.util.spec_from_file_location(f"{package}.{name}_{variant}", source)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"the plugin module {name} is missing in {package}: install the package anew")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module

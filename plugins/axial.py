@@ -38,6 +38,7 @@ class AxialMesh(mi.Mesh):
         self.kind = self.kind if self.capped else f"open {self.kind}"
         self.placement = Placement(props)
         self.unit = KINDS[self.kind].mesh(segments(props, 256))
+        #: the unit frame in world space, in double precision (see ``intersect``)
         self.exact_frame = self._frame_of(vector64(ends[0]), vector64(ends[1]), radius)
         sizes = len(self.unit.points), len(self.unit.faces)
         construct(self, plugin, sizes, props, normals=True, texcoords=True)
@@ -51,10 +52,6 @@ class AxialMesh(mi.Mesh):
 
     def _frame_of(self, p0: Any, p1: Any, radius: Any) -> Frame:
         return self.placement(KINDS[self.kind].frame(p0, p1, radius))
-
-    def frame(self) -> Frame:
-        """Return the shape's unit frame in world space, in double precision (see ``intersect``)."""
-        return self.exact_frame
 
     def quadrics(self) -> QuadricTable:
         """Return what ``mrt_whitted`` intersects in place of the mesh."""

@@ -15,7 +15,7 @@ from .fresnel import f0_from_ior
 from .kernel_plan import GRADIENTS, VARYING, Mirror
 from .lobes import LOBES, TABLED, Lobes, Pair
 from .parameters import ParameterError, choice, flag, number, spectrum
-from .variants import first, is_jit, largest, updatable, varies, varies_by_face
+from .variants import first, is_jit, largest, updatable, varies
 
 FRESNEL_FORMS = ("schlick", "dielectric", "unity")
 
@@ -128,25 +128,20 @@ class MrtBSDF(mi.BSDF):
         given = {name: self._read(name, si, active) for name in self.parameters}
         return Lobes(self.fresnel, given, si.wi, visible=self.sample_visible)
 
-    def rows(self, points: mi.SurfaceInteraction3f | None = None) -> np.ndarray | str:
-        """Return the parameters as plain numbers [n, 1 + lobes, 4], or why they are none: numbers, and a
+    def row(self) -> np.ndarray | str:
+        """Return the parameters as plain numbers [1 + lobes, 4], or why they are none: numbers, and a
         reflectance for each lobe.
-
-        ``points``: one surface point on each object of a shape, for textures that vary from face to face.
         """
-        varying = [self.parameters[name] for name in self.parameters if self._varies(name)]
-        if "f0" in self.parameters or not all(points is not None and varies_by_face(p) for p in varying):
+        if "f0" in self.parameters or any(self._varies(name) for name in self.parameters):
             return VARYING
-        count = 1 if points is None else dr.width(points)
-        given = self.lobes(dr.zeros(mi.SurfaceInteraction3f) if points is None else points, True).given
+        given = self.lobes(dr.zeros(mi.SurfaceInteraction3f), True).given
         if dr.grad_enabled(given):
             return GRADIENTS
-        rows = np.zeros((count, 1 + len(LOBES), 4))
+        row = np.zeros((1 + len(LOBES), 4))
         parts = [given[name] for name in TABLED], *(given[lobe.reflectance] for lobe in LOBES)
         for k, part in enumerate(parts):
-            for channel, value in enumerate(part):
-                rows[:, k, channel] = value
-        return rows
+            row[k, : len(part)] = [first(value) for value in part]
+        return row
 
     # -------------------------------------- Value and density ------------------------------------------
 

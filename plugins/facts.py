@@ -33,7 +33,7 @@ class Reading:
     ``unit_normal``, ``distance`` and ``tangents``; a mesh that stands for exact quadrics by ``quadrics()``
     (a ``QuadricTable``) and ``moving_frame()``; a light of a table by ``numbers()``; a BSDF with the
     attributes ``mirror_reflectance`` and ``int_ior`` by ``mirror_bound()`` and ``value_bound()``, one of a
-    table by ``rows()``, too.
+    table by ``row()``, too.
     """
 
     def __init__(self, snapshot: Snapshot, kept: Kept) -> None:

@@ -88,19 +88,15 @@ def _table(props: mi.Properties, name: str, width: int | None = None) -> np.ndar
 
 
 def _check(numbers: np.ndarray) -> None:
-    finite, positive = np.isfinite(numbers).all(axis=1), numbers[:, -1] > 0
-    long = (
-        np.ones(len(numbers), bool)
-        if numbers.shape[1] == 4
-        else (numbers[:, :3] != numbers[:, 3:6]).any(axis=1)
-    )
-    for right, fault in (
-        (finite, "not finite"),
-        (positive, "a radius that is not > 0"),
-        (long, "an axis of no length"),
-    ):
-        if not right.all():
-            row = int(np.argmin(right))
+    ends = numbers[:, :-1].reshape(len(numbers), -1, 3)
+    faults = {
+        "not finite": ~np.isfinite(numbers).all(axis=1),
+        "a radius that is not > 0": ~(numbers[:, -1] > 0),
+        "an axis of no length": (ends[:, 0] == ends[:, -1]).all(axis=1) & (ends.shape[1] > 1),
+    }
+    for fault, wrong in faults.items():
+        if wrong.any():
+            row = int(np.argmax(wrong))
             raise ParameterError(f'mrt_group: row {row} of "numbers" is {fault}: {numbers[row].tolist()}')
 
 

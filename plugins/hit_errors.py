@@ -104,17 +104,17 @@ def any_touching(shapes: Sequence[Any], points: Sequence[tuple[float, ...]]) -> 
         return False
     p = np.array(points)  # [n, 3]
     balls = np.array([center_and_radius(s) for s in shapes if is_sphere(s)]).reshape(-1, 4)
-    return any(_on_spheres(balls, q) for q in p) or any(_touches(s, p) for s in shapes if not is_sphere(s))
+    tables = [s.quadrics() for s in shapes if hasattr(s, "quadrics")]
+    if len(balls):
+        tables.append(QuadricTable.of_numbers("sphere", balls, 0, lambda frame: frame, flipped=False))
+    others = [s for s in shapes if not (is_sphere(s) or hasattr(s, "quadrics"))]
+    return any(_on_quadrics(table, p) for table in tables) or any(_on_other(s, p) for s in others)
 
 
-def _touches(shape: Any, points: np.ndarray) -> bool:
+def _on_other(shape: Any, points: np.ndarray) -> bool:
     if hasattr(shape, "unit_normal"):
         heights = np.abs(points @ shape.unit_normal + shape.distance)
         return bool((heights <= CURVED * np.maximum(abs(shape.distance), _sizes(points))).any())
-    if hasattr(shape, "quadrics"):
-        table = shape.quadrics()
-        boxes = table.boxes()
-        return any(_on_quadrics(table, boxes, p) for p in points)
     box = np.array([[list(shape.bbox().min), list(shape.bbox().max)]], float).reshape(1, 2, 3)
     known = np.isfinite(box).all()  # merged rectangles have none
     inside = [p for p in points if not known or _holding(box, p)[0].any()]
@@ -127,12 +127,6 @@ def _sizes(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(values).reshape(len(values), -1).max(axis=1))
 
 
-def _on_spheres(balls: np.ndarray, p: np.ndarray) -> bool:
-    heights = np.abs(np.linalg.norm(balls[:, :3] - p, axis=1) - balls[:, 3])
-    sizes = np.abs(balls[:, :3]).max(axis=1, initial=0) + balls[:, 3]
-    return bool((heights <= CURVED * np.maximum(sizes, np.abs(p).max())).any())
-
-
 def _holding(boxes: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which boxes [n, 2, 3] hold a point, and the slack [n] that they have for it."""
     slack = CURVED * np.maximum(_sizes(boxes), np.abs(p).max())
@@ -140,17 +134,17 @@ def _holding(boxes: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return ((p >= low) & (p <= high)).all(axis=1), slack
 
 
-def _on_quadrics(table: QuadricTable, boxes: np.ndarray, p: np.ndarray) -> bool:
-    near, slack = _holding(boxes, p)
-    kind, vector = KINDS[table.kind], drjit.scalar.Array3f64
-    for k in np.flatnonzero(near)[:MOST_LOOKED_AT]:
-        origin, x, y, z = (vector(row.tolist()) for row in (table.origins[k], *table.rows[k]))
-        frame = Frame(origin, x, y, z)
-        feet = np.array([kind.surface(vector(p.tolist()), part, frame).p for part in kind.parts])
-        # A part goes on beyond the object, but not within its box, or nearly so
-        there = [_holding(boxes[k : k + 1], foot)[0][0] for foot in feet]
-        if (there & (np.linalg.norm(feet - p, axis=1) <= slack[k])).any():
-            return True
+def _on_quadrics(table: QuadricTable, points: np.ndarray) -> bool:
+    boxes, kind, vector = table.boxes(), KINDS[table.kind], drjit.scalar.Array3f64
+    for p in points:
+        near, slack = _holding(boxes, p)
+        for k in np.flatnonzero(near)[:MOST_LOOKED_AT]:
+            frame = Frame(*(vector(row.tolist()) for row in (table.origins[k], *table.rows[k])))
+            feet = np.array([kind.surface(vector(p.tolist()), part, frame)[0] for part in kind.parts])
+            # A part goes on beyond the object, but not within its box, or nearly so
+            there = [_holding(boxes[k : k + 1], foot)[0][0] for foot in feet]
+            if (there & (np.linalg.norm(feet - p, axis=1) <= slack[k])).any():
+                return True
     return False
 
 

@@ -8,6 +8,7 @@ selected as a whole.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,19 +98,11 @@ class Frame:
         return self.x * g.x + self.y * g.y + self.z * g.z
 
 
-@dataclass
-class SurfaceHit:
-    """Where a ray meets a surface first: ``t`` in units of |d|, inf for a miss, and the ``part`` it is on."""
-
-    t: Any
-    part: Any
-
-
 def _cross(a: Any, b: Any) -> Any:
     return type(a)([a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x])
 
 
-def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> SurfaceHit:
+def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> tuple[Any, Any]:
     """Return the first hit at t > 0 of a ray with a cone: lateral surface and, if ``capped``, base disc.
 
     Seen from inside, the far side is met. With p the point of the line nearest to the apex, u its unit
@@ -117,8 +110,7 @@ def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> Surf
     2⟨p,u⟩ s + ⟨p,p⟩. Their discriminant is written as m.x² + m.y² − m.z² with the line's moment m = p × u
     (Lagrange's identity), so that it is accurate relative to |p|², and p · u = 0 makes ⟨p,u⟩ = −2 p.z u.z.
     """
-    line = _line(o, d, frame)
-    p, u = line.p, line.u
+    p, u, t_of = _line(o, d, frame)
     rho = dr.sqrt(dr.square(u.x) + dr.square(u.y))
     r = dr.sqrt(dr.square(p.x) + dr.square(p.y))
     a = (rho - dr.abs(u.z)) * (rho + dr.abs(u.z))
@@ -143,18 +135,23 @@ def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> Surf
     near_part = dr.select(enter_base > near, BASE, LATERAL)
     far_part = dr.select(leave_base < far, BASE, LATERAL)
     return _first_boundary(
-        line, inside, dr.maximum(near, enter_base), near_part, dr.minimum(far, leave_base), far_part, capped
+        t_of,
+        inside,
+        dr.maximum(near, enter_base),
+        near_part,
+        dr.minimum(far, leave_base),
+        far_part,
+        capped,
     )
 
 
-def intersect_cylinder(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> SurfaceHit:
+def intersect_cylinder(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> tuple[Any, Any]:
     """Return the first hit at t > 0 of a ray with a cylinder: lateral surface and, if ``capped``, two discs.
 
     As ``intersect_cone``, for the form a.x b.x + a.y b.y: the discriminant is ρ² − (p × u).z², ρ² = u.x² +
     u.y².
     """
-    line = _line(o, d, frame)
-    p, u = line.p, line.u
+    p, u, t_of = _line(o, d, frame)
     rho = dr.sqrt(dr.square(u.x) + dr.square(u.y))
     r = dr.sqrt(dr.square(p.x) + dr.square(p.y))
     moment = dr.abs(p.x * u.y - p.y * u.x)
@@ -172,28 +169,19 @@ def intersect_cylinder(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> 
     near_part = dr.select(enter > near, dr.select(down, TOP, BASE), LATERAL)
     far_part = dr.select(leave < far, dr.select(down, BASE, TOP), LATERAL)
     return _first_boundary(
-        line, inside, dr.maximum(near, enter), near_part, dr.minimum(far, leave), far_part, capped
+        t_of, inside, dr.maximum(near, enter), near_part, dr.minimum(far, leave), far_part, capped
     )
 
 
-@dataclass
-class _Line:
-    """A ray's line in the unit frame: s ↦ p + s u with |u| = 1, p · u = 0, and s = t length − start."""
-
-    p: Any
-    u: Any
-    start: Any
-    length: Any
-
-
-def _line(o: Any, d: Any, frame: Frame) -> _Line:
+def _line(o: Any, d: Any, frame: Frame) -> tuple[Any, Any, Callable[[Any], Any]]:
+    """Return a ray's line in the unit frame: p, u of s ↦ p + s u with |u| = 1, p · u = 0; and t of s."""
     o, d = frame.point(o), frame.vector(d)
     length = dr.norm(d)
     u = d / length
     along = dr.dot(o, u)
     p = type(d)(o) - u * along
     rest = dr.dot(p, u)  # from far away, the rounding of the first step is not small against the shape
-    return _Line(p - u * rest, u, -(along + rest), length)
+    return p - u * rest, u, lambda s: (s - (along + rest)) / length
 
 
 def off_zero(x: Any, least: float = _TINY) -> Any:
@@ -213,15 +201,15 @@ def _roots(a: Any, half_b: Any, c: Any, discriminant: Any) -> tuple[Any, Any]:
 
 
 def _first_boundary(
-    line: _Line, inside: Any, near: Any, near_part: Any, far: Any, far_part: Any, capped: bool
-) -> SurfaceHit:
+    t_of: Callable, inside: Any, near: Any, near_part: Any, far: Any, far_part: Any, capped: bool
+) -> tuple[Any, Any]:
     """Return the first end at t > 0 of the interval [near, far] of s, and what is hit there."""
     inside = inside & (near <= far)
-    near_t, far_t = (near + line.start) / line.length, (far + line.start) / line.length
+    near_t, far_t = t_of(near), t_of(far)
     if not capped:
         near_t = dr.select(near_part == LATERAL, near_t, -dr.inf)
         far_t = dr.select(far_part == LATERAL, far_t, -dr.inf)
     from_outside = near_t > 0
     t = dr.select(from_outside, near_t, far_t)
     part = dr.select(from_outside, near_part, far_part)
-    return SurfaceHit(dr.select(inside & (t > 0), t, dr.inf), part)
+    return dr.select(inside & (t > 0), t, dr.inf), part

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -57,29 +57,11 @@ class Pair:
         return cls(wi, wo, tan2, active)
 
 
-class Lobe(Protocol):
-    """A row of ``LOBES``."""
-
-    name: str
-    reflectance: str  # the parameter that scales it
-    default: float  # of that parameter
-    flag: str  # of its component, among ``mi.BSDFFlags``
-    numbers: tuple[str, ...]  # the other parameters that it depends on
-
-    def value(self, at: Lobes, pair: Pair) -> mi.UnpolarizedSpectrum:
-        """Return f cos θo."""
-
-    def density(self, at: Lobes, pair: Pair) -> mi.Float:
-        """Return the density of the samples."""
-
-    def sample(self, at: Lobes, wi: mi.Vector3f, sample2: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
-        """Draw a direction; return it, and tan² of the half vector."""
-
-    def albedo(self, at: Lobes) -> mi.UnpolarizedSpectrum:
-        """Return what it reflects of light from ``at.wi``, by which it is chosen."""
-
-    def bound(self, alpha: float, f0: float) -> float:
-        """Return a bound of the value for a reflectance of 1."""
+# A lobe has a name, the parameter that scales it with its default, the flag of its component among
+# ``mi.BSDFFlags`` and the names of the other parameters that it depends on. ``value`` is f cos θo, and
+# ``density`` that of its samples; ``sample`` draws a direction, and tan² of the angle of the half vector;
+# ``albedo`` is what it reflects of light from ``at.wi``, by which it is chosen; ``bound`` is one of the value
+# for a reflectance of 1
 
 
 class Diffuse:
@@ -151,7 +133,7 @@ class Specular:
 
 
 # In the order of the components of the BSDF
-LOBES: tuple[Lobe, ...] = (Diffuse(), Specular())
+LOBES: tuple[Any, ...] = (Diffuse(), Specular())
 
 # Numbers, of which a table of materials has up to four
 TABLED = ("alpha", "int_ior", "ext_ior")
@@ -231,7 +213,7 @@ class Lobes:
         wo, tan2_theta_h = dr.detach(wo), dr.detach(tan2_theta_h)
         return wo, Pair.above(dr.select(above, self.wi, up), wo, above, tan2_theta_h), component
 
-    def _chances(self, ctx: mi.BSDFContext) -> list[tuple[int, Lobe, mi.Float]]:
+    def _chances(self, ctx: mi.BSDFContext) -> list[tuple[int, Any, mi.Float]]:
         """Return the enabled lobes, and how likely each is drawn from: after their reflectances."""
         lobes = _enabled(ctx)
         if len(lobes) < 2:
@@ -243,7 +225,7 @@ class Lobes:
         return [(k, lobe, p) for (k, lobe), p in zip(lobes, [1 - sum(shares), *shares], strict=True)]
 
 
-def _enabled(ctx: mi.BSDFContext) -> list[tuple[int, Lobe]]:
+def _enabled(ctx: mi.BSDFContext) -> list[tuple[int, Any]]:
     """Return the lobes that take part, with their places in ``LOBES``."""
     return [(k, x) for k, x in enumerate(LOBES) if ctx.is_enabled(getattr(mi.BSDFFlags, x.flag), k)]
 

@@ -8,7 +8,7 @@ import numpy as np
 from .mesh_api import Placement, construct, write_buffers
 from .parameters import ParameterError
 
-# What vertices may have, and numbers for each in the bitmap
+# What vertices may have, and numbers for each in the bitmap: so many are used, or more given
 _EXTRAS = {"texcoords": (2, 3), "normals": (3,)}
 
 
@@ -35,12 +35,15 @@ class MrtMesh(mi.Mesh):
 
     def __init__(self, props: mi.Properties) -> None:
         positions, faces = _array(props, "positions", 3), _array(props, "faces", 3)
-        extras = {name: _array(props, name, *widths) for name, widths in _EXTRAS.items() if name in props}
+        given = [name for name in _EXTRAS if name in props]
+        extras = {name: _array(props, name, *_EXTRAS[name])[:, : _EXTRAS[name][0]] for name in given}
         if (faces % 1).any():
             raise ParameterError('mrt_mesh: "faces" holds a number that is not whole')
-        if len(faces) and not (faces.min() >= 0 and faces.max() < len(positions)):
-            wrong = faces.max() if faces.max() >= len(positions) else faces.min()
-            raise ParameterError(f'mrt_mesh: "faces" holds {wrong}, but there are {len(positions)} positions')
+        wrong = faces[(faces < 0) | (faces >= len(positions))]
+        if len(wrong):
+            raise ParameterError(
+                f'mrt_mesh: "faces" holds {wrong[0]}, but there are {len(positions)} positions'
+            )
         for name, array in extras.items():
             if len(array) != len(positions):
                 raise ParameterError(
@@ -50,26 +53,20 @@ class MrtMesh(mi.Mesh):
             placement = Placement(props)
             positions = placement.points(positions.astype(np.float64))
             faces = faces[:, ::-1] if placement.mirrors else faces
-            extras |= {name: extras[name] @ placement.inverse for name in ("normals",) if name in extras}
+            if "normals" in extras:
+                extras["normals"] = extras["normals"] @ placement.inverse
+        if "normals" in extras:
+            lengths = np.linalg.norm(extras["normals"], axis=1, keepdims=True)
+            extras["normals"] = extras["normals"] / np.where(lengths == 0, 1, lengths)
         sizes = len(positions), len(faces)
         construct(self, "mrt_mesh", sizes, props, **{name: name in extras for name in _EXTRAS})
         arrays = {"positions": positions, **extras}
-        flat = {f"vertex_{name}": _buffer(name, array) for name, array in arrays.items()}
+        flat = {f"vertex_{name}": array.astype(np.float32).ravel() for name, array in arrays.items()}
         write_buffers(self, **flat, faces=faces.astype(np.uint32).ravel())
         self.content = f"positions={len(positions)}, faces={len(faces)}"
 
     def to_string(self) -> str:
         return f"MrtMesh[{self.content}]"
-
-
-def _buffer(name: str, array: np.ndarray) -> np.ndarray:
-    """Return what Mitsuba takes: two texture coordinates, unit normals."""
-    if name == "texcoords":
-        array = array[:, :2]
-    if name == "normals":
-        lengths = np.linalg.norm(array, axis=1, keepdims=True)
-        array = array / np.where(lengths == 0, 1, lengths)
-    return array.astype(np.float32).ravel()
 
 
 def _array(props: mi.Properties, name: str, *widths: int) -> np.ndarray:

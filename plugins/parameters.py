@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 import drjit as dr
@@ -42,14 +42,21 @@ def number(
     return rounded
 
 
-def integer(props: Any, name: str, default: int, *, least: int, most: int | None = None) -> int:
-    """Return an integer parameter >= ``least`` and, if given, <= ``most``."""
+def _checked(props: Any, name: str, default: Any, right: Callable[[Any], Any], allowed: str) -> Any:
     value = props.get(name, default)
-    limits = f">= {least}" if most is None else f"from {least} to {most}"
-    right = isinstance(value, int) and not isinstance(value, bool)
-    if not right or value < least or (most is not None and value > most):
-        _fail(props, name, value, f"an integer {limits}")
+    if not right(value):
+        _fail(props, name, value, allowed)
     return value
+
+
+def integer(props: Any, name: str, default: int, *, least: int, most: float = math.inf) -> int:
+    """Return an integer parameter from ``least`` to ``most``."""
+    limits = f">= {least}" if most == math.inf else f"from {least} to {most}"
+
+    def right(value: Any) -> bool:
+        return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+
+    return _checked(props, name, default, right, f"an integer {limits}")
 
 
 def segments(props: Any, default: int) -> int:
@@ -59,18 +66,13 @@ def segments(props: Any, default: int) -> int:
 
 def flag(props: Any, name: str, default: bool) -> bool:
     """Return a boolean parameter."""
-    value = props.get(name, default)
-    if not isinstance(value, bool):
-        _fail(props, name, value, "true or false")
-    return value
+    return _checked(props, name, default, lambda value: isinstance(value, bool), "true or false")
 
 
 def choice(props: Any, name: str, allowed: Sequence[str]) -> str:
     """Return one of a few strings; the first is the default."""
-    value = props.get(name, allowed[0])
-    if not isinstance(value, str) or value not in allowed:
-        _fail(props, name, value, "one of " + ", ".join(allowed))
-    return value
+    limits = "one of " + ", ".join(allowed)
+    return _checked(props, name, allowed[0], lambda v: isinstance(v, str) and v in allowed, limits)
 
 
 def vector(
@@ -110,7 +112,4 @@ def spectrum(props: Any, name: str, default: float | None = None, *, emissive: b
 
 def text(props: Any, name: str) -> str:
     """Return a string parameter."""
-    value = props[name]
-    if not isinstance(value, str) or not value:
-        _fail(props, name, value, "a text that is not empty")
-    return value
+    return _checked(props, name, "", lambda v: isinstance(v, str) and v, "a text that is not empty")

@@ -51,7 +51,11 @@ class MrtPlane(mi.Mesh):
         self.unit_normal = normal / np.linalg.norm(normal)  # [3], float64
         self.distance = number(props, "distance", 0.0)
         extent = number(props, "extent", 100.0, above=0)
-        self.tangents = _tangents(self.unit_normal)  # [2, 3]
+        # A right-handed frame with the normal. Crossing with the axis that it has least of keeps planes that
+        # are across an axis so
+        s = np.cross(np.eye(3)[np.argmin(np.abs(self.unit_normal))], self.unit_normal)
+        s /= np.linalg.norm(s)
+        self.tangents = np.array([s, np.cross(self.unit_normal, s)])  # [2, 3]
         construct(self, "mrt_plane", (4, 2), props, texcoords=True)
         corners = 0.5 * extent * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # [4, 2]
         positions = corners @ self.tangents - self.distance * self.unit_normal  # [4, 3]
@@ -65,17 +69,6 @@ class MrtPlane(mi.Mesh):
 
     def to_string(self) -> str:
         return f"MrtPlane[normal={self.unit_normal.tolist()}, distance={self.distance:g}]"
-
-
-def _tangents(n: np.ndarray) -> np.ndarray:
-    """Return two unit vectors [2, 3] that make a right-handed frame with the unit vector ``n`` [3].
-
-    Crossing with the axis that ``n`` has least of keeps axis-aligned planes axis-aligned.
-    """
-    axis = np.eye(3)[np.argmin(np.abs(n))]
-    s = np.cross(axis, n)
-    s /= np.linalg.norm(s)
-    return np.array([s, np.cross(n, s)])
 
 
 mi.register_shape("mrt_plane", MrtPlane)

@@ -62,7 +62,9 @@ class Planes:
 
         Returns the size of its coordinates; ``scale`` elsewhere.
         """
-        n, distance = self._equation(index)
+        (n, distance), *others = self.equations
+        for k, (normal, d) in enumerate(others, start=1):  # of few planes, quicker chosen than looked up
+            n, distance = dr.select(index == k, normal, n), dr.select(index == k, d, distance)
         p = dr.fma(ray.d, ray.maxt, ray.o)
         # Along a grazing ray the error of t is far larger than that of the plane
         p -= n * _height(p, n, distance)
@@ -79,13 +81,6 @@ class Planes:
         si.uv = dr.select(where, uv, si.uv)
         si.shape = dr.select(where, self.shapes(index, where), si.shape)
         return dr.select(where, dr.abs(distance), scale)
-
-    def _equation(self, index: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
-        """Return normal and distance of a plane: of few planes, quicker chosen than looked up."""
-        (normal, distance), *others = self.equations
-        for k, (n, d) in enumerate(others, start=1):
-            normal, distance = dr.select(index == k, n, normal), dr.select(index == k, d, distance)
-        return normal, distance
 
 
 def _height(p: Any, normal: Any, distance: Any) -> Any:

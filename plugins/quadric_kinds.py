@@ -21,7 +21,6 @@ from .intersect import (
     LATERAL,
     TOP,
     Frame,
-    SurfaceHit,
     intersect_cone,
     intersect_cylinder,
     intersect_sphere,
@@ -30,15 +29,8 @@ from .intersect import (
 POINT, DISC, BALL = (0, 0, 0), (1, 1, 0), (1, 1, 1)
 """What the ends of a quadric are, by the squared semi-axes of their unit frame that span them."""
 
-
-@dataclass
-class SurfacePoint:
-    """A point ``p`` put onto a surface, the outward unit normal ``n``, and texture coordinates ``u, v``."""
-
-    p: Any
-    n: Any
-    u: Any
-    v: Any
+Hit = tuple[Any, Any]  # t in units of |d|, inf for a miss, and the part of the surface
+SurfacePoint = tuple[Any, Any, Any, Any]  # on the surface; the outward unit normal; texture coordinates u, v
 
 
 @dataclass(frozen=True)
@@ -65,10 +57,10 @@ class Sphere:
             center, make([inverse, zero, zero]), make([zero, inverse, zero]), make([zero, zero, inverse])
         )
 
-    def intersect(self, o: Any, d: Any, frame: Frame) -> SurfaceHit:
+    def intersect(self, o: Any, d: Any, frame: Frame) -> Hit:
         """Return the first hit at t > 0."""
         o = frame.point(o)
-        return SurfaceHit(intersect_sphere(o, frame.vector(d), type(o)([0.0, 0.0, 0.0]), 1.0), LATERAL)
+        return intersect_sphere(o, frame.vector(d), type(o)([0.0, 0.0, 0.0]), 1.0), LATERAL
 
     def surface(self, p: Any, part: Any, frame: Frame) -> SurfacePoint:
         """Put a point near the sphere onto it, along the normal.
@@ -83,7 +75,7 @@ class Sphere:
         inverse = 1 / dr.select(at_center, 1, dr.norm(g))
         n = g * inverse
         v = dr.acos(dr.clip(gradient.z, -1, 1)) / dr.pi
-        return SurfacePoint(p - n * ((r - 1) * inverse), n, _turn(q), v)
+        return p - n * ((r - 1) * inverse), n, _turn(q), v
 
     def derivatives(self, q: Any, part: Any) -> tuple[Any, Any]:
         """Return derivatives by u and v of a surface point ``q``, both in the unit frame."""
@@ -149,7 +141,7 @@ class Axial:
         n = g * inverse
         u = dr.select(side, _turn(q), 0.5 + 0.5 * q.x)
         v = dr.clip(dr.select(side, 1 - q.z, 0.5 + 0.5 * q.y), 0, 1)
-        return SurfacePoint(p - n * (dr.select(side, off_side, off_disc) * inverse), n, u, v)
+        return p - n * (dr.select(side, off_side, off_disc) * inverse), n, u, v
 
     def derivatives(self, q: Any, part: Any) -> tuple[Any, Any]:
         """Return derivatives by u and v of a surface point ``q``, both in the unit frame."""
@@ -167,7 +159,7 @@ class Cone(Axial):
 
     slope, ends = 1, (POINT, DISC)
 
-    def intersect(self, o: Any, d: Any, frame: Frame) -> SurfaceHit:
+    def intersect(self, o: Any, d: Any, frame: Frame) -> Hit:
         """Return the first hit at t > 0."""
         return intersect_cone(o, d, frame, capped=self.closed)
 
@@ -188,7 +180,7 @@ class Cylinder(Axial):
 
     parts = (LATERAL, BASE, TOP)
 
-    def intersect(self, o: Any, d: Any, frame: Frame) -> SurfaceHit:
+    def intersect(self, o: Any, d: Any, frame: Frame) -> Hit:
         """Return the first hit at t > 0."""
         return intersect_cylinder(o, d, frame, capped=self.closed)
 
@@ -283,19 +275,24 @@ class QuadricTable:
         rows = np.stack([row.array() for row in (frame.x, frame.y, frame.z)], axis=1)
         return cls(kind, frame.origin.array(), rows, faces * np.arange(len(numbers)), flipped)
 
-    def hulls(self) -> np.ndarray:
-        """Return the ellipsoids [n, 2, 3, 4] whose convex hull each is: three semi-axes, centre."""
-        columns = np.linalg.inv(self.rows)
-        axis = columns[:, :, 2] * (KINDS[self.kind].points - 1)
-        semi_axes = [columns * np.array(end) for end in KINDS[self.kind].ends]
-        centers = np.stack([self.origins, self.origins + axis], axis=1)
-        return np.concatenate([np.stack(semi_axes, axis=1), centers[..., None]], axis=3)
-
     def boxes(self) -> np.ndarray:
-        """Return the bounding boxes [n, 2, 3]."""
-        hulls = self.hulls()
-        half, centers = np.sqrt((hulls[..., :3] ** 2).sum(axis=3)), hulls[..., 3]
+        """Return the bounding boxes [n, 2, 3]: of ellipsoids at both ends."""
+        columns, kind = np.linalg.inv(self.rows), KINDS[self.kind]
+        half = np.stack([np.sqrt((columns**2 * end).sum(axis=2)) for end in kind.ends], axis=1)
+        axis = columns[:, :, 2] * (kind.points - 1)
+        centers = np.stack([self.origins, self.origins + axis], axis=1)  # [n, end, 3]
         return np.stack([(centers - half).min(axis=1), (centers + half).max(axis=1)], axis=1)
+
+    def numbers(self, kinds: list[str]) -> np.ndarray:
+        """Return what a kernel for such kinds reads of each object, [n, 4, 4]: four numbers at a time.
+
+        A row and a coordinate of the origin, three times; kind, size of coordinates, 0, side of the normal.
+        """
+        numbers = np.zeros((len(self.rows), 4, 4))
+        numbers[:, :3, :3], numbers[:, :3, 3] = self.rows, self.origins
+        numbers[:, 3, 0], numbers[:, 3, 1] = kinds.index(self.kind), np.abs(self.boxes()).max(axis=(1, 2))
+        numbers[:, 3, 3] = -1 if self.flipped else 1
+        return numbers
 
     def stand_in(self, unit: UnitMesh) -> dict[str, np.ndarray]:
         """Return the buffers of a mesh of all objects, each of them ``unit``; frames may be left-handed."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from .intersect import LATERAL, Frame
 from .lookup import aligned, shape_ids
-from .quadric_kinds import KINDS, QuadricTable, SurfacePoint
+from .quadric_kinds import KINDS
 from .tree import Tree
 from .variants import is_jit
 
@@ -30,7 +30,7 @@ class Quadrics:
         self.kinds = sorted({t.kind for t in tables})  # the kernel holds these only
         self.flipped = any(t.flipped for t in tables)
         boxes = np.concatenate([t.boxes() for t in tables])
-        numbers = _numbers(tables, self.kinds, boxes)
+        numbers = np.concatenate([t.numbers(self.kinds) for t in tables])
         owners = np.repeat(np.arange(len(shapes)), counts)
         faces = np.concatenate([t.first_faces for t in tables])
         if not is_jit():
@@ -59,9 +59,9 @@ class Quadrics:
         """Return whether there is a quadric before ``ray.maxt``."""
         return active & (self._walk(ray, active, any_hit=True)[0] < ray.maxt)
 
-    def hulls(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return what holds the quadrics, ellipsoids [n, 2, 3, 4], and their places in the rows."""
-        return np.concatenate([t.hulls() for t in self._tables]), self.tree.leaf_of
+    def boxes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the boxes [n, 2, 3] of the quadrics, and their places in the rows."""
+        return np.concatenate([t.boxes() for t in self._tables]), self.tree.leaf_of
 
     def block(self, leaf: Any, ray: Any) -> Any:
         """Return whether a quadric is before ``ray.maxt``."""
@@ -82,25 +82,28 @@ class Quadrics:
         for number, moving in self.moving:
             rows = zip((moving.origin, moving.x, moving.y, moving.z), vars(frame).values(), strict=True)
             frame = Frame(*(dr.select(leaf == number, mi.Vector3f(a), mi.Vector3f(b)) for a, b in rows))
+
+        def surface(p: Any) -> tuple:
+            return self._by_kind(kind, lambda one: one.surface(p, part, frame))
+
         if self.moving:
             # The hit goes along the ray as the surface moves
-            surface = self._surface(ray.o + ray.d * t, part, frame, kind)
-            to_surface = dr.dot(surface.p - (ray.o + ray.d * t), surface.n)
-            t = dr.replace_grad(t, t + to_surface / dr.dot(ray.d, surface.n))
-        surface = self._surface(dr.fma(ray.d, t, ray.o), part, frame, kind)
+            p, n, _, _ = surface(ray.o + ray.d * t)
+            t = dr.replace_grad(t, t + dr.dot(p - (ray.o + ray.d * t), n) / dr.dot(ray.d, n))
+        p, n, u, v = surface(dr.fma(ray.d, t, ray.o))
         if tangents:
-            q = frame.point(surface.p)
+            q = frame.point(p)
             by_u, by_v = self._by_kind(kind, lambda one: one.derivatives(q, part))
             si.dp_du = dr.select(where, frame.to_world(by_u), si.dp_du)
             si.dp_dv = dr.select(where, frame.to_world(by_v), si.dp_dv)
         if self.flipped:
-            surface.n *= side
-        normal = mi.Normal3f(surface.n)
+            n *= side
+        normal = mi.Normal3f(n)
         si.t = dr.select(where, t, si.t)
-        si.p = dr.select(where, surface.p, si.p)
+        si.p = dr.select(where, p, si.p)
         si.n = dr.select(where, normal, si.n)
         si.sh_frame.n = dr.select(where, normal, si.sh_frame.n)
-        si.uv = dr.select(where, mi.Point2f(surface.u, surface.v), si.uv)
+        si.uv = dr.select(where, mi.Point2f(u, v), si.uv)
         if not is_jit():
             si.shape, si.prim_index = self.shapes[leaf], self.faces[leaf]
             return
@@ -135,15 +138,10 @@ class Quadrics:
         frame, kind, _ = self._row(leaf)
 
         def meet(one: Any) -> tuple[Any, Any]:
-            hit = one.intersect(ray.o, ray.d, frame)
-            return hit.t, mi.Int32(hit.part)
+            t, part = one.intersect(ray.o, ray.d, frame)
+            return t, mi.Int32(part)
 
         return self._by_kind(kind, meet)
-
-    def _surface(self, p: Any, part: Any, frame: Frame, kind: Any) -> SurfacePoint:
-        """Put a point onto the quadric of this frame and kind."""
-        found = self._by_kind(kind, lambda one: tuple(vars(one.surface(p, part, frame)).values()))
-        return SurfacePoint(*found)
 
     def _by_kind(self, kind: Any, function: Any) -> tuple:
         """Return the tuple that a function of a kind gives for the kind of each quadric."""
@@ -154,18 +152,3 @@ class Quadrics:
             other = function(KINDS[name])
             found = tuple(dr.select(kind == k, *pair) for pair in zip(other, found, strict=True))
         return found
-
-
-def _numbers(tables: list[QuadricTable], kinds: list[str], boxes: np.ndarray) -> np.ndarray:
-    """Return what a kernel reads of each quadric, [n, 4, 4]: four numbers at a time.
-
-    A row and a coordinate of the origin, three times; kind, size of coordinates, nothing, side of the normal.
-    """
-    counts = [len(t.rows) for t in tables]
-    numbers = np.zeros((len(boxes), 4, 4))
-    numbers[:, :3, :3] = np.concatenate([t.rows for t in tables])
-    numbers[:, :3, 3] = np.concatenate([t.origins for t in tables])
-    numbers[:, 3, 0] = np.repeat([kinds.index(t.kind) for t in tables], counts)
-    numbers[:, 3, 1] = np.abs(boxes).max(axis=(1, 2))
-    numbers[:, 3, 3] = np.repeat([-1 if t.flipped else 1 for t in tables], counts)
-    return numbers

@@ -21,7 +21,7 @@ from .planes import Planes
 from .point_buffer import PointBuffer, point_buffer
 from .quadrics import Quadrics
 from .snapshot import Kept
-from .spheres import SphereBlockers, Spheres
+from .spheres import Spheres
 from .variants import but_not, is_jit
 
 # Where a light lies on a surface, shadow rays end by this share of their way short of it: it shines to both
@@ -41,18 +41,6 @@ class Hit:
     error: mi.Float  # how far the point may be off the surface
 
 
-@dataclass
-class Traced:
-    """The shapes, sorted by who traces them."""
-
-    bvh: mi.Scene | None  # those that only Mitsuba can trace; None: the scene itself
-    planes: Planes
-    quadrics: Any
-    errors: HitErrors
-    spheres: Spheres | None
-    rays: list[Any] | None = None  # what Mitsuba's ray queries read; None: not known yet
-
-
 class SceneData:
     """The data of the kernels for a scene, as a plan wants them, and its ray queries.
 
@@ -61,27 +49,34 @@ class SceneData:
 
     def __init__(self, reading: Reading, plan: KernelPlan, kept: Kept) -> None:
         self.plan, self.facts, self.environment = plan, reading.facts, reading.snapshot.environment
-        now = reading.snapshot
-        form = plan.bvh, plan.planes, plan.quadrics, plan.spheres
-        traced = kept("traced", (now.shape_part, *form), lambda: _trace(reading, plan))
-        self.bvh, self.planes, self.quadrics = traced.bvh, traced.planes, traced.quadrics
-        self.errors, self.spheres = traced.errors, traced.spheres
-        self.lights = kept(
+        now, self._kept = reading.snapshot, kept
+        self._form = form = now.shape_part, plan.bvh, plan.planes, plan.quadrics, plan.spheres
+        # The shapes by who traces them; ``bvh``: a scene of those that only Mitsuba can, or None for all
+        self.bvh, self.planes, self.quadrics, self.errors, self.spheres = kept(
+            "traced", form, lambda: _trace(reading, plan)
+        )
+        self.lights: Lights = kept(
             "lights",
             (now.light_part, plan.lights),
             lambda: Lights(reading.lights, reading.numbers, plan.lights),
         )
+
+        def light_buffers() -> list[tuple[PointBuffer, Any]]:
+            """Return lists of what may be in the way of the lights, with what tests it."""
+            things = [] if self.quadrics is None else [self.quadrics]
+            things += [self.spheres] if plan.bvh else []
+            places = np.array([row[0] for _, row in reading.numbers or ()])
+            pairs = [(point_buffer(places, *thing.boxes()), thing) for thing in things]
+            return [] if any(buffer is None for buffer, _ in pairs) else pairs  # too long
+
         self.buffers = kept(
-            "buffers",
-            (now.shape_part, now.light_part, plan.buffers, *form),
-            lambda: self._light_buffers(reading) if plan.buffers else [],
+            "buffers", (now.light_part, plan.buffers, *form), lambda: light_buffers() if plan.buffers else []
         )
         self.merged = kept(
             "merged",
             (now.shape_part, now.material_part, plan.merged),
             lambda: MaterialTable(now.shapes, reading.materials) if plan.merged else None,
         )
-        self._traced = traced
         self.path_limit: Any = plan.cut_off[0]
         if is_jit() and self.path_limit not in (0, math.inf, self.facts.lights + 1):
             self.path_limit = dr.opaque(mi.Float, self.path_limit)  # a brighter sky needs no new kernel
@@ -89,78 +84,58 @@ class SceneData:
         self.ray_flags |= +mi.RayFlags.UV if plan.textures else 0
         self.ray_flags |= +mi.RayFlags.ShadingFrame if plan.shading_frames else 0
 
-    def _light_buffers(self, reading: Reading) -> list[tuple[PointBuffer, Any]]:
-        """Return lists of what may be in the way of the lights, with what tests it; empty for none."""
-        things = [] if self.quadrics is None else [self.quadrics]
-        if self.plan.bvh:
-            things.append(SphereBlockers(reading.native))
-        places = np.array([row[0] for _, row in reading.numbers or ()])
-        pairs = [(point_buffer(places, *thing.hulls()), thing) for thing in things]
-        buffers = [(buffer, thing) for buffer, thing in pairs if buffer is not None]
-        return buffers if len(buffers) == len(pairs) else []
-
     def arrays(self, scene: mi.Scene) -> list[Any] | None:
         """Return all that the kernels read; None where they call plugins, which may read anything."""
-        plan = self.plan
+        plan, sky = self.plan, self.environment
         tabled = plan.merged and (plan.lights == "none" or self.facts.tabled)
         tabled = tabled and (plan.spheres == "table" or not plan.bvh)
-        sky = self.environment
         if not tabled or (sky is not None and sky.class_name() != "ConstantBackgroundEmitter"):
             return None
-        if self._traced.rays is None:
-            self._traced.rays = _ray_arrays(self.bvh or scene) if plan.bvh else []
-        own = _arrays_in(
-            [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.buffers, self.merged]
-        )
-        return [*own, *self._traced.rays, self.path_limit, sky]
+        rays = self._kept("rays", self._form, lambda: _ray_arrays(self.bvh or scene)) if plan.bvh else []
+        own = [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.buffers, self.merged]
+        return [*_arrays_in(own), *rays, self.path_limit, sky]
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 
     def intersect(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> Hit:
         """Return the nearest hit among Mitsuba's shapes, the quadrics and the analytic planes."""
+        plan = self.plan
         t, plane, on_plane = self.planes.intersect(ray, active)
         # What lies behind a plane need not be looked for
         ray = mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths)
-        si, found, scale = self._intersect_shapes(scene, ray, active)
+        # ``scale``: the size of the coordinates of what is hit
+        si, found, scale = dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False), mi.Float(0)
+        if plan.bvh:
+            pi = (self.bvh or scene).ray_intersect_preliminary(ray, plan.coherent, active)
+            found = active & pi.is_valid()
+            differentiable = scene.shapes_grad_enabled() or dr.grad_enabled(ray)
+            if plan.spheres == "table" and not differentiable:
+                si, scale = self.spheres.interaction(pi, ray, found)
+            else:
+                si = pi.compute_surface_interaction(ray, self.ray_flags, found)
+                if self.spheres is not None:
+                    self.spheres.put_back(si, found)
+                scale = self.errors.size(si, found)
         flat = self.errors.of_flat(si, found)
         if self.quadrics is not None:
             reach = dr.select(found, si.t, ray.maxt)
             nearer = mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths)
             quadric = self.quadrics.intersect(nearer, active)
             closer = active & (quadric[0] < reach)
-            self.quadrics.put_into(si, ray, quadric, closer, tangents=self.plan.tangents)
+            self.quadrics.put_into(si, ray, quadric, closer, tangents=plan.tangents)
             scale = dr.select(closer, self.quadrics.scale(quadric[1], closer), scale)
             flat = None if flat is None else dr.select(closer, dr.inf, flat)
             found = found | closer
-        if self.plan.planes:
+        if plan.planes:
             on_plane = but_not(on_plane, found)
-            scale = self.planes.put_into(si, ray, plane, on_plane, scale, tangents=self.plan.tangents)
+            scale = self.planes.put_into(si, ray, plane, on_plane, scale, tangents=plan.tangents)
             flat = None if flat is None else dr.select(on_plane, dr.inf, flat)
             found = found | on_plane
-        si.sh_frame = _frame_along(si) if self.plan.tangents else mi.Frame3f(si.sh_frame.n)
+        si.sh_frame = _frame_along(si) if plan.tangents else mi.Frame3f(si.sh_frame.n)
         si.wi = si.to_local(-ray.d)
         si.time, si.wavelengths = ray.time, ray.wavelengths
         error = CURVED * dr.maximum(scale, dr.max(dr.abs(si.p)))
         return Hit(si, found, error if flat is None else dr.minimum(error, flat))
-
-    def _intersect_shapes(
-        self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
-    ) -> tuple[mi.SurfaceInteraction3f, mi.Bool, mi.Float]:
-        """Return the interaction with the nearest of Mitsuba's shapes, where there is one, and the size of
-        its coordinates.
-        """
-        if not self.plan.bvh:
-            return dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False), mi.Float(0)
-        pi = (self.bvh or scene).ray_intersect_preliminary(ray, self.plan.coherent, active)
-        found = active & pi.is_valid()
-        differentiable = scene.shapes_grad_enabled() or dr.grad_enabled(ray)
-        if self.spheres is not None and self.plan.spheres == "table" and not differentiable:
-            si, scale = self.spheres.interaction(pi, ray, found)
-            return si, found, scale
-        si = pi.compute_surface_interaction(ray, self.ray_flags, found)
-        if self.spheres is not None:
-            self.spheres.put_back(si, found)
-        return si, found, self.errors.size(si, found)
 
     def occluded(
         self, scene: mi.Scene, hit: Hit, light: Any, ds: mi.DirectionSample3f, active: mi.Bool
@@ -193,22 +168,9 @@ class SceneData:
 
     @staticmethod
     def _off_surface(hit: Hit, d: mi.Vector3f) -> mi.Point3f:
-        """Return the point of ``hit`` moved to the side of its surface that ``d`` points to, clear of
-        rounding errors.
-        """
-        distance = hit.error
+        """Return the point of ``hit``, clear of rounding errors on the side that ``d`` points to."""
         n = hit.si.n
-        return hit.si.p + n * dr.select(dr.dot(n, d) >= 0, distance, -distance)
-
-    # -------------------------------------------- Materials -----------------------------------------------
-
-    def context(self) -> mi.BSDFContext:
-        """Return what of the materials is evaluated."""
-        context = mi.BSDFContext()
-        if 0 < len(self.plan.lobes) < len(LOBES):
-            flags = [getattr(mi.BSDFFlags, lobe.flag) for lobe in LOBES if lobe.name in self.plan.lobes]
-            context.type_mask = sum(map(int, flags))
-        return context
+        return hit.si.p + n * dr.select(dr.dot(n, d) >= 0, hit.error, -hit.error)
 
     def eval_bsdf(
         self, hit: Hit, wos: list[mi.Vector3f], facing: list[mi.Bool], mirror: bool
@@ -216,9 +178,13 @@ class SceneData:
         """Return the values f cos θo at ``hit`` towards ``wos``, the mirror reflectance and its index of
         refraction: all of it in one call.
         """
+        context, lobes = mi.BSDFContext(), self.plan.lobes
+        if 0 < len(lobes) < len(LOBES):
+            flags = [+getattr(mi.BSDFFlags, lobe.flag) for lobe in LOBES if lobe.name in lobes]
+            context.type_mask = sum(flags)
         arguments = (hit.si, wos, facing, hit.found)
         # Not among the arguments, where dispatch would take a bool for its mask
-        evaluate = partial(_eval_bsdf, mirror, self.context())
+        evaluate = partial(_eval_bsdf, mirror, context)
         if not is_jit():
             return evaluate(hit.si.bsdf() if hit.found else None, *arguments)
         if self.merged is None:
@@ -229,15 +195,14 @@ class SceneData:
         )
 
 
-def _trace(reading: Reading, plan: KernelPlan) -> Traced:
+def _trace(reading: Reading, plan: KernelPlan) -> tuple:
     """Sort the shapes by who traces them."""
     exact = [s for s in reading.quadrics if s.quadrics().kind in plan.quadrics]
     planes = reading.planes if plan.planes else []
     own = {id(s) for s in (*exact, *planes)}
-    others = [s for s in reading.snapshot.shapes if id(s) not in own]
+    others, bvh = [s for s in reading.snapshot.shapes if id(s) not in own], None
     if others and not plan.bvh:
         raise ValueError(f"the plan leaves {len(others)} shapes untraced: set its bvh to True")
-    bvh = None
     if own and others:
         # The stand-ins of planes and quadrics must not be hit: rays are traced in a scene of the others only.
         # Mitsuba names an object after its key, and these belong to another scene: they get their names back
@@ -247,8 +212,7 @@ def _trace(reading: Reading, plan: KernelPlan) -> Traced:
         for thing, name in zip(things, names, strict=True):
             thing.set_id(name)
     spheres = Spheres(others) if plan.spheres != "none" else None
-    quadrics = Quadrics(exact) if exact else None
-    return Traced(bvh, Planes(planes), quadrics, HitErrors(others), spheres)
+    return bvh, Planes(planes), Quadrics(exact) if exact else None, HitErrors(others), spheres
 
 
 def _frame_along(si: mi.SurfaceInteraction3f) -> mi.Frame3f:
@@ -271,21 +235,17 @@ def _eval_bsdf(
     facing: list[mi.Bool],
     active: mi.Bool,
 ) -> tuple[list[mi.UnpolarizedSpectrum], mi.UnpolarizedSpectrum, mi.Float]:
-    values = [mi.UnpolarizedSpectrum(0) for _ in wos]
     reflectance, int_ior = mi.UnpolarizedSpectrum(0), mi.Float(1)
     if bsdf is None:
-        return values, reflectance, int_ior
+        return [mi.UnpolarizedSpectrum(0) for _ in wos], reflectance, int_ior
+    seen = zip(wos, facing, strict=True)
     if isinstance(bsdf, MaterialTable):
         lobes = bsdf.lobes(si)
-        pairs = (Pair.above(si.wi, wo, seen) for wo, seen in zip(wos, facing, strict=True))
-        values = [lobes.value(context, pair) for pair in pairs]
+        values = [lobes.value(context, Pair.above(si.wi, wo, there)) for wo, there in seen]
         if mirror:
             reflectance, int_ior = lobes.mirror_reflectance, lobes.given["int_ior"]
         return values, reflectance, int_ior
-    values = [
-        mi.unpolarized_spectrum(bsdf.eval(context, si, wo, seen))
-        for wo, seen in zip(wos, facing, strict=True)
-    ]
+    values = [mi.unpolarized_spectrum(bsdf.eval(context, si, wo, there)) for wo, there in seen]
     if mirror and bsdf.has_attribute("mirror_reflectance"):
         reflectance = bsdf.eval_attribute("mirror_reflectance", si, active)
         int_ior = bsdf.eval_attribute_1("int_ior", si, active)
@@ -312,20 +272,13 @@ def _ray_arrays(scene: mi.Scene) -> list[Any]:
     return found if np.array_equal(numbers, known) else [scene]  # fields may come in another order
 
 
-def _arrays_in(things: list[Any]) -> list[Any]:
+def _arrays_in(value: Any) -> list[Any]:
     """Return the arrays in objects of this package and in what they hold."""
-    found, waiting, seen = list[Any](), list(things), set[int]()
-    while waiting:
-        value = waiting.pop()
-        if id(value) in seen or isinstance(value, type):
-            continue
-        seen.add(id(value))
-        if dr.is_array_v(value):
-            found += [value] if dr.width(value) else []  # Dr.Jit aborts on an array of nothing
-        elif isinstance(value, dict):
-            waiting += value.values()
-        elif isinstance(value, list | tuple):
-            waiting += value
-        elif type(value).__module__.startswith(f"{__package__}.") and hasattr(value, "__dict__"):
-            waiting.append(vars(value))
-    return found
+    if isinstance(value, type):
+        return []
+    if dr.is_array_v(value):
+        return [value] if dr.width(value) else []  # Dr.Jit aborts on an array of nothing
+    if type(value).__module__.startswith(f"{__package__}.") and hasattr(value, "__dict__"):
+        value = vars(value)
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
+    return [array for part in inside for array in _arrays_in(part)]

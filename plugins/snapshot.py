@@ -41,10 +41,8 @@ class Part:
         if thing is None or id(thing) in self._held:
             return
         self._held[id(thing)] = thing
-        seen = _collector(mi.variant())()
-        thing.traverse(seen)
         own = getattr(thing, "__dict__", None) or {}  # of a class in Python
-        for name, value, kind in [*seen.entries, *((name, value, None) for name, value in own.items())]:
+        for name, value, kind in [*parameters_of(thing), *((name, own[name], None) for name in own)]:
             if isinstance(value, mi.Object):
                 if isinstance(value, elsewhere):
                     continue
@@ -83,15 +81,11 @@ class Snapshot:
         """Look at a scene; parts that have not changed since ``before`` are taken from there."""
         # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed
         self.shapes, self.emitters, self.environment = scene.shapes(), scene.emitters(), scene.environment()
-        seen = _collector(mi.variant())()
-        scene.traverse(seen)
         # Groups are traced through their instances, which don't say of which group they are
-        self.groups = [v for _, v, _ in seen.entries if isinstance(v, mi.Shape) and _is_group(v)]
-        self.inner: list[Any] = []  #: the shapes of the groups
-        for group in self.groups:
-            inside = _collector(mi.variant())()
-            group.traverse(inside)
-            self.inner += [v for _, v, _ in inside.entries if isinstance(v, mi.Shape)]
+        inside = [value for _, value, _ in parameters_of(scene) if isinstance(value, mi.Shape)]
+        self.groups = [shape for shape in inside if shape.class_name().startswith("ShapeGroup")]
+        #: the shapes of the groups
+        self.inner = [v for g in self.groups for _, v, _ in parameters_of(g) if isinstance(v, mi.Shape)]
         shapes, materials, lights = Part(), Part(), Part()
         for shape in [*self.shapes, *self.groups, *self.inner]:
             shapes.add(
@@ -134,8 +128,11 @@ def once(things: Iterable[Any]) -> list[Any]:
     return list({id(thing): thing for thing in things if thing is not None}.values())
 
 
-def _is_group(shape: Any) -> bool:
-    return shape.class_name().startswith("ShapeGroup")
+def parameters_of(thing: Any) -> list[tuple[str, Any, Any]]:
+    """Return the parameters of one object: name, value, and how ``mi.get_property`` reads it, or None."""
+    found = _collector(mi.variant())()
+    thing.traverse(found)
+    return found.entries
 
 
 @cache
@@ -143,8 +140,6 @@ def _collector(variant: str) -> type:
     """Return the class of what collects parameters, for a variant: there is none before one is chosen."""
 
     class Collector(mi.TraversalCallback):
-        """The parameters of one object: name, value, and how to read it."""
-
         def __init__(self) -> None:
             super().__init__()
             self.entries: list[tuple[str, Any, Any]] = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -11,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from .lookup import ByShape, Table
+from .snapshot import parameters_of
 from .variants import first
 
 
@@ -22,6 +22,7 @@ class Spheres:
     """
 
     def __init__(self, shapes: Sequence[mi.Shape]) -> None:
+        self.shapes = shapes
         self.by_shape = ByShape(mi.Vector4f, shapes, [center_and_radius(s) for s in shapes], [0.0] * 4)
 
     def interaction(
@@ -53,26 +54,19 @@ class Spheres:
         row = self.by_shape(si, found)
         return mi.Point3f(row.x, row.y, row.z), row.w
 
-
-class SphereBlockers:
-    """Mitsuba's spheres in the way of shadow rays."""
-
-    def __init__(self, shapes: Sequence[mi.Shape]) -> None:
-        frames = [_to_world(s).matrix for s in shapes]
+    def boxes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the boxes [n, 2, 3] of the spheres, and their numbers; they are then ready for ``block``."""
+        found = [(s, next(e for e in parameters_of(s) if e[0] == "to_world")) for s in self.shapes]
+        frames = [mi.get_property(value, kind, s).matrix for s, (_, value, kind) in found]
         numbers = np.array([[first(m[row][column]) for row in range(3) for column in (0, 3)] for m in frames])
-        # To the last bit, which boxes do not have
-        self._balls = np.column_stack([numbers[:, 1::2], np.linalg.norm(numbers[:, ::2], axis=1)])
-        self.table = Table(mi.Vector4f, self._balls.tolist())
-
-    def hulls(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the spheres as ellipsoids [n, 1, 3, 4], three semi-axes and centre, and their numbers."""
-        centers, radii = self._balls[:, :3, None], self._balls[:, 3, None, None]
-        hulls = np.concatenate([np.eye(3) * radii, centers], axis=2)
-        return hulls[:, None], np.arange(len(hulls))
+        # To the last bit, which Mitsuba's boxes do not have
+        centers, radii = numbers[:, 1::2], np.linalg.norm(numbers[:, ::2], axis=1)[:, None]
+        self.balls = Table(mi.Vector4f, np.column_stack([centers, radii]))
+        return np.stack([centers - radii, centers + radii], axis=1), np.arange(len(radii))
 
     def block(self, index: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
         """Return whether a sphere is in the way of a ray: to the bit what Mitsuba says."""
-        row = self.table(index, mi.Bool(True))
+        row = self.balls(index, mi.Bool(True))
         o = ray.o - mi.Point3f(row.x, row.y, row.z)
         a, b = dr.squared_norm(ray.d), 2 * dr.dot(o, ray.d)
         c = dr.squared_norm(o) - dr.square(row.w)
@@ -90,27 +84,6 @@ def is_sphere(shape: Any) -> bool:
 def is_plain_sphere(shape: Any) -> bool:
     """Return whether a shape is a sphere that faces outwards and does not emit."""
     return is_sphere(shape) and not (shape.has_flipped_normals() or shape.is_emitter())
-
-
-def _to_world(sphere: Any) -> Any:
-    """Return the transform of a sphere: a tenth of the time that ``mi.traverse`` takes."""
-    found = _finder(mi.variant())()
-    sphere.traverse(found)
-    return mi.get_property(*found.entry, sphere)
-
-
-@cache
-def _finder(variant: str) -> type:
-    """Return the class of what finds a transform, for a variant: there is none before one is chosen."""
-
-    class Finder(mi.TraversalCallback):
-        """Keeps the parameter ``to_world``."""
-
-        def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
-            if name == "to_world":
-                self.entry = value, cpptype
-
-    return Finder
 
 
 def center_and_radius(shape: Any) -> list[float]:

@@ -40,11 +40,6 @@ def varies(texture: mi.Texture) -> bool:
     return texture.is_spatially_varying() or texture.class_name() == "MeshAttribute"
 
 
-def varies_by_face(texture: mi.Texture) -> bool:
-    """Return whether a texture is the same all over each face of a mesh."""
-    return texture.class_name() == "MeshAttribute" and 'name = "face_' in str(texture)
-
-
 def largest(texture: mi.Texture) -> float:
     """Return the largest value of a texture; inf where it is not known."""
     if varies(texture) or (mi.is_spectral and not is_jit()):

@@ -12,7 +12,6 @@ import mitsuba as mi
 from .facts import Reading
 from .kernel_plan import BUDGETS, KernelPlan, SceneFacts, Settings, make_plan
 from .parameters import LARGEST, choice, flag, integer, number, spectrum
-from .protocols import LayeredIntegrator
 from .scene_data import Hit, SceneData
 from .snapshot import Kept, Snapshot
 from .variants import but_not, construct_quietly, largest
@@ -332,5 +331,4 @@ class MrtWhitted(mi.SamplingIntegrator):
         return dr.select(active, mi.unpolarized_spectrum(sky.eval(si, active)), 0)
 
 
-LayeredIntegrator.register(MrtWhitted)
 mi.register_integrator(MrtWhitted.plugin_name, MrtWhitted)

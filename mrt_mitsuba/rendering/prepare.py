@@ -12,7 +12,6 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.interrupts import held
-from mrt_mitsuba.plugins.protocols import LayeredIntegrator
 from mrt_mitsuba.plugins.snapshot import Part
 from mrt_mitsuba.rendering.api import render_with
 from mrt_mitsuba.rendering.result import Result
@@ -77,7 +76,7 @@ class Prepared:
         plain = plan.film is None or (plan.film.sampler, plan.film.rfilter, plan.film.pixel_format) == (
             "IndependentSampler", "BoxFilter", "rgb")  # fmt: skip
         if not (
-            plain and isinstance(self._integrator, LayeredIntegrator) and plan.variant == "llvm_ad_rgb"
+            plain and hasattr(self._integrator, "kernel_plan") and plan.variant == "llvm_ad_rgb"
             and [step.layers for step in plan.passes] == [{"image"}] and not plan.layers and not plan.motion
             and (plan.lattice.kind == FILM or plan.lattice.count * plan.repeats == 1)
             and (plan.region.width, plan.region.height) == (plan.width, plan.height)

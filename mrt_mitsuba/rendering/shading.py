@@ -15,7 +15,6 @@ from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.output.layers import FIRST_HIT, named
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.plugins.parameters import ParameterError
-from mrt_mitsuba.plugins.protocols import LayeredIntegrator
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,7 @@ class View:
 class RayValues:
     """Values along camera rays, for the rows of the table of layers; what no row reads costs nothing.
 
-    ``trace``: what a ``LayeredIntegrator`` found; None of any other, where Mitsuba finds the first hit.
+    ``trace``: what one with a ``kernel_plan`` found; None of any other, where Mitsuba finds the first hit.
     """
 
     def __init__(
@@ -160,8 +159,8 @@ class RayValues:
 class Shader:
     """An integrator on a scene.
 
-    A ``LayeredIntegrator`` plans its kernels and knows layers of its own; any other that follows camera rays
-    gives the picture, and Mitsuba the first hit; the rest give whole pictures only, and no layers.
+    One with a ``kernel_plan`` knows layers of its own; any other that follows camera rays gives the picture,
+    and Mitsuba the first hit; the rest give whole pictures only, and no layers.
     """
 
     facts: SceneFacts | None = None  #: what its kernels depend on; None where it does not say
@@ -171,7 +170,7 @@ class Shader:
 
     def __init__(self, scene: Any, integrator: Any) -> None:
         self.scene, self.integrator, self.name = scene, integrator, integrator.class_name()
-        self.layered = isinstance(integrator, LayeredIntegrator)
+        self.layered = hasattr(integrator, "kernel_plan")
         self._derivatives = isinstance(integrator, mi.CppADIntegrator)  # such as prb
         if self.layered:
             try:

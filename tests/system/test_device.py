@@ -27,7 +27,7 @@ def different(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb"], indirect=True)
-@pytest.mark.parametrize("number", [0, 1, 2, 3, 4, 9])
+@pytest.mark.parametrize("number", [3, 4, 9])
 @pytest.mark.filterwarnings("ignore:scalar_:mrt_mitsuba.MrtWarning")
 def test_pictures_are_those_of_the_scalar_variant(number: int, variant: str) -> None:
     options = {"aa": 1, "aamode": "none", "focaldist": 0, "layers": ["depth", "bounces"]}

@@ -20,7 +20,6 @@ from mrt_mitsuba.validation.tools.bsdf_probe import (
     interaction,
     lobe_pairs,
     rgb,
-    unit,
 )
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -53,16 +52,14 @@ def test_obeys_the_laws_of_any_bsdf(name: str) -> None:
 
 
 @in_variants
-@pytest.mark.parametrize("alpha", [0.001, 0.01, 0.1, 0.4, 1.0])
+@pytest.mark.parametrize("alpha", [0.01, 0.4])
 def test_equals_roughconductor(variant: str, alpha: float) -> None:
     found = compare_pointwise(alpha, count=100 if variant.startswith("scalar") else 20_000)
     assert max(found.values()) < POINTWISE
 
 
 @pytest.mark.parametrize("visible", [True, False])
-@pytest.mark.parametrize(
-    ("alpha", "theta"), [(0.05, 85), (0.3, 70), (0.3, 89), (1.0, 45), (1.0, 85), (3.0, 80)]
-)
+@pytest.mark.parametrize(("alpha", "theta"), [(0.05, 85), (0.3, 89), (3.0, 80)])
 def test_samples_fit_density_and_value(alpha: float, theta: float, visible: bool) -> None:
     """Drawn from a fine grid of numbers: the mean weight is the integral of the value, and as many directions
     are drawn as the density integrates to."""
@@ -143,9 +140,8 @@ def test_reflected_light_is_depolarised(variant: str) -> None:
 # ---------------------------------------------- Sampling -----------------------------------------------
 
 
-@pytest.mark.parametrize("alpha", [0.0, 1e-8, 1e-6, 1e-4, -1e-4])
-@pytest.mark.parametrize("degrees", [0, 60, 85])
 @pytest.mark.parametrize("visible", [True, False])
+@pytest.mark.parametrize(("alpha", "degrees"), [(0.0, 60), (1e-6, 85), (1e-4, 0), (-1e-4, 60)])
 def test_narrow_lobes_are_sampled_as_mirrors(alpha: float, degrees: float, visible: bool) -> None:
     """Every sample carries all of Ks F, along the mirror direction to within the lobe and float32."""
     b = bsdf(alpha=alpha, diffuse_reflectance=0.0, fresnel="dielectric", sample_visible=visible)
@@ -160,18 +156,6 @@ def test_narrow_lobes_are_sampled_as_mirrors(alpha: float, degrees: float, visib
 
 
 # ------------------------------------- Lobes, contexts, parameters -------------------------------------
-
-
-@in_variants
-def test_flags(variant: str) -> None:
-    b, flags = bsdf(), mi.BSDFFlags
-    assert b.component_count() == 2
-    assert b.flags(0) == flags.DiffuseReflection | flags.FrontSide
-    assert b.flags(1) == flags.GlossyReflection | flags.FrontSide
-    assert b.flags() == b.flags(0) | b.flags(1)
-    assert not b.needs_differentials()
-    varying = [mi.has_flag(bsdf(alpha=CHECKERS).flags(k), flags.SpatiallyVarying) for k in range(2)]
-    assert varying == [False, True]
 
 
 @pytest.mark.parametrize(
@@ -239,42 +223,6 @@ def test_parameters_can_be_updated(variant: str) -> None:
     assert dr.allclose(b.eval_attribute_1("int_ior", interaction(wi[0])), 2.0)
 
 
-@in_variants
-def test_loads_from_xml(variant: str) -> None:
-    b = mi.load_string("""
-        <bsdf version="3.0.0" type="mrt_bsdf">
-            <float name="alpha" value="0.06"/>
-            <float name="int_ior" value="1.38"/>
-            <string name="fresnel" value="dielectric"/>
-            <boolean name="sample_visible" value="false"/>
-            <rgb name="diffuse_reflectance" value="0.3"/>
-            <rgb name="specular_reflectance" value="1.2"/>
-        </bsdf>""")
-    wi, wo = lobe_pairs(20, 0.06)
-    same = bsdf(
-        alpha=0.06,
-        int_ior=1.38,
-        fresnel="dielectric",
-        sample_visible=False,
-        diffuse_reflectance=rgb((0.3, 0.3, 0.3)),
-        specular_reflectance=rgb((1.2, 1.2, 1.2)),
-    )
-    for found, value in zip(evaluate(b, wi, wo), evaluate(same, wi, wo), strict=True):
-        np.testing.assert_array_equal(found, value)
-    assert "fresnel=dielectric" in str(b) and "1.38" in str(b)
-
-
-def test_unknown_attributes_are_named() -> None:
-    b, si = bsdf(), interaction(np.array([0, 0, 1.0]))
-    assert (
-        b.has_attribute("mirror_reflectance") and b.has_attribute("int_ior") and not b.has_attribute("color")
-    )
-    with pytest.raises(ValueError, match=r'mrt_bsdf: no spectrum attribute "color"'):
-        b.eval_attribute("color", si)
-    with pytest.raises(ValueError, match=r'mrt_bsdf: no scalar attribute "color"'):
-        b.eval_attribute_1("color", si)
-
-
 @pytest.mark.parametrize("form", FORMS)
 def test_mirror_reflectance_is_ks_times_fresnel(form: str) -> None:
     b = colored(int_ior=1.7, fresnel=form)
@@ -289,13 +237,6 @@ def test_mirror_reflectance_is_ks_times_fresnel(form: str) -> None:
 
 
 # -------------------------------------------- Extreme values -------------------------------------------
-
-
-def test_zero_and_tiny_roughness_act_as_the_least() -> None:
-    wi = unit(np.array([[0.4, 0.3, 0.866]]))
-    least, *others = (evaluate(bsdf(alpha=a), wi, wi * [-1, -1, 1]) for a in (1e-8, 0.0, 1e-9, 1e-30))
-    for found in others:
-        assert all(map(np.array_equal, found, least))
 
 
 def test_negative_roughness_stays_drawable() -> None:

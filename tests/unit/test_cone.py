@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -55,7 +56,7 @@ def rays_at(count: int, seed: int = 1):
 def errors_of(name: str, segments: int, **scene):
     """Errors of a mesh against the surface: relative distance, normal and uv on the same part."""
     mesh = shape(name, segments=segments)
-    ray = rays_at(200_000)
+    ray = rays_at(50_000)
     loaded = mi.load_dict({"type": "scene", "shape": mesh, **scene})
     si = loaded.ray_intersect(ray)
     hit = mi.load_dict({"type": "mrt_whitted"}).trace(loaded, None, ray).hit
@@ -65,7 +66,7 @@ def errors_of(name: str, segments: int, **scene):
     du = dr.abs(si.uv.x - exact.uv.x)
     uv = dr.maximum(dr.minimum(du, 1 - du), dr.abs(si.uv.y - exact.uv.y))
     pick = dr.compress(si.is_valid() & hit.found & (normal < 0.5))  # a ray near a rim may meet another part
-    assert dr.width(pick) > 100_000
+    assert dr.width(pick) > 25_000
     return [dr.gather(mi.Float, x, pick).numpy() for x in (distance, normal, uv)]
 
 
@@ -105,32 +106,23 @@ def test_positions_differentiate_with_the_parameters(name: str) -> None:
     """Derivatives of all vertices by automatic differentiation against finite differences."""
     ends = [key for key in SHAPES[name] if key not in ("type", "radius")]
     weights = mi.Float(np.random.default_rng(4).normal(size=3 * len(shape(name, segments=8).unit.points)))
+    steps = [(ends[0], (1, 0, 0)), (ends[0], (0, 1, 0)), (ends[1], (0, 0, 1)), ("radius", 1)]
 
-    def weighted_sum(values: dict, gradient: bool):
+    def weighted_sum(key: str, step: Any, by: Any) -> Any:
         mesh = shape(name, segments=8)
         parameters = mi.traverse(mesh)
-        for key, value in values.items():
-            parameters[key] = value
-            if gradient:
-                dr.enable_grad(parameters[key])
+        value = parameters[key]
+        parameters[key] = value + by if key == "radius" else mi.Point3f(value + mi.Vector3f(step) * by)
         parameters.update()
-        inputs = [parameters[key] for key in values]
-        return dr.sum(mi.traverse(mesh)["vertex_positions"] * weights), inputs
+        return dr.sum(mi.traverse(mesh)["vertex_positions"] * weights)
 
-    point = {ends[0]: mi.Point3f(0.1, 1.4, 0), ends[1]: mi.Point3f(0.5, 0.3, 0.3), "radius": mi.Float(0.6)}
-    total, inputs = weighted_sum(point, gradient=True)
-    dr.backward(total)
-    step = 1e-2  # a step of 1e-2 leaves a truncation of 1e-4, and a rounding of 1e-7 / 1e-2
-    for value, key in zip(inputs, point, strict=True):
-        gradient = np.atleast_1d(np.squeeze(dr.grad(value).numpy()))
-        for k, slope in enumerate(gradient):
-            sums = []
-            for sign in (1, -1):
-                moved = np.atleast_1d(np.squeeze(point[key].numpy())).astype(float)
-                moved[k] += sign * step
-                kind = type(point[key])
-                sums.append(weighted_sum({**point, key: kind(*map(float, moved))}, gradient=False)[0][0])
-            assert slope == pytest.approx((sums[0] - sums[1]) / (2 * step), rel=2e-2, abs=2e-2)
+    for key, step in steps:
+        by = mi.Float(0)
+        dr.enable_grad(by)
+        dr.backward(weighted_sum(key, step, by))
+        # a step of 1e-2 leaves a truncation of 1e-4, and a rounding of 1e-7 / 1e-2
+        above, below = (weighted_sum(key, step, sign * 1e-2)[0] for sign in (1, -1))
+        assert dr.grad(by)[0] == pytest.approx((above - below) / 2e-2, rel=2e-2, abs=2e-2)
 
 
 def test_update_of_parameters_equals_construction() -> None:
@@ -142,7 +134,7 @@ def test_update_of_parameters_equals_construction() -> None:
         parameters.update()
         got, same = (np.array(mi.traverse(m)["vertex_positions"]) for m in (mesh, wanted))
         np.testing.assert_allclose(got, same, atol=4e-7)  # some float32 roundings of coordinates up to 2
-        assert np.allclose(list(mesh.frame().z), list(wanted.frame().z))
+        assert np.allclose(list(mesh.exact_frame.z), list(wanted.exact_frame.z))
 
 
 def test_scenes_keep_the_shapes_apart() -> None:

@@ -100,7 +100,6 @@ def forward(*arguments: Any) -> float:
 KEYS = {
     "ball.bsdf.alpha": 1e-2,
     "ball.bsdf.int_ior": 2e-2,
-    "ball.bsdf.ext_ior": 2e-2,
     "ball.bsdf.diffuse_reflectance.value": 2e-2,
     "ball.bsdf.specular_reflectance.value": 2e-2,
     "light.intensity.value": 2e-2,
@@ -135,17 +134,6 @@ def test_materials_of_every_form(change: dict[str, Any], key: str) -> None:
         return scene(ball={"type": "sphere", "bsdf": MATERIAL | change})
 
     assert backward(key, (), make) == pytest.approx(difference(key, 4e-3, make), rel=1e-2)
-
-
-def test_sky_of_the_integrator() -> None:
-    def make() -> mi.Scene:
-        ball = {"type": "sphere", "radius": 0.2, "bsdf": MATERIAL}
-        return scene(integrator={"type": "mrt_whitted", "max_depth": 1, "sky": rgb(0.3, 0.2, 0.1)}, ball=ball)
-
-    # A parameter of an integrator is none of the scene; it must not be lost among those that are
-    assert backward("ball.bsdf.alpha", (), make) == pytest.approx(
-        difference("ball.bsdf.alpha", 1e-2, make), rel=1e-2
-    )
 
 
 @pytest.mark.parametrize("update", [True, False])

@@ -134,8 +134,6 @@ def test_kernel_obeys(name: str) -> None:
         ({"a": SPHERE}, "coherent", "no mesh in the scene"),
         ({"a": MESH}, "spheres", "no sphere in the scene"),
         ({"a": SPHERE, "b": MESH}, "spheres", "other shapes, or spheres that emit or face inwards"),
-        ({"a": SPHERE}, "quadrics", "none in the scene"),
-        ({"a": SPHERE}, "planes", "none in the scene"),
         ({"a": SPHERE}, "lights", "no light"),
         ({"a": SPHERE, "light": LIGHT}, "random", "every light is a point or a direction"),
         ({"a": SPHERE, "light": LIGHT}, "touching", "no point light is on a surface"),
@@ -150,17 +148,13 @@ def test_kernel_obeys(name: str) -> None:
             "buffers",
             "other shapes, or spheres that emit or face inwards",
         ),
-        ({"a": SPHERE}, "emission", "no surface emits"),
-        ({"a": SPHERE}, "sky", "no sky in the scene"),
         ({"a": {**SPHERE, "bsdf": MATTE}}, "mirrors", "no material reflects visibly"),
         (
             {"a": SPHERE, "integrator": {"type": "mrt_whitted", "max_depth": 1}},
             "mirrors",
             "max_depth admits no mirror ray",
         ),
-        ({"a": SPHERE}, "textures", "every material is uniform"),
-        ({"a": SPHERE}, "shading_frames", "no mesh in the scene"),
-        ({"a": GROUP}, "textures", "every material is uniform"),
+        ({"a": GROUP}, "merged", "a material varies over its surface"),
         ({"a": SPHERE}, "tangents", "no material depends on the direction of texture coordinates"),
         (
             {"a": {**SPHERE, "bsdf": BRUSHED}},
@@ -202,18 +196,3 @@ def test_no_light_buffers_where_they_would_be_too_long() -> None:
         integrator.kernel_plan(replace(facts, lights=2**11 + 1)).reason("buffers")
         == "too many lights and objects"
     )
-
-
-def test_materials_of_the_objects_of_a_group_are_looked_up_in_the_table() -> None:
-    """As by a call to the BSDF, next to other shapes; not where a texture varies over an object."""
-    loaded = scene(a=GROUP, b=SPHERE, c={**GROUP, "bsdf": MATTE}, light=LIGHT)
-    integrator = loaded.integrator()
-    plan = integrator.prepare(loaded).plan
-    assert plan.merged and not plan.textures
-    table = np.array(mi.render(loaded, spp=4, seed=1))
-    integrator.kernel_plan = lambda facts: replace(plan, merged=False)
-    np.testing.assert_allclose(table, np.array(mi.render(loaded, spp=4, seed=1)), atol=1e-6)
-    attribute = {"type": "mesh_attribute", "name": "vertex_gloss"}
-    for texture in (TEXTURE, attribute):
-        other = {**GROUP, "bsdf": {"type": "mrt_bsdf", "specular_reflectance": texture}}
-        assert plan_of(a=other).reason("merged") == "a material varies over its surface"

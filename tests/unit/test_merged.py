@@ -82,25 +82,6 @@ def test_materials_are_recorded_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert counts[0] == counts[1] > 0
 
 
-TEXTURE = {"type": "checkerboard", "color0": rgb(0.1, 0.1, 0.1), "color1": rgb(0.9, 0.9, 0.9)}
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        {"type": "diffuse"},
-        {"type": "mrt_bsdf", "diffuse_reflectance": TEXTURE},
-        {"type": "mrt_bsdf", "alpha": TEXTURE},
-        {"type": "mrt_bsdf", "f0": 0.5},
-        {"type": "mrt_bsdf", "fresnel": "unity"},
-    ],
-)
-def test_other_materials_are_called(other: dict[str, Any]) -> None:
-    """One that does not fit into the table, and all are called as Mitsuba calls them."""
-    more = {"type": "sphere", "center": [0, 2, 0], "radius": 0.5, "bsdf": other}
-    assert not merged(mi.load_dict(spheres(3, more=more)))
-
-
 def test_a_scene_without_shapes_is_the_sky() -> None:
     scene = spheres(0)
     del scene["floor"]

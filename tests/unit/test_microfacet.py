@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from mpmath import mp
 
 from mrt_mitsuba.plugins.microfacet import (
-    TAN2_MAX,
     beckmann_d,
     half_vector_angles,
     microfacet_specular,
@@ -26,7 +25,7 @@ from mrt_mitsuba.validation.oracles import exact
 
 Vector = drjit.scalar.Array3f64
 ALPHAS = st.floats(1e-3, 2)
-COSINES = st.floats(1e-4, 1)
+COSINES = st.floats(1e-6, 1)
 
 # The negative ones of scene 2
 NEGATIVE_ALPHAS = (-0.0432, -0.0432 + 0.1 / 3)
@@ -97,15 +96,6 @@ def test_half_vector_angles_keep_small_angles() -> None:
     assert relative_errors(sines2, truth_s2)[wide].max() < 1e-5
 
 
-def test_tangent_is_limited_but_never_infinite() -> None:
-    assert tan2_theta(Vector(1, 0, 0)) == TAN2_MAX
-    assert tan2_theta(Vector(1, 0, 1e-30)) == TAN2_MAX
-    assert tan2_theta(Vector(3, 4, -5)) == pytest.approx(1, rel=1e-15)
-    assert tan2_theta(Vector(0, 0, 2)) == 0
-    d = np.array(beckmann_d(float32([TAN2_MAX]), float32([1e-8])))
-    assert d == 0
-
-
 # -------------------------------------------------- Laws ---------------------------------------------------
 
 
@@ -120,14 +110,6 @@ def test_g1_is_that_of_fifty_digits(cos_theta: float, alpha: float) -> None:
     assert smith_g1_over_cos(v, alpha) == pytest.approx(truth / cos_theta, rel=1e-12)
     assert beckmann_d(0.001, alpha) == beckmann_d(0.001, -alpha)
     assert smith_g1(Vector(0, 0, 1), alpha) == 1  # straight up there is no sign: b is infinite
-
-
-@given(cos_theta=st.floats(0, 1e-6), alpha=ALPHAS)
-def test_g1_over_cos_is_finite_at_grazing(cos_theta: float, alpha: float) -> None:
-    """Its limit there is 3.535 / (alpha tan θ cos θ) -> 3.535 / alpha."""
-    v = direction(cos_theta)
-    assert smith_g1_over_cos(v, alpha) == pytest.approx(3.535 / alpha, rel=3e-3)
-    assert smith_g1(v, alpha) <= 3.54e-6 / alpha
 
 
 @given(alpha=st.floats(-1, 1).filter(lambda a: abs(a) > 1e-6), u1=st.floats(0, 0.999), u2=st.floats(0, 1))

@@ -40,8 +40,7 @@ def floor(kind: str, half: float, turn: mi.ScalarTransform4f) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", ["rectangle", "mesh"])
-@pytest.mark.parametrize("place", [(0, 0, 0), (3, 2, 1)])
-@pytest.mark.parametrize("half", [1.0, 1e3, 1e4])
+@pytest.mark.parametrize(("place", "half"), [((0, 0, 0), 1.0), ((3, 2, 1), 1.0), ((3, 2, 1), 1e4)])
 def test_a_grain_on_a_wide_floor_has_its_shadow(variant: str, kind: str, place: tuple, half: float) -> None:
     """A ball of radius 0.005, as ``direct`` draws it."""
     turn = mi.ScalarTransform4f().translate(list(place)).rotate([1, 0, 0], -90)
@@ -85,7 +84,7 @@ def test_rays_leave_triangles_of_every_form(variant: str, scale: float) -> None:
         assert dr.none(hit.found & scene.ray_test(mirror))
 
 
-@pytest.mark.parametrize("size", [1e-9, 1e-12, 1e11, 1e15])
+@pytest.mark.parametrize("size", [1e-9, 1e11])
 def test_meshes_that_rays_cannot_meet_are_refused(variant: str, size: float) -> None:
     scene = {
         "type": "scene",
