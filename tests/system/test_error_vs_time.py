@@ -138,7 +138,7 @@ def test_wrong_arguments(arguments, message, variant):
 def point(name: str, times: list[float], rmse: float = 0.1, gram: np.ndarray | None = None) -> Point:
     image = np.full((2, 2, 3), 0.5, np.float32)
     gram = rmse**2 * np.eye(len(times)) if gram is None else gram
-    return Point(name, {}, np.array(times), gram, 1.0, 0.5, {}, image, mrt.compare(image, image), 0.0)
+    return Point(name, np.array(times), gram, 1.0, 0.5, {}, image, mrt.compare(image, image), 0.0)
 
 
 def found_of(*points: Point, errors: tuple[float, ...] = (0.1,)) -> Findings:
@@ -187,6 +187,12 @@ def test_names_that_differ_in_numbers_are_one_curve(name, family):
 def test_front_is_what_nothing_beats_in_both():
     figures = {"a": (1, 0.5), "b": (2, 0.6), "c": (3, 0.1), "d": (4, 0.1), "e": (0.5, 0.9)}
     assert [p.name for p in front([point(n, [t], e) for n, (t, e) in figures.items()])] == ["e", "a", "c"]
+
+
+def test_intervals_are_students():
+    """Of the mean of 0.01, 0.02 and 0.03: t = 4.3027, so 0.02 ± 0.02484."""
+    found = point("a", [1.0, 2.0, 3.0], gram=np.diag([0.01, 0.02, 0.03])).rmse_interval
+    assert np.log(found) == pytest.approx(np.log(0.02) / 2 + np.array([-1, 1]) * 0.02484 / 0.04, rel=1e-3)
 
 
 @pytest.mark.parametrize("count", [3, 5, 10])

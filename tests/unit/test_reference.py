@@ -134,6 +134,7 @@ NEAR, FAR = Sphere((0.5, 0, 0), 0.5, WOOD), Sphere((-2, 0, 0), 0.5, WOOD)
         ((Plane((2, 0, 0), 5, WOOD), TUBE), (3, 4, 0), (0, 4, 0), 8, (1, 0, 0), 0),
         ((CONE,), (0.1, -3, 0), (0.1, 0, 0), 3, (0, -1, 0), 0),
         ((CONE,), (3, 0.2, 0), (0, 0.2, 0), 3 - 0.4, (2 / 5**0.5, 1 / 5**0.5, 0), 0),  # a slope of 1 over 0.5
+        ((CONE,), (0.3, 3, 0), (0.3, 0, 0), 2.6, (2 / 5**0.5, 1 / 5**0.5, 0), 0),  # no disc at the apex
         ((CONE,), (3, 1.2, 0), (0, 1.2, 0), np.inf, (0, 0, 0), -1),
         ((TUBE,), (3, 0, 0), (0, 0, 0), 2.5, (1, 0, 0), 0),
         ((TUBE,), (0.2, 5, 0), (0.2, 0, 0), 3, (0, 1, 0), 0),
@@ -176,6 +177,17 @@ def test_picture_is_the_right_way_up_and_mirrored_as_in_the_original() -> None:
     # the sphere's centre projects to u = 0.6 / 3 / tan 30° of half the width, v likewise
     assert columns.mean() + 0.5 == pytest.approx(16 + 16 * 0.2 / tan, abs=0.5)
     assert rows.mean() + 0.5 == pytest.approx(12 - 16 * 0.8 / 3 / tan, abs=0.5)
+
+
+def test_no_light_is_negative_and_each_is_seen_by_itself() -> None:
+    """With a roughness of the wrong sign, Smith's term is negative where the eye is low, the light high."""
+    wrong = Plane((1, 2, 0), 0, replace(WOOD, alpha=-1.5, diffuse=(0, 0, 0)))
+    assert (pixel(scene(wrong, lights=[Light((1.6, 1.7, 0), (1, 1, 1))]), clamp=False) == 0).all()
+    ball, lights = Sphere((0, 0, 0), 1, WOOD), [Light((x, 1, 0), (1, 1, 1)) for x in (5, -5)]
+    hashes = [
+        reference_render(scene(ball, lights=order), **ONE_PIXEL).lights for order in (lights, lights[::-1])
+    ]
+    assert hashes[0] != hashes[1]
 
 
 def test_sensitivity_names_what_changes() -> None:

@@ -63,7 +63,6 @@ class Point:
     """One case: what it costs and how far off it is."""
 
     name: str
-    options: Mapping[str, Any]
     times: np.ndarray  #: seconds of each repeat, warm, without loading the scene
     gram: np.ndarray  #: G[r, s], see above
     cold: float  #: seconds of a first run, its kernels compiled or read from a cache

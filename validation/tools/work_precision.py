@@ -73,7 +73,7 @@ def error_vs_time(
             f"{own_error:.2g}, and only errors above twice that stand out; take a better reference"
         )
     runs, failed = _measure(run, cases, halves[0].shape, repeats, progress or Progress())
-    points = {name: _point(name, cases[name], found, halves, own_error) for name, found in runs.items()}
+    points = {name: _point(name, found, halves, own_error) for name, found in runs.items()}
     return Findings(
         scene=next((found[0].plan.scene for found in runs.values()), "scene"),
         points=points,
@@ -161,7 +161,7 @@ def _measure(
     return {name: found for name, found in runs.items() if name not in failed}, failed
 
 
-def _point(name: str, options: Options, runs: Sequence[Result], halves: Halves, own_error: float) -> Point:
+def _point(name: str, runs: Sequence[Result], halves: Halves, own_error: float) -> Point:
     """Return the figures of a case; its first run was cold."""
     images = [result.image for result in runs[1:]]
     errors = [np.stack([(image - half).ravel() for image in images]) for half in halves]
@@ -169,7 +169,6 @@ def _point(name: str, options: Options, runs: Sequence[Result], halves: Halves, 
     seconds = np.array([result.timings.total - result.timings.load for result in runs])
     return Point(
         name=name,
-        options=options,
         times=seconds[1:],
         gram=(gram + gram.T) / 2,
         cold=float(seconds[0]),
