@@ -28,7 +28,7 @@ def blocks(path: Path, language: str) -> list[str]:
 def code(path: Path) -> str:
     """All Python of a page, cells that are run and what is only shown; the gallery at a smaller size."""
     text = "\n".join(blocks(path, "{code-cell}") + blocks(path, "python"))
-    return text.replace('"width": 400, "height": 300', '"width": 80, "height": 60')
+    return text.replace('"width": 400, "height": 300, "p', '"width": 80, "height": 60, "p')
 
 
 @pytest.fixture
