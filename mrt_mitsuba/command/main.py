@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         setattr(sys, ("stdin", "stdout", "stderr")[lowest], os.fdopen(lowest, "w" if lowest else "r"))
     os.close(lowest)
     with warnings.catch_warnings():
-        warnings.showwarning = _show_warning
+        warnings.showwarning = lambda message, *place, **more: _say(f"warning: {message}")
         code = _guarded(words)
     picture = bool(words) and words[0] not in registry.ALL
     if arguments is None and (picture or code in (INTERRUPTED, TERMINATED)):
@@ -50,23 +50,23 @@ def _guarded(words: list[str]) -> int:
             sys.stdout.flush()
         return code
     except MrtError as error:
-        return _fail(str(error), error.exit_code)
+        return _say(str(error), error.exit_code)
     except Terminated:
-        return _fail("terminated", TERMINATED)
+        return _say("terminated", TERMINATED)
     except KeyboardInterrupt:
-        return _fail("interrupted", INTERRUPTED)
+        return _say("interrupted", INTERRUPTED)
     except MemoryError:
-        return _fail("out of memory: choose a smaller width, height or aa", 1)
+        return _say("out of memory: choose a smaller width, height or aa", 1)
     except Exception as error:
         if isinstance(error, OSError) and error.errno in UNPRINTED and error.filename is None:
             # or Python complains once more at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             if isinstance(error, BrokenPipeError):
                 return 1
-            return _fail(f"cannot print: {error.strerror}; send the output elsewhere", 1)
+            return _say(f"cannot print: {error.strerror}; send the output elsewhere", 1)
         if os.environ.get(TRACEBACK):
             raise
-        return _fail(f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)", 1)
+        return _say(f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)", 1)
 
 
 def _dispatch(words: list[str]) -> int:
@@ -91,7 +91,7 @@ def _dispatch(words: list[str]) -> int:
     return render.run(options)
 
 
-def _fail(message: str, code: int) -> int:
+def _say(message: str, code: int = 1) -> int:
     print(f"mrt: {one_line(message)}", file=sys.stderr)
     return code
 
@@ -102,10 +102,6 @@ def _end_by_force() -> None:
     discard_unfinished()
     newline = "\n" if sys.stderr.isatty() else ""  # below the progress bar
     print(f"{newline}mrt: interrupted", file=sys.stderr)
-
-
-def _show_warning(message: Warning | str, *place: object, **more: object) -> None:
-    print(f"mrt: warning: {one_line(str(message))}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import io
-import math
 import os
 import re
 import stat
@@ -13,9 +12,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mrt_mitsuba.errors import MrtWarning, SceneError
+from mrt_mitsuba.scene.model import LARGEST
 
 LONGEST_LINE = 2**18  # bytes, about 40,000 corners of a face
 MISSING = "is missing or may not be read in"  # what messages say about a file that was not found
+
+
+_REAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 
 
 def require_file(path: str | os.PathLike[str]) -> None:
@@ -125,13 +128,7 @@ def numbers(where: str, statement: str, words: list[str], least: int, most: int)
     if not least <= len(words) <= most:
         wanted = f"{least}" if least == most else f"{least} to {most}"
         raise SceneError(f"{where}: {statement} has {len(words)} numbers, but must have {wanted}")
-    values = []
     for word in words:
-        try:
-            value = float(word) if word.isascii() and "_" not in word else math.nan
-        except ValueError:
-            value = math.nan
-        if not abs(value) <= 3.4e38:  # the largest float32; false for NaN, too
+        if not _REAL.fullmatch(word) or abs(float(word)) > LARGEST:
             raise SceneError(f"{where}: {statement} holds {word[:40]!r}, which is not a finite number")
-        values.append(value)
-    return values
+    return [float(word) for word in words]

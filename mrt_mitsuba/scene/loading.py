@@ -28,7 +28,6 @@ from mrt_mitsuba.scene.files import picture_size, require_file
 DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from about 3000 on
 MOST_SAMPLES = 2**24  # of a pixel; some samplers divide by none, or never end at 2^31
 _PICTURES = ("mrt_texture", "bitmap", "envmap")  # plugins that read one
-_NATIVE = (".so", ".dylib", ".dll")
 
 # The lines of a traceback, which are indented but for the first, and the type of this project's error
 _TRACEBACK = re.compile(
@@ -163,16 +162,13 @@ def _resolved(path: str) -> str:
 
 def _check_plugin(plugin: str, name: str) -> None:
     """Refuse a native plugin that lies outside Mitsuba's folder. Mitsuba reports a name that it knows not."""
-    if plugin == "scene":  # never looked up
-        return
-    for ending in _NATIVE:
-        file = os.path.join("plugins", plugin + ending)
-        strange = "/" in plugin or not os.path.isfile(os.path.join(mitsuba_home(), file))
-        if strange and os.path.exists(_resolved(file)):
-            raise SceneError(
-                f"cannot load {name}: the plugin {plugin!r} is {_resolved(file)}, native code that is not "
-                f"Mitsuba's; move it away or, if you trust it, into {mitsuba_home()}/plugins"
-            )
+    file = os.path.join("plugins", f"{plugin}.so")
+    known = "/" not in plugin and os.path.isfile(os.path.join(mitsuba_home(), file))
+    if plugin != "scene" and not known and os.path.exists(_resolved(file)):  # "scene" is never looked up
+        raise SceneError(
+            f"cannot load {name}: the plugin {plugin!r} is {_resolved(file)}, native code that is not "
+            f"Mitsuba's; move it away or, if you trust it, into {mitsuba_home()}/plugins"
+        )
 
 
 def _check_data(filename: str) -> None:

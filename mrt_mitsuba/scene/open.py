@@ -7,7 +7,7 @@ import operator
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
@@ -52,13 +52,6 @@ def open_scene(
     ``model_scene``.
     """
     check_model_options(scene, model or {})
-    terms = scene if isinstance(scene, Scene) else None  # the scene in the report's terms
-    if hasattr(scene, "__index__"):
-        terms = report_scene(operator.index(scene))
-    elif is_obj(scene):
-        from mrt_mitsuba.scene.obj import model_scene
-
-        terms = model_scene(scene, **(model or {}))
     # a key of mi.traverse has a dot, the name of a parameter of an XML file has none
     keys = {key: value for key, value in (params or {}).items() if "." in key}
     declared = {key: value for key, value in (params or {}).items() if "." not in key}
@@ -66,7 +59,23 @@ def open_scene(
         raise UsageError(
             f"params: {next(iter(declared))} is not a key of mi.traverse, and only an XML file declares names"
         )
-    if terms is None:
+    terms = scene  # or the scene in the report's terms
+    if hasattr(scene, "__index__"):
+        terms = report_scene(operator.index(scene))
+    elif is_obj(scene):
+        from mrt_mitsuba.scene.obj import model_scene
+
+        terms = model_scene(scene, **(model or {}))
+    if isinstance(terms, Scene):
+        if budget is not None:
+            budget.inputs.update(terms.files)
+        size, fresnel = (size[0] or SIZE[0], size[1] or SIZE[1]), fresnel or "schlick"
+        name = str(operator.index(scene)) if hasattr(scene, "__index__") else terms.title or "a scene"
+        nodes = terms.to_dict(width=size[0], height=size[1], fresnel=fresnel)
+        # its meshes have a material each: kept apart, they stay in order, and a file has the same layers
+        loaded = load_dict(nodes, name, budget, merge=False)
+        distance, reach = terms.focal_distance, terms.focal_range
+    else:
         if fresnel is not None:
             raise UsageError(
                 "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
@@ -76,20 +85,11 @@ def open_scene(
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
         # of write_xml
         distance, reach = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
-    else:
-        if budget is not None:
-            budget.inputs.update(terms.files)
-        size, fresnel = (size[0] or SIZE[0], size[1] or SIZE[1]), fresnel or "schlick"
-        nodes = terms.to_dict(width=size[0], height=size[1], fresnel=fresnel)
-        name = str(operator.index(scene)) if hasattr(scene, "__index__") else terms.title or "a scene"
-        # its meshes have a material each: kept apart, they stay in order, and a file has the same layers
-        loaded = load_dict(nodes, name, budget, merge=False)
-        distance, reach = terms.focal_distance, terms.focal_range
     set_parameters(loaded, keys)
-    view, chosen = _sensor(name, loaded, sensor), _integrator(integrator, loaded)
-    columns, rows = view.film().crop_size()
-    width, height = size[0] or int(columns), size[1] or int(rows)
-    return Source(name, loaded, view, chosen, width, height, distance, reach, fresnel, own=terms is None)
+    source = opened(name, loaded, _sensor(name, loaded, sensor), _integrator(integrator, loaded))
+    width, height = size[0] or source.width, size[1] or source.height
+    decided = {"width": width, "height": height, "fresnel": fresnel, "own": not isinstance(terms, Scene)}
+    return replace(source, focal_distance=distance, focal_range=reach, **decided)
 
 
 def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
@@ -110,13 +110,6 @@ def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
         except (TypeError, ValueError, RuntimeError):
             raise UsageError(f"{key}={value!r}: must be a {kind.__name__}") from None
     parameters.update()
-
-
-def opened(name: str, scene: Any, sensor: Any, integrator: Any) -> Source:
-    """Return the source of a loaded scene of one's own, seen by one of its sensors."""
-    _check_sensor(name, sensor)
-    width, height = map(int, sensor.film().crop_size())
-    return Source(name, scene, sensor, integrator, width, height, own=True)
 
 
 @contextmanager
@@ -185,12 +178,11 @@ def _sensor(name: str, scene: Any, number: int) -> Any:
         raise SceneError(f"{name} has no sensor: add one, so that there is something to look through")
     if number >= len(sensors):
         raise UsageError(f"sensor={number}: {name} has {len(sensors)}, counted from 0")
-    _check_sensor(name, sensors[number])
     return sensors[number]
 
 
-def _check_sensor(name: str, sensor: Any) -> None:
-    """Raise ``SceneError`` for a sensor that cannot be rendered."""
+def opened(name: str, scene: Any, sensor: Any, integrator: Any) -> Source:
+    """Return the source of a loaded scene of one's own; raise ``SceneError`` if its sensor sees nothing."""
     import mitsuba as mi
 
     parts = [sensor] if sensor.class_name() != "BatchSensor" else mi.traverse(sensor).hierarchy
@@ -204,15 +196,14 @@ def _check_sensor(name: str, sensor: Any) -> None:
     if not 0 <= film.rfilter().radius() <= WIDEST_FILTER:
         radius = film.rfilter().radius()
         raise SceneError(f"{name} has a filter of radius {radius:g}: give at most {WIDEST_FILTER} pixels")
+    return Source(name, scene, sensor, integrator, int(width), int(height), own=True)
 
 
 def _integrator(integrator: Any, scene: Any) -> Any:
     import mitsuba as mi
 
     if integrator is None:
-        integrator = scene.integrator()
-    if integrator is None:
-        integrator = {"type": "mrt_whitted"}
+        integrator = scene.integrator() or "mrt_whitted"
     if isinstance(integrator, str):
         integrator = {"type": integrator}
     if isinstance(integrator, dict):
