@@ -17,6 +17,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,14 +68,15 @@ def start(turns: int) -> Row:
     """Return the seconds of the command against those of a bare start, as after installation."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     silent: dict[str, Any] = {"check": True, "stdout": subprocess.DEVNULL, "timeout": 600, "env": environment}
+
+    def seconds(command: Sequence[str], turn: int = 0) -> float:
+        return timed(lambda: subprocess.run([sys.executable, *command], **silent))[1]
+
     with tempfile.TemporaryDirectory() as folder:
-        commands = [("-m", "mrt_mitsuba.command.main", f"{folder}/out", "0", "quiet=1"), ("-c", BARE)]
-        sides = [
-            lambda _, c=command: timed(lambda: subprocess.run([sys.executable, *c], **silent))[1]
-            for command in commands
-        ]
-        for side in sides:
-            side(0)  # Python compiles modules once
+        commands = ("-m", "mrt_mitsuba.command.main", f"{folder}/out", "0", "quiet=1"), ("-c", BARE)
+        for command in commands:
+            seconds(command)  # Python compiles modules once
+        sides = [partial(seconds, command) for command in commands]
         return _row(Ratio.of(*in_turns(sides, turns)), START_GOAL)
 
 

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.validation.studies.filters import rmse
 from mrt_mitsuba.validation.tools.scenery import LOCAL, SCENES, SPP, load
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.timing import in_turns, timed
@@ -56,11 +57,6 @@ def run(study: Study, *, quick: bool) -> None:
     study.records("equal-error", title, rows, note, first=True)
 
 
-def rmse(picture: np.ndarray, truth: np.ndarray) -> float:
-    """Return the root of the mean squared difference."""
-    return float(np.sqrt(np.mean(np.square(picture - truth, dtype=np.float64))))
-
-
 def measure(scene: Any, repeats: int) -> tuple[Any, ...]:
     """Render by ``mi.render``, with ``aamode="noise"``, and to the error of the first, in turns.
 
@@ -86,7 +82,8 @@ def measure(scene: Any, repeats: int) -> tuple[Any, ...]:
     for kind in kinds:
         kind(1000)  # compiles
     found = []
-    for side in in_turns([lambda seed, kind=kind: timed(lambda: kind(seed)) for kind in kinds], repeats):
+    sides = [lambda seed, kind=kind: timed(lambda: kind(seed)) for kind in kinds]
+    for side in in_turns(sides, repeats):
         pictures, rays = zip(*(result for result, _ in side), strict=True)
         mean = np.asarray(np.mean(pictures, axis=0, dtype=np.float64))
         squares = [rmse(picture, mean) ** 2 * repeats / (repeats - 1) for picture in pictures]

@@ -63,11 +63,12 @@ def _crowded(lights: int) -> Scene:
     for i in range(330):
         place, radius = rng.uniform(-2, 2, 3), float(rng.uniform(0.08, 0.2))
         first, end = (tuple(p.tolist()) for p in (place, place + 0.5 * rng.normal(size=3)))
-        kind, make, ends = (
-            ("spheres", Sphere, (first,)),
-            ("cones", Cone, (first, end)),
-            ("cylinders", Cylinder, (first, end)),
-        )[i % 3]
+        rows: list[Any] = [
+            ("spheres", Sphere, [first]),
+            ("cones", Cone, [first, end]),
+            ("cylinders", Cylinder, [first, end]),
+        ]
+        kind, make, ends = rows[i % 3]
         things[kind].append(make(*ends, radius, (GREY, SHINY)[i % 5 == 0]))
     places = 6 * rng.normal(size=(lights, 3)) + [0, 6, 6]
     lamps = tuple(Light(tuple(p.tolist()), (1.2 / lights, 1.2 / lights, 1.44 / lights)) for p in places)
@@ -162,7 +163,8 @@ def pictures(study: Study, *, quick: bool) -> None:
     """Judge our pictures of all scenes."""
     rows: list[dict[str, Any]] = []
     for name, case in study.each("Scenes in float64", CASES.items()):
-        size, form = case.quick if quick else case.size, {"fresnel": case.fresnel}
+        size = case.quick if quick else case.size
+        form: dict[str, Any] = {"fresnel": case.fresnel}
         image = draw(case.scene, size, **form)
         error, reason = judge(image, case.scene, **form)
         hold(study, name, error, reason)

@@ -154,7 +154,8 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
 
 def other_ways(extent: Extent) -> Iterator[Pair]:
     """Yield searches by our tree against Mitsuba's, what a plan leaves out, and a sweep against a loop."""
-    count, size = extent.growth, {"width": extent.width, "height": extent.height}
+    count = extent.growth
+    size: dict[str, Any] = {"width": extent.width, "height": extent.height}
 
     def of_crowd(kind: str, **options: Any) -> Run:
         return partial(mrt.render, load(renders.crowd(count, kind, **size)), **PLAIN | options)

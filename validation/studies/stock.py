@@ -58,7 +58,7 @@ def direct(study: Study, *, quick: bool) -> None:
             theirs = mrt.render(loaded, integrator="direct", **AT_CENTRES).image
             near = ~(one.layers["depth.Z"] > NEAR) | np.isinf(one.layers["depth.Z"])
             error = (np.abs(one.image - theirs) / (1 + theirs)).max(axis=-1)[near]
-            seen = float((one.image > 0.05).any(axis=-1)[near].mean())
+            seen = float((one.image.max(axis=-1) > 0.05)[near].mean())
             figures = {"median": float(np.median(error)), "99.9 %": float(np.quantile(error, 0.999))}
             off = float(np.mean(error > DIRECT_TOLERANCE))
             found.append(

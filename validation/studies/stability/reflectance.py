@@ -30,7 +30,7 @@ COSINES = np.array([1, 0.5, 0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7])
 IN_BOUND = -np.log(1e-7)
 STEEPNESS = np.array([0, 0.1, 1, 4, 9, IN_BOUND, 25, 35, -np.log(1e-20)])
 IORS = np.array([1.5, 1.33, 3, 1 + 1e-7, 1 - 1e-7, 0.5, 1e-3, 1e6], np.float32)
-FRESNEL_IORS = np.float32(
+FRESNEL_IORS = np.array(
     [
         1e-3,
         1e-2,
@@ -46,7 +46,8 @@ FRESNEL_IORS = np.float32(
         1.5,
         3,
         *10.0 ** np.arange(1, 7),
-    ]
+    ],
+    np.float32,
 )
 
 # What is measured, with its limits. The first holds where D is at least 1e-7 of its peak, for alpha 1e-4 … 1:
@@ -206,15 +207,15 @@ def mrt_bsdf(wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
 
 # --------------------------------------------- Every cosine -----------------------------------------------
 
+
+def _g1(alpha: float) -> Callable[[Any], Any]:
+    return lambda c: microfacet.smith_g1(Columns((dr.sqrt((1 - c) * (1 + c)), c * 0, c)), alpha)
+
+
 OF_COSINE: dict[str, Callable[[Any], Any]] = {
     "Schlick, F0 = 0.04": lambda c: fresnel.fresnel_schlick(c, float(np.float32(0.04))),
     "exact Fresnel, into n = 1.5": lambda c: fresnel.fresnel_dielectric(c, 1.0, 1.5),
-    **{
-        f"Smith's G1, alpha = {alpha:g}": lambda c, alpha=float(alpha): microfacet.smith_g1(
-            Columns((dr.sqrt((1 - c) * (1 + c)), c * 0, c)), alpha
-        )
-        for alpha in np.float32([0.05, 0.2, 1])
-    },
+    **{f"Smith's G1, alpha = {alpha}": _g1(float(np.float32(alpha))) for alpha in (0.05, 0.2, 1.0)},
 }
 ONE, LEAST = 0x3F800000, 0x00800000  # the bits of 1, and of the least number with all its digits
 CHUNK = 2**24
