@@ -30,25 +30,7 @@ COSINES = np.array([1, 0.5, 0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7])
 IN_BOUND = -np.log(1e-7)
 STEEPNESS = np.array([0, 0.1, 1, 4, 9, IN_BOUND, 25, 35, -np.log(1e-20)])
 IORS = np.array([1.5, 1.33, 3, 1 + 1e-7, 1 - 1e-7, 0.5, 1e-3, 1e6], np.float32)
-FRESNEL_IORS = np.array(
-    [
-        1e-3,
-        1e-2,
-        0.1,
-        0.5,
-        0.9,
-        0.99,
-        1 - 1e-7,
-        1 + 1e-7,
-        1.0001,
-        1.01,
-        1.33,
-        1.5,
-        3,
-        *10.0 ** np.arange(1, 7),
-    ],
-    np.float32,
-)
+FRESNEL_IORS = np.array([*IORS, 1e-2, 0.1, 0.9, 0.99, 1.0001, 1.01, *10.0 ** np.arange(1, 6)], np.float32)
 
 # What is measured, with its limits. The first holds where D is at least 1e-7 of its peak, for alpha 1e-4 … 1:
 # 80 roundings, for the argument of exp is up to 16 there, and its error is multiplied by as much. The second
