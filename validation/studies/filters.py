@@ -49,15 +49,8 @@ class Extent(NamedTuple):
     lens: tuple[int, int, int, int]  # width, height, aa and samples
 
 
-FULL = Extent(
-    range(5),
-    (2, 4, 8),
-    32,
-    (400, 300),
-    (200, 150, 64),
-    (2, 4, 8, 16, 32, 64),
-    (400, 300, 4, 32),
-)
+NOISE = (2, 4, 8, 16, 32, 64)
+FULL = Extent(range(5), (2, 4, 8), 32, (400, 300), (200, 150, 64), NOISE, (400, 300, 4, 32))
 QUICK = Extent((0, 3), (2, 4), 16, (120, 90), (80, 60, 16), (4, 16), (128, 96, 3, 12))
 
 
