@@ -88,7 +88,7 @@ print("integral of pdf() by uniform directions:", dr.mean(bsdf.pdf(ctx, si, wo))
 @figures(
     cells=("at least", "chance of such counts if samples follow pdf(), the least of {angles} angles, for "
            "their number", LEVEL, RARE, SAMPLING),
-    integral=("at most", f"integral of pdf() less the share of samples it stands for, beyond {SIGMAS} "
+    integral=("most", f"integral of pdf() less the share of samples it stands for, beyond {SIGMAS} "
               "standard errors", FIT, "rational fits of Smith's G1 in use are off by 0.35 %", NORMALISED),
     small=("at least", "chance of such counts of all angles in cells of a degree, for their number",
            LEVEL, RARE, SAMPLING),
@@ -102,6 +102,7 @@ def sampling(law: Law, case: Case) -> None:
     case.need_smooth()
     tests, sums, beyond = [], np.zeros((6, 2)), []
     for view, found in case.densities:
+        beyond.append(0.0)
         if found is None:
             continue
         (codes, share), count = view.judged, len(view.density) - view.pilot
@@ -109,19 +110,19 @@ def sampling(law: Law, case: Case) -> None:
         sums += by_width
         tests += [(float(stats.chi2.sf(*test)), view, cell) for test in by_width]
         off = np.sqrt(share * (1 - share) / count + found.variance.sum())
-        beyond.append((max(abs(share - found.mean.sum()) - SIGMAS * off, 0), view))
+        beyond[-1] = max(abs(share - found.mean.sum()) - SIGMAS * off, 0)
     if not tests:
         raise Skip(f"{UNRESOLVED} at every angle")
     p, view, cell = min(tests, key=lambda test: test[0])
     p = sidak(min(p, *stats.chi2.sf(*sums.T)), len(tests) + len(sums))  # of all angles together, too
-    law.hold("cells", p, wi=view.wi, uv=view.uv, cell=cell, angles=len(beyond))
-    most, view = max(beyond, key=lambda pair: pair[0])
-    law.hold("integral", most, wi=view.wi, uv=view.uv)
+    judged = len(tests) // len(sums)
+    law.hold("cells", p, wi=view.wi, uv=view.uv, cell=cell, angles=judged)
+    law.hold("integral", beyond, **case.incidence)
     views = [view for view in case.views if 0 < view.density.max() < BROAD]
     if views and not case.quick and not is_scalar():
         _in_small_cells(law, case, views)
-    if len(beyond) < len(case.views):
-        law.notes.append(f"{UNRESOLVED} at {len(case.views) - len(beyond)} angles, which are left out")
+    if judged < len(case.views):
+        law.notes.append(f"{UNRESOLVED} at {len(case.views) - judged} angles, which are left out")
 
 
 def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
@@ -158,7 +159,7 @@ AGAIN = "the same formula, evaluated once more at a rounded direction"
 @figures(
     density=("most", f"density of a sample against pdf(), {BEYOND}", POINTWISE, AGAIN, WEIGHT),
     weight=("most", f"weight of a sample against eval() / pdf(), {BEYOND}", POINTWISE, AGAIN, WEIGHT),
-    discrete=("at most", f"probability of a single direction (delta) less its share, beyond {SIGMAS} "
+    discrete=("most", f"probability of a single direction (delta) less its share, beyond {SIGMAS} "
               "standard errors", POINTWISE, "a count", DISCRETE),
 )  # fmt: skip
 def weights(law: Law, case: Case) -> None:
@@ -180,18 +181,16 @@ def weights(law: Law, case: Case) -> None:
         for name, stated, function in (("density", drawn.pdf, case.pdf), ("weight", drawn.weight, ratio)):
             error = excess(stated, function(*at), case.spread(function, *at))
             law.hold(name, np.where(counts, error, 0), **names)
-    off = []
-    for view in case.views:
-        s = view.samples
+    off, deltas = np.zeros(len(case.views)), False
+    for i, s in enumerate(view.samples for view in case.views):
         for kind in np.unique(s.component[s.delta] * 4096 + s.type[s.delta]):
             here = s.delta & (s.component * 4096 + s.type == kind)
             stated = float(np.nan_to_num(s.pdf[here].mean()))
-            error = np.sqrt(max(stated * (1 - stated), 0) / len(here))
+            sigma = np.sqrt(max(stated * (1 - stated), 0) / len(here))
             if s.lit[here].any():
-                off.append((max(abs(here.mean() - stated) - SIGMAS * error, 0), view))
-    if off:
-        most, view = max(off, key=lambda pair: pair[0])
-        law.hold("discrete", most, wi=view.wi, uv=view.uv)
+                off[i], deltas = max(abs(here.mean() - stated) - SIGMAS * sigma, off[i]), True
+    if deltas:
+        law.hold("discrete", off, **case.incidence)
     if not law.parts:
         raise Skip("no direction of incidence has samples")
 
@@ -206,9 +205,9 @@ print("these by uniform directions:", dr.mean(bsdf.eval(ctx, si, wo), axis=1) * 
 
 
 @figures(
-    largest=("at most", f"largest albedo, less {SIGMAS} standard errors", 1 + FIT,
+    largest=("most", f"largest albedo, less {SIGMAS} standard errors", 1 + FIT,
              "no more light leaves than arrives; 0.5 % for fits of G1", ALBEDO),
-    apart=("at most", "albedo by quadrature of eval() against mean weight, relative, beyond "
+    apart=("most", "albedo by quadrature of eval() against mean weight, relative, beyond "
            f"{SIGMAS} standard errors", 2 * FIT, "0.5 % for fits of G1 in the density", ALBEDO),
 )  # fmt: skip
 def energy(law: Law, case: Case) -> None:
@@ -217,22 +216,20 @@ def energy(law: Law, case: Case) -> None:
     In the mode of importance, in which transmitted energy is not rescaled.
     """
     # that surely reached near the horizon, where lobes peak, by samples alone
-    count, brightest, apart = case.count(2**12, 2**14), [], []
-    for angle in GRAZING:
-        wi, uv = direction(np.cos(np.radians(angle)), case.rng.uniform(0, 2 * np.pi)), case.uniform(2)
-        drawn = case.sample(wi, case.uniform(count, 3), uv, context(importance=True))
-        mean, error = _mean(drawn.weight)
-        brightest.append((float((mean - SIGMAS * error).max()), wi, uv))
+    count, albedos, apart = case.count(2**12, 2**14), [], []
+    wi = direction(np.cos(np.radians(GRAZING)), case.rng.uniform(0, 2 * np.pi, len(GRAZING)))
+    uv = case.uniform(len(GRAZING), 2)
+    for i, t in zip(wi, uv, strict=True):
+        mean, error = _mean(case.sample(i, case.uniform(count, 3), t, context(importance=True)).weight)
+        albedos.append((mean - SIGMAS * error).max())
     for view, density in case.densities:
         albedo, off = _albedo(case, view, density)
-        brightest.append((albedo, view.wi, view.uv))
-        if off is not None:
-            apart.append((off, view))
-    albedo, wi, uv = max(brightest, key=lambda found: found[0])
-    law.hold("largest", albedo, wi=wi, uv=uv)
-    if apart:
-        most, view = max(apart, key=lambda found: found[0])
-        law.hold("apart", most, wi=view.wi, uv=view.uv)
+        albedos.append(albedo)
+        apart.append(off)
+    wi, uv = np.concatenate([wi, case.incidence["wi"]]), np.concatenate([uv, case.incidence["uv"]])
+    law.hold("largest", albedos, wi=wi, uv=uv)
+    if not np.isnan(apart).all():
+        law.hold("apart", np.nan_to_num(apart), **case.incidence)
 
 
 def _mean(weight: Array) -> tuple[Array, Array]:
@@ -241,15 +238,15 @@ def _mean(weight: Array) -> tuple[Array, Array]:
     return weight.mean(axis=0), weight.std(axis=0) / np.sqrt(len(weight))
 
 
-def _albedo(case: Case, view: View, cells: Cells | None) -> tuple[float, float | None]:
-    """Return an albedo that is surely reached, and by how much sampling and quadrature differ, if known."""
+def _albedo(case: Case, view: View, cells: Cells | None) -> tuple[float, float]:
+    """Return an albedo that is surely reached, and how far sampling and quadrature differ; NaN: unknown."""
     mode, count, drawn, holes = context(importance=True), len(view.density), view.samples, []
     if (drawn.wo[:, 2] * view.wi[2] < 0).any():
         drawn = case.sample(view.wi, case.uniform(count, 3), view.uv, mode)
     mean, error = _mean(drawn.weight)
     least = float((mean - SIGMAS * error).max())
     if cells is None:
-        return least, None
+        return least, np.nan
 
     def value(wo: Array) -> Array:
         values = case.eval(view.wi, wo, view.uv, mode)
@@ -263,7 +260,7 @@ def _albedo(case: Case, view: View, cells: Cells | None) -> tuple[float, float |
     least = max(least, float((by_cells + mean - by_samples - SIGMAS * (error + other)).max()))
     both = np.maximum(np.maximum(by_samples, by_cells), 1e-3)
     off = np.maximum(np.abs(by_samples - by_cells) - SIGMAS * np.hypot(error, other), 0) / both
-    return least, float(off.max()) if max(holes) < 0.01 else None  # else the law ``finite`` says why
+    return least, float(off.max()) if max(holes) < 0.01 else np.nan  # then the law ``finite`` says why
 
 
 # ----------------------------------------------- Values --------------------------------------------------
@@ -425,7 +422,9 @@ def finite(law: Law, case: Case) -> None:
     pool = direction(np.repeat(cosines, 6), np.tile([0, np.pi / 2, np.pi, -np.pi / 2, 0.7, 4], len(cosines)))
     rng, count = case.rng, case.count(2**14, 2**17)
     wi, any_ = pool[rng.integers(len(pool), size=(2, count))]
-    wo = np.choose(rng.integers(4, size=count)[:, None], [any_, wi * np.float32([-1, -1, 1]), -wi, wi])
+    wo = np.choose(
+        rng.integers(4, size=count)[:, None], [any_, wi * np.array([-1, -1, 1], np.float32), -wi, wi]
+    )
     u = np.where(rng.random((count, 3)) < 0.6, rng.choice(UNIFORM, (count, 3)), case.uniform(count, 3))
     uv = np.where(rng.random((count, 2)) < 0.3, rng.integers(0, 2, (count, 2)), rng.random((count, 2)))
     extremes = wi, wo, u.astype(np.float32), uv.astype(np.float32)

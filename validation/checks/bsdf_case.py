@@ -97,11 +97,15 @@ class Case(Subject, Probe):
     @cached_property
     def drawn(self) -> tuple[Samples, dict[str, Array]]:
         """The first samples of all views, and what they were drawn with."""
-        few, views = slice(0, self.count(2**12, 2**13)), self.views
-        names = {"u": np.concatenate([view.u[few] for view in views])}
-        for name in ("wi", "uv"):
-            names[name] = np.concatenate([np.tile(getattr(v, name), (len(v.u[few]), 1)) for v in views])
-        return joined([view.samples.only(few) for view in views]), names
+        each = self.count(2**12, 2**13)
+        names = {name: np.repeat(rows, each, axis=0) for name, rows in self.incidence.items()}
+        names["u"] = np.concatenate([view.u[:each] for view in self.views])
+        return joined([view.samples.only(slice(0, each)) for view in self.views]), names
+
+    @cached_property
+    def incidence(self) -> dict[str, Array]:
+        """The directions of incidence and texture coordinates of all views."""
+        return {name: np.array([getattr(view, name) for view in self.views]) for name in ("wi", "uv")}
 
     @cached_property
     def densities(self) -> list[tuple[View, Integrals | None]]:
@@ -161,7 +165,8 @@ class Case(Subject, Probe):
         for side in (wi[:, 2] > 0, wi[:, 2] < 0):
             known = across & side & np.isfinite(samples.eta)
             eta[side & crosses] = np.median(samples.eta[known]) if known.any() else 1
-        return Pairs(wi, wo, uv, *self.both(wi, wo, uv), np.where(across, samples.eta, eta))
+        eta = np.where(across, samples.eta, eta)
+        return Pairs(*[wi, wo, uv, *self.both(wi, wo, uv), eta])
 
     @cached_property
     def lit(self) -> Pairs:

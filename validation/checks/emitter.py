@@ -77,7 +77,7 @@ class Case(Subject):
             found = lanes(call, ("Point3f", points), ("Point2f", self.uniform(len(points), 2)))
         except (NotImplementedError, RuntimeError) as error:
             raise Skip(f"directions cannot be sampled: {reason(error)}") from error
-        return Samples(*found, (found[6] != 0).any(axis=1))
+        return Samples(*[*found, (found[6] != 0).any(axis=1)])
 
     def seen(self, d: Array) -> tuple[Array, Array]:
         """Return the density of directions [N] and the light that is seen there [N, channels]."""

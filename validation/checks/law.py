@@ -88,7 +88,7 @@ class Law:
     figures: Mapping[str, Figure] = field(default_factory=dict)
     program: Callable[..., str] | None = None  # writes snippets, while the law is checked
 
-    def hold(self, name: str, measured: Any, *, limit: float | None = None, **names: Any) -> None:
+    def hold(self, name: str, measured: Any, *, limit: Any = None, **names: Any) -> None:
         """Hold a figure, a number or N errors, to its limit.
 
         ``names`` fill its words and its snippet: values, or arrays that have a row for each error.

@@ -133,7 +133,7 @@ def surface(law: Law, case: Case) -> None:
     again = trace(case.target, before, d)
     missed = ~again.found | (np.linalg.norm(again.p - met.p, axis=1) >= 1e-3 * case.size)
     law.hold("missed", missed, o=before, d=d)
-    few, scale = slice(0, case.count(300, 1000)), np.abs(o).max(axis=1) + met.t
+    first, scale = slice(0, case.count(300, 1000)), np.abs(o).max(axis=1) + met.t
     for what, pick, size in (
         ("distance", lambda h: h.t, scale),
         ("hit point", lambda h: h.p.sum(axis=1), scale),
@@ -143,8 +143,8 @@ def surface(law: Law, case: Case) -> None:
         def function(x: Array, pick: Any = pick) -> Array:
             return np.asarray(pick(trace(case.target, x[:, :3], x[:, 3:])))
 
-        inputs = np.concatenate([o[few], d[few]], axis=1)
-        found = noise.measure(function, inputs, size=size[few], strides=(64,), seed=case.seed)
+        inputs = np.concatenate([o[first], d[first]], axis=1)
+        found = noise.measure(function, inputs, size=size[first], strides=(64,), seed=case.seed)
         law.hold("noise", found.lost, o=o, d=d, what=what)
 
 

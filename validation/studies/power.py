@@ -20,7 +20,7 @@ TITLE = "The least faults that the laws of plugins find"
 DIFFUSE, GLOSS = {"type": "diffuse"}, {"type": "roughconductor", "alpha": 0.2}
 PLACE = (0.48, 0.36, 0.8)  # a direction away from all axes
 DEGREE = 0.01745
-AS_IS = ({}, "", lambda value, *_: value)
+AS_IS: tuple[dict[str, Any], str, Any] = ({}, "", lambda value, *_: value)
 
 
 def changed_bsdf(changes: Mapping[str, tuple[dict[str, Any], str, Any]]) -> type:
