@@ -34,8 +34,8 @@ def changed_bsdf(changes: Mapping[str, tuple[dict[str, Any], str, Any]]) -> type
     class Changed(mi.BSDF):
         def __init__(self, props: Any) -> None:
             mi.BSDF.__init__(self, props)
-            (self.nested,) = (value for _, value in props.items() if isinstance(value, mi.BSDF))
-            _, self.kind, self.change = changes.get(props["change"], AS_IS)
+            self.nested, name = props["nested"], props["change"]
+            _, self.kind, self.change = changes.get(name, AS_IS)[:3]
             more = self.change if self.kind == "flags" else 0
             count = self.nested.component_count()
             self.m_components = [int(self.nested.flags(i)) | more for i in range(count)]
