@@ -38,7 +38,7 @@ from mrt_mitsuba.validation.checks.probe import (
     is_scalar,
     unit,
 )
-from mrt_mitsuba.validation.checks.sphere import Cells, chi_square, encode, integrate
+from mrt_mitsuba.validation.checks.sphere import DEPTH, Cells, chi_square, encode, integrate
 from mrt_mitsuba.validation.checks.subject import elsewhere, other_kind
 from mrt_mitsuba.validation.tools.image_tests import sidak
 
@@ -130,7 +130,8 @@ def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
     wo, omega = cells.points(case.rng)
     seen, expected, variance = np.zeros((3, len(omega)))
     for view in views:
-        seen += np.bincount(cells.find(encode(view.samples.wo[view.density > 0])), minlength=len(omega))
+        codes = encode(view.samples.wo[view.density > 0]) // 4 ** (DEPTH - SMALL)
+        seen += np.bincount(codes, minlength=len(omega))
         pdf = case.pdf(view.wi, wo.reshape(-1, 3), view.uv).reshape(omega.shape) * omega
         count = len(view.density) * omega.shape[1]
         expected, variance = expected + count * pdf.mean(axis=1), variance + count**2 * pdf.var(axis=1)
