@@ -42,7 +42,8 @@ def poisoned() -> None:
 @pytest.fixture
 def scene(tmp_path: Path) -> Any:
     """Writes the scene with a BSDF on its ball."""
-    inside = {"diffuse": "", "poisoned": '<string name="change" value="poison"/><bsdf type="diffuse" name="nested"/>'}
+    poison = '<string name="change" value="poison"/><bsdf type="diffuse" name="nested"/>'
+    inside = {"diffuse": "", "poisoned": poison}
 
     def write(bsdf: str) -> str:
         path = tmp_path / "scene.xml"

@@ -179,8 +179,8 @@ def weights(law: Law, case: Case) -> None:
         return value / np.where(pdf > 0, pdf, np.inf)[:, None]
 
     if not drawn.delta.all():
-        for name, stated, function in (("density", drawn.pdf, case.pdf), ("weight", drawn.weight, ratio)):
-            error = excess(stated, function(*at), case.spread(function, *at))
+        for name, given, function in (("density", drawn.pdf, case.pdf), ("weight", drawn.weight, ratio)):
+            error = excess(given, function(*at), case.spread(function, *at))
             law.hold(name, np.where(counts, error, 0), **names)
     off, deltas = np.zeros(len(case.views)), False
     for i, s in enumerate(view.samples for view in case.views):

@@ -19,7 +19,7 @@ DEPTH = 17  # the finest cell is a hundred times what float32 rounding moves a d
 SIDE = 6
 POINTS = SIDE**2  # at which a cell is integrated
 HEMISPHERE = 4**DEPTH  # codes of each
-_SPREAD = sum((np.arange(2**DEPTH) >> k & 1) << 2 * k for k in range(DEPTH))  # bits with gaps in between
+_SPREAD = np.sum([(np.arange(2**DEPTH) >> k & 1) << 2 * k for k in range(DEPTH)], axis=0)  # bits with gaps
 
 
 def encode(wo: Array) -> Array:
