@@ -381,7 +381,7 @@ def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path: Pa
     errors = {row["seed"]: row["error"] for row in table.failed}
     assert errors.keys() == {1, 3, 4} and errors[1] == "RuntimeError: out of luck"
     assert errors[3] == errors[4] and "every worker that rendered it died, perhaps for want of" in errors[3]
-    assert table.rows[1]["attempts"] == table.rows[2]["attempts"] == 2
+    assert table.rows[1]["attempts"] == 2 <= table.rows[2]["attempts"]
     assert len(pictures(out)) == 17 and not left_over(out)
 
 
