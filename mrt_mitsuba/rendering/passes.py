@@ -199,7 +199,7 @@ class Passes:
 
     def _blur(self, step: Pass) -> None:
         """Blur the picture, and note by how much."""
-        focus = {"focal_distance": self._plan.focus.distance, "focal_range": self._plan.focus.range}
+        focus: Any = {"focal_distance": self._plan.focus.distance, "focal_range": self._plan.focus.range}
         amount = self._add("blur") if "blur" in self._plan.layers else None
         with self._job.stage(step.name, len(self._pixels), "Computing depth of field..") as advance:
             for rows in self._blurring(self.layers["image"]):
@@ -213,7 +213,11 @@ class Passes:
         What the next band sees of this one is kept as it was.
         """
         depth, above, focus = self.layers["depth"][..., 0], image[:0], self._plan.focus
-        options = {"focal_distance": focus.distance, "focal_range": focus.range, "mode": str(self._plan.blur)}
+        options: Any = {
+            "focal_distance": focus.distance,
+            "focal_range": focus.range,
+            "mode": str(self._plan.blur),
+        }
         for rows, seen, inner in self._bands(dof.REACH):
             sharp = image[rows.start : seen.stop]
             if len(above):
