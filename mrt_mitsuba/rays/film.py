@@ -52,6 +52,8 @@ class Film:
     sensor: Any
     width: int  #: pixels that are sampled in a row
     height: int  #: rows that are sampled
+    shape: tuple[int, int]  #: rows and columns that are sampled
+    pixels: int  #: number of pixels that are sampled
     border: int  #: pixels that are sampled around the picture, and are no part of it
     reach: int  #: pixels on either side to which a ray contributes
     alpha: bool  #: does it keep the coverage
@@ -68,17 +70,8 @@ class Film:
         width, height = (int(n) + 2 * border for n in film.crop_size())
         alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
         grey = pixel_format(film) in ("luminance", "y", "ya")
-        return cls(sensor, width, height, border, reach, alpha, grey, spectral_bands(film))
-
-    @property
-    def pixels(self) -> int:
-        """Number of pixels that are sampled."""
-        return self.width * self.height
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns that are sampled."""
-        return self.height, self.width
+        size, bands = (height, width), spectral_bands(film)
+        return cls(sensor, width, height, size, width * height, border, reach, alpha, grey, bands)
 
     def picture(self, sampled: np.ndarray) -> np.ndarray:
         """Return what lies in the picture, of an array [..., rows, columns, channels]."""

@@ -62,7 +62,7 @@ class Passes:
         for step in plan.passes:
             if step.name == FIRST_HITS:
                 self._trace(step, plan.first_hit(self._frame))
-            elif step.name == RENDERING and plan.on_film:
+            elif step.name in (RENDERING, REFINEMENT) and plan.on_film:
                 self._expose(step)
             elif step.name == RENDERING:
                 # a detector must see no noise: it looks at the centre of each pixel, at the same times
@@ -71,10 +71,7 @@ class Passes:
             elif step.name == EDGES:
                 self._detect(step)
             elif step.name == REFINEMENT:
-                if plan.on_film:
-                    self._expose_edges(step)
-                else:
-                    self._trace(step, plan.places(self._seed, self._frame, step.first))
+                self._trace(step, plan.places(self._seed, self._frame, step.first))
             elif step.name == BLUR:
                 self._blur(step)
             elif step.name == ROUNDS:
@@ -111,35 +108,31 @@ class Passes:
     # --------------------------------------------- Films --------------------------------------------
 
     def _expose(self, step: Pass) -> None:
-        """Expose every pixel alike."""
-        exposer, rays = self._exposer(step), self._film.rays_near(step.samples * step.repeats)
+        """Expose every pixel alike, or those at edges further."""
+        exposer, film, message = self._exposer(step), self._film, ""
+        rays, moments = film.rays_near(step.samples * step.repeats), "square" in step.layers
         if self._plan.whole:
             wholes = Wholes(exposer, self._seed)
             with self._job.stage(step.name, wholes.cost([rays])) as advance:
                 wholes.trace([rays], advance)
             self._develop(exposer, wholes)
             return
-        moments = "square" in step.layers
-        self._stack = Stack(self._film, 1, len(exposer.names))
-        with self._job.stage(step.name, len(self._near) * rays) as advance:
-            exposed = exposer.expose(Groups(rays, self._near), self._seed, moments=moments, advance=advance)
-            self._stack.add(exposed, np.ones_like(exposed.rays))
+        if step.name == RENDERING:
+            self._stack = Stack(film, 1, len(exposer.names))
+            seed, pixels, chosen = self._seed, self._near, np.ones((1, film.pixels), bool)
+        else:
+            seed, message = self._seed + 1, "Computing Anti aliasing.."
+            found = np.zeros((self._plan.height, self._plan.width), bool)
+            found[self._seen] = self.layers["samples"][..., 0] > 1
+            chosen = np.pad(found, film.border).reshape(1, -1)
+            pixels = np.flatnonzero(self._stack.widened(chosen)[0])
+        with self._job.stage(step.name, len(pixels) * rays, message) as advance:
+            exposed = exposer.expose(Groups(rays, pixels), seed, moments=moments, advance=advance)
+            self._stack.add(exposed, chosen)
         if moments:
             mean, square = exposed.total[0] / rays, exposed.square[0] / rays
-            variance = np.maximum(square - mean**2, 0) / (rays - 1) * self._film.averaging
-            self._set("square", self._film.picture(variance))
-        self._develop(exposer, self._stack)
-
-    def _expose_edges(self, step: Pass) -> None:
-        """Expose the pixels at edges further."""
-        film, rays = self._film, self._film.rays_near(step.samples * step.repeats)
-        found = np.zeros((self._plan.height, self._plan.width), bool)
-        found[self._seen] = self.layers["samples"][..., 0] > 1
-        found = np.pad(found, film.border).reshape(1, -1)
-        exposer, pixels = self._exposer(step), np.flatnonzero(self._stack.widened(found)[0])
-        with self._job.stage(step.name, len(pixels) * rays, "Computing Anti aliasing..") as advance:
-            exposed = exposer.expose(Groups(rays, pixels), self._seed + 1, advance=advance)
-            self._stack.add(exposed, found)
+            variance = np.maximum(square - mean**2, 0) / (rays - 1) * film.averaging
+            self._set("square", film.picture(variance))
         self._develop(exposer, self._stack)
 
     def _run_rounds(self, step: Pass, goal: Goal) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import groupby
 from typing import Any, NamedTuple
 
@@ -94,12 +93,15 @@ class Plan:
     kernel: KernelPlan | None  #: what the tracing kernels hold; None where the integrator does not say
     parts: SceneFacts | None  #: what the kernels depend on
     region: Region  #: that is returned
+    seen: Region  #: with the pixels around it that filters look at
     lattice: Lattice  #: where the samples of a pixel lie
+    on_film: bool  #: is a film exposed by its own rules, rather than a lattice
     detector: str | None  #: edge detector; None where every pixel gets all samples at once
     blur: str | None  #: depth-of-field mode
     repeats: int  #: rays for each sample
     motion: str | None  #: "frames", "stratified", or None where the camera stands still
     motion_samples: int  #: moments while the shutter is open
+    frames: int  #: pictures to average, each with filters of its own
     layers: frozenset[str]  #: that are returned
     passes: tuple[Pass, ...]  #: over the picture, in their order
     left_out: tuple[Omission, ...]  #: what, and why
@@ -112,17 +114,6 @@ class Plan:
             more = len(self.film.bands + self.film.aovs) if self.film else 0
             channels += (ROUND_CHANNELS if ROUNDS in {step.name for step in self.passes} else 28) + 5 * more
         return channels
-
-    @cached_property
-    def seen(self) -> Region:
-        """The region with the pixels around it that filters look at."""
-        reach = (edges.REACH if self.detector else 0) + (dof.REACH if self.blur else 0)
-        return self.region.grown(reach, self.width, self.height)
-
-    @property
-    def on_film(self) -> bool:
-        """Is a film exposed by its own rules, rather than a lattice."""
-        return self.lattice.kind == FILM
 
     def places(self, seed: int, frame: int | None = None, first: int = 0) -> Places:
         """Return the lattice's samples from ``first`` on; ``frame``: of the only moment that is seen."""
@@ -142,11 +133,6 @@ class Plan:
     def first_hit(self, frame: int | None) -> Places:
         """Return the pixel's centre when the shutter opens, or at the moment of the frame."""
         return Places(moments=int(self.motion is not None), phase=(frame or 0) / self.motion_samples)
-
-    @property
-    def frames(self) -> int:
-        """Pictures to average, each with filters of its own."""
-        return self.motion_samples if self.motion == "frames" and (self.detector or self.blur) else 1
 
     def __str__(self) -> str:
         lines = [f"Plan for {self.scene}, {self.width}x{self.height}, {self.integrator} in {self.variant}"]
@@ -181,13 +167,16 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
     aamode, on_film = str(settings.aamode), lattice.kind == FILM
     asked, possible = _layers(settings, shader)
     detector = aamode if aamode in DETECTORS and (lattice.aa > 1 or "edges" in asked) else None
-    repeats, moments = int(settings.spp or 1), settings.motionsamples
+    repeats, moments = int(settings.spp or 1), settings.motionsamples if settings.motion else 1
     if settings.motion and on_film and aamode != NOISE:  # on a film, each ray has a moment of its own
         least = -(-moments // lattice.count)
         repeats = repeats * moments if settings.motionmode == "frames" else max(repeats, least)
     traced = _traced(asked & shader.layers, focus, detector, shader, settings)
     passes = _passes(traced, lattice, detector, repeats, shader, settings)
-    passes += (Pass(BLUR, mode=settings.dof),) if focus.distance else ()
+    blur = settings.dof if focus.distance else None
+    passes += (Pass(BLUR, mode=blur),) if blur else ()
+    motion = (FILM if on_film else settings.motionmode) if settings.motion else None
+    reach = edges.REACH * bool(detector) + dof.REACH * bool(blur)
     made = {step.name for step in passes}
     region = Region(*(settings.region or (0, 0, source.width, source.height)))
     if region.x + region.width > source.width or region.y + region.height > source.height:
@@ -205,12 +194,15 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
         kernel=shader.kernel,
         parts=shader.facts,
         region=region,
+        seen=region.grown(reach, source.width, source.height),
         lattice=lattice,
+        on_film=on_film,
         detector=detector,
-        blur=settings.dof if focus.distance else None,
+        blur=blur,
         repeats=repeats,
-        motion=(FILM if on_film else settings.motionmode) if settings.motion else None,
-        motion_samples=moments if settings.motion else 1,
+        motion=motion,
+        motion_samples=moments,
+        frames=moments if motion == "frames" and (detector or blur) else 1,
         layers=asked | {name for name in possible if made & set(TABLE[name].free_with)},
         passes=passes,
         left_out=_left_out(traced, made, film, shader, settings),
