@@ -110,15 +110,6 @@ def test_frames_are_the_mean_of_renders_from_shifted_cameras(options):
     assert blurred.rays["primary"] == pytest.approx(sum(frame.rays["primary"] for frame in frames), rel=1e-3)
 
 
-def test_frames_without_filters_are_one_wavefront():
-    still = {**SMALL, "aa": 2, "aamode": "none"}
-    mrt.render(0, **still, motion=WAY)
-    many = mrt.render(0, **still, motion=WAY)
-    # one kernel for all rays, one or two for the means; loading a scene may fill small tables
-    assert many.kernel_launches <= 6
-    assert many.rays["primary"] == 16 * 4 * 96 * 72
-
-
 @pytest.mark.parametrize(
     "options", [{"aamode": "none"}, {"aamode": "luma", "aa": 2, "lattice": "report"}], ids=str
 )
@@ -136,16 +127,6 @@ def test_random_frames_draw_numbers_of_their_own(options):
 
 
 # ----------------------------------------------- Stratified -----------------------------------------------
-
-
-def test_stratified_rays_cost_no_more_than_a_still_picture():
-    still = mrt.render(0, **SMALL, aa=4, aamode="none")
-    moving = mrt.render(
-        0, **SMALL, aa=4, aamode="none", motion=WAY, motionsamples=16, motionmode="stratified"
-    )
-    assert moving.rays["primary"] == still.rays["primary"]
-    more = mrt.render(0, **SMALL, aa=4, aamode="none", motion=WAY, motionsamples=17, motionmode="stratified")
-    assert more.rays["primary"] == 2 * still.rays["primary"]
 
 
 @pytest.mark.parametrize(

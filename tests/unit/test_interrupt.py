@@ -58,20 +58,6 @@ def test_error_that_a_library_makes_of_it_is_undone(number: signal.Signals, kind
     assert found.type is kind
 
 
-def test_other_threads_may_use_it() -> None:
-    """Python sets handlers in the main thread only; elsewhere the block just runs."""
-    ran = []
-
-    def run() -> None:
-        with ending_soon(lambda: None):
-            ran.append(True)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    thread.join()
-    assert ran == [True]
-
-
 def test_a_held_interrupt_comes_at_the_end_of_the_block() -> None:
     """Raised while Mitsuba is imported, it ended the process in nanobind's code."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
