@@ -33,7 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         setattr(sys, ("stdin", "stdout", "stderr")[lowest], os.fdopen(lowest, "w" if lowest else "r"))
     os.close(lowest)
     with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *place, **more: _say(f"warning: {message}")
+        warnings.showwarning = lambda message, *place, **more: print(
+            f"mrt: warning: {one_line(str(message))}", file=sys.stderr
+        )
         code = _guarded(words)
     picture = bool(words) and words[0] not in registry.ALL
     if arguments is None and (picture or code in (INTERRUPTED, TERMINATED)):
@@ -91,7 +93,7 @@ def _dispatch(words: list[str]) -> int:
     return render.run(options)
 
 
-def _say(message: str, code: int = 1) -> int:
+def _say(message: str, code: int) -> int:
     print(f"mrt: {one_line(message)}", file=sys.stderr)
     return code
 

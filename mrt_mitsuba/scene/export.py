@@ -81,7 +81,7 @@ def write_xml(
         runtime.use()
         budget = Budget.of(None)
         text, values = rewrite_file(os.fspath(scene), budget, **params or {})
-        focus = {name: values[name] for name in ("focaldist", "focalrange") if name in values}
+        focus: dict[str, Any] = {name: values[name] for name in ("focaldist", "focalrange") if name in values}
         inputs: Iterable[str] = budget.inputs
     else:
         if params:

@@ -87,9 +87,15 @@ def open_scene(
         distance, reach = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
     set_parameters(loaded, keys)
     source = opened(name, loaded, _sensor(name, loaded, sensor), _integrator(integrator, loaded))
-    width, height = size[0] or source.width, size[1] or source.height
-    decided = {"width": width, "height": height, "fresnel": fresnel, "own": not isinstance(terms, Scene)}
-    return replace(source, focal_distance=distance, focal_range=reach, **decided)
+    return replace(
+        source,
+        width=size[0] or source.width,
+        height=size[1] or source.height,
+        focal_distance=distance,
+        focal_range=reach,
+        fresnel=fresnel,
+        own=not isinstance(terms, Scene),
+    )
 
 
 def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
