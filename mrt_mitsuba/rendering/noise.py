@@ -57,7 +57,8 @@ class Halves(Stack):
         self._exposer, self._seed, self._blurred = exposer, seed, blurred
         self._traced = np.zeros((PICTURES, film.pixels))
         self._total = np.zeros((PICTURES, *film.shape, 3), np.float32)
-        self._square, self._peak = np.zeros((2, PICTURES, *film.shape), np.float32)  # means of colours
+        self._square = np.zeros((PICTURES, *film.shape))  # mean of colours, as the next
+        self._peak = np.zeros((PICTURES, *film.shape), np.float32)
         self._bad, self._unfit = np.zeros(film.shape, bool), 0.0
 
     # ------------------------------------------- Rounds ---------------------------------------------
@@ -82,10 +83,12 @@ class Halves(Stack):
             self._bad |= bad.any(0)
             worst = exposed.total[bad].max()
             self._unfit = float(exposed.peak[bad].max() if np.isfinite(worst) else worst)
+            for values in (exposed.total, exposed.square, exposed.peak):
+                values[bad] = 0
         self._traced += exposed.rays
-        self._total += np.where(bad[..., None], 0, exposed.total)
-        self._square += np.where(bad, 0, exposed.square.mean(-1))
-        np.maximum(self._peak, np.where(bad, 0, exposed.peak[..., 0]), out=self._peak)
+        self._total += exposed.total
+        self._square += exposed.square.mean(-1)
+        np.maximum(self._peak, exposed.peak[..., 0], out=self._peak)
         sums, weights, rays = (v[:2] for v in (exposed.sums, exposed.weights, exposed.rays))
         with np.errstate(invalid="ignore"):
             self.add(replace(exposed, sums=sums, weights=weights, rays=rays), chosen[:2] > 0)
@@ -201,7 +204,7 @@ class Halves(Stack):
     def _moments(self, which: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Return the variance of a ray's value, mean of colours, and the rays, [H, W]."""
         rays, total = self.rows(self._traced)[which].sum(0), self._total[which].sum(0)
-        square = self._square[which].sum(0, dtype=np.float64)
+        square = self._square[which].sum(0)
         variance = (square - np.square(total, dtype=np.float64).mean(-1) / rays) / np.maximum(rays - 1, 1)
         return np.where(variance * rays > 1e-6 * square, variance, 0), rays
 
