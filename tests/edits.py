@@ -20,7 +20,7 @@ import mrt_mitsuba as mrt  # before mitsuba: it chooses the LLVM library
 
 EDITS = 6  # of each scene
 # Keys that shape the film, that hold an address of memory, or that edits may not take to any value
-LEFT_ALONE = (
+LEFT_ALONE = [
     "film",
     "sampler",
     "clip",
@@ -32,7 +32,7 @@ LEFT_ALONE = (
     "medium",
     "object_",
     "thread",
-)
+]
 
 Edit = tuple[str, Any]
 
@@ -82,17 +82,7 @@ def _place(rng: random.Random) -> Any:
     return turned.scale(rng.uniform(0.3, 0.8))
 
 
-SHAPES = (
-    "cube",
-    "rectangle",
-    "disk",
-    "cylinder",
-    "sdfgrid",
-    "mrt_cone",
-    "mrt_cylinder",
-    "mrt_mesh",
-    "group",
-)
+SHAPES = ["cube", "rectangle", "disk", "cylinder", "sdfgrid", "mrt_cone", "mrt_cylinder", "mrt_mesh", "group"]
 
 
 def _shape(rng: random.Random) -> dict[str, Any]:
@@ -132,10 +122,8 @@ def scene_of(rng: random.Random) -> dict[str, Any]:
         plane = {"type": "mrt_plane", "normal": [0, 1, 0], "distance": 1.0}
         scene["floor"] = {**plane, "bsdf": {"type": "ref", "id": rng.choice(materials)}}
     if rng.random() < 0.3:
-        scene["family"] = {
-            "type": "shapegroup",
-            "ball": {"type": "sphere", "radius": 0.4, "bsdf": _material(rng)},
-        }
+        ball = {"type": "sphere", "radius": 0.4, "bsdf": _material(rng)}
+        scene["family"] = {"type": "shapegroup", "ball": ball}
         scene["child"] = {"type": "instance", "to_world": _place(rng), "of": {"type": "ref", "id": "family"}}
     sky = {"type": "constant", "radiance": _color(rng)}
     if rng.random() < 0.5:
@@ -146,13 +134,9 @@ def scene_of(rng: random.Random) -> dict[str, Any]:
         {"type": "spot", "to_world": look, "intensity": _color(rng)},
         {"type": "projector", "to_world": look, "irradiance": _texture(rng, "bitmap")},
         sky,
-        {
-            "type": "sphere",
-            "center": [0, 3, 0],
-            "radius": 0.2,
-            "emitter": {"type": "area", "radiance": _color(rng)},
-        },
-    ]
+        {"type": "sphere", "center": [0, 3, 0], "radius": 0.2,
+         "emitter": {"type": "area", "radiance": _color(rng)}},
+    ]  # fmt: skip
     scene |= {f"l{i}": light for i, light in enumerate(rng.sample(more, rng.randint(0, 2)))}
     return scene
 

@@ -106,34 +106,6 @@ LIGHT = {"type": "mrt_light", "position": [1, 4, 5]}
 
 
 @pytest.mark.parametrize(
-    ("content", "dull", "name"),
-    [
-        ({"ball": BALL, "light": LIGHT}, {"ball": {"type": "sphere", "bsdf": glass(0.0)}}, "lobes"),
-        (
-            {"ball": {"type": "sphere", "bsdf": glass(0.0)}, "light": LIGHT},
-            {"ball": {"type": "sphere", "bsdf": glass(0.0, diffuse_reflectance=0.0)}},
-            "lights",
-        ),
-        ({"ball": BALL, "light": LIGHT}, {"light": {**LIGHT, "intensity": 0.0}}, "lights"),
-        ({"ball": BALL, "light": LIGHT, "lamp": LIGHT}, {"lamp": {**LIGHT, "intensity": rgb(0, 0, 0)}}, ""),
-    ],
-    ids=["no Ks", "neither", "a black light", "one of two lights black"],
-)
-def test_black_things_leave_no_code(content: dict[str, Any], dull: dict[str, Any], name: str) -> None:
-    _, operations, _, plan = work(content)
-    image, fewer, _, dull_plan = work(content | dull)
-    assert fewer < 0.97 * operations
-    assert not name or (plan.reason(name) is None and dull_plan.reason(name) is not None)
-    if not name:
-        assert np.array_equal(image, work({"ball": BALL, "light": LIGHT})[0])
-        return
-    # No mirror image is to be seen, so ``direct`` draws the same, rounded otherwise
-    scene = loaded(content | dull)
-    direct = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=1, seed=3))
-    assert np.abs(image - direct).max() < 1e-4
-
-
-@pytest.mark.parametrize(
     "shape",
     [
         {"type": "sphere"},

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from itertools import product
 
-import drjit as dr
 import drjit.scalar
 import numpy as np
 import pytest
@@ -12,11 +11,8 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from mpmath import mp
 
-from mrt_mitsuba import runtime
 from mrt_mitsuba.plugins.fresnel import f0_from_ior, fresnel_dielectric, fresnel_schlick
 from mrt_mitsuba.validation.oracles import exact
-
-needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, reason="no LLVM to run kernels")
 
 COSINES = st.floats(0, 1)
 INDICES = st.floats(0.2, 8)
@@ -94,20 +90,3 @@ def test_float64_is_that_of_fifty_digits(cos_theta: float, n1: float, n2: float)
 
 
 # ------------------------------------------------ Beyond it ------------------------------------------------
-
-
-@needs_llvm
-@pytest.mark.parametrize("cos_theta", [1.0, 0.5, 1e-3])
-def test_derivative_by_the_index(cos_theta: float) -> None:
-    """Against central differences, and zero, not NaN, where all is reflected."""
-    from drjit.llvm.ad import Float64
-
-    etas = np.array([0.2, 0.5, 0.9, 0.99, 1.01, 1.5, 4.0])
-    eta = Float64(etas)
-    dr.enable_grad(eta)
-    dr.backward(fresnel_dielectric(Float64(cos_theta), 1.0, eta))
-    step = 1e-6
-    above, below = ([fresnel_dielectric(cos_theta, 1, e) for e in etas + d] for d in (step, -step))
-    slope = np.subtract(above, below) / (2 * step)
-    # rounding of F over the step: 1e-16 / 1e-6; error of the difference: step² times a third derivative
-    np.testing.assert_allclose(np.array(dr.grad(eta)), slope, rtol=1e-6, atol=1e-7)

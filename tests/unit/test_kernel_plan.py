@@ -127,62 +127,39 @@ def test_kernel_obeys(name: str) -> None:
         assert np.allclose(image, changed, atol=1e-5)  # the same formulas in another order
 
 
-@pytest.mark.parametrize(
-    ("content", "name", "reason"),
-    [
-        ({"a": CONE}, "bvh", "no shapes but analytic ones"),
-        ({"a": SPHERE}, "coherent", "no mesh in the scene"),
-        ({"a": MESH}, "spheres", "no sphere in the scene"),
-        ({"a": SPHERE, "b": MESH}, "spheres", "other shapes, or spheres that emit or face inwards"),
-        ({"a": SPHERE}, "lights", "no light"),
-        ({"a": SPHERE, "light": LIGHT}, "random", "every light is a point or a direction"),
-        ({"a": SPHERE, "light": LIGHT}, "touching", "no point light is on a surface"),
-        ({"a": SPHERE, "light": LIGHT}, "buffers", "few objects"),
-        (
-            {**CROWD, "light": {"type": "point"}},
-            "buffers",
-            "a light other than mrt_light, or one with derivatives",
-        ),
-        (
-            {**CROWD, "light": LIGHT, "b": MESH},
-            "buffers",
-            "other shapes, or spheres that emit or face inwards",
-        ),
-        ({"a": {**SPHERE, "bsdf": MATTE}}, "mirrors", "no material reflects visibly"),
-        (
-            {"a": SPHERE, "integrator": {"type": "mrt_whitted", "max_depth": 1}},
-            "mirrors",
-            "max_depth admits no mirror ray",
-        ),
-        ({"a": GROUP}, "merged", "a material varies over its surface"),
-        ({"a": SPHERE}, "tangents", "no material depends on the direction of texture coordinates"),
-        (
-            {"a": {**SPHERE, "bsdf": BRUSHED}},
-            "spheres",
-            "a material needs the frame along texture coordinates",
-        ),
-        ({"a": {**SPHERE, "bsdf": MATTE}}, "lobes", "no material has the specular one"),
-        ({"a": SPHERE}, "mirrors", "a ray that leaves the only object meets nothing"),
-        (
-            {"a": SPHERE, "sky": {"type": "constant"}},
-            "mirror_rays",
-            "a ray that leaves the only object meets nothing",
-        ),
-        ({"a": SPHERE, "b": CONE, "sky": {"type": "constant"}}, "guarded", "no path gets that bright"),
-        (
-            {"a": SPHERE, "b": CONE, "lamp": LAMP, "integrator": {"type": "mrt_whitted", "clamp": False}},
-            "cut_off",
-            "what may still arrive has no known bound",
-        ),
-        ({"a": SPHERE}, "two_sided", "no material is lit from behind"),
-        ({"a": {"type": "sphere"}}, "merged", "a material other than mrt_bsdf"),
-        (
-            {"a": {**SPHERE, "bsdf": {"type": "mrt_bsdf", "alpha": TEXTURE}}},
-            "merged",
-            "a material varies over its surface",
-        ),
-    ],
-)
+REASONS = [
+    ({"a": CONE}, "bvh", "no shapes but analytic ones"),
+    ({"a": SPHERE}, "coherent", "no mesh in the scene"),
+    ({"a": MESH}, "spheres", "no sphere in the scene"),
+    ({"a": SPHERE, "b": MESH}, "spheres", "other shapes, or spheres that emit or face inwards"),
+    ({"a": SPHERE}, "lights", "no light"),
+    ({"a": SPHERE, "light": LIGHT}, "random", "every light is a point or a direction"),
+    ({"a": SPHERE, "light": LIGHT}, "touching", "no point light is on a surface"),
+    ({"a": SPHERE, "light": LIGHT}, "buffers", "few objects"),
+    ({**CROWD, "light": {"type": "point"}}, "buffers",
+     "a light other than mrt_light, or one with derivatives"),
+    ({**CROWD, "light": LIGHT, "b": MESH}, "buffers", "other shapes, or spheres that emit or face inwards"),
+    ({"a": {**SPHERE, "bsdf": MATTE}}, "mirrors", "no material reflects visibly"),
+    ({"a": SPHERE, "integrator": {"type": "mrt_whitted", "max_depth": 1}}, "mirrors",
+     "max_depth admits no mirror ray"),
+    ({"a": GROUP}, "merged", "a material varies over its surface"),
+    ({"a": SPHERE}, "tangents", "no material depends on the direction of texture coordinates"),
+    ({"a": {**SPHERE, "bsdf": BRUSHED}}, "spheres", "a material needs the frame along texture coordinates"),
+    ({"a": {**SPHERE, "bsdf": MATTE}}, "lobes", "no material has the specular one"),
+    ({"a": SPHERE}, "mirrors", "a ray that leaves the only object meets nothing"),
+    ({"a": SPHERE, "sky": {"type": "constant"}}, "mirror_rays",
+     "a ray that leaves the only object meets nothing"),
+    ({"a": SPHERE, "b": CONE, "sky": {"type": "constant"}}, "guarded", "no path gets that bright"),
+    ({"a": SPHERE, "b": CONE, "lamp": LAMP, "integrator": {"type": "mrt_whitted", "clamp": False}}, "cut_off",
+     "what may still arrive has no known bound"),
+    ({"a": SPHERE}, "two_sided", "no material is lit from behind"),
+    ({"a": {"type": "sphere"}}, "merged", "a material other than mrt_bsdf"),
+    ({"a": {**SPHERE, "bsdf": {"type": "mrt_bsdf", "alpha": TEXTURE}}}, "merged",
+     "a material varies over its surface"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("content", "name", "reason"), REASONS)
 def test_reasons(content: dict[str, Any], name: str, reason: str) -> None:
     assert plan_of(**content).reason(name) == reason
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import product
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from nodes import sensor
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -53,18 +50,6 @@ def test_corners_are_a_square_on_the_plane(variant: str) -> None:
             assert (points[:, axis] == np.float32(-distance * unit(normal)[axis])).all()
 
 
-@in_variants
-def test_stock_rays_meet_it(variant: str) -> None:
-    for (normal, distance), side in product(PLANES, (1, -1)):
-        scene = mi.load_dict({"type": "scene", "plane": plane(normal, distance)})
-        n = unit(normal)
-        tangent = unit(np.cross(n, (0.3, 0.5, 0.7)))
-        si = scene.ray_intersect(ray(-distance * n + side * 3 * n + 0.7 * tangent, -side * n))
-        assert dr.all(si.is_valid())
-        assert np.array(si.t) == pytest.approx(3, abs=1e-5)
-        np.testing.assert_allclose(np.array(si.n).ravel(), n, atol=1e-6)  # from both sides the same
-
-
 def test_texture_coordinates_are_lengths_from_the_foot() -> None:
     mesh = plane((0.3, -0.2, 1), 4.0)
     scene = mi.load_dict({"type": "scene", "plane": mesh})
@@ -76,26 +61,6 @@ def test_texture_coordinates_are_lengths_from_the_foot() -> None:
         point = -4 * n + u * s + v * t
         si = scene.ray_intersect(ray(point + n, -n))
         np.testing.assert_allclose(np.array(si.uv).ravel(), (u, v), atol=2e-5)
-
-
-def test_stock_integrators_draw_a_rectangle() -> None:
-    """They draw it as a stock rectangle in the same place: both are two triangles."""
-    transform = mi.ScalarTransform4f()
-
-    def image(shape: dict[str, Any]) -> np.ndarray:
-        scene = {
-            "type": "scene",
-            "integrator": {"type": "direct"},
-            "sensor": sensor([2, -6, 3], [0, 0, 0], (16, 12), up=[0, 0, 1]),
-            "light": {"type": "point", "position": [0, 0, 3], "intensity": 10.0},
-            "shape": {**shape, "bsdf": {"type": "diffuse", "reflectance": 0.6}},
-        }
-        return np.array(mi.render(mi.load_dict(scene), spp=1, seed=1))
-
-    ours = image({"type": "mrt_plane", "normal": [0, 0, 1], "distance": 0.5, "extent": 6.0})
-    theirs = image({"type": "rectangle", "to_world": transform.translate([0, 0, -0.5]).scale(3)})
-    assert 0.1 < (theirs > 0).mean() < 0.95  # the rim is in the picture
-    np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-6)
 
 
 def test_planes_of_one_material_stay_shapes_of_their_own() -> None:

@@ -128,31 +128,3 @@ def test_normals_of_corners_stay_across_the_surface() -> None:
     expected = np.array([list(to_world @ mi.ScalarNormal3f(n.tolist())) for n in points])
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     np.testing.assert_allclose(normals, expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder"])
-def test_derivatives_by_uv_are_those_of_the_surface(kind: str) -> None:
-    """dp/du and dp/dv of a hit by finite differences of the hits around it."""
-    points = {"sphere": [0.1, 0.2, 0.3], "cone": [0, 1.2, 0, 0.2, -1, 0.1]}.get(
-        kind, [0, 0.7, 0, 0.1, -0.7, 0.2]
-    )
-    numbers = mi.Bitmap(np.array([[*points, 0.8]], np.float32))
-    to_world = mi.ScalarTransform4f().rotate([1, 2, 3], 40).scale([1, 0.8, 1.3])
-    shape = {"type": "mrt_group", "kind": kind, "numbers": numbers, "to_world": to_world}
-    scene = mi.load_dict({"type": "scene", "shape": {**shape, "bsdf": brushed()}})
-    data = mi.load_dict({"type": "mrt_whitted"}).prepare(scene)
-    x, y = np.random.default_rng(1).uniform(-0.4, 0.4, (2, 2000))
-    hits = []
-    for dx, dy in ((0, 0), (1e-2, 0), (0, 1e-2)):
-        hit = data.intersect(
-            scene, mi.Ray3f(mi.Point3f(x + dx, y + dy, 5), mi.Vector3f(0, 0, -1)), mi.Bool(True)
-        )
-        hits.append([np.array(v) for v in (hit.si.p, hit.si.uv, hit.si.dp_du, hit.si.dp_dv)])
-    (p, uv, dp_du, dp_dv), *others = hits
-    for q, uv_q, *_ in others:
-        du, dv = uv_q - uv
-        along = dp_du * du + dp_dv * dv
-        smooth = (np.abs(du) < 0.1) & (np.abs(dv) < 0.1) & (np.linalg.norm(q - p, axis=0) < 0.05)
-        error = np.linalg.norm(q - p - along, axis=0)[smooth] / np.linalg.norm(q - p, axis=0)[smooth]
-        # Steps of a hundredth on radii of one: a second derivative of the order of one
-        assert smooth.mean() > 0.5 and np.median(error) < 0.02
