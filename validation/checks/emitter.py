@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -16,7 +16,6 @@ from mrt_mitsuba.validation.checks.probe import (
     BEYOND,
     ROUNDED,
     Array,
-    Lanes,
     at_wavelengths,
     excess,
     is_scalar,
@@ -32,19 +31,9 @@ TURNED = 4 * ROUNDED  # a direction passes through angles, a transform, and back
 LENGTH = 1e-4  # relative: a square root, and the difference of two points
 
 
-@dataclass(frozen=True)
-class Samples(Lanes):
-    """What ``sample_direction`` gives for N points, and what other functions say of it."""
-
-    p: Array  # [N, 3], the sampled point
-    d: Array  # [N, 3]
-    dist: Array
-    pdf: Array
-    again: Array  # pdf_direction()
-    delta: Array  # bool [N]
-    weight: Array  # [N, channels]
-    value: Array  # eval_direction() [N, channels]
-    lit: Array  # bool [N], whether the weight is not 0
+# The sampled point and its direction [N, 3], distance, density, pdf_direction() and whether it is a single
+# direction [N], weight and eval_direction() [N, channels]
+NAMES = ("p", "d", "dist", "pdf", "again", "delta", "weight", "value")
 
 
 class Case(Subject):
@@ -61,11 +50,11 @@ class Case(Subject):
         self.around = bool(flags & int(mi.EmitterFlags.Infinite)) and not flags & int(mi.EmitterFlags.Delta)
 
     @cached_property
-    def samples(self) -> Samples:
+    def samples(self) -> SimpleNamespace:
         return self.sample(self.points)
 
-    def sample(self, points: Array) -> Samples:
-        """Return a sample for each point."""
+    def sample(self, points: Array) -> SimpleNamespace:
+        """Return a sample for each point: arrays by ``NAMES``, and where the weight is not 0 (``lit``)."""
 
         def call(p: Any, u: Any) -> list[Any]:
             it = _seen_from(p)
@@ -77,7 +66,7 @@ class Case(Subject):
             found = lanes(call, ("Point3f", points), ("Point2f", self.uniform(len(points), 2)))
         except (NotImplementedError, RuntimeError) as error:
             raise Skip(f"directions cannot be sampled: {reason(error)}") from error
-        return Samples(*[*found, (found[6] != 0).any(axis=1)])
+        return SimpleNamespace(**dict(zip(NAMES, found, strict=True)), lit=(found[6] != 0).any(axis=1))
 
     def seen(self, d: Array) -> tuple[Array, Array]:
         """Return the density of directions [N] and the light that is seen there [N, channels]."""
@@ -123,13 +112,12 @@ def density(law: Law, case: Case) -> None:
 )  # fmt: skip
 def sampling(law: Law, case: Case) -> None:
     """p = o + dist · d; light from all around follows its density (Pearson's χ²)."""
-    found, points = case.samples.only(case.samples.lit), case.points[case.samples.lit]
-    if not len(found.pdf):
+    s, points = case.samples, case.points.astype(np.float64)
+    if not s.lit.any():
         raise Skip("no sample carries light")
-    away = found.p - points.astype(np.float64)
-    scale = np.abs(found.dist) + np.abs(points).max(axis=1)
-    off = np.linalg.norm(away - found.dist[:, None] * found.d, axis=1) / scale
-    law.hold("place", np.nan_to_num(off))
+    scale = np.abs(s.dist) + np.abs(points).max(axis=1)
+    off = np.linalg.norm(s.p - points - s.dist[:, None] * s.d, axis=1) / scale
+    law.hold("place", np.nan_to_num(off[s.lit]))
     if not case.around:
         law.notes.append("directions to surfaces are judged with their shapes")
         return
