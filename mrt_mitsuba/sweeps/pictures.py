@@ -10,7 +10,7 @@ import contextlib
 import itertools
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -116,8 +116,13 @@ def cut(job: Job, tiles: tuple[int, int]) -> list[Job]:
     return found
 
 
-def join(job: Job, tiles: Sequence[Job], folder: str, scratch: str) -> None:
-    """Write a picture from its tiles, and remove these; raise ``OutputError`` where that fails."""
+def join(
+    job: Job, tiles: Sequence[Job], found: Sequence[Mapping[str, Any]], folder: str, scratch: str
+) -> dict[str, Any]:
+    """Write a picture from its tiles, and remove these; return its facts, given theirs."""
+    for facts in found:
+        if "error" in facts:
+            return {"error": facts["error"]}
     own, path = os.path.join(folder, f"{job.name}.tiles"), os.path.join(scratch, job.file)
     try:
         _write_rows(job, tiles, folder, path)
@@ -128,7 +133,9 @@ def join(job: Job, tiles: Sequence[Job], folder: str, scratch: str) -> None:
         with contextlib.suppress(OSError):  # something of the user's own is in there
             os.rmdir(own)
     except (OSError, RuntimeError) as error:
-        raise OutputError(f"cannot put {job.name} together: {error}") from error
+        return {"error": f"cannot put {job.name} together: {error}"}
+    sums = {name: sum(facts[name] for facts in found) if all(found) else None for name in ("seconds", "rays")}
+    return {"file": job.file, **sums}
 
 
 def _write_rows(job: Job, tiles: Sequence[Job], folder: str, path: str) -> None:

@@ -141,7 +141,8 @@ def _render(
 
     def finish(job: Job, parts: list[Job]) -> None:
         if all(part.name in made for part in parts):
-            facts = made[job.name] if parts == [job] else _join(job, parts, made, setting)
+            found = [made[part.name] for part in parts]
+            facts = found[0] if parts == [job] else join(job, parts, found, setting.folder, setting.scratch)
             begun = max(1, *(attempts(part, setting) for part in parts))
             table.add(job.name, facts | {"attempts": begun, "versions": setting.software})
 
@@ -175,19 +176,3 @@ def _render(
         table.write()
         if client.status == "running":
             client.cancel(list(calls))
-
-
-def _join(
-    job: Job, tiles: Sequence[Job], made: Mapping[str, Mapping[str, Any]], setting: Setting
-) -> dict[str, Any]:
-    """Put a picture together from its tiles; return its facts, given theirs."""
-    found = [made[tile.name] for tile in tiles]
-    for facts in found:
-        if "error" in facts:
-            return {"error": facts["error"]}
-    try:
-        join(job, tiles, setting.folder, setting.scratch)
-    except OutputError as error:
-        return {"error": str(error)}
-    sums = {name: sum(facts[name] for facts in found) if all(found) else None for name in ("seconds", "rays")}
-    return {"file": job.file, **sums}
