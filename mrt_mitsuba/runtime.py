@@ -41,8 +41,7 @@ def use(variant: str | None = None) -> str:
         return _used
     llvm.prepare()
     check_start()
-    with one_at_a_time, held():
-        load()
+    with one_at_a_time, held(), rewriting_later():
         import mitsuba as mi
 
         if variant is None:
