@@ -86,14 +86,14 @@ def cases(given: argparse.Namespace, turns: int) -> Iterator[tuple[str, Row]]:
 
     names = [name for name in renders.CASES if "small" in name or not (given.small or given.quick)]
 
-    def measure(python: str) -> dict[str, float]:
+    def measure(python: str, turn: int) -> dict[str, float]:
         command = [python, str(renders.__file__), *names]
         ran = subprocess.run(command, check=True, stdout=subprocess.PIPE, timeout=3600)
         found: dict[str, float] = json.loads(ran.stdout.splitlines()[-1])
         return found
 
     pythons = [sys.executable, *([given.before] if given.before else [])]
-    found = in_turns([lambda _, python=python: measure(python) for python in pythons], turns)
+    found = in_turns([partial(measure, python) for python in pythons], turns)
     for name in names:
         times = [[run[name] for run in side] for side in found]
         yield name, _row(Ratio.of(*times)) if given.before else {"seconds": statistics.median(times[0])}
