@@ -251,6 +251,7 @@ FACE = "f 1 2 3\n"
 BROKEN_OBJ: list[tuple[str, int | None, str]] = [
     ("", None, "has no faces; export the model with its geometry"),
     (SQUARE + "f 1 2 9\n", 5, "v index 9, but the file has 4"),
+    (SQUARE + "f 1 \\\n2 \\\n3\nf 1 2 9\n", 8, "v index 9"),
     (SQUARE + "f 0 1 2\n", 5, "v index 0: indices count from 1"),
     (SQUARE + UVS + "f 1/1 2/2 3/5\n", 9, "vt index 5, but the file has 4"),
     (SQUARE + "f 1/-1 2/-1 3/-1\n", 5, "vt index -1: only 0 came before"),
@@ -274,6 +275,7 @@ BROKEN_MTL: list[tuple[str, int | None, str]] = [
     ("newmtl a\nKd 1 1\n", 2, "2 numbers"),
     ("newmtl a\nNi\n", 2, "0 numbers"),
     ("newmtl a\nNi glass\n", 2, "'glass'"),
+    ("newmtl a\nKd 1e39 0 0\n", 2, "'1e39', which is not a finite number"),
     ("newmtl a\nKd spectral file.rfl\n", 2, "not supported"),
     ("newmtl a\nmap_Kd\n", 2, "names no file"),
     ("newmtl a\n\0", None, "zero byte"),

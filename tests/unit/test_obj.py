@@ -85,11 +85,6 @@ def test_polygons_become_fans(model, corners: int) -> None:
     assert areas.sum() == pytest.approx(corners / 2 * math.sin(2 * math.pi / corners), rel=1e-6)
 
 
-def test_continued_lines_keep_line_numbers(model) -> None:
-    with pytest.raises(SceneError, match=r"model\.obj:8: f has the v index 9"):
-        model(SQUARE + "f 1 \\\n2 \\\n3\nf 1 2 9\n")
-
-
 def test_runs_of_lines_equal_single_lines(model) -> None:
     """A comment keeps a line out of the fast path; more lines than it takes at once."""
     rng = np.random.default_rng(1)
