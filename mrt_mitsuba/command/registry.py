@@ -70,7 +70,8 @@ def run(name: str, words: Sequence[str]) -> int:
     keys = [word.partition("=")[0] for word in needed if word[0].islower()]
     missing = wanted[len(plain) :] + [key for key in keys if not given.get(key)]
     if missing:
-        raise UsageError(f"{missing[0]} is missing. {usage}")
+        flag = "--" if f"--{missing[0]}" in form else ""
+        raise UsageError(f"{flag}{missing[0]} is missing. {usage}")
     if form or name == "doctor":  # the others do without Mitsuba
         from mrt_mitsuba.runtime import check_start
 
