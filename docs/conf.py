@@ -19,6 +19,7 @@ release = mrt_mitsuba.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
+myst_heading_anchors = 2  # links to headings, as in own_scenes.md
 exclude_patterns = ["_build", "_generated/*.inc.md", "examples", "jupyter_execute"]
 html_theme = "furo"
 html_title = "mrt-mitsuba"

@@ -19,9 +19,9 @@ a²/(8 − 4a²)`` below 1 and ``√(2a − 23/16) − ½`` from there.
 The discs reach a pixel and cover each other by these rules:
 
 * Every pixel of the sharp picture is a disc, given by a signed radius r in pixels that is negative on the
-  near side of the focus. The disc is whole up to |r| from its centre and fades out over one pixel more: its
-  coverage at distance d is ``clip(|r| + 1 − d, 0, 1)``, so r = 0 is the pixel itself. Its light is spread
-  evenly: a pixel gets coverage over the sum of coverages.
+  near side of the focus. The disc is whole up to ``|r|`` from its centre and fades out over one pixel more:
+  its coverage at distance d is ``clip(|r| + 1 − d, 0, 1)``, so r = 0 is the pixel itself. Its light is
+  spread evenly: a pixel gets coverage over the sum of coverages.
 * Seen from a pixel p, a neighbour q is in front, in the same layer or behind by the difference of their
   signed radii: fully so from one pixel on, in proportion below, so that no seam shows. The radius and not the
   depth decides, since surfaces that are equally blurred need no order.
