@@ -90,7 +90,11 @@ class Places:
 
 def opaque(number: float) -> Any:
     """Return a number as data of a kernel, so that another needs no other kernel."""
-    return number if mi.variant().startswith("scalar") else _opaque(mi.variant(), number, type(number))[0]
+    return (
+        number
+        if mi.variant().startswith("scalar")
+        else _opaque(mi.variant(), number, isinstance(number, int))[0]
+    )
 
 
 def divide(n: Any, divisor: int) -> tuple[Any, Any]:
@@ -102,13 +106,13 @@ def divide(n: Any, divisor: int) -> tuple[Any, Any]:
     """
     if mi.variant().startswith("scalar"):
         return divmod(n, divisor)
-    number, inverse = _opaque(mi.variant(), divisor, int)
+    number, inverse = _opaque(mi.variant(), divisor, True)
     quotient = mi.UInt32((mi.Float64(n) + 0.5) * inverse)
     return quotient, n - quotient * number
 
 
 @lru_cache(maxsize=64)
-def _opaque(variant: str, number: float, kind: type) -> tuple[Any, Any]:
-    if kind is float:
+def _opaque(variant: str, number: float, whole: bool) -> tuple[Any, Any]:
+    if not whole:
         return dr.opaque(mi.Float, number), None
     return dr.opaque(mi.UInt32, number), dr.opaque(mi.Float64, 1 / number if number else 0)

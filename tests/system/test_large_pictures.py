@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import signal
@@ -26,7 +25,8 @@ FOCUS = {"focaldist": 2.0, "focalrange": 0.5}
 WAYS = [
     *({"aamode": aamode, "dof": dof, **FOCUS, "lattice": "centered" if dof == "corrected" else "report",
        "layers": ["normal", "reflection", *["edges"] * (aamode != "none"), *["blur"]]}
-      for aamode, dof in itertools.product(["none", "luma", "sobel", "geometry"], ["report", "corrected"])),
+      for aamode, dof in
+          zip(["none", "luma", "sobel", "geometry"], 2 * ["report", "corrected"], strict=True)),
     *({"aamode": aamode, "integrator": "path", "spp": 2, "focaldist": 2.0, "seed": 5}
       for aamode in ("none", "sobel")),
     {"aamode": "sobel", "focaldist": 0, "layers": ["samples"]},

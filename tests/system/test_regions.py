@@ -37,7 +37,9 @@ def assert_put_together(scene: Any, **options: Any) -> None:
         assert part.options["region"] == (x, y, width, height)
 
 
-MODES = list(itertools.product(["none", "luma", "sobel", "geometry"], [None, "report", "corrected"]))
+MODES = [
+    ("none", None), ("none", "report"), ("luma", "corrected"), ("sobel", "report"), ("geometry", "corrected"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("aamode", "dof"), MODES)
