@@ -18,7 +18,7 @@ from .lights import Lights
 from .lobes import LOBES, Pair
 from .materials import MaterialTable
 from .planes import Planes
-from .point_buffer import PointBuffer, point_buffer
+from .point_buffer import point_buffer
 from .quadrics import Quadrics
 from .snapshot import Kept
 from .spheres import Spheres
@@ -61,7 +61,7 @@ class SceneData:
             lambda: Lights(reading.lights, reading.numbers, plan.lights),
         )
 
-        def light_buffers() -> list[tuple[PointBuffer, Any]]:
+        def light_buffers() -> list[tuple[Any, Any]]:
             """Return lists of what may be in the way of the lights, with what tests it."""
             things = [] if self.quadrics is None else [self.quadrics]
             things += [self.spheres] if plan.bvh else []

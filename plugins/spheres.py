@@ -61,7 +61,7 @@ class Spheres:
         numbers = np.array([[first(m[row][column]) for row in range(3) for column in (0, 3)] for m in frames])
         # To the last bit, which Mitsuba's boxes do not have
         centers, radii = numbers[:, 1::2], np.linalg.norm(numbers[:, ::2], axis=1)[:, None]
-        self.balls = Table(mi.Vector4f, np.column_stack([centers, radii]))
+        self.balls = Table(mi.Vector4f, np.column_stack([centers, radii]).tolist())
         return np.stack([centers - radii, centers + radii], axis=1), np.arange(len(radii))
 
     def block(self, index: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:

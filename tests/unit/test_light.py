@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -12,6 +13,8 @@ import pytest
 from nodes import sensor
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.plugins import plugin
+from mrt_mitsuba.plugins.lights import PointLight
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -110,6 +113,38 @@ def test_light_tracing_is_refused() -> None:
         light().sample_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
     with pytest.raises(RuntimeError):
         lit_floor({"type": "mrt_light"}, "ptracer")
+
+
+def test_other_kinds_of_lights_join_the_table() -> None:
+    """Next to ``mrt_light``, and by themselves: the picture is that of calls to each."""
+
+    class Leaning(PointLight):
+        def arriving(self, d: Any) -> Any:
+            return self.intensity * dr.clip(2 * dr.dot(d, self.more[0]) - 1, 0, 1)
+
+    class LeaningLight(plugin("light").MrtLight):  # type: ignore[misc]
+        def row(self, it: Any, active: Any = True) -> PointLight:
+            light = super().row(it, active)
+            return Leaning(light.position, light.intensity, mi.Vector3f(0.6, 0, 0.8))
+
+    mi.register_emitter("leaning", LeaningLight)
+    for kinds in (["leaning"], ["mrt_light", "leaning"], ["leaning", "mrt_light"]):
+        lights = {
+            f"light{k}": {"type": kinds[k % len(kinds)], "position": [k - 4, 0, 3], "intensity": 0.1}
+            for k in range(9)
+        }
+        scene = mi.load_dict({
+            "type": "scene",
+            "integrator": {"type": "mrt_whitted", "max_depth": 1, "min_contribution": 0.0},
+            "sensor": sensor([0, 0, 5], [0, 0, 0], (32, 24)),
+            "floor": {"type": "mrt_plane", "normal": [0, 0, 1], "bsdf": {"type": "mrt_bsdf"}},
+            **lights,
+        })  # fmt: skip
+        image, integrator = np.array(mi.render(scene, spp=1)), scene.integrator()
+        plan = integrator.prepare(scene).plan
+        assert plan.lights == "table" and image.std() > 1e-3
+        integrator.kernel_plan = lambda facts, plan=plan: replace(plan, lights="loop")
+        np.testing.assert_allclose(image, np.array(mi.render(scene, spp=1)), atol=1e-6)
 
 
 # --------------------------------------------- Parameters ----------------------------------------------
