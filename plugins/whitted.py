@@ -275,8 +275,9 @@ class MrtWhitted(mi.SamplingIntegrator):
         throughput: mi.UnpolarizedSpectrum,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32]:
         plan, si, radiance, shadow_rays = data.plan, hit.si, mi.UnpolarizedSpectrum(0), mi.UInt32(0)
-        if plan.emission:
-            radiance += mi.unpolarized_spectrum(si.emitter(scene, hit.found).eval(si, hit.found))
+        emitter = si.emitter(scene, hit.found) if plan.emission else None
+        if emitter is not None:  # as it is of most surfaces in scalar variants
+            radiance += mi.unpolarized_spectrum(emitter.eval(si, hit.found))
 
         def sampled(light: Any, sampler: mi.Sampler) -> tuple:
             """Return direction to a light, locally too, what may arrive from it, and if on the lit side."""

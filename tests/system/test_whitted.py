@@ -112,8 +112,9 @@ def test_a_plane_hides_lights_behind_it_only(scale: float) -> None:
         assert (found > 0.1).all() if lit else (found == 0).all()
 
 
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
 @pytest.mark.parametrize("kind", ["rectangle", "sphere", "disk"])
-def test_a_lamp_is_not_in_its_own_shadow(kind: str) -> None:
+def test_a_lamp_is_not_in_its_own_shadow(variant: str, kind: str) -> None:
     place = mi.ScalarTransform4f().translate([0.3, 0.2, 3]).rotate([1, 0, 0], 180)
     scene = mi.load_dict({
         "type": "scene",
