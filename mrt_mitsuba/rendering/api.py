@@ -83,7 +83,7 @@ def render(scene: Any = 0, **options: Any) -> Result:
         VariantError: for a variant that cannot run here.
     """
     with runtime.one_at_a_time, held():
-        return render_with(scene, RenderSettings(**options))
+        return render_with(scene, RenderSettings.of(**options))
 
 
 def render_with(

@@ -33,7 +33,7 @@ class Prepared:
     _launch: Any = None  # what launches them; None where nothing is recorded
 
     def __init__(self, scene: Any, options: dict[str, Any]) -> None:
-        self._scene, self._settings = scene, RenderSettings(**options)
+        self._scene, self._settings = scene, RenderSettings.of(**options)
         with runtime.one_at_a_time, held():
             self._made = self._render(self._settings.seed)  # result from which others differ by the picture
             self._integrator, self.params = self._source.integrator, mi.traverse(self._source.scene)

@@ -4,6 +4,7 @@ Python, by editors and by the command, which adds its own."""
 from __future__ import annotations
 
 import dataclasses
+import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -171,6 +172,16 @@ class RenderSettings:
             if field.metadata and values[field.name] is not field.default:
                 values[field.name] = checked(field, values[field.name])
         self.model()  # checks what shows nothing
+
+    @classmethod
+    def of(cls, **options: Any) -> RenderSettings:
+        """Return the settings of the options that a user gives; raise ``TypeError`` for one that is none."""
+        for name in options.keys() - cls.__dataclass_fields__.keys():
+            close = difflib.get_close_matches(name, cls.__dataclass_fields__, 1)
+            raise TypeError(
+                f"{name!r} is not an option of render" + "".join(f": did you mean {c}?" for c in close)
+            )
+        return cls(**options)
 
     def but(self, **values: Any) -> RenderSettings:
         """Return the settings with other values, which are known to be right."""
