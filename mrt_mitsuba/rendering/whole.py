@@ -102,7 +102,7 @@ class Wholes:
 
     def rmse(self) -> float:
         """Return the estimated RMSE of the picture."""
-        return math.sqrt(float(self._squares(0).mean()))
+        return math.sqrt(float(self._squares(0).mean(-1).mean()))  # summed as in ``error``
 
     def error(self) -> ErrorEstimate:
         """Return the estimated RMSE of the picture, by the difference of its halves; see ``Halves.error``.
