@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import product
-
 import drjit.scalar
 import numpy as np
 import pytest
@@ -31,21 +29,6 @@ def relative_errors(found, truth: list) -> np.ndarray:
 
 
 # ------------------------------------------------- Values --------------------------------------------------
-
-# The grid of the course's table; above the diagonal light enters the denser medium, below it may be reflected
-# totally
-TABLE = list(product((0.1, 0.3, 0.5, 0.7, 0.9), (1.1, 1.3, 1.5, 1.7), (1.1, 1.3, 1.5, 1.7)))
-
-
-def test_course_table_to_six_decimals() -> None:
-    """Agree in float64 at the decimal numbers of the table, in float32 at their float32 values."""
-    truth = [float(exact.fresnel_dielectric(*(str(x) for x in row))) for row in TABLE]
-    assert sum(t == 1 for t in truth) > 10 and sum(t < 1e-40 for t in truth) == 20  # all branches are in it
-    double = [fresnel_dielectric(*row) for row in TABLE]
-    np.testing.assert_allclose(double, truth, rtol=0, atol=ROUNDING)
-    columns = [float32(column) for column in zip(*TABLE, strict=True)]
-    truth = [float(exact.fresnel_dielectric(*row)) for row in zip(*map(np.array, columns), strict=True)]
-    np.testing.assert_allclose(np.array(fresnel_dielectric(*columns)), truth, rtol=0, atol=5e-7)
 
 
 def test_schlick_and_its_f0_keep_their_digits() -> None:

@@ -64,23 +64,14 @@ def test_colour_does_not_depend_on_the_distance(variant: str) -> None:
         assert np.array(ds.dist) == pytest.approx(distance, rel=1e-6)
         assert np.array(ds.pdf) == 1 and dr.all(ds.delta)
         assert np.array(ds.time) == 0.25
-    ds, _ = light().sample_direction(point_at(np.array(POSITION) - towards), mi.Point2f(0.5))
+    it, one = light(intensity=2.0), point_at(np.array(POSITION) - towards)
+    ds, _ = it.sample_direction(one, mi.Point2f(0.5))
     np.testing.assert_array_equal(entries(ds.p), POSITION)
+    np.testing.assert_allclose(spectrum(it.eval_direction(one, ds)), stock_spectrum(2.0), rtol=1e-6)
+    assert np.array(it.pdf_direction(one, ds)) == 0 and (spectrum(it.eval(one)) == 0).all()
+    assert mi.has_flag(it.flags(), mi.EmitterFlags.DeltaPosition) and not it.is_environment()
     ds, _ = light().sample_direction(point_at(POSITION), mi.Point2f(0.5))
     assert np.linalg.norm(entries(ds.d)) == pytest.approx(1)  # there is none, and any will do
-
-
-@in_variants
-def test_is_a_delta_light(variant: str) -> None:
-    """It cannot be met by chance: no density, nothing to see of it, and a box that is one point."""
-    it, one = light(intensity=2.0), point_at((0, 0, 0))
-    ds, _ = it.sample_direction(one, mi.Point2f(0.5))
-    assert mi.has_flag(it.flags(), mi.EmitterFlags.DeltaPosition)
-    assert not it.is_environment()
-    assert np.array(it.pdf_direction(one, ds)) == 0
-    assert (spectrum(it.eval(one)) == 0).all()
-    np.testing.assert_allclose(spectrum(it.eval_direction(one, ds)), stock_spectrum(2.0), rtol=1e-6)
-    assert list(it.bbox().min) == list(it.bbox().max) == list(POSITION)
 
 
 # ---------------------------------------------- In scenes ----------------------------------------------
@@ -153,6 +144,7 @@ def test_other_kinds_of_lights_join_the_table() -> None:
 @in_variants
 def test_parameters_can_be_updated(variant: str) -> None:
     it = light()
+    assert list(it.bbox().min) == list(it.bbox().max) == list(POSITION)
     parameters = mi.traverse(it)
     parameters["position"] = [0, 0, 2]
     if not mi.is_spectral:  # there the default is a lamp, D65, with tables of its own
@@ -163,19 +155,6 @@ def test_parameters_can_be_updated(variant: str) -> None:
     np.testing.assert_allclose(entries(ds.d), [0, 0, 1])
     np.testing.assert_allclose(spectrum(weight), stock_spectrum(1.0 if mi.is_spectral else 4.0), rtol=1e-6)
     assert list(it.bbox().min) == [0, 0, 2]
-
-
-@in_variants
-def test_loads_from_xml(variant: str) -> None:
-    it = mi.load_string("""
-        <emitter version="3.0.0" type="mrt_light">
-            <point name="position" x="1" y="-2" z="3"/>
-            <rgb name="intensity" value="2"/>
-        </emitter>""")
-    assert list(it.bbox().min) == list(POSITION)
-    _, weight = it.sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
-    np.testing.assert_allclose(spectrum(weight), stock_spectrum({"type": "rgb", "value": 2.0}), rtol=1e-6)
-    assert "position" in str(it)
 
 
 def upright(kind: str) -> Callable[[float], dict[str, Any]]:

@@ -30,22 +30,6 @@ def wheel(prefix: Path, name: str = "libLLVM.so.23.1") -> tuple[str, str]:
     return str(info.parent), path
 
 
-@pytest.mark.parametrize(
-    ("name", "version"),
-    [
-        ("libLLVM-15.so", (15,)),
-        ("libLLVM-15.so.1", (15,)),
-        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
-        ("/some/where/libLLVM.so.19.1", (19, 1)),
-        ("libLLVM.so", None),
-        ("libLLVM-17git.so", None),
-        ("libclang-19.so", None),
-    ],
-)
-def test_version_in_name(name: str, version: tuple[int, ...] | None) -> None:
-    assert llvm.version_in_name(name) == version
-
-
 # What DRJIT_LIBLLVM_PATH names, the wheel's library, those of the system, the choice, and how many are passed
 # over; names of files, "" for none
 CHOICES = [
@@ -55,6 +39,7 @@ CHOICES = [
     *(("libLLVM-16.so.1", "libLLVM.so.16.0", f"libLLVM-{v}.so.1", "", 3) for v in (14, 15, 16)),
     ("", "", "libLLVM-17.so.1", "libLLVM-17.so.1", 0),
     ("", "libLLVM.so.16.0", "libLLVM-17.so.1", "libLLVM-17.so.1", 1),
+    ("", "", "libLLVM-18.1.8.so.1 libLLVM-20git.so libclang-21.so", "libLLVM-18.1.8.so.1", 0),
 ]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.output.error import DOUBTFUL, tail_shape
+from mrt_mitsuba.output.error import DOUBTFUL
 from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.rendering.exposing import Exposed
 from mrt_mitsuba.rendering.noise import Halves
@@ -101,15 +101,6 @@ def test_rare_bright_values_keep_their_share() -> None:
         warnings.simplefilter("ignore", mrt.MrtWarning)
         means = np.array([_render(exposer, seed).image.mean() for seed in range(150)])
     assert abs(means.mean() - expected) < 3 * means.std(ddof=1) / len(means) ** 0.5
-
-
-@pytest.mark.parametrize("shape", [0.1, 0.4, 0.9])
-def test_tail_has_the_shape_of_what_was_drawn(shape: float) -> None:
-    rng = np.random.default_rng(4)
-    found = [tail_shape(rng.pareto(1 / shape, 4000), np.ones(4000)) for _ in range(30)]
-    assert (np.median(found) > DOUBTFUL) == (shape > DOUBTFUL)
-    assert np.median(found) == pytest.approx(shape, abs=0.25)
-    assert tail_shape(np.full(100, 3.0), np.full(100, 7.0)) == 0
 
 
 @pytest.mark.parametrize(("draw", "doubtful"), [(_calm, False), (_rare(0.3), False), (_rare(0.003, 8), True)])

@@ -220,22 +220,9 @@ def test_standard_textures_stand_upright_and_the_reports_upside_down(tmp_path):
         assert image[2, 4].argmax() == above and image[5, 4].argmax() == 2 - above
 
 
-def test_the_standard_uses_normals_and_the_report_does_not(tmp_path):
-    """A coarse ball: with the normals of a sphere, it is shaded as one."""
-    long, wide = 8, 5
-    angle, height = np.meshgrid(np.arange(long) * 2 * np.pi / long, np.linspace(-1.4, 1.4, wide))
-    points = np.stack([np.cos(height) * np.sin(angle), np.sin(height), np.cos(height) * np.cos(angle)], -1)
-    text = "".join(f"v {x} {y} {z}\nvn {x} {y} {z}\n" for x, y, z in points.reshape(-1, 3))
-    for row in range(wide - 1):
-        for k in range(long):
-            low, right = row * long + 1, (k + 1) % long
-            around = [low + k, low + right, low + long + right, low + long + k]
-            text += "f " + " ".join(f"{i}//{i}" for i in around) + "\n"
-    (tmp_path / "ball.mtl").write_text("newmtl m\nKd 1 1 1\nKs 0 0 0\n")
-    (tmp_path / "ball.obj").write_text("mtllib ball.mtl\nusemtl m\n" + text)
-    view = {"light": (600, 0, 1000), "camera": (0, 0, 4), "fov": 30, "width": 32, "height": 32, "aa": 1}
-    steps = []
-    for convention in ("report", "standard"):
-        image = mrt.render(tmp_path / "ball.obj", convention=convention, **view).image[16, 8:24, 0]
-        steps.append(np.abs(np.diff(image)).max())
-    assert steps[1] < steps[0] / 2
+def test_the_standard_uses_normals_and_the_report_does_not(model):
+    """That they shade: ``tests/system/test_whitted.py``."""
+    text = SQUARE + "vn 0 0 1\nvn 0 1 0\nf 1//1 2//1 3//2\n"
+    assert model(text, convention="report")[0].normals is None
+    (mesh,) = model(text, convention="standard")
+    np.testing.assert_array_equal(mesh.normals[mesh.faces[0]], [[0, 0, 1], [0, 0, 1], [0, 1, 0]])

@@ -9,7 +9,6 @@ import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,9 @@ def image() -> np.ndarray:
     return np.random.default_rng(1).normal(0.5, 1, (7, 5, 3)).astype(np.float32)
 
 
+LEVEL = np.arange(256) / 255
+
+
 def grey(*values: float) -> np.ndarray:
     """A picture one pixel high with these grey values."""
     return np.repeat(np.array(values, np.float32)[None, :, None], 3, axis=2)
@@ -40,21 +42,18 @@ def levels(values: np.ndarray, tonemap: str) -> list[int]:
     return output.to_8bit(values, tonemap)[0, :, 0].tolist()
 
 
-def test_report_levels_are_truncated_without_gamma() -> None:
-    values = grey(-np.inf, -1, 0, 0.999 / 255, 1.001 / 255, 0.5, 254.9 / 255, 1, 7, np.inf)
-    assert levels(values, "report") == [0, 0, 0, 0, 1, 127, 254, 255, 255, 255]
-
-
-def test_srgb_levels() -> None:
-    # 0.0031308: where the two pieces of the curve meet; 0.2140: the linear value of 127.49 / 255
-    values = grey(-1, 0, 0.0031308, 0.18, 0.2140, 0.5, 1, 3)
-    assert levels(values, "srgb") == [0, 0, 10, 118, 127, 188, 255, 255]
-
-
-def test_srgb_inverts_the_decoding_of_every_level() -> None:
-    encoded = np.arange(256) / 255
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    assert levels(grey(*linear), "srgb") == list(range(256))
+@pytest.mark.parametrize(
+    ("tonemap", "values", "expected"),
+    [
+        ("report", [-np.inf, -1, 0, 0.999 / 255, 1.001 / 255, 0.5, 254.9 / 255, 1, 7, np.inf],
+         [0, 0, 0, 0, 1, 127, 254, 255, 255, 255]),
+        # 0.0031308: where the two pieces of the curve meet; 0.2140: the linear value of 127.49 / 255
+        ("srgb", [-1, 0, 0.0031308, 0.18, 0.2140, 0.5, 1, 3], [0, 0, 10, 118, 127, 188, 255, 255]),
+        ("srgb", np.where(LEVEL <= 0.04045, LEVEL / 12.92, ((LEVEL + 0.055) / 1.055) ** 2.4), range(256)),
+    ],
+)  # fmt: skip
+def test_levels(tonemap: str, values: Any, expected: Any) -> None:
+    assert levels(grey(*values), tonemap) == list(expected)
 
 
 def test_nan_is_black_with_a_warning() -> None:
@@ -73,12 +72,7 @@ def test_rows_beyond_the_first_block(tmp_path: Path) -> None:
 def test_exr_holds_every_bit(tmp_path: Path, image: np.ndarray) -> None:
     image[0, 0] = np.nan, np.inf, -np.inf
     layers = {"depth.Z": image[:, :, 0], "normal": image, "albedo": image * 2, "samples": image[:, :, 1]}
-    header = {
-        "mrt:version": "1",
-        "mrt:alpha": 1.5,
-        "mrt:scene": "4",
-        "mrt:options": {"aa": 4, "layers": ["depth"]},
-    }
+    header = {"mrt:alpha": 1.5, "mrt:options": {"aa": 4, "layers": ["depth"]}}
     output.write_exr(tmp_path / "a.exr", image, layers, header)
     back = output.read_exr(tmp_path / "a.exr")
     np.testing.assert_array_equal(back.image, image)
@@ -115,10 +109,6 @@ def test_reading_what_is_no_exr(tmp_path: Path, content: bytes | None) -> None:
 @pytest.mark.parametrize(
     ("make", "name", "reason"),
     [
-        (None, "none/a.png", "does not exist; create it first"),
-        (Path.touch, "a.png/b.png", "is a file, not a folder"),
-        (Path.mkdir, "a.png", "is a folder"),
-        (lambda path: path.symlink_to(path), "a.png", "in a circle"),
         (lambda path: path.touch(0o444), "a.png", "is read-only"),
         (None, "/dev/full", "not a regular file"),
         (None, "a" * 300 + ".png", "name too long"),
@@ -127,6 +117,7 @@ def test_reading_what_is_no_exr(tmp_path: Path, content: bytes | None) -> None:
 def test_target_that_cannot_be_written(
     tmp_path: Path, image: np.ndarray, make, name: str, reason: str
 ) -> None:
+    """What else is refused: ``tests/system/test_refusals.py``."""
     if make:
         make(tmp_path / "a.png")
     before, path = sorted(tmp_path.rglob("*")), tmp_path / name
@@ -142,25 +133,19 @@ def test_extension_says_the_format(tmp_path: Path, image: np.ndarray, name: str)
         output.save(tmp_path / name, image)
 
 
-@pytest.fixture
-def old(tmp_path: Path) -> Callable[..., list[Path]]:
-    """Old files of some endings."""
-
-    def write(endings: list[str]) -> list[Path]:
-        paths = [tmp_path / f"a.{ending}" for ending in endings]
-        for path in paths:
-            path.write_bytes(b"old")
-        return paths
-
-    return write
+def old(folder: Path, endings: list[str]) -> list[Path]:
+    paths = [folder / f"a.{ending}" for ending in endings]
+    for path in paths:
+        path.write_bytes(b"old")
+    return paths
 
 
 @pytest.mark.parametrize(
     ("endings", "room"),
-    [(["png"], 100), (["exr"], 0), (["exr"], 2000), (["png", "exr"], 6000)],  # the last is enough for one
+    [(["exr"], 0), (["exr"], 2000), (["png", "exr"], 6000)],  # the last is enough for one
 )
-def test_full_disk_leaves_the_old_files(tmp_path: Path, old, endings: list[str], room: int) -> None:
-    paths = old(endings)
+def test_full_disk_leaves_the_old_files(tmp_path: Path, endings: list[str], room: int) -> None:
+    paths = old(tmp_path, endings)
     noise = np.random.default_rng(0).random((40, 40, 3), np.float32)  # does not compress
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
@@ -173,12 +158,11 @@ def test_full_disk_leaves_the_old_files(tmp_path: Path, old, endings: list[str],
     assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
-@pytest.mark.parametrize("endings", [["exr"], ["png", "exr"]])
 @pytest.mark.parametrize("step", ["fsync", "fchmod", "replace"])
 def test_interrupt_leaves_all_files_old_or_makes_all_new(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image: np.ndarray, old, endings: list[str], step: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image: np.ndarray, step: str
 ) -> None:
-    paths, before = old(endings), getattr(os, step)
+    paths, before = old(tmp_path, ["png", "exr"]), getattr(os, step)
 
     def interrupted(*words: object) -> object:
         done = before(*words)
@@ -207,8 +191,7 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path: Path, image: np.nda
 
 
 def test_link_stays_and_its_target_is_replaced(tmp_path: Path, image: np.ndarray) -> None:
-    (tmp_path / "real").mkdir()
-    target = tmp_path / "real" / "b.png"
+    target = tmp_path / "b.png"
     (tmp_path / "a.png").symlink_to(target)
     output.write_png(tmp_path / "a.png", image)
     assert (tmp_path / "a.png").is_symlink() and target.stat().st_size > 0
@@ -243,23 +226,17 @@ def test_a_forked_process_can_write_too(tmp_path: Path, image: np.ndarray) -> No
 
 def test_no_file_is_replaced_that_the_scene_was_read_from(tmp_path: Path) -> None:
     """By whatever path or link: its own name, one through another folder, symbolic and hard links."""
-    (tmp_path / "folder").mkdir()
-    texture, xml = tmp_path / "texture.png", tmp_path / "scene.xml"
+    texture, model = tmp_path / "texture.png", tmp_path / "a.obj"
     output.save(texture, grey(0, 1))
-    node = (
-        '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="{}"/>'
-    )
-    xml.write_text(
-        f'<scene version="3.0.0"><shape type="sphere">{node.format(texture.name)}</texture></bsdf></shape>'
-        '<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>'
-        '<integer name="height" value="4"/></film></sensor></scene>'
-    )
-    result = mrt.render(xml, integrator="path", spp=1)
-    before = {path: path.read_bytes() for path in (texture, xml)}
-    for name, source in (("a.png", texture), ("b.exr", texture), ("c.png", xml)):
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd texture.png\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n"
+    model.write_text(f"mtllib a.mtl\n{corners}usemtl m\nf 1/1 2/1 3/1\n")
+    result = mrt.render(model, width=4, height=3, aa=1)
+    for name, source in (("a.png", texture), ("b.exr", texture), ("c.png", model)):
         (tmp_path / f"soft-{name}").symlink_to(source)
         os.link(source, tmp_path / f"hard-{name}")
-    for name in ("texture.png", "folder/../texture.png", *(p.name for p in tmp_path.glob("*-*"))):
+    before = {path: path.read_bytes() for path in (texture, model)}
+    for name in ("texture.png", f"../{tmp_path.name}/texture.png", *(p.name for p in tmp_path.glob("*-*"))):
         with pytest.raises(OutputError, match="made from this file; choose another name"):
             result.save(tmp_path / "new.exr", tmp_path / name)
     assert {path: path.read_bytes() for path in before} == before and not (tmp_path / "new.exr").exists()
@@ -278,10 +255,8 @@ WAYS = {
     [
         ("mrt_mitsuba", ""),
         ("mrt_mitsuba.validation.cli", "scenes --quick"),
-        *(
-            ("mrt_mitsuba.command.main", words)
-            for words in ("out 3", "export 0 --xml a.xml", "diff a.exr b.exr", "check 0", "doctor")
-        ),
+        ("mrt_mitsuba.command.main", "out 3"),
+        ("mrt_mitsuba.command.main", "diff a.exr b.exr"),
     ],
 )
 def test_a_deleted_working_folder_is_named(tmp_path: Path, module: str, words: str) -> None:

@@ -33,12 +33,6 @@ def test_modules_come_from_one_place() -> None:
     assert not {"plugins", "validation", "scenes_xml", "filters"} & set(sys.modules)
 
 
-def test_submodules_import_from_any_folder(run_python) -> None:
-    names = [f"mrt_mitsuba.{name}" for name in ("errors", "plugins", "validation", "scenes_xml", "filters")]
-    done = run_python(f"import {', '.join(names)}; print({', '.join(f'{name}.__name__' for name in names)})")
-    assert done.stdout.split() == names, done.stderr
-
-
 def test_checkout_works_without_installation(run_python) -> None:
     """The installed package is a copy elsewhere, and Python is started in the checkout."""
     code = """

@@ -74,17 +74,3 @@ def test_planes_of_one_material_stay_shapes_of_their_own() -> None:
         }
     )
     assert sorted(s.distance for s in scene.shapes()) == [0, 1, 2]
-
-
-@in_variants
-def test_loads_from_xml(variant: str) -> None:
-    mesh = mi.load_string("""
-        <shape version="3.0.0" type="mrt_plane">
-            <vector name="normal" x="0" y="2" z="0"/>
-            <float name="distance" value="0.2"/>
-            <float name="extent" value="8"/>
-            <bsdf type="mrt_bsdf"/>
-        </shape>""")
-    np.testing.assert_array_equal(mesh.unit_normal, [0, 1, 0])
-    np.testing.assert_array_equal(corners(mesh)[:, 1], np.float32(-0.2))
-    assert np.ptp(corners(mesh)[:, 0]) == 8

@@ -1,4 +1,4 @@
-"""The edge detectors against the float64 loops, at their corners, under noise, and on known geometry."""
+"""Edge detectors and depth of field against the float64 loops, at their corners, and on known geometry."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from mrt_mitsuba import UsageError, filters, runtime
-from mrt_mitsuba.filters import edges_image, geometry_edges, luma_edges, sobel_edges
+from mrt_mitsuba.filters import (
+    blur_amount,
+    edges_image,
+    gaussian_dof,
+    geometry_edges,
+    luma_edges,
+    sobel_edges,
+)
 from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.validation.oracles import filters as reference
 
@@ -103,24 +110,6 @@ def test_sobel_needs_more_than_its_threshold(threshold: float, is_edge: bool) ->
 
 
 # ---- noise ----
-
-
-def noisy(mean: np.ndarray, samples: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Mean, and estimated variance of the mean, of exponential samples: skewed, like a path tracer's."""
-    values = mean[None, ..., None] * rng.exponential(1, (samples, *mean.shape, 1)) * np.ones(3)
-    return values.mean(0), values.var(0, ddof=1) / samples
-
-
-@pytest.mark.parametrize("detector", DETECTORS)
-@pytest.mark.parametrize(("level", "samples"), [(0.05, 16), (0.3, 64), (0.8, 4)])
-def test_noise_is_no_edge(detector: Any, level: float, samples: int) -> None:
-    image, variance = noisy(np.full((150, 200), level), samples, np.random.default_rng(samples))
-    inner = (slice(1, -1), slice(1, -1))
-    assert detector(image).mask[inner].mean() > 0.95  # as long as it does not know the noise
-    # three deviations leave 0.5 % for normal noise (|Gx| + |Gy|: 4 × 0.135 %); 4 skewed samples reach 1.3 %
-    assert detector(image, variance=variance).mask[inner].mean() < (0.02 if samples == 4 else 0.008)
-    # the limit is not that far because the detector is blind: at one deviation it still fires
-    assert detector(image, variance=variance, noise_sigmas=1).mask[inner].mean() > 0.2
 
 
 def test_noise_of_the_channels_adds_up_as_if_it_were_one() -> None:
@@ -214,18 +203,106 @@ def test_geometry_has_no_edges_on_the_border() -> None:
         assert not edges.mask.any() and not edges.value.any()
 
 
+# ---- depth of field ----
+
+MODES = ["report", "corrected"]
+SIXTEENTH = st.integers(0, 16 * 14).map(lambda n: n / 16)  # exact in float32, as are all amounts made of them
+ANY_PICTURE = given(
+    size=st.one_of(st.just((37, 41)), st.tuples(st.integers(1, 30), st.integers(1, 20))),
+    seed=st.integers(0, 2**32 - 1),
+    focus=st.fixed_dictionaries({"focal_distance": SIXTEENTH.filter(bool), "focal_range": SIXTEENTH}),
+)
+
+
+def scene(size: tuple[int, int], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Colours, and distances in sixteenths from 0 to 14 in patches and speckles, with misses of all kinds."""
+    rng = np.random.default_rng(seed)
+    depth = (rng.integers(0, 16 * 14, (3, 4)) / 16)[np.arange(size[0]) * 3 // size[0]]
+    depth = depth[:, np.arange(size[1]) * 4 // size[1]]
+    speckles = rng.random(size) < 0.2
+    depth[speckles] = rng.choice([1 / 16, 1, 2.5, 6, 12, 0, -1, np.inf], speckles.sum())
+    return rng.uniform(-1, 1, (*size, 3)).astype(np.float32), depth
+
+
+@ANY_PICTURE
+@settings(max_examples=40)
+def test_amount_equals_the_definition(size: Any, seed: int, focus: dict[str, float]) -> None:
+    _, depth = scene(size, seed)
+    amount = blur_amount(depth, **focus)
+    assert amount.dtype == np.float32
+    # sixteenths: no rounding anywhere
+    np.testing.assert_array_equal(amount, reference.blur_amount(depth, **focus))
+
+
+@pytest.mark.parametrize(
+    ("reach", "expected"), [({}, [0, 1, 8, 8, 8]), ({"focal_range": np.inf}, [0, 0, 8, 8, 8])]
+)
+def test_amount_of_bad_depths_and_misses(reach: dict[str, float], expected: list[float]) -> None:
+    """A depth that is no number is sharp, a miss blurred whatever the range, which is two unless given."""
+    depth = np.array([[np.nan, 5.0, np.inf, 0.0, -3.0]])
+    assert blur_amount(depth, focal_distance=2.0, **reach).tolist() == [expected]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@ANY_PICTURE
+@settings(max_examples=25)
+def test_report_equals_the_loops(backend: str, size: Any, seed: int, focus: dict[str, float]) -> None:
+    """Windows of every size, cut at borders; what is in focus gives nothing; below k = 1 nothing is taken."""
+    image, depth = scene(size, seed)
+    found = np.array(gaussian_dof(tensor(backend, image), tensor(backend, depth), **focus))
+    amount = reference.blur_amount(depth, **focus)
+    # sums of up to 16 weighted values along rows, 16 along columns, and a quotient: 33 roundings of 6e-8
+    np.testing.assert_allclose(found, reference.gaussian_dof(image, amount), atol=2e-6, rtol=0)
+    np.testing.assert_array_equal(found[amount < 1], image[amount < 1])
+
+
+@ANY_PICTURE
+@settings(max_examples=12)
+def test_corrected_equals_the_loops(size: Any, seed: int, focus: dict[str, float]) -> None:
+    """Discs of all sizes on both sides of the focus, layers near and far apart, borders."""
+    image, depth = scene(size, seed)
+    radius = reference.disc_radius(reference.blur_amount(depth, **focus))
+    radius[(depth > 0) & (depth < focus["focal_distance"])] *= -1
+    # float32 sums of up to 81 terms, and quotients of them
+    found = gaussian_dof(image, depth, mode="corrected", **focus)
+    np.testing.assert_allclose(found, reference.corrected_dof(image, radius), atol=5e-6)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_bad_colour_gives_nothing(mode: str) -> None:
+    image = np.full((25, 30, 3), 0.75)
+    image[12, 15, 2] = image[3, 0, 0] = np.nan
+    good = np.isfinite(image).all(axis=-1)
+    for amount in (np.full((25, 30), 8.0), np.arange(750.0).reshape(25, 30) % 9):
+        found = gaussian_dof(image, 1 + amount, focal_distance=1.0, focal_range=0, mode=mode)
+        # the weights of what is left add up to one, but for the rounding of their sums of 61 terms at most
+        np.testing.assert_allclose(found[good], 0.75, rtol=61 * 6e-8)
+
+
 # ---- kinds of arrays, pictures of edges, errors ----
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_arrays_give_arrays_of_their_kind(backend: str) -> None:
-    module, image = importlib.import_module(f"drjit.{backend}"), picture((6, 7), 0, 0, 1)
+    module, (image, depth) = importlib.import_module(f"drjit.{backend}"), scene((40, 50), 1)
     plain, listed, found = map(sobel_edges, (image, image.tolist(), tensor(backend, image)))
     assert isinstance(plain.mask, np.ndarray) and plain.mask.dtype == bool
     assert isinstance(plain.value, np.ndarray) and plain.value.dtype == np.float32
     assert type(found.mask) is module.TensorXb and type(found.value) is module.TensorXf
     np.testing.assert_array_equal(listed.mask, plain.mask)
     np.testing.assert_array_equal(np.array(found.mask), plain.mask)
+    for mode in MODES:
+        given_image = tensor(backend, image)
+        blurred, first, second = (
+            gaussian_dof(each, depth, focal_distance=3.0, focal_range=0.5, mode=mode)
+            for each in (image, given_image, given_image)
+        )
+        assert isinstance(blurred, np.ndarray) and blurred.dtype == np.float32
+        assert type(first) is module.TensorXf and first.shape == (40, 50, 3)
+        np.testing.assert_array_equal(np.array(first), np.array(second))
+        # the same operations in the same order, but for fused multiply-adds: a rounding for each term
+        np.testing.assert_allclose(np.array(first), blurred, atol=61 * 6e-8)
+        np.testing.assert_array_equal(np.array(given_image), image)
 
 
 @pytest.mark.parametrize("ending", ["png", "exr"])
@@ -266,6 +343,14 @@ SHAPES = [(), (4,), (4, 5), (4, 5, 4), (4, 5, 1), (3, 4, 5, 3), (0, 5, 3), (5, 0
         (partial(geometry_edges, IMAGE, DEPTH[:2]), "depth has shape"),
         (partial(geometry_edges, IMAGE, DEPTH, crease_angle=0), "crease_angle=0"),
         (partial(geometry_edges, IMAGE, DEPTH, depth_step=0), "depth_step=0"),
+        (
+            partial(gaussian_dof, IMAGE, DEPTH, focal_distance=1, mode="lens"),
+            "use one of report, corr",
+        ),
+        (partial(gaussian_dof, IMAGE, DEPTH, focal_distance=np.nan), "focal_distance is not a number"),
+        (partial(gaussian_dof, IMAGE, DEPTH, focal_distance=1, focal_range=np.nan), "focal_range is not a"),
+        (partial(gaussian_dof, IMAGE, DEPTH.T, focal_distance=1), r"shape \(5, 4\); expected \[4, 5\]"),
+        (partial(gaussian_dof, DEPTH, DEPTH, focal_distance=1), "image has shape"),
         (filters.contours, "at least one"),
         (lambda: filters.contours(sobel_edges(IMAGE), sobel_edges(IMAGE[1:])), "different heights"),
     ],
