@@ -24,13 +24,17 @@ from mrt_mitsuba.validation.tools.bsdf_probe import (
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-VECTORISED = ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized"]
-VARIANTS = [*VECTORISED, "llvm_ad_spectral_polarized", "scalar_rgb", "scalar_spectral_polarized"]
+VARIANTS = [
+    "llvm_ad_rgb",
+    "llvm_ad_mono",
+    "llvm_ad_spectral_polarized",
+    "scalar_rgb",
+    "scalar_spectral_polarized",
+]
 in_variants = pytest.mark.parametrize("variant", VARIANTS, indirect=True)
 
 KD, KS = (0.1, 0.3, 0.5), (0.9, 0.6, 0.2)
 FORMS = exact.FRESNEL_FORMS
-CHECKERS = {"type": "checkerboard"}
 
 
 def bsdf(**parameters: Any) -> mi.BSDF:
@@ -48,9 +52,6 @@ def test_obeys_the_laws_of_any_bsdf(name: str) -> None:
     assert found.passed and not any(law.skipped for law in found.laws.values()), str(found)
 
 
-# ------------------------------------------ Value and density -------------------------------------------
-
-
 @in_variants
 @pytest.mark.parametrize("alpha", [0.01, 0.4])
 def test_equals_roughconductor(variant: str, alpha: float) -> None:
@@ -58,13 +59,14 @@ def test_equals_roughconductor(variant: str, alpha: float) -> None:
     assert max(found.values()) < POINTWISE
 
 
-@pytest.mark.parametrize("visible", [True, False])
-@pytest.mark.parametrize(("alpha", "theta"), [(0.05, 85), (0.3, 89), (3.0, 80)])
+@pytest.mark.parametrize(
+    ("alpha", "theta", "visible"), [(0.05, 85, True), (0.3, 89, True), (3.0, 80, True), (0.3, 80, False)]
+)
 def test_samples_fit_density_and_value(alpha: float, theta: float, visible: bool) -> None:
     """Drawn from a fine grid of numbers: the mean weight is the integral of the value, and as many directions
     are drawn as the density integrates to."""
     made = bsdf(alpha=alpha, fresnel="unity", diffuse_reflectance=0.0, sample_visible=visible)
-    count = 2000
+    count = 1500
     u = (np.mgrid[:count, :count].reshape(2, -1) + 0.5) / count
     angle = np.radians(theta)
     si = dr.zeros(mi.SurfaceInteraction3f, count**2)
@@ -90,7 +92,7 @@ def test_samples_fit_density_and_value(alpha: float, theta: float, visible: bool
 @pytest.mark.parametrize("alpha", [0.02, 0.3, -0.0432])
 def test_value_is_the_formula_of_the_report(form: str, alpha: float) -> None:
     """Against 50 digits, at the same float32 directions and parameters."""
-    wi, wo = lobe_pairs(60, abs(alpha))
+    wi, wo = (np.float32([*v, (0, 0, 1)]) for v in lobe_pairs(60, abs(alpha)))
     value, _ = evaluate(colored(alpha=alpha, int_ior=1.7, fresnel=form), wi, wo)
     alpha32, ior32 = np.float32(alpha), np.float32(1.7)
     lobe = [
@@ -117,11 +119,7 @@ def test_nothing_below_the_horizon(variant: str) -> None:
     assert dr.all(b.eval_attribute("mirror_reflectance", interaction(down[0])) == 0, axis=None)
 
 
-@pytest.mark.parametrize(
-    "variant",
-    ["llvm_ad_mono_polarized", "llvm_ad_spectral_polarized", "scalar_spectral_polarized"],
-    indirect=True,
-)
+@pytest.mark.parametrize("variant", ["llvm_ad_mono_polarized", "scalar_spectral_polarized"], indirect=True)
 def test_reflected_light_is_depolarised(variant: str) -> None:
     """The Mueller matrix has one entry: intensity from intensity."""
     b, si = bsdf(alpha=0.3), interaction(np.array([0.6, 0, 0.8]))
@@ -130,18 +128,12 @@ def test_reflected_light_is_depolarised(variant: str) -> None:
         b.eval(mi.BSDFContext(), si, wo),
         b.sample(mi.BSDFContext(), si, 0.01, mi.Point2f(0.3, 0.2))[1],
     ):
-        entries = np.array([[dr.max(matrix[i, j], axis=None) for j in range(4)] for i in range(4)]).reshape(
-            4, 4
-        )
-        assert entries[0, 0] > 0
-        assert (entries.ravel()[1:] == 0).all()
-
-
-# ---------------------------------------------- Sampling -----------------------------------------------
+        entries = np.array([dr.max(matrix[i, j], axis=None) for i in range(4) for j in range(4)]).ravel()
+        assert entries[0] > 0 and (entries[1:] == 0).all()
 
 
 @pytest.mark.parametrize("visible", [True, False])
-@pytest.mark.parametrize(("alpha", "degrees"), [(0.0, 60), (1e-6, 85), (1e-4, 0), (-1e-4, 60)])
+@pytest.mark.parametrize(("alpha", "degrees"), [(0.0, 60), (1e-6, 85), (-1e-4, 60)])
 def test_narrow_lobes_are_sampled_as_mirrors(alpha: float, degrees: float, visible: bool) -> None:
     """Every sample carries all of Ks F, along the mirror direction to within the lobe and float32."""
     b = bsdf(alpha=alpha, diffuse_reflectance=0.0, fresnel="dielectric", sample_visible=visible)
@@ -153,9 +145,6 @@ def test_narrow_lobes_are_sampled_as_mirrors(alpha: float, degrees: float, visib
     if alpha >= 0:  # of a negative roughness G is less than 1, whatever its size
         assert weight.mean() == pytest.approx(f, rel=1e-3)
         assert weight.std() < 0.02 * f
-
-
-# ------------------------------------- Lobes, contexts, parameters -------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -234,9 +223,6 @@ def test_mirror_reflectance_is_ks_times_fresnel(form: str) -> None:
     assert max(KS) >= b.mirror_bound().reflectance >= max(KS) * 0.999
     bright = bsdf(f0=rgb((3, 1, 1)))
     assert bright.mirror_bound().reflectance >= 2.99  # an F₀ above 1 is allowed, and the bound knows
-
-
-# -------------------------------------------- Extreme values -------------------------------------------
 
 
 def test_negative_roughness_stays_drawable() -> None:

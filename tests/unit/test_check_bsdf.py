@@ -16,9 +16,7 @@ from unit import specimens
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.checks import noise
 from mrt_mitsuba.validation.checks.bsdf import LAWS
-from mrt_mitsuba.validation.studies.stability.reflectance import lobes_with_truth, mrt_bsdf, report
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -42,9 +40,6 @@ def run(snippet: str) -> None:
         exec(compile(snippet, "snippet", "exec"), {})
     finally:
         mi.set_variant(before)
-
-
-# ----------------------------------------------- Mistakes -------------------------------------------------
 
 
 def test_a_sound_bsdf_passes_as_a_dict_and_loaded(registered) -> None:
@@ -72,8 +67,6 @@ def test_each_mistake_fails_its_own_laws(name: str, registered, capsys) -> None:
     if name == "detached gradient":
         assert "detached: alpha" in check.laws["gradients"].note
 
-
-# -------------------------------------------- Mitsuba's BSDFs ---------------------------------------------
 
 # What each of them fails is explained in docs/check_your_plugin.md
 STOCK = {
@@ -133,9 +126,6 @@ def test_a_texture_that_loading_uses_up() -> None:
     # shading normals break reciprocity whoever computes them (Veach 1997, § 5.3)
     only = ["weights", "components", "variants", "switch"]
     holds(mrt.check_bsdf({**bumpy, "bsdf": {"type": "diffuse"}}, quick=True, only=only))
-
-
-# ---------------------------------------- Variants, time and settings -------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -218,26 +208,3 @@ def test_what_a_check_leaves(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["passed"] is False
     assert {path.suffix for path in tmp_path.iterdir()} >= {".html", ".json", ".csv"}
-
-
-# ------------------------------------------- Noise of rounding --------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("formula", "alpha"), [(report, 0.1), (report, 0.01), (mrt_bsdf, 0.1), (mrt_bsdf, 0.01)]
-)
-def test_noise_is_found_without_a_reference(formula: Any, alpha: float) -> None:
-    """Against 50 digits: the estimate is a deviation, 1.5 medians of an error, within a factor of 3."""
-    lobes, truth = lobes_with_truth(2)
-    here = np.isclose(lobes.alpha, alpha) & (lobes.wi[:, 2] > 5e-4) & (lobes.steepness < 16)
-    few = lobes.only(here)
-
-    def density(x: np.ndarray) -> np.ndarray:
-        wi, wo = (mi.Vector3f(np.ascontiguousarray(v.T)) for v in (x[:, :3], x[:, 3:]))
-        alphas, iors = (mi.Float(np.tile(v, len(x) // len(few.alpha))) for v in (few.alpha, few.ior))
-        return np.array(dr.detach(formula(wi, wo, alphas, iors)["d"]))
-
-    found = noise.measure(density, np.concatenate([few.wi, few.wo], axis=1))
-    error = np.abs(found.value / truth["d"][here] - 1) / noise.ROUNDING
-    assert 1 / 3 < np.nanmedian(found.noise) / (1.5 * np.median(error)) < 3
-    assert (np.nanquantile(found.lost, 0.9) > noise.LOST) == (formula is report)

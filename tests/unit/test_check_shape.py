@@ -58,9 +58,6 @@ def test_scalar_variant(variant: str) -> None:
     assert check.passed and not check.laws["variants"].skipped, str(check)
 
 
-# ----------------------------------------------- Mistakes -------------------------------------------------
-
-
 def flipped(si: Any, ray: Any) -> Any:
     si.n, si.sh_frame.n = -si.n, -si.sh_frame.n
     return si

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -84,49 +82,7 @@ def test_what_is_cut_off_is_not_seen(content: dict[str, Any], options: dict[str,
     assert np.abs(whole - picture(scene, **options)).max() < STEP / 16
 
 
-def work(content: dict[str, Any], **plan: Any) -> tuple[np.ndarray, int, int, Any]:
-    """The picture, the operations of its kernel, the mirror rays, and the plan."""
-    scene = loaded(content)
-    integrator = mi.load_dict({"type": "mrt_whitted", "clamp": False})
-    if plan:
-        own = replace(integrator.prepare(scene).plan, **plan)
-        integrator.kernel_plan = lambda facts: own
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        image = np.array(mi.render(scene, integrator=integrator, spp=1, seed=3))
-        operations = max(k["operation_count"] for k in dr.kernel_history([dr.KernelType.JIT]))
-    y, x = np.mgrid[-1:1:40j, -1:1:40j]
-    ray = mi.Ray3f(mi.Point3f(0.3, 1, 6), mi.Vector3f(x.ravel() * 0.3, y.ravel() * 0.3, -1))
-    bounces = integrator.trace(scene, None, ray).bounces
-    return image, operations, int(np.sum(np.array(bounces))), integrator.prepare(scene).plan
-
-
-BALL: dict[str, Any] = {"type": "sphere", "bsdf": glass()}
 LIGHT = {"type": "mrt_light", "position": [1, 4, 5]}
-
-
-@pytest.mark.parametrize(
-    "shape",
-    [
-        {"type": "sphere"},
-        {"type": "mrt_cone", "apex": [0, 1, 0], "base_center": [0, -1, 0]},
-        {"type": "mrt_plane", "normal": [0, 1, 0], "distance": 1.0},
-    ],
-    ids=lambda shape: shape["type"],
-)
-def test_a_lone_mirror_traces_nothing(shape: dict[str, Any]) -> None:
-    content = {"a": {**shape, "bsdf": glass(1.0)}, "light": LIGHT}
-    sky = {"sky": {"type": "constant", "radiance": rgb(0.2, 0.5, 0.9)}}
-    image, operations, bounces, plan = work(content | sky)
-    traced, more, traced_bounces, _ = work(content | sky, mirror_rays=True)
-    assert plan.mirrors and plan.reason("mirror_rays") == "a ray that leaves the only object meets nothing"
-    assert np.array_equal(image, traced)
-    assert bounces == 0 < traced_bounces and operations < more
-    assert (
-        work(content)[3].reason("mirrors") == "a ray that leaves the only object meets nothing"
-    )  # nor is there a sky to be seen
-    two = content | sky | {"b": {"type": "sphere", "center": [3, 0, 0], "bsdf": glass()}}
-    assert work(two)[3].mirror_rays
 
 
 def test_facing_planes_of_any_reflectance_give_numbers() -> None:

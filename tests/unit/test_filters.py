@@ -109,9 +109,6 @@ def test_sobel_needs_more_than_its_threshold(threshold: float, is_edge: bool) ->
     assert edges.mask[2].tolist() == [False, is_edge, is_edge, False, False]
 
 
-# ---- noise ----
-
-
 def test_noise_of_the_channels_adds_up_as_if_it_were_one() -> None:
     step = np.zeros((5, 6, 3))
     step[:, 3:] = 40 / 255
@@ -142,9 +139,6 @@ def test_noise_of_unknown_size_leaves_its_neighbourhood_alone(detector: Any) -> 
     inner[1:-1, 1:-1] = True
     np.testing.assert_array_equal(edges.mask, inner & ~near)
     assert np.isfinite(edges.value).all()
-
-
-# ---- geometry ----
 
 
 def test_geometry_leaves_a_floor_alone_up_to_its_horizon() -> None:
@@ -202,8 +196,6 @@ def test_geometry_has_no_edges_on_the_border() -> None:
         assert edges.mask.shape == edges.value.shape == size
         assert not edges.mask.any() and not edges.value.any()
 
-
-# ---- depth of field ----
 
 MODES = ["report", "corrected"]
 SIXTEENTH = st.integers(0, 16 * 14).map(lambda n: n / 16)  # exact in float32, as are all amounts made of them
@@ -277,9 +269,6 @@ def test_a_bad_colour_gives_nothing(mode: str) -> None:
         found = gaussian_dof(image, 1 + amount, focal_distance=1.0, focal_range=0, mode=mode)
         # the weights of what is left add up to one, but for the rounding of their sums of 61 terms at most
         np.testing.assert_allclose(found[good], 0.75, rtol=61 * 6e-8)
-
-
-# ---- kinds of arrays, pictures of edges, errors ----
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

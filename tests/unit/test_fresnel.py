@@ -28,9 +28,6 @@ def relative_errors(found, truth: list) -> np.ndarray:
     return np.array([float(abs(exact.number(a) - b) / b) for a, b in pairs])
 
 
-# ------------------------------------------------- Values --------------------------------------------------
-
-
 def test_schlick_and_its_f0_keep_their_digits() -> None:
     """F₀ next to an index of 1 is a small difference's square; the exact form is the stability study's."""
     near_one, large, small = (10 ** np.linspace(*ends, 400) for ends in ((-6.5, -2), (0.01, 6), (-9, -0.2)))
@@ -70,6 +67,3 @@ def test_float64_is_that_of_fifty_digits(cos_theta: float, n1: float, n2: float)
     f0 = float(exact.f0_from_ior(n1, n2))
     assert f0_from_ior(n1, n2) == pytest.approx(f0, rel=1e-13, abs=1e-30)
     assert fresnel_schlick(cos_theta, f0) == pytest.approx(exact.fresnel_schlick(cos_theta, f0), rel=ROUNDING)
-
-
-# ------------------------------------------------ Beyond it ------------------------------------------------

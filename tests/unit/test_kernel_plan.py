@@ -146,7 +146,9 @@ REASONS = [
     ({"a": SPHERE}, "tangents", "no material depends on the direction of texture coordinates"),
     ({"a": {**SPHERE, "bsdf": BRUSHED}}, "spheres", "a material needs the frame along texture coordinates"),
     ({"a": {**SPHERE, "bsdf": MATTE}}, "lobes", "no material has the specular one"),
-    ({"a": SPHERE}, "mirrors", "a ray that leaves the only object meets nothing"),
+    *(({"a": {**thing, "bsdf": {"type": "mrt_bsdf"}}}, "mirrors",
+       "a ray that leaves the only object meets nothing")
+      for thing in (SPHERE, CONE, {"type": "mrt_plane", "normal": [0, 1, 0]})),
     ({"a": SPHERE, "sky": {"type": "constant"}}, "mirror_rays",
      "a ray that leaves the only object meets nothing"),
     ({"a": SPHERE, "b": CONE, "sky": {"type": "constant"}}, "guarded", "no path gets that bright"),

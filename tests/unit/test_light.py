@@ -74,9 +74,6 @@ def test_colour_does_not_depend_on_the_distance(variant: str) -> None:
     assert np.linalg.norm(entries(ds.d)) == pytest.approx(1)  # there is none, and any will do
 
 
-# ---------------------------------------------- In scenes ----------------------------------------------
-
-
 def lit_floor(emitter: dict[str, Any], integrator: str, *more: dict[str, Any]) -> np.ndarray:
     """A white diffuse floor seen from above at one point, the origin."""
     white = {"type": "diffuse", "reflectance": 1.0}
@@ -136,9 +133,6 @@ def test_other_kinds_of_lights_join_the_table() -> None:
         assert plan.lights == "table" and image.std() > 1e-3
         integrator.kernel_plan = lambda facts, plan=plan: replace(plan, lights="loop")
         np.testing.assert_allclose(image, np.array(mi.render(scene, spp=1)), atol=1e-6)
-
-
-# --------------------------------------------- Parameters ----------------------------------------------
 
 
 @in_variants

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -42,27 +41,8 @@ def spheres(count: int, **more: Any) -> dict[str, Any]:
     return scene | more
 
 
-def merged(scene: mi.Scene) -> bool:
-    return scene.integrator().prepare(scene).plan.merged
-
-
 def picture(scene: mi.Scene) -> np.ndarray:
     return np.array(mi.render(scene, spp=4, seed=1))
-
-
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono"], indirect=True)
-def test_picture_is_that_of_separate_calls(variant: str) -> None:
-    """Code and numbers are the same, from a table or from each BSDF."""
-    scene = mi.load_dict(spheres(7))
-    assert merged(scene)
-    together = picture(scene)
-    integrator = scene.integrator()
-    own = replace(integrator.prepare(scene).plan, merged=False)
-    integrator.kernel_plan = lambda facts: own
-    assert not merged(scene)
-    assert together.std() > 0.02  # there is something to see
-    # Compiled by itself or in place, a product and a sum may be rounded once or twice
-    assert np.abs(together - picture(scene)).max() < 1e-5
 
 
 def test_materials_are_recorded_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -96,9 +96,6 @@ def test_runs_of_lines_equal_single_lines(model) -> None:
     np.testing.assert_array_equal(triangles(fast), points[faces - 1])
 
 
-# --------------------------------------------- Materials ------------------------------------------------
-
-
 def test_a_mesh_for_each_material_with_its_own_vertices(model) -> None:
     text = (
         "mtllib model.mtl\n" + SQUARE + "f 1 2 3\nusemtl red\nf 1 3 4\nusemtl painted\nf 2 3 4\nusemtl red\n"
@@ -192,9 +189,6 @@ def test_any_text_is_read_or_refused(model, obj: bytes, start: str, mtl: str) ->
     for mesh in meshes:
         assert np.isfinite(mesh.vertices).all() and mesh.faces.shape[1] == 3
         assert len(mesh.faces) > 0 and mesh.faces.max() < len(mesh.vertices)
-
-
-# ------------------------------------------------ Pictures ----------------------------------------------
 
 
 def test_view_as_asked_for(tmp_path) -> None:

@@ -119,16 +119,6 @@ def test_any_text_is_taken_or_refused_in_one_line(name: str, text: str) -> None:
         assert checked(options.TABLE[name], value) == value
 
 
-@pytest.mark.fuzz
-@given(st.lists(st.text(max_size=12), max_size=5))
-def test_any_command_line(arguments: list[str]) -> None:
-    try:
-        parsed = parse(arguments)
-    except UsageError:
-        return
-    assert parsed.filename == arguments[0]
-
-
 @pytest.mark.parametrize(
     ("name", "value", "taken"),
     [

@@ -15,8 +15,6 @@ from mrt_mitsuba.rendering.settings import RenderSettings
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-# ------------------------------------------------ Kernels ------------------------------------------------
-
 MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
 LIGHT = {"type": "mrt_light", "position": [3, 5, 2], "intensity": 1.0}
 BALL = {"type": "sphere", "center": [0, 0, -4], "bsdf": MATTE}
@@ -82,9 +80,6 @@ def test_what_no_decision_depends_on_leaves_the_kernel(
 def test_what_the_integrator_does_not_say_is_not_made_up() -> None:
     plan = planned(scene(), integrator="direct")[0].plan
     assert plan.kernel is None and not any("shadow" in omission.what for omission in plan.left_out)
-
-
-# ------------------------------------------------ Passes -------------------------------------------------
 
 
 @pytest.mark.parametrize(

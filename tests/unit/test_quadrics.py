@@ -44,37 +44,27 @@ INF = np.inf
         ("sphere", (1, 2, 3), (0, 2, 0), 0.25, None),  # from the centre; t counts lengths of d
         ("sphere", (1, 2.5, 3), (0, 1, 0), INF, None),  # leaving its surface
         ("sphere", (1, 2.5, 3), (0, -1, 0), 1, None),  # through
-        ("sphere", (1, 2.5, 3), (1, 0, 0), INF, None),  # along
-        ("sphere", (1, 9, 3), (0, 1, 0), INF, None),  # behind
-        ("plane", (0, 1, 0), (1, 0, 0), INF, None),
         ("plane", (0, 0, 0), (1, -1, 0), INF, None),  # from on it
         ("plane", (0, 1, 0), (1, -2, 0), 0.5, None),
         ("plane", (0, -1, 0), (1, 2, 0), 0.5, None),  # from behind as well
-        ("plane", (0, -1, 0), (1, -2, 0), INF, None),
         ("cone", (0, 0, 5), (0, 0, -1), 4, LATERAL),  # onto the apex
         ("cone", (0, 0, -5), (0, 0, 1), 5, BASE),  # up the axis
         ("cone", (0, 0, 0.5), (0, 0, 1), 0.5, LATERAL),  # from inside, out at the apex
-        ("cone", (0, 0, 0.5), (0, 0, -1), 0.5, BASE),
         ("cone", (3, 0, 0.5), (-2, 0, 0), 1.25, LATERAL),
         ("cone", (3, 0, 1.5), (-1, 0, 0), INF, None),  # above the apex
         ("cone", (3, 0, -1e-9), (-1, 0, 0), INF, None),  # just below the base, level with it
         ("cone", (3, 0, 1e-9), (-1, 0, 0), 2 + 1e-9, LATERAL),  # just above
         ("cone", (-2, 0.1, 0), (1, 0, 1), INF, None),  # parallel to a generatrix, outside
         ("cone", (-0.5, 0, 0), (1, 0, 1), 0.75, LATERAL),  # ... from inside to the other side
-        ("cone", (-0.5, 0, -1), (1, 0, 1), 1, BASE),  # ... entered from below
-        ("cone", (3, 0, 2.5), (-1, 0, -1), 2.25, LATERAL),  # ... entered from the side
         ("cone", (0.5, 0, 2.5), (-1, 0, -1), INF, None),  # ... through the half above the apex only
         ("cone", (0, 0, 1.0 + 1e-9), (1, 0, 1), INF, None),  # off the apex, away
         ("open cone", (0.2, 0, -5), (0, 0, 1), 5.8, LATERAL),  # through to the side
         ("cylinder", (0, 0, 5), (0, 0, -1), 4, TOP),
         ("cylinder", (1 - 1e-12, 0, 5), (0, 0, -1), 4, TOP),  # parallel to the side, just inside
         ("cylinder", (1 + 1e-12, 0, 5), (0, 0, -1), INF, None),
-        ("cylinder", (0, 0, -5), (0, 0, 1), 5, BASE),
         ("cylinder", (0.2, 0, 0.5), (0, 0, 1), 0.5, TOP),
-        ("cylinder", (3, 0, 0.5), (-1, 0, 0), 2, LATERAL),
         ("cylinder", (3, 1 + 1e-12, 0.5), (-1, 0, 0), INF, None),
         ("cylinder", (3, 0, 1 + 1e-12), (-1, 0, 0), INF, None),
-        ("cylinder", (0, 0, 0.5), (1, 0, 0), 1, LATERAL),
         ("cylinder", (2, 0, -1), (-1, 0, 1), 1, LATERAL),  # onto the rim
         ("open cylinder", (0.2, 0, -5), (0, 0, 1), INF, None),
     ],
@@ -114,9 +104,6 @@ def test_surface_points_have_their_normal_and_uv(kind: str) -> None:
             azimuth = u * 2 * np.pi
             assert dr.all((u >= 0) & (u < 1))
             assert dr.all(other | (dr.abs(dr.sin(azimuth) * q.x - dr.cos(azimuth) * q.y) < 1e-12))
-
-
-# ------------------------------------------------ The tree ------------------------------------------------
 
 
 def nearest(kind: str, ends: np.ndarray, radii: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -170,9 +157,9 @@ def crowd(count: int, place: str, kind: str, rays: int = 8_000) -> tuple[np.ndar
 @pytest.mark.parametrize(
     ("count", "scale", "place"),
     [
-        *((120, 1.0, place) for place in ("among", "inside", "far away", "at the surface")),
+        *((120, 1.0, place) for place in ("inside", "far away", "at the surface")),
         *((120, scale, "among") for scale in (1e-6, 1e6)),
-        *((count, 1.0, "among") for count in (1, 2, 5)),
+        *((count, 1.0, "among") for count in (1, 5)),
     ],
 )
 def test_search_against_float64(kind: str, count: int, scale: float, place: str) -> None:
@@ -193,9 +180,6 @@ def test_search_against_float64(kind: str, count: int, scale: float, place: str)
         assert np.isfinite(exact).mean() > 0.3
         lost = np.where(np.arange(len(t)) % 1000 == 0, INF, t)
         assert disagreements(lost, exact, thinner).mean() > 2e-4
-
-
-# ------------------------------------------------- Scenes -------------------------------------------------
 
 
 def test_kernel_does_not_grow_with_the_number_of_cones() -> None:

@@ -5,13 +5,9 @@ Each test has a process of its own, since what is registered stays so until a pr
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from mrt_mitsuba import runtime
-
-ROOT = Path(__file__).parents[2]
 
 pytestmark = pytest.mark.skipif(
     runtime.obstacle(runtime.FAST) is not None, reason="no second kind of variant without LLVM"
@@ -106,19 +102,3 @@ draws("prb")
 print(dr.ast._syntax_counter - counted)
 """
     assert lines(run_python, code) == ["1", "1"]
-
-
-def test_plugins_are_known_from_xml_and_to_the_writer(run_python) -> None:
-    """Mitsuba's own writer, which works in scalar_rgb, writes a text with the plugins, and it loads."""
-    code = """
-mi.set_variant("scalar_rgb")
-mrt_mitsuba.register()
-mi.set_variant("llvm_ad_rgb")
-config = mi.parser.ParserConfig("llvm_ad_rgb")
-text = mi.parser.write_string(mi.parser.parse_dict(config, scene("direct")))
-for integrator in ("direct", "path", "mrt_whitted"):
-    value = pixel(mi.load_string(text.replace('"direct"', f'"{integrator}"')))
-    assert abs(value / 0.127324 - 1) < 2e-3, (integrator, value)
-print("written" if "mrt_plane" in text else "lost")
-"""
-    assert lines(run_python, code) == ["written"]

@@ -79,16 +79,6 @@ def test_scenes_of_models_render_and_repeat(number: int, triangles: int) -> None
     assert names == [name for name in nodes if name in names] and "mesh_0" in names
 
 
-def test_arrow_on_the_block_points_up() -> None:
-    """Above the middle of the block's front the picture is blue, below it is wood: v = 0 is the first row."""
-    image = mrt.render(8, width=240, height=180, aa=1).image
-    blue = (image[..., 2] > 1.3 * image[..., 0]) & (image[..., 2] > 0.25)
-    rows, columns = np.nonzero(blue[60:150, 100:140])
-    widths = [np.ptp(columns[rows == row]) for row in np.unique(rows)]
-    assert np.mean(widths[: len(widths) // 3]) < np.max(widths)  # a tip
-    assert np.argmax(widths) < len(widths) / 2  # the head is above the shaft
-
-
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_scene_of_an_obj_file(tmp_path: Path, scale: float) -> None:
     """All of the model is in view, from in front, whatever its size and place."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -59,29 +58,6 @@ def test_a_grain_on_a_wide_floor_has_its_shadow(variant: str, kind: str, place: 
     assert 700 < dark[1].sum() < 900
     # Rays of ``direct`` start 9e-5 (1 + |p|) off, 2 to 8 % of the ball's radius, and the rim moves with them
     assert (dark[0] != dark[1]).sum() < 60
-
-
-@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_rays_leave_triangles_of_every_form(variant: str, scale: float) -> None:
-    """Rays upwards from hits on single triangles, slivers of 1 : 1000 included, meet nothing."""
-    rng = np.random.default_rng(4)
-    for k in range(30):
-        corners = rng.normal(size=(3, 3)) * scale
-        corners[2] = corners[0] + 10 ** rng.uniform(-3, 0) * (corners[2] - corners[0])  # thin
-        corners = np.float32(corners + (k % 3) * 10 * scale * rng.normal(size=3))
-        faces = mi.Bitmap(np.array([[(0, 1, 2)]], np.uint32))
-        mesh = {"type": "mrt_mesh", "positions": mi.Bitmap(corners[np.newaxis]), "faces": faces}
-        scene = mi.load_dict({"type": "scene", "mesh": {**mesh, "bsdf": {"type": "mrt_bsdf"}}})
-        data = mi.load_dict({"type": "mrt_whitted"}).prepare(scene)
-        inside = rng.dirichlet([1, 1, 1], 2000) @ corners.astype(float)
-        o = inside + scale * rng.normal(size=(2000, 3))
-        ray = mi.Ray3f(mi.Point3f(o.T), dr.normalize(mi.Vector3f((inside - o).T)))
-        hit = data.intersect(scene, ray, mi.Bool(True))
-        up = dr.normalize(mi.Vector3f(rng.normal(size=(3, 2000))))
-        mirror = data.mirror_ray(mi.Ray3f(hit.si.p, up), hit)
-        mirror.o = hit.si.p + hit.si.n * dr.select(dr.dot(hit.si.n, mirror.d) >= 0, hit.error, -hit.error)
-        assert np.array(hit.found).mean() > 0.9
-        assert dr.none(hit.found & scene.ray_test(mirror))
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e11])
