@@ -131,7 +131,6 @@ def test_a_texture_that_loading_uses_up() -> None:
 @pytest.mark.parametrize(
     ("variant", "bsdf"),
     [
-        ("scalar_rgb", {"type": "mrt_bsdf", "alpha": 0.3}),
         ("scalar_rgb", {"type": "diffuse"}),  # in which Mitsuba leaves ``active`` out
         # a lobe 500 times as long as wide, of which so few samples and cells tell little
         ("scalar_rgb", {"type": "roughconductor", "alpha_u": 0.001, "alpha_v": 0.5}),

@@ -52,7 +52,6 @@ def test_accepted(arguments: str, values: dict[str, object]) -> None:
 
 BAD = [
     # argument(s), what the message must hold
-    ("width=0", "width=0: width must be a whole number from 1 to 65536"),
     ("width=1e3", "width=1e3: width must be a whole number"),
     ("width=" + "9" * 5000, "whole number"),
     ("width=\u0663", "whole number"),

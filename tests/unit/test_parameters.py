@@ -1,19 +1,23 @@
-"""``params``: values of a scene set once it is loaded."""
+"""Values of a scene that are set once it is loaded: by ``params``, and after ``mi.traverse``."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import sensor
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import UsageError
 
+pytestmark = pytest.mark.usefixtures("variant")
+
 SIZE = {"width": 32, "height": 24, "aa": 1}
 
 
-def test_a_render_with_params_is_that_of_the_scene_changed_by_hand(variant: str) -> None:
-    import mitsuba as mi
-
+def test_a_render_with_params_is_that_of_the_scene_changed_by_hand() -> None:
     values = {"material_0.alpha": 0.5, "light_1.intensity.value": [0.2, 0.4, 0.6]}
     scene = mi.load_dict(mrt.scene_dict(3, width=32, height=24))
     parameters = mi.traverse(scene)
@@ -37,16 +41,45 @@ def test_a_render_with_params_is_that_of_the_scene_changed_by_hand(variant: str)
         (3, "must be a dict of values"),
     ],
 )
-@pytest.mark.usefixtures("variant")
 def test_what_cannot_be_set(params: object, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         mrt.render(3, params=params, **SIZE)
 
 
-@pytest.mark.usefixtures("variant")
 def test_a_loaded_scene_is_not_changed() -> None:
-    import mitsuba as mi
-
     scene = mi.load_dict(mrt.scene_dict(0))
     with pytest.raises(UsageError, match="change a loaded one"):
         mrt.render(scene, params={"material_0.alpha": 0.5})
+
+
+def drawn(scene: mi.Scene) -> float:
+    return float(np.median(np.array(mi.render(scene, spp=1))))
+
+
+def update(scene: mi.Scene, name: str, value: Any) -> None:
+    parameters = mi.traverse(scene)
+    parameters[name] = value
+    parameters.update()
+
+
+def test_light_buffers_follow_the_light_and_the_spheres() -> None:
+    """A floor under a ball, and so many others that there are lists of what is in the way of the light."""
+    ours = {"bsdf": {"type": "mrt_bsdf"}}
+    others = {f"s{i}": {"type": "sphere", "center": [i, 90, 0], "radius": 0.2, **ours} for i in range(70)}
+    scene = mi.load_dict({
+        "type": "scene",
+        "integrator": {"type": "mrt_whitted"},
+        "sensor": sensor([0, 0, 5], [0, 0, 0], (32, 24), fov=1),
+        "light": {"type": "mrt_light", "position": [4, 0, 8]},
+        "floor": {"type": "mrt_plane", "normal": [0, 0, 1], **ours},
+        "ball": {"type": "sphere", "center": [2, 0, 4], "radius": 0.5, **ours},
+        **others,
+    })  # fmt: skip
+    assert drawn(scene) == 0
+    assert scene.integrator().prepare(scene).plan.buffers
+    update(scene, "light.position", [-4, 0, 8])
+    assert drawn(scene) > 0.1
+    update(scene, "ball.to_world", mi.ScalarTransform4f().translate([-2, 0, 4]).scale(0.5))
+    assert drawn(scene) == 0
+    update(scene, "light.position", [4, 0, 8])
+    assert drawn(scene) > 0.1

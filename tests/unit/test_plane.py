@@ -61,16 +61,3 @@ def test_texture_coordinates_are_lengths_from_the_foot() -> None:
         point = -4 * n + u * s + v * t
         si = scene.ray_intersect(ray(point + n, -n))
         np.testing.assert_allclose(np.array(si.uv).ravel(), (u, v), atol=2e-5)
-
-
-def test_planes_of_one_material_stay_shapes_of_their_own() -> None:
-    """Mitsuba merges meshes that share a BSDF; the integrator needs each plane's equation."""
-    material = {"type": "ref", "id": "material"}
-    scene = mi.load_dict(
-        {"type": "scene", "material": {"type": "diffuse"}}
-        | {
-            f"plane_{i}": {"type": "mrt_plane", "normal": [0, 1, 0], "distance": float(i), "bsdf": material}
-            for i in range(3)
-        }
-    )
-    assert sorted(s.distance for s in scene.shapes()) == [0, 1, 2]

@@ -1,12 +1,15 @@
-"""Places of samples: the division of lane numbers, and what rays add up to on a film."""
+"""Rays: the division of lane numbers, random numbers by ray, and what rays add up to on a film."""
 
 from __future__ import annotations
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.rays.lattice import divide
+from mrt_mitsuba.rays.samplers import ray_sampler
 from mrt_mitsuba.rendering.windows import dilated, window_means
 
 LARGEST = 2**32 - 1
@@ -17,8 +20,6 @@ def test_division_is_exact(number: int) -> None:
     """Next to multiples of the divisor, where a product with the rounded inverse could fall to the wrong
     side, and everywhere else."""
     mrt.register()
-    import mitsuba as mi
-
     rng = np.random.default_rng(number)
     multiples = rng.integers(0, LARGEST // number + 1, 10_000) * number
     near = np.concatenate([multiples + k for k in (-1, 0, 1)] + [rng.integers(0, LARGEST, 10_000)])
@@ -42,3 +43,26 @@ def test_windows_are_those_of_a_loop(shape, reach):
     near = np.array([[mask[w].any((-2, -1)) for w in line] for line in windows])
     assert np.allclose(window_means(values, reach), np.moveaxis(means, (0, 1), (-2, -1)), rtol=1e-13, atol=0)
     assert np.array_equal(dilated(mask, reach), np.moveaxis(near, (0, 1), (-2, -1)))
+
+
+def started(first: int, count: int):
+    """Return a sampler for the rays from ``first`` on."""
+    sampler = ray_sampler()
+    sampler.start(7, dr.arange(mi.UInt64, count) + first)
+    return sampler
+
+
+@pytest.mark.usefixtures("variant")
+def test_rays_beyond_32_bits_get_numbers_of_their_own() -> None:
+    seen = [np.array(started(first, 1000).next_1d()) for first in (0, 2**32, 2**33)]
+    assert not any((seen[i] == seen[i + 1]).any() for i in range(2))
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb"], indirect=True)
+def test_scalar_variants_draw_the_same(variant: str) -> None:
+    scalar, found = ray_sampler(), []
+    for ray in range(5):
+        scalar.start(7, ray)
+        found.append(scalar.next_1d())
+    mi.set_variant("llvm_ad_rgb")
+    np.testing.assert_array_equal(np.float32(found), started(0, 5).next_1d())

@@ -82,22 +82,6 @@ def square_scene(texture: str | None, texturing: str = "report") -> Scene:
     )
 
 
-def test_textured_square(picture) -> None:
-    """Kd/π under a distant light, texel by texel; the camera's picture is mirrored left to right."""
-    path, values = picture
-    nodes = square_scene(str(path)).to_dict(width=64, height=64)
-    scene = mi.load_dict(nodes)
-    ray, _ = scene.sensors()[0].sample_ray(0, 0, mi.Point2f([0.5, 0.31, 0.77], [0.5, 0.62, 0.45]), 0)
-    si = scene.ray_intersect(ray)
-    assert dr.all(si.is_valid())
-    wanted = expected(values, si.uv.x.numpy(), si.uv.y.numpy()) / np.pi
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, 3)
-    tracer = mi.load_dict({"type": "mrt_whitted"})
-    got = tracer.sample(scene, sampler, ray)[0].numpy().T
-    np.testing.assert_allclose(got, wanted, rtol=1e-4)  # the light is at 10⁴, not at infinity
-
-
 def test_standard_texturing_is_bilinear_and_decodes_srgb(picture) -> None:
     path, values = picture
     shape = mi.load_dict(square_scene(str(path), "standard").to_dict(width=8, height=8)).shapes()[0]
