@@ -68,18 +68,9 @@ def test_a_picture_without_noise_is_compared_too() -> None:
     assert compare(noisy(1.05 * TRUTH, 1), [TRUTH, TRUTH]).rejects
 
 
-def test_t_is_welchs_of_sums_of_cells_and_no_pixel_is_left_out() -> None:
-    """The last cell is one pixel wide."""
+def test_t_is_welchs_of_sums_of_cells() -> None:
     a, b = np.random.default_rng(0).normal(0.5, 0.02, (2, 6, 17, 33, 1))
     found = compare(a, b, tile=16)
-    tiles = [
-        stats.ttest_ind(*(s[:, y : y + 16, x : x + 16].sum(axis=(1, 2, 3)) for s in (a, b)), equal_var=False)[
-            0
-        ]
-        for y in (0, 16)
-        for x in (0, 16, 32)
-    ]
-    assert found.t["tile"] == pytest.approx(np.abs(tiles).max(), rel=1e-3)
     whole = stats.ttest_ind(a.sum(axis=(1, 2, 3)), b.sum(axis=(1, 2, 3)), equal_var=False)
     assert found.t["image"] == pytest.approx(abs(whole.statistic), rel=1e-3)
     assert found.p_values["image"] == pytest.approx(whole.pvalue, rel=1e-2)

@@ -73,28 +73,6 @@ def test_colour_does_not_depend_on_the_distance(variant: str) -> None:
     assert np.linalg.norm(entries(ds.d)) == pytest.approx(1)  # there is none, and any will do
 
 
-def lit_floor(emitter: dict[str, Any], integrator: str, *more: dict[str, Any]) -> np.ndarray:
-    """A white diffuse floor seen from above at one point, the origin."""
-    white = {"type": "diffuse", "reflectance": 1.0}
-    scene = {
-        "type": "scene",
-        "integrator": {"type": integrator},
-        "sensor": sensor([0, 0, 5], [0, 0, 0], (1, 1), rfilter="gaussian", fov=0.01),
-        "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(4), "bsdf": white},
-        "emitter": emitter,
-    }
-    scene |= {f"more_{i}": thing for i, thing in enumerate(more)}
-    return np.array(mi.render(mi.load_dict(scene), spp=4))[0, 0]
-
-
-def test_things_in_between_cast_a_shadow() -> None:
-    emitter = {"type": "mrt_light", "position": [0, 0.6, 0.8], "intensity": 3.0}
-    ball = {"type": "sphere", "center": [0, 0.3, 0.4], "radius": 0.1}
-    beyond = {"type": "sphere", "center": [0, 0.9, 1.2], "radius": 0.1}
-    assert (lit_floor(emitter, "direct", ball) == 0).all()
-    assert (lit_floor(emitter, "direct", beyond) > 0.5).all()
-
-
 def test_light_tracing_is_refused() -> None:
     with pytest.raises(NotImplementedError, match="light tracing needs a finite emitted power"):
         light().sample_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
