@@ -55,6 +55,7 @@ def _material(rng: random.Random) -> dict[str, Any]:
         "diffuse_reflectance": rng.choice([_color(rng), _texture(rng, "mrt_texture")]),
         "specular_reflectance": rng.choice([_color(rng), 0.0]),
     }
+    matte = {"type": "diffuse"}
     stock = [
         {"type": "diffuse", "reflectance": rng.choice([_color(rng), _texture(rng, "bitmap")])},
         {"type": "roughconductor", "alpha": rng.uniform(0.1, 0.5)},
@@ -62,15 +63,10 @@ def _material(rng: random.Random) -> dict[str, Any]:
         {"type": "conductor"},
         {"type": "roughplastic", "alpha": rng.uniform(0.1, 0.5)},
         {"type": "principled", "roughness": rng.uniform(0.2, 0.8), "metallic": rng.uniform(0, 1)},
-        {
-            "type": "blendbsdf",
-            "weight": rng.uniform(0, 1),
-            "a": {"type": "diffuse"},
-            "b": {"type": "conductor"},
-        },
-        {"type": "mask", "opacity": rng.uniform(0, 1), "nested": {"type": "diffuse"}},
-        {"type": "bumpmap", "bump": _texture(rng, "bitmap"), "nested": {"type": "diffuse"}},
-        {"type": "normalmap", "normalmap": _texture(rng, "bitmap"), "nested": {"type": "diffuse"}},
+        {"type": "blendbsdf", "weight": rng.uniform(0, 1), "a": matte, "b": {"type": "conductor"}},
+        {"type": "mask", "opacity": rng.uniform(0, 1), "nested": matte},
+        {"type": "bumpmap", "bump": _texture(rng, "bitmap"), "nested": matte},
+        {"type": "normalmap", "normalmap": _texture(rng, "bitmap"), "nested": matte},
         {"type": "dielectric"},
     ]
     return ours if rng.random() < 0.6 else rng.choice(stock)
@@ -154,16 +150,11 @@ def _changed(value: Any, rng: random.Random) -> Any:
     numbers = np.array(value)
     if numbers.dtype == np.uint32:  # faces: other corners, the other way round
         return type(value)(np.roll(numbers.reshape(-1, 3), 1, axis=0)[:, ::-1].ravel())
-    factors = np.array([rng.uniform(0.6, 1.4) for _ in range(numbers.size)], np.float32).reshape(
-        numbers.shape
-    )
-    return type(value)(np.ascontiguousarray(numbers * factors, np.float32))
+    factors = np.reshape([rng.uniform(0.6, 1.4) for _ in range(numbers.size)], numbers.shape)
+    return type(value)(np.ascontiguousarray(numbers * factors.astype(np.float32), np.float32))
 
 
-def edits_of(rng: random.Random) -> list[Edit]:
-    """Return edits: a kind, and a number from which the rest is drawn."""
-    kinds = ["update", "update", "update", "twice", "share", "interrupt", "switch", "other"]
-    return [(rng.choice(kinds), rng.random()) for _ in range(EDITS)]
+KINDS = ["update", "update", "update", "twice", "share", "interrupt", "switch", "other"]
 
 
 def edit(scene: mi.Scene, kind: str, number: float) -> None:
@@ -176,23 +167,22 @@ def edit(scene: mi.Scene, kind: str, number: float) -> None:
         return
     params = mi.traverse(scene)
     keys = sorted(k for k in params.keys() if not any(word in k for word in LEFT_ALONE))  # noqa: SIM118
-    kept = [
-        k
-        for k in keys
-        if isinstance(params[k], float)
-        or (dr.is_array_v(params[k]) and dr.width(params[k]))
-        or hasattr(params[k], "translate")
-    ]
-    for key in [rng.choice(kept)] * (2 if kind == "twice" else 1):
+
+    def movable(value: Any) -> bool:
+        array = dr.is_array_v(value) and dr.width(value)
+        return isinstance(value, float) or bool(array) or hasattr(value, "translate")
+
+    key = rng.choice([k for k in keys if movable(params[k])])
+    for _ in range(2 if kind == "twice" else 1):
         params[key] = _changed(params[key], rng)
         params.update()
 
 
 def stories(first: int, count: int) -> Iterator[tuple[int, dict[str, Any], list[Edit]]]:
-    """Yield numbers, scenes and edits."""
+    """Yield numbers, scenes and edits: a kind, and a number from which the rest is drawn."""
     for number in range(first, first + count):
         rng = random.Random(number)
-        yield number, scene_of(rng), edits_of(rng)
+        yield number, scene_of(rng), [(rng.choice(KINDS), rng.random()) for _ in range(EDITS)]
 
 
 def drawn(scene: Any, integrator: Any = None) -> np.ndarray:
@@ -207,10 +197,8 @@ def _interrupted(run: Callable[[], object], calls: int) -> None:
     def count(frame: Any, event: str, argument: Any) -> None:
         nonlocal left
         # Python ignores what is raised while it closes a generator
-        ours = (
-            "mrt_mitsuba" in frame.f_globals.get("__name__", "") and not frame.f_code.co_flags & CO_GENERATOR
-        )
-        left -= event == "call" and ours
+        ours = "mrt_mitsuba" in frame.f_globals.get("__name__", "")
+        left -= event == "call" and ours and not frame.f_code.co_flags & CO_GENERATOR
         if left == 0:
             sys.setprofile(None)
             raise KeyboardInterrupt
@@ -255,6 +243,4 @@ if __name__ == "__main__":
     mi.set_variant("llvm_ad_rgb")
     mrt.register()
     first, count, path = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
-    np.savez(
-        path, **{str(number): list(anew(content, edits)) for number, content, edits in stories(first, count)}
-    )
+    np.savez(path, **{str(n): list(anew(content, edits)) for n, content, edits in stories(first, count)})

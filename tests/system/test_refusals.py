@@ -44,17 +44,7 @@ def xml(inside: str, sensor: str = SMALL) -> dict[str, Content]:
     return {"a.xml": f"<scene version='3.0.0'>{sensor}{inside}</scene>"}
 
 
-def ball(material: str) -> dict[str, Content]:
-    return xml(f"<shape type='sphere'><bsdf type='mrt_bsdf'>{material}</bsdf></shape>")
-
-
-PAPERED = """<texture name='diffuse_reflectance' type='mrt_texture'><string name='filename' value='no.png'/>
-</texture>"""
-ENDS = "<point name='p0' value='1 0 0'/><point name='p1' value='{} 0 0'/><float name='radius' value='{}'/>"
-
-
-def shape(kind: str, parameters: str) -> dict[str, Content]:
-    return xml(f"<shape type='mrt_{kind}'>{parameters}</shape>")
+MISSPELT = "<shape type='sphere'><bsdf type='mrt_bsdf'><float name='aplha' value='1'/></bsdf></shape>"
 
 
 def textured(picture: Content) -> dict[str, Content]:
@@ -132,21 +122,29 @@ SCENES: list[Case] = [
     (xml(""), "out scene=a.xml fresnel=schlick", 2, "it is a parameter of mrt_bsdf"),
 ]
 
-PLUGINS: list[Case] = [
-    (ball("<float name='alpha' value='nan'/>"), "out scene=a.xml", 1, '"alpha" is nan, but must be a finite'),
-    (ball("<float name='aplha' value='1'/>"), "out scene=a.xml", 1, '- float "aplha"'),
-    (shape("cone", ""), "out scene=a.xml", 1, '"mrt_cone": mrt_cone: "apex" is missing; give three numbers'),
-    (shape("cylinder", ENDS.format(1, 1)), "out scene=a.xml", 1, "but must be two points"),
-    (ball(PAPERED), "out scene=a.xml", 1, "no.png', which cannot be read"),
+TABLES: list[Case] = [
+    ({"a.toml": text}, words.format("a.toml"), 2, message)
+    for words, text, message in [
+        ("error-vs-time 3 cases={}", "cases = {", "cannot read"),
+        ("error-vs-time 3 cases={}", "cases = {}", "no entry 'reference'"),
+        ("error-vs-time 3 cases={}", "repeat = 2\n[cases]\na = {aa = 1}\n", "unknown entry 'repeat'"),
+        ("sweep out {} workers=x", "", "must be a whole number"),
+        ("sweep out {} job=1", "", "unknown option 'job'"),
+        ("sweep out {}", "a =", "cannot read"),
+        ("sweep out {}", "grid = 3", "grid must be a table"),
+        ("sweep out {}", "out = 'x'", "out cannot be set in a file"),
+        ("sweep out {}", "[grid]\nmaterial_0.alpha = []", "material_0.alpha is an empty list"),
+    ]
 ]
 
 MODELS: list[Case] = [
+    (xml(MISSPELT), "out scene=a.xml", 1, '- float "aplha"'),
     (textured("no picture"), "out scene=a.obj", 1, "p.png', which cannot be read"),
     (textured(b"\x89PNG\r\n\x1a\n\0\0"), "out scene=a.obj", 1, "p.png', which cannot be read"),
     ({"a.obj": TRIANGLE}, "out scene=a.obj camera=0,9,0 target=0,0,0", 2, "choose another up"),
 ]
 
-CASES = OUTPUTS + SIZES + FILES + SCENES + PLUGINS + MODELS
+CASES = OUTPUTS + SIZES + FILES + SCENES + TABLES + MODELS
 
 
 def put(path: Path, content: Content) -> None:
@@ -228,22 +226,15 @@ def test_disk_that_is_full(tmp_path: Path, monkeypatch, capsys) -> None:
     assert (tmp_path / "out.xml").read_text() == "old"
 
 
-@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGBA", "I;16"])
-def test_pictures_of_every_kind_are_read(tmp_path: Path, monkeypatch, capfd, mode: str) -> None:
+def test_pictures_of_every_kind_are_read(variant: str, tmp_path: Path) -> None:
     """Black and white, grey, palette, alpha, 16 bits."""
     levels = np.arange(12).reshape(3, 4) * 20
-    image = Image.fromarray(levels.astype(np.uint16 if mode == "I;16" else np.uint8))
-    image = image if mode == "I;16" else image.convert(mode)
-    for name, content in textured("").items():
-        put(tmp_path / name, content)
-    image.save(tmp_path / "p.png")
-    monkeypatch.chdir(tmp_path)
-    arguments = ["out", "scene=a.obj", "width=8", "height=6", "aa=1", "format=png", "quiet=1"]
-    assert (cli.main(arguments), *capfd.readouterr()) == (0, "", "")
-    assert (tmp_path / "out.png").exists()
+    for mode in ("1", "L", "LA", "P", "RGBA", "I;16"):
+        image = Image.fromarray(levels.astype(np.uint16 if mode == "I;16" else np.uint8))
+        (image if mode == "I;16" else image.convert(mode)).save(tmp_path / "p.png")
+        texture = mi.load_dict({"type": "mrt_texture", "filename": str(tmp_path / "p.png")})
+        assert list(texture.resolution()) == [4, 3]
 
-
-# ------------------------------------------------- Models --------------------------------------------
 
 SQUARE, UVS, NORMAL = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n", "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n", "vn 0 0 1\n"
 FACE = "f 1 2 3\n"
@@ -416,38 +407,29 @@ def test_plugins_name_the_parameter(variant: str, plugin: dict[str, Any], text: 
 
 
 CORNERS = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
+MESH = {"type": "mrt_mesh", "positions": CORNERS, "faces": np.array([[[0, 1, 2]]], np.uint32)}
 ONE = np.array([[0, 0, 0, 1]], np.float32)
+GROUP = {"type": "mrt_group"}
 
 
 @pytest.mark.parametrize(
-    ("arrays", "text"),
+    ("plugin", "text"),
     [
-        ({"faces": None}, '"faces" must be'),
-        ({"faces": np.array([[[0, 1, 3]]], np.uint32)}, '"faces" holds 3, but there are 3'),
-        ({"positions": CORNERS * np.float32(np.nan)}, '"positions" holds a number that is not finite'),
-        ({"texcoords": CORNERS[:, :2]}, '"texcoords" has 2 entries for 3 positions'),
-        ({"faces": np.array([[[0, 1, -2]]], np.float32)}, '"faces" holds -2'),
+        (MESH | {"faces": None}, '"faces" must be'),
+        (MESH | {"faces": np.array([[[0, 1, 3]]], np.uint32)}, '"faces" holds 3, but there are 3'),
+        (MESH | {"positions": CORNERS * np.float32(np.nan)}, '"positions" holds a number that is not finite'),
+        (MESH | {"texcoords": CORNERS[:, :2]}, '"texcoords" has 2 entries for 3 positions'),
+        (MESH | {"faces": np.array([[[0, 1, -2]]], np.float32)}, '"faces" holds -2'),
+        (GROUP, '"numbers" must be a mi.Bitmap'),
+        (GROUP | {"numbers": ONE[:, :3]}, "3 numbers for an object, but must have 4"),
+        (GROUP | {"numbers": ONE * np.float32("nan")}, "row 0 of .*not finite"),
+        (GROUP | {"numbers": np.ones((1, 7), np.float32), "kind": "cone"}, "axis of no length"),
+        (GROUP | {"numbers": ONE, "face_x": np.ones((2, 1), np.float32)}, "has 2 rows for 1 objects"),
+        (GROUP | {"numbers": ONE, "kind": "cube"}, "sphere, cone, cylinder"),
     ],
+    ids=range(11),
 )
-def test_meshes_name_the_array(variant: str, arrays: dict[str, np.ndarray], text: str) -> None:
-    arrays = {"positions": CORNERS, "faces": np.array([[[0, 1, 2]]], np.uint32), **arrays}
-    bitmaps = {name: mi.Bitmap(array) for name, array in arrays.items() if array is not None}
-    with pytest.raises(RuntimeError, match=re.escape(text)):
-        mi.load_dict({"type": "mrt_mesh", **bitmaps})
-
-
-@pytest.mark.parametrize(
-    ("keys", "text"),
-    [
-        ({}, '"numbers" must be a mi.Bitmap'),
-        ({"numbers": ONE[:, :3]}, "3 numbers for an object, but must have 4"),
-        ({"numbers": ONE * np.float32("nan")}, "row 0 of .*not finite"),
-        ({"numbers": np.ones((1, 7), np.float32), "kind": "cone"}, "axis of no length"),
-        ({"numbers": ONE, "face_x": np.ones((2, 1), np.float32)}, "has 2 rows for 1 objects"),
-        ({"numbers": ONE, "kind": "cube"}, "sphere, cone, cylinder"),
-    ],
-)
-def test_groups_name_the_array(variant: str, keys: dict[str, Any], text: str) -> None:
-    bitmaps = {name: mi.Bitmap(v) if isinstance(v, np.ndarray) else v for name, v in keys.items()}
-    with pytest.raises(RuntimeError, match=f"mrt_group.*{text}"):
-        mi.load_dict({"type": "mrt_group", **bitmaps})
+def test_arrays_are_named(variant: str, plugin: dict[str, Any], text: str) -> None:
+    given = {name: mi.Bitmap(v) if isinstance(v, np.ndarray) else v for name, v in plugin.items()}
+    with pytest.raises(RuntimeError, match=f"{plugin['type']}.*{text}"):
+        mi.load_dict({name: v for name, v in given.items() if v is not None})

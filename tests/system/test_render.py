@@ -48,10 +48,6 @@ def test_rays_are_counted_as_the_scene_tells():
 # ------------------------------------------- What is left out -------------------------------------------
 
 
-def _omitted(result) -> set[str]:
-    return {omission.what for omission in result.plan.left_out}
-
-
 def _without_reflection(scene):
     """int_ior 0 is how the report switches reflection off; 1e-4 is as near as a dielectric comes."""
 
@@ -61,27 +57,6 @@ def _without_reflection(scene):
     return dataclasses.replace(
         scene, spheres=tuple(map(dull, scene.spheres)), planes=tuple(map(dull, scene.planes))
     )
-
-
-def test_no_light_means_no_shadow_ray_and_no_plane_no_plane():
-    scene = dataclasses.replace(report_scene(0), lights=(), planes=())
-    result = mrt.render(scene, **SMALL, aa=1, aamode="none", count_rays=True)
-    assert {"shadow rays", "planes"} <= _omitted(result)
-    assert result.rays["shadow"] == 0
-
-
-@pytest.mark.parametrize("lattice", ["report", "centered"])
-@pytest.mark.parametrize("aa", [2, 3])
-def test_edge_pixels_hold_the_whole_lattice_and_others_their_first_ray(lattice, aa):
-    options = {**SMALL, "aa": aa, "lattice": lattice, "focaldist": 0}
-    found, whole = (mrt.render(0, **options, aamode=mode) for mode in ("sobel", "none"))
-    edges = found.layers["samples.Y"] > 1
-    assert 0 < edges.mean() < 0.5
-    # sums in two parts, of values up to one
-    np.testing.assert_allclose(found.image[edges], whole.image[edges], atol=1e-6)
-    if lattice == "centered":
-        single = mrt.render(0, **{**options, "aa": 1}, aamode="none").image
-        np.testing.assert_allclose(found.image[~edges], single[~edges], atol=1e-6)
 
 
 # ------------------------------------------ The same picture ------------------------------------------

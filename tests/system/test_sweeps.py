@@ -479,26 +479,6 @@ def test_the_command(tmp_path: Path, capsys) -> None:
     assert {row["attempts"] for row in written(tmp_path / "out")} == {"1"}
 
 
-@pytest.mark.parametrize(
-    ("words", "text", "message"),
-    [
-        ([], "", "OUT is missing"),
-        (["workers=x"], "", "must be a whole number"),
-        (["job=1"], "", "unknown option 'job'"),
-        ([], "a =", "cannot read"),
-        ([], "grid = 3", "grid must be a table"),
-        ([], "out = 'x'", "out cannot be set in a file"),
-        ([], "[grid]\nmaterial_0.alpha = []", "material_0.alpha is an empty list"),
-    ],
-)
-def test_a_broken_command(tmp_path: Path, capsys, words: list[str], text: str, message: str) -> None:
-    (tmp_path / "sweep.toml").write_text(text)
-    arguments = [str(tmp_path / "out"), str(tmp_path / "sweep.toml"), *words] if text or words else []
-    assert cli.main(["sweep", *arguments]) == 2
-    errors = capsys.readouterr().err
-    assert message in errors and errors.count("\n") == 1
-
-
 def test_a_gpu_is_pinned_to_each_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether there are some or not: what the driver will go by is in each worker's environment."""
     from mrt_mitsuba.sweeps.cluster import connected
