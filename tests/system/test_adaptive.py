@@ -92,9 +92,6 @@ def test_every_pass_reports_its_progress_to_the_end():
     }
 
 
-# ------------------------------------------------- Noise -------------------------------------------------
-
-
 def test_plan_says_that_one_random_ray_takes_noise_for_edges():
     scene = mrt.scene_dict(0, width=8, height=6)
     one, two = (

@@ -37,13 +37,29 @@ def examples(tmp_path: Path) -> Path:
     return Path(shutil.copytree(DOCS / "examples", tmp_path / "examples"))
 
 
+README = DOCS.parent / "README.md"
+README_COMMANDS = re.findall(r"^mrt ([^#\n]*)", "".join(blocks(README, "sh")), flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("words", README_COMMANDS)
+def test_commands_of_the_readme_run(words: str, mrt_command, tmp_path: Path) -> None:
+    done = mrt_command(*shlex.split(words))
+    assert done.returncode == 0, done.stderr
+    if words.startswith("picture"):
+        assert {path.name for path in tmp_path.iterdir()} == {"picture.png", "picture.exr"}
+
+
+@pytest.mark.parametrize("example", blocks(README, "python"), ids=lambda example: example.splitlines()[0])
+def test_examples_of_the_readme_run(example: str, run_python) -> None:
+    done = run_python(example)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize("path", [p for p in PAGES if code(p)], ids=lambda path: path.stem)
 def test_pages_run(path: Path, run_python, examples: Path) -> None:
     done = run_python(code(path), PYTHONPATH=str(examples))
     assert done.returncode == 0, done.stderr
-    if (
-        path.stem == "tutorial"
-    ):  # whose scene is that of the file, but for the rounding of its camera's matrix
+    if path.stem == "tutorial":  # whose scene is the file's, but for the rounding of its camera's matrix
         written = read_exr(examples.parent / "mine.exr").image
         same = render(examples / "mine.xml", aa=3, aamode="sobel", focaldist=4.5, focalrange=0.5).image
         assert written.shape == (300, 400, 3) and abs(written - same).mean() < 1e-6

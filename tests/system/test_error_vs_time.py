@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from nodes import rgb, sensor
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
-from mrt_mitsuba.validation.tools.precision import Findings, Point, front
+from mrt_mitsuba.validation.tools.precision import Findings, Point
 
 for needed in ("matplotlib", "jinja2", "scipy", "flip_evaluator"):
     pytest.importorskip(needed)
@@ -132,9 +131,6 @@ def test_wrong_arguments(arguments, message, variant):
         mrt.error_vs_time(0, **{"cases": {"a": {}}, "reference": {}, **arguments})
 
 
-# ------------------------------------------- From known figures -------------------------------------------
-
-
 def point(name: str, times: list[float], rmse: float = 0.1, gram: np.ndarray | None = None) -> Point:
     image = np.full((2, 2, 3), 0.5, np.float32)
     gram = rmse**2 * np.eye(len(times)) if gram is None else gram
@@ -175,20 +171,6 @@ def test_one_repeat_gives_no_verdict_and_no_interval():
     assert np.isnan([found.time_to(0.1)["a"].low, found.points["a"].rmse_interval[1]]).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "family"),
-    [("path 16", "path"), ("none aa=4 report", "none report"), ("max_depth=3", "max_depth"),
-     ("cut 0.06/255", "cut"), ("a1e-3", "a"), ("exact", "exact"), ("64", "64")],
-)  # fmt: skip
-def test_names_that_differ_in_numbers_are_one_curve(name, family):
-    assert point(name, [1.0]).family == family
-
-
-def test_front_is_what_nothing_beats_in_both():
-    figures = {"a": (1, 0.5), "b": (2, 0.6), "c": (3, 0.1), "d": (4, 0.1), "e": (0.5, 0.9)}
-    assert [p.name for p in front([point(n, [t], e) for n, (t, e) in figures.items()])] == ["e", "a", "c"]
-
-
 @pytest.mark.parametrize("count", [3, 5, 10])
 def test_intervals_cover_what_they_should_and_equal_cases_have_no_winner(count):
     """95 % of them, of log-normal times as a busy machine makes them, and of pictures with a bias.
@@ -209,14 +191,6 @@ def test_intervals_cover_what_they_should_and_equal_cases_have_no_winner(count):
     assert winners <= 0.05 * trials
 
 
-# ---------------------------------------------- The command ----------------------------------------------
-
-
-def cases_file(folder: Path, text: str) -> str:
-    (folder / "cases.toml").write_text(text)
-    return f"cases={folder / 'cases.toml'}"
-
-
 GOOD = """
 repeats = 2
 shared = {width = 24, height = 18, aamode = "none", focaldist = 0}
@@ -228,12 +202,13 @@ reference = {aa = 4}
 
 
 def test_command_writes_a_page(tmp_path, capsys, variant):
-    out = tmp_path / "report"
-    assert main(["error-vs-time", "3", cases_file(tmp_path, GOOD), f"out={out}"]) == 0
+    out, cases = tmp_path / "report", tmp_path / "cases.toml"
+    cases.write_text(GOOD)
+    assert main(["error-vs-time", "3", f"cases={cases}", f"out={out}"]) == 0
     shown = capsys.readouterr().out
     assert "aa=2" in shown and "index.html" in shown
     names = {path.name for path in out.iterdir()}
     assert {"index.html", "summary.json", "error-vs-time-diagram.png", "error-vs-time-points.csv"} <= names
-    broken = cases_file(tmp_path, GOOD + '"bad" = {aa = 1, lattice = "none"}\n')
-    assert main(["error-vs-time", "scene=3", broken, f"out={out}"]) == 1
+    cases.write_text(GOOD + '"bad" = {aa = 1, lattice = "none"}\n')
+    assert main(["error-vs-time", "scene=3", f"cases={cases}", f"out={out}"]) == 1
     assert "bad" in capsys.readouterr().out

@@ -28,7 +28,6 @@ pytestmark = [pytest.mark.fuzz, pytest.mark.filterwarnings("ignore::mrt_mitsuba.
 # The folder of a test serves all of its inputs, and each writes the same files
 one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 
-# ------------------------------------------------- XML --------------------------------------------------
 
 WHOLE = """<scene version='3.0.0'>
 <integrator type='mrt_whitted'><integer name='max_depth' value='3'/><float name='min_contribution' value='0'/>
@@ -102,9 +101,6 @@ def test_any_scene_file_that_is_read_is_drawn(tmp_path: Path, variant: str, chan
     assert not np.isnan(image).any()
 
 
-# ------------------------------------------------- PNG --------------------------------------------------
-
-
 _stream = io.BytesIO()
 Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3) * 5).save(_stream, "PNG")
 PNG = _stream.getvalue()
@@ -142,8 +138,6 @@ def test_any_picture_is_read_or_refused(
     else:
         assert min(texture.resolution()) > 0
 
-
-# ---------------------------------------------- Parameters ----------------------------------------------
 
 PARAMETERS: dict[str, dict[str, Any]] = {
     "mrt_bsdf": {"alpha": 0.1, "int_ior": 1.5, "ext_ior": 1.0, "fresnel": "schlick", "f0": 0.04}

@@ -100,21 +100,6 @@ def test_derivatives_are_those_of_the_nested_integrator(nested: str) -> None:
     assert np.allclose(*found, rtol=1e-4) and (found[0] > 0).all()
 
 
-@pytest.mark.parametrize(
-    ("more", "text"),
-    [
-        ({"nested": None}, "give one integrator inside"),
-        ({"tarqet": 1.0}, '"tarqet" is none of its parameters'),
-        ({"target": 0.0}, '"target" is 0.0, but must be a finite number > 0'),
-        ({"target": 0.1, "spp": 64}, 'give "target" or "spp", not both'),
-    ],
-)
-def test_wrong_parameters_are_named(more: dict[str, Any], text: str) -> None:
-    given = {"type": "mrt_adaptive", "nested": {"type": "path"}} | more
-    with pytest.raises(Exception, match=text):
-        mi.load_dict({name: value for name, value in given.items() if value is not None})
-
-
 def test_files_and_the_command_know_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from mrt_mitsuba.command.main import main
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.command.main import main
 from mrt_mitsuba.memory import Workspace
+from mrt_mitsuba.output import read_exr
+from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.studies import adaptive, honest
 from mrt_mitsuba.validation.tools.scenery import SCENES, SPP, load, sensor
 from mrt_mitsuba.validation.tools.study import findings
@@ -32,9 +36,6 @@ def _sensor_of(name: str) -> dict[str, Any]:
 
 def _rmse(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(a - b, dtype=np.float64))))
-
-
-# --------------------------------------------- Uniform samples ------------------------------------------
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -64,10 +65,9 @@ def test_a_camera_in_fog():
 
 
 def test_a_scene_renders_by_itself_as_mitsuba_renders_it():
-    """Also under a filter so wide that each pixel sees all others."""
-    for film in ({}, {"rfilter": {"type": "gaussian", "stddev": 9.0}, "sample_border": True}):
-        scene = _load("area_light", film=film)
-        np.testing.assert_allclose(mrt.render(scene).image, np.array(mi.render(scene)), atol=1e-4)
+    """Under a filter so wide that each pixel sees all others."""
+    scene = _load("area_light", film={"rfilter": {"type": "gaussian", "stddev": 9.0}, "sample_border": True})
+    np.testing.assert_allclose(mrt.render(scene).image, np.array(mi.render(scene)), atol=1e-4)
 
 
 def test_filters_alpha_and_channels_are_kept(tmp_path):
@@ -83,8 +83,6 @@ def test_filters_alpha_and_channels_are_kept(tmp_path):
     assert ["R", "G", "B", *result.layers] == names
     for name in result.layers:
         np.testing.assert_allclose(result.layers[name], values[..., names.index(name)], atol=2e-3)
-    from mrt_mitsuba.output import read_exr
-
     result.save(tmp_path / "kept.exr")
     assert read_exr(tmp_path / "kept.exr").layers.keys() == result.layers.keys()
 
@@ -133,17 +131,10 @@ def test_size_sensor_and_parameters(tmp_path):
         '<emitter type="constant"><rgb name="radiance" value="$glow"/></emitter></scene>'
     )
     assert mrt.render(file, params={"wide": 12}).image.shape == (4, 12, 3)
-    from mrt_mitsuba.command.main import main
-
     out = tmp_path / "out"
     assert main([str(out), f"scene={file}", "glow=0.25", "format=exr", "quiet=1"]) == 0
-    from mrt_mitsuba.output import read_exr
-
     assert read_exr(f"{out}.exr").image.mean() == pytest.approx(0.25, rel=1e-3)
     assert main([str(out), f"scene={file}", "glo=0.25", "quiet=1"]) == 2
-
-
-# ---------------------------------------------- To an error ---------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:a few rays rule the error")
@@ -191,14 +182,11 @@ def test_wavefronts_do_not_change_a_bit(
 
 def test_kernels_are_compiled_once(tmp_path):
     """Rounds differ in their rays, not in their kernels."""
-    import drjit as dr
-
     scene = _load("spot")
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         mrt.render(scene, target=0.02)
         dr.kernel_history_clear()
     launches: list[dict[str, Any]] = []
-    from mrt_mitsuba.rendering.progress import Progress
 
     class Kernels(Progress):
         def kernels(self, records: list[dict[str, Any]]) -> None:
@@ -270,14 +258,12 @@ def test_errors_are_those_of_the_finished_picture():
         ({"target": 0.1, "region": (0, 0, 4, 4)}, "with region: rounds share the rays out"),
         ({"aamode": "noise", "spp": 64, "aa": 2}, "aamode=noise with aa=2"),
         ({"maxspp": 100}, "maxspp is of use only where rays go in rounds"),
-        ({"maxseconds": 1}, "maxseconds is of use only"),
         ({"on_round": print}, "on_round is of use only"),
         ({"target": 0.1, "on_round": 3}, "on_round=3: must be a function"),
         ({"progress": 3}, "progress=3: must be a"),
         ({"aamode": "noise"}, "give the mean of a pixel"),
         ({"aamode": "noise", "spp": 8}, "16 or more"),
         ({"target": 0.1, "aamode": "sobel"}, "target=0.1 with aamode=sobel: leave one of them out"),
-        ({"target": -1}, "target=-1: must be a positive number"),
         ({"target": 0.1, "lattice": "centered"}, "rounds follow the film; leave lattice out"),
         ({"layers": ["error"]}, "only rounds estimate them"),
         ({"camera": (0, 0, 1)}, "camera is of use only with an OBJ file"),

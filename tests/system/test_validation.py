@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation import cli
-from mrt_mitsuba.validation.oracles import filters as loops
 from mrt_mitsuba.validation.oracles.reference import reference_render
 from mrt_mitsuba.validation.studies import error_vs_time, roughconductor, scenes, speed, stock
 from mrt_mitsuba.validation.studies import filters as filter_study
@@ -41,11 +39,8 @@ Fault = Callable[[Patch], None]
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch: Patch, variant: str, tmp_path: Path) -> None:
     """Let studies measure as little as shows whether their bounds hold."""
-    monkeypatch.setattr(
-        filter_study,
-        "QUICK",
-        filter_study.Extent((0,), (2, 4), 8, (80, 60), (60, 45, 8), (4, 16), (96, 72, 2, 12)),
-    )
+    extent = filter_study.Extent((0,), (2, 4), 8, (80, 60), (60, 45, 8), (4, 16), (96, 72, 2, 12))
+    monkeypatch.setattr(filter_study, "QUICK", extent)
     trades = {"sampling": (0,), "whitted": (0,), "path": (0,)}
     tiny = error_vs_time.Extent((40, 30), (1, 4), 24, (1, 16), 256, trades, 1)
     monkeypatch.setattr(error_vs_time, "QUICK", tiny)
@@ -121,11 +116,6 @@ def turned(method: Any, self: Any, ctx: Any, si: Any, wo: Any) -> Any:
     other = type(si)(si)
     other.wi = -si.wi
     return method(self, ctx, other, -wo)
-
-
-def below_zero(method: Any, *given: Any) -> Any:
-    found = method(*given)
-    return (found[0] - 1e-3, found[1]) if isinstance(found, tuple) else found - 1e-3
 
 
 BRIGHT = of_bsdf(specular_reflectance=lambda _: 1.02)
@@ -223,11 +213,7 @@ def other_conductor(patch: Patch) -> None:
 FAULTS: list[tuple[str, Fault, str]] = [
     ("filters:modes", wrapped(mrt, "render", one_ray_too_many), "camera rays"),
     ("filters:modes", wrapped(mrt, "render", no_refinement), "error of sobel"),
-    (
-        "filters:noise",
-        wrapped(filters, "sobel_edges", lambda sobel, image, **_: sobel(image)),
-        "noise: share of",
-    ),
+    ("filters:noise", wrapped(filters, "sobel_edges", lambda f, image, **_: f(image)), "noise: share of"),
     ("filters:depth_of_field", wrapped(filters, "gaussian_dof", moved_blur), "corrected / report"),
     ("error_vs_time", wrong_cases("sampling", {"aa": 4}, {"aa": 1}), "RMSE of none aa=4"),
     ("error_vs_time", wrong_cases("path", {"spp": 16}, {"spp": 8}), "theory"),
@@ -242,12 +228,10 @@ FAULTS: list[tuple[str, Fault, str]] = [
     ("stock:mesh_cones", of_type("mrt_cone", capped=lambda _: False), "another part"),
     ("stock:direct", wrapped(mrt, "render", mirrors_too), "share of pixels off"),
     ("stock:whole_scenes", schlick_alone, "scene 0"),
-    ("roughconductor:pointwise", BRIGHT, "value"),
     ("roughconductor:pointwise", ROUGH, "value"),
     ("roughconductor:pointwise", in_bsdf(turned), "value"),
     ("bsdf_laws:dielectric_terms", SCHLICK, "reflection against Mitsuba's"),
     ("bsdf_laws:published", SCHLICK, "published albedos"),
-    ("bsdf_laws:never_negative", in_bsdf(below_zero), "least value"),
 ]
 
 
@@ -280,7 +264,8 @@ def brighter(scene: Scene) -> Scene:
 def moved(scene: Scene) -> Scene:
     """One sphere by a tenth of a pixel or less."""
     first, second, *others = scene.spheres
-    up = dataclasses.replace(second, center=tuple(np.add(second.center, (0, 1e-3, 0)).tolist()))
+    x, y, z = second.center
+    up = dataclasses.replace(second, center=(x, y + 1e-3, z))
     return dataclasses.replace(scene, spheres=(first, up, *others))
 
 
@@ -303,15 +288,11 @@ def verdict(number: int, scene: Scene | None = None, **integrator: Any) -> Study
     return findings(scenes.hold, name=str(number), error=error, reason=reason)
 
 
-@pytest.mark.parametrize("number", [1, 3])
-def test_small_mistakes_in_scenes_are_seen(number: int) -> None:
-    assert verdict(number).passed
-    for name, mistake in MISTAKES.items():
-        assert not verdict(number, mistake(report_scene(number))).passed, name
-
-
-def test_a_wrong_integrator_is_seen() -> None:
+def test_small_mistakes_are_seen() -> None:
     """Scene 1 has every roughness, and lights that need the clamp."""
+    assert verdict(1).passed
+    for name, mistake in MISTAKES.items():
+        assert not verdict(1, mistake(report_scene(1))).passed, name
     assert not verdict(1, clamp=False).passed and not verdict(1, bounce_budget="plain", max_depth=1).passed
 
 
@@ -323,23 +304,6 @@ def test_every_pixel_that_is_off_has_one_reason() -> None:
     counts = {name: int(np.sum(reason == i)) for i, name in enumerate(scenes.REASONS)}
     assert sum(counts.values()) == np.sum(error > scenes.STEP) > 5
     assert counts["silhouette"] > 0 and counts["unexplained"] == 0
-
-
-@pytest.mark.parametrize(("number", "aamode"), [(0, "luma"), (1, "sobel"), (3, "luma"), (3, "sobel")])
-def test_modes_are_those_of_the_tracer(number: int, aamode: str) -> None:
-    """The detector of the truth, too, looks at the picture in float64."""
-    places = product((0, 0.5), repeat=2)
-    every = np.array([reference_render(report_scene(number), displacement=p, **PLACES).image for p in places])
-    result = mrt.render(number, **PLACES, focaldist=0, fresnel="dielectric", aa=2, aamode=aamode)
-    edges = getattr(loops, f"{aamode}_edges")(every[0]).mask
-    assert 0.01 < edges.mean() < 0.95
-    # grey levels are truncated: a picture off by one rounding may refine a few pixels more or less
-    same = filter_study.refined_pixels(result) == edges
-    assert np.mean(~same) <= 0.002
-    truth = np.where(edges[..., None], every.mean(axis=0), every[0])
-    error = np.abs(result.image - truth).max(axis=-1)[same]
-    assert np.quantile(error, 0.99) <= scenes.CASES[str(number)].most + scenes.CUT
-    assert np.mean(error > scenes.STEP) <= 4 * scenes.SHARE  # four samples
 
 
 # -------------------------------------- What studies are made of --------------------------------------

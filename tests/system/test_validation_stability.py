@@ -30,8 +30,6 @@ def test_every_case_holds_and_is_a_row_with_a_mark() -> None:
     assert all(len(row[2]) > 30 for row in rows if row[-1] == "cannot hold")
 
 
-# ------------------------------------ What must not go unnoticed ------------------------------------------
-
 beckmann_d, blur, density = microfacet.beckmann_d, filters.gaussian_dof, lobes.Lobes.density
 schlick = fresnel.fresnel_schlick
 
