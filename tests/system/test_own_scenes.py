@@ -53,20 +53,17 @@ def test_uniform_samples_are_mitsubas(name):
 def test_a_camera_in_fog():
     fog = {"type": "homogeneous", "id": "fog", "sigma_t": 0.2, "albedo": 0.8}
     around = {"type": "sphere", "radius": 20, "bsdf": {"type": "null"}}
-    scene = _load(
-        "spot",
-        integrator={"type": "volpath", "max_depth": 4},
-        fog=fog,
-        around=around | {"interior": {"type": "ref", "id": "fog"}},
-        sensor=_sensor_of("spot") | {"medium": {"type": "ref", "id": "fog"}},
-    )
+    inside, volpath = {"type": "ref", "id": "fog"}, {"type": "volpath", "max_depth": 4}
+    camera = _sensor_of("spot") | {"medium": inside}
+    scene = _load("spot", integrator=volpath, fog=fog, around=around | {"interior": inside}, sensor=camera)
     theirs = np.array(mi.render(scene, spp=16, seed=7))
     assert _rmse(mrt.render(scene, spp=16, seed=7).image, theirs) < 0.01 < theirs.std()
 
 
 def test_a_scene_renders_by_itself_as_mitsuba_renders_it():
     """Under a filter so wide that each pixel sees all others."""
-    scene = _load("area_light", film={"rfilter": {"type": "gaussian", "stddev": 9.0}, "sample_border": True})
+    film = {"rfilter": {"type": "gaussian", "stddev": 9.0}, "sample_border": True}
+    scene = _load("area_light", width=16, height=12, film=film)
     np.testing.assert_allclose(mrt.render(scene).image, np.array(mi.render(scene)), atol=1e-4)
 
 

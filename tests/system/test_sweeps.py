@@ -105,9 +105,11 @@ def mortal(tmp_path: Path) -> Iterator[Callable[..., Cluster]]:
         cluster.stop()
 
 
-def in_background(*arguments: Any, **options: Any) -> Any:
-    """Start a sweep in a thread of its own, and return what will hold its outcome."""
-    return ThreadPool(1).apply_async(mrt.sweep, arguments, options)
+@pytest.fixture
+def in_background() -> Iterator[Callable[..., Any]]:
+    """Starts a sweep in a thread of its own, and gives what will hold its outcome."""
+    with ThreadPool(1) as pool:
+        yield lambda *arguments, **options: pool.apply_async(mrt.sweep, arguments, options)
 
 
 def pictures(folder: Path) -> list[str]:
@@ -238,7 +240,7 @@ def test_a_file_of_the_users_own_is_refused_by_name(address: str, tmp_path: Path
     assert contents() == before
 
 
-def test_a_scene_file_counts_by_its_contents(address: str, tmp_path: Path) -> None:
+def test_a_scene_file_counts_by_its_contents(address: str, in_background, tmp_path: Path) -> None:
     """Two versions in one folder after each other, two at a time, and a change while it is rendered."""
     scene, out = tmp_path / "mine.xml", tmp_path / "out"
     assert cli.main(["export", "0", "--xml", str(scene)]) == 0
@@ -369,7 +371,7 @@ def test_workers_with_other_software_are_refused(mortal, tmp_path: Path, preload
     assert "\n" not in str(caught.value) and not pictures(tmp_path / "out")
 
 
-def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(tmp_path: Path) -> None:
+def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(in_background, tmp_path: Path) -> None:
     import psutil
 
     def workers() -> list[psutil.Process]:
@@ -386,7 +388,7 @@ def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(tmp_path: Path
 
 @pytest.mark.parametrize("back", [True, False][:ROUNDS])
 def test_a_scheduler_killed_ends_the_sweep_and_a_second_run_finishes_it(
-    mortal, tmp_path: Path, back: bool
+    mortal, in_background, tmp_path: Path, back: bool
 ) -> None:
     """Also where one comes back at once under its address, without its workers."""
     cluster, out = mortal(), tmp_path / "out"
