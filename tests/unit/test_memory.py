@@ -37,6 +37,16 @@ def test_a_picture_that_does_not_fit_is_refused_with_both_sizes(more, needed):
         Workspace.next_to(16384, 16384, 3, budget=Budget(4 * GIB), **more)
 
 
+@pytest.mark.parametrize(("used", "flushed"), [(GIB // 4, False), (GIB // 4 + 1, True)])
+def test_what_a_large_pass_used_is_given_back(monkeypatch, used, flushed):
+    import drjit as dr
+
+    called = []
+    monkeypatch.setattr(dr, "flush_malloc_cache", lambda: called.append(True))
+    Workspace(GIB).give_back(used)
+    assert bool(called) is flushed
+
+
 def test_more_than_the_machine_has_is_never_used(monkeypatch):
     monkeypatch.setattr(memory, "all_memory", lambda: 8 * GIB)
     with pytest.raises(UsageError, match=r"and 8\.0 GiB may be used"):

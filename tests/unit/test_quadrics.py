@@ -76,6 +76,36 @@ def test_single_rays(shape: str, o: tuple, d: tuple, t: float, part: int | None)
     assert part is None or hit == part
 
 
+@pytest.mark.parametrize("kind", UNIT)
+def test_surface_points_have_their_normal_and_uv(kind: str) -> None:
+    """Points near each part end up on it, with the normal outwards; uv goes around the axis."""
+    import drjit.llvm.ad as arrays
+
+    rng = np.random.default_rng(2)
+    end0, end1 = np.array([0.3, 1.5, -0.2]), np.array([0.1, 0.4, 0.3])
+    frame = KINDS[kind].frame(
+        *(arrays.Array3f64(*map(arrays.Float64, end)) for end in (end0, end1)), arrays.Float64(0.7)
+    )
+    p = arrays.Array3f64(((end0 + end1) / 2 + rng.normal(size=(1000, 3)) * 0.4).T)
+    levels = {
+        LATERAL: lambda q: dr.sqrt(q.x**2 + q.y**2) - (q.z if kind == "cone" else 1),
+        BASE: lambda q: q.z - 1,
+        TOP: lambda q: -q.z,
+    }
+    for part in KINDS[kind].parts:
+        on, n, u, v = KINDS[kind].surface(p, part, frame)
+        q, back = frame.point(on), frame.point(on - n * 1e-6)
+        other = ~(q.z > 0.05)  # above its apex a cone has another half
+        assert dr.all(other | (dr.abs(levels[part](q)) < 1e-12))
+        assert dr.all(other | (levels[part](back) < -1e-7))  # 1e-6 inside, over lengths of about 1
+        assert dr.allclose(dr.norm(n), 1)
+        assert dr.all((v >= 0) & (v <= 1))
+        if part == LATERAL:
+            azimuth = u * 2 * np.pi
+            assert dr.all((u >= 0) & (u < 1))
+            assert dr.all(other | (dr.abs(dr.sin(azimuth) * q.x - dr.cos(azimuth) * q.y) < 1e-12))
+
+
 def nearest(kind: str, ends: np.ndarray, radii: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Distances [N] by the float64 tracer, in lengths of d."""
     make = Cone if kind == "cone" else Cylinder
