@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from mrt_mitsuba import SceneError
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Mesh, Plane, Scene, Sphere
 from mrt_mitsuba.validation.oracles.reference import reference_render
 
@@ -81,6 +84,21 @@ def test_a_ray_meets_the_nearest_thing(things, position, target, depth, normal, 
     assert result.depth[0, 0] == pytest.approx(depth, abs=1e-13)
     assert result.object_id[0, 0] == index
     np.testing.assert_allclose(result.normal[0, 0], normal, atol=1e-13, rtol=0)
+
+
+def test_triangles_show_the_nearest_texel(tmp_path: Path) -> None:
+    """v = 0 is the first row; one light along the normal sends back Kd / π."""
+    rows = [[(255, 0, 0), (0, 255, 0)], [(0, 0, 255), (255, 255, 255)]]
+    Image.fromarray(np.array(rows, np.uint8)).save(tmp_path / "four.png")
+    matte = Material(1, 1, (0, 0, 0), (0, 0, 0), str(tmp_path / "four.png"))
+    uvs = np.array([(0, 0), (1, 0), (0, 1)], np.float32)
+    for place, color in (((-0.5, -0.5), (1, 0, 0)), ((-0.5, 1.5), (0, 1, 0)), ((1.5, -0.5), (0, 0, 1))):
+        camera = Camera((3, *place), (0, *place))
+        mesh = replace(TRIANGLE, material=matte, uvs=uvs)
+        found = pixel(scene(mesh, camera=camera, lights=[Light((1e9, 0, 0), (1, 1, 1))]))
+        np.testing.assert_allclose(found * np.pi, color, atol=1e-6)
+    with pytest.raises(SceneError, match="textures on triangles only"):
+        pixel(scene(Sphere((0, 0, 0), 1, matte)))
 
 
 def test_no_light_is_negative_and_each_is_seen_by_itself() -> None:
