@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-import mrt_mitsuba as mrt
 from mrt_mitsuba.rays.lattice import divide
 from mrt_mitsuba.rays.samplers import ray_sampler
 from mrt_mitsuba.rendering.windows import dilated, window_means
@@ -15,11 +14,11 @@ from mrt_mitsuba.rendering.windows import dilated, window_means
 LARGEST = 2**32 - 1
 
 
+@pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize("number", [1, 2, 3, 7, 16, 641, 800, 16384, 65537, 2**31 - 1, 2**31, LARGEST])
 def test_division_is_exact(number: int) -> None:
     """Next to multiples of the divisor, where a product with the rounded inverse could fall to the wrong
     side, and everywhere else."""
-    mrt.register()
     rng = np.random.default_rng(number)
     multiples = rng.integers(0, LARGEST // number + 1, 10_000) * number
     near = np.concatenate([multiples + k for k in (-1, 0, 1)] + [rng.integers(0, LARGEST, 10_000)])
