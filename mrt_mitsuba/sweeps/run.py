@@ -155,7 +155,13 @@ def _render(
         with shown.stage("Sweep", len(calls)) as advance:
             for future in coming:
                 job, parts, part = calls.pop(future)
-                error = future.exception() if future.status == "error" else None
+                facts, error = {}, None
+                try:  # a worker may die with what it had finished: that is a death in the job, too
+                    facts = future.result()
+                except Exception as raised:
+                    if future.status != "error":  # the scheduler is gone
+                        raise
+                    error = raised
                 # The engine holds a worker's death against all jobs that the worker had been given
                 if error and attempts(part, setting) <= retries and handed[part.name] < retries + MOST_DEATHS:
                     hand_over(job, parts, part)
@@ -166,9 +172,8 @@ def _render(
                         text = (
                             "every worker that rendered it died, perhaps for want of memory: give each more"
                         )
-                    made[part.name] = {"error": text}
-                else:
-                    made[part.name] = future.result()
+                    facts = {"error": text}
+                made[part.name] = facts
                 future.release()  # what no one needs is not computed again when its worker goes
                 finish(job, parts)
                 advance(1)
