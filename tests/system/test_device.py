@@ -64,7 +64,7 @@ def test_make_test_gpu_runs_its_selection_where_it_is_told_to(tmp_path: Path) ->
 
     def run(device: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "device", "--co"]
-        tests = [str(Path(__file__)), str(Path(__file__).parents[1] / "unit" / "test_updates.py")]
+        tests = [str(Path(__file__)), str(Path(__file__).parents[1] / "unit" / "test_parameters.py")]
         environment = os.environ | {"MRT_DEVICE": device}
         return subprocess.run(
             [*command, *tests], env=environment, capture_output=True, text=True, timeout=120, check=False
