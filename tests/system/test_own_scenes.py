@@ -282,3 +282,14 @@ def test_every_pixel_has_its_place_shape_and_material():
     assert place[1] == pytest.approx(0, abs=1e-4)
     assert found["depth.Z"][-1, 0] == pytest.approx(np.linalg.norm(place - [0, 1.5, 5]), rel=1e-4)
     assert found["uv.U"].min() >= 0 and found["uv.V"].max() <= 1
+
+
+def test_rays_go_on_until_the_target_is_reached() -> None:
+    """By more rays than any target takes."""
+    box = mi.cornell_box()
+    box["sensor"]["film"] |= {"width": 24, "height": 24}
+    scene = mi.load_dict(box)
+    target = mrt.render(scene, integrator="path", aamode="noise", spp=256).error.rmse / 1.5
+    result = mrt.render(scene, integrator="path", target=target)
+    assert result.error.low <= target and result.error.rmse < 1.2 * target
+    assert 300 < result.rounds[-1].spp < 1200

@@ -7,6 +7,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import sensor
+
+import mrt_mitsuba as mrt
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -61,3 +64,16 @@ def test_texture_coordinates_are_lengths_from_the_foot() -> None:
         point = -4 * n + u * s + v * t
         si = scene.ray_intersect(ray(point + n, -n))
         np.testing.assert_allclose(np.array(si.uv).ravel(), (u, v), atol=2e-5)
+
+
+def test_a_light_just_behind_a_plane_is_hidden() -> None:
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "mrt_whitted"},
+        "sensor": sensor([0, 0, 0.5], [0, 0, 0], (8, 6), up=[0, 1, 0]),
+        "light": {"type": "mrt_light", "position": [0, 0, 1.0001]},
+        "floor": {"type": "mrt_plane", "normal": [0, 0, 1]},
+    }
+    lit = mrt.render(scene, aa=1).image
+    ceiling = {"type": "mrt_plane", "normal": [0, 0, 1], "distance": -1.0}
+    assert lit.min() > 0 and mrt.render(scene | {"ceiling": ceiling}, aa=1).image.max() == 0
