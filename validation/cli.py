@@ -13,13 +13,14 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from importlib import import_module, util
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
-from mrt_mitsuba.validation.tools import report
-from mrt_mitsuba.validation.tools.study import Study
-from mrt_mitsuba.validation.tools.timing import own_cache
+
+if TYPE_CHECKING:
+    from mrt_mitsuba.validation.tools.study import Study
 
 # By name: the module, imported when it is run; what --list says of it; seconds of a quick and of a full run
 # on two idle cores, about
@@ -80,6 +81,10 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> list[Study]:
     if missing:
         packages = " ".join(missing)
         raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
+    # Not before: NumPy needs a working folder under some Pythons
+    from mrt_mitsuba.validation.tools import report
+    from mrt_mitsuba.validation.tools.timing import own_cache
+
     report.prepare(out)
     seconds = sum(STUDIES[name][2] if quick else STUDIES[name][3] for name in names)
     print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
@@ -107,6 +112,8 @@ def _spoken(seconds: int) -> str:
 
 def run_study(name: str, *, quick: bool, progress: Progress | None = None) -> Study:
     """Run one of ``STUDIES`` in the default variant. What it raises becomes its failure."""
+    from mrt_mitsuba.validation.tools.study import Study
+
     study = Study(name, name, progress or Progress())
     start = time.perf_counter()
     try:

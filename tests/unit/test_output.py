@@ -246,10 +246,7 @@ LEAVE = "import os, shutil, sys; os.chdir(sys.argv[1]); shutil.rmtree(sys.argv.p
 WAYS = {
     "mrt_mitsuba": "import mrt_mitsuba as mrt\ntry: mrt.render(0)\nexcept mrt.MrtError as e: sys.exit(e)",
     "mrt_mitsuba.command.main": "from mrt_mitsuba.command.main import main\nsys.exit(main())",
-    # as an installed script starts, without the working folder among those to import from
-    "mrt_mitsuba.validation.cli": (
-        "sys.path.remove('')\nfrom mrt_mitsuba.validation.cli import main\nsys.exit(main())"
-    ),
+    "mrt_mitsuba.validation.cli": "from mrt_mitsuba.validation.cli import main\nsys.exit(main())",
 }
 
 
