@@ -160,10 +160,6 @@ class Draw:
         return mi.Vector3f(r * cosine, r * sine, z)
 
 
-def _not_unit(v: Any) -> Any:
-    return ~(dr.abs(dr.norm(v) - 1) < 1e-5)
-
-
 def bad_lanes(form: str, visible: bool, draw: Draw) -> int:
     """Count bad values, densities, samples and mirror reflectances; each lane has its alpha and indices."""
     bright = {"specular_reflectance": 100.0, "diffuse_reflectance": 2.0}
