@@ -16,18 +16,17 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.output.replacing import replacing
-from mrt_mitsuba.validation.tools.report import machine, prepare, versions
-from mrt_mitsuba.validation.tools.study import Goal
-from mrt_mitsuba.validation.tools.timing import Ratio, in_turns, timed
+from mrt_mitsuba.validation.tools import renders
+from mrt_mitsuba.validation.tools.report import machine, prepare
+from mrt_mitsuba.validation.tools.study import Bound
+from mrt_mitsuba.validation.tools.timing import in_turns, ratio_of, timed
 
-SCHEMA = 3  # of the file: machine, versions, options, and rows by name, see ``Row``
 START_GOAL = 1.7
 # What any program on Mitsuba waits for: import, variant, one kernel
 BARE = """
@@ -38,9 +37,8 @@ dr.eval(dr.arange(mi.Float, 16) + dr.opaque(mi.Float, 1))
 dr.sync_thread()
 """
 
-# Of a row: "seconds", and where there is another side "other_seconds", the "ratio" with its quartiles "low"
-# and "high", and the "goal" of it
-Row = dict[str, Any]
+# Of a row: "seconds", and where there is another side what ``ratio_of`` says, and the "goal" of the ratio
+Row = dict[str, float]
 
 
 def rows(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
@@ -51,17 +49,12 @@ def rows(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     if given.device:
         sizes, triangles = (((80, 60),), 1000) if given.quick else (((800, 600), (4096, 4096)), 10**6)
         for pair in speed.on_device(given.device, sizes, triangles):
-            yield pair.name, _row(speed.compare(pair, repeats)[0])
+            yield pair.name, speed.compare(pair, repeats)[0]
         return
     yield "mrt out 0 / a bare start of Mitsuba", start(repeats)
     yield from cases(given, repeats)
     for pair in () if given.small else speed.against_mitsuba(speed.QUICK if given.quick else speed.FULL):
-        yield pair.name, _row(speed.compare(pair, repeats)[0], pair.goal)
-
-
-def _row(time: Ratio, goal: float | None = None) -> Row:
-    found = asdict(time)
-    return {"ratio": found.pop("median"), **found, "goal": goal}
+        yield pair.name, speed.compare(pair, repeats)[0] | {"goal": pair.goal}
 
 
 def start(turns: int) -> Row:
@@ -69,21 +62,18 @@ def start(turns: int) -> Row:
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     silent: dict[str, Any] = {"check": True, "stdout": subprocess.DEVNULL, "timeout": 600, "env": environment}
 
-    def seconds(command: Sequence[str], turn: int = 0) -> float:
+    def seconds(command: Sequence[str], turn: int) -> float:
         return timed(lambda: subprocess.run([sys.executable, *command], **silent))[1]
 
     with tempfile.TemporaryDirectory() as folder:
         commands = ("-m", "mrt_mitsuba.command.main", f"{folder}/out", "0", "quiet=1"), ("-c", BARE)
-        for command in commands:
-            seconds(command)  # Python compiles modules once
         sides = [partial(seconds, command) for command in commands]
-        return _row(Ratio.of(*in_turns(sides, turns)), START_GOAL)
+        in_turns(sides, 1)  # Python compiles modules once
+        return ratio_of(*in_turns(sides, turns)) | {"goal": START_GOAL}
 
 
 def cases(given: argparse.Namespace, turns: int) -> Iterator[tuple[str, Row]]:
     """Yield the cases of ``renders``, each side in a process of its own, in turns."""
-    from mrt_mitsuba.validation.tools import renders
-
     names = [name for name in renders.CASES if "small" in name or not (given.small or given.quick)]
 
     def measure(python: str, turn: int) -> dict[str, float]:
@@ -96,33 +86,29 @@ def cases(given: argparse.Namespace, turns: int) -> Iterator[tuple[str, Row]]:
     found = in_turns([partial(measure, python) for python in pythons], turns)
     for name in names:
         times = [[run[name] for run in side] for side in found]
-        yield name, _row(Ratio.of(*times)) if given.before else {"seconds": statistics.median(times[0])}
+        yield name, ratio_of(*times) if given.before else {"seconds": statistics.median(times[0])}
 
 
 def line(name: str, row: Row, before: Row | None = None) -> str:
     """Return a row as text; with an earlier one, its figure is followed by the ratio to then."""
-    key = "seconds" if row.get("ratio") is None else "ratio"
-    earlier = f" ({row[key] / before[key]:.2f}x)" if before and before.get(key) else ""
+    key = "ratio" if "ratio" in row else "seconds"
+    earlier = f" ({row[key] / before[key]:.2f}x)" if before and key in before else ""
     text = f"{name:<62}{1000 * row['seconds']:>10.2f}"
     if key == "seconds":
         return text + earlier
-    text += f"{1000 * row['other_seconds']:>10.2f}{row['ratio']:>8.2f}{earlier}"
-    text += f"  {row['low']:.2f} to {row['high']:.2f}"
-    if row["goal"] is None:
+    low, high = row["low"], row["high"]
+    text += f"{1000 * row['other_seconds']:>10.2f}{row['ratio']:>8.2f}{earlier}  {low:.2f} to {high:.2f}"
+    if "goal" not in row:
         return text
-    goal = Goal(name, row["ratio"], row["goal"], low=row["low"], high=row["high"])
-    return f"{text}  {row['goal']:g} {goal.verdict}"
+    return f"{text}  {row['goal']:g} {Bound(name, row['ratio'], row['goal'], interval=(low, high)).verdict}"
 
 
-def read(path: Path) -> dict[str, Any]:
-    """Return an earlier run. Raises ``UsageError`` for a file that is none."""
+def read(path: Path) -> dict[str, Row]:
+    """Return the rows of an earlier run. Raises ``UsageError`` for a file that is none."""
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
-        if found["schema"] == SCHEMA and isinstance(found["rows"], dict):
-            return found
-    except (OSError, ValueError, TypeError, KeyError):
-        pass
-    raise UsageError(f"cannot compare with {path}: it is not a file of this benchmark (schema {SCHEMA})")
+        return dict(json.loads(path.read_text())["rows"])
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise UsageError(f"cannot compare with {path}: it is not a file of this benchmark") from error
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -130,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
     add = parser.add_argument
     add("--out", type=Path, default=Path("bench.json"), help="file to write (default: bench.json)")
-    add("--compare", type=Path, help="an earlier file; ratios above 1 are slower")
+    add("--compare", type=Path, help="a file of the same options; ratios above 1 are slower than then")
     add("--quick", action="store_true", help="small pictures, one turn: a trial, not a measurement")
     add("--small", action="store_true", help="the start of the command and small renders alone")
     add("--before", metavar="PYTHON", help="a Python that has an earlier version, to take turns with")
@@ -138,24 +124,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--device", metavar="VARIANT", help="against Mitsuba's integrators in a variant, such as cuda_ad_rgb")
     given = parser.parse_args(arguments)
     try:
-        before = read(given.compare) if given.compare else {"rows": {}}
+        before = read(given.compare) if given.compare else {}
         prepare(given.out.parent, given.out.name)
         print(f"{'milliseconds':<62}{'now':>10}{'other':>10}{'ratio':>8}  quartiles")
         found: dict[str, Row] = {}
         for name, row in rows(given):
             found[name] = row
-            print(line(name, row, before["rows"].get(name)), flush=True)
+            print(line(name, row, before.get(name)), flush=True)
     except UsageError as error:
         parser.error(str(error))
     except MrtError as error:
         print(f"make bench: {error}", file=sys.stderr)
         return error.exit_code
     options = {name: getattr(given, name) for name in ("quick", "device", "turns")}
-    now = {"schema": SCHEMA, "machine": machine(), "versions": versions(), "options": options, "rows": found}
+    now = {"machine": machine(), "options": options, "rows": found}
     with replacing(given.out) as file:
         file.write(json.dumps(now, indent=2).encode() + b"\n")
-    if given.compare and before.get("options") != options:
-        print("The earlier file was measured with other options: its ratios mean little.")
     return 0
 
 

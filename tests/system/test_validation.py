@@ -332,7 +332,7 @@ def test_fit_finds_a_lens_that_is_there(monkeypatch: Patch) -> None:
 def test_runs_are_timed_in_turns() -> None:
     order: list[str] = []
     runs = {name: (lambda name=name: order.append(name)) for name in "ab"}
-    assert ratio(runs["a"], runs["b"], repeats=3).median > 0
+    assert ratio(runs["a"], runs["b"], repeats=3)["ratio"] > 0
     assert order == list("ab" + "ab" + "ba" + "ab")
     assert in_turns([lambda turn: turn, lambda turn: -turn], 3) == [[0, 1, 2], [0, -1, -2]]
 

@@ -59,7 +59,7 @@ def good(study: Study, *, quick: bool) -> None:
     rows = [["Ag", 0.123456789, 2], ["Au", np.float32(2e-5), True], ["Cu", INFINITE, 12345678]]
     study.table("errors", "Errors", ["metal", "error", "n"], rows)
     study.table("answer", "What to do", ["setting"], [["aa=2"]], first=True)
-    study.plot("curve", "A curve", figure, "rises")
+    study.picture("curve", "A curve", figure, "rises")
     study.picture("ball", "A ball", np.full((4, 5, 3), 0.25))
     assert list(study.each("work", [1, 2])) == [1, 2]
 

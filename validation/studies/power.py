@@ -242,5 +242,5 @@ def least_found(fault: Fault, changes: dict[str, Any], *, quick: bool = False) -
 if __name__ == "__main__":  # the table of docs/check_your_plugin.md
     shown = Study("power", TITLE)
     run(shown, quick="--quick" in sys.argv)
-    for row in shown.tables["power"].rows:
+    for row in shown.tables["power"]["rows"]:
         print("| " + " | ".join(str(value) for value in row) + " |")

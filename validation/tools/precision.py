@@ -255,7 +255,7 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
     if not found.points:
         return
     figure, caption = _diagram(found), _caption(found, truth)
-    study.plot(f"{prefix}diagram", f"{title}: work and precision", figure, caption)
+    study.picture(f"{prefix}diagram", f"{title}: work and precision", figure, caption)
     if found.errors:
         note = "With 95 % intervals. Between measured cases a curve is straight in logarithms; beyond them "
         note += "nothing is assumed."

@@ -13,43 +13,35 @@ import re
 import tempfile
 from collections.abc import Sequence
 from datetime import datetime, timezone
-from importlib.resources import files
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import PIL.Image
 
+from mrt_mitsuba import runtime
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.output.files import to_8bit
 from mrt_mitsuba.output.replacing import check_target, replacing
-from mrt_mitsuba.validation.tools.study import Image, Study, Table
+from mrt_mitsuba.validation.tools.study import Study
 
 DOTS_PER_INCH = 110
-COLUMN = 6.5  # inches from which on a plot has a row of the page to itself, too
-BROAD = 2  # width over height from which on a picture has a row of the page to itself
+# Pictures this many times wider than high, and plots of so many inches, have a row of the page to themselves
+BROAD, COLUMN = 2, 6.5
 VALIDATION = "Validation of mrt-mitsuba"
 
 
 def machine() -> dict[str, Any]:
-    """Return the number of cores and the system, without the name of the machine."""
-    return {"cores": usable_cores(), "system": f"{platform.system()} {platform.machine()}"}
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of everything that bears on speed or accuracy, by name."""
-    import drjit as dr
-    import mitsuba as mi
-
-    import mrt_mitsuba
-
-    usable = dr.has_backend(dr.JitBackend.LLVM)
+    """Return everything that bears on speed or accuracy, without the name of the machine."""
+    found: dict[str, Any] = dict(runtime.versions())
     return {
-        "version": mrt_mitsuba.__version__,
-        "mitsuba": mi.MI_VERSION,
-        "drjit": dr.__version__,
-        "llvm": ".".join(map(str, dr.detail.llvm_version())) if usable else "none",
+        "version": found.pop("mrt-mitsuba"),
+        **found,
         "python": platform.python_version(),
+        "cores": usable_cores(),
+        "system": f"{platform.system()} {platform.machine()}",
     }
 
 
@@ -92,23 +84,17 @@ def save(
 
     place = Path(folder)
     prepare(place)
-    images: dict[int, dict[str, Any]] = {}  # as the page shows them, by the id of the part
+    images = {study.name: {n: _drawn(i["content"]) for n, i in study.images.items()} for study in studies}
     for study in studies:
-        for part in study.parts:
-            if isinstance(part, str):
-                continue
-            stem = "-".join(
-                re.sub(r"[^A-Za-z0-9.]+", "-", n).strip("-.").lower() for n in (study.name, part.name)
-            )
-            if isinstance(part, Table):
-                text = io.StringIO()
-                csv.writer(text, lineterminator="\n").writerows([part.columns, *part.rows])
-                _write(place / f"{stem}.csv", text.getvalue().encode())
-            else:
-                images[id(part)] = _drawn(part)
-                _write(place / f"{stem}.png", images[id(part)]["data"])
+        files = {f"{name}.png": image["data"] for name, image in images[study.name].items()}
+        for name, table in study.tables.items():
+            text = io.StringIO()
+            csv.writer(text, lineterminator="\n").writerows([table["columns"], *table["rows"]])
+            files[f"{name}.csv"] = text.getvalue().encode()
+        for name, data in files.items():
+            words = (re.sub(r"[^A-Za-z0-9.]+", "-", n).strip("-.").lower() for n in (study.name, name))
+            _write(place / "-".join(words), data)
     result = {
-        **versions(),
         **machine(),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "quick": quick,
@@ -116,10 +102,9 @@ def save(
         "studies": {study.name: study.summary() for study in studies},
     }
     _write(place / "summary.json", json.dumps(result, indent=2, allow_nan=False).encode() + b"\n")
-    template = (files("mrt_mitsuba.validation.tools") / "templates" / "report.html").read_text("utf-8")
+    template = (resources.files(__package__) / "templates" / "report.html").read_text("utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    environment.filters |= {"cell": cell, "id": id}
-    environment.filters["base64"] = lambda data: base64.b64encode(data).decode()
+    environment.filters |= {"cell": cell, "base64": lambda data: base64.b64encode(data).decode()}
     shown = {**result, "studies": studies, "images": images, "title": title, "explain": title == VALIDATION}
     _write(place / "index.html", environment.from_string(template).render(shown).encode())
 
@@ -132,20 +117,16 @@ def notebook(study: Study, *, title: str) -> str:
     return f'<iframe srcdoc="{html.escape(page)}" style="width: 100%; height: 40rem; border: 0"></iframe>'
 
 
-def _drawn(image: Image) -> dict[str, Any]:
+def _drawn(content: Any) -> dict[str, Any]:
     """Return the bytes of a PNG, the class of the picture, and whether it has a row of the page to itself."""
-    import PIL.Image
-
-    buffer, content = io.BytesIO(), image.content
+    buffer = io.BytesIO()
     if isinstance(content, np.ndarray):
-        PIL.Image.fromarray(to_8bit(content, "srgb")).save(buffer, format="PNG")
-        return {
-            "data": buffer.getvalue(),
-            "kind": "picture",
-            "broad": content.shape[1] > BROAD * len(content),
-        }
-    content.savefig(buffer, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight", facecolor="white")
-    return {"data": buffer.getvalue(), "kind": "plot", "broad": content.get_figwidth() > COLUMN}
+        kind, broad = "picture", content.shape[1] > BROAD * len(content)
+        PIL.Image.fromarray(to_8bit(content.astype(np.float32), "srgb")).save(buffer, format="PNG")
+    else:
+        kind, broad = "plot", content.get_figwidth() > COLUMN
+        content.savefig(buffer, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight", facecolor="white")
+    return {"data": buffer.getvalue(), "kind": kind, "broad": broad}
 
 
 def cell(value: Any) -> str:

@@ -7,7 +7,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,43 +38,31 @@ def in_turns(sides: Sequence[Callable[[int], Any]], turns: int) -> list[list[Any
     return results
 
 
-@dataclass(frozen=True)
-class Ratio:
-    """Seconds of one run over those of another, of pairs taken one after the other."""
-
-    median: float
-    low: float  # the lower and the upper quartile
-    high: float
-    seconds: float  # medians of the one and of the other
-    other_seconds: float
-
-    @classmethod
-    def of(cls, seconds: Sequence[float], others: Sequence[float]) -> Ratio:
-        """Return what pairs of seconds say."""
-        low, median, high = np.quantile(np.divide(seconds, others), (0.25, 0.5, 0.75)).tolist()
-        return cls(median, low, high, float(np.median(seconds)), float(np.median(others)))
+def ratio_of(seconds: Sequence[float], others: Sequence[float]) -> dict[str, float]:
+    """Return the median "ratio" of pairs of seconds, its quartiles "low" and "high", and both medians."""
+    low, middle, high = np.quantile(np.divide(seconds, others), (0.25, 0.5, 0.75)).tolist()
+    medians = {"seconds": float(np.median(seconds)), "other_seconds": float(np.median(others))}
+    return {"ratio": middle, "low": low, "high": high, **medians}
 
 
-def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> Ratio:
-    """Compare two runs in turns. Both run once before, which compiles their kernels."""
+def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> dict[str, float]:
+    """Compare two runs in turns, see ``ratio_of``. Both run once before, which compiles their kernels."""
     sides = [lambda _, side=side: timed(side)[1] for side in (run, other)]
     in_turns(sides, 1)
-    return Ratio.of(*in_turns(sides, repeats))
+    return ratio_of(*in_turns(sides, repeats))
 
 
 @contextmanager
 def own_cache() -> Iterator[None]:
     """Let Dr.Jit keep its kernels in a new folder, for ``forget`` to work; enter before it is imported."""
-    before = os.environ.get(CACHE)
+    before = {name: value for name, value in os.environ.items() if name == CACHE}
     with tempfile.TemporaryDirectory(prefix=PREFIX, ignore_cleanup_errors=True) as folder:
         os.environ[CACHE] = folder
         try:
             yield
         finally:
-            if before is None:
-                del os.environ[CACHE]
-            else:
-                os.environ[CACHE] = before
+            del os.environ[CACHE]
+            os.environ |= before
 
 
 def forget() -> None:
