@@ -15,7 +15,7 @@ from mrt_mitsuba.sweeps.cluster import ClusterError, check_engine, connected, in
 from mrt_mitsuba.sweeps.jobs import Job, check_parameters, jobs, sent
 from mrt_mitsuba.sweeps.pictures import check_tiles, cut, is_fresh, join, refuse_to_replace
 from mrt_mitsuba.sweeps.table import Table
-from mrt_mitsuba.sweeps.worker import Setting, attempts, render_job, software
+from mrt_mitsuba.sweeps.worker import Setting, noted, render_job, software
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -143,7 +143,7 @@ def _render(
         if all(part.name in made for part in parts):
             found = [made[part.name] for part in parts]
             facts = found[0] if parts == [job] else join(job, parts, found, setting.folder, setting.scratch)
-            begun = max(1, *(attempts(part, setting) for part in parts))
+            begun = max(1, *(noted(part, setting)[0] for part in parts))
             table.add(job.name, facts | {"attempts": begun, "versions": setting.software})
 
     try:
@@ -155,18 +155,16 @@ def _render(
         with shown.stage("Sweep", len(calls)) as advance:
             for future in coming:
                 job, parts, part = calls.pop(future)
-                facts, error = {}, None
-                try:  # a worker may die with what it had finished: that is a death in the job, too
-                    facts = future.result()
-                except Exception as raised:
-                    if future.status != "error":  # the scheduler is gone
-                        raise
-                    error = raised
+                if future.status not in ("finished", "error"):
+                    raise CancelledError
+                begun, facts = noted(part, setting)  # whatever has become of the worker since
+                again = facts.pop("again", not facts)
                 # The engine holds a worker's death against all jobs that the worker had been given
-                if error and attempts(part, setting) <= retries and handed[part.name] < retries + MOST_DEATHS:
+                if again and begun <= retries and handed[part.name] < retries + MOST_DEATHS:
                     hand_over(job, parts, part)
                     continue
-                if error:
+                if not facts:
+                    error = future.exception()
                     text = one_line(f"{type(error).__name__}: {error}")
                     if isinstance(error, KilledWorker):
                         text = (

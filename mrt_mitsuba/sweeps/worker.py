@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import socket
 import sys
@@ -12,7 +14,7 @@ from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.cores import affinity, usable_cores
-from mrt_mitsuba.errors import MrtError
+from mrt_mitsuba.errors import MrtError, one_line
 from mrt_mitsuba.memory import free_memory
 from mrt_mitsuba.options import SMALLEST_MEMORY
 from mrt_mitsuba.sweeps.jobs import SENT, Job, identify, receive
@@ -54,31 +56,47 @@ def _cores() -> str:
     return f"{socket.gethostname()} {affinity()}"
 
 
-def attempts(job: Job, setting: Setting) -> int:
-    """Return how often workers have begun a job."""
-    try:
-        return os.path.getsize(os.path.join(setting.scratch, f"{job.name}.begun"))
-    except FileNotFoundError:
-        return 0
+def noted(job: Job, setting: Setting) -> tuple[int, dict[str, Any]]:
+    """Return how often workers have begun a job, and what the last that ended it noted: facts, or an error.
+
+    Notes outlive workers: one may die of its next job before Dask has reported on this.
+    """
+    path, begun, outcome = os.path.join(setting.scratch, job.name), 0, {}
+    with contextlib.suppress(FileNotFoundError):
+        begun = os.path.getsize(f"{path}.begun")
+        with open(f"{path}.json", encoding="utf-8") as file:
+            outcome = json.load(file)
+    return begun, outcome
 
 
-def render_job(job: Job, setting: Setting) -> dict[str, Any]:
-    """Render a picture and write it; return its facts for the table, or the reason why there is none.
+def render_job(job: Job, setting: Setting) -> None:
+    """Render a picture, write it, and note its facts for the table, or the reason why there is none.
 
-    Errors that are not this project's are raised: a repetition may help, where memory or a device ran out.
+    Errors that are not this project's are raised, too: a repetition may help, where memory or a device ran
+    out.
     """
     from distributed import get_worker
 
+    from mrt_mitsuba.output.replacing import replacing
+
+    if "file" in noted(job, setting)[1]:  # Dask repeats what it cannot get the result of
+        return
     worker, scratch = get_worker(), os.path.join(setting.scratch, job.name)
     os.makedirs(os.path.dirname(scratch), exist_ok=True)  # tiles have a folder of their own
     with open(f"{scratch}.begun", "ab") as file:
         file.write(b"+")
+    outcome: dict[str, Any] = {}
     try:
         with runtime.one_at_a_time:
-            found = _render(job, setting, scratch, worker)
+            outcome = _render(job, setting, scratch, worker)
     except MrtError as error:
-        found = {"error": str(error)}
-    return found | {"worker": worker.address}
+        outcome = {"error": str(error)}
+    except BaseException as error:
+        outcome = {"error": one_line(f"{type(error).__name__}: {error}"), "again": True}
+        raise
+    finally:
+        with replacing(f"{scratch}.json") as file:
+            file.write(json.dumps(outcome | {"worker": worker.address}).encode())
 
 
 def _render(job: Job, setting: Setting, scratch: str, worker: Any) -> dict[str, Any]:
@@ -124,6 +142,6 @@ def _render(job: Job, setting: Setting, scratch: str, worker: Any) -> dict[str, 
     return {
         "file": job.file,
         "seconds": time.perf_counter() - start,
-        "rays": sum(result.rays.values()),
-        "rmse": result.error.rmse if result.error else None,
+        "rays": int(sum(result.rays.values())),
+        "rmse": float(result.error.rmse) if result.error else None,
     }
