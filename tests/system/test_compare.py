@@ -36,7 +36,7 @@ def test_measures_are_those_of_a_known_difference() -> None:
     assert found.largest == pytest.approx(0.1, rel=1e-6) and found.place == (3, 5)
     assert found.flip > 0 and found.p_value is None
     np.testing.assert_array_equal(found.difference, spotted() - GREY)
-    assert "<td>rmse</td>" in found._repr_html_()
+    assert "rmse" in found._repr_html_()
     same = mrt.compare(GREY, GREY)
     assert (same.mae, same.rmse, same.psnr, same.largest, same.flip) == (0, 0, np.inf, 0, 0)
 

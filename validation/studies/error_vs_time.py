@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.tools.precision import Point, describe
 from mrt_mitsuba.validation.tools.study import Study
-from mrt_mitsuba.validation.tools.work_precision import error_vs_time
+from mrt_mitsuba.validation.tools.work_precision import Point, describe, error_vs_time
 
 TITLE = "Error against run time"
 

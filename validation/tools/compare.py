@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import html
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -87,16 +88,12 @@ class Difference:
             f"{stem}.png", colormaps["inferno"](np.minimum(size / scale, 1))[..., :3].astype(np.float32)
         )
 
-    def _shown(self) -> dict[str, str]:
-        return {k: "-" if v is None else f"{v:.4g}" for k, v in self.measures().items()}
-
     def __str__(self) -> str:
-        lines = [f"{name:<8} {value}" for name, value in self._shown().items()]
+        lines = [f"{name:<8} {'-' if v is None else f'{v:.4g}'}" for name, v in self.measures().items()]
         return "\n".join([*lines, f"the largest is at row {self.place[0]}, column {self.place[1]}"])
 
     def _repr_html_(self) -> str:
-        cells = "".join(f"<tr><td>{k}</td><td>{v}</td></tr>" for k, v in self._shown().items())
-        return f"<table>{cells}</table>"
+        return f"<pre>{html.escape(str(self))}</pre>"
 
 
 def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference:
@@ -114,14 +111,13 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
     compared: another size or data window, no such layer, NaN.
     """
     sides = [read_layer(side, layer, name) for side, name in ((a, "a"), (b, "b"))]
-    first, second = (side.values for side in sides)
+    (first, _, window), (second, _, other) = sides
     if first.shape != second.shape:
         sizes = " and ".join(f"{s.shape[1]}x{s.shape[0]} with {s.shape[2]} channels" for s in (first, second))
         raise UsageError(f"cannot compare pictures of {sizes}: their sizes must be the same")
-    windows = [side.window for side in sides if side.window]
-    if len(set(windows)) == 2:
+    if window and other and window != other:
         raise UsageError(
-            f"cannot compare the data windows {windows[0]} and {windows[1]}, of first column and row to last "
+            f"cannot compare the data windows {window} and {other}, of first column and row to last "
             "column and row: the pictures show other places"
         )
     with np.errstate(all="ignore"):
@@ -147,12 +143,9 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
     )
 
 
-class Layer(NamedTuple):
-    """A picture or layer [H, W, C], and the variance of its mean [H, W, C] or [H, W, 1], if it is known."""
-
-    values: np.ndarray
-    variance: np.ndarray | None = None
-    window: tuple[int, ...] = ()  # of an EXR: first column and row, last column and row
+# A picture or layer [H, W, C]; the variance of its mean [H, W, C] or [H, W, 1], if it is known; and of an EXR
+# the first column and row, and the last ones
+Layer = tuple[np.ndarray, np.ndarray | None, tuple[int, ...]]
 
 
 def read_layer(source: Any, layer: str = "", name: str = "the picture") -> Layer:
@@ -172,8 +165,8 @@ def read_layer(source: Any, layer: str = "", name: str = "the picture") -> Layer
         values = np.asarray(source, np.float32)
         if values.ndim not in (2, 3) or not values.size:
             raise UsageError(f"{name} has the shape {values.shape}: a picture is [H, W] or [H, W, C]")
-        found = Layer(np.atleast_3d(values))
-    bad = np.argwhere(np.isnan(found.values).any(axis=-1))
+        found = np.atleast_3d(values), None, ()
+    bad = np.argwhere(np.isnan(found[0]).any(axis=-1))
     if len(bad):
         place = f"row {bad[0][0]}, column {bad[0][1]}"
         raise UsageError(f"{name} is NaN in {len(bad)} pixels, the first at {place}: mend it first")
@@ -203,7 +196,7 @@ def _layer_of(channels: Mapping[str, np.ndarray], headers: Mapping[str, Any], la
         spread, power = spreads[0]
         variance = stacked(chosen(spread)).astype(np.float64) ** power
     corners = headers[keys[0]]["dataWindow"] if headers else ()
-    return Layer(stacked(keys), variance, tuple(int(n) for corner in corners for n in corner))
+    return stacked(keys), variance, tuple(int(n) for corner in corners for n in corner)
 
 
 def _p_value(sides: Sequence[Layer]) -> float | None:
@@ -213,15 +206,15 @@ def _p_value(sides: Sequence[Layer]) -> float | None:
     which is exact. How the largest difference over its deviation continues the tail of the others depends on
     sizes alone; it is off where a single ray may make it, and has a hundredth of the level.
     """
-    if all(side.variance is None for side in sides):
+    variances = [variance.mean(axis=2) for _, variance, _ in sides if variance is not None]
+    if not variances:
         return None
-    values = [side.values.astype(np.float64).mean(axis=2) for side in sides]
-    variance = sum(side.variance.mean(axis=2) for side in sides if side.variance is not None)
+    values = [picture.astype(np.float64).mean(axis=2) for picture, _, _ in sides]
     brightness = np.maximum(*np.abs(values))
     rounding = ROUNDING * (brightness + brightness.mean())
     difference = values[0] - values[1]
     difference -= np.clip(difference, -rounding, rounding)
-    pixels = exceedance(np.abs(difference) / np.sqrt(variance + rounding**2 + 1e-300))
+    pixels = exceedance(np.abs(difference) / np.sqrt(sum(variances) + rounding**2 + 1e-300))
     least = min(_p_of_means(difference) / 0.99, pixels / 0.01)
     return float(-np.expm1(np.log1p(-min(0.99 * least, 1 - 1e-15)) + np.log1p(-0.01 * least)))
 

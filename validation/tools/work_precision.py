@@ -1,12 +1,19 @@
 """``error_vs_time``: what settings of ``render`` cost, how far off they are, and which of them are ahead.
 
-Each case is repeated with other seeds; ``precision`` says what is made of the pictures.
+Each case is repeated with other seeds. Its pictures x₁ … x_R and two independent halves h₁, h₂ of the
+reference give the matrix G[r, s] = mean (x_r − h₁)(x_s − h₂), in which the reference's own noise cancels. The
+mean of its diagonal is the squared error, that of the rest the squared bias; the difference is the variance.
 """
 
 from __future__ import annotations
 
+import math
+import os
+import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -17,17 +24,190 @@ from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.rendering.result import Result
 from mrt_mitsuba.scene.open import open_scene
-from mrt_mitsuba.validation.tools import timing
-from mrt_mitsuba.validation.tools.compare import compare, read_layer
-from mrt_mitsuba.validation.tools.precision import RESOLVED, TITLE, Findings, Point
+from mrt_mitsuba.validation.tools import report, timing
+from mrt_mitsuba.validation.tools.compare import Difference, compare, read_layer
+from mrt_mitsuba.validation.tools.study import Study
 
+TITLE = "Error against time"
 REFERENCE_SEEDS = (2**20 + 1, 2**20 + 2)  # far from those of the repeats
-STEPS = (1, 2, 5)  # of the errors that the time is asked for, times powers of ten
-MOST_ERRORS = 4
+RESOLVED = 2.0  # an error is known from this many times the reference's own error on
+ERRORS = 4  # that the time is given for, unless they are chosen
+NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?"
+NOTHING = 1e-15  # an RMSE of 0, as logarithms have it
+LEVEL = 0.95  # of all intervals
+SAME = 0.02  # errors closer than this are the same: no reason to wait longer
 
 Options = Mapping[str, Any]
 Run = Callable[[Options, int], Result]  # a render with options and a seed
 Halves = tuple[np.ndarray, np.ndarray]  # two independent pictures, or the same one twice
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """One case: what it costs and how far off it is. Of one repeat, intervals, variance and bias are NaN."""
+
+    name: str
+    seconds: float  #: median of warm renders, without loading the scene
+    seconds_interval: Interval
+    rmse: float  #: over all repeats
+    rmse_interval: Interval
+    variance: float  #: mean variance of a pixel between repeats
+    bias: float  #: √(MSE − variance), 0 where noise explains the whole error
+    bias_interval: Interval
+    efficiency: float  #: 1 / (variance × seconds); NaN where nothing is random
+    cold: float  #: seconds of a first run, its kernels compiled or read from a cache
+    compile: float  #: seconds of that in the compiler
+    rays: Mapping[str, int]
+    image: np.ndarray  #: of the first repeat
+    difference: Difference  #: of it from the reference
+    reference_error: float
+
+    @classmethod
+    def of(cls, name: str, times: np.ndarray, gram: np.ndarray, **more: Any) -> Point:
+        """Return the figures of the seconds of repeats and their matrix G; ``more``: the other fields."""
+        seconds, squares, repeats = float(np.median(times)), np.diag(gram), len(times)
+        # The standard error of a median is at most √(π/2) times that of a mean
+        slower = math.exp(math.sqrt(math.pi / 2) * _reach(np.log(times)))
+        mse = max(float(squares.mean()), NOTHING**2)
+        rmse, worse = math.sqrt(mse), math.exp(min(_reach(squares) / mse / 2, 99))
+        # Pairs of different repeats: their mean varies as twice that of what they have in common
+        pairs = (gram.sum(axis=1) - squares) / (repeats - 1 or math.nan)
+        square, width = float(pairs.mean()), 2 * _reach(pairs) if repeats > 2 else math.inf
+        bias, low, high = np.sqrt(np.maximum([square, square - width, square + width], 0)).tolist()
+        variance = float(np.maximum(mse - square, 0))
+        return cls(
+            name=name,
+            seconds=seconds,
+            seconds_interval=(seconds / slower, seconds * slower),
+            rmse=rmse if rmse > NOTHING else 0.0,
+            rmse_interval=(rmse / worse, rmse * worse),
+            variance=variance,
+            bias=bias,
+            bias_interval=(low, high),
+            efficiency=1 / variance / seconds if variance > 1e-12 * mse else math.nan,
+            **more,
+        )
+
+    @property
+    def family(self) -> str:
+        """The name without its numbers: cases that differ in these alone are one curve."""
+        return " ".join(re.sub(f"=?{NUMBER}", " ", self.name).split()) or self.name
+
+    @property
+    def resolved(self) -> bool:
+        """Return whether the error can be distinguished from the reference's own."""
+        return self.rmse > RESOLVED * self.reference_error
+
+
+@dataclass(frozen=True)
+class Findings:
+    """The findings of ``error_vs_time`` about several cases."""
+
+    scene: str
+    points: Mapping[str, Point]
+    failed: Mapping[str, str]  #: why, by case
+    reference: np.ndarray
+    reference_error: float  #: RMSE of the reference itself, below which nothing is claimed; 0: exact
+    repeats: int
+    errors: Sequence[float]  #: for which the time is given
+    took: float = 0.0
+
+    @property
+    def families(self) -> dict[str, list[Point]]:
+        """The points of each curve, fastest first."""
+        groups: dict[str, list[Point]] = {point.family: [] for point in self.points.values()}
+        for point in sorted(self.points.values(), key=lambda p: p.seconds):
+            groups[point.family].append(point)
+        return groups
+
+    def time_to(self, error: float) -> dict[str, tuple[float, ...]]:
+        """Return when each curve comes down to an RMSE, in seconds with an interval; infinite if never.
+
+        The interval is from where the lower ends of all intervals come so low to where the upper ends do.
+        """
+        found = {}
+        for name, points in self.families.items():
+            times = np.array([(p.seconds, *p.seconds_interval) for p in points]).T
+            errors = np.array([(p.rmse, *p.rmse_interval) for p in points]).T
+            found[name] = tuple(_crossing(*curve, error) for curve in zip(times, errors, strict=True))
+        return found
+
+    @property
+    def verdicts(self) -> list[str]:
+        """A sentence for each of ``errors``; it names a winner only if its interval meets no other."""
+        if self.repeats < 2:
+            return ["No verdict on time: a single repeat has no interval."]
+        sentences = []
+        for error in self.errors:
+            reached = {name: t for name, t in self.time_to(error).items() if math.isfinite(t[0])}
+            best, *others = sorted(reached, key=lambda name: reached[name][0]) or [""]
+            if not reached:
+                verdict = "no case comes so low"
+            elif like := [name for name in others if not reached[best][2] < reached[name][1]]:
+                verdict = f"no winner, for the intervals overlap: {', '.join([best, *like])}"
+            elif not others:
+                verdict = f"only {best} comes so low, in {_shown(*reached[best])} s"
+            else:
+                longer = reached[others[0]][0] / reached[best][0]
+                verdict = f"{best} is the fastest, {_shown(*reached[best])} s; {others[0]} takes "
+                verdict += f"{longer:.2g} times as long"
+            sentences.append(f"RMSE of {error:g}: {verdict}.")
+        return sentences
+
+    def __str__(self) -> str:
+        width = max(map(len, [*self.points, *self.failed]), default=0)
+        lines = [
+            f"{p.name:<{width}}  {_shown(p.seconds, *p.seconds_interval)} s, "
+            f"RMSE {_shown(p.rmse, *p.rmse_interval)}"
+            for p in self.points.values()
+        ]
+        lines += [f"{name:<{width}}  FAILED {why}" for name, why in self.failed.items()]
+        own = f"{self.reference_error:.2g}" if self.reference_error else "not known"
+        return "\n".join([*lines, f"the reference's own error: {own}", *self.verdicts])
+
+    def study(self) -> Study:
+        """Return what the page shows."""
+        scene = f"scene {self.scene}" if self.scene.isdigit() else self.scene
+        study = Study("error-vs-time", f"{TITLE}: {scene}", seconds=self.took)
+        describe(study, self, "", "All cases")
+        return study
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""
+        report.save(folder, self.study(), title=TITLE)
+
+    def _repr_html_(self) -> str:
+        return report.notebook(self.study(), title=TITLE)
+
+
+def _reach(values: np.ndarray) -> float:
+    """Return how far Student's interval goes to each side of the mean of values; NaN of a single one."""
+    from scipy import stats
+
+    if len(values) < 2:
+        return math.nan
+    return float(stats.t.ppf((1 + LEVEL) / 2, len(values) - 1) * stats.sem(values))
+
+
+def _crossing(seconds: np.ndarray, errors: np.ndarray, error: float) -> float:
+    """Return when a curve of seconds and RMSEs comes down to an error, infinity if it does not.
+
+    Between its points it is straight in logarithms; beyond them nothing is assumed.
+    """
+    down = errors < np.minimum.accumulate([math.inf, *errors[:-1]])
+    if not down.any():  # NaN: a single repeat has no interval
+        return math.nan
+    depths, times = -np.log(np.maximum(errors[down], NOTHING)), np.log(seconds[down])
+    # an error that is met to rounding is met
+    return float(np.exp(np.interp(-math.log(error * (1 + 1e-9)), depths, times, right=math.inf)))
+
+
+def _shown(value: float, low: float, high: float) -> str:
+    return f"{value:.3g}" if math.isnan(low) else f"{value:.3g} ({low:.3g} to {high:.3g})"
+
+
+# ---------------------------------------------- Measuring ----------------------------------------------
 
 
 def error_vs_time(
@@ -53,7 +233,7 @@ def error_vs_time(
             read from its layer "error".
         repeats: with other seeds, in turn, after a cold and a warm run of each case.
         shared: options of all cases and of the reference.
-        errors: RMSEs to give the time for; by default round ones in the range that was measured.
+        errors: RMSEs to give the time for; by default four over the range that was measured.
 
     A case that fails is kept, with the reason. Raises ``UsageError`` for wrong arguments, and what
     ``render`` raises for the reference.
@@ -74,6 +254,10 @@ def error_vs_time(
         )
     runs, failed = _measure(run, cases, halves[0].shape, repeats, progress or Progress())
     points = {name: _point(name, found, halves, own_error) for name, found in runs.items()}
+    known = [p.rmse for p in points.values() if p.resolved and p.rmse > 1e-9]
+    if errors is None and known:  # rounded up, so that there is a case that comes so low
+        inside = np.geomspace(max(known), min(known), ERRORS + 2)[1:-1]
+        errors = list(dict.fromkeys(float(f"{1.05 * e:.1e}") for e in inside))
     return Findings(
         scene=next((found[0].plan.scene for found in runs.values()), "scene"),
         points=points,
@@ -81,7 +265,7 @@ def error_vs_time(
         reference=(halves[0] + halves[1]) / 2,
         reference_error=own_error,
         repeats=repeats,
-        errors=_round_errors(points.values(), own_error) if errors is None else list(errors),
+        errors=list(errors or ()),
         took=time.perf_counter() - start,
     )
 
@@ -117,10 +301,9 @@ def _reference(reference: Any, run: Run) -> tuple[Halves, float]:
     if isinstance(reference, Sequence) and not isinstance(reference, str):
         first, second = (_picture(run(r, s)) for r, s in zip(reference, REFERENCE_SEEDS, strict=True))
         return (first, first), compare(first, second).rmse
-    picture = read_layer(reference)
-    known = 0.0 if picture.variance is None else float(picture.variance.mean()) ** 0.5
-    values = picture.values.astype(np.float64)
-    return (values, values), known
+    values, variance, _ = read_layer(reference)
+    picture = values.astype(np.float64)
+    return (picture, picture), 0.0 if variance is None else float(variance.mean()) ** 0.5
 
 
 def _picture(result: Result) -> np.ndarray:
@@ -167,10 +350,10 @@ def _point(name: str, runs: Sequence[Result], halves: Halves, own_error: float) 
     errors = [np.stack([(image - half).ravel() for image in images]) for half in halves]
     gram = errors[0] @ errors[1].T / errors[0].shape[1]
     seconds = np.array([result.timings.total - result.timings.load for result in runs])
-    return Point(
-        name=name,
-        times=seconds[1:],
-        gram=(gram + gram.T) / 2,
+    return Point.of(
+        name,
+        seconds[1:],
+        (gram + gram.T) / 2,
         cold=float(seconds[0]),
         compile=runs[0].timings.compile,
         rays=dict(runs[1].rays),
@@ -180,12 +363,114 @@ def _point(name: str, runs: Sequence[Result], halves: Halves, own_error: float) 
     )
 
 
-def _round_errors(points: Iterable[Point], floor: float) -> list[float]:
-    """Return some round errors between the largest and the least that are resolved."""
-    found = [p.rmse for p in points if p.resolved and p.rmse > 1e-9]
-    if not found:
-        return []
-    powers = range(int(np.floor(np.log10(min(found)))), int(np.ceil(np.log10(max(found)))) + 1)
-    errors = [float(f"{step}e{power}") for power in powers for step in STEPS]
-    inside = [e for e in errors if max(min(found), RESOLVED * floor) <= e <= max(found)]
-    return inside[::-1][:MOST_ERRORS] or [float(f"{np.sqrt(min(found) * max(found)):.1e}")]
+# ------------------------------------------------ The page ------------------------------------------------
+
+
+def describe(study: Study, found: Findings, name: str, title: str, truth: str = "") -> None:
+    """Add the diagram, the answers and the tables to a study; ``truth`` says what the reference is."""
+    prefix, where = (f"{name}-", f"{name}: ") if name else ("", "")
+    study.at_most(f"{where}cases that failed", len(found.failed), 0, "each of them could be rendered")
+    if not found.points:
+        return
+    points = [point for points in found.families.values() for point in points]  # curve after curve
+    ahead = front(points) if found.repeats > 1 else []
+    caption = ["Down and to the left is better. Bars are 95 % intervals, numbers those of the table."]
+    if names := [f"{p.name} ({p.seconds:.2g} s, RMSE {p.rmse:.2g})" for p in ahead if p.resolved]:
+        caption.append(f"Ahead of the others: {'; '.join(names)}.")
+    caption += [f"Reference: {truth}."] if truth else []
+    own = f"about {found.reference_error:.2g}; no claim is made below twice that."
+    unknown = "not known: every RMSE has it in it."
+    caption.append(f"The RMSE of the reference itself is {own if found.reference_error else unknown}")
+    caption += found.verdicts
+    figure = _diagram(found, points)
+    study.picture(f"{prefix}diagram", f"{title}: work and precision", figure, " ".join(caption))
+    if found.errors:
+        note = "With 95 % intervals. Between measured cases a curve is straight in logarithms; beyond them "
+        note += "nothing is assumed."
+        rows: dict[str, dict[str, Any]] = {name: {"curve": name} for name in found.families}
+        for error in found.errors:
+            for curve, t in found.time_to(error).items():
+                rows[curve][f"RMSE {error:g}"] = _shown(*t) if math.isfinite(t[0]) else "not reached"
+        study.records(
+            f"{prefix}times", f"{title}: seconds to an error", [*rows.values()], note, first=not name
+        )
+    note = "Seconds: medians of warm renders without loading the scene; cold: a first run. Errors in units "
+    note += "of linear light. Ahead: no other case has less error in less time."
+    study.records(f"{prefix}points", f"{title}: every case", _rows(points, ahead), note)
+    if found.failed:
+        study.table(
+            f"{prefix}failed", f"{title}: cases that failed", ["case", "why"], [*found.failed.items()]
+        )
+
+
+def front(points: Iterable[Point]) -> list[Point]:
+    """Return the points that gain error over all faster ones, fastest first."""
+    best: list[Point] = []
+    for point in sorted(points, key=lambda p: (p.seconds, p.rmse)):
+        if not best or point.rmse < (1 - SAME) * best[-1].rmse:
+            best.append(point)
+    return best
+
+
+def _rows(points: Sequence[Point], ahead: Sequence[Point]) -> list[dict[str, Any]]:
+    """Return the table of all cases."""
+
+    def interval(ends: Interval) -> str:
+        return f"{ends[0]:.3g} to {ends[1]:.3g}" if np.isfinite(ends[0]) else "one repeat"
+
+    def known(value: float | None) -> float | str:
+        return "–" if value is None or np.isnan(value) else value
+
+    return [
+        {
+            "#": number,
+            "case": p.name,
+            "seconds": p.seconds,
+            "interval, s": interval(p.seconds_interval),
+            "cold, s": p.cold,
+            "of it compiling, s": p.compile,
+            "RMSE": p.rmse if p.resolved else "at the floor",
+            "interval": interval(p.rmse_interval) if p.resolved else "",
+            "|bias|": known(p.bias),
+            "interval of it": interval(p.bias_interval),
+            "1 / (variance × s)": known(p.efficiency),
+            "relMSE": p.difference.rel_mse,
+            "largest": p.difference.largest,
+            "FLIP": known(p.difference.flip),
+            "rays": sum(p.rays.values()),
+            "ahead": "yes" if p in ahead else "",
+        }
+        for number, p in enumerate(points, 1)
+    ]
+
+
+def _diagram(found: Findings, points: Sequence[Point]) -> Any:
+    """Return the work-precision diagram: RMSE against seconds, both with intervals, and the floor.
+
+    Points have the numbers of the table next to them.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    axes, floor = figure.subplots(), found.reference_error
+    errors = [p.rmse for p in points if p.rmse > 0] + ([floor] if floor else [])
+    bottom = 0.4 * min(errors, default=1e-6)  # where cases without error are drawn
+    for (name, curve), marker in zip(found.families.items(), cycle("osD^vP*X<>hp"), strict=False):
+        places = np.array([[p.seconds, max(p.rmse, bottom)] for p in curve]).T
+        ends = np.array([[p.seconds_interval, p.rmse_interval] for p in curve]).transpose(1, 2, 0)
+        x, y = np.nan_to_num(np.maximum(np.stack([places - ends[:, 0], ends[:, 1] - places], axis=1), 0))
+        style: dict[str, Any] = {"marker": marker, "markersize": 5, "linewidth": 1, "capsize": 2}
+        axes.errorbar(*places, xerr=x, yerr=y, label=name, **style)
+    for number, point in enumerate(points, 1):
+        place = point.seconds, max(point.rmse, bottom)
+        axes.annotate(str(number), place, textcoords="offset points", xytext=(4, 4), fontsize=8)
+    if floor:
+        axes.axhspan(bottom / 10, floor, color="0.9", zorder=0, label="within the reference's error")
+    if any(p.rmse == 0 for p in points):
+        axes.axhline(bottom, color="0.9", linewidth=8, zorder=0, label="no error")
+    axes.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="RMSE")
+    axes.set_ylim(bottom=0.8 * bottom)
+    axes.margins(x=0.08, y=0.08)
+    axes.grid(alpha=0.3)
+    figure.legend(fontsize=8, ncols=4, loc="outside lower center")
+    return figure
