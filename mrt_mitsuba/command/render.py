@@ -79,12 +79,12 @@ def show_log(level: str) -> None:
 
 def banner(options: Options) -> str:
     """Return the parameters of the render, one per line."""
-    focus = options.focus(None, FOCAL_RANGE)
+    distance, reach = options.focus(None, FOCAL_RANGE)
     if options.scene is None:
         from mrt_mitsuba.scene.report import report_scene
 
         scene = report_scene(options.scene_number)
-        focus = options.focus(scene.focal_distance, scene.focal_range)
+        distance, reach = options.focus(scene.focal_distance, scene.focal_range)
     film = "from the file" if options.scene is not None and not is_obj(options.scene) else ""
     aamode = options.aamode or (NOISE if options.rmse else None)
     lines = {
@@ -93,7 +93,7 @@ def banner(options: Options) -> str:
         "Height": options.height or film or SIZE[1],
         "AA": options.aa or ("as noise needs" if aamode == NOISE else film or 4),
         "AA mode": aamode or film or "sobel",
-        "F distance": focus.distance or "off",
-        "F range": focus.range if focus.distance else "off",
+        "F distance": distance or "off",
+        "F range": reach if distance else "off",
     }
     return "\n".join(f"{name + ':':<12}{value}" for name, value in lines.items())

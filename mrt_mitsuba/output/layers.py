@@ -40,7 +40,7 @@ _ROWS = (
         "Z",
         FIRST_HIT,
         "distance of the hit",
-        lambda r: r.at_hit("Float", r.view.distance(r.si), math.inf),
+        lambda r: r.at_hit("Float", r.distance, math.inf),
         free_with=("depth of field",),
     ),
     Layer("normal", "XYZ", FIRST_HIT, "geometric normal", lambda r: r.at_hit("Vector3f", r.si.n)),

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.rays.lattice import divide, opaque
+from mrt_mitsuba.rays.starts import divide, opaque
 
 STEPS = 32  # of a pixel, where integrals over a filter are summed
 
@@ -45,33 +44,32 @@ class Region(NamedTuple):
         return slice(top, top + self.height), slice(left, left + self.width)
 
 
-@dataclass(frozen=True)
 class Film:
-    """The film of a sensor. Pixels are numbered row by row, with the border that it samples around it."""
+    """The film of a sensor, as Mitsuba would expose it.
 
-    sensor: Any
-    width: int  #: pixels that are sampled in a row
-    height: int  #: rows that are sampled
-    shape: tuple[int, int]  #: rows and columns that are sampled
-    pixels: int  #: number of pixels that are sampled
-    border: int  #: pixels that are sampled around the picture, and are no part of it
-    reach: int  #: pixels on either side to which a ray contributes
-    alpha: bool  #: does it keep the coverage
-    grey: bool  #: does it keep the luminance only
-    bands: tuple[str, ...]  #: names of its spectral bands, if it has such
+    Pixels are numbered row by row, with the border that it samples around the picture.
+    """
 
-    @classmethod
-    def of(cls, sensor: Any) -> Film:
-        """Return the film of a sensor as Mitsuba would expose it."""
-        film = sensor.film()
-        rfilter = film.rfilter()
-        reach = 0 if rfilter.is_box_filter() else int(rfilter.border_size())
-        border = int(rfilter.border_size()) if film.sample_border() else 0
-        width, height = (int(n) + 2 * border for n in film.crop_size())
-        alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        grey = pixel_format(film) in ("luminance", "y", "ya")
-        size, bands = (height, width), spectral_bands(film)
-        return cls(sensor, width, height, size, width * height, border, reach, alpha, grey, bands)
+    def __init__(self, sensor: Any) -> None:
+        film, sampler = sensor.film(), sensor.sampler()
+        rfilter, found = film.rfilter(), re.search(r"pixel_format = (\w+)", str(film))
+        self.sensor = sensor
+        #: pixels on either side to which a ray contributes
+        self.reach = 0 if rfilter.is_box_filter() else int(rfilter.border_size())
+        #: pixels that are sampled around the picture, and are no part of it
+        self.border = int(rfilter.border_size()) if film.sample_border() else 0
+        self.width, self.height = (int(n) + 2 * self.border for n in film.crop_size())  # with the border
+        self.shape, self.pixels = (self.height, self.width), self.height * self.width
+        #: as the film prints it, "rgb" or "ya"; "" for a film of another kind
+        self.pixel_format = found[1] if found else ""
+        self.grey = self.pixel_format in ("luminance", "y", "ya")
+        self.alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)  #: does it keep the coverage
+        self.bands: tuple[str, ...] = ()  #: names of its spectral bands, if it has such
+        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+            film.prepare([])  # it knows its channels from then on
+            self.bands = tuple(field.name for field in film.bitmap().struct_())
+        self.rays = int(sampler.sample_count())  #: of a pixel, as the scene's sampler has them
+        self.sampler, self.rfilter = sampler.class_name(), rfilter.class_name()
 
     def picture(self, sampled: np.ndarray) -> np.ndarray:
         """Return what lies in the picture, of an array [..., rows, columns, channels]."""
@@ -139,26 +137,23 @@ class Canvas:
     neighbours there: each pixel adds them up by itself, in the same order every time. Sums along a row are
     formed in single precision, those of rows in double, so that pictures are the same wherever wavefronts are
     cut between rows.
+
+    ``sums`` [pictures, H, W, channels] has filtered values times their weights, ``weights`` [pictures, H, W]
+    these. With ``moments``, ``total`` and ``square`` [pictures, H, W, 3] have the colours of the rays in each
+    pixel and their squares, unfiltered, and ``peak`` [pictures, H, W, 1] the mean colour of the brightest.
     """
 
     def __init__(self, film: Film, rays: np.ndarray, channels: int, *, moments: bool) -> None:
-        """Take up values of so many channels of so many rays in each pixel, [pictures, pixels].
-
-        Args:
-            moments: add up the colours of the rays of each pixel and their squares as well, unfiltered, and
-                note the brightest.
-        """
-        self._film, self._share = film, np.float32(1 / np.maximum(rays, 1)).ravel()
-        self._shape = len(rays), film.height, film.width
-        self._sums = np.zeros((channels + 1, rays.size))
-        self._moments = np.zeros((7 * moments, rays.size))
-
-    def finished(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the sums of values and, last, of weights, [pictures, H, W, channels + 1]; those of colours
-        and of their squares, and the mean colour of the brightest ray, [pictures, H, W, 7] or empty."""
-        planes = (planes.reshape(-1, *self._shape) for planes in (self._sums, self._moments))
-        sums, moments = (np.moveaxis(each, 0, -1) for each in planes)
-        return sums, moments
+        """Take up values of so many channels of so many rays in each pixel, [pictures, pixels]."""
+        self.rays, self._film = rays, film
+        self._share = np.float32(1 / np.maximum(rays, 1)).ravel()
+        self._sums, self._moments = np.zeros((channels + 1, rays.size)), np.zeros((7 * moments, rays.size))
+        sums, found = (
+            np.moveaxis(planes.reshape(-1, len(rays), *film.shape), 0, -1)
+            for planes in (self._sums, self._moments)
+        )
+        self.sums, self.weights = sums[..., :-1], sums[..., -1]
+        self.total, self.square, self.peak = np.split(found, [3, 6], axis=-1)
 
     def put(self, place: Any, values: Sequence[Any], pixels: np.ndarray) -> None:
         """Add the values of rays, [channels] each, colours first, at their places on the film.
@@ -182,8 +177,7 @@ class Canvas:
             for index, found in enumerate(more):
                 known = self._moments[index, low:high]
                 (np.add if index < 6 else np.maximum)(known, np.asarray(found), out=known)
-        share = mi.Float(self._share[pixels])
-        sums = self._near(place, values, share, first, pixel)
+        sums = self._near(place, values, mi.Float(self._share[pixels]), first, pixel)
         dr.eval(sums)
         for total, found in zip(self._sums, sums, strict=True):
             total[low:high] += np.asarray(found)
@@ -250,17 +244,3 @@ def _moments(values: Sequence[Any], first: Any, last: Any) -> list[Any]:
     state = first, [mi.Float(0)] * (2 * len(values)), mi.Float(0)
     _, sums, most = dr.while_loop(state, lambda ray, *_: ray < last, add)
     return [*sums, most]
-
-
-def spectral_bands(film: Any) -> tuple[str, ...]:
-    """Return the names of a film's spectral bands, in its order; nothing for one that keeps colours."""
-    if not mi.has_flag(film.flags(), mi.FilmFlags.Special):
-        return ()
-    film.prepare([])  # it knows its channels from then on
-    return tuple(field.name for field in film.bitmap().struct_())
-
-
-def pixel_format(film: Any) -> str:
-    """Return the pixel format of a film as it prints it, "rgb" or "ya"; nothing for one without."""
-    found = re.search(r"pixel_format = (\w+)", str(film))
-    return found[1] if found else ""

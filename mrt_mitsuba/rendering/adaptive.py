@@ -109,9 +109,8 @@ class MrtAdaptive(mi.SamplingIntegrator):
             source = opened("a Mitsuba scene", scene, view, self.nested)
             result = render_with(scene, settings, opener=lambda *_, **__: source)
             film, layers = view.film(), result.layers
-            bands = result.plan.film.bands if result.plan.film else ()
             names = self.aov_names() if _further(film) else []
-            colors = [layers[name] for name in bands] or list(np.moveaxis(result.image, -1, 0))
+            colors = [layers[name] for name in result.plan.bands] or list(np.moveaxis(result.image, -1, 0))
             alpha = [layers["A"]] if "A" in layers else []
             planes = [*colors, *alpha, np.ones_like(result.image[..., 0]), *(layers[name] for name in names)]
             film.prepare(names)

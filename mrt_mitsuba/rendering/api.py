@@ -6,34 +6,105 @@ scene → plan → rays → integrator → filters → result: each step is a mo
 from __future__ import annotations
 
 import dataclasses
+import io
 import logging
 import os
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from inspect import Parameter, Signature
-from typing import Any, ParamSpec, Protocol, cast
+from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, cast
 
 import drjit as dr
 import numpy as np
+from numpy.typing import NDArray
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.memory import Budget, Workspace
+from mrt_mitsuba.output import files
 from mrt_mitsuba.output.layers import AVERAGED, TABLE
 from mrt_mitsuba.rendering import settings as table
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import Plan, make_plan
 from mrt_mitsuba.rendering.progress import Job, Progress, TerminalProgress
-from mrt_mitsuba.rendering.result import Result, Timings
-from mrt_mitsuba.rendering.rounds import Goal
 from mrt_mitsuba.rendering.settings import RenderSettings
-from mrt_mitsuba.rendering.shading import Shader, View
+from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import Source, open_scene, sized
 
+if TYPE_CHECKING:
+    from mrt_mitsuba.output.error import ErrorEstimate, Round
+
 log = logging.getLogger(__name__)
+Image = NDArray[np.float32]
 Options = ParamSpec("Options")
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Seconds of one render; ``load`` and ``passes`` add up to about ``total``."""
+
+    total: float  #: all of the render
+    load: float  #: scene and plan
+    compile: float  #: kernels that were not in the cache
+    kernels: float  #: kernels running
+    passes: Mapping[str, float]  #: by the name of the pass
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished picture, its layers, and how it was made."""
+
+    image: Image  #: float32 [H, W, 3], linear, top row first
+    layers: Mapping[str, Image]  #: float32 [H, W] by EXR channel name, such as "depth.Z"
+    plan: Plan  #: what ran, what was left out and why
+    timings: Timings  #: seconds
+    rays: Mapping[str, int]  #: number by kind; "mirror" and "shadow" only where they were counted
+    kernel_launches: int  #: how many kernels ran
+    options: Mapping[str, Any]  #: the values in force
+    versions: Mapping[str, str]  #: of what decides about pixels
+    camera: Mapping[str, np.ndarray]  #: float64 [4, 4], see ``rendering.view``
+    inputs: frozenset[str] = frozenset()  #: paths of the files that the scene was read from
+    error: ErrorEstimate | None = None  #: to the converged picture; None where nothing was estimated
+    rounds: tuple[Round, ...] = ()  #: what was known after each: the error over the time of this render
+
+    def save(self, *paths: str | os.PathLike[str], tonemap: str = "report") -> None:
+        """Write .png and .exr files, all or none; raise ``OutputError``, also for a file that the scene was
+        read from.
+
+        ``tonemap`` ("report" or "srgb") concerns a PNG only.
+        """
+        header = self.header()
+        files.save(paths, self.image, layers=self.layers, header=header, tonemap=tonemap, inputs=self.inputs)
+
+    def header(self) -> dict[str, Any]:
+        """Return the header attributes of an EXR: how the picture was made, and nothing such as seconds that
+        changes when it is made again.
+        """
+        version = self.versions["mrt-mitsuba"]
+        error = self.error and {name: getattr(self.error, name) for name in ("rmse", "low", "high", "tail")}
+        if error and error["high"] == np.inf:
+            error["high"] = None  # JSON has no infinity
+        rounds = [{"spp": each.spp, "rmse": each.rmse} for each in self.rounds]
+        return {
+            "software": f"mrt-mitsuba {version}",
+            "mrt:version": version,
+            "mrt:scene": self.plan.scene,
+            "mrt:options": dict(self.options),
+            "mrt:variant": self.plan.variant,
+            **{f"mrt:{name}": self.versions[name] for name in ("mitsuba", "drjit", "llvm")},
+            **({"mrt:error": error, "mrt:rounds": rounds} if error else {}),
+            **{f"mrt:{name}": matrix.tolist() for name, matrix in self.camera.items()},
+        }
+
+    def _repr_png_(self) -> bytes:
+        """Show the picture in a notebook, in sRGB as screens expect it."""
+        from PIL import Image as PilImage
+
+        buffer = io.BytesIO()
+        PilImage.fromarray(files.to_8bit(self.image, "srgb")).save(buffer, format="PNG")
+        return buffer.getvalue()
 
 
 class Render(Protocol[Options]):
@@ -117,14 +188,14 @@ def render_with(
 
 def _render(source: Source, settings: RenderSettings, budget: Budget, start: float) -> Result:
     """Render an open scene."""
-    shader = Shader(source.scene, source.integrator)
+    shader = Shader(source, settings.motion)
     plan, settings = make_plan(source, shader, settings)
     workspace = Workspace.next_to(
         plan.seen.width,
         plan.seen.height,
         plan.channels,
         pictures=min(plan.frames, 2),  # the frames' sum, and one of them
-        rays_per_pixel=plan.places(0).size,
+        rays_per_pixel=max(step.places.size for step in plan.passes),
         budget=budget,
     )
     in_notebook = settings.progress is None and "ipykernel" in sys.modules
@@ -133,54 +204,41 @@ def _render(source: Source, settings: RenderSettings, budget: Budget, start: flo
     shader.prepare(plan.kernel)
     load = time.perf_counter() - start
     log.info("scene %s loaded in %.3f s for %s", source.name, load, plan.variant)
-    view = View(source.sensor, source.width, source.height, settings.motion)
-    most = plan.repeats if settings.maxspp is None else settings.maxspp
-    goal = Goal(settings.rmse, most, settings.maxseconds, settings.on_round)
-    frames, total = plan.frames, dict[str, np.ndarray]()
-    for frame in range(frames):
-        # two passes in a frame, each with random numbers of its own
-        seed, moment = settings.seed + 2 * frame, frame if frames > 1 else None
-        passes = Passes(job, shader, view, plan, seed, moment)
-        for name, values in passes.run(goal).items():
-            if name not in total:
-                total[name] = values
-            elif (
-                name not in TABLE or TABLE[name].source == AVERAGED
-            ):  # of others, those of the first frame stay
-                total[name] += values
-            if frames > 1 and frame == frames - 1 and (name not in TABLE or TABLE[name].source == AVERAGED):
-                total[name] /= np.float32(frames)
-    image, layers = _cut(total, plan)
+    total = dict[str, np.ndarray]()
+    for frame in range(plan.frames):
+        passes = Passes(job, shader, plan, settings, frame)
+        found = passes.run()
+        total = total or found
+        for name in found if plan.frames > 1 else ():
+            if name in TABLE and TABLE[name].source != AVERAGED:
+                continue  # those of the first frame stay
+            if frame:
+                total[name] += found[name]
+            if frame == plan.frames - 1:
+                total[name] /= np.float32(plan.frames)
+    inside = plan.region.inside(plan.seen)
+    # views of the region [H, W] by EXR channel, first those of the film and the integrator
+    channels = {name: values[inside][..., 0] for name, values in total.items() if name not in TABLE}
+    for name in sorted(total.keys() & plan.layers):
+        for index, letter in enumerate(TABLE[name].letters):
+            channels[f"{name}.{letter}"] = total[name][inside][..., index]
     job.collect()
     log.info("%d kernels: compiled in %.3f s, ran for %.3f s", job.launches, job.compiling, job.running)
     seconds = time.perf_counter() - start
     return Result(
-        image,
-        layers,
+        total["image"][inside],
+        channels,
         plan,
         Timings(seconds, load, job.compiling, job.running, job.passes),
         job.rays,
         job.launches,
         _in_force(settings, plan, source),
         runtime.versions(),
-        view.matrices(),
+        camera_matrices(source.sensor),
         frozenset(map(os.path.abspath, budget.inputs)),
         passes.error,
         tuple(passes.rounds),
     )
-
-
-def _cut(total: dict[str, np.ndarray], plan: Plan) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the region of the picture [H, W, 3], and of its layers by EXR channel, [H, W] each: views.
-
-    First come the channels of the film and the integrator, in Mitsuba's order.
-    """
-    inside = plan.region.inside(plan.seen)
-    channels = {name: values[inside][..., 0] for name, values in total.items() if name not in TABLE}
-    for name in sorted(total.keys() & plan.layers):
-        letters = enumerate(TABLE[name].letters)
-        channels |= {f"{name}.{letter}": total[name][inside][..., index] for index, letter in letters}
-    return total["image"][inside], channels
 
 
 def _in_force(settings: RenderSettings, plan: Plan, source: Source) -> dict[str, Any]:
@@ -190,8 +248,8 @@ def _in_force(settings: RenderSettings, plan: Plan, source: Source) -> dict[str,
         "width": plan.width,
         "height": plan.height,
         "fresnel": source.fresnel,
-        "focaldist": plan.focus.distance or 0.0,
-        "focalrange": plan.focus.range,
+        "focaldist": plan.focus[0] or 0.0,
+        "focalrange": plan.focus[1],
         "variant": plan.variant,
         "integrator": plan.integrator,
         "layers": tuple(name for name in settings.layers if name in plan.layers),

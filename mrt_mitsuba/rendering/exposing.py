@@ -16,16 +16,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mrt_mitsuba.filters.grid import dilated
 from mrt_mitsuba.interrupts import heed
 from mrt_mitsuba.memory import BYTES_PER_CHANNEL_OF_RAY
 from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.output.layers import channels as channel_count
 from mrt_mitsuba.rays.film import Canvas, Film
-from mrt_mitsuba.rays.lattice import Places, divide, opaque
-from mrt_mitsuba.rays.samplers import pixel_sequence, ray_sampler
+from mrt_mitsuba.rays.starts import Places, divide, opaque, pixel_sequence, ray_sampler
 from mrt_mitsuba.rendering.progress import Job
-from mrt_mitsuba.rendering.shading import Shader, View
-from mrt_mitsuba.rendering.windows import dilated
+from mrt_mitsuba.rendering.shading import Shader
 
 log = logging.getLogger(__name__)
 
@@ -62,18 +61,6 @@ class Groups(NamedTuple):
             yield part, Groups(self.size, self.pixels[part], None if self.first is None else self.first[part])
 
 
-@dataclass(frozen=True)
-class Exposed:
-    """The sums over the rays of one exposure; the rays of a pixel weigh 1 in all."""
-
-    sums: np.ndarray  #: [pictures, H, W, channels]: filtered values times their weights
-    weights: np.ndarray  #: [pictures, H, W]: filtered weights
-    rays: np.ndarray  #: [pictures, pixels]: how many started there
-    total: np.ndarray  #: [pictures, H, W, 3]: of the colours of those; empty where not asked for
-    square: np.ndarray  #: [pictures, H, W, 3]: of their squares
-    peak: np.ndarray  #: [pictures, H, W, 1]: mean colour of the brightest
-
-
 class Stack:
     """Pictures in the making, exposure upon exposure.
 
@@ -96,14 +83,14 @@ class Stack:
         return np.maximum(groups, near.reshape(groups.shape))
 
     @np.errstate(over="ignore")  # of light beyond float32, whose mean is infinite
-    def add(self, exposed: Exposed, chosen: np.ndarray) -> None:
-        """Add an exposure that was made for the ``chosen`` pixels [pictures, pixels]."""
-        each = np.float32(1 / np.maximum(exposed.rays, 1))
-        amount = self.rows(chosen) / self.film.spread_out(self.rows(each))
-        self._sums += amount[..., None] * exposed.sums
-        self._weights += amount * exposed.weights
+    def add(self, exposed: Canvas, chosen: np.ndarray) -> None:
+        """Add as many pictures of an exposure as there are ``chosen`` pixels for, [pictures, pixels]."""
+        rays = exposed.rays[: len(chosen)]
+        amount = self.rows(chosen) / self.film.spread_out(self.rows(np.float32(1 / np.maximum(rays, 1))))
+        self._sums += amount[..., None] * exposed.sums[: len(chosen)]
+        self._weights += amount * exposed.weights[: len(chosen)]
         self._amount += amount
-        self.rays += exposed.rays
+        self.rays += rays
 
     def pictures(self) -> np.ndarray:
         """Return the pictures one by one, [pictures, H, W, channels], with the film's border."""
@@ -122,19 +109,22 @@ class Stack:
 
 @dataclass
 class Exposer:
-    """A shader that exposes pixels of a view, or of its film."""
+    """A shader that exposes pixels of a lattice, or of its film."""
 
     job: Job
     shader: Shader
-    view: View
-    film: Any = None
-    layers: Sequence[str] = ()  #: to expose; with a film, averaged ones, next to the picture
+    layers: Sequence[str]  #: to expose; on a film, averaged ones, next to the picture
+    on_film: bool = True
+
+    @property
+    def film(self) -> Film:
+        """The film."""
+        return self.shader.film
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Channels of the picture: R, G, B, those that the film and the integrator have, and the layers'."""
-        film = self.film
-        own = () if film is None else (*(("A",) if film.alpha else ()), *film.bands)
+        """Channels of the film: R, G, B, its own, the integrator's, and the layers'."""
+        own = (*(("A",) if self.film.alpha else ()), *self.film.bands)
         layers = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
         return ("R", "G", "B", *own, *self.shader.aovs, *layers)
 
@@ -147,8 +137,8 @@ class Exposer:
         the rays of each pixel, or what the first ray hit. They do not depend on the parts.
         """
         workspace, channels, size = self.job.workspace, channel_count(self.layers), places.size
-        width, height = self.view.width, self.view.height
-        random = self.shader.random or mi.is_spectral or self.view.sensor.needs_aperture_sample()
+        width, height = self.shader.width, self.shader.height
+        random = self.shader.random or mi.is_spectral or self.shader.sensor.needs_aperture_sample()
         sampler = ray_sampler() if random else None
 
         def start(pixel: Any, number: Any) -> tuple[Any, Any, Any, Any]:
@@ -171,7 +161,7 @@ class Exposer:
         progressive: bool = False,
         moments: bool = False,
         advance: Callable[[int], object] = lambda rays: None,
-    ) -> Exposed:
+    ) -> Canvas:
         """Trace groups of rays in as many wavefronts as fit into memory, and add their values up.
 
         Args:
@@ -189,30 +179,26 @@ class Exposer:
             planes = [plane for channels in values.values() for plane in channels]
             canvas.put(place, planes, np.repeat(some.pixels, size))
             advance(len(some.pixels) * size)
-        sums, colors = canvas.finished()
-        return Exposed(sums[..., :-1], sums[..., -1], rays, *np.split(colors, [3, 6], axis=-1))
+        return canvas
 
     def _on_film(self, groups: Groups, seed: int, before: int, progressive: bool) -> Start:
         """Return where rays of groups start, ``before`` of which were traced already."""
         film, size, scalar = self.film, groups.size, mi.variant().startswith("scalar")
-        stock = film.sensor.sampler()
-        key = seed if scalar else dr.opaque(mi.UInt32, seed)
-        independent = scalar or stock.class_name() == "IndependentSampler"
-        sampler = ray_sampler()
-        if progressive and not scalar:
-            sampler = pixel_sequence()
-        elif not independent:
-            sampler = stock.clone()
+        sequence = progressive and not scalar
+        independent = scalar or film.sampler == "IndependentSampler"
+        sampler = pixel_sequence() if sequence else ray_sampler()
+        if not (sequence or independent):
+            sampler = film.sensor.sampler().clone()
             sampler.set_sample_count(size)
             sampler.set_samples_per_wavefront(size)
             sampler.seed((seed + before) % 2**32, len(groups.pixels) * size)
 
         def start(pixel: Any, number: Any) -> tuple[Any, Any, Any, Any]:
-            if progressive and not scalar:
-                sampler.start(number, mi.sample_tea_32(pixel, key)[0])
+            if sequence:
+                sampler.start(number, mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, seed))[0])
             elif independent:  # numbered as Mitsuba numbers the rays of a whole picture
                 rays = 2**24 if progressive else opaque(size)
-                sampler.start(key, mi.UInt64(pixel) * mi.UInt64(rays) + mi.UInt64(number))
+                sampler.start(seed, mi.UInt64(pixel) * mi.UInt64(rays) + mi.UInt64(number))
             if progressive:
                 _, pixel = divide(pixel, film.pixels)
             return *film.place(pixel, sampler), None, sampler
@@ -255,18 +241,14 @@ class Exposer:
     def _ray(self, pixel: Any, number: Any, start: Start) -> tuple[Any, dict[str, list[Any]]]:
         """Trace a ray, or one in each lane: return its place on the film, and its values."""
         place, inside, time, sampler = start(pixel, number)
-        ray, weight = self.view.rays(inside, time, sampler)
-        values, film = self.shader.values(self.view, ray, weight, sampler), self.film
-        found: dict[str, Any] = {}
-        if film is not None:
-            grey = film.grey and mi.Color3f(mi.luminance(mi.Color3f(values.image)))
-            found["image"] = grey if film.grey else values.image
+        values, film, found = self.shader.values(inside, time, sampler), self.film, dict[str, Any]()
+        if self.on_film:
+            found["image"] = mi.Color3f(mi.luminance(values.image)) if film.grey else values.image
             if film.alpha:
                 found["A"] = dr.select(values.valid, mi.Float(1), 0)
             if film.bands:
-                bands = film.sensor.film().prepare_sample(
-                    values.spectrum, ray.wavelengths, len(film.bands) + 1
-                )
+                sensed = film.sensor.film().prepare_sample
+                bands = sensed(values.spectrum, values.ray.wavelengths, len(film.bands) + 1)
                 found |= zip(film.bands, bands, strict=False)  # without the weight
             found |= zip(self.shader.aovs, values.aovs, strict=True)
         found |= {name: TABLE[name].value(values) for name in self.layers}

@@ -15,14 +15,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
 from mrt_mitsuba.filters.dof import REACH
+from mrt_mitsuba.filters.grid import dilated, window_means
 from mrt_mitsuba.output.error import ErrorEstimate, tail_shape
 from mrt_mitsuba.rendering.exposing import Exposer, Groups, Stack
-from mrt_mitsuba.rendering.windows import dilated, window_means
 
 PICTURES = 4
 HALVES, SCOUTS = [0, 1], [2, 3]
@@ -89,9 +88,8 @@ class Halves(Stack):
         self._total += exposed.total
         self._square += exposed.square.mean(-1)
         np.maximum(self._peak, exposed.peak[..., 0], out=self._peak)
-        sums, weights, rays = (v[:2] for v in (exposed.sums, exposed.weights, exposed.rays))
         with np.errstate(invalid="ignore"):
-            self.add(replace(exposed, sums=sums, weights=weights, rays=rays), chosen[:2] > 0)
+            self.add(exposed, chosen[:2] > 0)
 
     def unfit(self) -> str:
         """Return what radiance has no square in float32, and where; nothing if all has."""

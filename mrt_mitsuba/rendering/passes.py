@@ -7,7 +7,8 @@ rays are independent of each other, and a filter sees as many rows around a band
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,77 +16,69 @@ from mrt_mitsuba import filters
 from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.filters.grid import bands
 from mrt_mitsuba.memory import BYTES_PER_PIXEL_OF_FILTER, keep_freed_blocks
-from mrt_mitsuba.output.error import ErrorEstimate, Round
 from mrt_mitsuba.output.layers import TABLE
-from mrt_mitsuba.rays.film import Film, Region
-from mrt_mitsuba.rays.lattice import Places
+from mrt_mitsuba.rays.film import Region
 from mrt_mitsuba.rendering.exposing import Exposer, Groups, Stack
-from mrt_mitsuba.rendering.plan import BLUR, EDGES, FIRST_HITS, REFINEMENT, RENDERING, ROUNDS, Pass, Plan
+from mrt_mitsuba.rendering.plan import BLUR, EDGES, REFINEMENT, RENDERING, ROUNDS, Pass, Plan
 from mrt_mitsuba.rendering.progress import Job
-from mrt_mitsuba.rendering.rounds import Goal, run_rounds
-from mrt_mitsuba.rendering.settings import DETECTORS
-from mrt_mitsuba.rendering.shading import Shader, View
-from mrt_mitsuba.rendering.whole import Wholes
+from mrt_mitsuba.rendering.settings import DETECTORS, RenderSettings
+from mrt_mitsuba.rendering.shading import Shader
+
+if TYPE_CHECKING:
+    from mrt_mitsuba.output.error import ErrorEstimate, Round
+
+SAID = {REFINEMENT: "Computing Anti aliasing..", BLUR: "Computing depth of field.."}
 
 
 class Passes:
     """A picture in the making. ``layers``: by name, [H, W, channels] float32, with the film's and the
     integrator's own channels, [H, W, 1]; ``error`` and ``rounds``: where they were estimated.
 
-    Where the plan's lattice is a film, the film is exposed with a border, and developed into layers; else
-    each pixel is the mean of its samples.
+    A lattice gives each pixel the mean of its samples; a film is exposed with its border, and developed into
+    layers. ``frame``: number of the only moment that is seen; None where rays are spread over the time.
     """
 
-    def __init__(
-        self, job: Job, shader: Shader, view: View, plan: Plan, seed: int, frame: int | None
-    ) -> None:
-        self._job, self._shader, self._view = job, shader, view
-        self._plan, self._seed, self._frame = plan, seed, frame
+    error: ErrorEstimate | None = None
+    rounds: Sequence[Round] = ()
+
+    def __init__(self, job: Job, shader: Shader, plan: Plan, settings: RenderSettings, frame: int) -> None:
+        self._job, self._shader, self._plan, self._settings = job, shader, plan, settings
+        self._phase = {"phase": frame / plan.moments} if plan.frames > 1 else {}
+        self._seed = settings.seed + 2 * frame  # two passes in a frame, each with random numbers of its own
         self._shape = plan.seen.height, plan.seen.width
         self._pixels = plan.seen.pixels(plan.width)
         self._rows_at_once = job.workspace.rows_at_once(plan.seen.width)
         self.layers: dict[str, np.ndarray] = {}
-        self.error: ErrorEstimate | None = None
-        self.rounds: Sequence[Round] = ()
-        if plan.on_film:
-            self._film = Film.of(view.sensor)
-            picture = Region(0, 0, plan.width, plan.height)
-            self._seen = plan.seen.inside(picture)
-            # pixels whose rays reach what is seen, as the film numbers them
-            near = np.zeros((plan.height, plan.width), bool)
-            near[plan.seen.grown(self._film.reach, plan.width, plan.height).inside(picture)] = True
-            self._near = np.flatnonzero(np.pad(near, self._film.border, constant_values=True))
+        self._picture = Region(0, 0, plan.width, plan.height)
+        self._seen = plan.seen.inside(self._picture)
 
-    def run(self, goal: Goal) -> dict[str, np.ndarray]:
-        """Run the passes of the plan, rounds until they reach a goal; return the layers."""
-        plan = self._plan
-        for step in plan.passes:
-            if step.name == FIRST_HITS:
-                self._trace(step, plan.first_hit(self._frame))
-            elif step.name in (RENDERING, REFINEMENT) and plan.on_film:
-                self._expose(step)
-            elif step.name == RENDERING:
-                # a detector must see no noise: it looks at the centre of each pixel, at the same times
-                alike = plan.centre(self._frame) if plan.detector else plan.places(self._seed, self._frame)
-                self._trace(step, alike)
-            elif step.name == EDGES:
+    def run(self) -> dict[str, np.ndarray]:
+        """Run the passes of the plan; return the layers."""
+        for step in self._plan.passes:
+            if step.name == EDGES:
                 self._detect(step)
-            elif step.name == REFINEMENT:
-                self._trace(step, plan.places(self._seed, self._frame, step.first))
             elif step.name == BLUR:
                 self._blur(step)
             elif step.name == ROUNDS:
-                self._run_rounds(step, goal)
-        if "samples" in plan.layers and "samples" not in self.layers:
-            self._add("samples")[:] = plan.lattice.count
+                self._run_rounds(step)
+            elif step.on_film:
+                self._expose(step)
+            else:
+                self._trace(step)
+        if "samples" in self._plan.layers and "samples" not in self.layers:
+            self._add("samples")[:] = self._plan.samples
         return self.layers
+
+    def _stage(self, step: Pass, total: int) -> Any:
+        return self._job.stage(step.name, total, SAID.get(step.name, ""))
 
     # ------------------------------------------- Lattices -------------------------------------------
 
-    def _trace(self, step: Pass, places: Places) -> None:
+    def _trace(self, step: Pass) -> None:
         """Trace all pixels, whose layers are new; or of those at edges the lattice's other samples."""
-        seed, pixels, edge = self._seed, self._pixels, np.zeros(0)
-        if step.name == REFINEMENT:
+        refined, seed, pixels, edge = step.name == REFINEMENT, self._seed, self._pixels, np.zeros(0)
+        places = replace(step.places, seed=seed, **self._phase)
+        if refined:
             edge = np.flatnonzero(self.layers["samples"] > 1).astype(np.uint32)
             whole = isinstance(pixels, range)
             seed, pixels = seed + 1, edge + np.uint32(pixels.start) if whole else pixels[edge]
@@ -93,14 +86,13 @@ class Passes:
             for name in step.layers:
                 self._add(name)
         flat = {name: self.layers[name].reshape(len(self._pixels), -1) for name in step.layers}
-        message = "Computing Anti aliasing.." if step.name == REFINEMENT else ""
-        with self._job.stage(step.name, len(pixels), message) as advance:
-            for part, planes in self._exposer(step).means(pixels, places, seed):
+        exposer = Exposer(self._job, self._shader, [n for n in TABLE if n in step.layers], on_film=False)
+        with self._stage(step, len(pixels)) as advance:
+            for part, planes in exposer.means(pixels, places, seed):
                 for name, channel, plane in planes:
-                    if step.name == REFINEMENT:
-                        before = step.first * flat[name][edge[part], channel]
-                        total = before + places.count * plane
-                        flat[name][edge[part], channel] = total / np.float32(self._plan.lattice.count)
+                    if refined:
+                        total = places.first * flat[name][edge[part], channel] + places.count * plane
+                        flat[name][edge[part], channel] = total / np.float32(self._plan.samples)
                     else:
                         flat[name][part, channel] = plane
                 advance(part.stop - part.start)
@@ -109,51 +101,61 @@ class Passes:
 
     def _expose(self, step: Pass) -> None:
         """Expose every pixel alike, or those at edges further."""
-        exposer, film, message = self._exposer(step), self._film, ""
-        rays, moments = film.rays_near(step.samples * step.repeats), "square" in step.layers
-        if self._plan.whole:
-            wholes = Wholes(exposer, self._seed)
-            with self._job.stage(step.name, wholes.cost([rays])) as advance:
+        exposer, film, plan, seed = self._film_exposer(step), self._shader.film, self._plan, self._seed
+        rays, moments = film.rays_near(step.places.size), "square" in step.layers
+        if not self._shader.layers:
+            from mrt_mitsuba.rendering.whole import Wholes
+
+            wholes = Wholes(exposer, seed)
+            with self._stage(step, wholes.cost([rays])) as advance:
                 wholes.trace([rays], advance)
-            self._develop(exposer, wholes)
+            self._develop(exposer, wholes.mean())
             return
+        marked = np.zeros((plan.height, plan.width), bool)
         if step.name == RENDERING:
-            self._stack = Stack(film, 1, len(exposer.names))
-            seed, pixels, chosen = self._seed, self._near, np.ones((1, film.pixels), bool)
+            self._stack, chosen = Stack(film, 1, len(exposer.names)), np.ones((1, film.pixels), bool)
+            # pixels whose rays reach what is seen
+            marked[plan.seen.grown(film.reach, plan.width, plan.height).inside(self._picture)] = True
+            pixels = np.flatnonzero(np.pad(marked, film.border, constant_values=True))
         else:
-            seed, message = self._seed + 1, "Computing Anti aliasing.."
-            found = np.zeros((self._plan.height, self._plan.width), bool)
-            found[self._seen] = self.layers["samples"][..., 0] > 1
-            chosen = np.pad(found, film.border).reshape(1, -1)
+            seed, marked[self._seen] = seed + 1, self.layers["samples"][..., 0] > 1
+            chosen = np.pad(marked, film.border).reshape(1, -1)
             pixels = np.flatnonzero(self._stack.widened(chosen)[0])
-        with self._job.stage(step.name, len(pixels) * rays, message) as advance:
+        with self._stage(step, len(pixels) * rays) as advance:
             exposed = exposer.expose(Groups(rays, pixels), seed, moments=moments, advance=advance)
             self._stack.add(exposed, chosen)
         if moments:
             mean, square = exposed.total[0] / rays, exposed.square[0] / rays
             variance = np.maximum(square - mean**2, 0) / (rays - 1) * film.averaging
             self._set("square", film.picture(variance))
-        self._develop(exposer, self._stack)
+        self._develop(exposer, self._stack.mean())
 
-    def _run_rounds(self, step: Pass, goal: Goal) -> None:
+    def _run_rounds(self, step: Pass) -> None:
         """Expose pixels until the noise is as low as was asked for."""
         from mrt_mitsuba.rendering.noise import Halves
+        from mrt_mitsuba.rendering.rounds import Goal, run_rounds
+        from mrt_mitsuba.rendering.whole import Wholes
 
         keep_freed_blocks()
-        exposer = self._exposer(step)
+        exposer, settings = self._film_exposer(step), self._settings
+        most = int(settings.maxspp or settings.spp or 1)
+        goal = Goal(settings.rmse, most, settings.maxseconds, settings.on_round)
         blurred = self._blurred if self._plan.blur else None
-        whole = self._plan.whole
+        whole = not self._shader.layers
         halves: Any = Wholes(exposer, self._seed) if whole else Halves(exposer, self._seed, blurred)
-        self.rounds, self.error = run_rounds(halves, self._film.pixels, goal, self._job.stage)
-        self._develop(exposer, halves)
+        self.rounds, self.error = run_rounds(halves, self._shader.film.pixels, goal, self._job.stage)
+        self._develop(exposer, halves.mean())
         variance = halves.variance()
         self._set("variance", variance)
         self._set("error", np.sqrt(variance.mean(-1, keepdims=True)))
         self._set("samples", halves.samples()[..., None])
 
-    def _develop(self, exposer: Exposer, stack: Stack | Wholes) -> None:
-        """Turn what is exposed into layers."""
-        picture = stack.mean()
+    def _film_exposer(self, step: Pass) -> Exposer:
+        layers = step.layers - {"image", "square"}  # the film has its own
+        return Exposer(self._job, self._shader, [name for name in TABLE if name in layers])
+
+    def _develop(self, exposer: Exposer, picture: np.ndarray) -> None:
+        """Turn what is exposed, [H, W, channels], into layers."""
         self._set("image", picture[..., :3])
         picture = picture[self._seen]
         for number, channel in enumerate(exposer.names[3:], 3):
@@ -164,40 +166,35 @@ class Passes:
             layer = self.layers[name] if name in self.layers else self._add(name)
             layer[..., TABLE[name].letters.index(letter)] = picture[..., number]
 
-    def _exposer(self, step: Pass) -> Exposer:
-        on_film = self._plan.on_film and step.name != FIRST_HITS
-        without = {"image", "square"} if on_film else set()  # the film has its own
-        layers = [name for name in TABLE if name in step.layers - without]
-        return Exposer(self._job, self._shader, self._view, self._film if on_film else None, layers)
-
     # -------------------------------------------- Filters --------------------------------------------
 
     def _detect(self, step: Pass) -> None:
         """Look for edges, and note how many samples each pixel is due."""
         found, samples = self._add("edges")[..., 0], self._add("samples")[..., 0]
         square, detect = self.layers.pop("square", None), getattr(filters, f"{step.mode}_edges")
-        if square is not None and not self._plan.on_film:  # the mean square of the rays of each pixel
-            rays = self._plan.centre(self._frame).size
-            square = np.maximum(square - self.layers["image"] ** 2, 0) / (rays - 1)
-        with self._job.stage(step.name, len(self._pixels)) as advance:
+        first = next(each for each in self._plan.passes if each.name == RENDERING)
+        if square is not None and not first.on_film:  # the mean square of the rays of each pixel
+            square = np.maximum(square - self.layers["image"] ** 2, 0) / (first.places.size - 1)
+        with self._stage(step, len(self._pixels)) as advance:
             for rows, seen, inner in self._bands(edges.REACH):
                 read = [self.layers[name][seen] for name in DETECTORS[step.mode]]
                 read = [layer if layer.shape[-1] > 1 else layer[..., 0] for layer in read]
                 edge = detect(*read, **({} if square is None else {"variance": square[seen]}))
                 found[rows] = edge.value[inner]
-                samples[rows] = np.where(
-                    edge.mask[inner], np.float32(self._plan.lattice.count), np.float32(1)
-                )
+                samples[rows] = np.where(edge.mask[inner], np.float32(self._plan.samples), np.float32(1))
                 advance(samples[rows].size)
 
     def _blur(self, step: Pass) -> None:
         """Blur the picture, and note by how much."""
-        focus: Any = {"focal_distance": self._plan.focus.distance, "focal_range": self._plan.focus.range}
+        distance, reach = self._plan.focus
         amount = self._add("blur") if "blur" in self._plan.layers else None
-        with self._job.stage(step.name, len(self._pixels), "Computing depth of field..") as advance:
+        with self._stage(step, len(self._pixels)) as advance:
             for rows in self._blurring(self.layers["image"]):
                 if amount is not None:
-                    amount[rows, :, 0] = filters.blur_amount(self.layers["depth"][rows, :, 0], **focus)
+                    depth = self.layers["depth"][rows, :, 0]
+                    amount[rows, :, 0] = filters.blur_amount(
+                        depth, focal_distance=distance, focal_range=reach
+                    )
                 advance((rows.stop - rows.start) * self._shape[1])
 
     def _blurring(self, image: np.ndarray) -> Iterator[slice]:
@@ -205,17 +202,14 @@ class Passes:
 
         What the next band sees of this one is kept as it was.
         """
-        depth, above, focus = self.layers["depth"][..., 0], image[:0], self._plan.focus
-        options: Any = {
-            "focal_distance": focus.distance,
-            "focal_range": focus.range,
-            "mode": str(self._plan.blur),
-        }
+        depth, above, (distance, reach) = self.layers["depth"][..., 0], image[:0], self._plan.focus
         for rows, seen, inner in self._bands(dof.REACH):
             sharp = image[rows.start : seen.stop]
             if len(above):
                 sharp = np.concatenate([above, sharp])
-            blurred = filters.gaussian_dof(sharp, depth[seen], **options)
+            blurred = filters.gaussian_dof(
+                sharp, depth[seen], focal_distance=distance, focal_range=reach, mode=str(self._plan.blur)
+            )
             above = sharp[: inner.stop][-dof.REACH :].copy()
             image[rows] = blurred[inner]
             yield rows
@@ -237,11 +231,9 @@ class Passes:
 
     def _add(self, name: str) -> np.ndarray:
         """Return a new layer, 0 everywhere; all but the picture channel by channel, as an EXR wants them."""
-        channels = TABLE[name].channels
-        if name == "image":
-            self.layers[name] = np.zeros((*self._shape, channels), np.float32)
-        else:
-            self.layers[name] = np.moveaxis(np.zeros((channels, *self._shape), np.float32), 0, -1)
+        shape, channels = self._shape, TABLE[name].channels
+        planes = np.zeros((*shape, channels) if name == "image" else (channels, *shape), np.float32)
+        self.layers[name] = planes if name == "image" else np.moveaxis(planes, 0, -1)
         return self.layers[name]
 
     def _set(self, name: str, picture: np.ndarray) -> None:

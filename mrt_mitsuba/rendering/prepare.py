@@ -13,10 +13,10 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.plugins.snapshot import Part
-from mrt_mitsuba.rendering.api import render_with
-from mrt_mitsuba.rendering.result import Result
-from mrt_mitsuba.rendering.settings import FILM, RenderSettings
-from mrt_mitsuba.rendering.shading import View
+from mrt_mitsuba.rays.film import Film
+from mrt_mitsuba.rendering.api import Result, render_with
+from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.rendering.shading import camera_matrices
 from mrt_mitsuba.scene.open import open_scene
 
 
@@ -73,12 +73,16 @@ class Prepared:
         """Record the kernels, if they read only what is known and give the picture that they should."""
         self._launch, plan, made = None, self._made.plan, self._made
         sensor, film, size = self._source.sensor, self._source.sensor.film(), [plan.width, plan.height]
-        plain = plan.film is None or (plan.film.sampler, plan.film.rfilter, plan.film.pixel_format) == (
-            "IndependentSampler", "BoxFilter", "rgb")  # fmt: skip
+        rules, places = Film(sensor), plan.passes[0].places
+        plain = (rules.sampler, rules.rfilter, rules.pixel_format) == (
+            "IndependentSampler",
+            "BoxFilter",
+            "rgb",
+        )
         if not (
             plain and hasattr(self._integrator, "kernel_plan") and plan.variant == "llvm_ad_rgb"
             and [step.layers for step in plan.passes] == [{"image"}] and not plan.layers and not plan.motion
-            and (plan.lattice.kind == FILM or plan.lattice.count * plan.repeats == 1)
+            and (plan.passes[0].on_film or places.size == 1)
             and (plan.region.width, plan.region.height) == (plan.width, plan.height)
             and sensor.class_name() == "PerspectiveCamera" and sensor.shutter_open_time() == 0
             and (list(film.crop_size()) != size or list(film.size()) == size)
@@ -95,7 +99,7 @@ class Prepared:
         own, theirs = mi.traverse(self._sensor), mi.traverse(sensor)
         names = "x_fov", "principal_point_offset_x", "principal_point_offset_y", "to_world"
         own.update({name: theirs[name] for name in names})
-        self._size, self._rays = dr.opaque(mi.Vector2f, size), plan.lattice.count * plan.repeats
+        self._size, self._rays = dr.opaque(mi.Vector2f, size), places.size
         # By a weak reference: in a ring, garbage collection would free recordings in the midst of another one
         me: Any = weakref.ref(self)
         self._launch = dr.freeze(lambda seed, inputs: me()._trace(seed))
@@ -104,7 +108,7 @@ class Prepared:
                 self._launch = None
         except RuntimeError:  # something else is read
             self._launch = None
-        self._made = replace(made, camera=View(self._sensor, plan.width, plan.height, None).matrices())
+        self._made = replace(made, camera=camera_matrices(self._sensor))
 
     def _picture(self, seed: int) -> np.ndarray:
         inputs = [self._data.arrays(self._source.scene), self._integrator.sky, self._sensor, self._size]
@@ -119,7 +123,7 @@ class Prepared:
         pixel = lane // rays
         corner = mi.Point2f(mi.Float(pixel % plan.width), mi.Float(pixel // plan.width))
         offset = mi.Point2f(0.5)
-        if plan.lattice.kind == FILM:
+        if plan.film:
             state, sequence = mi.sample_tea_32(seed, lane)
             random = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
             offset = mi.Point2f(random.next_float32(), random.next_float32())

@@ -7,7 +7,7 @@ import dataclasses
 import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import (
@@ -46,13 +46,6 @@ NOISE = "noise"  # the aamode that puts rays where the variance is
 MIN_SPP = 16  # rays of a pixel from which its variance is known
 MAX_SPP = 4096  # of a pixel on average, where a target alone would ask for more
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
-
-
-class Focus(NamedTuple):
-    """The range of sharp distances, in scene units."""
-
-    distance: float | None  #: from the camera; None for no depth of field
-    range: float  #: half-width of the sharp zone around it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,10 +200,11 @@ class RenderSettings:
         given = {name: getattr(self, name) for name in names} | {"target": None if self.rmse else self.target}
         return {"convention": self.convention} | {k: v for k, v in given.items() if v is not None}
 
-    def focus(self, distance: float | None, reach: float) -> Focus:
-        """Return the focus, in a scene that suggests ``distance`` and ``reach``; 0 turns it off."""
+    def focus(self, distance: float | None, reach: float) -> tuple[float | None, float]:
+        """Return the distance that is sharp, None for no depth of field, and half of the sharp range; in a
+        scene that suggests ``distance`` and ``reach``, in its units."""
         distance = distance if self.focaldist is None else self.focaldist
-        return Focus(distance or None, reach if self.focalrange is None else self.focalrange)
+        return distance or None, reach if self.focalrange is None else self.focalrange
 
 
 #: The options of a render by name, without those that only Python can give

@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.filters.grid import window_means
 from mrt_mitsuba.output.error import ErrorEstimate, tail_shape
 from mrt_mitsuba.rendering.exposing import Exposer
-from mrt_mitsuba.rendering.windows import window_means
 
 PICTURES = 4  # two halves, whose mean is the picture, and two scouts, which decide when to stop
 SCOUTING = 1 / 8  # rays of scouts over those of halves
@@ -61,7 +61,7 @@ class Wholes:
 
     def _rendered(self, rays: int) -> np.ndarray:
         """Return the channels of a picture, [H, W, channels], by seeds of its own."""
-        shader, sensor = self._exposer.shader, self._exposer.view.sensor
+        shader, sensor = self._exposer.shader, self._exposer.shader.sensor
         seed, self._runs = (self._seed + self._runs * _STRIDE) % 2**32, self._runs + 1
         try:
             shader.integrator.render(shader.scene, sensor, seed=seed, spp=rays)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rays.lattice import Lattice, Places
+from mrt_mitsuba.rays.starts import Places
 from mrt_mitsuba.scene.report import report_scene
 
 SMALL = {"width": 96, "height": 72, "focaldist": 0}
@@ -30,7 +30,7 @@ def _shifted(number: int, way: tuple[float, ...]):
 
 def _times(pixels: int = 64, aa: int = 4, repeats: int = 1, **shutter) -> np.ndarray:
     """Times of all rays, [pixels, rays of a pixel]."""
-    places = Places(Lattice("report", aa), 0, aa**2, repeats, **shutter)
+    places = Places("report", aa, 0, aa**2, repeats, **shutter)
     pixel, ray = np.divmod(np.arange(pixels * places.size, dtype=np.uint32), places.size)
     size = 8, pixels // 8
     if mi.variant().startswith("scalar"):

@@ -14,7 +14,6 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba.output.error import DOUBTFUL
 from mrt_mitsuba.rays.film import Film
-from mrt_mitsuba.rendering.exposing import Exposed
 from mrt_mitsuba.rendering.noise import Halves
 from mrt_mitsuba.rendering.rounds import Goal, run_rounds
 
@@ -33,10 +32,10 @@ class Draws:
 
         mrt.register()
         film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}}
-        self.film = Film.of(mi.load_dict({"type": "perspective", "film": film}))
+        self.film = Film(mi.load_dict({"type": "perspective", "film": film}))
         self.draws = [draw_other or draw if picture == other else draw for picture in range(4)]
 
-    def expose(self, groups: Any, seed: int, *, pictures: int, **_: Any) -> Exposed:
+    def expose(self, groups: Any, seed: int, *, pictures: int, **_: Any) -> Any:
         shape, rays = (pictures, SIDE, SIDE), np.zeros((pictures, PIXELS), np.int64)
         np.add.at(rays.ravel(), groups.pixels, groups.size)
         before = np.zeros((pictures, PIXELS), np.int64)
@@ -52,7 +51,8 @@ class Draws:
         total, square = (np.repeat(v.reshape(*shape, 1), 3, axis=-1) for v in (total, square))
         sums = total / np.maximum(rays, 1).reshape(*shape, 1)
         weights = (rays > 0).reshape(shape).astype(float)
-        return Exposed(sums, weights, rays, total, square, peak.reshape(*shape, 1))
+        peak = peak.reshape(*shape, 1)
+        return SimpleNamespace(sums=sums, weights=weights, rays=rays, total=total, square=square, peak=peak)
 
 
 def _render(exposer: Draws, seed: int = 0, **goal: Any) -> Any:

@@ -7,9 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mrt_mitsuba.rays.lattice import divide
-from mrt_mitsuba.rays.samplers import ray_sampler
-from mrt_mitsuba.rendering.windows import dilated, window_means
+from mrt_mitsuba.filters.grid import dilated, window_means
+from mrt_mitsuba.rays.starts import divide, ray_sampler
 
 LARGEST = 2**32 - 1
 

@@ -17,7 +17,7 @@ from mrt_mitsuba.errors import OutputError, UsageError
 from mrt_mitsuba.output.error import exceedance
 from mrt_mitsuba.output.files import read_channels, write_exr, write_png
 from mrt_mitsuba.output.replacing import check_target
-from mrt_mitsuba.rendering.result import Result
+from mrt_mitsuba.rendering.api import Result
 from mrt_mitsuba.validation.tools.image_tests import ROUNDING, cell_sums
 
 ORDER = {letter: index for index, letter in enumerate("RGBXYZUVA")}  # of channels within a layer

@@ -20,9 +20,8 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError, UsageError
-from mrt_mitsuba.rendering.api import render
+from mrt_mitsuba.rendering.api import Result, render
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.rendering.result import Result
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.validation.tools import report, timing
 from mrt_mitsuba.validation.tools.compare import Difference, compare, read_layer
@@ -294,7 +293,7 @@ def _reference(reference: Any, run: Run) -> tuple[Halves, float]:
         spp = {"spp": int(reference["spp"]) // 2} if reference.get("spp", 1) > 1 else {}
         results = [run({**reference, **spp}, seed) for seed in REFERENCE_SEEDS]
         first, second = map(_picture, results)
-        if (first == second).all() and (aa := results[0].plan.lattice.aa) > 1:
+        if (first == second).all() and (aa := results[0].options["aa"]) > 1:
             coarser = _picture(run({**reference, "aa": aa - 1}, REFERENCE_SEEDS[0]))
             return (first, first), compare(first, coarser).rmse
         return (first, second), compare(first, second).rmse / 2
