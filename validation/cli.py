@@ -10,7 +10,6 @@ import time
 import traceback
 import warnings
 from collections.abc import Sequence
-from contextlib import nullcontext
 from importlib import import_module, util
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,7 +35,6 @@ STUDIES: dict[str, tuple[str, str, int, int]] = {
     "error-vs-time": ("error_vs_time", "what does each setting buy for its time", 9, 480),
     "speed": ("speed", "how fast against Mitsuba's plugins, other ways, smaller tasks", 20, 300),
 }
-TIMED = ("error-vs-time", "speed")
 EXTRAS = ("matplotlib", "jinja2", "scipy", "mpmath", "flip_evaluator")
 INTERRUPTED = 128 + signal.SIGINT
 
@@ -83,15 +81,12 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> list[Study]:
         raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
     # Not before: NumPy needs a working folder under some Pythons
     from mrt_mitsuba.validation.tools import report
-    from mrt_mitsuba.validation.tools.timing import own_cache
 
     report.prepare(out)
     seconds = sum(STUDIES[name][2] if quick else STUDIES[name][3] for name in names)
     print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
-    # With a cache of their own, studies of speed see how long compilation takes
-    with nullcontext() if quick or not set(names) & set(TIMED) else own_cache():
-        progress = TerminalProgress(unit="step")
-        studies = [run_study(name, quick=quick, progress=progress) for name in names]
+    progress = TerminalProgress(unit="step")
+    studies = [run_study(name, quick=quick, progress=progress) for name in names]
     print(report.terminal_table(studies), flush=True)
     report.save(out, *studies, quick=quick)
     print(f"\nReport: {out / 'index.html'}")

@@ -80,12 +80,6 @@ def test_a_place_that_cannot_be_written_is_found_before_measuring(tmp_path, caps
         assert text == "" and errors.startswith("make bench: ") and reason in errors
 
 
-def test_the_place_of_kernels_can_be_chosen_in_time(run_python):
-    """Dr.Jit reads it once, when it is imported."""
-    modules = "from mrt_mitsuba.validation import cli; from mrt_mitsuba.validation.tools import commands"
-    assert run_python(f"import sys; {modules}; print('drjit' in sys.modules)").stdout == "False\n"
-
-
 def test_renders_know_public_names_only():
     """So that an earlier version can be measured."""
     lines = Path(renders.__file__).read_text().splitlines()

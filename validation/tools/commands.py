@@ -59,24 +59,21 @@ def check(scene: str, *, out: str | None = None, quick: str = "0") -> int:
 
 def error_vs_time(scene: str, *, cases: str, out: str = "error-vs-time") -> int:
     """Measure the cases of a TOML file; return 0, or 1 where one of them failed."""
-    from mrt_mitsuba.validation.tools.timing import own_cache
+    from mrt_mitsuba.validation.tools import report, work_precision
 
     settings = read_toml(cases)
     wrong = [f"an unknown entry {name!r}" for name in sorted(settings.keys() - set(KEYS))]
     wrong += [f"no entry {name!r}" for name in KEYS[:2] if name not in settings]
     if wrong:
         raise UsageError(f"{cases} has {wrong[0]}: it holds {', '.join(KEYS)}")
-    with own_cache():  # cold times are then those of the compiler; before Dr.Jit starts
-        from mrt_mitsuba.validation.tools import report, work_precision
-
-        report.prepare(Path(out), inputs=[scene, cases])
-        try:
-            progress = TerminalProgress(unit="render")
-            found = work_precision.error_vs_time(_scene(scene), progress=progress, **settings)
-        except SceneError as error:  # of the scene or its reference: nothing was measured
-            raise UsageError(str(error)) from error
-        print(found)
-        found.save(out)
+    report.prepare(Path(out), inputs=[scene, cases])
+    try:
+        progress = TerminalProgress(unit="render")
+        found = work_precision.error_vs_time(_scene(scene), progress=progress, **settings)
+    except SceneError as error:  # of the scene or its reference: nothing was measured
+        raise UsageError(str(error)) from error
+    print(found)
+    found.save(out)
     print(f"Report: {Path(out) / 'index.html'}")
     return MISSED if found.failed else 0
 

@@ -21,8 +21,6 @@ from mrt_mitsuba.rendering.api import Result
 from mrt_mitsuba.validation.tools.image_tests import ROUNDING, cell_sums
 
 ORDER = {letter: index for index, letter in enumerate("RGBXYZUVA")}  # of channels within a layer
-# What may stand next to a picture and says how well it is known: the layer, and its power of the deviation
-SPREADS = {"error": 2, "variance": 1}
 EPSILON = 0.01  # keeps black pixels, which no relative error describes, from ruling it
 CELL = 16  # pixels, a side of the cells whose means are compared
 BLOCKS = 64  # at most, along a side of the picture, whose signs are changed at a time
@@ -32,7 +30,7 @@ MEASURES = ("mae", "rmse", "rel_mse", "psnr", "largest", "flip", "p_value")
 UNDEFINED = {
     "flip": "FLIP needs three channels, finite and not negative, a reference that is not black, and the "
     "package flip-evaluator",
-    "p_value": 'neither has a layer "error" or "variance" next to its picture',
+    "p_value": 'neither has a layer "error" next to its picture',
 }
 
 
@@ -104,7 +102,7 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
         layer: a layer of an EXR or a result ("depth"), or one channel of it ("depth.Z"); the picture without.
         peak: brightest value, for the PSNR.
 
-    The p-value needs a layer "error" (standard error) or "variance" (of the mean) next to the picture, as
+    The p-value needs a layer "error", the standard error of each pixel, next to the picture, as
     ``render(target=...)`` and ``aamode="noise"`` write it, and pixels that are independent: a box filter.
 
     An EXR of several parts has each as a layer, by its name. Raises ``UsageError`` for what cannot be
@@ -143,7 +141,7 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
     )
 
 
-# A picture or layer [H, W, C]; the variance of its mean [H, W, C] or [H, W, 1], if it is known; and of an EXR
+# A picture or layer [H, W, C]; the variance of its mean [H, W, 1], if it is known; and of an EXR
 # the first column and row, and the last ones
 Layer = tuple[np.ndarray, np.ndarray | None, tuple[int, ...]]
 
@@ -190,11 +188,8 @@ def _layer_of(channels: Mapping[str, np.ndarray], headers: Mapping[str, Any], la
     if not keys:
         named = sorted({key.rpartition(".")[0] or key for key in channels})
         raise UsageError(f"{name} has no layer {layer or 'R, G, B'!r}; it has {', '.join(named)}")
-    spreads = [(spread, power) for spread, power in SPREADS.items() if not layer and chosen(spread)]
-    variance = None
-    if spreads:
-        spread, power = spreads[0]
-        variance = stacked(chosen(spread)).astype(np.float64) ** power
+    errors = [] if layer else chosen("error")
+    variance = stacked(errors).astype(np.float64) ** 2 if errors else None
     corners = headers[keys[0]]["dataWindow"] if headers else ()
     return stacked(keys), variance, tuple(int(n) for corner in corners for n in corner)
 

@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba.rendering.progress import Progress
-
-CACHE = "DRJIT_CACHE_DIR"
-PREFIX = "mrt-kernels-"
 
 
 def timed(run: Callable[[], Any]) -> tuple[Any, float]:
@@ -50,30 +43,6 @@ def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> 
     sides = [lambda _, side=side: timed(side)[1] for side in (run, other)]
     in_turns(sides, 1)
     return ratio_of(*in_turns(sides, repeats))
-
-
-@contextmanager
-def own_cache() -> Iterator[None]:
-    """Let Dr.Jit keep its kernels in a new folder, for ``forget`` to work; enter before it is imported."""
-    before = {name: value for name, value in os.environ.items() if name == CACHE}
-    with tempfile.TemporaryDirectory(prefix=PREFIX, ignore_cleanup_errors=True) as folder:
-        os.environ[CACHE] = folder
-        try:
-            yield
-        finally:
-            del os.environ[CACHE]
-            os.environ |= before
-
-
-def forget() -> None:
-    """Make the next render compile its kernels, or, without a cache of our own, read them from the cache."""
-    import drjit as dr
-
-    dr.flush_kernel_cache()
-    folder = Path(os.environ.get(CACHE, ""))
-    if folder.name.startswith(PREFIX):
-        for file in folder.iterdir():
-            file.unlink(missing_ok=True)
 
 
 def operations(render: Callable[..., Any]) -> int:

@@ -23,7 +23,7 @@ from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.rendering.api import Result, render
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.open import open_scene
-from mrt_mitsuba.validation.tools import report, timing
+from mrt_mitsuba.validation.tools import report
 from mrt_mitsuba.validation.tools.compare import Difference, compare, read_layer
 from mrt_mitsuba.validation.tools.study import Study
 
@@ -320,6 +320,8 @@ def _measure(
 
     Each runs cold, warm, and ``repeats`` times in turn, so that a load on the machine meets all alike.
     """
+    import drjit as dr
+
     failed: dict[str, str] = {}
     runs: dict[str, list[Result]] = {name: [] for name in cases}
     with progress.stage(TITLE, len(cases) * (repeats + 2)) as advance:
@@ -330,7 +332,7 @@ def _measure(
                     continue
                 try:
                     if turn == -2:
-                        timing.forget()
+                        dr.flush_kernel_cache()
                     result = run(cases[name], max(turn, 0))
                     if (image := _picture(result)).shape != shape:
                         both = (f"{i[1]}x{i[0]}" for i in (image.shape, shape))
