@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 import os
 import re
@@ -11,10 +12,10 @@ from typing import Any
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.memory import Budget
-from mrt_mitsuba.options import check
+from mrt_mitsuba.options import check, choice
 from mrt_mitsuba.output.replacing import replacing_together
 from mrt_mitsuba.scene.loading import rewrite_file
-from mrt_mitsuba.scene.model import FRESNEL, OBJECTS, SIDE, SIZE, Scene, check_model_options, is_obj
+from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE, Scene, check_model_options, is_obj
 from mrt_mitsuba.scene.report import report_scene
 
 FLAVORS = ("mrt", "stock")
@@ -37,8 +38,7 @@ def scene_dict(
     Raises ``UsageError`` for a scene, flavor, size or formula that there is not, ``SceneError`` for a stock
     flavor that cannot be had.
     """
-    if flavor not in FLAVORS:
-        raise UsageError(f"flavor={flavor!r}: must be {' or '.join(FLAVORS)}")
+    check("flavor", choice(*FLAVORS), flavor)
     given = {"width": (SIDE, width), "height": (SIDE, height), "fresnel": (FRESNEL, fresnel)}
     options = {name: check(name, kind, value) for name, (kind, value) in given.items() if value is not None}
     runtime.use()
@@ -71,13 +71,13 @@ def write_xml(
     """
     from mrt_mitsuba.scene.obj import model_scene  # with numpy
 
+    check("flavor", choice(*FLAVORS), flavor)
     check_model_options(scene, model)
     files: dict[str, bytes] = {}  # of shapes, by their paths
     if isinstance(scene, str | os.PathLike) and not is_obj(scene):
-        given = {"fresnel": fresnel, "width": width, "height": height, "flavor=stock": flavor != "mrt"}
-        useless = [name for name, value in given.items() if value]
-        if useless:
-            raise UsageError(f"{useless[0]} is of no use with an XML file, which is written as it is")
+        given = {"fresnel": fresnel, "width": width, "height": height, "flavor=stock": flavor == "stock"}
+        for name in (name for name, value in given.items() if value):
+            raise UsageError(f"{name} is of no use with an XML file, which is written as it is")
         runtime.use()
         budget = Budget.of(None)
         text, values = rewrite_file(os.fspath(scene), budget, **params or {})
@@ -88,14 +88,20 @@ def write_xml(
             raise UsageError(f"params: only an XML file declares names, such as {next(iter(params))}")
         if not isinstance(scene, Scene):
             scene = model_scene(scene, **model) if is_obj(scene) else report_scene(scene)  # type: ignore[arg-type]
-        mine = scene_dict(
+        nodes = scene_dict(
             scene, fresnel=fresnel or "schlick", width=width or SIZE[0], height=height or SIZE[1]
         )
-        for name, node in mine.items():
-            if isinstance(node, dict) and node["type"] in _IN_FILES[flavor]:
+        for name, node in nodes.items():
+            kind = node["type"] if isinstance(node, dict) else ""
+            if kind == "mrt_group":
+                raise SceneError(
+                    f"{name} cannot be written as XML: mrt_group is made of arrays; render it from Python, "
+                    "or write at most 1000 spheres or 100 objects of another kind"
+                )
+            if kind == "mrt_mesh" or (kind == "mrt_cone" and flavor == "stock"):
                 file = f"{os.path.splitext(os.fspath(path))[0]}_{name}.ply"
-                mine[name], files[file] = _in_file(node, os.path.basename(file))
-        text = _text_of(mine, scene, flavor)
+                nodes[name], files[file] = _in_file(node, os.path.basename(file))
+        text = _xml(_stock(nodes, scene) if flavor == "stock" else nodes)
         focus = {"focaldist": scene.focal_distance, "focalrange": scene.focal_range}
         focus = focus if scene.focal_distance is not None else {}
         inputs = scene.files
@@ -108,26 +114,11 @@ def write_xml(
     return [*files, os.fspath(path)]
 
 
-def _text_of(mine: dict[str, Any], model: Scene, flavor: str) -> str:
-    """Return the XML of a dict of this project's plugins."""
+def _xml(nodes: dict[str, Any]) -> str:
     import mitsuba as mi
 
-    for name, node in mine.items():
-        if not isinstance(node, dict):
-            continue
-        if node["type"] == "mrt_group":
-            raise SceneError(
-                f"{name} cannot be written as XML: mrt_group is made of arrays; render it from Python, or "
-                "write at most 1000 spheres or 100 objects of another kind"
-            )
-        picture = node.get("diffuse_reflectance", {})
-        if "filename" in picture:  # found from wherever the XML lies
-            whole = {**picture, "filename": os.path.abspath(picture["filename"])}
-            mine[name] = {**node, "diffuse_reflectance": whole}
     variant = runtime.use()
-    nodes = _stock(mine, model) if flavor == "stock" else mine
-    # The writer looks plugins up in scalar_rgb, whatever the current variant
-    runtime.use("scalar_rgb")
+    runtime.use("scalar_rgb")  # where the writer looks plugins up, whatever the current variant
     runtime.use(variant)
     return str(mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(variant), nodes)))
 
@@ -150,9 +141,6 @@ def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for name, node in nodes.items():
         kind = node["type"] if isinstance(node, dict) else ""
-        if kind in _WITHOUT_STOCK:
-            reason = f"{kind} {_WITHOUT_STOCK[kind]}"
-            raise SceneError(f"{name} has no counterpart among Mitsuba's plugins: {reason}")
         result[name] = node
         if kind == "mrt_whitted":
             result[name] = {"type": "path", "max_depth": 4}
@@ -163,16 +151,19 @@ def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
             color = {**node["intensity"], "value": [c * squared for c in node["intensity"]["value"]]}
             result[name] = {"type": "point", "position": node["position"], "intensity": color}
         elif kind == "mrt_plane":
-            normal = _unit(node["normal"])
+            length = math.hypot(*node["normal"])
+            normal = [c / length for c in node["normal"]]
             square = _facing([-node["distance"] * c for c in normal], normal, STOCK_EXTENT / 2)
             result[name] = {"type": "rectangle", "to_world": square, "bsdf": node["bsdf"]}
         elif kind == "mrt_cylinder":  # an open tube, and at each end a disc that faces away from the other
             result[f"{name}_tube"] = {**result.pop(name), "type": "cylinder"}
             ends = node["p0"], node["p1"]
             for number, (center, opposite) in enumerate((ends, ends[::-1])):
-                away = list(map(operator.sub, center, opposite))
-                place = {"to_world": _facing(center, away, node["radius"]), "bsdf": node["bsdf"]}
-                result[f"{name}_disc{number}"] = {"type": "disk", **place}
+                place = _facing(center, list(map(operator.sub, center, opposite)), node["radius"])
+                result[f"{name}_disc{number}"] = {"type": "disk", "to_world": place, "bsdf": node["bsdf"]}
+        elif kind.startswith("mrt_"):
+            reason = "is made of arrays, or a mesh to them; write_xml, or mrt export, writes meshes and cones"
+            raise SceneError(f"{name} has no counterpart among Mitsuba's plugins: {kind} {reason} into files")
     return result
 
 
@@ -187,7 +178,7 @@ def _stock_bsdf(node: dict[str, Any]) -> dict[str, Any]:
             # The nearest texel as stored; half a texel off the report's look-up, which shrinks the picture so
             # far
             stored = {"raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
-            color = {"type": "bitmap", "filename": os.path.abspath(color["filename"]), **stored}
+            color = {"type": "bitmap", "filename": color["filename"], **stored}
         colors[name] = color
     if node["specular_reflectance"].get("value") == [0.0, 0.0, 0.0]:
         return {"type": "diffuse", "reflectance": colors["diffuse_reflectance"]}
@@ -195,28 +186,12 @@ def _stock_bsdf(node: dict[str, Any]) -> dict[str, Any]:
     return {"type": "roughplastic", "distribution": "beckmann", **rough, **colors}
 
 
-def _unit(vector: list[float]) -> list[float]:
-    length = sum(c * c for c in vector) ** 0.5
-    return [c / length for c in vector]
-
-
 def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
     """Return what takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
     import mitsuba as mi
 
-    normal = _unit(normal)
+    length = math.hypot(*normal)
+    normal = [c / length for c in normal]
     up = [0, 0, 1] if abs(normal[2]) < 0.9 else [1, 0, 0]
-    target = list(map(operator.add, center, normal))
-    to_world = mi.ScalarTransform4f().look_at(center, target, up)
+    to_world = mi.ScalarTransform4f().look_at(center, list(map(operator.add, center, normal)), up)
     return to_world @ mi.ScalarTransform4f().scale([half_size, half_size, 1])
-
-
-# Solids that Mitsuba's own plugins show as meshes
-_AS_MESHES = {f"mrt_{kind}" for kind in OBJECTS} - {"mrt_sphere", "mrt_cylinder"}
-# Shapes that are written as files next to the XML
-_IN_FILES = {"mrt": {"mrt_mesh"}, "stock": {"mrt_mesh", *_AS_MESHES}}
-_WITHOUT_STOCK = {
-    **dict.fromkeys(_AS_MESHES, "is a mesh to them; write_xml, or mrt export, puts it into a file"),
-    "mrt_mesh": "is made of arrays, and ply reads a file; write_xml, or mrt export, writes it",
-    "mrt_group": "is one shape of many objects; use the flavor mrt",
-}

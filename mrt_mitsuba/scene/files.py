@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import os
 import re
@@ -27,20 +26,18 @@ def require_file(path: str | os.PathLike[str]) -> None:
     name = os.fspath(path)
     try:
         mode = os.stat(path).st_mode
-        if stat.S_ISREG(mode) and os.access(path, os.R_OK):
-            return
-        problem = "it is not a regular file; copy its content into one"
         if stat.S_ISDIR(mode):
             problem = "it is a folder; name a file in it"
-        elif stat.S_ISREG(mode):
+        elif not stat.S_ISREG(mode):
+            problem = "it is not a regular file; copy its content into one"
+        elif not os.access(path, os.R_OK):
             problem = f"permission denied; try chmod +r {name}"
+        else:
+            return
     except (FileNotFoundError, NotADirectoryError):
         problem = f"there is no such file in {os.path.dirname(os.path.abspath(name))}"
-    except ValueError:  # a zero byte in the name
-        problem = "its name holds a zero byte"
-    except OSError as error:
-        circle = error.errno == errno.ELOOP
-        problem = "its symbolic links lead in a circle" if circle else error.strerror or str(error)
+    except (OSError, ValueError) as error:  # also of a zero byte in the name
+        problem = getattr(error, "strerror", None) or str(error)
     raise SceneError(f"cannot read {name or repr(name)}: {problem}")
 
 
@@ -57,17 +54,12 @@ def read_text(path: Path) -> bytes:
         raise SceneError(f"cannot read {path}: {error.strerror or error}") from None
     if b"\0" in data:
         raise SceneError(f"{path}: is not a text file (it holds a zero byte); export it as OBJ or MTL text")
-    data = re.sub(rb"\r\n?", b"\n", data).removeprefix(b"\xef\xbb\xbf")
-    first, *others = data.split(b"\\\n")
-    parts, owed = [first], 0
-    for part in others:
-        rest, newline, following = part.partition(b"\n")
-        owed += 1
-        parts += [b" ", rest]
-        if newline:
-            parts += [b"\n" * (owed + 1), following]
-            owed = 0
-    data = b"".join([*parts, b"\n" * (owed + 1)])
+    data = re.sub(rb"\r\n?", b"\n", data).removeprefix(b"\xef\xbb\xbf") + b"\n"
+
+    def joined(lines: re.Match[bytes]) -> bytes:
+        return lines[0].replace(b"\\\n", b" ") + b"\n" * lines[0].count(b"\\\n")
+
+    data = re.sub(rb"(?m)^(?:.*\\\n)+.*\n", joined, data)
     longest = max(io.BytesIO(data), key=len).removesuffix(b"\n")
     if len(longest) > LONGEST_LINE:
         number = data.count(b"\n", 0, data.find(longest)) + 1
@@ -118,9 +110,10 @@ def picture_size(path: str) -> tuple[int, int] | None:
 
 def warn(findings: Mapping[str, list[str]]) -> None:
     """Show what a reading found, by the plural of what it is about: the first, and how many more."""
-    for kind, (first, *others) in findings.items():
-        more = f" (and so do {len(others)} more {kind})" if others else ""
-        warnings.warn(f"{first}{more}", MrtWarning, stacklevel=4)
+    for kind, texts in findings.items():
+        more = f" (and so do {len(texts) - 1} more {kind})" if texts[1:] else ""
+        if texts:
+            warnings.warn(f"{texts[0]}{more}", MrtWarning, stacklevel=4)
 
 
 def numbers(where: str, statement: str, words: list[str], least: int, most: int) -> list[float]:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
@@ -24,14 +25,11 @@ Color = tuple[float, float, float]
 # The sky of most scenes of the report
 BLUE_SKY: Color = (0.2, 0.2, 0.7)
 
-
 SIZE = (800, 600)  # of the picture, in pixels, where the scene brings no film
 SIDE = integer(1, 65536)  # of a picture, in pixels; whether the memory suffices is checked later
 FRESNEL = choice("schlick", "dielectric")
 LARGEST = 3.4e38  # number that Mitsuba's float32 can hold
 FOCAL_RANGE = 2.0  # half-width of the sharp zone
-
-
 # What is of use only with an OBJ file
 MODEL_OPTIONS = ("convention", "texturing", "camera", "target", "up", "fov", "light")
 
@@ -156,19 +154,18 @@ class Scene:
             return {"type": "ref", "id": names.setdefault(material, f"material_{len(names)}")}
 
         shapes: dict[str, Any] = {}
-        for kind, plugin in OBJECTS.items():
+        for kind, plugin in PLUGINS.items():
             things = getattr(self, f"{kind}s")
-            many = bool(things) and len(things) > MOST_SINGLE[plugin]
+            many = len(things) > MOST_SINGLE.get(kind, math.inf)
             grouped = [thing for thing in things if many and thing.material.texture is None]
             single = [thing for thing in things if not many or thing.material.texture is not None]
             for i, thing in enumerate(single):
-                shapes[f"{kind}_{i}"] = {**_shape(kind, thing), "bsdf": bsdf(thing.material)}
+                *parameters, (_, material) = vars(thing).items()
+                values = {n: float(v) if n in ("radius", "distance") else list(v) for n, v in parameters}
+                shapes[f"{kind}_{i}"] = {"type": plugin, **values, "bsdf": bsdf(material)}
             if grouped:
                 shape, own = _group(kind, grouped, fresnel)
                 shapes[f"{kind}s"] = {**shape, "bsdf": own or bsdf(grouped[0].material)}
-        for i, p in enumerate(self.planes):
-            place = {"normal": list(p.normal), "distance": float(p.distance)}
-            shapes[f"plane_{i}"] = {"type": "mrt_plane", **place, "bsdf": bsdf(p.material)}
         for i, m in enumerate(self.meshes):
             shapes[f"mesh_{i}"] = {**_mesh(m, self.texturing), "bsdf": bsdf(m.material)}
         lights = {
@@ -208,42 +205,35 @@ class Scene:
         }
 
 
-# What the plugins of the same names draw; the fields but for the material are their parameters
-OBJECTS: dict[str, type] = {"sphere": Sphere, "cone": Cone, "cylinder": Cylinder}
+# The plugins of objects; the fields but for the material, which is the last, are their parameters
+PLUGINS = {"sphere": "sphere", "cone": "mrt_cone", "cylinder": "mrt_cylinder", "plane": "mrt_plane"}
 # More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape
 # and more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of
 # recursion
-MOST_SINGLE = dict.fromkeys(OBJECTS.values(), 100) | {Sphere: 1000}
+MOST_SINGLE = {"sphere": 1000, "cone": 100, "cylinder": 100}
 
 
-def _shape(kind: str, thing: Any) -> dict[str, Any]:
-    """Return an object's points and its radius, by the names that its plugin has for them, too."""
-    values = {f.name: getattr(thing, f.name) for f in fields(thing) if f.name != "material"}
-    listed = {name: float(value) if name == "radius" else list(value) for name, value in values.items()}
-    return {"type": "sphere" if kind == "sphere" else f"mrt_{kind}", **listed}
-
-
-def _numbers(thing: Any) -> list[float]:
-    """Return the coordinates of an object's points, and its radius."""
-    *points, radius = (getattr(thing, f.name) for f in fields(thing) if f.name != "material")
-    return [*(x for point in points for x in point), radius]
+def _all_finite(values: Sequence[float], count: int) -> bool:
+    """Return whether these are so many numbers that a float32 can hold."""
+    try:
+        return len(values) == count and all(abs(value) <= LARGEST for value in values)
+    except TypeError:
+        return False
 
 
 def _check(scene: Scene) -> None:
     """Refuse what Mitsuba would draw as nothing, or as noise, without a word. Materials, lights, planes and
     meshes are checked by their plugins."""
-    from mrt_mitsuba.plugins.quadric_kinds import KINDS  # which brings Dr.Jit
-
     if problem := view_problem(scene.camera):
         raise SceneError(problem)
     if not _all_finite(scene.sky, 3):
         raise SceneError(f"sky is {scene.sky!r}, but must be three finite numbers: red, green and blue")
     if scene.texturing not in ("report", "standard"):
         raise SceneError(f"texturing is {scene.texturing!r}, but must be report or standard")
-    for kind in OBJECTS:
+    for kind in MOST_SINGLE:
         for i, thing in enumerate(getattr(scene, f"{kind}s")):
-            numbers = _numbers(thing)
-            if not _all_finite(numbers, KINDS[kind].width) or not numbers[-1] > 0:
+            *points, radius, _ = vars(thing).values()
+            if not (all(_all_finite(p, 3) for p in points) and _all_finite([radius], 1) and radius > 0):
                 raise SceneError(f"{kind}s[{i}] is {thing!r}, but must have finite places and a radius > 0")
 
 
@@ -267,14 +257,6 @@ def view_problem(camera: Camera) -> str | None:
     return None
 
 
-def _all_finite(values: Sequence[float], count: int) -> bool:
-    """Return whether these are so many numbers that a float32 can hold."""
-    try:
-        return len(values) == count and all(abs(value) <= LARGEST for value in values)
-    except TypeError:
-        return False
-
-
 def _rgb(color: Color) -> dict[str, Any]:
     return {"type": "rgb", "value": list(color)}
 
@@ -284,22 +266,19 @@ def _group(kind: str, objects: list, fresnel: str) -> tuple[dict[str, Any], dict
     import mitsuba as mi
     import numpy as np
 
-    def bitmap(rows: list) -> Any:
-        return mi.Bitmap(np.array(rows, np.float32))
-
-    shape = {"type": "mrt_group", "kind": kind, "numbers": bitmap([_numbers(o) for o in objects])}
-    own = [o.material for o in objects]
-    if len(set(own)) == 1:
-        return shape, None
-    columns = {
-        "alpha": bitmap([(m.alpha,) for m in own]),
-        "int_ior": bitmap([(max(m.ior, _SMALLEST_IOR),) for m in own]),
-        "diffuse_reflectance": bitmap([m.diffuse for m in own]),
-        "specular_reflectance": bitmap([m.specular for m in own]),
-    }
-    attributes = {name: {"type": "mesh_attribute", "name": f"face_{name}"} for name in columns}
-    shape |= {f"face_{name}": values for name, values in columns.items()}
-    return shape, {"type": "mrt_bsdf", "fresnel": fresnel, **attributes}
+    own = [each.material for each in objects]
+    places = [vars(each).values() for each in objects]
+    tables: dict[str, list] = {"numbers": [[*chain(*points), radius] for *points, radius, _ in places]}
+    attributes: dict[str, Any] = {}
+    if len(set(own)) > 1:
+        tables["face_alpha"] = [(m.alpha,) for m in own]
+        tables["face_int_ior"] = [(max(m.ior, _SMALLEST_IOR),) for m in own]
+        tables["face_diffuse_reflectance"] = [m.diffuse for m in own]
+        tables["face_specular_reflectance"] = [m.specular for m in own]
+        attributes = {n.removeprefix("face_"): {"type": "mesh_attribute", "name": n} for n in [*tables][1:]}
+    bitmaps = {name: mi.Bitmap(np.array(rows, np.float32)) for name, rows in tables.items()}
+    bsdf = {"type": "mrt_bsdf", "fresnel": fresnel, **attributes} if attributes else None
+    return {"type": "mrt_group", "kind": kind, **bitmaps}, bsdf
 
 
 def _mesh(m: Mesh, texturing: str) -> dict[str, Any]:
@@ -325,7 +304,8 @@ _SMALLEST_IOR = 1e-8
 def _mrt_bsdf(m: Material, fresnel: str, texturing: str) -> dict[str, Any]:
     diffuse = _rgb(m.diffuse)
     if m.texture is not None:  # looked up as in the report, or as by Mitsuba: bilinear, sRGB-aware, repeated
-        diffuse = {"type": "mrt_texture" if texturing == "report" else "bitmap", "filename": m.texture}
+        kind = "mrt_texture" if texturing == "report" else "bitmap"
+        diffuse = {"type": kind, "filename": os.path.abspath(m.texture)}
     return {
         "type": "mrt_bsdf",
         "alpha": float(m.alpha),

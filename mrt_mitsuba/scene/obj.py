@@ -8,7 +8,6 @@ with the size of the file whatever it holds: the lengths of numbers and gaps in 
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
 from collections.abc import Sequence
@@ -44,12 +43,12 @@ _LINES_AT_ONCE = 4096  # regular expressions keep a state for each repetition
 _GAP, _END = rb"[ \t]{1,99}", rb"[ \t]{0,99}\n"
 _REAL = rb"[-+]?(?:\d{1,99}(?:\.\d{0,99})?|\.\d{1,99})(?:[eE][-+]?\d{1,9})?"
 _INDEX = rb"-?\d{1,18}"  # what fits 64 bits
-# Forms of a corner: the pattern, and what its indices are of
+# Forms of a corner: the pattern, and which of ``_VALUES`` its indices are of
 _CORNERS = {
-    "c": (_INDEX, ("v",)),
-    "t": (_INDEX + b"/" + _INDEX, ("v", "vt")),
-    "n": (_INDEX + b"//" + _INDEX, ("v", "vn")),
-    "tn": (_INDEX + b"/" + _INDEX + b"/" + _INDEX, ("v", "vt", "vn")),
+    "c": (_INDEX, [0]),
+    "t": (_INDEX + b"/" + _INDEX, [0, 1]),
+    "n": (_INDEX + b"//" + _INDEX, [0, 2]),
+    "tn": (_INDEX + b"/" + _INDEX + b"/" + _INDEX, [0, 1, 2]),
 }
 
 
@@ -97,20 +96,22 @@ def read_model(
 
 
 class _Reader:
+    """What has been read of a file."""
+
     def __init__(self, path: Path, convention: str) -> None:
         self.path = path
         self.convention = convention
-        self.materials: dict[str, Material] = {}
-        self.arrays: dict[str, list[np.ndarray]] = {kind: [] for kind in _VALUES}
-        self.counts = dict.fromkeys(_VALUES, 0)
-        # Of faces of as many corners, one on each line: indices from 0, int64 [F, corners], −1 for none, of
-        # "v", "vt" and "vn"; the material; the first line
-        self.faces: list[tuple[dict[str, np.ndarray], str | None, int]] = []
-        self.material: str | None = None
         self.line = 1
-        self.unknown_materials: set[str] = set()
-        self.findings: dict[str, list[str]] = {}
+        self.arrays = {kind: [np.empty((0, used), np.float32)] for kind, (_, _, used) in _VALUES.items()}
+        self.counts = dict.fromkeys(_VALUES, 0)
+        # Of faces of as many corners, one on each line: indices from 0, int64 [F, corners, 3], −1 for none, of
+        # "v", "vt" and "vn"; the material; the first line
+        self.faces: list[tuple[np.ndarray, str, int]] = []
+        self.material = ""
+        self.materials: dict[str, Material] = {}
+        self.named: dict[str, str] = {}  # by the name of a material, where it was used first
         self.libraries: set[str] = set()
+        self.missing: list[str] = []
 
     def fail(self, text: str, line: int | None = None) -> None:
         raise SceneError(f"{self.path}:{self.line if line is None else line}: {text}")
@@ -142,10 +143,7 @@ class _Reader:
             self.fail(f"{keyword} has no name; write {keyword} {'NAME' if keyword == 'usemtl' else 'FILE'}")
         elif keyword == "usemtl":
             self.material = name
-            if name not in self.materials and name not in self.unknown_materials:
-                self.unknown_materials.add(name)
-                unknown = f"{where}: no library has the material {name!r}; it gets the default"
-                self.findings.setdefault("materials", []).append(unknown)
+            self.named.setdefault(name, where)
         elif keyword == "mtllib":
             folder = self.path.parent
             for each in [name] if find(name, [folder]) else words:
@@ -154,9 +152,7 @@ class _Reader:
                     self.materials |= read_mtl(found, convention=self.convention, folder=folder)
                 else:
                     missing = f"{where}: the material library {each} {MISSING} {folder}"
-                    self.findings.setdefault("libraries", []).append(
-                        f"{missing}; its materials get the default"
-                    )
+                    self.missing.append(f"{missing}; its materials get the default")
         elif keyword and keyword not in _IGNORED:
             self.fail(
                 f"unknown statement {keyword[:40]!r}; expected v, vt, vn, f, usemtl, mtllib or the like"
@@ -167,9 +163,8 @@ class _Reader:
             narrow = values[:, : _VALUES[kind][2]].astype(np.float32)
         finite = np.isfinite(narrow).all(axis=1)
         if not finite.all():
-            self.fail(
-                f"{kind} holds a number that is too large for a float32", self.line + int(finite.argmin())
-            )
+            line = self.line + int(finite.argmin())
+            self.fail(f"{kind} holds a number that is too large for a float32", line)
         self.arrays[kind].append(narrow)
         self.counts[kind] += len(values)
 
@@ -177,87 +172,71 @@ class _Reader:
         """Read a face of any number of corners, in any of the four forms."""
         if len(words) < 3:
             self.fail(f"f has {len(words)} corners, but must have 3 or more")
-        corners, forms = [], set()
+        corners, forms = [], []
         for word in words:
-            parts = word.split("/")
             if not re.fullmatch(r"[-+]?[0-9]{1,18}(/([-+]?[0-9]{1,18})?){0,2}", word):
                 self.fail(f"f has the corner {word[:40]!r}, but must have v, v/vt, v//vn or v/vt/vn")
-            forms.add(tuple(kind for kind, part in zip(_VALUES, parts, strict=False) if part))
-            corners.append([int(part) for part in parts if part])
-        if len(forms) > 1:
+            given = {kind: int(part) for kind, part in enumerate(word.split("/")) if part}
+            corners.append([*given.values()])
+            forms.append([*given])
+        if any(form != forms[0] for form in forms):
             self.fail(f"f has corners of different forms: {' '.join(words)[:80]}; give all the same indices")
-        self._add_faces(np.array([corners], np.int64), forms.pop())
+        self._add_faces(np.array([corners], np.int64), forms[0])
 
-    def _add_faces(self, indices: np.ndarray, kinds: tuple[str, ...]) -> None:
+    def _add_faces(self, indices: np.ndarray, kinds: list[int]) -> None:
         """Add faces [F, corners, kinds of index], their indices counted from 0."""
-        added = {kind: np.full(indices.shape[:2], -1) for kind in _VALUES}
-        for k, kind in enumerate(kinds):
-            index, count = indices[:, :, k], self.counts[kind]
-            added[kind] = np.where(index > 0, index - 1, index + count)
-            self._check(kind, index, index == 0, ": indices count from 1, or back from -1", self.line)
-            self._check(kind, index, added[kind] < 0, f": only {count} came before", self.line)
-        self.faces.append((added, self.material, self.line))
+        faces = np.full((*indices.shape[:2], len(_VALUES)), -1)
+        for index, k in zip(np.moveaxis(indices, -1, 0), kinds, strict=True):
+            count = [*self.counts.values()][k]
+            self._check(k, index, index == 0, ": indices count from 1, or back from -1", self.line)
+            self._check(k, index, index < -count, f": only {count} came before", self.line)
+            faces[:, :, k] = np.where(index > 0, index - 1, index + count)
+        self.faces.append((faces, self.material, self.line))
 
-    def _check(self, kind: str, index: np.ndarray, wrong: np.ndarray, reason: str, line: int) -> None:
+    def _check(self, k: int, index: np.ndarray, wrong: np.ndarray, reason: str, line: int) -> None:
         """Refuse the first of the indices [F, corners] that are wrong."""
         if wrong.any():
             row, corner = np.argwhere(wrong)[0]
-            self.fail(f"f has the {kind} index {index[row, corner]}{reason}", line + int(row))
+            self.fail(f"f has the {[*_VALUES][k]} index {index[row, corner]}{reason}", line + int(row))
 
     def meshes(self) -> tuple[Mesh, ...]:
         """Return one mesh for each material, in the order of their first use."""
-        warn(self.findings)
-        for kind, (index, _, line) in itertools.product(_VALUES, self.faces):
-            count = self.counts[kind]
-            self._check(kind, index[kind] + 1, index[kind] >= count, f", but the file has {count}", line)
-        points, uvs, normals = (
-            np.concatenate(self.arrays[kind] or [np.empty((0, used), np.float32)])
-            for kind, (_, _, used) in _VALUES.items()
-        )
-        by_material: dict[tuple[Material, bool], list[dict[str, np.ndarray]]] = {}
-        for index, name, _ in self.faces:
-            material = self.materials.get(name or "", DEFAULT_MATERIAL)
-            if index["vt"][0, 0] < 0:
+        unknown = [
+            f"{where}: no library has the material {name!r}; it gets the default"
+            for name, where in self.named.items()
+            if name not in self.materials
+        ]
+        warn({"libraries": self.missing, "materials": unknown})
+        parts: dict[tuple[Material, bool], list[np.ndarray]] = {}
+        for faces, name, line in self.faces:
+            for k, count in enumerate(self.counts.values()):
+                index = faces[:, :, k]
+                self._check(k, index + 1, index >= count, f", but the file has {count}", line)
+            material = self.materials.get(name, DEFAULT_MATERIAL)
+            if faces[0, 0, 1] < 0:
                 material = replace(material, texture=None)  # no coordinates to look it up
-            smooth = self.convention == "standard" and index["vn"][0, 0] >= 0
-            by_material.setdefault((material, smooth), []).append(index)
-        if not by_material:
+            smooth = self.convention == "standard" and faces[0, 0, 2] >= 0
+            second = np.arange(1, faces.shape[1] - 1)  # corners of the triangles of a fan
+            fan = np.stack([0 * second, second, second + 1], axis=1)
+            parts.setdefault((material, smooth), []).append(faces[:, fan].reshape(-1, 3, 3))
+        if not parts:
             raise SceneError(f"{self.path}: has no faces; export the model with its geometry")
-        return tuple(
-            _mesh(points, uvs, normals if smooth else None, faces, material)
-            for (material, smooth), faces in by_material.items()
-        )
+        values = [np.concatenate(self.arrays[kind]) for kind in _VALUES]
+        return tuple(_mesh(values, np.concatenate(t), *which) for which, t in parts.items())
 
 
-def _mesh(
-    points: np.ndarray,
-    uvs: np.ndarray,
-    normals: np.ndarray | None,
-    faces: list[dict[str, np.ndarray]],
-    material: Material,
-) -> Mesh:
-    """Return the mesh of some faces, with the vertices that they use; each face is a fan of triangles."""
-    v, vt, vn = (
-        np.concatenate(
-            [
-                np.stack([f[kind][:, [0, k, k + 1]] for k in range(1, f[kind].shape[1] - 1)], 1).reshape(
-                    -1, 3
-                )
-                for f in faces
-            ]
-        )
-        for kind in _VALUES
-    )
-    if material.texture is None and normals is None:
+def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, material: Material, smooth: bool) -> Mesh:
+    """Return the mesh of triangles [T, 3, kinds of index], with the vertices that they use."""
+    (points, uvs, normals), (v, vt, vn) = values, np.moveaxis(triangles, -1, 0)
+    if material.texture is None and not smooth:
         used = np.zeros(len(points), bool)
         used[v] = True
         new = np.cumsum(used, dtype=np.uint32) - np.uint32(1)  # the vertices used, in their order
         return Mesh(points[used], new[v], material)
     # Each corner becomes a vertex: a point may have another texture or normal in another triangle
-    index = np.arange(v.size, dtype=np.uint32).reshape(-1, 3)
+    faces = np.arange(v.size, dtype=np.uint32).reshape(-1, 3)
     textured = None if material.texture is None else uvs[vt.ravel()]
-    smooth = None if normals is None else normals[vn.ravel()]
-    return Mesh(points[v.ravel()], index, material, textured, smooth)
+    return Mesh(points[v.ravel()], faces, material, textured, normals[vn.ravel()] if smooth else None)
 
 
 # ------------------------------------------- Camera and lights -----------------------------------------

@@ -8,38 +8,60 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from functools import cache
-from itertools import product
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 
+
+def _material(ior: float, alpha: float, *colors: float) -> Material:
+    """Return a material of numbers in a row, the specular colour before the diffuse one."""
+    return Material(ior, alpha, colors[:3], colors[3:])  # type: ignore[arg-type]
+
+
+def _lights(*rows: Any) -> tuple[Light, ...]:
+    """Return a light for each row of a position and a colour."""
+    return tuple(Light(row[:3], row[3:]) for row in rows)
+
+
+def _spheres(*rows: Any) -> tuple[Sphere, ...]:
+    """Return a sphere for each row of a centre, a radius and a material."""
+    return tuple(Sphere(row[:3], row[3], _material(*row[4:])) for row in rows)
+
+
+def _planes(*rows: Any) -> tuple[Plane, ...]:
+    """Return a plane for each row of a normal, a distance and a material."""
+    return tuple(Plane(row[:3], row[3], _material(*row[4:])) for row in rows)
+
+
 # The ten materials that scene 4 draws from, in the order of its random numbers
 SCENE_4_MATERIALS = (
-    Material(2.4449, 0.0681, (1.0, 0.882, 0.786), (0.014, 0.012, 0.012)),
-    Material(1.0720, 0.0588, (1.0, 0.824, 0.945), (0.002, 0.002, 0.003)),
-    Material(1.1051, 0.0568, (0.005, 0.013, 0.032), (1.0, 0.748, 0.718)),
-    Material(1.1051, 0.0567, (0.006, 0.026, 0.022), (1.0, 0.739, 0.721)),
-    Material(1.1022, 0.0579, (0.286, 0.235, 0.128), (1.0, 0.766, 0.762)),
-    Material(1.0893, 0.0604, (0.202, 0.035, 0.033), (1.0, 0.857, 0.866)),
-    Material(1.1382, 0.0886, (0.301, 0.034, 0.039), (1.0, 0.992, 0.98)),
-    Material(1.0771, 0.0589, (0.26, 0.036, 0.014), (1.0, 0.852, 1.172)),
-    Material(1.1481, 0.0625, (0.016, 0.073, 0.04), (1.0, 1.056, 1.146)),
-    Material(1.1153, 0.0680, (0.012, 0.036, 0.106), (1.0, 0.965, 1.07)),
+    _material(2.4449, 0.0681, 1.0, 0.882, 0.786, 0.014, 0.012, 0.012),
+    _material(1.0720, 0.0588, 1.0, 0.824, 0.945, 0.002, 0.002, 0.003),
+    _material(1.1051, 0.0568, 0.005, 0.013, 0.032, 1.0, 0.748, 0.718),
+    _material(1.1051, 0.0567, 0.006, 0.026, 0.022, 1.0, 0.739, 0.721),
+    _material(1.1022, 0.0579, 0.286, 0.235, 0.128, 1.0, 0.766, 0.762),
+    _material(1.0893, 0.0604, 0.202, 0.035, 0.033, 1.0, 0.857, 0.866),
+    _material(1.1382, 0.0886, 0.301, 0.034, 0.039, 1.0, 0.992, 0.98),
+    _material(1.0771, 0.0589, 0.26, 0.036, 0.014, 1.0, 0.852, 1.172),
+    _material(1.1481, 0.0625, 0.016, 0.073, 0.04, 1.0, 1.056, 1.146),
+    _material(1.1153, 0.0680, 0.012, 0.036, 0.106, 1.0, 0.965, 1.07),
 )
 
 
 def scene_0() -> Scene:
-    grey = (0.5, 0.5, 0.5)
-    colors = {(0, 0, 0): grey, (1, 0, 0): (0.5, 0, 0), (0, 1, 0): (0, 0.5, 0.5), (0, 0, 1): (0, 0, 0.5)}
+    centers = (0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)
+    colors = (0.5, 0.5, 0.5), (0.5, 0, 0), (0, 0.5, 0.5), (0, 0, 0.5)
+    glossy = 1.3, 0.1, 0.5, 0.5, 0.5
     return Scene(
         title="four spheres on a plane",
         camera=Camera((3, 1, 0), (0, 0.3, 0)),
         sky=(0.1, 0.3, 0.5),
-        lights=(Light((10, 10, 10), (1, 1, 1)), Light((4, 10, -2), (1, 1, 1))),
-        spheres=tuple(Sphere(p, 0.25, Material(1.3, 0.1, grey, kd)) for p, kd in colors.items()),
-        planes=(Plane((0, 1, 0), 0, Material(1.3, 0.1, grey, (0.6, 0.6, 0.6))),),
+        lights=_lights((10, 10, 10, 1, 1, 1), (4, 10, -2, 1, 1, 1)),
+        spheres=_spheres(*((*p, 0.25, *glossy, *kd) for p, kd in zip(centers, colors, strict=True))),
+        planes=_planes((0, 1, 0, 0, *glossy, 0.6, 0.6, 0.6)),
     )
 
 
@@ -49,86 +71,61 @@ def _row(i: int) -> float:
 
 
 def scene_1() -> Scene:
-    lower = [
-        Sphere(
-            (0, 0, _row(i)), 0.15, Material(1.1382, (10 - i) / 90, (1, 0.992, 0.98), (0.301, 0.034, 0.039))
-        )
-        for i in range(10)
-    ]
-    upper = [
-        Sphere((0, 1, _row(i)), 0.15, Material(1.1153, (i + 1) / 10, (1, 0.965, 1.07), (0.012, 0.036, 0.106)))
-        for i in range(10)
-    ]
-    mirror = Sphere((-3, 1, 0), 2, SCENE_4_MATERIALS[0])
+    red, blue = (1, 0.992, 0.98, 0.301, 0.034, 0.039), (1, 0.965, 1.07, 0.012, 0.036, 0.106)
+    lower = _spheres(*((0, 0, _row(i), 0.15, 1.1382, (10 - i) / 90, *red) for i in range(10)))
+    upper = _spheres(*((0, 1, _row(i), 0.15, 1.1153, (i + 1) / 10, *blue) for i in range(10)))
     return Scene(
         title="roughness along two rows of spheres, before a large mirror",
         camera=Camera((3, 0, 0), (0, 0.3, 0)),
         sky=BLUE_SKY,
-        lights=(Light((10, 10, 10), (10, 10, 10)), Light((4, 10, -2), (5, 3, 10))),
-        spheres=(*lower, *upper, mirror),
-        planes=(Plane((0, 1, 0), 1, Material(1.1481, 0.0625, (1, 1.056, 1.146), (0.016, 0.073, 0.04))),),
+        lights=_lights((10, 10, 10, 10, 10, 10), (4, 10, -2, 5, 3, 10)),
+        spheres=(*lower, *upper, Sphere((-3, 1, 0), 2, SCENE_4_MATERIALS[0])),
+        planes=_planes((0, 1, 0, 1, 1.1481, 0.0625, 1, 1.056, 1.146, 0.016, 0.073, 0.04)),
     )
 
 
 def scene_2() -> Scene:
-    def material(column: int, row: int) -> Material:
-        # The two leftmost columns have a negative roughness, as in the original
-        return Material(
-            1.0051 + 0.4 * row / 3, -0.0432 + 0.1 * column / 3, (1, 0.748, 0.718), (0.005, 0.013, 0.032)
-        )
-
+    """The two leftmost columns have a negative roughness, as in the original."""
+    spheres = (
+        (_row(i), 0, 0.4 * (j + 1), 0.15, 1.0051 + 0.4 * j / 3, -0.0432 + 0.1 * i / 3)
+        for j, i in product(range(4), range(10))
+    )
     return Scene(
         title="roughness against index of refraction",
         camera=Camera((0.5, 3, 1), (0, 0, 0.6), (0, 0, 1)),
         sky=BLUE_SKY,
-        lights=(
-            Light((-20, 5, 10), (30, 30, 30)),
-            Light((10, 10, 10), (30, 30, 30)),
-            Light((50, -100, 10), (1, 0.7, 2)),
-        ),
-        spheres=tuple(
-            Sphere((_row(column), 0, 0.4 * (row + 1)), 0.15, material(column, row))
-            for row, column in product(range(4), range(10))
-        ),
-        planes=(Plane((0, 0, 1), 0, Material(1.1022, 0.0579, (0.95, 0.95, 0.95), (0.05, 0.05, 0.05))),),
+        lights=_lights((-20, 5, 10, 30, 30, 30), (10, 10, 10, 30, 30, 30), (50, -100, 10, 1, 0.7, 2)),
+        spheres=_spheres(*((*sphere, 1, 0.748, 0.718, 0.005, 0.013, 0.032) for sphere in spheres)),
+        planes=_planes((0, 0, 1, 0, 1.1022, 0.0579, 0.95, 0.95, 0.95, 0.05, 0.05, 0.05)),
     )
 
 
 def scene_3() -> Scene:
-    dark = (0.014, 0.012, 0.012)
     return Scene(
         title="six spheres in the corner of three planes",
         camera=Camera((4.5, 0.8, 4.5), (0, 0.3, 0)),
         sky=BLUE_SKY,
-        lights=(
-            Light((0, 1.7, 1), (1.5, 1.5, 1.5)),
-            Light((3, 2, 3), (2, 2, 2)),
-            Light((4, 3, -1), (2.5, 2.5, 2.5)),
+        lights=_lights((0, 1.7, 1, 1.5, 1.5, 1.5), (3, 2, 3, 2, 2, 2), (4, 3, -1, 2.5, 2.5, 2.5)),
+        spheres=_spheres(
+            (0, 0.1, 0, 0.3, 6, 0.0181, 0.7, 0.882, 0.786, 0.014, 0.012, 0.012),
+            (1, -0.05, 0, 0.15, 1.3771, 0.01589, 1, 0.852, 1.172, 0.26, 0.036, 0.014),
+            (3, 0.05, 2, 0.25, 3, 0.00181, 0.7, 0.882, 0.786, 0.014, 0.012, 0.012),
+            (1.3, 0, 2.6, 0.215, 1.5771, 0.01589, 0.8, 0.852, 0.8172, 0.46, 0.136, 0.114),
+            (1.9, 0.05, 2.2, 0.25, 1.3051, 0.567, 0.7, 0.739, 0.721, 0.06, 0.26, 0.22),
+            (0, 0, 1, 0.2, 1.1153, 0.18, 1, 0.965, 1.07, 0.012, 0.036, 0.406),
         ),
-        spheres=(
-            Sphere((0, 0.1, 0), 0.3, Material(6, 0.0181, (0.7, 0.882, 0.786), dark)),
-            Sphere((1, -0.05, 0), 0.15, Material(1.3771, 0.01589, (1, 0.852, 1.172), (0.26, 0.036, 0.014))),
-            Sphere((3, 0.05, 2), 0.25, Material(3, 0.00181, (0.7, 0.882, 0.786), dark)),
-            Sphere(
-                (1.3, 0, 2.6), 0.215, Material(1.5771, 0.01589, (0.8, 0.852, 0.8172), (0.46, 0.136, 0.114))
-            ),
-            Sphere((1.9, 0.05, 2.2), 0.25, Material(1.3051, 0.567, (0.7, 0.739, 0.721), (0.06, 0.26, 0.22))),
-            Sphere((0, 0, 1), 0.2, Material(1.1153, 0.18, (1, 0.965, 1.07), (0.012, 0.036, 0.406))),
-        ),
-        planes=(
-            Plane((0, 1, 0), 0.2, Material(1.382, 0.05886, (0.2, 0.2, 0.2), (0.2, 0.4, 0.3))),
-            Plane((1, 0, -1), 2, Material(1.8382, 0.886, (0.2, 0.2, 0.1), (0.5, 0.09, 0.07))),
-            Plane((0.3, -0.2, 1), 4, Material(1.9382, 0.0886, (0.5, 0.5, 0.5), (0.1, 0.3, 0.05))),
+        planes=_planes(
+            (0, 1, 0, 0.2, 1.382, 0.05886, 0.2, 0.2, 0.2, 0.2, 0.4, 0.3),
+            (1, 0, -1, 2, 1.8382, 0.886, 0.2, 0.2, 0.1, 0.5, 0.09, 0.07),
+            (0.3, -0.2, 1, 4, 1.9382, 0.0886, 0.5, 0.5, 0.5, 0.1, 0.3, 0.05),
         ),
         focal_distance=2.0,
     )
 
 
-def scene_of_spheres(count: int = 600) -> Scene:
-    """Return scene 4, with ``count`` spheres."""
-    numbers = c_rand()
-    spheres = []
-    for _ in range(count):
+def scene_4() -> Scene:
+    numbers, spheres = c_rand(), []
+    for _ in range(600):
         material = SCENE_4_MATERIALS[next(numbers) % 10]
         radius = 0.05 + next(numbers) % 200 / 1000
         z, y, x = 1 + next(numbers) % 650 / 100, next(numbers) % 650 / 100, 1 + next(numbers) % 650 / 100
@@ -137,16 +134,12 @@ def scene_of_spheres(count: int = 600) -> Scene:
         title="600 spheres in the corner of three planes",
         camera=Camera((6, 4, 6), (0, 1, 0), hfov=90),
         sky=BLUE_SKY,
-        lights=(
-            Light((10, 10.7, 1), (1.5, 1.5, 1.5)),
-            Light((8, 20, 3), (2, 2, 2)),
-            Light((4, 30, -1), (2.5, 2.5, 2.5)),
-        ),
+        lights=_lights((10, 10.7, 1, 1.5, 1.5, 1.5), (8, 20, 3, 2, 2, 2), (4, 30, -1, 2.5, 2.5, 2.5)),
         spheres=tuple(spheres),
-        planes=(
-            Plane((0, 1, 0), 0.2, Material(2.382, 0.005886, (0.2, 0.2, 0.2), (0.2, 0.4, 0.3))),
-            Plane((1, 0, 0), 2, Material(2.8382, 0.00886, (0.2, 0.2, 0.1), (0.5, 0.09, 0.07))),
-            Plane((0, 0, 1), 4, Material(2.9382, 0.00886, (0.5, 0.5, 0.5), (0.1, 0.3, 0.05))),
+        planes=_planes(
+            (0, 1, 0, 0.2, 2.382, 0.005886, 0.2, 0.2, 0.2, 0.2, 0.4, 0.3),
+            (1, 0, 0, 2, 2.8382, 0.00886, 0.2, 0.2, 0.1, 0.5, 0.09, 0.07),
+            (0, 0, 1, 4, 2.9382, 0.00886, 0.5, 0.5, 0.5, 0.1, 0.3, 0.05),
         ),
         focal_distance=0.1,
         focal_range=3.0,
@@ -160,9 +153,10 @@ def _with_model(name: str, **parts: Any) -> Scene:
     return Scene(meshes=read_obj(Path(__file__).parent / "assets" / name), **parts)
 
 
-def _matte(r: float, g: float, b: float) -> Material:
-    """Return a rough surface without mirror reflection: index of refraction 0, as in the report's files."""
-    return Material(0.0, 0.6, (0.0, 0.0, 0.0), (r, g, b))
+# Surfaces of index 0, as in the report's files, have no mirror reflection
+_GRASS = (0.0, 0.6, 0.0, 0.0, 0.0, 0.22, 0.36, 0.12)
+_BARK = _material(0.0, 0.6, 0.0, 0.0, 0.0, 0.3, 0.18, 0.1)
+_FLAME = _material(0.0, 0.5, 0.0, 0.0, 0.0, 1.6, 0.7, 0.15)
 
 
 def scene_5() -> Scene:
@@ -171,35 +165,34 @@ def scene_5() -> Scene:
         title="a ring, stones and two glossy spheres",
         camera=Camera((2.8, 1.5, 3.2), (0.1, 0.45, 0)),
         sky=(0.25, 0.35, 0.6),
-        lights=(Light((4, 6, 3), (3.2, 3.2, 3.0)), Light((-3, 4, 5), (1.5, 1.5, 1.9))),
-        spheres=(
-            Sphere((-1.05, 0.45, 0.35), 0.45, Material(6.0, 0.02, (0.9, 0.9, 0.9), (0.02, 0.02, 0.02))),
-            Sphere((1.25, 0.3, 0.75), 0.3, Material(2.0, 0.03, (0.9, 0.85, 0.6), (0.5, 0.06, 0.05))),
+        lights=_lights((4, 6, 3, 3.2, 3.2, 3.0), (-3, 4, 5, 1.5, 1.5, 1.9)),
+        spheres=_spheres(
+            (-1.05, 0.45, 0.35, 0.45, 6.0, 0.02, 0.9, 0.9, 0.9, 0.02, 0.02, 0.02),
+            (1.25, 0.3, 0.75, 0.3, 2.0, 0.03, 0.9, 0.85, 0.6, 0.5, 0.06, 0.05),
         ),
-        planes=(Plane((0, 1, 0), 0, Material(1.3, 0.1, (0.25, 0.25, 0.25), (0.55, 0.52, 0.5))),),
+        planes=_planes((0, 1, 0, 0, 1.3, 0.1, 0.25, 0.25, 0.25, 0.55, 0.52, 0.5)),
     )
 
 
 def scene_6() -> Scene:
-    bark, flame = _matte(0.3, 0.18, 0.1), Material(0.0, 0.5, (0.0, 0.0, 0.0), (1.6, 0.7, 0.15))
     turns = [(math.cos(a), math.sin(a)) for a in (2 * math.pi * k / 9 for k in range(0, 9, 2))]
-    logs = [
-        Cylinder((0.28 * x, 0.05, 0.28 * z), (0.03 * x, 0.3, 0.03 * z), 0.045, bark) for x, z in turns
-    ]  # that lean against each other
+    logs = [  # that lean against each other
+        Cylinder((0.28 * x, 0.05, 0.28 * z), (0.03 * x, 0.3, 0.03 * z), 0.045, _BARK) for x, z in turns
+    ]
     seats = (
-        Cylinder((-1.0, 0.1, 0.5), (-0.55, 0.1, 1.15), 0.1, bark),
-        Cylinder((1.15, 0.1, 0.1), (0.9, 0.1, 0.85), 0.1, bark),
+        Cylinder((-1.0, 0.1, 0.5), (-0.55, 0.1, 1.15), 0.1, _BARK),
+        Cylinder((1.15, 0.1, 0.1), (0.9, 0.1, 0.85), 0.1, _BARK),
     )
     return _with_model(
         "camp.obj",
         title="a camp: tents, firs and a fire",
         camera=Camera((1.6, 1.5, 4.2), (-0.1, 0.5, -0.3)),
         sky=(0.75, 0.45, 0.3),
-        lights=(Light((6, 5, 4), (3.4, 2.7, 2.1)), Light((0.0, 0.75, 0.0), (2.2, 1.1, 0.4))),
-        planes=(Plane((0, 1, 0), 0, _matte(0.22, 0.36, 0.12)),),
+        lights=_lights((6, 5, 4, 3.4, 2.7, 2.1), (0.0, 0.75, 0.0, 2.2, 1.1, 0.4)),
+        planes=_planes((0, 1, 0, 0, *_GRASS)),
         cones=(
-            Cone((0, 0.62, 0), (0, 0.12, 0), 0.13, flame),
-            Cone((0.07, 0.45, 0.06), (0.07, 0.12, 0.06), 0.09, flame),
+            Cone((0, 0.62, 0), (0, 0.12, 0), 0.13, _FLAME),
+            Cone((0.07, 0.45, 0.06), (0.07, 0.12, 0.06), 0.09, _FLAME),
         ),
         cylinders=(*logs, *seats),
     )
@@ -211,8 +204,8 @@ def scene_7() -> Scene:
         title="a lake between hills",
         camera=Camera((0.4, 0.9, 5.6), (0, 0.35, 0)),
         sky=(0.45, 0.65, 0.9),
-        lights=(Light((8, 9, 6), (2.6, 2.5, 2.2)), Light((-6, 7, 3), (0.7, 0.75, 0.9))),
-        planes=(Plane((0, 1, 0), 0, Material(1.33, 0.03, (0.7, 0.75, 0.8), (0.02, 0.08, 0.12))),),
+        lights=_lights((8, 9, 6, 2.6, 2.5, 2.2), (-6, 7, 3, 0.7, 0.75, 0.9)),
+        planes=_planes((0, 1, 0, 0, 1.33, 0.03, 0.7, 0.75, 0.8, 0.02, 0.08, 0.12)),
     )
 
 
@@ -222,21 +215,19 @@ def scene_8() -> Scene:
         title="a textured block on a glossy plane",
         camera=Camera((1.6, 1.25, 2.2), (0, 0.42, 0)),
         sky=(0.2, 0.25, 0.35),
-        lights=(Light((3, 4, 2), (3.2, 3.2, 3.0)), Light((-2, 3, 4), (2.4, 2.4, 2.6))),
-        planes=(Plane((0, 1, 0), 0, Material(2.2, 0.05, (0.6, 0.6, 0.62), (0.12, 0.12, 0.13))),),
+        lights=_lights((3, 4, 2, 3.2, 3.2, 3.0), (-2, 3, 4, 2.4, 2.4, 2.6)),
+        planes=_planes((0, 1, 0, 0, 2.2, 0.05, 0.6, 0.6, 0.62, 0.12, 0.12, 0.13)),
     )
 
 
 def scene_9() -> Scene:
-    wood = Material(1.0771, 0.0589, (0.26, 0.036, 0.014), (1, 0.852, 1.172))
+    wood = _material(1.0771, 0.0589, 0.26, 0.036, 0.014, 1, 0.852, 1.172)
+    dim = (0.3764705882352941, 0.11176470588235295, 0.08431372549019608)
     return Scene(
         title="a cone above a plane",
         camera=Camera((3, 3, 0), (0, 0, 0)),
         sky=BLUE_SKY,
-        lights=(
-            Light((2.8, -28.34, 4.33), (0.3764705882352941, 0.11176470588235295, 0.08431372549019608)),
-            Light((3, 3, 3), (2.5, 2.5, 2.5)),
-        ),
+        lights=_lights((2.8, -28.34, 4.33, *dim), (3, 3, 3, 2.5, 2.5, 2.5)),
         planes=(Plane((0, 1, 0), 0, wood),),
         cones=(Cone((0, 1.5, 0), (0, 0.5, 0), 0.648361, wood),),
     )
@@ -252,26 +243,13 @@ def c_rand(seed: int = 1) -> Iterator[int]:
     for _ in range(30):
         words.append(16807 * words[-1] % 0x7FFFFFFF)
     words += words[:3]
-    for i in range(34, 344):
+    for i in count(34):
         words.append((words[i - 31] + words[i - 3]) & 0xFFFFFFFF)
-    while True:
-        words = words[-31:]
-        words.append((words[-31] + words[-3]) & 0xFFFFFFFF)
-        yield words[-1] >> 1
+        if i >= 344:
+            yield words[-1] >> 1
 
 
-_BUILDERS = (
-    scene_0,
-    scene_1,
-    scene_2,
-    scene_3,
-    scene_of_spheres,
-    scene_5,
-    scene_6,
-    scene_7,
-    scene_8,
-    scene_9,
-)
+_BUILDERS = (scene_0, scene_1, scene_2, scene_3, scene_4, scene_5, scene_6, scene_7, scene_8, scene_9)
 NUMBERS = tuple(range(len(_BUILDERS)))
 
 
