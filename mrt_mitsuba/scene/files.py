@@ -1,4 +1,4 @@
-"""Reading the text files of a model: bytes, lines, numbers, and where a file that they name lies."""
+"""Reading the text files of a model: bytes, lines, and where a file that they name lies."""
 
 from __future__ import annotations
 
@@ -11,13 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mrt_mitsuba.errors import MrtWarning, SceneError
-from mrt_mitsuba.scene.model import LARGEST
 
 LONGEST_LINE = 2**18  # bytes, about 40,000 corners of a face
 MISSING = "is missing or may not be read in"  # what messages say about a file that was not found
-
-
-_REAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 
 
 def require_file(path: str | os.PathLike[str]) -> None:
@@ -59,7 +55,8 @@ def read_text(path: Path) -> bytes:
     def joined(lines: re.Match[bytes]) -> bytes:
         return lines[0].replace(b"\\\n", b" ") + b"\n" * lines[0].count(b"\\\n")
 
-    data = re.sub(rb"(?m)^(?:.*\\\n)+.*\n", joined, data)
+    if b"\\\n" in data:
+        data = re.sub(rb"(?m)^(?:.*\\\n)+.*\n", joined, data)
     longest = max(io.BytesIO(data), key=len).removesuffix(b"\n")
     if len(longest) > LONGEST_LINE:
         number = data.count(b"\n", 0, data.find(longest)) + 1
@@ -114,14 +111,3 @@ def warn(findings: Mapping[str, list[str]]) -> None:
         more = f" (and so do {len(texts) - 1} more {kind})" if texts[1:] else ""
         if texts:
             warnings.warn(f"{texts[0]}{more}", MrtWarning, stacklevel=4)
-
-
-def numbers(where: str, statement: str, words: list[str], least: int, most: int) -> list[float]:
-    """Return ``least`` to ``most`` finite numbers. Raises ``SceneError`` that names the statement."""
-    if not least <= len(words) <= most:
-        wanted = f"{least}" if least == most else f"{least} to {most}"
-        raise SceneError(f"{where}: {statement} has {len(words)} numbers, but must have {wanted}")
-    for word in words:
-        if not _REAL.fullmatch(word) or abs(float(word)) > LARGEST:
-            raise SceneError(f"{where}: {statement} holds {word[:40]!r}, which is not a finite number")
-    return [float(word) for word in words]

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError
-from mrt_mitsuba.scene.files import MISSING, decode, find, numbers, read_text, warn
-from mrt_mitsuba.scene.model import Color, Material
+from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn
+from mrt_mitsuba.scene.model import LARGEST, Color, Material
 
 CONVENTIONS = ("report", "standard")
 
@@ -97,15 +97,14 @@ def _value(
             missing = f"{where}: the texture {text} {MISSING} {folder}; Kd is used in its place"
             findings.setdefault("textures", []).append(missing)
         return None if found is None else str(found)
-    colored = statement.startswith("K")
-    if colored and words and words[0] in ("spectral", "xyz"):
-        raise SceneError(f"{where}: {statement} {words[0]} is not supported; give red, green and blue")
-    values = numbers(where, statement, words, 1, 3 if colored else 1)
-    if min(values) < 0:
-        what = "a colour must not" if colored else "must not"
-        raise SceneError(f"{where}: {statement} is {text}, but {what} be negative")
-    if len(values) == 2:
-        raise SceneError(f"{where}: {statement} has 2 numbers, but must have 1 or 3")
-    if not colored:
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    counts = (1, 3) if statement.startswith("K") else (1,)
+    if len(values) not in counts or not all(0 <= value <= LARGEST for value in values):
+        form = f"{' or '.join(map(str, counts))} finite numbers, which must not be negative"
+        raise SceneError(f"{where}: {statement} must have {form}, but is {text[:80]!r}")
+    if len(counts) == 1:
         return values[0]
     return values[0], values[len(values) // 2], values[-1]

@@ -1,9 +1,10 @@
 """OBJ files: meshes with shared materials, errors that name file and line, and a camera and lights for them.
 
 Mitsuba's own ``obj`` plugin makes one mesh with one material of a whole file, so the reader is the project's
-own. Runs of lines of the usual forms are recognised by one regular expression and turned into arrays at once,
-a million triangles in two or three seconds; every other line is read by itself, with care. The time grows
-with the size of the file whatever it holds: the lengths of numbers and gaps in the expression are bounded.
+own. One regular expression recognises runs of lines of one form, which are turned into arrays at once, a
+million triangles in two or three seconds; a line with a comment or more blanks is a run of its own. The time
+grows with the size of the file whatever it holds: the lengths of numbers and gaps in the expression are
+bounded.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.scene.files import MISSING, decode, find, numbers, read_text, warn
+from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn
 from mrt_mitsuba.scene.model import (
     BLUE_SKY,
     Camera,
@@ -32,18 +33,23 @@ from mrt_mitsuba.scene.model import (
 )
 from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, read_mtl
 
-# Numbers of numbers, least, most and used: positions may have a weight, a colour or both behind them
-_VALUES = {"v": (3, 7, 3), "vt": (1, 3, 2), "vn": (3, 3, 3)}
+# Numbers of each kind of values that are used: positions may have a weight, a colour or both behind them
+_USED = {"v": 3, "vt": 2, "vn": 3}
+_FORMS = {
+    "v": "v must have 3 to 7 numbers",
+    "vt": "vt must have 1 to 3 numbers",
+    "vn": "vn must have 3 numbers",
+    "f": "f must have 3 corners or more, all v, v/vt, v//vn or v/vt/vn",
+}
 # Names, groups, smoothing, curves and display: nothing that is rendered here
 _UNUSED = """g s o mg l p vp deg bmat step cstype curv curv2 surf parm trim hole scrv sp end con bevel
     c_interp d_interp lod shadow_obj trace_obj ctech stech call csh maplib usemap"""
 _IGNORED = frozenset(_UNUSED.split())
 
-_LINES_AT_ONCE = 4096  # regular expressions keep a state for each repetition
 _GAP, _END = rb"[ \t]{1,99}", rb"[ \t]{0,99}\n"
 _REAL = rb"[-+]?(?:\d{1,99}(?:\.\d{0,99})?|\.\d{1,99})(?:[eE][-+]?\d{1,9})?"
-_INDEX = rb"-?\d{1,18}"  # what fits 64 bits
-# Forms of a corner: the pattern, and which of ``_VALUES`` its indices are of
+_INDEX = rb"[-+]?\d{1,18}"  # what fits 64 bits
+# Forms of a corner: the pattern, and of which of the values its indices are
 _CORNERS = {
     "c": (_INDEX, [0]),
     "t": (_INDEX + b"/" + _INDEX, [0, 1]),
@@ -53,14 +59,16 @@ _CORNERS = {
 
 
 def _run(name: str, word: bytes) -> bytes:
-    """Return the pattern of up to some thousand lines: "f_3_tn" has the keyword f and three words."""
+    """Return the pattern of lines: of "f_3_tn", up to some thousand with the keyword f and three words; of
+    "f_0_tn", one with any number of words. Regular expressions keep a state for each repetition."""
     keyword, count, *_ = name.split("_")
-    words = (_GAP + word) * int(count)
-    return b"(?P<%s>(?:%s%s%s){1,%d})" % (name.encode(), keyword.encode(), words, _END, _LINES_AT_ONCE)
+    words, most = ((_GAP + word) * int(count), 4096) if int(count) else (b"(?:%s){7,}" % (_GAP + word), 1)
+    return b"(?P<%s>(?:%s%s%s){1,%d})" % (name.encode(), keyword.encode(), words, _END, most)
 
 
-_RUNS = [_run(name, _REAL) for name in ("v_3", "v_4", "v_6", "v_7", "vt_2", "vt_3", "vn_3")]
-_RUNS += [_run(f"f_{n}_{form}", word) for n in range(3, 7) for form, (word, _) in _CORNERS.items()]
+_VALUE_RUNS = "v_3 v_4 v_5 v_6 v_7 vt_1 vt_2 vt_3 vn_3"
+_RUNS = [_run(name, _REAL) for name in _VALUE_RUNS.split()]
+_RUNS += [_run(f"f_{n}_{form}", word) for n in (3, 4, 5, 6, 0) for form, (word, _) in _CORNERS.items()]
 _BLOCKS = re.compile(b"|".join(_RUNS) + rb"|(?P<line>[^\n]*\n)")
 
 # Letters of keywords, slashes and line ends as blanks: what is left are the numbers
@@ -90,7 +98,9 @@ def read_model(
     if convention not in CONVENTIONS:
         raise UsageError(f"convention={convention!r}: must be {' or '.join(CONVENTIONS)}")
     reader = _Reader(Path(path), convention)
-    reader.read()
+    for block in _BLOCKS.finditer(read_text(reader.path)):
+        reader.read(block)
+        reader.line += block[0].count(b"\n")
     textures = {material.texture for material in reader.materials.values() if material.texture is not None}
     return reader.meshes(), frozenset({os.fspath(path), *reader.libraries, *textures})
 
@@ -102,45 +112,58 @@ class _Reader:
         self.path = path
         self.convention = convention
         self.line = 1
-        self.arrays = {kind: [np.empty((0, used), np.float32)] for kind, (_, _, used) in _VALUES.items()}
-        self.counts = dict.fromkeys(_VALUES, 0)
-        # Of faces of as many corners, one on each line: indices from 0, int64 [F, corners, 3], −1 for none, of
-        # "v", "vt" and "vn"; the material; the first line
-        self.faces: list[tuple[np.ndarray, str, int]] = []
+        self.values = {kind: [np.empty((0, used), np.float32)] for kind, used in _USED.items()}
+        self.counts = dict.fromkeys(_USED, 0)
+        # Of faces of as many corners, one on each line: indices from 0, int64 [F, corners, kinds]; the kinds,
+        # as in ``_CORNERS``; the material; the first line
+        self.faces: list[tuple[np.ndarray, list[int], str, int]] = []
         self.material = ""
         self.materials: dict[str, Material] = {}
         self.named: dict[str, str] = {}  # by the name of a material, where it was used first
         self.libraries: set[str] = set()
         self.missing: list[str] = []
 
-    def fail(self, text: str, line: int | None = None) -> None:
-        raise SceneError(f"{self.path}:{self.line if line is None else line}: {text}")
+    def fail(self, text: str, line: int) -> None:
+        raise SceneError(f"{self.path}:{line}: {text}")
 
-    def read(self) -> None:
-        for match in _BLOCKS.finditer(read_text(self.path)):
-            kind, *form = str(match.lastgroup).split("_")
-            lines = match[0].count(b"\n")
-            words = match[0].translate(_NUMBERS_ONLY)
-            if kind == "line":
-                self._statement(match[0])
-            elif kind == "f":
-                indices = np.fromstring(words, np.int64, sep=" ").reshape(lines, int(form[0]), -1)
-                self._add_faces(indices, _CORNERS[form[1]][1])
-            else:
-                self._add_values(kind, np.fromstring(words, np.float64, sep=" ").reshape(lines, -1))
-            self.line += lines
+    def read(self, block: re.Match[bytes]) -> None:
+        """Read a run of lines."""
+        kind, *form = str(block.lastgroup).split("_")
+        lines, words = block[0].count(b"\n"), block[0].translate(_NUMBERS_ONLY)
+        if kind == "line":
+            self._statement(block[0])
+        elif kind == "f":
+            kinds = _CORNERS[form[1]][1]
+            index = np.fromstring(words, np.int64, sep=" ").reshape(lines, -1, len(kinds))
+            behind = index + [[*self.counts.values()][kind] for kind in kinds]
+            faces = np.where(index > 0, index - 1, np.where(index < 0, behind, -1))
+            self.faces.append((faces, kinds, self.material, self.line))
+        else:
+            values = np.fromstring(words, np.float64, sep=" ").reshape(lines, -1)[:, : _USED[kind]]
+            used = np.zeros((lines, _USED[kind]), np.float32)
+            with np.errstate(over="ignore"):
+                used[:, : values.shape[1]] = values
+            large = ~np.isfinite(used).all(axis=1)
+            if large.any():
+                self.fail(
+                    f"{kind} holds a number that is too large for a float32", self.line + large.argmax()
+                )
+            self.values[kind].append(used)
+            self.counts[kind] += lines
 
     def _statement(self, text: bytes) -> None:
-        """Read one line of a form that is not covered by the runs."""
+        """Read one line of another form."""
         keyword, *words = decode(text.split(b"#", 1)[0]).split() or [""]
         name, where = decode(text).strip()[len(keyword) :].strip(), f"{self.path}:{self.line}"
-        if keyword in _VALUES:
-            least, most, used = _VALUES[keyword]
-            self._add_values(keyword, np.array([[*numbers(where, keyword, words, least, most), 0.0][:used]]))
-        elif keyword == "f":
-            self._face(words)
+        if keyword in _FORMS:
+            plain = " ".join([keyword, *(word.rstrip("/") for word in words)])
+            again = _BLOCKS.fullmatch(plain.encode() + b"\n")
+            if again is None or again.lastgroup == "line":
+                self.fail(f"{_FORMS[keyword]}, but is {plain[:80]!r}", self.line)
+            else:
+                self.read(again)
         elif keyword in ("usemtl", "mtllib") and not name:
-            self.fail(f"{keyword} has no name; write {keyword} {'NAME' if keyword == 'usemtl' else 'FILE'}")
+            self.fail(f"{keyword} has no name; write {keyword} NAME", self.line)
         elif keyword == "usemtl":
             self.material = name
             self.named.setdefault(name, where)
@@ -154,50 +177,8 @@ class _Reader:
                     missing = f"{where}: the material library {each} {MISSING} {folder}"
                     self.missing.append(f"{missing}; its materials get the default")
         elif keyword and keyword not in _IGNORED:
-            self.fail(
-                f"unknown statement {keyword[:40]!r}; expected v, vt, vn, f, usemtl, mtllib or the like"
-            )
-
-    def _add_values(self, kind: str, values: np.ndarray) -> None:
-        with np.errstate(over="ignore"):
-            narrow = values[:, : _VALUES[kind][2]].astype(np.float32)
-        finite = np.isfinite(narrow).all(axis=1)
-        if not finite.all():
-            line = self.line + int(finite.argmin())
-            self.fail(f"{kind} holds a number that is too large for a float32", line)
-        self.arrays[kind].append(narrow)
-        self.counts[kind] += len(values)
-
-    def _face(self, words: list[str]) -> None:
-        """Read a face of any number of corners, in any of the four forms."""
-        if len(words) < 3:
-            self.fail(f"f has {len(words)} corners, but must have 3 or more")
-        corners, forms = [], []
-        for word in words:
-            if not re.fullmatch(r"[-+]?[0-9]{1,18}(/([-+]?[0-9]{1,18})?){0,2}", word):
-                self.fail(f"f has the corner {word[:40]!r}, but must have v, v/vt, v//vn or v/vt/vn")
-            given = {kind: int(part) for kind, part in enumerate(word.split("/")) if part}
-            corners.append([*given.values()])
-            forms.append([*given])
-        if any(form != forms[0] for form in forms):
-            self.fail(f"f has corners of different forms: {' '.join(words)[:80]}; give all the same indices")
-        self._add_faces(np.array([corners], np.int64), forms[0])
-
-    def _add_faces(self, indices: np.ndarray, kinds: list[int]) -> None:
-        """Add faces [F, corners, kinds of index], their indices counted from 0."""
-        faces = np.full((*indices.shape[:2], len(_VALUES)), -1)
-        for index, k in zip(np.moveaxis(indices, -1, 0), kinds, strict=True):
-            count = [*self.counts.values()][k]
-            self._check(k, index, index == 0, ": indices count from 1, or back from -1", self.line)
-            self._check(k, index, index < -count, f": only {count} came before", self.line)
-            faces[:, :, k] = np.where(index > 0, index - 1, index + count)
-        self.faces.append((faces, self.material, self.line))
-
-    def _check(self, k: int, index: np.ndarray, wrong: np.ndarray, reason: str, line: int) -> None:
-        """Refuse the first of the indices [F, corners] that are wrong."""
-        if wrong.any():
-            row, corner = np.argwhere(wrong)[0]
-            self.fail(f"f has the {[*_VALUES][k]} index {index[row, corner]}{reason}", line + int(row))
+            expected = "expected v, vt, vn, f, usemtl, mtllib or the like"
+            self.fail(f"unknown statement {keyword[:40]!r}; {expected}", self.line)
 
     def meshes(self) -> tuple[Mesh, ...]:
         """Return one mesh for each material, in the order of their first use."""
@@ -208,25 +189,27 @@ class _Reader:
         ]
         warn({"libraries": self.missing, "materials": unknown})
         parts: dict[tuple[Material, bool], list[np.ndarray]] = {}
-        for faces, name, line in self.faces:
-            for k, count in enumerate(self.counts.values()):
-                index = faces[:, :, k]
-                self._check(k, index + 1, index >= count, f", but the file has {count}", line)
+        for faces, kinds, name, line in self.faces:
+            counts = np.array([*self.counts.values()])[kinds]
+            for row, _, k in np.argwhere((faces < 0) | (faces >= counts))[:1]:
+                index = f"a {[*_USED][kinds[k]]} index of 0, or beyond the {counts[k]} of the file"
+                self.fail(f"f has {index}; indices count from 1, or back from -1", line + row)
             material = self.materials.get(name, DEFAULT_MATERIAL)
-            if faces[0, 0, 1] < 0:
+            if 1 not in kinds:
                 material = replace(material, texture=None)  # no coordinates to look it up
-            smooth = self.convention == "standard" and faces[0, 0, 2] >= 0
             second = np.arange(1, faces.shape[1] - 1)  # corners of the triangles of a fan
-            fan = np.stack([0 * second, second, second + 1], axis=1)
-            parts.setdefault((material, smooth), []).append(faces[:, fan].reshape(-1, 3, 3))
+            fans = np.zeros((*faces.shape[:2], len(_USED)), np.int64)
+            fans[:, :, kinds] = faces
+            fans = fans[:, np.stack([0 * second, second, second + 1], axis=1)].reshape(-1, 3, len(_USED))
+            parts.setdefault((material, self.convention == "standard" and 2 in kinds), []).append(fans)
         if not parts:
             raise SceneError(f"{self.path}: has no faces; export the model with its geometry")
-        values = [np.concatenate(self.arrays[kind]) for kind in _VALUES]
-        return tuple(_mesh(values, np.concatenate(t), *which) for which, t in parts.items())
+        values = [np.concatenate(arrays) for arrays in self.values.values()]
+        return tuple(_mesh(values, np.concatenate(fans), *which) for which, fans in parts.items())
 
 
 def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, material: Material, smooth: bool) -> Mesh:
-    """Return the mesh of triangles [T, 3, kinds of index], with the vertices that they use."""
+    """Return the mesh of triangles [T, 3, kinds of values], with the vertices that they use."""
     (points, uvs, normals), (v, vt, vn) = values, np.moveaxis(triangles, -1, 0)
     if material.texture is None and not smooth:
         used = np.zeros(len(points), bool)
