@@ -138,7 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return error.exit_code
     options = {name: getattr(given, name) for name in ("quick", "device", "turns")}
     now = {"machine": machine(), "options": options, "rows": found}
-    with replacing(given.out) as file:
+    with replacing(given.out) as (file,):
         file.write(json.dumps(now, indent=2).encode() + b"\n")
     return 0
 

@@ -8,15 +8,15 @@ import os
 import stat
 import sys
 import warnings
+from collections import namedtuple
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import IO, TYPE_CHECKING, Any
 
 from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
 from mrt_mitsuba.output.layers import LAYERS
-from mrt_mitsuba.output.replacing import replacing, replacing_together
+from mrt_mitsuba.output.replacing import replacing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -37,13 +37,9 @@ TONEMAPS = ("report", "srgb")
 _PIXELS = 2**14  # converted to 8 bit at a time, so that intermediate arrays stay in the processor's cache
 
 
-@dataclass(frozen=True)
-class Picture:
-    """An EXR as read: ``image`` [H, W, 3], ``layers`` [H, W] by channel name ("depth.Z"), all float32."""
-
-    image: Image
-    layers: dict[str, Image]
-    header: dict[str, Any]
+Picture = namedtuple("Picture", "image layers header")
+Picture.__doc__ = """An EXR as read: ``image`` [H, W, 3], and ``layers`` [H, W] by channel name ("depth.Z"),
+all float32; ``header``: its values by name."""
 
 
 def save(
@@ -69,7 +65,7 @@ def save(
     for path, ending in zip(paths, endings, strict=True):
         if ending not in (".png", ".exr"):
             raise OutputError(f"cannot write {os.fspath(path)}: the name must end in .png or .exr")
-    with replacing_together(paths, inputs) as files:
+    with replacing(*paths, inputs=inputs) as files:
         for file, ending in zip(files, endings, strict=True):
             if ending == ".png":
                 _write_png(file, image, tonemap)
@@ -79,7 +75,7 @@ def save(
 
 def write_png(path: Path, image: Image, *, tonemap: str = "report") -> None:
     """Write a linear picture [H, W, 3] as PNG, whatever the path's ending; see ``save``."""
-    with replacing(path) as file:
+    with replacing(path) as (file,):
         _write_png(file, image, tonemap)
 
 
@@ -90,7 +86,7 @@ def write_exr(
     header: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a linear picture [H, W, 3] as float32 EXR, whatever the path's ending; see ``save``."""
-    with replacing(path) as file:
+    with replacing(path) as (file,):
         _write_exr(file, image, layers or {}, header or {})
 
 

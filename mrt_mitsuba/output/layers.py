@@ -6,33 +6,24 @@ A new layer takes one row. What its ``value`` is computed from along camera rays
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
 
 FIRST_HIT = "first hit"  # of the first ray of a pixel; a mean would name no point
 AVERAGED = "averaged"  # over the rays of a pixel, as the picture is
 DERIVED = "derived"  # by a pass over the picture
 
 
-@dataclass(frozen=True)
-class Layer:
-    """A row of the table."""
+Layer = namedtuple(
+    "Layer", "name letters source doc value free_with counts internal", defaults=(None, (), "", False)
+)
+Layer.__doc__ = """A row of the table.
 
-    name: str
-    letters: str  #: names of its EXR channels, in the order of the last axis
-    source: str  #: ``FIRST_HIT``, ``AVERAGED`` or ``DERIVED``
-    doc: str  #: for the page of the command
-    value: Any = None  #: function of what is known along rays; None of a derived layer
-    free_with: tuple[str, ...] = ()  #: the passes that make it in any case
-    counts: str = ""  #: the kind of rays that it counts
-    internal: bool = False  #: cannot be asked for
-
-    @property
-    def channels(self) -> int:
-        """Number of float32 values in a pixel."""
-        return len(self.letters)
-
+``letters`` name its EXR channels, in the order of the last axis. ``source``: ``FIRST_HIT``, ``AVERAGED`` or
+``DERIVED``. ``doc``: for the page of the command. ``value``: a function of what is known along rays; None for
+a derived layer. ``free_with``: the passes that make it in any case. ``counts``: the kind of rays that it
+counts. ``internal``: it cannot be asked for.
+"""
 
 _ROWS = (
     Layer(
@@ -64,15 +55,7 @@ _ROWS = (
         lambda r: r.rgb(r.trace.radiance - r.trace.direct),
     ),
     Layer("bounces", "Y", AVERAGED, "number of mirror rays", lambda r: r.trace.bounces, counts="mirror"),
-    Layer(
-        "shadow_rays",
-        "Y",
-        AVERAGED,
-        "shadow rays",
-        lambda r: r.trace.shadow_rays,
-        counts="shadow",
-        internal=True,
-    ),
+    Layer("shadow_rays", "Y", AVERAGED, "", lambda r: r.trace.shadow_rays, counts="shadow", internal=True),
     Layer("square", "RGB", AVERAGED, "square of the picture", lambda r: r.image * r.image, internal=True),
 )
 
@@ -88,4 +71,4 @@ def named(source: str) -> frozenset[str]:
 
 def channels(layers: Iterable[str]) -> int:
     """Return the number of float32 values that layers take in a pixel."""
-    return sum(TABLE[name].channels for name in layers)
+    return sum(len(TABLE[name].letters) for name in layers)

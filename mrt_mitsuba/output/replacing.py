@@ -13,7 +13,7 @@ import logging
 import os
 import stat
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path as Folder
 from typing import IO
 
@@ -40,21 +40,12 @@ def check_target(path: Path, inputs: Iterable[Path] = ()) -> None:
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """Give a binary file to write to, which takes the place of ``path`` when all went well.
+def replacing(*paths: Path, inputs: Iterable[Path] = ()) -> Iterator[list[IO[bytes]]]:
+    """Give binary files to write to, which take the places of ``paths``, all of them, when all went well.
 
-    A symbolic link stays and its target is replaced. Whatever is raised inside, the old file is left as it
-    was and no temporary file remains; an ``OSError`` becomes an ``OutputError``.
-    """
-    with replacing_together([path]) as (file,):
-        yield file
-
-
-@contextlib.contextmanager
-def replacing_together(paths: Sequence[Path], inputs: Iterable[Path] = ()) -> Iterator[list[IO[bytes]]]:
-    """Give a file for each of several paths, as ``replacing`` does; all are replaced, or none.
-
-    ``inputs`` as in ``check_target``.
+    A symbolic link stays and its target is replaced. Whatever is raised inside, the old files stay as they
+    were and no temporary file remains; an ``OSError`` becomes an ``OutputError``. ``inputs``: as in
+    ``check_target``.
     """
     with contextlib.ExitStack() as stack:
         files, targets = [], []
@@ -64,15 +55,14 @@ def replacing_together(paths: Sequence[Path], inputs: Iterable[Path] = ()) -> It
                 files.append(stack.enter_context(_temporary(os.path.dirname(targets[-1]))))
         with _explained(*paths):
             yield files
-        for path, file, target in zip(paths, files, targets, strict=True):
-            with _explained(path):
+            for file, target in zip(files, targets, strict=True):
                 file.flush()
                 os.fsync(file.fileno())
                 if os.path.exists(target):
                     os.fchmod(file.fileno(), stat.S_IMODE(os.stat(target).st_mode))
-        with held(), _explained(*paths):  # an interrupt in between is raised afterwards
-            for file, target in zip(files, targets, strict=True):
-                os.replace(file.name, target)
+            with held():  # an interrupt in between is raised afterwards
+                for file, target in zip(files, targets, strict=True):
+                    os.replace(file.name, target)
     for target in targets:
         log.info("wrote %s", target)
 
@@ -98,29 +88,29 @@ def _target(path: Path, inputs: Iterable[Path]) -> str:
     name = os.fspath(path)
     target = os.path.realpath(name)
     folder = os.path.dirname(target)
-    if os.path.exists(folder) and not os.path.isdir(folder):
-        raise OutputError(f"cannot write {name}: {folder} is a file, not a folder; choose another place")
     if not os.path.isdir(folder):
-        raise OutputError(f"cannot write {name}: the folder {folder} does not exist; create it first")
+        problem = "is a file, not a folder; choose another place"
+        problem = problem if os.path.exists(folder) else "does not exist; create it first"
+        raise OutputError(f"cannot write {name}: the place {folder} {problem}")
     try:
         found, around = os.lstat(target), os.stat(folder)
     except FileNotFoundError:
         return target
-    mode, problem = found.st_mode, ""
-    if stat.S_ISLNK(mode):
-        problem = "its symbolic links lead in a circle"
-    elif stat.S_ISDIR(mode):
-        problem = "it is a folder; choose another name"
-    elif not stat.S_ISREG(mode):
-        problem = "it is not a regular file"
-    elif any(os.path.exists(each) and os.path.samefile(target, each) for each in inputs):
-        problem = "what is written is made from this file; choose another name"
-    # The superuser may write to any file; its owner's "read-only" is respected all the same.
-    elif not mode & 0o222 or not os.access(target, os.W_OK):
-        problem = "the file is read-only; remove it or choose another name"
-    elif around.st_mode & stat.S_ISVTX and os.geteuid() not in (0, found.st_uid, around.st_uid):
-        problem = "the file is another user's, and only its owner may replace it here; choose another name"
-    if problem:
+    mode, sticky = found.st_mode, around.st_mode & stat.S_ISVTX
+    problems = {
+        "its symbolic links lead in a circle": stat.S_ISLNK(mode),
+        "it is a folder; choose another name": stat.S_ISDIR(mode),
+        "it is not a regular file": not stat.S_ISREG(mode),
+        "what is written is made from this file; choose another name": any(
+            os.path.exists(each) and os.path.samefile(target, each) for each in inputs
+        ),
+        # The superuser may write to any file; its owner's "read-only" is respected all the same
+        "the file is read-only; remove it or choose another name": not mode & 0o222
+        or not os.access(target, os.W_OK),
+        "the file is another user's, and only its owner may replace it here; choose another name": sticky
+        and os.geteuid() not in (0, found.st_uid, around.st_uid),
+    }
+    for problem in (problem for problem, holds in problems.items() if holds):
         raise OutputError(f"cannot write {name}: {problem}")
     return target
 

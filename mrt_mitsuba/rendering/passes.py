@@ -231,7 +231,7 @@ class Passes:
 
     def _add(self, name: str) -> np.ndarray:
         """Return a new layer, 0 everywhere; all but the picture channel by channel, as an EXR wants them."""
-        shape, channels = self._shape, TABLE[name].channels
+        shape, channels = self._shape, len(TABLE[name].letters)
         planes = np.zeros((*shape, channels) if name == "image" else (channels, *shape), np.float32)
         self.layers[name] = planes if name == "image" else np.moveaxis(planes, 0, -1)
         return self.layers[name]

@@ -13,7 +13,7 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.options import check, choice
-from mrt_mitsuba.output.replacing import replacing_together
+from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.scene.loading import rewrite_file
 from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE, Scene, check_model_options, is_obj
 from mrt_mitsuba.scene.report import report_scene
@@ -108,7 +108,7 @@ def write_xml(
     # What Mitsuba's cameras have no parameters for, and ``render`` reads
     lines = "".join(f'\n    <default name="{name}" value="{value}"/>' for name, value in focus.items())
     text = re.sub("<scene[^>]*>", lambda tag: tag[0] + lines, text, count=1) + "\n"
-    with replacing_together([*files, path], inputs) as opened:
+    with replacing(*files, path, inputs=inputs) as opened:
         for stream, content in zip(opened, (*files.values(), text.encode()), strict=True):
             stream.write(content)
     return [*files, os.fspath(path)]

@@ -101,10 +101,8 @@ def _value(
         values = [float(word) for word in words]
     except ValueError:
         values = []
-    counts = (1, 3) if statement.startswith("K") else (1,)
-    if len(values) not in counts or not all(0 <= value <= LARGEST for value in values):
-        form = f"{' or '.join(map(str, counts))} finite numbers, which must not be negative"
-        raise SceneError(f"{where}: {statement} must have {form}, but is {text[:80]!r}")
-    if len(counts) == 1:
-        return values[0]
-    return values[0], values[len(values) // 2], values[-1]
+    colored = statement.startswith("K")
+    if len(values) not in ((1, 3) if colored else (1,)) or not all(0 <= v <= LARGEST for v in values):
+        form = f"{'one or three numbers' if colored else 'one number'}, finite and not negative"
+        raise SceneError(f"{where}: {statement} must be {form}, but is {text[:80]!r}")
+    return (values[0], values[len(values) // 2], values[-1]) if colored else values[0]

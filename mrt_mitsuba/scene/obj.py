@@ -191,9 +191,12 @@ class _Reader:
         parts: dict[tuple[Material, bool], list[np.ndarray]] = {}
         for faces, kinds, name, line in self.faces:
             counts = np.array([*self.counts.values()])[kinds]
-            for row, _, k in np.argwhere((faces < 0) | (faces >= counts))[:1]:
-                index = f"a {[*_USED][kinds[k]]} index of 0, or beyond the {counts[k]} of the file"
-                self.fail(f"f has {index}; indices count from 1, or back from -1", line + row)
+            for row, corner, k in np.argwhere((faces < 0) | (faces >= counts))[:1]:
+                index, kind = faces[row, corner, k] + 1, [*_USED][kinds[k]]
+                of = f"the {kind} index {index}, but the file has {counts[k]}"
+                if index < 1:
+                    of = f"a {kind} index of 0, or before the first; indices count from 1, or back from -1"
+                self.fail(f"f has {of}", line + row)
             material = self.materials.get(name, DEFAULT_MATERIAL)
             if 1 not in kinds:
                 material = replace(material, texture=None)  # no coordinates to look it up

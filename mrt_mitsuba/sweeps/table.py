@@ -92,7 +92,7 @@ class Table:
                     json.dumps(value, default=word) if isinstance(value, list | tuple) else word(value)
                 )
             writer.writerow(cells)
-        with replacing(self._path) as file:
+        with replacing(self._path) as (file,):
             file.write(text.getvalue().encode())
         self._written = time.monotonic()
 

@@ -115,7 +115,7 @@ import sys, time, types
 class Result:
     def save(self, path, tonemap):
         from mrt_mitsuba.output.replacing import replacing
-        with replacing(path) as file:
+        with replacing(path) as (file,):
             file.write(b"half")
             file.flush()
             work()

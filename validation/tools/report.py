@@ -137,5 +137,5 @@ def cell(value: Any) -> str:
 
 
 def _write(path: Path, data: bytes) -> None:
-    with replacing(path) as file:
+    with replacing(path) as (file,):
         file.write(data)
