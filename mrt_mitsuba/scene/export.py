@@ -42,9 +42,9 @@ def scene_dict(
     given = {"width": (SIDE, width), "height": (SIDE, height), "fresnel": (FRESNEL, fresnel)}
     options = {name: check(name, kind, value) for name, (kind, value) in given.items() if value is not None}
     runtime.use()
-    scene = scene if isinstance(scene, Scene) else report_scene(scene)
-    result = scene.to_dict(**options)
-    return result if flavor == "mrt" else _stock(result, scene)
+    terms = _in_terms(scene, {})
+    result = terms.to_dict(**options)
+    return result if flavor == "mrt" else _stock(result, terms)
 
 
 def write_xml(
@@ -69,49 +69,45 @@ def write_xml(
     for groups of objects (``mrt_group``), which have neither an XML form nor a stock counterpart; and what
     ``render`` raises for a scene or an option.
     """
-    from mrt_mitsuba.scene.obj import model_scene  # with numpy
-
     check("flavor", choice(*FLAVORS), flavor)
     check_model_options(scene, model)
     files: dict[str, bytes] = {}  # of shapes, by their paths
+    focus: dict[str, Any] = {}  # what Mitsuba's cameras have no parameters for, and ``render`` reads
     if isinstance(scene, str | os.PathLike) and not is_obj(scene):
         given = {"fresnel": fresnel, "width": width, "height": height, "flavor=stock": flavor == "stock"}
-        for name in (name for name, value in given.items() if value):
-            raise UsageError(f"{name} is of no use with an XML file, which is written as it is")
+        if useless := [name for name, value in given.items() if value]:
+            raise UsageError(f"{useless[0]} is of no use with an XML file, which is written as it is")
         runtime.use()
         budget = Budget.of(None)
         text, values = rewrite_file(os.fspath(scene), budget, **params or {})
-        focus: dict[str, Any] = {name: values[name] for name in ("focaldist", "focalrange") if name in values}
+        focus = {name: values[name] for name in ("focaldist", "focalrange") if name in values}
         inputs: Iterable[str] = budget.inputs
+    elif params:
+        raise UsageError(f"params: only an XML file declares names, such as {next(iter(params))}")
     else:
-        if params:
-            raise UsageError(f"params: only an XML file declares names, such as {next(iter(params))}")
-        if not isinstance(scene, Scene):
-            scene = model_scene(scene, **model) if is_obj(scene) else report_scene(scene)  # type: ignore[arg-type]
-        nodes = scene_dict(
-            scene, fresnel=fresnel or "schlick", width=width or SIZE[0], height=height or SIZE[1]
-        )
-        for name, node in nodes.items():
-            kind = node["type"] if isinstance(node, dict) else ""
-            if kind == "mrt_group":
-                raise SceneError(
-                    f"{name} cannot be written as XML: mrt_group is made of arrays; render it from Python, "
-                    "or write at most 1000 spheres or 100 objects of another kind"
-                )
-            if kind == "mrt_mesh" or (kind == "mrt_cone" and flavor == "stock"):
-                file = f"{os.path.splitext(os.fspath(path))[0]}_{name}.ply"
-                nodes[name], files[file] = _in_file(node, os.path.basename(file))
-        text = _xml(_stock(nodes, scene) if flavor == "stock" else nodes)
-        focus = {"focaldist": scene.focal_distance, "focalrange": scene.focal_range}
-        focus = focus if scene.focal_distance is not None else {}
-        inputs = scene.files
-    # What Mitsuba's cameras have no parameters for, and ``render`` reads
+        terms = _in_terms(scene, model)
+        size = {"width": width or SIZE[0], "height": height or SIZE[1]}
+        nodes = scene_dict(terms, fresnel=fresnel or "schlick", **size)
+        files = _put_into_files(nodes, os.path.splitext(os.fspath(path))[0], flavor)
+        text = _xml(_stock(nodes, terms) if flavor == "stock" else nodes)
+        if terms.focal_distance is not None:
+            focus = {"focaldist": terms.focal_distance, "focalrange": terms.focal_range}
+        inputs = terms.files
     lines = "".join(f'\n    <default name="{name}" value="{value}"/>' for name, value in focus.items())
     text = re.sub("<scene[^>]*>", lambda tag: tag[0] + lines, text, count=1) + "\n"
     with replacing(*files, path, inputs=inputs) as opened:
         for stream, content in zip(opened, (*files.values(), text.encode()), strict=True):
             stream.write(content)
     return [*files, os.fspath(path)]
+
+
+def _in_terms(scene: Any, model: Mapping[str, Any]) -> Scene:
+    """Return a scene, a number or the path of an OBJ file in the report's terms."""
+    if is_obj(scene):
+        from mrt_mitsuba.scene.obj import model_scene  # with numpy
+
+        return model_scene(scene, **model)
+    return scene if isinstance(scene, Scene) else report_scene(scene)
 
 
 def _xml(nodes: dict[str, Any]) -> str:
@@ -123,17 +119,26 @@ def _xml(nodes: dict[str, Any]) -> str:
     return str(mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(variant), nodes)))
 
 
-def _in_file(node: dict[str, Any], filename: str) -> tuple[dict[str, Any], bytes]:
-    """Return a shape that reads its mesh from a binary PLY file, and the file. Triangles of ``mrt_mesh`` are
-    flat."""
+def _put_into_files(nodes: dict[str, Any], stem: str, flavor: str) -> dict[str, bytes]:
+    """Replace shapes that are meshes by readers of binary PLY files; return these by their paths."""
     import mitsuba as mi
 
-    flat = {"face_normals": True} if node["type"] == "mrt_mesh" else {}
-    stream = mi.MemoryStream()
-    mi.load_dict({name: value for name, value in node.items() if name != "bsdf"}).write_ply(stream)
-    stream.seek(0)
-    shape = {"type": "ply", "filename": filename, **flat, "bsdf": node["bsdf"]}
-    return shape, bytes(stream.read(stream.size()))
+    files: dict[str, bytes] = {}
+    for name, node in nodes.items():
+        kind = node["type"] if isinstance(node, dict) else ""
+        if kind == "mrt_group":
+            raise SceneError(
+                f"{name} cannot be written as XML: mrt_group is made of arrays; render it from Python, or "
+                "write at most 1000 spheres or 100 objects of another kind"
+            )
+        if kind == "mrt_mesh" or (kind == "mrt_cone" and flavor == "stock"):
+            file, bsdf, stream = f"{stem}_{name}.ply", node.pop("bsdf"), mi.MemoryStream()
+            mi.load_dict(node).write_ply(stream)
+            stream.seek(0)
+            files[file] = bytes(stream.read(stream.size()))
+            flat = {"face_normals": True} if kind == "mrt_mesh" else {}
+            nodes[name] = {"type": "ply", "filename": os.path.basename(file), **flat, "bsdf": bsdf}
+    return files
 
 
 def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
@@ -148,12 +153,12 @@ def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
             result[name] = _stock_bsdf(node)
         elif kind == "mrt_light":  # with falloff, of the same irradiance at the camera's target
             squared = sum((a - b) ** 2 for a, b in zip(node["position"], scene.camera.target, strict=True))
-            color = {**node["intensity"], "value": [c * squared for c in node["intensity"]["value"]]}
-            result[name] = {"type": "point", "position": node["position"], "intensity": color}
+            color = {**node["intensity"], "value": _times(squared, node["intensity"]["value"])}
+            result[name] = {**node, "type": "point", "intensity": color}
         elif kind == "mrt_plane":
-            length = math.hypot(*node["normal"])
-            normal = [c / length for c in node["normal"]]
-            square = _facing([-node["distance"] * c for c in normal], normal, STOCK_EXTENT / 2)
+            square = _facing(
+                _times(-node["distance"], _unit(node["normal"])), node["normal"], STOCK_EXTENT / 2
+            )
             result[name] = {"type": "rectangle", "to_world": square, "bsdf": node["bsdf"]}
         elif kind == "mrt_cylinder":  # an open tube, and at each end a disc that faces away from the other
             result[f"{name}_tube"] = {**result.pop(name), "type": "cylinder"}
@@ -186,12 +191,20 @@ def _stock_bsdf(node: dict[str, Any]) -> dict[str, Any]:
     return {"type": "roughplastic", "distribution": "beckmann", **rough, **colors}
 
 
+def _times(factor: float, vector: list[float]) -> list[float]:
+    return [factor * c for c in vector]
+
+
+def _unit(vector: list[float]) -> list[float]:
+    length = math.hypot(*vector)
+    return [c / length for c in vector]
+
+
 def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
     """Return what takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
     import mitsuba as mi
 
-    length = math.hypot(*normal)
-    normal = [c / length for c in normal]
+    normal = _unit(normal)
     up = [0, 0, 1] if abs(normal[2]) < 0.9 else [1, 0, 0]
     to_world = mi.ScalarTransform4f().look_at(center, list(map(operator.add, center, normal)), up)
     return to_world @ mi.ScalarTransform4f().scale([half_size, half_size, 1])

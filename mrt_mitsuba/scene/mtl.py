@@ -98,7 +98,7 @@ def _value(
             findings.setdefault("textures", []).append(missing)
         return None if found is None else str(found)
     try:
-        values = [float(word) for word in words]
+        values = list(map(float, words))
     except ValueError:
         values = []
     colored = statement.startswith("K")

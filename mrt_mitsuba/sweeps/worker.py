@@ -95,7 +95,7 @@ def render_job(job: Job, setting: Setting) -> None:
         outcome = {"error": one_line(f"{type(error).__name__}: {error}"), "again": True}
         raise
     finally:
-        with replacing(f"{scratch}.json") as file:
+        with replacing(f"{scratch}.json") as (file,):
             file.write(json.dumps(outcome | {"worker": worker.address}).encode())
 
 
