@@ -7,6 +7,7 @@ are what it measures, each with its statistic, limit, reason, and the snippet th
 from __future__ import annotations
 
 from collections.abc import Iterable
+from types import SimpleNamespace
 from typing import Any
 
 import mitsuba as mi
@@ -14,17 +15,8 @@ import numpy as np
 from scipy import stats
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.checks import noise
-from mrt_mitsuba.validation.checks.bsdf_case import (
-    FIT,
-    POINTWISE,
-    Case,
-    View,
-    changed,
-    live,
-    narrow,
-    parameters,
-)
+from mrt_mitsuba.validation.checks import bsdf_case, noise
+from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, live, narrow, parameters
 from mrt_mitsuba.validation.checks.bsdf_gradients import gradients
 from mrt_mitsuba.validation.checks.law import LEVEL, RARE, SIGMAS, TIMEOUT, Check, Law, Skip, examine, figures
 from mrt_mitsuba.validation.checks.probe import (
@@ -39,7 +31,7 @@ from mrt_mitsuba.validation.checks.probe import (
     unit,
 )
 from mrt_mitsuba.validation.checks.sphere import DEPTH, Cells, chi_square, encode, integrate
-from mrt_mitsuba.validation.checks.subject import elsewhere, other_kind
+from mrt_mitsuba.validation.checks.subject import VALUES, elsewhere, other_kind
 from mrt_mitsuba.validation.tools.image_tests import sidak
 
 
@@ -65,33 +57,47 @@ def check_bsdf(
 UNRESOLVED = "neither float32 directions nor the samples resolve the lobe"
 SMALL, BROAD = 7, 20.0  # level of cells of a degree; a density per steradian: lobes are then wide against one
 GRAZING = (83, 86, 88, 89.5, 94, 92, 90.5)  # degrees
-
-SAMPLING = """point draw
-r0, r1, phi0, phi1, side = {cell}  # a cell: sqrt(1 - |cos|) and azimuth from ... to, and which hemisphere
+AGAIN = "the same formula, evaluated once more at a rounded direction"
+DRAW = """ctx.mode = mi.TransportMode.Importance
+n = 1_000_000
+rng = mi.PCG32(n)
+bs, weight = bsdf.sample(ctx, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+smooth = ~delta & (bsdf.pdf(ctx, si, bs.wo) > 0)
+"""
+CELL = f"""{DRAW}r0, r1, phi0, phi1, side = {{cell}}  # sqrt(1 - |cos|), azimuth from ... to; which hemisphere
 r, phi = dr.sqrt((bs.wo.x**2 + bs.wo.y**2) / (1 + dr.abs(bs.wo.z))), dr.atan2(bs.wo.y, bs.wo.x)
-inside = (r >= r0) & (r < r1) & (phi >= phi0) & (phi < phi1) & (bs.wo.z * side > 0)
-inside &= (bsdf.pdf(ctx, si, bs.wo) > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+inside = smooth & (r >= r0) & (r < r1) & (phi >= phi0) & (phi < phi1) & (bs.wo.z * side > 0)
 r, phi = r0 + (r1 - r0) * rng.next_float32(), phi0 + (phi1 - phi0) * rng.next_float32()
 sin = r * dr.sqrt(2 - r * r)
 wo = mi.Vector3f(sin * dr.cos(phi), sin * dr.sin(phi), side * (1 - r * r))
 density = dr.mean(bsdf.pdf(ctx, si, wo) * 2 * r)[0] * (r1 - r0) * (phi1 - phi0)
 print("share of samples in the cell:", dr.count(inside)[0] / n, "pdf() says:", density)
 """
-NORMALISED = """point draw
-smooth = (bsdf.pdf(ctx, si, bs.wo) > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+WHOLE = f"""{DRAW}wo = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
 print("share of samples that pdf() stands for:", dr.count(smooth)[0] / n)
-wo = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
 print("integral of pdf() by uniform directions:", dr.mean(bsdf.pdf(ctx, si, wo))[0] * 4 * dr.pi)
+print("albedo by samples:", dr.mean(weight, axis=1))
+print("without lobes of one direction:", dr.mean(dr.select(delta, 0, weight), axis=1))
+print("these by uniform directions:", dr.mean(bsdf.eval(ctx, si, wo), axis=1) * 4 * dr.pi)
+for i in range(bsdf.component_count()):
+    here = delta & (bs.sampled_component == i)
+    stated = dr.sum(dr.select(here, bs.pdf, 0))[0] / max(dr.count(here)[0], 1)
+    print("component", i, "states a probability of", stated, "and its share is", dr.count(here)[0] / n)
+"""
+SAMPLE = """pdf = bsdf.pdf(ctx, si, bs.wo)
+print("a sample of", bs, "weight", weight)
+print("there, pdf():", pdf, "eval() / pdf():", bsdf.eval(ctx, si, bs.wo) / pdf)
 """
 
 
 @figures(
     cells=("at least", "chance of such counts if samples follow pdf(), the least of {angles} angles, for "
-           "their number", LEVEL, RARE, SAMPLING),
+           "their number", LEVEL, RARE, CELL),
     integral=("most", f"integral of pdf() less the share of samples it stands for, beyond {SIGMAS} "
-              "standard errors", FIT, "rational fits of Smith's G1 in use are off by 0.35 %", NORMALISED),
+              "standard errors", FIT, "rational fits of Smith's G1 in use are off by 0.35 %", WHOLE),
     small=("at least", "chance of such counts of all angles in cells of a degree, for their number",
-           LEVEL, RARE, SAMPLING),
+           LEVEL, RARE, CELL),
 )  # fmt: skip
 def sampling(law: Law, case: Case) -> None:
     """Samples against the density: ∫ pdf dω over a cell is the share of samples in it (Pearson's χ²).
@@ -100,32 +106,31 @@ def sampling(law: Law, case: Case) -> None:
     in one place at any incidence.
     """
     case.need_smooth()
-    tests, sums, beyond = [], np.zeros((6, 2)), []
-    for view, found in case.densities:
-        beyond.append(0.0)
-        if found is None:
-            continue
-        (codes, share), count = view.judged, len(view.density) - view.pilot
-        by_width, cell = chi_square(found, codes, count, 0.5 * FIT)
-        sums += by_width
-        tests += [(float(stats.chi2.sf(*test)), view, cell) for test in by_width]
-        off = np.sqrt(share * (1 - share) / count + found.variance.sum())
-        beyond[-1] = max(abs(share - found.mean.sum()) - SIGMAS * off, 0)
+    tests, worst, beyond = [], [], np.zeros(len(case.views))
+    for i, (view, found) in enumerate(zip(case.views, case.densities, strict=True)):
+        if found is not None:
+            count = len(view.density) - view.pilot
+            by_width, cell = chi_square(found, view.codes, count, 0.5 * FIT)
+            tests.append(by_width)
+            worst.append({"wi": view.wi, "uv": view.uv, "cell": cell})
+            off = np.sqrt(view.share * (1 - view.share) / count + found.variance.sum())
+            beyond[i] = max(abs(view.share - found.mean.sum()) - SIGMAS * off, 0)
     if not tests:
         raise Skip(f"{UNRESOLVED} at every angle")
-    p, view, cell = min(tests, key=lambda test: test[0])
-    p = sidak(min(p, *stats.chi2.sf(*sums.T)), len(tests) + len(sums))  # of all angles together, too
-    judged = len(tests) // len(sums)
-    law.hold("cells", p, wi=view.wi, uv=view.uv, cell=cell, angles=judged)
+    chances = stats.chi2.sf(
+        *np.moveaxis([*tests, np.sum(tests, axis=0)], 2, 0)
+    )  # of all angles together, too
+    names = worst[int(chances[:-1].min(axis=1).argmin())]
+    law.hold("cells", sidak(float(chances.min()), chances.size), **names, angles=len(tests))
     law.hold("integral", beyond, **case.incidence)
     views = [view for view in case.views if 0 < view.density.max() < BROAD]
     if views and not case.quick and not is_scalar():
         _in_small_cells(law, case, views)
-    if judged < len(case.views):
-        law.notes.append(f"{UNRESOLVED} at {len(case.views) - judged} angles, which are left out")
+    if len(tests) < len(case.views):
+        law.notes.append(f"{UNRESOLVED} at {len(case.views) - len(tests)} angles, which are left out")
 
 
-def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
+def _in_small_cells(law: Law, case: Case, views: list[SimpleNamespace]) -> None:
     cells = Cells.around(np.zeros(0, np.int64), 0, SMALL)
     wo, omega = cells.points(case.rng)
     seen, expected, variance = np.zeros((3, len(omega)))
@@ -142,26 +147,11 @@ def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
     law.hold("small", sidak(float(p.min()), 2 * len(p)), wi=view.wi, uv=view.uv, cell=cell)
 
 
-WEIGHT = """point sample
-pdf = bsdf.pdf(ctx, si, bs.wo)
-print("a sample of density", bs.pdf, "weight", weight, "and index of refraction", bs.eta)
-print("there, pdf():", pdf, "eval() / pdf():", bsdf.eval(ctx, si, bs.wo) / pdf)
-"""
-DISCRETE = """point draw
-component, stated = np.array(bs.sampled_component), np.array(bs.pdf)
-delta = np.array(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta))
-for i in np.unique(component[delta]):
-    here = delta & (component == i)
-    print("component", i, "states a probability of", stated[here].mean(), "and its share is", here.mean())
-"""
-AGAIN = "the same formula, evaluated once more at a rounded direction"
-
-
 @figures(
-    density=("most", f"density of a sample against pdf(), {BEYOND}", POINTWISE, AGAIN, WEIGHT),
-    weight=("most", f"weight of a sample against eval() / pdf(), {BEYOND}", POINTWISE, AGAIN, WEIGHT),
+    density=("most", f"density of a sample against pdf(), {BEYOND}", POINTWISE, AGAIN, SAMPLE),
+    weight=("most", f"weight of a sample against eval() / pdf(), {BEYOND}", POINTWISE, AGAIN, SAMPLE),
     discrete=("most", f"probability of a single direction (delta) less its share, beyond {SIGMAS} "
-              "standard errors", POINTWISE, "a count", DISCRETE),
+              "standard errors", POINTWISE, "a count", WHOLE),
 )  # fmt: skip
 def weights(law: Law, case: Case) -> None:
     """Density and weight of a sample are ``pdf`` and ``eval`` / ``pdf`` of its direction.
@@ -182,34 +172,25 @@ def weights(law: Law, case: Case) -> None:
         for name, given, function in (("density", drawn.pdf, case.pdf), ("weight", drawn.weight, ratio)):
             error = excess(given, function(*at), case.spread(function, *at))
             law.hold(name, np.where(counts, error, 0), **names)
-    off, deltas = np.zeros(len(case.views)), False
+    off = []
     for i, s in enumerate(view.samples for view in case.views):
-        for kind in np.unique(s.component[s.delta] * 4096 + s.type[s.delta]):
+        for kind in np.unique(s.component[s.delta & s.lit] * 4096 + s.type[s.delta & s.lit]):
             here = s.delta & (s.component * 4096 + s.type == kind)
             stated = float(np.nan_to_num(s.pdf[here].mean()))
             sigma = np.sqrt(max(stated * (1 - stated), 0) / len(here))
-            if s.lit[here].any():
-                off[i], deltas = max(abs(here.mean() - stated) - SIGMAS * sigma, off[i]), True
-    if deltas:
-        law.hold("discrete", off, **case.incidence)
+            off.append((max(abs(here.mean() - stated) - SIGMAS * sigma, 0), i))
+    if off:
+        error, of = np.transpose(off)
+        law.hold("discrete", error, **{name: rows[of.astype(int)] for name, rows in case.incidence.items()})
     if not law.parts:
         raise Skip("no direction of incidence has samples")
 
 
-ALBEDO = """point importance draw
-print("albedo by samples:", dr.mean(weight, axis=1))
-smooth = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), 0, weight)
-print("without lobes of one direction:", dr.mean(smooth, axis=1))
-wo = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-print("these by uniform directions:", dr.mean(bsdf.eval(ctx, si, wo), axis=1) * 4 * dr.pi)
-"""
-
-
 @figures(
     largest=("most", f"largest albedo, less {SIGMAS} standard errors", 1 + FIT,
-             "no more light leaves than arrives; 0.5 % for fits of G1", ALBEDO),
+             "no more light leaves than arrives; 0.5 % for fits of G1", WHOLE),
     apart=("most", "albedo by quadrature of eval() against mean weight, relative, beyond "
-           f"{SIGMAS} standard errors", 2 * FIT, "0.5 % for fits of G1 in the density", ALBEDO),
+           f"{SIGMAS} standard errors", 2 * FIT, "0.5 % for fits of G1 in the density", WHOLE),
 )  # fmt: skip
 def energy(law: Law, case: Case) -> None:
     """The albedo ∫ f |cos θo| dωo is at most 1, and the same by samples and by quadrature.
@@ -223,8 +204,8 @@ def energy(law: Law, case: Case) -> None:
     for i, t in zip(wi, uv, strict=True):
         mean, error = _mean(case.sample(i, case.uniform(count, 3), t, context(importance=True)).weight)
         albedos.append((mean - SIGMAS * error).max())
-    for view, density in case.densities:
-        albedo, off = _albedo(case, view, density)
+    for view, cells in zip(case.views, case.densities, strict=True):
+        albedo, off = _albedo(case, view, cells)
         albedos.append(albedo)
         apart.append(off)
     wi, uv = np.concatenate([wi, case.incidence["wi"]]), np.concatenate([uv, case.incidence["uv"]])
@@ -239,7 +220,7 @@ def _mean(weight: Array) -> tuple[Array, Array]:
     return weight.mean(axis=0), weight.std(axis=0) / np.sqrt(len(weight))
 
 
-def _albedo(case: Case, view: View, cells: Cells | None) -> tuple[float, float]:
+def _albedo(case: Case, view: SimpleNamespace, cells: Cells | None) -> tuple[float, float]:
     """Return an albedo that is surely reached, and how far sampling and quadrature differ; NaN: unknown."""
     mode, count, drawn, holes = context(importance=True), len(view.density), view.samples, []
     if (drawn.wo[:, 2] * view.wi[2] < 0).any():
@@ -266,21 +247,22 @@ def _albedo(case: Case, view: View, cells: Cells | None) -> tuple[float, float]:
 
 # ----------------------------------------------- Values --------------------------------------------------
 
-PAIR = """point wo
+VALUE = """print("eval():", bsdf.eval(ctx, si, wo), "pdf():", bsdf.pdf(ctx, si, wo))
 print("eval_pdf():", bsdf.eval_pdf(ctx, si, wo))
-print("eval():", bsdf.eval(ctx, si, wo), "pdf():", bsdf.pdf(ctx, si, wo))
-"""
-INACTIVE = """point wo
-print("a lane switched off:", bsdf.eval(ctx, si, wo, False), "should be 0")
+print("a lane switched off:", bsdf.eval(ctx, si, wo, False))
+print("the whole:", bsdf.eval(mi.BSDFContext(), si, wo), "flags:", hex(int(bsdf.flags())))
+for ctx.component in range(bsdf.component_count()):
+    flags = hex(int(bsdf.flags(ctx.component)))
+    print("component", ctx.component, bsdf.eval(ctx, si, wo), "flags:", flags)
 """
 TWO_WAYS = "two ways to the same number"
 
 
 @figures(
-    value=("most", f"value of eval_pdf() against that of eval(), {BEYOND}", 1e-4, TWO_WAYS, PAIR),
-    density=("most", f"density of eval_pdf() against that of pdf(), {BEYOND}", 1e-4, TWO_WAYS, PAIR),
+    value=("most", f"value of eval_pdf() against that of eval(), {BEYOND}", 1e-4, TWO_WAYS, VALUE),
+    density=("most", f"density of eval_pdf() against that of pdf(), {BEYOND}", 1e-4, TWO_WAYS, VALUE),
     inactive=("none", "values that are not 0 where active is False", 0,
-              "a sum over lanes must not hold those that are switched off", INACTIVE),
+              "a sum over lanes must not hold those that are switched off", VALUE),
 )  # fmt: skip
 def eval_pdf(law: Law, case: Case) -> None:
     """``eval_pdf`` is ``eval`` and ``pdf``; both ways to a value are 0 where ``active`` is False.
@@ -290,8 +272,8 @@ def eval_pdf(law: Law, case: Case) -> None:
     case.need_smooth()
     p, bsdf = case.pairs, case.plugin
     value, pdf = case.pair(p.wi, p.wo, p.uv)
-    law.hold("value", excess(value, p.value, case.spread(case.eval, p.wi, p.wo, p.uv)), **vars(p))
-    law.hold("density", excess(pdf, p.pdf, case.spread(case.pdf, p.wi, p.wo, p.uv)), **vars(p))
+    law.hold("value", excess(value, p.value, p.value_off), **vars(p))
+    law.hold("density", excess(pdf, p.pdf, p.pdf_off), **vars(p))
     if not is_scalar():  # where Mitsuba takes ``active`` out of its plugins
 
         def inactive(c: Any, si: Any, o: Any) -> list[Any]:
@@ -302,20 +284,14 @@ def eval_pdf(law: Law, case: Case) -> None:
         law.hold("inactive", (values != 0).any(axis=1), **vars(p))
 
 
-RECIPROCITY = """point wo
-eta = {eta}  # index of refraction at wo over that at wi
+RECIPROCITY = """eta = {eta}  # index of refraction at wo over that at wi
 forth = bsdf.eval(ctx, si, wo) / dr.abs(wo.z) * eta**2
+importance = bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), si, wo) / dr.abs(wo.z)
 si.wi, wo = wo, si.wi
 back = bsdf.eval(ctx, si, wo) / dr.abs(wo.z)
-print(forth, "should be", back)
+print(forth, "should be", back, "and in the mode of importance", importance)
 """
-MODES = """point wo
-eta = {eta}  # index of refraction at wo over that at wi
-print("radiance, times eta^2:", bsdf.eval(ctx, si, wo) * eta**2)
-print("importance:", bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), si, wo))
-"""
-DELTA_RECIPROCITY = """point
-# the way back should lead to where it came from, with the same product
+THERE_AND_BACK = """# the way back should lead to where it came from, with the same product
 for u in (({u}), ({back})):
     bs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))
     print(si.wi, "->", bs.wo, "probability x weight x eta^2:", bs.pdf * weight * bs.eta**2)
@@ -327,15 +303,15 @@ EITHER_WAY = "light can be followed either way; transmitted radiance scales by t
 @figures(
     swapped=("most", f"f(wi, wo) against f(wo, wi), {BEYOND}", POINTWISE, EITHER_WAY, RECIPROCITY),
     modes=("most", f"f in the mode of radiance against that of importance, {BEYOND}", POINTWISE, EITHER_WAY,
-           MODES),
-    medium=("most", "index of refraction of reflected samples, less 1", ROUNDED, "one medium", WEIGHT),
+           RECIPROCITY),
+    medium=("most", "index of refraction of reflected samples, less 1", ROUNDED, "one medium", SAMPLE),
     returns=("at least", "share of single directions (delta) that the way back returns to", 0.05,
              "light can be followed either way; of several directions, the way back may draw another",
-             DELTA_RECIPROCITY),
+             THERE_AND_BACK),
     single=("most", f"probability x weight x eta^2 of a single direction (delta) against the way "
-            f"back, {BEYOND}", POINTWISE, EITHER_WAY, DELTA_RECIPROCITY),
+            f"back, {BEYOND}", POINTWISE, EITHER_WAY, THERE_AND_BACK),
     single_modes=("most", "weight of a single direction (delta) x eta^2 against the mode of "
-                  "importance, relative", POINTWISE, EITHER_WAY, DELTA_RECIPROCITY),
+                  "importance, relative", POINTWISE, EITHER_WAY, THERE_AND_BACK),
 )  # fmt: skip
 def reciprocity(law: Law, case: Case) -> None:
     """f(ωi, ωo) η_o² = f(ωo, ωi) η_i², with the indices of the media that the directions are in.
@@ -403,19 +379,12 @@ def _delta_either_way(law: Law, case: Case) -> None:
 COSINES = (1, 1 - 6e-8, 0.5, 1e-2, 1e-4, 1e-7, 0)
 INDICES = ("eta", "k", "int_ior", "ext_ior")
 UNIFORM = (0, 2.0**-24, 0.5, 1 - 2.0**-24)
-
-FINITE = """point wo setting
-print("eval():", bsdf.eval(ctx, si, wo), "pdf():", bsdf.pdf(ctx, si, wo))
-"""
-FINITE_SAMPLE = """point setting sample
-print("weight:", weight, "density:", bs.pdf, "direction:", bs.wo)
-"""
 WRONG, SPOILS = "results not finite, or negative{where}: {faults}", "one such number spoils a picture"
 
 
 @figures(
-    values=("at most", WRONG, 0, SPOILS, FINITE),
-    samples=("at most", WRONG, 0, SPOILS, FINITE_SAMPLE),
+    values=("at most", WRONG, 0, SPOILS, VALUE),
+    samples=("at most", WRONG, 0, SPOILS, SAMPLE),
 )  # fmt: skip
 def finite(law: Law, case: Case) -> None:
     """No NaN, no infinity, nothing negative: extreme directions, random numbers and parameters."""
@@ -439,7 +408,7 @@ def finite(law: Law, case: Case) -> None:
             ends = (0.0, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)
         for end in ends:
             copy = case.copy()
-            with changed(copy, key, lambda old, end=end: type(old)(old * 0 + end)):
+            with bsdf_case.changed(copy, key, lambda old, end=end: type(old)(old * 0 + end)):
                 _finite(law, copy, extremes, known, (key, end))
     law.parts = [part for part in law.parts if not part.holds] or law.parts[:1]
 
@@ -475,8 +444,7 @@ def _finite(law: Law, case: Case, extremes: tuple, known: Array, setting: tuple 
     return faults
 
 
-NOISE = """point wo
-for k in range(9):  # float32 steps in all components: a smooth function would change evenly
+NOISE = """for k in range(9):  # float32 steps in all components: a smooth function would change evenly
     x = (np.array([{wo}], np.float32).view(np.int32) + {stride} * k).view(np.float32)
     print(np.ravel(bsdf.{function}(ctx, si, mi.Vector3f(*map(float, x)))))
 """
@@ -487,9 +455,10 @@ for k in range(9):  # float32 steps in all components: a smooth function would c
 def roundoff(law: Law, case: Case) -> None:
     """Noise of float32 evaluation beyond what the rounding of the directions explains (``noise``)."""
     case.need_smooth()
-    lit = case.pairs.only((np.abs(case.pairs.wi[:, 2]) > 0.1) & (np.abs(case.pairs.wo[:, 2]) > 0.1))
+    p = case.pairs
+    steep = (np.abs(p.wi[:, 2]) > 0.1) & (np.abs(p.wo[:, 2]) > 0.1)
     # far off a lobe, an exponent of 40 makes 40 roundings of one: of nothing
-    lit = lit.only((lit.pdf > 1e-3) & (lit.value.max(axis=1) > 1e-20))
+    lit = p.only(steep & (p.pdf > 1e-3) & (p.value.max(axis=1) > 1e-20))
     few = lit.only(slice(0, case.count(500, 2000)))
     if len(few.pdf) < 20:
         raise Skip("too few pairs of directions with a value")
@@ -516,31 +485,14 @@ def roundoff(law: Law, case: Case) -> None:
 
 # --------------------------------------------- Components ------------------------------------------------
 
-FLAGS = """
-print("flags of the components:", [hex(int(bsdf.flags(i))) for i in range(bsdf.component_count())])
-print("flags of the whole:", hex(int(bsdf.flags())))
-"""
-UPDATED = """
-params = mi.traverse(bsdf)
+UPDATED = """params = mi.traverse(bsdf)
 print("components before:", bsdf.component_count())
 for key in {keys}:
     params[key] = 0.9 * params[key]
 params.update()
 print("and after params.update():", bsdf.component_count())
 """
-PARTS = """point wo
-print("whole:", bsdf.eval(ctx, si, wo))
-for i in range(bsdf.component_count()):
-    ctx.component = i
-    print("component", i, bsdf.eval(ctx, si, wo))
-"""
-SIDE = """point wo component
-print("value:", bsdf.eval(ctx, si, wo), "flags:", hex(int(bsdf.flags(ctx.component))))
-"""
-SAMPLE = """point component sample
-print("flags:", hex(int(bsdf.flags(ctx.component))))
-print("sample:", bs, "weight:", weight)
-"""
+FLAGS = "print([hex(int(bsdf.flags(i))) for i in range(bsdf.component_count())], hex(int(bsdf.flags())))\n"
 SIDES = "reflection stays on its side, transmission crosses, lobes of one direction have no value"
 
 
@@ -549,10 +501,10 @@ SIDES = "reflection stays on its side, transmission crosses, lobes of one direct
            "flags() is the union of flags(i)", FLAGS),
     updated=("at most", "components more or fewer after params.update()", 0,
              "an update says nothing about lobes", UPDATED),
-    sum=("most", "sum of the components against the whole, relative", 1e-4, "a sum", PARTS),
-    values=("none", "results of eval() that contradict the flags of component {component}", 0, SIDES, SIDE),
+    sum=("most", "sum of the components against the whole, relative", 1e-4, "a sum", VALUE),
+    values=("none", "results of eval() that contradict the flags of component {component}", 0, SIDES, VALUE),
     samples=("none", "results of sample() that contradict the flags of component {component}", 0, SIDES,
-             SAMPLE),
+             FLAGS + SAMPLE),
     dark=("at most", "sides that a component's flags name, and from which it is black", 0,
           "a flag without a lobe", FLAGS),
 )  # fmt: skip
@@ -569,8 +521,7 @@ def components(law: Law, case: Case) -> None:
         params.update()
         law.hold("updated", abs(copy.component_count() - len(flags)), keys=keys)
     parts, dark = [case.eval(p.wi, p.wo, p.uv, context(i)) for i in range(len(flags))], 0
-    error = excess(np.sum(parts, axis=0), p.value, case.spread(case.eval, p.wi, p.wo, p.uv))
-    law.hold("sum", error, **vars(p))
+    law.hold("sum", excess(np.sum(parts, axis=0), p.value, p.value_off), **vars(p))
     for i, (flag, value) in enumerate(zip(flags, parts, strict=True)):
         lit = (value != 0).any(axis=1)
         bad = lit & np.isfinite(value).all(axis=1) & ~_allowed(flag, p.wi, p.wo, smooth=True)
@@ -601,18 +552,14 @@ def _allowed(flags: int, wi: Array, wo: Array, *, smooth: bool) -> Array:
 
 # ---------------------------------------------- Variants -------------------------------------------------
 
-VALUES = "each"  # the snippet: value and density in several variants
-
 
 @figures(same=("most", "value and density in {other} against {here}, relative, beyond rounding", POINTWISE,
                "the same formula", VALUES))  # fmt: skip
 def variants(law: Law, case: Case) -> None:
     """Values in the scalar variant, and in the spectral one where colours are grey."""
     here = mi.variant()
-    case.load()
-    few = case.pairs.only(slice(0, case.count(200, 800)))
-    few = few.only(np.isfinite(few.value).all(axis=1))
-    of_value, of_pdf = (case.spread(f, few.wi, few.wo, few.uv) for f in (case.eval, case.pdf))
+    case.with_()
+    few = case.pairs.only(np.isfinite(case.pairs.value).all(axis=1)).only(slice(0, case.count(200, 800)))
     others = [other_kind()] if other_kind() in mi.variants() else []
     if here.endswith("_rgb"):
         if np.ptp(few.value, axis=1).max() <= 1e-5 * few.value.max():
@@ -625,10 +572,10 @@ def variants(law: Law, case: Case) -> None:
         except Skip as reason:
             law.notes.append(str(reason))
             continue
-        expected, allowed = few.value, of_value
+        expected, allowed = few.value, few.value_off
         if not other.endswith("_rgb"):  # the mean of equal channels, however many there are
-            value, expected, allowed = value.mean(axis=1), expected.mean(axis=1), of_value.max(axis=1)
-        error = np.maximum(excess(value, expected, allowed), excess(pdf, few.pdf, of_pdf))
+            value, expected, allowed = value.mean(axis=1), expected.mean(axis=1), allowed.max(axis=1)
+        error = np.maximum(excess(value, expected, allowed), excess(pdf, few.pdf, few.pdf_off))
         law.hold("same", error, variants=(here, other), other=other, here=here, **vars(few))
     if not law.parts:
         raise Skip("; ".join(law.notes) or "no other variant to compare with")
@@ -638,11 +585,8 @@ def variants(law: Law, case: Case) -> None:
                "rounding", 1e-4, "the same formula with the same numbers", VALUES))  # fmt: skip
 def switch(law: Law, case: Case) -> None:
     """Values after a switch to another variant and back, of the BSDF as it was and loaded anew."""
-    here = mi.variant()
+    here, few = mi.variant(), case.pairs.only(slice(0, case.count(1000, 1000)))
     other = next((v for v in ("scalar_rgb", *runtime.usable_variants()) if v != here), None)
-    few = case.pairs.only(slice(0, case.count(1000, 1000)))
-    at = few.wi, few.wo, few.uv
-    before, allowed = case.both(*at), [case.spread(f, *at) for f in (case.eval, case.pdf)]
     if other is None:
         raise Skip("there is no other variant to switch to")
     mi.set_variant(other)
@@ -653,21 +597,22 @@ def switch(law: Law, case: Case) -> None:
     else:
         law.notes.append("a loaded BSDF was given: it was not loaded anew")
     for which, bsdf in candidates.items():
-        after = Probe(bsdf).both(*at)
-        error = np.maximum(*(excess(*three) for three in zip(before, after, allowed, strict=True)))
+        value, pdf = Probe(bsdf).both(few.wi, few.wo, few.uv)
+        error = np.maximum(excess(value, few.value, few.value_off), excess(pdf, few.pdf, few.pdf_off))
         law.hold("same", error, which=which, other=other, variants=(here, other, here), **vars(few))
 
 
-LAWS = {
-    "sampling": sampling,
-    "weights": weights,
-    "eval_pdf": eval_pdf,
-    "energy": energy,
-    "reciprocity": reciprocity,
-    "finite": finite,
-    "roundoff": roundoff,
-    "gradients": gradients,
-    "components": components,
-    "variants": variants,
-    "switch": switch,
-}
+_LAWS = (
+    sampling,
+    weights,
+    eval_pdf,
+    energy,
+    reciprocity,
+    finite,
+    roundoff,
+    gradients,
+    components,
+    variants,
+    switch,
+)
+LAWS = {law.__name__: law for law in _LAWS}

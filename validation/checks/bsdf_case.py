@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -19,14 +19,13 @@ from mrt_mitsuba.validation.checks.probe import (
     Array,
     Lanes,
     Probe,
-    Samples,
     direction,
     is_scalar,
     joined,
     spread,
     unit,
 )
-from mrt_mitsuba.validation.checks.sphere import DEPTH, POINTS, Cells, Integrals, encode, integrate
+from mrt_mitsuba.validation.checks.sphere import DEPTH, POINTS, Cells, encode, integrate
 from mrt_mitsuba.validation.checks.subject import Subject
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
@@ -35,40 +34,6 @@ FIT = 5e-3  # the rational fits of Smith's G₁ in use are off by up to 0.35 %, 
 POINTWISE = 2e-3  # relative, beyond what rounding explains
 OVERLOOKED = 0.02  # share of samples about which quadrature may know nothing; of lobes it resolves, 0.001
 NARROW = 16 * ROUNDED  # width of a lobe that rounded directions do not resolve
-
-
-@dataclass(frozen=True)
-class View:
-    """A direction of incidence at a texture coordinate, and samples drawn for it."""
-
-    wi: Array  # float32 [3]
-    uv: Array  # float32 [2]
-    u: Array  # the random numbers of the samples [N, 3]
-    samples: Samples
-    density: Array  # pdf() at the samples that count: of lobes with a width, not refused; 0 elsewhere [N]
-
-    @property
-    def pilot(self) -> int:
-        """How many of the samples, the first, make the cells in which the others are judged."""
-        return len(self.density) // 4
-
-    @cached_property
-    def judged(self) -> tuple[Array, float]:
-        """Codes of the other samples that count, and their share."""
-        alive = self.density[self.pilot :] > 0
-        return encode(self.samples.wo[self.pilot :][alive]), float(alive.mean())
-
-
-@dataclass(frozen=True)
-class Pairs(Lanes):
-    """N pairs of directions, and what ``eval`` and ``pdf`` give."""
-
-    wi: Array
-    wo: Array
-    uv: Array
-    value: Array  # [N, channels]
-    pdf: Array
-    eta: Array  # index of refraction at wo over that at wi
 
 
 class Case(Subject, Probe):
@@ -83,19 +48,28 @@ class Case(Subject, Probe):
             raise UsageError(f"{kind} is not a BSDF of {mi.variant()}: give a dict or a loaded BSDF")
 
     @cached_property
-    def views(self) -> list[View]:
-        """Samples at every angle of incidence, at random azimuths and texture coordinates."""
+    def views(self) -> list[SimpleNamespace]:
+        """Directions of incidence ``wi`` at all angles, each at a ``uv``, and ``samples`` drawn with ``u``.
+
+        ``density``: pdf() at the samples that count, of lobes with a width and not refused; 0 elsewhere. The
+        first ones (``pilot``) make the cells in which the others are judged, by their ``codes``; ``share``
+        of these count.
+        """
         found = []
         for angle in QUICK_ANGLES if self.quick else ANGLES:
             wi = direction(np.cos(np.radians(angle)), self.rng.uniform(0, 2 * np.pi))
             uv, u = self.uniform(2), self.uniform(self.count(2**16, 2**19), 3)
             samples = self.sample(wi, u, uv)
             value, pdf = self.both(wi, samples.wo, uv)
-            found.append(View(wi, uv, u, samples, np.where(live(wi, samples, value, pdf), pdf, 0)))
+            density, pilot = np.where(live(wi, samples, value, pdf), pdf, 0), len(u) // 4
+            alive = density[pilot:] > 0
+            codes, share = encode(samples.wo[pilot:][alive]), float(alive.mean())
+            view = {"wi": wi, "uv": uv, "u": u, "samples": samples, "density": density, "pilot": pilot}
+            found.append(SimpleNamespace(**view, codes=codes, share=share))
         return found
 
     @cached_property
-    def drawn(self) -> tuple[Samples, dict[str, Array]]:
+    def drawn(self) -> tuple[Lanes, dict[str, Array]]:
         """The first samples of all views, and what they were drawn with."""
         each = self.count(2**12, 2**13)
         names = {name: np.repeat(rows, each, axis=0) for name, rows in self.incidence.items()}
@@ -108,12 +82,15 @@ class Case(Subject, Probe):
         return {name: np.array([getattr(view, name) for view in self.views]) for name in ("wi", "uv")}
 
     @cached_property
-    def densities(self) -> list[tuple[View, Integrals | None]]:
+    def densities(self) -> list[Cells | None]:
         """The integrals of the density for each view, in cells that resolve it; None where none do."""
-        return [(view, self._integrals(view)) for view in self.views]
+        return [self._integrals(view) for view in self.views]
 
-    def _integrals(self, view: View) -> Integrals | None:
-        pilot = view.samples.wo[: view.pilot][view.density[: view.pilot] > 0]
+    def _integrals(self, view: SimpleNamespace) -> Cells | None:
+        pilot, density = (
+            view.samples.wo[: view.pilot][view.density[: view.pilot] > 0],
+            view.density[view.pilot :],
+        )
         # around the mirror direction at all scales, where lobes may be that are not sampled
         around = 10 ** self.rng.uniform(-4, 0, (600, 1)) * self.rng.normal(size=(600, 3))
         seeds = encode(np.concatenate([pilot, unit(view.wi * [-1, -1, 1] + around)]))
@@ -125,16 +102,16 @@ class Case(Subject, Probe):
             centre = (np.hypot(*pilot.T[:2]) < np.sqrt(2) * 0.5**DEPTH).sum()
             if max(held[held > 4 * most].sum(), centre) > 0.01 * len(pilot):
                 return None
-        (codes, share), density = view.judged, view.density[view.pilot :]
-        found = integrate(
-            lambda wo: np.maximum(self.pdf(view.wi, wo, view.uv), 0),
-            cells, self.rng, codes, np.ones(len(codes)), len(density),
-        )  # fmt: skip
+
+        def pdf(wo: Array) -> Array:
+            return np.maximum(self.pdf(view.wi, wo, view.uv), 0)
+
+        found = integrate(pdf, cells, self.rng, view.codes, np.ones(len(view.codes)), len(density))
         # samples in cells of whose points less than two are expected where the lobe is
-        cell = found.find(codes)
+        cell = found.find(view.codes)
         covered = np.bincount(cell, 1 / (len(density) * density[density > 0]), minlength=len(found.start))
         overlooked = (covered * POINTS < 2 * found.solid_angle)[cell].sum() / len(density)
-        return found if found.mean.sum() > share or overlooked < OVERLOOKED else None
+        return found if found.mean.sum() > view.share or overlooked < OVERLOOKED else None
 
     def copy(self) -> Case:
         """Return a case whose parameters can be changed, with a BSDF of its own if it can be loaded."""
@@ -152,8 +129,12 @@ class Case(Subject, Probe):
             raise Skip("all lobes are single directions (delta): eval and pdf are 0")
 
     @cached_property
-    def pairs(self) -> Pairs:
-        """Directions of incidence over the sphere with one exitant each: some sampled, some at random."""
+    def pairs(self) -> Lanes:
+        """Directions over the sphere, ``wi`` and ``wo``, some sampled and some at random, at a ``uv`` each.
+
+        With ``value`` and ``pdf`` there, how far these change as directions are rounded (``value_off``,
+        ``pdf_off``), and ``eta``, the index of refraction at wo over that at wi.
+        """
         count = self.count(2**13, 2**15)
         wi, uv = self.units(count), self.uniform(count, 2)
         samples = self.sample(wi, self.uniform(count, 3), uv)
@@ -166,10 +147,13 @@ class Case(Subject, Probe):
             known = across & side & np.isfinite(samples.eta)
             eta[side & crosses] = np.median(samples.eta[known]) if known.any() else 1
         eta = np.where(across, samples.eta, eta)
-        return Pairs(*[wi, wo, uv, *self.both(wi, wo, uv), eta])
+        value, pdf = self.both(wi, wo, uv)
+        off = self.spread(lambda *at: np.column_stack(self.both(*at)), wi, wo, uv)
+        known = {"value": value, "pdf": pdf, "value_off": off[:, :-1], "pdf_off": off[:, -1]}
+        return Lanes(wi=wi, wo=wo, uv=uv, eta=eta, **known)
 
     @cached_property
-    def lit(self) -> Pairs:
+    def lit(self) -> Lanes:
         """The pairs with a value, away from the horizon, over which values jump."""
         p = self.pairs
         up = (np.abs(p.wo[:, 2]) > 0.05) & (np.abs(p.wi[:, 2]) > 0.05)
@@ -180,7 +164,7 @@ class Case(Subject, Probe):
         return spread(lambda i, o: quantity(i, o, uv, *others), (wi, wo), self.rng)
 
 
-def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:
+def live(wi: Array, s: Lanes, value: Array, pdf: Array) -> Array:
     """Return where samples come from lobes with a width and count for the density.
 
     Weight 0 is how ``sample`` refuses: its direction is then any, or on the wrong side. It may also be that
@@ -195,7 +179,7 @@ def live(wi: Array, s: Samples, value: Array, pdf: Array) -> Array:
     return ~s.delta & np.isfinite(pdf) & (pdf > 0) & ~refused
 
 
-def narrow(wi: Array, s: Samples) -> Array:
+def narrow(wi: Array, s: Lanes) -> Array:
     """Return where samples are of a component whose lobe is narrower than rounded directions resolve."""
     drawn, found = ~s.delta & (s.pdf > 0), np.zeros(len(s.pdf), bool)
     # a lobe of width w along the plane of incidence is w cos θ wide across: density 1 / (w² cos θ)

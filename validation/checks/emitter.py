@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cached_property
-from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -11,29 +10,16 @@ import mitsuba as mi
 import numpy as np
 from scipy import stats
 
+from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.law import LEVEL, RARE, Law, Skip, figures
-from mrt_mitsuba.validation.checks.probe import (
-    BEYOND,
-    ROUNDED,
-    Array,
-    at_wavelengths,
-    excess,
-    is_scalar,
-    lanes,
-    spread,
-)
+from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, excess, lanes
 from mrt_mitsuba.validation.checks.sphere import Cells, chi_square, encode, integrate
 from mrt_mitsuba.validation.checks.subject import Subject, reason
 from mrt_mitsuba.validation.tools.image_tests import sidak
 
 SAME = 1e-3  # relative: the same formula, evaluated once more
-TURNED = 4 * ROUNDED  # a direction passes through angles, a transform, and back
+TURNED = 4 * probe.ROUNDED  # a direction passes through angles, a transform, and back
 LENGTH = 1e-4  # relative: a square root, and the difference of two points
-
-
-# The sampled point and its direction [N, 3], distance, density, pdf_direction() and whether it is a single
-# direction [N], weight and eval_direction() [N, channels]
-NAMES = ("p", "d", "dist", "pdf", "again", "delta", "weight", "value")
 
 
 class Case(Subject):
@@ -50,11 +36,11 @@ class Case(Subject):
         self.around = bool(flags & int(mi.EmitterFlags.Infinite)) and not flags & int(mi.EmitterFlags.Delta)
 
     @cached_property
-    def samples(self) -> SimpleNamespace:
+    def samples(self) -> Lanes:
         return self.sample(self.points)
 
-    def sample(self, points: Array) -> SimpleNamespace:
-        """Return a sample for each point: arrays by ``NAMES``, and where the weight is not 0 (``lit``)."""
+    def sample(self, points: Array) -> Lanes:
+        """Return a sample for each point; ``again``: pdf_direction(), ``value``: eval_direction()."""
 
         def call(p: Any, u: Any) -> list[Any]:
             it = _seen_from(p)
@@ -66,7 +52,8 @@ class Case(Subject):
             found = lanes(call, ("Point3f", points), ("Point2f", self.uniform(len(points), 2)))
         except (NotImplementedError, RuntimeError) as error:
             raise Skip(f"directions cannot be sampled: {reason(error)}") from error
-        return SimpleNamespace(**dict(zip(NAMES, found, strict=True)), lit=(found[6] != 0).any(axis=1))
+        names = ("p", "d", "dist", "pdf", "again", "delta", "weight", "value")
+        return Lanes(**dict(zip(names, found, strict=True)), lit=(found[6] != 0).any(axis=1))
 
     def seen(self, d: Array) -> tuple[Array, Array]:
         """Return the density of directions [N] and the light that is seen there [N, channels]."""
@@ -86,14 +73,14 @@ class Case(Subject):
         s = self.samples
         if not self.around:
             return np.zeros_like(s.pdf), np.zeros_like(s.value)
-        found = spread(lambda d: np.column_stack(self.seen(d)), [s.d], self.rng, TURNED)
+        found = probe.spread(lambda d: np.column_stack(self.seen(d)), [s.d], self.rng, TURNED)
         return found[:, 0], found[:, 1:]
 
 
 def _seen_from(p: Any) -> Any:
     it = dr.zeros(mi.SurfaceInteraction3f)
     it.p = p
-    return at_wavelengths(it)
+    return probe.at_wavelengths(it)
 
 
 @figures(same=("most", f"density of a direction against pdf_direction(), {BEYOND}", SAME, "one number"))
@@ -121,12 +108,12 @@ def sampling(law: Law, case: Case) -> None:
     if not case.around:
         law.notes.append("directions to surfaces are judged with their shapes")
         return
-    count = 2**12 if is_scalar() else 2**18
+    count = 2**12 if probe.is_scalar() else 2**18
     pilot, codes = np.split(encode(case.sample(np.repeat(case.points[:1], count, axis=0)).d), [count // 4])
     cells, ones = Cells.around(pilot, max(len(pilot) // 1000, 8)), np.ones(len(codes))
     integrals = integrate(lambda d: case.seen(d)[0], cells, case.rng, codes, ones, len(codes))
-    tests, _ = chi_square(integrals, codes, len(codes))
-    law.hold("counts", sidak(min(float(stats.chi2.sf(*test)) for test in tests), len(tests)))
+    chances = stats.chi2.sf(*chi_square(integrals, codes, len(codes))[0].T)
+    law.hold("counts", sidak(float(chances.min()), len(chances)))
 
 
 @figures(
@@ -154,4 +141,4 @@ def finite(law: Law, case: Case) -> None:
     law.hold("bad", bad | s.lit & ~((length <= LENGTH) & np.isfinite(s.dist) & (s.pdf >= 0)))
 
 
-LAWS = {"density": density, "sampling": sampling, "weights": weights, "finite": finite}
+LAWS = {law.__name__: law for law in (density, sampling, weights, finite)}

@@ -9,9 +9,9 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -40,8 +40,9 @@ class TimedOut(BaseException):
 
 @dataclass(frozen=True)
 class Part(Bound):
-    """One figure of a law; the note is the reason for its limit, the snippet shows its worst case."""
+    """A figure that was measured; the note is the reason for its limit, the snippet shows its worst case."""
 
+    figure: str = ""  # its name in the law
     snippet: str = ""
 
     @property
@@ -53,25 +54,15 @@ class Part(Bound):
         return over / under if under > 0 else 0.0
 
 
-class Figure(NamedTuple):
-    """A figure of a law: what is held to which limit, why that, and the body of the snippet that shows it.
+def figures(**rows: tuple[Any, ...]) -> Callable[[LawFunction], LawFunction]:
+    """Give a law its figures, by name: how, what is held to which limit, why that, and a snippet's body.
 
-    ``how``: a number "at most" or "at least"; or of N errors the "most", "none" or a "share" of those that
-    are bad, or a quantile, NaN left out.
+    How: a number "at most" or "at least"; or of N errors the "most", "none" or a "share" of those that are
+    bad, or a quantile, NaN left out.
     """
 
-    how: str | float
-    what: str
-    limit: float
-    why: str
-    snippet: str = ""
-
-
-def figures(**rows: tuple[Any, ...]) -> Callable[[LawFunction], LawFunction]:
-    """Give a law its figures, by name."""
-
     def mark(law: LawFunction) -> LawFunction:
-        setattr(law, "figures", {name: Figure(*row) for name, row in rows.items()})  # noqa: B010
+        vars(law)["figures"] = rows
         return law
 
     return mark
@@ -85,7 +76,7 @@ class Law:
     parts: list[Part] = field(default_factory=list)
     skipped: str = ""
     notes: list[str] = field(default_factory=list)
-    figures: Mapping[str, Figure] = field(default_factory=dict)
+    figures: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
     program: Callable[..., str] | None = None  # writes snippets, while the law is checked
 
     def hold(self, name: str, measured: Any, *, limit: Any = None, **names: Any) -> None:
@@ -93,7 +84,7 @@ class Law:
 
         ``names`` fill its words and its snippet: values, or arrays that have a row for each error.
         """
-        how, what, usual, why, body = self.figures[name]
+        how, what, usual, why, *body = self.figures[name]
         if how not in ("at most", "at least"):
             errors = np.asarray(measured, np.float64)
             if isinstance(how, float):
@@ -103,9 +94,10 @@ class Law:
                 i = int(np.where(np.isnan(errors), np.inf, errors).argmax())
                 measured = {"most": errors[i], "none": errors.sum(), "share": errors.mean()}[how]
             names = {key: x[i] if isinstance(x, np.ndarray) else x for key, x in names.items()}
-        snippet = self.program(body, **names) if self.program and body else ""
+        snippet = self.program(*body, **names) if self.program and body else ""
         limit = float(usual if limit is None else limit)
-        self.parts.append(Part(what.format(**names), float(measured), limit, how != "at least", why, snippet))
+        what = what.format(**names)
+        self.parts.append(Part(what, float(measured), limit, how != "at least", why, name, snippet))
 
     @property
     def worst(self) -> Part:
@@ -113,26 +105,15 @@ class Law:
         none = Part("", math.nan, math.nan)
         return max(self.parts, key=lambda part: (not part.holds, part.severity), default=none)
 
+    measured = property(lambda self: self.worst.measured)
+    limit = property(lambda self: self.worst.limit)
+    why = property(lambda self: self.worst.note)
+    snippet = property(lambda self: self.worst.snippet)
+
     @property
     def holds(self) -> bool:
         """Return whether every figure is within its limit; a skipped law does not fail."""
         return bool(self.skipped) or (bool(self.parts) and all(part.holds for part in self.parts))
-
-    @property
-    def measured(self) -> float:
-        return self.worst.measured
-
-    @property
-    def limit(self) -> float:
-        return self.worst.limit
-
-    @property
-    def why(self) -> str:
-        return self.worst.note
-
-    @property
-    def snippet(self) -> str:
-        return self.worst.snippet
 
     @property
     def note(self) -> str:
@@ -175,16 +156,14 @@ class Check:
 
     def study(self) -> Study:
         """Return the findings in the form that pages are made of."""
-        study = Study(self.subject, f"{self.subject}, {self.variant}", seconds=self.seconds)
-        for law in self.laws.values():
-            for part in law.parts:
-                name = f"{law.name}: {part.name}"
-                study.bounds.append(Bound(name, part.measured, part.limit, part.at_most, part.note))
-        rows = [[law.name, law.verdict, law.skipped or law.note] for law in self.laws.values()]
-        study.table("laws", "Laws", ["law", "verdict", "note"], rows, first=True)
-        worst = [[law.name, law.snippet] for law in self.laws.values() if law.snippet and not law.holds]
-        if worst:
-            study.table("snippets", "Worst cases, to run by themselves", ["law", "snippet"], worst)
+        study, laws = Study(self.subject, f"{self.subject}, {self.variant}"), self.laws.values()
+        study.seconds = self.seconds
+        study.bounds += [replace(p, name=f"{law.name}: {p.name}") for law in laws for p in law.parts]
+        rows = [
+            [law.name, law.verdict, law.skipped or law.note, "" if law.holds else law.snippet] for law in laws
+        ]
+        columns = ["law", "verdict", "note", "the worst case, to run by itself"]
+        study.table("laws", "Laws", columns, rows, first=True)
         return study
 
     def save(self, folder: str | Path) -> None:
@@ -217,27 +196,25 @@ def examine(
     start, variant, found, late = time.perf_counter(), mi.variant(), {}, ""
     with settings_restored():
         case = kind(given, quick, seed)
-    for name in [name for name in laws if name in chosen]:
-        figures = getattr(laws[name], "figures", {})
+    for name in (name for name in laws if name in chosen):
+        figures = vars(laws[name]).get("figures", {})
         law = found[name] = Law(name, figures=figures, program=case.program)
-        if late:
-            law.skipped = f"a law before it {late}"
-            continue
         try:
             with settings_restored(), _limited(timeout):
+                if late:
+                    raise Skip(f"a law before it {late}")
                 laws[name](law, case)
         except Skip as reason:
             law.skipped = str(reason)
         except TimedOut:
-            late, why = f"took longer than {timeout:g} s", "a plugin must come to an end"
-            law.parts.append(Part(f"it {late}", math.inf, timeout, note=why))
+            late = f"took longer than {timeout:g} s"
+            law.parts.append(Part(f"it {late}", math.inf, timeout, note="a plugin must come to an end"))
         except Exception as error:
             lines = str(error).strip().splitlines() or [""]
             # Mitsuba quotes the traceback of an error in a Python plugin, with the error last
             line = lines[-1] if lines[0].startswith("Traceback") else lines[0]
             what = f"it raised {type(error).__name__}: {line}"
             law.parts.append(Part(what, math.inf, 0, note="a plugin must not raise"))
-    for law in found.values():
         law.program = None
     return Check(case.name, variant, found, time.perf_counter() - start, quick)
 

@@ -10,11 +10,11 @@ the differences of order k, σ² ≈ γ_k ⟨T_k²⟩, γ_k = (k!)² / (2k)!.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-Array = np.ndarray
+from mrt_mitsuba.validation.checks.probe import Array, Lanes
+
 ROUNDING = 2.0**-24
 ALLOWANCE = 8.0  # roundings that a formula of some dozen operations may make of its own
 LOST = 2.5  # sound formulas stay below 1.6
@@ -25,21 +25,6 @@ COARSE = (2**13, 2**15, 2**17, 2**19)  # the same for stairs on a slope
 TABLES = 1000.0  # roundings: linear interpolation in a table of 64 entries leaves up to 150
 ALIKE = 3  # a kink's noise is four times as large at four times the step
 REACHES = tuple(2**k for k in (2, 5, 8, 11, 13))  # float32 steps to either side, for the slope
-
-
-@dataclass(frozen=True)
-class Noise:
-    """The effect of rounding on a function at N points; all [N], and in roundings (2⁻²⁴) of its value."""
-
-    value: Array
-    noise: Array  # found by differences
-    explained: Array  # what rounding of the inputs alone would do
-    stride: Array  # the most float32 steps between points of its line
-
-    @property
-    def lost(self) -> Array:
-        """Return noise over what inputs, rounded twice, and ``ALLOWANCE`` other roundings explain."""
-        return np.nan_to_num(self.noise / np.hypot(2 * self.explained, ALLOWANCE), posinf=0)
 
 
 def ecnoise(lines: Array, *, coarse: bool = False) -> Array:
@@ -82,8 +67,12 @@ def measure(
     strides: Sequence[int] = STRIDES,
     seed: int = 0,
     project: Callable[[Array], Array] | None = None,
-) -> Noise:
-    """Estimate the noise of ``function([M, K]) -> [M]`` at float32 inputs [N, K], and what they explain.
+) -> Lanes:
+    """Estimate the noise of ``function([M, K]) -> [M]`` at float32 inputs [N, K].
+
+    Return the ``noise`` found by differences and what rounding of the inputs alone would do (``explained``),
+    both in roundings (2⁻²⁴) of the value; the noise over what inputs, rounded twice, and ``ALLOWANCE`` other
+    roundings explain (``lost``); and the most float32 steps between points of a line (``stride``).
 
     ``size`` [N]: what roundings are of, the value itself if left out. ``strides``: the most float32 steps
     between points of a line, in ascending order; the first counts along which the value changes at half of
@@ -123,4 +112,6 @@ def measure(
         small, large = np.minimum(stairs[:-1], stairs[1:]), np.maximum(stairs[:-1], stairs[1:])
         both = np.where((large <= ALIKE * small) & (small > TABLES * unit), small, 0).max(axis=0)
         noise = np.where(np.nan_to_num(noise) < both, both, noise)
-    return Noise(line[0], noise / unit, explained / unit, np.take(strides, chosen))
+    noise, explained = noise / unit, explained / unit
+    lost = np.nan_to_num(noise / np.hypot(2 * explained, ALLOWANCE), posinf=0)
+    return Lanes(noise=noise, explained=explained, lost=lost, stride=np.take(strides, chosen))

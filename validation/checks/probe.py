@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import drjit as dr
@@ -15,43 +15,20 @@ from mrt_mitsuba.plugins.lookup import aligned
 Array = np.ndarray
 ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32
 BEYOND = "relative, beyond 8 times what the rounding of directions explains"  # as ``excess`` has it
-Kept = TypeVar("Kept", bound="Lanes")
+Part = TypeVar("Part", bound="Lanes")
 
 
-class Lanes:
-    """The base of dataclasses of arrays that have a row for each lane."""
+class Lanes(SimpleNamespace):
+    """Arrays by name that have a row for each of N lanes."""
 
-    def only(self: Kept, keep: Any) -> Kept:
+    def only(self: Part, keep: Any) -> Part:
         """Return some of the lanes."""
-        return type(self)(*(value[keep] for value in vars(self).values()))
+        return type(self)(**{name: column[keep] for name, column in vars(self).items()})
 
 
-def joined(parts: Sequence[Kept]) -> Kept:
-    """Return the lanes of several dataclasses, one after the other."""
-    columns = zip(*(vars(part).values() for part in parts), strict=True)
-    return type(parts[0])(*(np.concatenate(column) for column in columns))
-
-
-@dataclass(frozen=True)
-class Samples(Lanes):
-    """The returned values of ``sample`` for N lanes."""
-
-    wo: Array  # [N, 3]
-    pdf: Array  # [N]
-    eta: Array  # [N]
-    type: Array  # int [N]
-    component: Array  # int [N]
-    weight: Array  # [N, channels]
-
-    @property
-    def delta(self) -> Array:
-        """Where the sample comes from a lobe that is one direction only. [N]"""
-        return (self.type & int(mi.BSDFFlags.Delta)) != 0
-
-    @property
-    def lit(self) -> Array:
-        """Where the weight is not 0. [N]"""
-        return (self.weight != 0).any(axis=1)
+def joined(parts: Sequence[Part]) -> Part:
+    """Return the lanes of several, one after the other."""
+    return type(parts[0])(**{name: np.concatenate([vars(p)[name] for p in parts]) for name in vars(parts[0])})
 
 
 def is_scalar() -> bool:
@@ -112,15 +89,21 @@ class Probe:
         """Return what ``eval_pdf`` gives."""
         return self.ask(lambda *at: self.plugin.eval_pdf(*at), wi, wo, uv, ctx)
 
-    def sample(self, wi: Array, u: Array, uv: Array, ctx: Any = None) -> Samples:
-        """Return what ``sample`` gives."""
+    def sample(self, wi: Array, u: Array, uv: Array, ctx: Any = None) -> Lanes:
+        """Return what ``sample`` gives: ``wo`` [N, 3], ``weight`` [N, channels], the others [N].
+
+        ``delta``: whether it is from a lobe of one direction only; ``lit``: whether its weight is not 0.
+        """
 
         def call(c: Any, si: Any, u: Any) -> list[Any]:
             bs, weight = self.plugin.sample(c, si, u.x, mi.Point2f(u.y, u.z))
             return [bs.wo, bs.pdf, bs.eta, bs.sampled_type, bs.sampled_component, weight]
 
         wo, pdf, eta, kind, component, weight = self.ask(call, wi, u, uv, ctx)
-        return Samples(wo, pdf, eta, kind.astype(np.int64), component.astype(np.int64), weight)
+        kind, component = kind.astype(np.int64), component.astype(np.int64)
+        delta, lit = (kind & int(mi.BSDFFlags.Delta)) != 0, (weight != 0).any(axis=1)
+        columns = {"wo": wo, "pdf": pdf, "eta": eta, "type": kind, "component": component, "weight": weight}
+        return Lanes(**columns, delta=delta, lit=lit)
 
 
 def not_finite(*values: Any, least: float = -np.inf) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -97,8 +97,7 @@ def check_scene(
     runtime.use()
     source = open_scene(scene, **options)
     kinds, instances = _plugins(source.scene)
-    checks: dict[str, Callable[..., Check]]
-    checks = {"BSDF": check_bsdf, "shape": check_shape, "emitter": partial(_check_emitter, source.scene)}
+    laws = {"BSDF": check_bsdf, "shape": check_shape, "emitter": partial(_check_emitter, source.scene)}
     found: dict[str, Check] = {}
     chosen = {kind: range(0, len(alike), max(len(alike) // ALIKE, 1)) for kind, alike in kinds.items()}
     with (progress or Progress()).stage("Laws", sum(map(len, chosen.values()))) as advance:
@@ -106,8 +105,7 @@ def check_scene(
             plugin = kinds[kind][number]
             name = f"{kind} {plugin.id() or number}"
             name = name if name not in found else f"{name} ({number})"
-            check = checks[kind.split()[0]](plugin, quick=quick, seed=seed)
-            found[name] = replace(check, subject=name)
+            found[name] = replace(laws[kind.split()[0]](plugin, quick=quick, seed=seed), subject=name)
             advance(1)
     more = {kind: len(alike) - len(chosen[kind]) for kind, alike in kinds.items()}
     left_out = [f"{n} more of {kind} are like those that were checked" for kind, n in more.items() if n]
@@ -118,14 +116,13 @@ def check_scene(
 
 def _plugins(scene: Any) -> tuple[dict[str, list[Any]], int]:
     """Return the BSDFs, shapes and emitters of a scene, each once, by kind, and how many instances it has."""
-    every = scene.shapes()
-    shapes = [shape for shape in every if shape.class_name() != "Instance"]
+    shapes = [shape for shape in scene.shapes() if shape.class_name() != "Instance"]
     bsdfs = {str(id(b)): b for b in (shape.bsdf() for shape in shapes) if b is not None}.values()
     kinds: dict[str, list[Any]] = {}
     for word, plugins in (("BSDF", bsdfs), ("shape", shapes), ("emitter", scene.emitters())):
         for plugin in plugins:
             kinds.setdefault(f"{word} {class_name(plugin)}", []).append(plugin)
-    return kinds, len(every) - len(shapes)
+    return kinds, len(scene.shapes()) - len(shapes)
 
 
 def _check_emitter(scene: Any, plugin: Any, *, quick: bool, seed: int) -> Check:
@@ -165,11 +162,12 @@ def _bad(source: Any, spp: int, seed: int) -> np.ndarray:
 @contextmanager
 def _cropped(sensor: Any, crop: tuple[int, int, int, int]) -> Iterator[None]:
     """Crop the film for a while."""
-    params = mi.traverse(sensor)
-    before = {key: type(params[key])(params[key]) for key in ("film.crop_size", "film.crop_offset")}
+    params, keys = mi.traverse(sensor), ("film.crop_size", "film.crop_offset")
+    before = [type(params[key])(params[key]) for key in keys]
 
-    def change(size: Any, offset: Any) -> None:
-        params["film.crop_size"], params["film.crop_offset"] = size, offset
+    def change(*values: Any) -> None:
+        for key, value in zip(keys, values, strict=True):
+            params[key] = value
         params.update()
         sensor.parameters_changed()
 
@@ -177,17 +175,16 @@ def _cropped(sensor: Any, crop: tuple[int, int, int, int]) -> Iterator[None]:
     try:
         yield
     finally:
-        change(before["film.crop_size"], before["film.crop_offset"])
+        change(*before)
 
 
 def _culprit(source: Any, spp: int, seed: int) -> str:
     """Follow paths through the crop, and name the object whose own numbers are first not finite."""
     if mi.variant().startswith("scalar"):
         return "something that scalar variants do not reveal: check it in a vectorised one"
-    counts: Counter[str] = Counter()
     pixels = int(np.prod(np.array(source.sensor.film().crop_size())))
     for attempt in range(8):
-        counts.update(_follow(source, min(max(spp, 2**12) * pixels, 2**20), seed + attempt))
+        counts = _follow(source, min(max(spp, 2**12) * pixels, 2**20), seed + attempt)
         if counts:
             return counts.most_common(1)[0][0]
     return "no object's own numbers: by the integrator, or a sum that overflows"
@@ -196,36 +193,35 @@ def _culprit(source: Any, spp: int, seed: int) -> str:
 def _follow(source: Any, count: int, seed: int) -> Counter[str]:
     """Trace one batch of paths; return how often each object was the first to give an infinity or NaN."""
     scene, ctx, rng = source.scene, mi.BSDFContext(), mi.PCG32(count, initstate=seed)
+    counts: Counter[str] = Counter()
     active, draw = mi.Bool(True), rng.next_float32
     # the unit square covers the crop of a cropped film
     ray, _ = source.sensor.sample_ray(draw(), draw(), mi.Point2f(draw(), draw()), mi.Point2f(draw(), draw()))
-    counts: Counter[str] = Counter()
 
-    def note(bad: Any, name: Callable[[Any], str], pointers: Any, plugins: Iterable[Any]) -> Any:
-        bad &= active
-        if dr.any(bad):
-            for plugin in plugins:
-                counts[name(plugin)] += int(dr.count(bad & (pointers == type(pointers)(plugin)))[0])
+    def sound(name: Callable[[Any], str], pointers: Any, *values: Any) -> Any:
+        """Return where values are finite, and count those that are not for the objects of ``pointers``."""
+        bad, plugins = active & not_finite(*values), scene.emitters() if name is _emitter else scene.shapes()
+        for plugin in plugins if dr.any(bad) else ():
+            counts[name(plugin)] += int(dr.count(bad & (pointers == type(pointers)(plugin)))[0])
         return ~bad
-
-    shapes, emitters = scene.shapes(), scene.emitters()
 
     for _ in range(DEPTH):
         si = scene.ray_intersect(ray, active)
         met = si.emitter(scene, active)
-        active &= note(not_finite(met.eval(si, active)), _emitter, met, emitters)
+        active &= sound(_emitter, met, met.eval(si, active))
         active &= si.is_valid()
-        bad = not_finite(si.p, si.n, si.sh_frame.n, si.uv)
-        active &= note(bad, lambda shape: f"the shape {_name(shape)}", si.shape, shapes)
+        active &= sound(lambda shape: f"the shape {_name(shape)}", si.shape, si.p, si.n, si.sh_frame.n, si.uv)
         ds, light = scene.sample_emitter_direction(si, mi.Point2f(draw(), draw()), True, active)
-        active &= note(not_finite(light), _emitter, ds.emitter, emitters)
+        active &= sound(_emitter, ds.emitter, light)
         bsdf = si.bsdf(ray)
         value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active & (ds.pdf > 0))
         bs, weight = bsdf.sample(ctx, si, draw(), mi.Point2f(draw(), draw()), active)
-        lit = dr.any(mi.unpolarized_spectrum(weight) != 0)
-        bad = not_finite(mi.unpolarized_spectrum(value), pdf, mi.unpolarized_spectrum(weight))
-        bad |= lit & not_finite(bs.wo, bs.pdf)
-        active &= lit & note(bad, lambda s: f"the BSDF {_name(s.bsdf())}, on {_name(s)}", si.shape, shapes)
+        value, weight = mi.unpolarized_spectrum(value), mi.unpolarized_spectrum(weight)
+        lit = dr.any(weight != 0)
+        drawn = dr.select(lit, bs.wo, 0), dr.select(lit, bs.pdf, 0)
+        active &= lit & sound(
+            lambda s: f"the BSDF {_name(s.bsdf())}, on {_name(s)}", si.shape, value, pdf, weight, *drawn
+        )
         ray = si.spawn_ray(si.to_world(bs.wo))
         dr.eval(ray, active, rng)
         if not dr.any(active):

@@ -17,18 +17,7 @@ from mrt_mitsuba.validation.checks import noise
 from mrt_mitsuba.validation.checks.law import LEVEL, RARE, SIGMAS, TIMEOUT, Check, Law, Skip, examine, figures
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import Array, lanes, unit
-from mrt_mitsuba.validation.checks.shape_case import (
-    FLAT,
-    Case,
-    Hits,
-    dot,
-    leave,
-    mesh,
-    near,
-    offset,
-    trace,
-    walk,
-)
+from mrt_mitsuba.validation.checks.shape_case import FLAT, Case, dot, leave, near, offset, trace, walk
 from mrt_mitsuba.validation.checks.subject import Kept, elsewhere, other_kind, reason
 from mrt_mitsuba.validation.tools.image_tests import sidak
 
@@ -40,8 +29,10 @@ FAR = 1e4  # sizes away
 SMOOTHED = ("SDFGrid", "BSplineCurve", "LinearCurve", "Instance")
 DIGITS = f"over that of {noise.ALLOWANCE:g} roundings with a rounded ray, 9 in 10"
 
-RAY = """ray
-print(scene.ray_intersect(mi.Ray3f(o, d)))
+RAY = """si = scene.ray_intersect(mi.Ray3f(o, d))
+print(si)
+back = scene.ray_intersect(mi.Ray3f(si.spawn_ray(d).o, -d))
+print("from just behind:", back.n, "at", back.t)
 """
 
 
@@ -62,8 +53,7 @@ def check_shape(
     return examine(Case, shape, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
 
 
-MAXT = """ray
-ray = mi.Ray3f(o, d)
+MAXT = """ray = mi.Ray3f(o, d)
 print("meets the surface at", scene.ray_intersect(ray).t)
 ray.maxt = float("{maxt}")
 print("up to", ray.maxt, "ray_test():", scene.ray_test(ray), "ray_intersect():", scene.ray_intersect(ray).t)
@@ -94,9 +84,8 @@ def hits(law: Law, case: Case) -> None:
             return [case.target.ray_test(ray), case.target.ray_intersect(ray).is_valid()]
 
         answers = lanes(call, ("Point3f", o), ("Vector3f", d), ("Float", maxt))
-        steep = ~seen.found | (np.abs(dot(seen.n, d)) > FLAT)
         for name, answer in zip(("ray_test", "ray_intersect"), answers, strict=True):
-            wrong = steep & (answer != (seen.found & (reach > 1)))
+            wrong = (~seen.found | seen.steep) & (answer != (seen.found & (reach > 1)))
             law.hold(name, wrong, limit=5e-4 if np.isinf(reach) else 0, o=o, d=d, maxt=maxt, rays=rays)
 
 
@@ -166,13 +155,7 @@ def _from_near_by(law: Law, case: Case) -> None:
             law.hold(name, np.where(known, error / (ROUNDING * largest), np.nan), o=close, d=d)
 
 
-BEHIND = """ray
-si = scene.ray_intersect(mi.Ray3f(o, d))
-back = scene.ray_intersect(mi.Ray3f(si.spawn_ray(d).o, -d))
-print("from the front:", si.n, "and from just behind:", back.n, "at", back.t)
-"""
-NEIGHBOUR = """ray
-aside = mi.Vector3f({aside})
+NEIGHBOUR = """aside = mi.Vector3f({aside})
 si = scene.ray_intersect(mi.Ray3f(o, d))
 near = scene.ray_intersect(mi.Ray3f(o + 1e-3 * {size} * aside, d))
 step, uv = near.p - si.p, near.uv - si.uv
@@ -187,10 +170,10 @@ PARTED = "extrapolated to no step; edges may part neighbours"
               "a closed shape has an outside; what edges hide is left room for", RAY),
     length=("most", "length of a normal less 1", NORMAL, "a square root and a quotient", RAY),
     side=("none", "shading normals on the other side than the geometric one", 0, "one surface", RAY),
-    shading=(0.9, "shading normal against the geometric one, or the interpolated one of a mesh, 9 in 10",
+    shading=(0.9, "shading normal against the geometric one, but for smoothed meshes, 9 in 10",
              TILTED, "the same, but for some roundings", RAY),
     turned=("share", "share of normals that turn where the same point is met from behind", 1e-3,
-            "a surface has one normal; thin parts are left room for", BEHIND),
+            "a surface has one normal; thin parts are left room for", RAY),
     slant=("most", "cosine between the normal and a partial derivative of the point", 1e-3,
            "both are known to a few roundings; near a pole the derivatives are short", RAY),
     slope=(0.95, "slope of the surface against its normal, by differences, 95 in 100", 1e-2, PARTED,
@@ -210,9 +193,10 @@ def normals(law: Law, case: Case) -> None:
     length = np.linalg.norm(np.stack([met.n, met.shading]).astype(np.float64), axis=-1)
     law.hold("length", np.abs(length - 1).max(axis=0), o=o, d=d)
     law.hold("side", dot(met.n, met.shading) <= 0, o=o, d=d)
-    expected = _interpolated(case, met)
-    if expected is not None:
-        law.hold("shading", np.linalg.norm(met.shading - expected, axis=1), o=o, d=d)
+    shape = case.plugin if isinstance(case.plugin, mi.Shape) else None
+    smoothed = isinstance(shape, mi.Mesh) and shape.has_vertex_normals()
+    if not smoothed and (shape is None or shape.class_name() not in SMOOTHED):
+        law.hold("shading", np.linalg.norm(met.shading - met.n, axis=1), o=o, d=d)
     # the normal is the surface's, not the ray's: the same for a ray that comes back from behind
     back = case.behind
     same = back.found & near(met.p, back.p) & (back.part == met.part)
@@ -223,27 +207,6 @@ def normals(law: Law, case: Case) -> None:
         slant = np.maximum(*(np.abs(dot(unit(v), met.n)) for v in (met.du, met.dv)))
         law.hold("slant", np.where(usable & np.isfinite(slant), slant, 0), o=o, d=d)
     _differences(law, case)
-
-
-def _interpolated(case: Case, met: Hits) -> Array | None:
-    """Return what shading normals should be; None where the shape is smoothed in a way of its own."""
-    shape = case.plugin
-    if isinstance(shape, mi.Shape) and shape.class_name() in SMOOTHED:
-        return None
-    if not isinstance(shape, mi.Mesh) or not shape.has_vertex_normals():
-        return met.n
-    found = mesh(shape, "vertex_normals")
-    if found is None:
-        return None
-    vertex, faces, normal = (x.astype(np.float64) for x in found)
-    faces = faces.astype(int)[met.part.astype(int)]
-    a, b, c = (vertex[faces[:, k]] for k in range(3))
-    across = np.cross(b - a, c - a)
-    v, w = (
-        dot(np.cross(x, y), across) / dot(across, across) for x, y in ((met.p - a, c - a), (b - a, met.p - a))
-    )
-    mixed = np.einsum("kn,nkx->nx", np.stack([1 - v - w, v, w]), normal[faces])
-    return (-1 if shape.has_flipped_normals() else 1) * mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
 
 
 def _differences(law: Law, case: Case) -> None:
@@ -269,7 +232,7 @@ def _differences(law: Law, case: Case) -> None:
 
 @figures(
     blind=("share", "share of rays that pass the surface from behind", 1e-2,
-           "it has two sides; edges have room", BEHIND),
+           "it has two sides; edges have room", RAY),
     odd=("share", "share of lines, of {judged}, that cross the surface an odd number of times", 1e-3,
          "near sharp edges, the offset of a ray that goes on leads out again; grazing lines are left out",
          RAY),
@@ -280,7 +243,7 @@ def watertight(law: Law, case: Case) -> None:
     """Lines enter and leave in turn, and no ray from inside gets out without a hit."""
     o, d, met = case.met
     # else such a ray may fall off an edge, or its offset be larger than the shape
-    steep = (np.abs(dot(met.n, d)) > 0.5) & (offset(met.p) < 1e-3 * case.size)
+    steep = (np.abs(met.cos) > 0.5) & (offset(met.p) < 1e-3 * case.size)
     blind = steep & ~case.behind.found
     if blind.mean() > 1e-2:
         law.hold("blind", blind, o=o, d=d)
@@ -291,7 +254,7 @@ def watertight(law: Law, case: Case) -> None:
     law.hold("odd", judged & ~even, o=o, d=d, judged=judged.sum())
     inside = np.zeros((0, 3), np.float32)
     if len(case.crossings) > 1:  # points well inside: middles of the longer first chords
-        (first, enter, _), (second, leaving, _) = case.crossings[:2]
+        (first, enter), (second, leaving) = case.crossings[:2]
         _, i, j = np.intersect1d(first, second, return_indices=True)
         chord = np.linalg.norm(enter.p[i] - leaving.p[j], axis=1)
         inside = ((enter.p[i] + leaving.p[j]) / 2)[chord >= np.median(chord)].astype(np.float32)
@@ -301,14 +264,11 @@ def watertight(law: Law, case: Case) -> None:
     count = case.count(10**5, 10**6)
     o, d = inside[case.rng.integers(len(inside), size=count)], case.units(count)
     out = ~trace(case.target, o, d).found
-    surely = (
-        stats.beta.ppf(LEVEL, out.sum(), count - out.sum() + 1) if out.any() else 0
-    )  # Clopper and Pearson
+    surely = stats.binomtest(int(out.sum()), count).proportion_ci(1 - 2 * LEVEL).low  # Clopper and Pearson
     law.hold("out", surely, o=o[out.argmax()], d=d[out.argmax()], count=count)
 
 
-SCALED = """ray
-print("as it is, t:", scene.ray_intersect(mi.Ray3f(o, d)).t)
+SCALED = """print("as it is, t:", scene.ray_intersect(mi.Ray3f(o, d)).t)
 shape = load(to_world=mi.ScalarTransform4f({matrix}))
 scene = mi.load_dict({{"type": "scene", "shape": shape}})
 print("scaled, t over the scale:", scene.ray_intersect(mi.Ray3f(o * 2.0**{power}, d)).t / 2.0**{power})
@@ -327,7 +287,6 @@ def scale(law: Law, case: Case) -> None:
     matrix = given.values if isinstance(given, Kept) else np.eye(4)
     few = slice(0, case.count(2**12, 2**14))
     o, d, seen = case.seen[0][few], case.seen[1][few], case.seen[2].only(few)
-    steep = ~seen.found | (np.abs(dot(seen.n, d)) > FLAT)
     for power in (-20, -10, 10, 20):
         larger = np.diag([2.0**power] * 3 + [1]) @ matrix
         try:
@@ -339,15 +298,15 @@ def scale(law: Law, case: Case) -> None:
             raise Skip("to_world does not scale all of it (of curves, the radius stays)")
         scene = case.scene(to_world=mi.ScalarTransform4f(larger))
         there = trace(scene, (o * 2.0**power).astype(np.float32), d)
-        both = steep & there.found & seen.found
+        both = seen.steep & there.found
         apart = np.abs(there.t / 2.0**power - seen.t) / np.where(both, seen.t, 1)
         error = np.where(both, np.maximum(apart, 1 - dot(there.n, seen.n)), 0)
-        for name, errors in (("answer", steep & (there.found != seen.found)), ("off", error)):
+        otherwise = (~seen.found | seen.steep) & (there.found != seen.found)
+        for name, errors in (("answer", otherwise), ("off", error)):
             law.hold(name, errors, o=o, d=d, power=power, matrix=larger.tolist())
 
 
-TWICE = """ray
-for o in (o, mi.Point3f({other})):
+TWICE = """for o in (o, mi.Point3f({other})):
     dr.make_opaque(o)
     print("from", o, "it is met at", scene.ray_intersect(mi.Ray3f(o, d)).p)
 """
@@ -363,7 +322,7 @@ def far(law: Law, case: Case) -> None:
     origin = (goal - distance * d.astype(np.float64)).astype(np.float32)
     closer = (origin + (FAR - 1.5) * case.size * d.astype(np.float64)).astype(np.float32)
     there, here = trace(case.target, origin, d), trace(case.target, closer, d)
-    cos = np.abs(dot(here.n, d))
+    cos = np.abs(here.cos)
     error = np.linalg.norm(there.p.astype(np.float64) - here.p, axis=1) * cos / (ROUNDING * distance)
     bad = here.found & (cos > 4 * FLAT) & (~there.found | (error > HIT_ROUNDINGS))
     # a rounded origin moves the line: only what all lines around it meet counts
@@ -386,7 +345,7 @@ def finite(law: Law, case: Case) -> None:
         met.p[pick(len(met.p), size=count)],
         case.middle + case.size * 10.0 ** case.rng.uniform(0, 5, (count, 1)) * case.units(count),
     ]
-    if case.corners is not None:
+    if len(case.corners):
         kinds.append(case.corners[pick(len(case.corners), size=count)])
     o = np.choose(pick(len(kinds), size=count)[:, None], kinds).astype(np.float32)
     d = case.units(count)
@@ -405,10 +364,8 @@ def finite(law: Law, case: Case) -> None:
 def bbox(law: Law, case: Case) -> None:
     """Whatever is hit or sampled lies in the bounding box."""
     o, d, met = case.met
-    points = [met.p]
-    if case.corners is not None:
-        points.append(case.corners)
-    elif hasattr(case.plugin, "sample_position"):
+    points = [met.p, case.corners]
+    if not len(case.corners) and hasattr(case.plugin, "sample_position"):
         try:
             u = case.uniform(len(o), 2)
             points += lanes(lambda x: [case.plugin.sample_position(0, x).p], ("Point2f", u))
@@ -431,16 +388,14 @@ def variants(law: Law, case: Case) -> None:
     few, other = slice(0, case.count(500, 2000)), other_kind()
     o, d, seen = case.seen[0][few], case.seen[1][few], case.seen[2].only(few)
     there = elsewhere(other, lambda: trace(case.scene(), o, d))
-    steep = np.abs(dot(seen.n, d)) > FLAT
-    law.hold("answer", (there.found != seen.found) & (steep | ~seen.found), o=o, d=d, other=other)
+    law.hold("answer", (there.found != seen.found) & (seen.steep | ~seen.found), o=o, d=d, other=other)
     error = np.abs(there.t - seen.t) / (ROUNDING * (np.abs(o).max(axis=1) + seen.t))
-    law.hold("distance", np.where(there.found & seen.found & steep, error, 0), o=o, d=d, other=other)
+    law.hold("distance", np.where(there.found & seen.steep, error, 0), o=o, d=d, other=other)
 
 
 # ---------------------------------------------- Samples --------------------------------------------------
 
-POSITIONS = """
-n = 100_000
+POSITIONS = """n = 100_000
 rng = mi.PCG32(n)
 ps = shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))
 print("mean of 1 / density:", dr.mean(1 / ps.pdf), "surface_area():", shape.surface_area())
@@ -522,7 +477,7 @@ def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
     d = case.units(count)
     disk = radius * np.sqrt(case.rng.random((count, 1))) * unit(np.cross(d, case.units(count)))
     twice, crossed, found = doubled(p, n), np.zeros(count), []
-    for line, hit, _ in walk(case.target, (case.middle + disk - 2 * radius * d).astype(np.float32), d):
+    for line, hit in walk(case.target, (case.middle + disk - 2 * radius * d).astype(np.float32), d):
         crossed[line] += 1
         found.append(hit.p[~doubled(hit.p, hit.n)] if twice.any() else hit.p)
     estimate, error = 2 * np.pi * radius**2 * np.array([crossed.mean(), crossed.std() / np.sqrt(count)])
@@ -556,8 +511,7 @@ def _directions(law: Law, case: Case, u: Array) -> None:
         return
     drawn, met = pdf > 0, trace(case.target, o, d.astype(np.float32))
     law.hold("direction", np.where(drawn, np.abs(pdf / again - 1), 0), o=o, d=d)
-    steep = np.abs(dot(met.n, d)) > FLAT
-    law.hold("misses", drawn & np.where(met.found, steep & (met.t > dist * (1 + 1e-3)), True), o=o, d=d)
+    law.hold("misses", drawn & np.where(met.found, met.steep & (met.t > dist * (1 + 1e-3)), True), o=o, d=d)
     visible = drawn & met.found & (met.t > dist * (1 - 1e-3))
     mean, variance = _moments(case, o, d, met.p, np.where(visible, 1 / np.where(drawn, pdf, 1), 0))
     # the same by uniform directions into the cone that holds the shape
@@ -585,15 +539,5 @@ def _moments(case: Case, o: Array, d: Array, p: Array, weight: Array) -> tuple[A
     return found.mean(axis=0), found.var(axis=0) / len(found)
 
 
-LAWS = {
-    "hits": hits,
-    "surface": surface,
-    "normals": normals,
-    "watertight": watertight,
-    "scale": scale,
-    "far": far,
-    "finite": finite,
-    "sampling": sampling,
-    "bbox": bbox,
-    "variants": variants,
-}
+_LAWS = (hits, surface, normals, watertight, scale, far, finite, sampling, bbox, variants)
+LAWS = {law.__name__: law for law in _LAWS}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -21,29 +20,23 @@ FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
 MOST_HITS = 16  # along a line
 
 
-@dataclass(frozen=True)
-class Hits(Lanes):
-    """The hits of N rays."""
+def trace(target: Any, o: Array, d: Array) -> Lanes:
+    """Trace rays from float32 points [N, 3] in directions [N, 3].
 
-    found: Array  # bool [N]
-    t: Array  # [N]
-    p: Array  # [N, 3], as are the others
-    n: Array
-    shading: Array
-    du: Array
-    dv: Array
-    uv: Array  # [N, 2]
-    part: Array  # index of the triangle or the like [N]
-
-
-def trace(target: Any, o: Array, d: Array) -> Hits:
-    """Trace rays from float32 points [N, 3] in directions [N, 3]."""
+    Return whether each ``found`` anything, the distance ``t``, the points and vectors ``p``, ``n``,
+    ``shading``, ``du``, ``dv`` [N, 3], ``uv`` [N, 2], the index of the triangle or the like (``part``), and
+    whether the surface is ``steep``: met, and not in passing.
+    """
 
     def call(origin: Any, direction: Any) -> list[Any]:
         si = target.ray_intersect(mi.Ray3f(origin, direction))
         return [si.is_valid(), si.t, si.p, si.n, si.sh_frame.n, si.dp_du, si.dp_dv, si.uv, si.prim_index]
 
-    return Hits(*lanes(call, ("Point3f", o), ("Vector3f", d)))
+    names = ("found", "t", "p", "n", "shading", "du", "dv", "uv", "part")
+    hits = Lanes(**dict(zip(names, lanes(call, ("Point3f", o), ("Vector3f", d)), strict=True)))
+    hits.cos = dot(hits.n, d)
+    hits.steep = hits.found & (np.abs(hits.cos) > FLAT)
+    return hits
 
 
 def dot(a: Array, b: Array) -> Array:
@@ -51,14 +44,14 @@ def dot(a: Array, b: Array) -> Array:
     return (a * b).sum(axis=-1)
 
 
-def walk(target: Any, o: Array, d: Array, first: Hits | None = None) -> Iterator[tuple[Array, Hits, Array]]:
-    """Follow N lines through all that they meet; yield which do, what they meet, and the cosine with it."""
+def walk(target: Any, o: Array, d: Array, first: Lanes | None = None) -> Iterator[tuple[Array, Lanes]]:
+    """Follow N lines through all that they meet; yield hit by hit which lines do, and what they meet."""
     line, hits = np.arange(len(o)), first or trace(target, o, d)
     for _ in range(MOST_HITS):
         line, d, hits = line[hits.found], d[hits.found], hits.only(hits.found)
         if not len(line):
             return
-        yield line, hits, dot(hits.n, d)
+        yield line, hits
         hits = trace(target, leave(hits.p, hits.n, d), d)
 
 
@@ -86,7 +79,7 @@ class Case(Subject):
         if not np.isfinite(self.box).all() or (self.box[1] < self.box[0]).any():
             raise UsageError(f"the bounding box of the shape is {self.box}: it must be finite")
         self.corners = corners(self.plugin)
-        points = self.box if self.corners is None else np.concatenate([self.box, self.corners])
+        points = np.concatenate([self.box, self.corners])
         self.low, self.high = points.min(axis=0), points.max(axis=0)  # the box itself may be wrong
         self.middle, self.size = (self.low + self.high) / 2, float(np.linalg.norm(self.high - self.low))
 
@@ -95,7 +88,7 @@ class Case(Subject):
         return (self.middle + 1.5 * self.size * self.units(count)).astype(np.float32)
 
     @cached_property
-    def seen(self) -> tuple[Array, Array, Hits]:
+    def seen(self) -> tuple[Array, Array, Lanes]:
         """Rays from all around to points in the box, and what they meet."""
         o = self.around(self.count(2**14, 2**17))
         extent = np.maximum(self.high - self.low, 0.01 * self.size)
@@ -103,23 +96,22 @@ class Case(Subject):
         return o, d, trace(self.target, o, d)
 
     @cached_property
-    def met(self) -> tuple[Array, Array, Hits]:
-        """Return the rays that meet the surface and do not graze it, and their hits."""
+    def met(self) -> tuple[Array, Array, Lanes]:
+        """The rays that meet the surface and do not graze it, and their hits."""
         o, d, hits = self.seen
-        steep = hits.found & (np.abs(dot(hits.n, d)) > FLAT)
-        if steep.sum() < 20:
+        if hits.steep.sum() < 20:
             raise Skip("hardly any ray towards its bounding box meets the shape")
-        return o[steep], d[steep], hits.only(steep)
+        return o[hits.steep], d[hits.steep], hits.only(hits.steep)
 
     @cached_property
-    def behind(self) -> Hits:
-        """Return the hits of rays that come back from just behind ``met``."""
+    def behind(self) -> Lanes:
+        """The hits of rays that come back from just behind ``met``."""
         _, d, hits = self.met
         return trace(self.target, leave(hits.p, hits.n, d), -d)
 
     @cached_property
-    def crossings(self) -> list[tuple[Array, Hits, Array]]:
-        """Whole lines: hit by hit, which line, what it meets, and the cosine with the normal."""
+    def crossings(self) -> list[tuple[Array, Lanes]]:
+        """Whole lines: hit by hit, which line, and what it meets."""
         return list(walk(self.target, *self.seen))
 
     @cached_property
@@ -130,16 +122,14 @@ class Case(Subject):
 
     @cached_property
     def lines(self) -> tuple[Array, Array]:
-        """Return which lines can be judged, and which cross the surface an even number of times; both [N]."""
-        count = len(self.seen[0])
-        met, even, clear = np.zeros(count, bool), np.ones(count, bool), np.ones(count, bool)
-        last = np.full((count, 3), np.inf)
-        for line, hits, cos in self.crossings:
-            met[line] = True
-            clear[line] &= (np.abs(cos) > 4 * FLAT) & ~near(hits.p, last[line])
+        """Which lines can be judged, and which cross the surface an even number of times; both [N]."""
+        met, even = self.seen[2].found, np.ones(len(self.seen[0]), bool)
+        clear, last = met.copy(), np.full((len(met), 3), np.inf)
+        for line, hits in self.crossings:
+            clear[line] &= (np.abs(hits.cos) > 4 * FLAT) & ~near(hits.p, last[line])
             even[line] ^= True
             last[line] = hits.p
-        return met & clear, even
+        return clear, even
 
 
 def offset(p: Array) -> Array:
@@ -157,18 +147,10 @@ def leave(p: Array, n: Array, d: Array) -> Array:
     return (p + np.sign(dot(n, d))[:, None] * n * offset(p)[:, None]).astype(np.float32)
 
 
-def mesh(shape: Any, *more: str) -> list[Array] | None:
-    """Return the vertices [V, 3], faces [F, 3] and ``more`` vectors of a mesh; None for other shapes."""
-    names = ("vertex_positions", "faces", *more)
+def corners(shape: Any) -> Array:
+    """Return the vertices of a mesh and the middles of its edges [N, 3]; none for other shapes."""
+    names = ("vertex_positions", "faces")
     if not isinstance(shape, mi.Mesh) or not set(names) <= set(mi.traverse(shape).keys()):
-        return None  # a rectangle hides that it is a mesh
-    return [np.array(mi.traverse(shape)[name]).reshape(-1, 3) for name in names]
-
-
-def corners(shape: Any) -> Array | None:
-    """Return the vertices of a mesh and the middles of its edges; None for other shapes."""
-    found = mesh(shape)
-    if found is None:
-        return None
-    vertex, face = found
+        return np.zeros((0, 3))  # a rectangle hides that it is a mesh
+    vertex, face = (np.array(mi.traverse(shape)[name]).reshape(-1, 3) for name in names)
     return np.concatenate([vertex, *((vertex[face[:, k]] + vertex[face[:, k - 1]]) / 2 for k in range(3))])

@@ -7,9 +7,7 @@ Morton code at which it starts.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -32,28 +30,21 @@ def encode(wo: Array) -> Array:
     return (z < 0) * HEMISPHERE + (a | (b << 1))
 
 
-@dataclass(frozen=True)
 class Cells(Lanes):
-    """Cells that cover the sphere, in the order of their codes."""
-
-    start: Array  # int64 [C]
-    level: Array  # int64 [C]
+    """Cells that cover the sphere: ``start`` and ``level`` [C], and what else is known of each."""
 
     @staticmethod
     def around(codes: Array, most: int, coarsest: int = 4) -> Cells:
         """Return cells of which none holds more than ``most`` of the directions, unless it is the finest."""
         codes, done = np.sort(codes), []
         start = np.arange(2 * 4**coarsest) * 4 ** (DEPTH - coarsest)
-        cells = Cells(start, np.full(len(start), coarsest))
+        cells = Cells(start=start, level=np.full(len(start), coarsest))
         while len(cells.start):
             first, last = np.searchsorted(codes, [cells.start, cells.end])
             full = (last - first > most) & (cells.level < DEPTH)
             done.append(cells.only(~full))
             cells = cells.only(full).quartered()
-        return joined(done).sorted()
-
-    def sorted(self) -> Any:
-        return self.only(np.argsort(self.start))
+        return in_order(done)
 
     @property
     def end(self) -> Array:
@@ -77,9 +68,8 @@ class Cells(Lanes):
     def quartered(self) -> Cells:
         """Return four cells for each, one after the other."""
         level = np.repeat(self.level + 1, 4)
-        return Cells(
-            np.repeat(self.start, 4) + np.tile(np.arange(4), len(self.start)) * 4 ** (DEPTH - level), level
-        )
+        part = np.tile(np.arange(4), len(self.start))
+        return Cells(start=np.repeat(self.start, 4) + part * 4 ** (DEPTH - level), level=level)
 
     def at(self, i: Array, j: Array) -> tuple[Array, Array]:
         """Return directions [C, P, 3] at places of each cell, from 0 to 1, and r there."""
@@ -108,12 +98,10 @@ class Cells(Lanes):
         return r, r + width, phi, phi + 2 * np.pi * width, sign
 
 
-@dataclass(frozen=True)
-class Integrals(Cells):
-    """Integrals over cells, and the variances of these estimates: both [C, K] of K integrands."""
-
-    mean: Array
-    variance: Array
+def in_order(parts: Sequence[Cells]) -> Cells:
+    """Return the cells of several sets, in the order of their codes."""
+    cells = joined(parts)
+    return cells.only(np.argsort(cells.start))
 
 
 def integrate(
@@ -123,11 +111,12 @@ def integrate(
     codes: Array,
     weights: Array,
     samples: int,
-) -> Integrals:
+) -> Cells:
     """Integrate ``function(directions [N, 3]) -> [N, K]`` over cells; those known too badly are cut further.
 
     ``codes`` and ``weights`` of ``samples`` samples say what the first integrand gives where; the integrals
-    are made as certain as so many samples would be.
+    are made as certain as so many samples would be. The cells returned have the ``mean`` of each estimate and
+    its ``variance``, both [C, K].
     """
     done = []
     order = np.argsort(codes)
@@ -143,21 +132,19 @@ def integrate(
         bad = (variance / total**2 > 0.25 * np.abs(mean) / total / samples + 1 / samples**2).any(axis=1)
         bad |= ((last - first) * samples > 1.5) & (mean[:, 0] < 0.2 * (last - first))
         bad &= (cells.level < DEPTH) & (attempt < 7)
-        done.append(Integrals(cells.start, cells.level, mean, variance).only(~bad))
+        done.append(Cells(**{**vars(cells), "mean": mean, "variance": variance}).only(~bad))
         if not bad.any():
             break
         cells = cells.only(bad).quartered()
-    return joined(done).sorted()
+    return in_order(done)
 
 
-def chi_square(
-    found: Integrals, codes: Array, count: int, known: float = 0.0
-) -> tuple[list[tuple[float, int]], tuple]:
+def chi_square(found: Cells, codes: Array, count: int, known: float = 0.0) -> tuple[Array, tuple]:
     """Compare the counts of samples with those that integrals expect.
 
-    Return χ² and its degrees of freedom in six ways to group cells, so that faults of any width show:
-    neighbours that expect 25 samples or more, a 128th and a 16th of all, and slices along x, y and z of a
-    16th; and the cell that is most off. ``known``: to how much the density is known, relative.
+    Return χ² and its degrees of freedom [6, 2] in six ways to group cells, so that faults of any width
+    show: neighbours that expect 25 samples or more, a 128th and a 16th of all, and slices along x, y and z of
+    a 16th; and the cell that is most off. ``known``: to how much the density is known, relative.
     """
     seen = np.bincount(found.find(codes), minlength=len(found.start))
     expected, variance = count * found.mean[:, 0], count**2 * found.variance[:, 0]
@@ -173,4 +160,4 @@ def chi_square(
         pull = (seen_in - expected_in)[used] ** 2 / np.maximum(variance_in, 1e-6)[used]
         tests.append((float(pull.sum()), max(len(pull), 1)))
     cell = int(np.argmax(np.abs(seen - expected) / np.sqrt(expected + variance + 1)))
-    return tests, found.bounds(cell)
+    return np.array(tests), found.bounds(cell)

@@ -1,7 +1,7 @@
 """A plugin under examination: loaded, loaded again in other variants, and as a program in plain Mitsuba.
 
-A law's ``snippet`` is such a program with the numbers of its worst case. Each law has the body next to it,
-whose first line names what of ``_SETUP`` comes before it.
+A law's ``snippet`` is such a program with the numbers of its worst case. Each law has the body next to it;
+``_SETUP`` comes before it, for the names that are known.
 """
 
 from __future__ import annotations
@@ -79,25 +79,23 @@ class Subject:
 
     def program(self, body: str, **names: Any) -> str:
         """Return a program that loads the plugin and runs ``body``, filled with ``names``."""
-        setup, _, rest = body.partition("\n")
-        text = "".join(_SETUP[word] for word in setup.split()) + "\n" + rest
+        text = "".join(setup for name, setup in _SETUP.items() if names.get(name) is not None) + "\n" + body
         variant = mi.variant()
         if "PCG32(n)" in text:
             variant = variant.replace("scalar_", "llvm_ad_")
-        given = _source(self.description) if self.description is not None else None
-        ours = given is not None and "'mrt_" in given
-        lines = ["import mrt_mitsuba as mrt  # before mitsuba"] if ours else []
-        lines += [f"import {module}" for module in ("drjit as dr", "mitsuba as mi", "numpy as np")]
-        lines += ["", f"mi.set_variant({variant!r})", *(["mrt.register()"] if ours else [])]
-        if given is None:
-            lines += [f"# {self.word}: the object that was checked", f"load = lambda: {self.word}"]
-        else:
-            if not type(self.plugin).__module__.startswith("mitsuba") and not ours:
-                lines += [f"# register {self.name!r} here"]
-            lines += ["", "def load(**more):", f"    return mi.load_dict({{**{given}, **more}})"]
-            lines += ["", f"{self.word} = load()"]
-        shown = {key: _written(value) for key, value in names.items()}
-        return "\n".join([*lines, ""]) + text.format(variant=variant, **shown)
+        given = None if self.description is None else _source(self.description)
+        ours = "'mrt_" in (given or "")
+        known = ours or type(self.plugin).__module__.startswith("mitsuba")
+        load = f"# {self.word}: the object that was checked\nload = lambda: {self.word}\n"
+        if given is not None:
+            load = "mrt.register()\n" if ours else "" if known else f"# register {self.name!r} here\n"
+            load += f"\ndef load(**more):\n    return mi.load_dict({{**{given}, **more}})\n"
+            load += f"\n{self.word} = load()\n"
+        start = "import mrt_mitsuba as mrt  # before mitsuba\n" if ours else ""
+        start += (
+            f"import drjit as dr\nimport mitsuba as mi\nimport numpy as np\n\nmi.set_variant({variant!r})\n"
+        )
+        return start + load + text.format(variant=variant, **{k: _written(v) for k, v in names.items()})
 
 
 def class_name(plugin: Any) -> str:
@@ -150,16 +148,17 @@ def _made(value: Any) -> Any:
 
 def _source(value: Any) -> str | None:
     """Return a kept dict's value as Python; None where it holds what has no source."""
-    if isinstance(value, dict):
-        parts = {key: _source(entry) for key, entry in value.items()}
-        inner = ", ".join(f"{key!r}: {text}" for key, text in parts.items())
-        return None if None in parts.values() else f"{{{inner}}}"
+    if isinstance(value, (dict, list, tuple)):
+        entries = value.values() if isinstance(value, dict) else value
+        parts = [_source(entry) for entry in entries]
+        if None in parts:
+            return None
+        if isinstance(value, dict):
+            return f"{{{', '.join(f'{key!r}: {part}' for key, part in zip(value, parts, strict=True))}}}"
+        return f"[{', '.join(map(str, parts))}]"
     if isinstance(value, Kept):
         array = f"np.array({value.values.tolist()}, np.float32)"
         return f"mi.{value.kind}({array})" if value.values.size <= 64 else None
-    if isinstance(value, (list, tuple)):
-        entries = [_source(entry) for entry in value]
-        return None if None in entries else f"[{', '.join(map(str, entries))}]"
     return repr(value) if isinstance(value, (bool, int, float, str)) else None
 
 
@@ -172,7 +171,7 @@ def _written(value: Any) -> str:
 
 
 _SETUP = {
-    "point": """
+    "wi": """
 si = dr.zeros(mi.SurfaceInteraction3f)
 si.n, si.t, si.p = mi.Normal3f(0, 0, 1), 1, mi.Point3f(0, 0, 0)
 si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
@@ -184,29 +183,21 @@ si.wi = mi.Vector3f({wi})
 dr.make_opaque(si.wi)  # numbers, not parts of the program: they are computed with otherwise
 ctx = mi.BSDFContext()
 """,
-    "wo": "wo = mi.Vector3f({wo})\ndr.make_opaque(wo)\n",
-    "draw": """
-n = 1_000_000
-rng = mi.PCG32(n)
-bs, weight = bsdf.sample(ctx, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
-""",
-    "sample": "u = {u}\nbs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))\n",
-    "component": "ctx.component = {component}\n",
-    "importance": "ctx = mi.BSDFContext(mi.TransportMode.Importance)\n",
     "setting": """
-setting = {setting}  # a parameter and its value
-if setting:
-    params = mi.traverse(bsdf)
-    key = setting[0]
-    params[key] = type(params[key])(params[key] * 0 + setting[1])
-    params.update()
+key, number = {setting}
+params = mi.traverse(bsdf)
+params[key] = type(params[key])(params[key] * 0 + number)
+params.update()
 """,
-    "ray": """
+    "component": "ctx.component = {component}\n",
+    "wo": "wo = mi.Vector3f({wo})\ndr.make_opaque(wo)\n",
+    "u": "u = {u}\nbs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))\n",
+    "o": """
 scene = mi.load_dict({{"type": "scene", "shape": shape}})
 o, d = mi.Point3f({o}), mi.Vector3f({d})
 dr.make_opaque(o, d)
 """,
 }
-_SETUP["each"] = "\nfor variant in {variants}:\n    mi.set_variant(variant)\n    bsdf = load()\n" + indent(
-    _SETUP["point"] + _SETUP["wo"] + "print(variant, bsdf.eval(ctx, si, wo), bsdf.pdf(ctx, si, wo))\n", "    "
-)
+VALUES = "for variant in {variants}:\n    mi.set_variant(variant)\n    bsdf = load()\n" + indent(
+    _SETUP["wi"] + _SETUP["wo"] + "print(variant, bsdf.eval(ctx, si, wo), bsdf.pdf(ctx, si, wo))\n", "    "
+)  # in several variants
