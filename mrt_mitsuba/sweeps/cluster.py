@@ -1,4 +1,4 @@
-"""Workers: processes of this machine, or of a cluster that somebody else has started."""
+"""Workers: processes of this machine, or of a cluster that somebody else has started; and jobs on them."""
 
 from __future__ import annotations
 
@@ -7,19 +7,22 @@ import logging
 import os
 import subprocess
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.cores import usable_cores
-from mrt_mitsuba.errors import MrtError, OutputError, UsageError
+from mrt_mitsuba.errors import MrtError, OutputError, UsageError, one_line
 from mrt_mitsuba.sweeps import worker
+from mrt_mitsuba.sweeps.jobs import Job
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Future
 
 CONNECTING = 10  # seconds to reach a scheduler, and for its first worker to be there
 STARTING = 120  # seconds for worker processes of this machine; a busy one takes its time
+MOST_DEATHS = 10  # of workers that had been given a job which they did not begin
 
 
 class ClusterError(MrtError):
@@ -47,9 +50,10 @@ def connected(
     """Give a client whose workers are there; see ``sweep``.
 
     Workers of this machine, as many as there are jobs at most, end with the block. Raises ``ClusterError``
-    where no scheduler answers, or it has no worker.
+    where no scheduler answers or has a worker, and where it goes away in the block.
     """
     from distributed import Client
+    from distributed.client import ClosedClientError
 
     with ExitStack() as stack:
         # Whoever asked for connections that break says so once
@@ -72,7 +76,12 @@ def connected(
                 f"no scheduler with workers answers at {cluster}: start 'dask scheduler' and then "
                 "'dask worker ADDRESS --nthreads 1' with its address, such as tcp://host:8786"
             ) from error
-        yield client
+        try:
+            yield client
+        except (CancelledError, ClosedClientError, OSError) as error:
+            raise ClusterError(
+                "the scheduler is gone: start it and its workers, then run the same sweep again; it continues"
+            ) from error
 
 
 def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
@@ -99,7 +108,7 @@ def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
         settings = {"worker_kwargs": options | {"env": kernels | pinned}}
         workers[number] = {"cls": SubprocessWorker, "options": settings}
     scheduler = {
-        "allowed_failures": 0,  # a job that lost its worker is handed over again by ``sweep``
+        "allowed_failures": 0,  # ``outcomes`` hands over again a job that lost its worker
         "host": "127.0.0.1",
         "dashboard": dashboard is not None,
         "dashboard_address": f":{dashboard or 0}",
@@ -112,19 +121,18 @@ def gpus() -> list[str]:
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     if named is not None:
         return [name for name in named.split(",") if name]
-    try:
+    with suppress(OSError, subprocess.SubprocessError):
         listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=30, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return []
-    return [str(number) for number, _ in enumerate(listed.stdout.splitlines())]
+        return [str(number) for number, _ in enumerate(listed.stdout.splitlines())]
+    return []
 
 
-def inspect(client: Client, scratch: str) -> dict[str, int]:
-    """Check all workers; return how many share cores.
+def inspect(client: Client, scratch: str) -> dict[str, Any]:
+    """Check all workers; return the versions of their software, and how many share cores (``render_job``).
 
     Raises ``ClusterError`` or ``OutputError`` if they cannot be used.
     """
-    here = worker.software()
+    here = worker.describe(scratch)["versions"]
     try:
         found = client.run(worker.describe, scratch)
     except Exception as error:  # whatever another Python or another version makes of it
@@ -134,9 +142,58 @@ def inspect(client: Client, scratch: str) -> dict[str, int]:
     for name, facts in found.items():
         if not facts["sees"]:
             raise OutputError(f"the worker {name} cannot write to {scratch}: choose a folder that all share")
-        if facts["software"] != here:
+        if facts["versions"] != here:
             raise ClusterError(
-                f"the worker {name} has {facts['software']} and this process {here}: install the same "
+                f"the worker {name} has {facts['versions']} and this process {here}: install the same "
                 "everywhere"
             )
-    return dict(Counter(facts["cores"] for facts in found.values()))
+    return {"versions": here, "sharing": dict(Counter(facts["cores"] for facts in found.values()))}
+
+
+def outcomes(
+    client: Client, jobs: Sequence[Job], retries: int, scratch: str, **setting: Any
+) -> Iterator[tuple[Job, dict[str, Any]]]:
+    """Let workers render jobs, and yield each as it ends, with its facts or its "error".
+
+    One that lost its worker, or failed by accident, is handed over again. ``setting``: of ``render_job``.
+    """
+    from distributed import KilledWorker, as_completed
+
+    calls: dict[Future, Job] = {}
+    handed: Counter[str] = Counter()
+    coming = as_completed(loop=client.loop)
+
+    def hand_over(job: Job) -> None:
+        handed[job.name] += 1
+        key = f"{os.path.basename(scratch)} {job.name} {handed[job.name]}"
+        future = client.submit(worker.render_job, job, scratch=scratch, **setting, key=key, pure=False)
+        calls[future] = job
+        coming.add(future)
+
+    try:
+        for job in jobs:
+            hand_over(job)
+        for future in coming:
+            job = calls.pop(future)
+            if future.status not in ("finished", "error"):
+                raise CancelledError
+            facts = worker.outcome(job, scratch)
+            ended = "error" in facts or "file" in facts
+            # The engine holds a worker's death against all jobs that the worker had been given
+            if facts.pop("again", not ended) and (
+                facts["attempts"] <= retries and handed[job.name] < retries + MOST_DEATHS
+            ):
+                hand_over(job)
+                continue
+            error = future.exception()
+            if not ended and isinstance(error, KilledWorker):
+                facts["error"] = (
+                    "every worker that rendered it died, perhaps for want of memory: give each more"
+                )
+            elif not ended:
+                facts["error"] = one_line(f"{type(error).__name__}: {error}")
+            future.release()  # what no one needs is not computed again when its worker goes
+            yield job, facts
+    finally:
+        if client.status == "running":
+            client.cancel(list(calls))

@@ -1,5 +1,5 @@
-"""The jobs of a sweep: every combination of a grid's values, checked, with the name of its file; the scenes
-on their way to the workers; and the fingerprint of all that decides about a picture."""
+"""The jobs of a sweep: every combination of a grid's values, checked, with the name of its file, and the
+scenes on their way to the workers."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, SupportsIndex
+from typing import Any, NamedTuple, SupportsIndex
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.runtime import use, versions
@@ -32,28 +31,30 @@ NOT_SWEPT = frozenset({"scene", "progress", "on_round", "region", "params"})
 SENT = ".scene"  # ending of a scene that is written next to the pictures, for the workers to read
 
 
-@dataclass(frozen=True)
-class Job:
-    """One picture."""
+class Job(NamedTuple):
+    """One picture, or a tile of one."""
 
     name: str  #: of its file, without ending
     scene: Any
     arguments: Mapping[str, Any]  #: of ``render``, without the scene
-    parameters: Mapping[str, Any]  #: its values of the grid, by key
     identity: str = ""  #: fingerprint of the scene
-    made_with: str = ""  #: fingerprint of scene, settings and versions
 
     @property
     def file(self) -> str:
         """The name of its picture in the folder."""
         return f"{self.name}.exr"
 
+    @property
+    def made_with(self) -> str:
+        """Fingerprint of all that decides about its pixels: scene, settings and versions."""
+        pixels = sorted((key, value) for key, value in self.arguments.items() if key != "memory")
+        return fingerprint(self.identity, pixels, versions())
 
-def jobs(scene: Any, grid: Any, zipped: bool, fixed: Mapping[str, Any]) -> list[Job]:
-    """Return the jobs of a grid, in the order of its axes, the last of which varies fastest.
 
-    ``zipped``: the axes are columns of one list, whose rows are the jobs; ``fixed``: arguments of ``render``
-    that all jobs share.
+def points(grid: Any, zipped: bool) -> dict[str, dict[str, Any]]:
+    """Return the values of each job by their axes, by the name of its file; the last axis varies fastest.
+
+    ``zipped``: the axes are columns of one list, whose rows are the jobs, and files are numbered.
 
     Raises ``UsageError`` for an axis that is empty or no list, an unknown key, a value out of range, columns
     of different lengths, and jobs whose files would have the same name.
@@ -61,38 +62,17 @@ def jobs(scene: Any, grid: Any, zipped: bool, fixed: Mapping[str, Any]) -> list[
     if not isinstance(grid, Mapping):
         raise UsageError(f'grid={grid!r}: give a dict of lists, such as {{"aa": [1, 2]}}')
     axes = {key: _axis(key, values) for key, values in grid.items()}
-    twice = axes.keys() & {*fixed, "" if scene is None else "scene"}
-    if twice:
-        raise UsageError(f"{min(twice)} is given twice: as an axis of the grid and for all jobs; drop one")
-    shared = {key: _checked(key, [value])[0] for key, value in fixed.items() if value is not None}
-    points = _points(axes, zipped)
-    found = []
-    for name, point in zip(_names(points, zipped), points, strict=True):
-        dotted = {key: value for key, value in point.items() if "." in key}
-        arguments = shared | {key: value for key, value in point.items() if key not in dotted}
-        params = {**shared.get("params", {}), **point.get("params", {}), **dotted}
-        if params:
-            arguments["params"] = params
-        found.append(Job(name, arguments.pop("scene", scene), arguments, point))
-    return found
-
-
-def _points(axes: Mapping[str, Sequence[Any]], zipped: bool) -> list[dict[str, Any]]:
-    """Return the values of each job by their axes."""
     lengths = list(map(len, axes.values()))
     if zipped and len(set(lengths)) > 1:
         raise UsageError(f"zipped axes must be of one length, and those of {', '.join(axes)} are {lengths}")
-    if not zipped and math.prod(lengths) > MOST_JOBS:
+    if (max(lengths, default=0) if zipped else math.prod(lengths)) > MOST_JOBS:
         raise UsageError(f"the grid has more than {MOST_JOBS} jobs: make several sweeps of it")
-    rows = zip(*axes.values(), strict=True) if zipped else itertools.product(*axes.values())
-    return [dict(zip(axes, row, strict=True)) for row in rows]
-
-
-def _names(points: Sequence[Mapping[str, Any]], zipped: bool) -> list[str]:
-    """Return the name of each job's file; raise ``UsageError`` where two are the same or one is too long."""
-    if zipped:
-        return [f"frame_{number:04}" for number in range(len(points))]  # as programs for films expect them
-    names = [",".join(f"{word(k)}={word(v)}" for k, v in point.items()) or "picture" for point in points]
+    columns = [checked(key, values) for key, values in axes.items()]
+    rows = zip(*columns, strict=True) if zipped else itertools.product(*columns)
+    found = [dict(zip(axes, row, strict=True)) for row in rows]
+    if zipped:  # as programs for films expect them
+        return {f"frame_{number:04}": point for number, point in enumerate(found)}
+    names = [",".join(f"{word(k)}={word(v)}" for k, v in point.items()) or "picture" for point in found]
     counts = Counter(name.casefold() for name in names)  # some file systems ignore case
     for name in names:
         problem, count = "", counts[name.casefold()]
@@ -102,7 +82,7 @@ def _names(points: Sequence[Mapping[str, Any]], zipped: bool) -> list[str]:
             problem = f"{count} jobs would write the same file {name}"
         if problem:
             raise UsageError(f"{problem}: take values out, or use zipped=True, which numbers the files")
-    return names
+    return dict(zip(names, found, strict=True))
 
 
 def _axis(key: Any, values: Any) -> list[Any]:
@@ -111,14 +91,13 @@ def _axis(key: Any, values: Any) -> list[Any]:
     values = values.tolist() if hasattr(values, "tolist") else values
     if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
         raise UsageError(f"grid: {key} is {values!r}; give a list of values, such as [{values!r}]")
-    values = list(itertools.islice(values, MOST_JOBS + 1))  # some never end
-    if not 0 < len(values) <= MOST_JOBS:
-        problem = f"has more than {MOST_JOBS} values" if values else "is an empty list"
-        raise UsageError(f"grid: {key} {problem}; give it values, or leave it out")
-    return _checked(key, values)
+    found = list(itertools.islice(values, MOST_JOBS + 1))  # some never end
+    if not found:
+        raise UsageError(f"grid: {key} is an empty list; give it values, or leave it out")
+    return found
 
 
-def _checked(key: str, values: Sequence[Any]) -> list[Any]:
+def checked(key: str, values: Sequence[Any]) -> list[Any]:
     """Return values as ``render`` takes them; raise ``UsageError`` where it cannot."""
     from mrt_mitsuba import render
     from mrt_mitsuba.rendering import settings
@@ -135,9 +114,8 @@ def _checked(key: str, values: Sequence[Any]) -> list[Any]:
             raise UsageError(f"{key}={value!r}: give finite numbers")
         if key == "params" and not isinstance(value, Mapping):
             raise UsageError(f"params={value!r}: give a dict of values by name")
-    return (
-        [settings.check(key, value) for value in found] if key in settings.TABLE and key in known else found
-    )
+    table = settings.TABLE if key in known else {}
+    return [settings.check(key, value) for value in found] if key in table else found
 
 
 def word(value: Any) -> str:
@@ -154,16 +132,44 @@ def word(value: Any) -> str:
     return re.sub(r"[^\w.+-]+", "-", str(value))
 
 
+def jobs(
+    scene: Any, named: Mapping[str, Mapping[str, Any]], fixed: Mapping[str, Any], folder: str
+) -> list[Job]:
+    """Return the job of each point, given what all share, with scenes as workers can open them: numbers and
+    absolute paths. Any other scene is written into a folder.
+
+    Raises ``UsageError`` for what is given twice, or cannot be sent to another process, and ``SceneError``
+    for a file that cannot be read.
+    """
+    shared = {key: checked(key, [value])[0] for key, value in fixed.items() if value is not None}
+    axes = {key for point in named.values() for key in point}
+    if twice := axes & {*fixed, "" if scene is None else "scene"}:
+        raise UsageError(f"{min(twice)} is given twice: as an axis of the grid and for all jobs; drop one")
+    scenes: dict[int, tuple[Any, str]] = {}
+    found = []
+    for name, point in named.items():
+        dotted = {key: value for key, value in point.items() if "." in key}
+        arguments = shared | {key: value for key, value in point.items() if key not in dotted}
+        if params := {**shared.get("params", {}), **point.get("params", {}), **dotted}:
+            arguments["params"] = params
+        own = arguments.pop("scene", scene)
+        if id(own) not in scenes:
+            sent = _send(own, os.path.join(folder, f"{len(scenes)}{SENT}"))
+            scenes[id(own)] = sent, identify(sent)
+        found.append(Job(name, scenes[id(own)][0], arguments, scenes[id(own)][1]))
+    return found
+
+
 def check_parameters(jobs: Sequence[Job]) -> None:
     """Raise ``UsageError`` if a job sets what its scene does not have; each scene is loaded once."""
-    loaded: dict[tuple[int, str], Any] = {}
+    loaded: dict[str, Any] = {}
     for job in jobs:
         params = job.arguments.get("params", {})
         declared = {name: value for name, value in params.items() if "." not in name}
-        which = id(job.scene), repr(declared)
+        which = fingerprint(job.scene, declared)
         if params and which not in loaded:
             use()
-            loaded[which] = open_scene(job.scene, params=declared).scene
+            loaded[which] = open_scene(receive(job.scene), params=declared).scene
         if params.keys() > declared.keys():
             set_parameters(loaded[which], {key: params[key] for key in params.keys() - declared.keys()})
 
@@ -171,32 +177,15 @@ def check_parameters(jobs: Sequence[Job]) -> None:
 # ------------------------------------- Scenes on their way to workers ------------------------------------
 
 
-def sent(jobs: Sequence[Job], folder: str) -> list[Job]:
-    """Return jobs as workers take them, with their fingerprints; they need no values of the grid.
-
-    Scenes that are numbers and paths stay, anything else goes into a file in ``folder``. Raises
-    ``UsageError`` for a number without a scene and for what cannot leave this process.
-    """
-    scenes: dict[int, tuple[Any, str]] = {}
-    found = []
-    for job in jobs:
-        if id(job.scene) not in scenes:
-            scene = job.scene
-            if isinstance(scene, str | os.PathLike):
-                scene = os.path.abspath(scene)
-            elif isinstance(scene, SupportsIndex):
-                scene = operator.index(scene)
-                report_scene(scene)
-            else:
-                scene = os.path.join(folder, f"{fingerprint(scene)}{SENT}")
-                with open(scene, "wb") as file:
-                    file.write(_encode(job.scene))
-            scenes[id(job.scene)] = scene, identify(scene)
-        scene, identity = scenes[id(job.scene)]
-        pixels = sorted((key, value) for key, value in job.arguments.items() if key != "memory")
-        made = fingerprint(identity, pixels, versions())
-        found.append(replace(job, scene=scene, parameters={}, identity=identity, made_with=made))
-    return found
+def _send(scene: Any, path: str) -> Any:
+    if isinstance(scene, str | os.PathLike):
+        return os.path.abspath(scene)
+    if isinstance(scene, SupportsIndex):
+        report_scene(number := operator.index(scene))
+        return number
+    with open(path, "wb") as file:
+        file.write(_encode(scene))
+    return path
 
 
 def receive(scene: Any) -> Any:

@@ -11,13 +11,12 @@ import itertools
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
-from mrt_mitsuba.errors import OutputError, UsageError
-from mrt_mitsuba.sweeps.jobs import Job, fingerprint
+from mrt_mitsuba.errors import MrtError, OutputError, UsageError
+from mrt_mitsuba.sweeps.jobs import Job, receive
 
-MADE_WITH = "mrt:sweep"  # in the header of each picture: fingerprint of scene, settings and versions
+MADE_WITH = "mrt:sweep"  # in the header of each picture: its job's ``made_with``
 ROWS = 64  # of a picture, read at a time; a multiple of the 16 that are compressed together
 # Memory for a tile, unless the caller says: what is kept of a pixel is 84 bytes at most
 BYTES_PER_PIXEL = 128
@@ -29,7 +28,7 @@ def endings(png: bool) -> tuple[str, ...]:
     return ("exr", "png") if png else ("exr",)
 
 
-def made_with(path: str, whole: bool = False) -> str | None:
+def mark(path: str, whole: bool = False) -> str | None:
     """Return the fingerprint in a picture that a sweep made, "" in any other; None for what is no picture,
     or, if that is asked for, no ``whole`` one."""
     import OpenEXR
@@ -55,48 +54,39 @@ def made_with(path: str, whole: bool = False) -> str | None:
         return None
 
 
-def is_fresh(job: Job, folder: str, png: bool = False) -> bool:
-    """Return whether a picture is there, whole, and made with the same scene, settings and versions."""
-    path = os.path.join(folder, job.name)
-    return all(made_with(f"{path}.{ending}", whole=True) == job.made_with for ending in endings(png))
+def is_fresh(job: Job, folder: str, png: bool = False, listed: bool = False) -> bool:
+    """Return whether a job's files are there, whole, and made with the same scene, settings and versions.
 
-
-def refuse_to_replace(job: Job, folder: str, listed: bool = False, png: bool = False) -> None:
-    """Raise ``OutputError`` for a file of the user's own under the name of a picture.
-
-    A sweep's own has a mark in its header or, where that is broken, a row in the table (``listed``).
+    Raises ``OutputError`` for a file of the user's own under their names. A sweep's own has a mark in its
+    header or, where that is broken, a row in the table (``listed``).
     """
+    wanted, fresh = job.made_with, True
     for ending in endings(png):
         path = os.path.join(folder, f"{job.name}.{ending}")
-        found = made_with(path)
+        found = mark(path)
         if os.path.lexists(path) and not (found or (found is None and listed and os.path.isfile(path))):
             raise OutputError(
                 f"{path} was not made by a sweep, which would replace it: move it away, or choose "
                 "another folder"
             )
+        fresh = fresh and found == wanted == mark(path, whole=True)
+    return fresh
 
 
-def check_tiles(tiles: Any, png: bool, jobs: Sequence[Job]) -> None:
-    """Raise ``UsageError`` for numbers of rows and columns, or for jobs, that cannot be cut into tiles."""
+def cut(job: Job, tiles: Any) -> list[Job]:
+    """Return the jobs of a picture's tiles, row by row, each with a file in a folder named after the picture.
+
+    ``tiles``: the numbers of rows and of columns. Raises ``UsageError`` if the picture cannot be cut so.
+    """
     pair = isinstance(tiles, list | tuple) and [type(number) for number in tiles] == [int, int]
     if not (pair and min(tiles) > 0):
         raise UsageError(f"tiles={tiles!r}: give rows and columns, such as (4, 4)")
-    if png:
-        raise UsageError("tiles: pictures in tiles are written as EXR only; leave out png")
-    if any(job.arguments.get("target") or job.arguments.get("aamode") == "noise" for job in jobs):
+    if job.arguments.get("target") or job.arguments.get("aamode") == "noise":
         raise UsageError("tiles: target and aamode=noise share the rays out over the whole picture")
-
-
-def cut(job: Job, tiles: tuple[int, int]) -> list[Job]:
-    """Return the jobs of a picture's tiles, row by row, each with a file in a folder named after the picture.
-
-    Raises ``UsageError`` if the picture has too few pixels.
-    """
     width, height = job.arguments.get("width"), job.arguments.get("height")
     if not (width and height):  # only the scene knows
         from mrt_mitsuba import runtime
         from mrt_mitsuba.scene.open import open_scene
-        from mrt_mitsuba.sweeps.jobs import receive
 
         runtime.use()
         source = open_scene(receive(job.scene), size=(width, height))
@@ -111,38 +101,35 @@ def cut(job: Job, tiles: tuple[int, int]) -> list[Job]:
         region = (left, top, right - left, bottom - top)
         memory = max(LEAST_MEMORY, BYTES_PER_PIXEL * region[2] * region[3])
         arguments = {"memory": memory, **job.arguments, "region": region}
-        name, made = f"{job.name}.tiles/{row},{column}", fingerprint(job.made_with, region)
-        found.append(replace(job, name=name, arguments=arguments, made_with=made))
+        found.append(job._replace(name=f"{job.name}.tiles/{row},{column}", arguments=arguments))
     return found
 
 
-def join(
-    job: Job, tiles: Sequence[Job], found: Sequence[Mapping[str, Any]], folder: str, scratch: str
-) -> dict[str, Any]:
+def join(job: Job, tiles: Sequence[Job], found: Sequence[Mapping[str, Any]], folder: str) -> dict[str, Any]:
     """Write a picture from its tiles, and remove these; return its facts, given theirs."""
     for facts in found:
         if "error" in facts:
             return {"error": facts["error"]}
-    own, path = os.path.join(folder, f"{job.name}.tiles"), os.path.join(scratch, job.file)
+    own = os.path.join(folder, f"{job.name}.tiles")
     try:
-        _write_rows(job, tiles, folder, path)
-        os.replace(path, os.path.join(folder, job.file))
+        _write_rows(job, tiles, folder)
         for tile in (os.path.join(own, name) for name in os.listdir(own)):
-            if made_with(tile):  # also those of another number of tiles
+            if mark(tile):  # also those of another number of tiles
                 os.unlink(tile)
         with contextlib.suppress(OSError):  # something of the user's own is in there
             os.rmdir(own)
-    except (OSError, RuntimeError) as error:
+    except (MrtError, OSError, RuntimeError) as error:
         return {"error": f"cannot put {job.name} together: {error}"}
     sums = {name: sum(facts[name] for facts in found) if all(found) else None for name in ("seconds", "rays")}
     return {"file": job.file, **sums}
 
 
-def _write_rows(job: Job, tiles: Sequence[Job], folder: str, path: str) -> None:
+def _write_rows(job: Job, tiles: Sequence[Job], folder: str) -> None:
     import numpy as np
     import OpenEXR
 
     from mrt_mitsuba.output.files import compressing, compression
+    from mrt_mitsuba.output.replacing import replacing
 
     files = [OpenEXR.InputFile(os.path.join(folder, tile.file)) for tile in tiles]
     regions = [tile.arguments["region"] for tile in tiles]
@@ -156,19 +143,18 @@ def _write_rows(job: Job, tiles: Sequence[Job], folder: str, path: str) -> None:
     header["mrt:options"] = json.dumps(options).encode()
     header[MADE_WITH] = job.made_with.encode()
     columns = [region[1] for region in regions].count(0)  # those in the first row
-    with compressing(), contextlib.closing(OpenEXR.OutputFile(path, header)) as picture:
-        for first in range(0, len(files), columns):
-            for parts in zip(*map(_strips, files[first : first + columns]), strict=True):
-                planes, rows = {}, 0
-                for name in header["channels"]:
-                    blocks = [np.frombuffer(part[name], np.float32) for part in parts]
-                    rows = len(blocks[0]) // regions[first][2]
-                    planes[name] = np.hstack([block.reshape(rows, -1) for block in blocks]).tobytes()
-                picture.writePixels(planes, rows)
-    # The library does not report a full disk: read the last row, and let the file reach the disk
-    OpenEXR.InputFile(path).channel("R", scanLine1=top + high - 1, scanLine2=top + high - 1)
-    with open(path, "rb") as file:
-        os.fsync(file.fileno())
+    with replacing(os.path.join(folder, job.file)) as (file,):
+        with compressing(), contextlib.closing(OpenEXR.OutputFile(file.name, header)) as picture:
+            for first in range(0, len(files), columns):
+                for parts in zip(*map(_strips, files[first : first + columns]), strict=True):
+                    planes, rows = {}, 0
+                    for name in header["channels"]:
+                        blocks = [np.frombuffer(part[name], np.float32) for part in parts]
+                        rows = len(blocks[0]) // regions[first][2]
+                        planes[name] = np.hstack([block.reshape(rows, -1) for block in blocks]).tobytes()
+                    picture.writePixels(planes, rows)
+        # The library does not report a full disk: read the last row
+        OpenEXR.InputFile(file.name).channel("R", scanLine1=top + high - 1, scanLine2=top + high - 1)
 
 
 def _strips(file: Any) -> Iterator[dict[str, bytes]]:

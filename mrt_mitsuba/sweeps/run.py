@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from concurrent.futures import CancelledError
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing
+from itertools import chain
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from mrt_mitsuba.errors import OutputError, one_line
+from mrt_mitsuba.errors import OutputError, UsageError
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
-from mrt_mitsuba.sweeps.cluster import ClusterError, check_engine, connected, inspect
-from mrt_mitsuba.sweeps.jobs import Job, check_parameters, jobs, sent
-from mrt_mitsuba.sweeps.pictures import check_tiles, cut, is_fresh, join, refuse_to_replace
+from mrt_mitsuba.sweeps.cluster import check_engine, connected, inspect, outcomes
+from mrt_mitsuba.sweeps.jobs import Job, check_parameters, jobs, points
+from mrt_mitsuba.sweeps.pictures import cut, is_fresh, join
 from mrt_mitsuba.sweeps.table import Table
-from mrt_mitsuba.sweeps.worker import Setting, noted, render_job, software
-
-if TYPE_CHECKING:
-    from distributed import Client, Future
-
-MOST_DEATHS = 10  # of workers that had been given a job which they did not begin
+from mrt_mitsuba.sweeps.worker import describe
 
 
 def sweep(
@@ -68,114 +63,50 @@ def sweep(
             there.
     """
     check_engine(cluster, workers=workers, retries=retries, dashboard=dashboard)
-    planned = jobs(scene, {} if grid is None else grid, zipped, options)
-    if tiles is not None:
-        check_tiles(tiles, png, planned)
+    if tiles is not None and png:
+        raise UsageError("tiles: pictures in tiles are written as EXR only; leave out png")
+    named = points({} if grid is None else grid, zipped)
     try:
         folder = os.path.abspath(os.fsdecode(out))
         os.makedirs(folder, exist_ok=True)
     except (OSError, TypeError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise OutputError(f"cannot make the folder {out!s}: {reason}") from error
-    table = Table(folder, tuple(grid or {}), planned)
+    table = Table(folder, named)
     shown = TerminalProgress(unit=" pictures") if progress is None else progress
     with TemporaryDirectory(prefix=".mrt-", dir=folder, ignore_cleanup_errors=True) as scratch:
-        pictures = sent(planned, scratch)
-        for job in pictures:
-            refuse_to_replace(job, folder, job.file in table.earlier, png)
-        rest = [job for job in pictures if not (resume and is_fresh(job, folder, png))]
-        work = [(job, cut(job, tiles) if tiles else [job]) for job in rest]
-        made: dict[str, dict[str, Any]] = {}  # facts of tiles that an earlier sweep left, which has kept none
-        for tile in (tile for _, own in work for tile in own if tiles):
-            refuse_to_replace(tile, folder)
-            if resume and is_fresh(tile, folder):
-                made[tile.name] = {}
-        left = {job.name for job in rest}
-        for job in pictures:
-            if job.name not in left:
+        planned = jobs(scene, named, options, scratch)
+        fresh = [is_fresh(job, folder, png, job.file in table.earlier) for job in planned]
+        missing = [job for job, whole in zip(planned, fresh, strict=True) if not (whole and resume)]
+        parts = {job.name: [job] if tiles is None else cut(job, tiles) for job in missing}
+        pictures = {part.name: job for job in missing for part in parts[job.name]}
+        every = list(chain(*parts.values()))
+        # Tiles of an earlier sweep, which has kept no facts of them
+        kept = {tile.name: tile for tile in every if tiles is not None and is_fresh(tile, folder) and resume}
+        rest = [part for part in every if part.name not in kept]
+        check_parameters(missing)
+        versions = describe(scratch)["versions"]
+        for job in planned:
+            if job.name not in parts:
                 known = table.earlier.get(job.file, {})
-                table.add(job.name, known | {"file": job.file, "error": "", "versions": software()})
-        if rest:
-            from distributed.client import ClosedClientError
-
-            check_parameters(planned)
-            variant, most = options.get("variant") or "", sum(len(own) for _, own in work)
-            with connected(cluster, most, workers, dashboard, variant) as client:
-                setting = Setting(folder, scratch, png, software(), inspect(client, scratch))
-                try:
-                    _render(client, setting, retries, work, made, table, shown)
-                except (CancelledError, ClosedClientError, OSError) as error:
-                    raise ClusterError(
-                        "the scheduler is gone: start it and its workers, then run the same sweep again; "
-                        "it continues"
-                    ) from error
-        table.write()
-    return table
-
-
-def _render(
-    client: Client,
-    setting: Setting,
-    retries: int,
-    work: Sequence[tuple[Job, list[Job]]],
-    made: dict[str, dict[str, Any]],
-    table: Table,
-    shown: Progress,
-) -> None:
-    """Let workers render pictures in their parts, tiles or the whole; put tiles together here.
-
-    Each picture's row goes into the table as its last part ends. ``made``: facts of parts that are there.
-    """
-    from distributed import KilledWorker, as_completed
-
-    calls: dict[Future, tuple[Job, list[Job], Job]] = {}
-    handed: Counter[str] = Counter()
-    coming = as_completed(loop=client.loop)
-
-    def hand_over(job: Job, parts: list[Job], part: Job) -> None:
-        handed[part.name] += 1
-        key = f"{os.path.basename(setting.scratch)} {part.name} {handed[part.name]}"
-        future = client.submit(render_job, part, setting, key=key, pure=False)
-        calls[future] = job, parts, part
-        coming.add(future)
-
-    def finish(job: Job, parts: list[Job]) -> None:
-        if all(part.name in made for part in parts):
-            found = [made[part.name] for part in parts]
-            facts = found[0] if parts == [job] else join(job, parts, found, setting.folder, setting.scratch)
-            begun = max(1, *(noted(part, setting)[0] for part in parts))
-            table.add(job.name, facts | {"attempts": begun, "versions": setting.software})
-
-    try:
-        for job, parts in work:
-            for part in parts:
-                if part.name not in made:
-                    hand_over(job, parts, part)
-            finish(job, parts)
-        with shown.stage("Sweep", len(calls)) as advance:
-            for future in coming:
-                job, parts, part = calls.pop(future)
-                if future.status not in ("finished", "error"):
-                    raise CancelledError
-                begun, facts = noted(part, setting)  # whatever has become of the worker since
-                again = facts.pop("again", not facts)
-                # The engine holds a worker's death against all jobs that the worker had been given
-                if again and begun <= retries and handed[part.name] < retries + MOST_DEATHS:
-                    hand_over(job, parts, part)
-                    continue
-                if not facts:
-                    error = future.exception()
-                    text = one_line(f"{type(error).__name__}: {error}")
-                    if isinstance(error, KilledWorker):
-                        text = (
-                            "every worker that rendered it died, perhaps for want of memory: give each more"
-                        )
-                    facts = {"error": text}
+                table.add(job.name, known | {"file": job.file, "error": "", "versions": versions})
+        made: dict[str, dict[str, Any]] = {}
+        ending: Iterator[tuple[Job, dict[str, Any]]] = iter(())
+        variant = options.get("variant") or ""
+        with ExitStack() as stack:
+            if missing:
+                client = stack.enter_context(connected(cluster, len(every), workers, dashboard, variant))
+                setting = {"scratch": scratch, "folder": folder, "png": png, **inspect(client, scratch)}
+                ending = stack.enter_context(closing(outcomes(client, rest, retries, **setting)))
+            stack.callback(table.write)
+            advance = stack.enter_context(shown.stage("Sweep", len(every)))
+            for part, facts in chain(((tile, {}) for tile in kept.values()), ending):
                 made[part.name] = facts
-                future.release()  # what no one needs is not computed again when its worker goes
-                finish(job, parts)
+                job, own = pictures[part.name], parts[pictures[part.name].name]
+                if all(each.name in made for each in own):
+                    found = [made[each.name] for each in own]
+                    facts = facts if own == [job] else join(job, own, found, folder)
+                    begun = max(each.get("attempts", 1) for each in found)
+                    table.add(job.name, facts | {"attempts": begun, "versions": versions})
                 advance(1)
-    finally:
-        table.write()
-        if client.status == "running":
-            client.cancel(list(calls))
+    return table

@@ -8,12 +8,12 @@ import io
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.output.replacing import check_target, replacing
-from mrt_mitsuba.sweeps.jobs import Job, word
+from mrt_mitsuba.sweeps.jobs import word
 
 FACTS = {
     "file": str,
@@ -31,15 +31,15 @@ PAUSE = 1.0  # seconds from one writing to the next, so that short jobs do not r
 class Table:
     """The outcome of each job of a sweep.
 
-    ``folder``: of the pictures, whose ``table.csv`` it is; ``keys``: of the grid; ``earlier``: the facts that
-    the file held before, by the name of the picture.
+    ``folder``: of the pictures, whose ``table.csv`` it is; ``points``: values of each job by key, by its
+    name; ``earlier``: the facts that the file held before, by the name of the picture.
 
     Raises ``OutputError`` for a ``table.csv`` that no sweep made, or that cannot be written.
     """
 
-    def __init__(self, folder: str, keys: tuple[str, ...], jobs: Sequence[Job]) -> None:
-        self.folder, self.keys = folder, keys
-        self._parameters = {job.name: job.parameters for job in jobs}
+    def __init__(self, folder: str, points: Mapping[str, Mapping[str, Any]]) -> None:
+        self.folder, self.keys = folder, tuple(next(iter(points.values()), ()))
+        self._points = points
         self._ended: dict[str, dict[str, Any]] = {}
         self._path = os.path.join(folder, "table.csv")
         self._written = 0.0
@@ -54,67 +54,55 @@ class Table:
         "seconds", "rays", "rmse", "attempts", "worker" and "versions". None stands for the
         unknown: what an earlier sweep did not record, an error that the render did not estimate.
         """
-        return [self._ended[name] for name in self._parameters if name in self._ended]
+        return [self._ended[name] for name in self._points if name in self._ended]
 
     @property
     def failed(self) -> list[dict[str, Any]]:
         """The rows of jobs that left no picture."""
         return [row for row in self.rows if row["error"]]
 
-    def __len__(self) -> int:
-        return len(self._ended)
-
     def __str__(self) -> str:
-        return f"{len(self) - len(self.failed)} of {len(self._parameters)} pictures in {self.folder}"
+        made = len(self._ended) - len(self.failed)
+        return f"{made} of {len(self._points)} pictures in {self.folder}"
 
     def add(self, name: str, facts: Mapping[str, Any]) -> None:
         """Add the row of a job that ended; the file follows once in a while."""
-        self._ended[name] = {
-            **self._parameters[name],
-            **dict.fromkeys(FACTS),
-            "file": "",
-            "error": "",
-            **facts,
-        }
+        unknown = dict.fromkeys(FACTS) | {"file": "", "error": ""}
+        self._ended[name] = {**self._points[name], **unknown, **facts}
         if time.monotonic() > self._written + PAUSE:
             self.write()
 
     def write(self) -> None:
         """Write the file, which replaces the one before when it is complete."""
         text = io.StringIO()
-        writer = csv.DictWriter(text, (*self.keys, *FACTS), lineterminator="\n")
-        writer.writeheader()
-        for row in self.rows:
-            cells = {key: value for key, value in row.items() if isinstance(value, str | float | int | None)}
-            for key in row.keys() - cells.keys():
-                value = row[key]
-                cells[key] = (
-                    json.dumps(value, default=word) if isinstance(value, list | tuple) else word(value)
-                )
-            writer.writerow(cells)
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerows([(*self.keys, *FACTS), *(map(_cell, row.values()) for row in self.rows)])
         with replacing(self._path) as (file,):
             file.write(text.getvalue().encode())
         self._written = time.monotonic()
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, str | float | int | None):
+        return value
+    return json.dumps(value, default=word) if isinstance(value, list | tuple) else word(value)
 
 
 def _read(path: str) -> dict[str, dict[str, Any]]:
     """Return the facts of an earlier table by the name of the file."""
     if not os.path.exists(path):
         return {}
-    rows: list[dict[str, str]] = []
-    columns: Sequence[str] = ()
+    rows, columns = [], []
     with (
-        contextlib.suppress(OSError, UnicodeDecodeError, csv.Error),
+        contextlib.suppress(OSError, ValueError, csv.Error),
         open(path, encoding="utf-8", newline="") as file,
     ):
-        reader = csv.DictReader(file)
-        rows, columns = list(reader), reader.fieldnames or ()
-    if tuple(columns[-len(FACTS) :]) != tuple(FACTS):
+        columns, *rows = csv.reader(file)
+    if columns[-len(FACTS) :] != [*FACTS]:
         raise OutputError(f"{path} is not the table of a sweep: move it away, or choose another folder")
     found: dict[str, dict[str, Any]] = {}
-    for row in rows:
-        facts = found.setdefault(row["file"], {})
-        for name, kind in FACTS.items():
-            with contextlib.suppress(ValueError, TypeError):
-                facts[name] = kind(row[name])
+    for row in (row[-len(FACTS) :] for row in rows if len(row) == len(columns)):
+        found[row[0]] = {}
+        with contextlib.suppress(ValueError):  # it was edited
+            found[row[0]] = {name: FACTS[name](text) for name, text in zip(FACTS, row, strict=True) if text}
     return found
