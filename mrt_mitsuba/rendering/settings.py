@@ -209,10 +209,3 @@ class RenderSettings:
 
 #: The options of a render by name, without those that only Python can give
 TABLE = table(RenderSettings)
-
-
-def check(name: str, value: Any) -> Any:
-    """Return a value of the option ``name`` as ``RenderSettings`` holds it; raise ``UsageError``."""
-    if name not in TABLE:
-        raise UsageError(f"unknown option {name!r}")
-    return checked(TABLE[name], value)

@@ -39,8 +39,6 @@ def check_engine(cluster: Any, **numbers: Any) -> None:
             raise UsageError(f"{name}={number!r}: must be a whole number, {least} or more")
     if numbers["workers"] is not None and cluster is not None:
         raise UsageError("workers are for this machine, and a cluster brings its own: give one of them")
-    if numbers["dashboard"] is not None and importlib.util.find_spec("bokeh") is None:
-        raise UsageError("the dashboard needs Bokeh: pip install bokeh, or leave dashboard out")
 
 
 @contextmanager

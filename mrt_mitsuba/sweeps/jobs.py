@@ -3,9 +3,7 @@ scenes on their way to the workers."""
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-import inspect
 import io
 import itertools
 import math
@@ -19,15 +17,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, SupportsIndex
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.runtime import use, versions
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.open import open_scene, set_parameters
 from mrt_mitsuba.scene.report import report_scene
 
 MOST_JOBS = 100_000  # all are held in memory
-LONGEST_NAME = 200  # bytes of a file's name without its ending; file systems take 255
-# Arguments of ``render`` that stay in this process, or that are given otherwise
-NOT_SWEPT = frozenset({"scene", "progress", "on_round", "region", "params"})
 SENT = ".scene"  # ending of a scene that is written next to the pictures, for the workers to read
 
 
@@ -44,6 +40,10 @@ class Job(NamedTuple):
         """The name of its picture in the folder."""
         return f"{self.name}.exr"
 
+    def files(self, png: bool) -> list[str]:
+        """Return the names of all that it leaves in the folder."""
+        return [self.file, *([f"{self.name}.png"] if png else [])]
+
     @property
     def made_with(self) -> str:
         """Fingerprint of all that decides about its pixels: scene, settings and versions."""
@@ -56,8 +56,8 @@ def points(grid: Any, zipped: bool) -> dict[str, dict[str, Any]]:
 
     ``zipped``: the axes are columns of one list, whose rows are the jobs, and files are numbered.
 
-    Raises ``UsageError`` for an axis that is empty or no list, an unknown key, a value out of range, columns
-    of different lengths, and jobs whose files would have the same name.
+    Raises ``UsageError`` for an axis that is empty or no list, columns of different lengths, too many jobs,
+    and jobs whose files would have the same name.
     """
     if not isinstance(grid, Mapping):
         raise UsageError(f'grid={grid!r}: give a dict of lists, such as {{"aa": [1, 2]}}')
@@ -67,55 +67,31 @@ def points(grid: Any, zipped: bool) -> dict[str, dict[str, Any]]:
         raise UsageError(f"zipped axes must be of one length, and those of {', '.join(axes)} are {lengths}")
     if (max(lengths, default=0) if zipped else math.prod(lengths)) > MOST_JOBS:
         raise UsageError(f"the grid has more than {MOST_JOBS} jobs: make several sweeps of it")
-    columns = [checked(key, values) for key, values in axes.items()]
-    rows = zip(*columns, strict=True) if zipped else itertools.product(*columns)
+    rows = zip(*axes.values(), strict=True) if zipped else itertools.product(*axes.values())
     found = [dict(zip(axes, row, strict=True)) for row in rows]
     if zipped:  # as programs for films expect them
         return {f"frame_{number:04}": point for number, point in enumerate(found)}
     names = [",".join(f"{word(k)}={word(v)}" for k, v in point.items()) or "picture" for point in found]
     counts = Counter(name.casefold() for name in names)  # some file systems ignore case
     for name in names:
-        problem, count = "", counts[name.casefold()]
-        if len(name.encode()) > LONGEST_NAME:
-            problem = f"the file {name[:60]}... would have a name of {len(name)} characters"
-        elif count > 1:
-            problem = f"{count} jobs would write the same file {name}"
-        if problem:
-            raise UsageError(f"{problem}: take values out, or use zipped=True, which numbers the files")
+        if (count := counts[name.casefold()]) > 1:
+            raise UsageError(
+                f"{count} jobs would write the same file {name}: take values out, or use zipped=True, which "
+                "numbers the files"
+            )
     return dict(zip(names, found, strict=True))
 
 
 def _axis(key: Any, values: Any) -> list[Any]:
     if not (isinstance(key, str) and key.isprintable()):
         raise UsageError(f"grid: the key {key!r} is no name of an option or a parameter")
-    values = values.tolist() if hasattr(values, "tolist") else values
+    values = values.tolist() if hasattr(values, "tolist") else values  # NumPy's
     if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
         raise UsageError(f"grid: {key} is {values!r}; give a list of values, such as [{values!r}]")
     found = list(itertools.islice(values, MOST_JOBS + 1))  # some never end
     if not found:
         raise UsageError(f"grid: {key} is an empty list; give it values, or leave it out")
-    return found
-
-
-def checked(key: str, values: Sequence[Any]) -> list[Any]:
-    """Return values as ``render`` takes them; raise ``UsageError`` where it cannot."""
-    from mrt_mitsuba import render
-    from mrt_mitsuba.rendering import settings
-
-    known = inspect.signature(render).parameters.keys() - NOT_SWEPT
-    if key not in {*known, "scene", "params"} and "." not in key:
-        close = difflib.get_close_matches(key, known, n=1)
-        hint = f"did you mean {close[0]}?" if close else "a parameter of the scene has a dot in its key"
-        raise UsageError(f"{key} is not an option of render: {hint}")
-    found = [value.tolist() if hasattr(value, "tolist") else value for value in values]  # NumPy's
-    for value in found:
-        numbers = value if isinstance(value, list | tuple) else [value]
-        if not all(math.isfinite(number) for number in numbers if isinstance(number, float)):
-            raise UsageError(f"{key}={value!r}: give finite numbers")
-        if key == "params" and not isinstance(value, Mapping):
-            raise UsageError(f"params={value!r}: give a dict of values by name")
-    table = settings.TABLE if key in known else {}
-    return [settings.check(key, value) for value in found] if key in table else found
+    return [value.tolist() if hasattr(value, "tolist") else value for value in found]
 
 
 def word(value: Any) -> str:
@@ -138,10 +114,9 @@ def jobs(
     """Return the job of each point, given what all share, with scenes as workers can open them: numbers and
     absolute paths. Any other scene is written into a folder.
 
-    Raises ``UsageError`` for what is given twice, or cannot be sent to another process, and ``SceneError``
-    for a file that cannot be read.
+    Raises ``UsageError`` for what ``render`` does not take, is given twice, or cannot be sent to another
+    process, and ``SceneError`` for a file that cannot be read.
     """
-    shared = {key: checked(key, [value])[0] for key, value in fixed.items() if value is not None}
     axes = {key for point in named.values() for key in point}
     if twice := axes & {*fixed, "" if scene is None else "scene"}:
         raise UsageError(f"{min(twice)} is given twice: as an axis of the grid and for all jobs; drop one")
@@ -149,10 +124,14 @@ def jobs(
     found = []
     for name, point in named.items():
         dotted = {key: value for key, value in point.items() if "." in key}
-        arguments = shared | {key: value for key, value in point.items() if key not in dotted}
-        if params := {**shared.get("params", {}), **point.get("params", {}), **dotted}:
-            arguments["params"] = params
+        arguments = {**fixed, **{key: value for key, value in point.items() if key not in dotted}}
         own = arguments.pop("scene", scene)
+        try:
+            RenderSettings.of(**arguments)
+        except TypeError as error:
+            raise UsageError(str(error)) from None
+        if params := {**(fixed.get("params") or {}), **(point.get("params") or {}), **dotted}:
+            arguments["params"] = params
         if id(own) not in scenes:
             sent = _send(own, os.path.join(folder, f"{len(scenes)}{SENT}"))
             scenes[id(own)] = sent, identify(sent)
@@ -164,7 +143,7 @@ def check_parameters(jobs: Sequence[Job]) -> None:
     """Raise ``UsageError`` if a job sets what its scene does not have; each scene is loaded once."""
     loaded: dict[str, Any] = {}
     for job in jobs:
-        params = job.arguments.get("params", {})
+        params = job.arguments.get("params") or {}
         declared = {name: value for name, value in params.items() if "." not in name}
         which = fingerprint(job.scene, declared)
         if params and which not in loaded:

@@ -23,11 +23,6 @@ BYTES_PER_PIXEL = 128
 LEAST_MEMORY = 2**27
 
 
-def endings(png: bool) -> tuple[str, ...]:
-    """Return the kinds of files that a job leaves."""
-    return ("exr", "png") if png else ("exr",)
-
-
 def mark(path: str, whole: bool = False) -> str | None:
     """Return the fingerprint in a picture that a sweep made, "" in any other; None for what is no picture,
     or, if that is asked for, no ``whole`` one."""
@@ -61,8 +56,7 @@ def is_fresh(job: Job, folder: str, png: bool = False, listed: bool = False) -> 
     header or, where that is broken, a row in the table (``listed``).
     """
     wanted, fresh = job.made_with, True
-    for ending in endings(png):
-        path = os.path.join(folder, f"{job.name}.{ending}")
+    for path in (os.path.join(folder, file) for file in job.files(png)):
         found = mark(path)
         if os.path.lexists(path) and not (found or (found is None and listed and os.path.isfile(path))):
             raise OutputError(

@@ -16,8 +16,9 @@ from mrt_mitsuba.cores import affinity, usable_cores
 from mrt_mitsuba.errors import MrtError, one_line
 from mrt_mitsuba.memory import free_memory
 from mrt_mitsuba.options import SMALLEST_MEMORY
+from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.sweeps.jobs import Job, identify, receive
-from mrt_mitsuba.sweeps.pictures import MADE_WITH, endings
+from mrt_mitsuba.sweeps.pictures import MADE_WITH
 
 
 def describe(folder: str, dask_worker: Any = None) -> dict[str, Any]:
@@ -74,7 +75,7 @@ def render_job(
             if here["versions"] != versions:
                 raise MrtError(f"the worker has {here['versions']}; the sweep began with {versions}")
             threads = max(1, usable_cores() // sharing.get(here["cores"], 1))
-            facts |= _render(job, folder, own, endings(png), threads, worker.memory_manager.memory_limit)
+            facts |= _render(job, folder, scratch, png, threads, worker.memory_manager.memory_limit)
     except MrtError as error:
         facts["error"] = str(error)
     except BaseException as error:
@@ -91,7 +92,7 @@ def _note(own: str, facts: Mapping[str, Any]) -> None:
 
 
 def _render(
-    job: Job, folder: str, own: str, kinds: tuple[str, ...], threads: int, limit: int | None
+    job: Job, folder: str, scratch: str, png: bool, threads: int, limit: int | None
 ) -> dict[str, Any]:
     start = time.perf_counter()
     import drjit as dr
@@ -101,7 +102,6 @@ def _render(
     from mrt_mitsuba.output.files import save, to_8bit
     from mrt_mitsuba.output.replacing import check_target
     from mrt_mitsuba.rendering.api import render
-    from mrt_mitsuba.rendering.progress import Progress
 
     if dr.thread_count() != threads:
         dr.set_thread_count(threads)
@@ -113,19 +113,16 @@ def _render(
     if identify(job.scene) != job.identity:
         raise MrtError(f"{job.scene} has changed since the sweep began: run it again")
     header = result.header() | {MADE_WITH: job.made_with}
-    save(f"{own}.exr", result.image, layers=result.layers, header=header)
-    if "png" in kinds:
+    save(f"{scratch}/{job.file}", result.image, layers=result.layers, header=header)
+    if png:
         mark = PngInfo()
         mark.add_text(MADE_WITH, job.made_with)
-        Image.fromarray(to_8bit(result.image)).save(f"{own}.png", pnginfo=mark)
-    for ending in kinds:
-        target = os.path.join(folder, f"{job.name}.{ending}")
+        Image.fromarray(to_8bit(result.image)).save(f"{scratch}/{job.name}.png", pnginfo=mark)
+    for file in job.files(png):
+        target = os.path.join(folder, file)
         os.makedirs(os.path.dirname(target), exist_ok=True)
         check_target(target, result.inputs)  # a scene may read pictures of earlier sweeps
-        os.replace(f"{own}.{ending}", target)
-    return {
-        "file": job.file,
-        "seconds": time.perf_counter() - start,
-        "rays": int(sum(result.rays.values())),
-        "rmse": float(result.error.rmse) if result.error else None,
-    }
+        os.replace(os.path.join(scratch, file), target)
+    error = result.error and float(result.error.rmse)
+    rays = int(sum(result.rays.values()))
+    return {"file": job.file, "seconds": time.perf_counter() - start, "rays": rays, "rmse": error}
