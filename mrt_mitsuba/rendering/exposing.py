@@ -265,6 +265,6 @@ def _by_pixel(values: dict[str, list[Any]], size: int) -> Iterator[tuple[str, in
                 plane = np.asarray(plane)[::size]
             elif size > 1 and isinstance(plane, np.ndarray):
                 plane = plane.reshape(-1, size).sum(1)
-            elif size > 1:
-                plane = dr.block_reduce(dr.ReduceOp.Add, plane, size)
+            elif size > 1:  # a value of one entry is that of all rays
+                plane = dr.block_reduce(dr.ReduceOp.Add, plane, size) if dr.width(plane) > 1 else plane * size
             yield name, channel, np.asarray(plane, np.float32) * np.float32(1 if first else 1 / size)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from nodes import sensor
 
+import mrt_mitsuba as mrt
+
 pytestmark = pytest.mark.usefixtures("variant")
 
 WHITTED = {"type": "mrt_whitted", "clamp": False, "min_contribution": 0.0, "bounce_budget": "plain"}
@@ -148,3 +150,13 @@ def test_a_bounce_costs_what_the_index_leaves_of_ten(ior: float, bounces: int) -
     tracer = mi.load_dict({**WHITTED, "bounce_budget": "report", "sky": 1.0})
     ray = mi.Ray3f(mi.Point3f(0, 0, 0.5), mi.Vector3f(0, 0, -1))
     assert np.array(tracer.trace(scene, None, ray).bounces).item() == bounces
+
+
+def test_mirror_rays_are_counted_where_there_are_none() -> None:
+    scene = {
+        "type": "scene",
+        "sensor": sensor([0, 0, 5], [0, 0, 0], (8, 6)),
+        "floor": {**FLOOR, "bsdf": MATTE},
+    }
+    result = mrt.render(scene, integrator=WHITTED, aa=2, aamode="none", lattice="report", layers=["bounces"])
+    assert result.layers["bounces.Y"].shape == (6, 8) and not result.layers["bounces.Y"].any()
