@@ -36,8 +36,6 @@ def scene_xml(inside: str) -> str:
     return f"<scene version='3.0.0'>{SENSOR}{inside}</scene>"
 
 
-# ------------------------------------------- 1: native code --------------------------------------------
-
 TRAP = """
 #include <stdlib.h>
 #include <fcntl.h>
@@ -94,9 +92,6 @@ def test_no_native_code_from_the_folders_of_process_and_scene(
     assert not sign.exists()
 
 
-# ------------------------------------------- 2: many shapes --------------------------------------------
-
-
 def test_hundreds_of_python_shapes_load(variant: str, tmp_path: Path) -> None:
     """Loaded in parallel, 300 of them overflowed the stack each time."""
     count = 400 if ROUNDS == 1 else 10_000
@@ -115,8 +110,6 @@ def test_hundreds_of_python_shapes_load(variant: str, tmp_path: Path) -> None:
     (tmp_path / "m.obj").write_text("\n".join(lines + [f"usemtl {n}\nf 1 2 3" for n in names]) + "\n")
     assert mrt.render(str(tmp_path / "m.obj"), width=4, height=3, aa=1).image.shape == (3, 4, 3)
 
-
-# ------------------------------------------- 3: long lines --------------------------------------------
 
 READ_MODELS = """
 import sys, warnings
@@ -150,9 +143,6 @@ def test_time_to_read_a_model_grows_with_its_size(run_python) -> None:
     assert all(len(line) < 200 for line in lines)
 
 
-# -------------------------------------------- 4: memory -----------------------------------------------
-
-
 PIPE = "<string name='filename' value='pipe'/>"
 TEXTURED = "<bsdf type='{}'><texture name='{}' type='{}'>{}</texture></bsdf>"
 REFLECTANCES = (("mrt_bsdf", "diffuse_reflectance"), ("diffuse", "reflectance"))
@@ -175,9 +165,6 @@ def test_limited_addresses_end_in_a_message(run_command, megabytes: int) -> None
     done = run_command("sh", "-c", f"ulimit -v {megabytes * 1000} && exec {command}")
     if done.returncode != 0:
         assert done.returncode == 2 and "memory=" in done.stderr and done.stderr.count("\n") == 1, done.stderr
-
-
-# ------------------------------------------- 6: XML and pipes ------------------------------------------
 
 
 @pytest.mark.parametrize("depth", [1000, 100_000])
@@ -213,8 +200,6 @@ def test_pipes_are_refused(variant: str, tmp_path: Path, inside: str) -> None:
     with pytest.raises(SceneError, match="pipe: it is not a regular file"):
         mrt.render(str(tmp_path / "a.xml"), aa=1)
 
-
-# --------------------------------------- Every plugin in every place -----------------------------------
 
 KINDS = {
     "sensor": "perspective thinlens orthographic radiancemeter irradiancemeter distant batch",
@@ -267,9 +252,6 @@ def test_every_plugin_in_every_place(mrt_command, tmp_path: Path, place: int) ->
     assert done.stderr.count("\n") == (done.returncode != 0), (inside, done.stderr)
 
 
-# -------------------------------------- 9, 12: files that lie -----------------------------------------
-
-
 @pytest.mark.parametrize("name", ["n" * 300, "closed/m", "pipe", "folder"])
 def test_unreadable_library_and_texture_are_warnings(variant: str, tmp_path: Path, name: str) -> None:
     """A mode of 0 does not keep the superuser out; a folder of that name stands for it."""
@@ -303,8 +285,6 @@ def test_messages_are_printable_short_and_few(variant: str, tmp_path: Path) -> N
     assert len(warned) == 1 and "and so do 19999 more materials" in str(warned[0].message)
     assert str(warned[0].message).isprintable()
 
-
-# ---------------------------------------- 8, 11: threads, Ctrl-C ---------------------------------------
 
 THREADS = """
 from concurrent.futures import ThreadPoolExecutor

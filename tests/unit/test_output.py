@@ -182,10 +182,9 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path: Path, image: np.nda
     left, alive, recent = (tmp_path / f".mrt-{name}.tmp" for name in ("left", "alive", "recent"))
     with alive.open("wb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        for path in (left, recent):
+        for path, made in ((left, 0), (alive, 0), (recent, 2**32)):
             path.touch()
-        for path in (left, alive):
-            os.utime(path, (0, 0))
+            os.utime(path, (made, made))
         output.save(tmp_path / "a.png", image)
     assert sorted(path.name for path in tmp_path.iterdir()) == [alive.name, recent.name, "a.png"]
 
@@ -217,7 +216,7 @@ def test_a_forked_process_can_write_too(tmp_path: Path, image: np.ndarray) -> No
     output.write_exr(tmp_path / "a.exr", image)
     child = os.fork()
     if child == 0:
-        signal.alarm(20)  # end it, should it wait
+        signal.alarm(100)  # end it, should it wait
         output.write_exr(tmp_path / "b.exr", image)
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0
@@ -252,12 +251,7 @@ WAYS = {
 
 @pytest.mark.parametrize(
     ("module", "words"),
-    [
-        ("mrt_mitsuba", ""),
-        ("mrt_mitsuba.validation.cli", "scenes --quick"),
-        ("mrt_mitsuba.command.main", "out 3"),
-        ("mrt_mitsuba.command.main", "diff a.exr b.exr"),
-    ],
+    [("mrt_mitsuba", ""), ("mrt_mitsuba.validation.cli", "scenes"), ("mrt_mitsuba.command.main", "out")],
 )
 def test_a_deleted_working_folder_is_named(tmp_path: Path, module: str, words: str) -> None:
     """Mitsuba itself ends in an ImportError there, and then by a signal."""

@@ -3,52 +3,29 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.scene.model import Material, Scene
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
 SIZE = {"width": 96, "height": 72, "aa": 1}
 
 
-def numbers_of(scene: Scene) -> list[float]:
-    """Every number of a scene, in a fixed order."""
-
-    def material(m: Material) -> list[float]:
-        return [m.ior, m.alpha, *m.specular, *m.diffuse]
-
-    camera = scene.camera
-    numbers = [*camera.position, *camera.target, *camera.up, camera.hfov, *scene.sky]
-    numbers += [x for light in scene.lights for x in (*light.position, *light.color)]
-    numbers += [x for s in scene.spheres for x in (*s.center, s.radius, *material(s.material))]
-    numbers += [x for p in scene.planes for x in (*p.normal, p.distance, *material(p.material))]
-    numbers += [x for c in scene.cones for x in (*c.apex, *c.base_center, c.radius, *material(c.material))]
-    return numbers
+CHECKSUMS = {0: "feba33f127b306e6", 1: "1e50e54ba02c76ea", 2: "b1370db4e03bb43f"}
+CHECKSUMS |= {3: "1283761a604bf9e8", 4: "dd85fef2a53f26c1", 9: "ee199ea7fa12b9c4"}
 
 
-@pytest.mark.parametrize(
-    ("number", "checksum", "focus", "counts"),
-    [
-        (0, "a4fed8279d9f45a4", (None, 2), (2, 4, 1, 0)),
-        (1, "59e6d0293dcd62af", (None, 2), (2, 21, 1, 0)),
-        (2, "479f60dbec271721", (None, 2), (3, 40, 1, 0)),
-        (3, "669691de4cc8b866", (2, 2), (3, 6, 3, 0)),
-        (4, "8c1edd15fa716260", (0.1, 3), (3, 600, 3, 0)),
-        (9, "181e4b35414501f8", (None, 2), (2, 0, 1, 1)),
-    ],
-)
-def test_no_number_has_changed(number: int, checksum: str, focus: tuple, counts: tuple) -> None:
+@pytest.mark.parametrize("number", CHECKSUMS)
+def test_no_number_has_changed(number: int) -> None:
     """Nine digits count; the checksums were taken once the numbers had been compared with the original's."""
-    scene = report_scene(number)
-    assert tuple(map(len, (scene.lights, scene.spheres, scene.planes, scene.cones))) == counts
-    assert (scene.focal_distance, scene.focal_range) == focus
-    text = " ".join(f"{x + 0.0:.9g}" for x in numbers_of(scene))
-    assert hashlib.sha256(text.encode()).hexdigest()[:16] == checksum
+    found = re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", repr(report_scene(number)))
+    text = " ".join(f"{float(x) + 0.0:.9g}" for x in found)
+    assert hashlib.sha256(text.encode()).hexdigest()[:16] == CHECKSUMS[number]
 
 
 def test_there_are_ten_scenes_each_read_once_and_no_others() -> None:
