@@ -83,6 +83,8 @@ def _read(props: mi.Properties) -> mi.Bitmap:
         path = mi.file_resolver().resolve(text(props, "filename"))
         try:
             bitmap = mi.Bitmap(str(path))
+            if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+                raise RuntimeError("it has channels that are no colour")
         except RuntimeError as error:
             raise ParameterError(
                 f'mrt_texture: "filename" is {str(path)!r}, which cannot be read: {error}'

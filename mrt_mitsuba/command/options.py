@@ -105,7 +105,7 @@ def _filename(text: str) -> str:
         raise UsageError(f"unknown option {text}: options are written name=value; 'mrt help' lists them")
     if ending.lower() in (".png", ".exr"):
         raise UsageError(f"FILENAME has no extension: write {stem} format={ending[1:].lower()}")
-    if not os.path.basename(text) or "\0" in text:
+    if not os.path.basename(text).strip(".") or "\0" in text:
         raise UsageError(f"FILENAME {text!r} names no file")
     return text
 

@@ -189,6 +189,8 @@ def read_channels(path: Path) -> tuple[dict[str, Image], dict[str, dict[str, Any
     if not parts:
         problem = "a deep EXR holds many values in a pixel; flatten it first" if deep else "not a whole EXR"
         raise OutputError(f"cannot read {name}: {problem}")
+    if any(len({values.pixels.shape for values in part.channels.values()}) > 1 for part in parts):
+        raise OutputError(f"cannot read {name}: its channels differ in size; write it without sub-sampling")
     planes: dict[str, Image] = {}
     headers: dict[str, dict[str, Any]] = {}
     for part in parts:

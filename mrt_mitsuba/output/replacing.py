@@ -86,6 +86,8 @@ def _explained(*paths: Path) -> Iterator[None]:
 def _target(path: Path, inputs: Iterable[Path]) -> str:
     """Return the real path to write; raise ``OutputError`` where replacing a file there would be wrong."""
     name = os.fspath(path)
+    if "\0" in name or os.path.basename(name) in ("", ".", ".."):
+        raise OutputError(f"cannot write {name!r}: it names no file")
     target = os.path.realpath(name)
     folder = os.path.dirname(target)
     if not os.path.isdir(folder):

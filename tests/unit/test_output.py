@@ -106,12 +106,27 @@ def test_reading_what_is_no_exr(tmp_path: Path, content: bytes | None) -> None:
         output.read_exr(path)
 
 
+def test_channels_of_different_sizes_are_refused(tmp_path: Path) -> None:
+    import OpenEXR
+
+    header = OpenEXR.Header(4, 2)
+    kind = header["channels"]["R"]
+    header["channels"] = {"R": kind, "G": type(kind)(kind.type, 2, 2), "B": kind}
+    picture = OpenEXR.OutputFile(str(tmp_path / "a.exr"), header)
+    picture.writePixels({"R": bytes(32), "G": bytes(8), "B": bytes(32)})
+    picture.close()
+    with pytest.raises(OutputError, match="its channels differ in size; write it without sub-sampling"):
+        output.read_exr(tmp_path / "a.exr")
+
+
 @pytest.mark.parametrize(
     ("make", "name", "reason"),
     [
         (lambda path: path.touch(0o444), "a.png", "is read-only"),
         (None, "/dev/full", "not a regular file"),
         (None, "a" * 300 + ".png", "name too long"),
+        (None, "a\0.png", "names no file"),
+        (None, "..", "names no file"),
     ],
 )
 def test_target_that_cannot_be_written(

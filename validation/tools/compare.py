@@ -74,6 +74,8 @@ class Difference:
         """
         from matplotlib import colormaps
 
+        if not Path(path).name.strip("."):
+            raise OutputError(f"cannot write {str(path)!r}: it names no file")
         stem = Path(path).with_suffix("") if Path(path).suffix in (".exr", ".png") else Path(path)
         for ending in ("exr", "png"):
             check_target(f"{stem}.{ending}", self.inputs)
