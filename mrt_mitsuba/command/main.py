@@ -10,9 +10,9 @@ import warnings
 from collections.abc import Sequence
 
 from mrt_mitsuba.command import registry
-from mrt_mitsuba.command.interrupt import Terminated, ending_soon, leave_now
 from mrt_mitsuba.command.options import parse
 from mrt_mitsuba.errors import MrtError, UsageError, one_line
+from mrt_mitsuba.interrupts import Terminated, ending_soon, leave_now
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from mrt_mitsuba.command.registry import split
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import choice, either, from_text, option, path, switch, table
 from mrt_mitsuba.rendering import settings
@@ -58,43 +60,29 @@ def parse(arguments: Sequence[str]) -> Options:
     if not arguments:
         raise UsageError(f"FILENAME is missing: {FORM}")
     values: dict[str, Any] = {"filename": _filename(arguments[0])}
-    given: dict[str, str] = {}
-    for place, argument in enumerate(arguments[1:]):
-        name, equals, text = argument.partition("=")
-        if name in given:
-            raise UsageError(f"{name} is given twice")
-        if equals:
-            given[name] = text
-        elif place > 0:
-            raise UsageError(f"unexpected argument {argument!r}: options are written name=value")
-        else:
-            values["scene_number"] = _scene_number(argument)
-    if "scene" in given and "scene_number" in values:
-        raise UsageError(f"both SCENE {values['scene_number']} and scene={given['scene']}: give one of them")
-    for name in ("motionsamples", "motionmode"):
-        if name in given and "motion" not in given:
-            raise UsageError(f"{name} is of use only with motion=dx,dy,dz")
+    plain, given = split(arguments[1:])
+    if len(plain) > 1:
+        raise UsageError(f"unexpected argument {plain[-1]!r}: options are written name=value")
+    if plain:
+        values["scene_number"] = _scene_number(plain[0])
+        if "scene" in given:
+            raise UsageError(f"both SCENE {plain[0]} and scene={given['scene']}: give one of them")
+    if "motion" not in given and (idle := given.keys() & {"motionsamples", "motionmode"}):
+        raise UsageError(f"{min(idle)} is of use only with motion=dx,dy,dz")
     values |= {name: from_text(TABLE[name], text) for name, text in given.items() if name in TABLE}
     params = {name: text for name, text in given.items() if name not in TABLE}
     if params:
-        _check_declared(params, values.get("scene", ""))
+        from mrt_mitsuba.scene.loading import declared
+
+        scene = values.get("scene", "")
+        known = declared(scene) if scene.lower().endswith(".xml") else {}
+        for strange in (name for name in params if name not in known):
+            close = difflib.get_close_matches(strange.lstrip("-").lower(), [*TABLE, *known], n=1)
+            hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
+            raise UsageError(f"unknown option {strange!r}.{hint}")
     options = Options(**values, params=params or None)
     check_model_options(options.scene, options.model())
     return options
-
-
-def _check_declared(params: Iterable[str], scene: str) -> None:
-    """Raise ``UsageError`` for names that are neither options nor parameters of an XML file."""
-    from difflib import get_close_matches
-
-    from mrt_mitsuba.scene.loading import declared
-
-    known = declared(scene) if scene.lower().endswith(".xml") else {}
-    for strange in params:
-        if strange not in known:
-            close = get_close_matches(strange.lstrip("-").lower(), [*TABLE, *known], n=1)
-            hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
-            raise UsageError(f"unknown option {strange!r}.{hint}")
 
 
 def _filename(text: str) -> str:

@@ -4,53 +4,71 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 
 from mrt_mitsuba.errors import UsageError
 
-# name: its words as the help shows them, what it does, and "module:function". The function takes plain words
+TOOLS, CHECKS = "mrt_mitsuba.command.tools", "mrt_mitsuba.validation.tools.commands"
+
+# name: its words as the help shows them, what it does, module and function. The function takes plain words
 # in turn and the others by name, all as text, raises ``MrtError`` and returns the exit code
 COMMANDS = {
-    "help": ("", "print this text", "mrt_mitsuba.command.tools:show_help"),
-    "doctor": (
-        "",
-        "print versions, the LLVM in use, the variants; render a self-test",
-        "mrt_mitsuba.command.tools:doctor",
-    ),
-    "scenes": ("", "list the scenes", "mrt_mitsuba.command.tools:show_scenes"),
+    "help": ("", "print this text", TOOLS, "show_help"),
+    "doctor": ("", "print versions, the LLVM in use, the variants; render a self-test", TOOLS, "doctor"),
+    "scenes": ("", "list the scenes", TOOLS, "show_scenes"),
     "export": (
         "SCENE|scene=PATH --xml PATH [--stock] [name=value ...]",
         "write a scene as Mitsuba XML; --stock: with stock plugins only",
-        "mrt_mitsuba.command.tools:export",
+        TOOLS,
+        "export",
     ),
     "sweep": (
         "OUT FILE.toml [workers=N] [cluster=ADDRESS]",
         "render the grid in a file on several processes or machines",
-        "mrt_mitsuba.command.tools:sweep",
+        TOOLS,
+        "sweep",
     ),
     "diff": (
         "A.exr B.exr [layer=NAME] [mae|rmse|rel_mse|psnr|largest|flip|p_value=LIMIT] [out=PATH]",
         "compare two pictures; exit code 1 beyond a limit, 2 if they do not compare",
-        "mrt_mitsuba.validation.tools.commands:diff",
+        CHECKS,
+        "diff",
     ),
     "check": (
         "SCENE|scene=PATH [out=DIR] [quick=1]",
         "check the laws of every BSDF, shape and emitter, and find pixels that are not finite",
-        "mrt_mitsuba.validation.tools.commands:check",
+        CHECKS,
+        "check",
     ),
     "error-vs-time": (
         "SCENE|scene=PATH cases=FILE.toml [out=DIR]",
         "measure error and time of any settings of any scene",
-        "mrt_mitsuba.validation.tools.commands:error_vs_time",
+        CHECKS,
+        "error_vs_time",
     ),
 }
 ALL = {
     **COMMANDS,  # the others are not in the help
     "-h": COMMANDS["help"],
     "--help": COMMANDS["help"],
-    "--version": ("", "print the version", "mrt_mitsuba.command.tools:show_version"),
+    "--version": ("", "print the version", TOOLS, "show_version"),
 }
+
+
+def split(words: Iterable[str]) -> tuple[list[str], dict[str, str]]:
+    """Return plain words, and those of the form ``name=value`` by name, of which each may be given once."""
+    plain: list[str] = []
+    given: dict[str, str] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if name in given:
+            raise UsageError(f"{name} is given twice")
+        if equals:
+            given[name] = value
+        else:
+            plain.append(word)
+    return plain, given
 
 
 def run(name: str, words: Sequence[str]) -> int:
@@ -58,52 +76,38 @@ def run(name: str, words: Sequence[str]) -> int:
 
     Raises ``UsageError`` for words that its row does not have.
     """
-    form, _, home = ALL[name]
+    form, _, module, function = ALL[name]
     usage = f"Usage: mrt {name} {form}".strip()
-    plain, given = _read(words, form, usage)
+    rest, flags = iter(words), re.findall(r"--\w+(?: PATH)?", form)
+    plain, given = split(
+        f"{word[2:]}={next(rest, '')}"
+        if f"{word} PATH" in flags
+        else f"{word[2:]}=1"
+        if word in flags
+        else word
+        for word in rest
+    )
+    names = names_in(form)
+    for strange in (each for each in given if each not in names and "name" not in names):
+        close = difflib.get_close_matches(strange, names, n=1)
+        raise UsageError(f"unknown option {strange!r}{f', meant {close[0]}?' if close else '.'} {usage}")
     if "scene" in given:  # in place of SCENE
         plain.append(given.pop("scene"))
-    needed = _FLAG_WITH_VALUE.sub(r"\1=\2", form).split()
-    wanted = [word for word in needed if word[0].isupper()]
+    wanted = [word for word in form.replace("--xml PATH", "").split() if word[0].isupper()]
     if len(plain) > len(wanted):
         raise UsageError(f"unexpected argument {plain[len(wanted)]!r} after mrt {name}. {usage}")
-    keys = [word.partition("=")[0] for word in needed if word[0].islower()]
-    missing = wanted[len(plain) :] + [key for key in keys if not given.get(key)]
+    needed = re.findall(r"(?<!\S)(?:--)?([a-z_]+)[= ]", form)  # without brackets
+    missing = wanted[len(plain) :] + [
+        f"{'--' * (f'--{key}' in form)}{key}" for key in needed if not given.get(key)
+    ]
     if missing:
-        flag = "--" if f"--{missing[0]}" in form else ""
-        raise UsageError(f"{flag}{missing[0]} is missing. {usage}")
+        raise UsageError(f"{missing[0]} is missing. {usage}")
     if form or name == "doctor":  # the others do without Mitsuba
         from mrt_mitsuba.runtime import check_start
 
         check_start()
-    module, _, function = home.partition(":")
     code: int = getattr(import_module(module), function)(*plain, **given)
     return code
-
-
-def _read(words: Sequence[str], form: str, usage: str) -> tuple[list[str], dict[str, str]]:
-    """Return plain words, and the others by name."""
-    names = names_in(form)
-    plain: list[str] = []
-    given: dict[str, str] = {}
-    rest = iter(words)
-    for word in rest:
-        name, equals, value = word.partition("=")
-        if not equals and not (name.startswith("--") and name[2:] in names):
-            plain.append(word)
-            continue
-        if not equals:
-            name, value = name[2:], next(rest, "") if f"{word} PATH" in form else "1"
-        if name not in names and "name" not in names:
-            close = difflib.get_close_matches(name, names, n=1)
-            raise UsageError(f"unknown option {name!r}{f', meant {close[0]}?' if close else '.'} {usage}")
-        if name in given:
-            raise UsageError(f"{word.partition('=')[0]} is given twice. {usage}")
-        given[name] = value
-    return plain, given
-
-
-_FLAG_WITH_VALUE = re.compile(r"--(\w+) (\w+)")
 
 
 def names_in(form: str) -> list[str]:

@@ -36,7 +36,7 @@ def usage() -> str:
         f"(default: {field.metadata['shown'] or field.default})"
         for name, field in TABLE.items()
     }
-    commands = {f"{name} {form}".strip(): text for name, (form, text, _) in COMMANDS.items()}
+    commands = {f"{name} {form}".strip(): text for name, (form, text, *_) in COMMANDS.items()}
     lines = [
         "usage: mrt FILENAME [SCENE] [name=value ...]",
         f"       mrt {' | '.join(COMMANDS)} ...",

@@ -6,7 +6,6 @@ from __future__ import annotations
 import hashlib
 import io
 import itertools
-import math
 import operator
 import os
 import pickle
@@ -65,14 +64,14 @@ def points(grid: Any, zipped: bool) -> dict[str, dict[str, Any]]:
     lengths = list(map(len, axes.values()))
     if zipped and len(set(lengths)) > 1:
         raise UsageError(f"zipped axes must be of one length, and those of {', '.join(axes)} are {lengths}")
-    if (max(lengths, default=0) if zipped else math.prod(lengths)) > MOST_JOBS:
-        raise UsageError(f"the grid has more than {MOST_JOBS} jobs: make several sweeps of it")
     rows = zip(*axes.values(), strict=True) if zipped else itertools.product(*axes.values())
-    found = [dict(zip(axes, row, strict=True)) for row in rows]
+    found = [dict(zip(axes, row, strict=True)) for row in itertools.islice(rows, MOST_JOBS + 1)]
+    if len(found) > MOST_JOBS:
+        raise UsageError(f"the grid has more than {MOST_JOBS} jobs: make several sweeps of it")
     if zipped:  # as programs for films expect them
         return {f"frame_{number:04}": point for number, point in enumerate(found)}
-    names = [",".join(f"{word(k)}={word(v)}" for k, v in point.items()) or "picture" for point in found]
-    counts = Counter(name.casefold() for name in names)  # some file systems ignore case
+    names = [_name(point) for point in found]
+    counts = Counter(map(str.casefold, names))  # some file systems ignore case
     for name in names:
         if (count := counts[name.casefold()]) > 1:
             raise UsageError(
@@ -92,6 +91,10 @@ def _axis(key: Any, values: Any) -> list[Any]:
     if not found:
         raise UsageError(f"grid: {key} is an empty list; give it values, or leave it out")
     return [value.tolist() if hasattr(value, "tolist") else value for value in found]
+
+
+def _name(point: Mapping[str, Any]) -> str:
+    return ",".join(f"{word(key)}={word(value)}" for key, value in point.items()) or "picture"
 
 
 def word(value: Any) -> str:

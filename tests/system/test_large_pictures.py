@@ -180,7 +180,7 @@ TerminalProgress.stage = stage
 )
 def test_a_signal_in_the_middle_ends_it_in_order(start, tmp_path, code: str, words: tuple[str, ...]) -> None:
     """It ends in order, not by force: Python comes to act on the signal while it writes and between bands."""
-    patient = "from mrt_mitsuba.command import interrupt\ninterrupt.GRACE = 20.0\n"  # on a busy machine
+    patient = "from mrt_mitsuba import interrupts\ninterrupts.GRACE = 20.0\n"  # on a busy machine
     with start(sys.executable, "-c", patient + code + COMMAND, "out", *words) as process:
         while "working" not in (line := process.stdout.readline()):
             assert line, process.stderr.read()

@@ -59,7 +59,7 @@ doctor now -> unexpected argument 'now' after mrt doctor; scenes all -> unexpect
 help me -> unexpected; export -> PATH is missing; export 3 -> --xml PATH; export 3 --xml -> --xml PATH
 export --xml a.xml -> PATH is missing; export 17 --xml a.xml -> SCENE 17; export 3 --obj a.xml -> --xml PATH
 export 3 --xml a.xml b.xml -> unexpected argument
-export 0 --xml a.xml --stock --stock -> --stock is given twice; export 3 --xml a.xml aa=2 -> aa is of no use
+export 0 --xml a.xml --stock --stock -> stock is given twice; export 3 --xml a.xml aa=2 -> aa is of no use
 export 3 --xml a.xml fov=30 -> only with an OBJ file; .. 3 -> names no file
 export 3 scene=a.xml --xml b.xml -> unexpected argument
 check -> SCENE|scene=PATH is missing; check 0 1 -> unexpected argument '1'

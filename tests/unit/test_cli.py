@@ -187,8 +187,7 @@ def test_bar_on_a_terminal_shows_the_time_left(monkeypatch) -> None:
 
 def test_every_word_of_every_command_arrives() -> None:
     """A command declares its words in its form, and its function takes each of them by name."""
-    for name, (form, _, home) in registry.ALL.items():
-        module, _, function = home.partition(":")
+    for name, (form, _, module, function) in registry.ALL.items():
         taken = inspect.signature(getattr(importlib.import_module(module), function)).parameters
         names = {key for key, each in taken.items() if each.kind is each.KEYWORD_ONLY}
         if "limits" in taken:
@@ -208,7 +207,7 @@ def test_words_reach_the_function_of_their_command(monkeypatch) -> None:
         ("S --xml PATH [--stock] [name=value ...]", "--xml a 3 w=1", (("3",), {"xml": "a", "w": "1"})),
         ("S --xml PATH [--stock]", "3 --stock --xml a", (("3",), {"xml": "a", "stock": "1"})),
     ]:
-        monkeypatch.setitem(registry.ALL, "try", (form, "", "fake:work"))
+        monkeypatch.setitem(registry.ALL, "try", (form, "", "fake", "work"))
         assert registry.run("try", words.split()) == 0
         assert calls.pop() == call
 

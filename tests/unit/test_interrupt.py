@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from mrt_mitsuba import interrupts
-from mrt_mitsuba.command.interrupt import Terminated, ending_soon
+from mrt_mitsuba.interrupts import Terminated, ending_soon
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 
