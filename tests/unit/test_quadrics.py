@@ -111,11 +111,7 @@ def nearest(kind: str, ends: np.ndarray, radii: np.ndarray, o: np.ndarray, d: np
     make = Cone if kind == "cone" else Cylinder
     things = [make(*e.tolist(), float(r), MATTE) for e, r in zip(ends, radii, strict=True)]
     length = np.linalg.norm(np.float64(d), axis=1)
-    with np.errstate(all="ignore"):
-        shapes = reference.Axial(things)
-        parts = np.array_split(np.arange(len(o)), 20)
-        found = [shapes.distances(np.float64(o[k]), d[k] / length[k, None]).min(axis=1) for k in parts]
-    return np.concatenate(found) / length
+    return reference.nearest(things, np.float64(o), d / length[:, None])[0] / length
 
 
 def disagreements(t: np.ndarray, exact: np.ndarray, thinner: np.ndarray) -> np.ndarray:

@@ -2,32 +2,22 @@
 
 Written to be read next to the definitions, and for finite numbers only: detectors by SciPy's filters, the
 original's blur one pixel after the other, the corrected one one neighbour after the other.
+
+A detector gives [H, W] arrays: mask, value, and margin, the distance of the value from the threshold. Where
+that is below the rounding error of float32, a float32 detector may decide otherwise.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter, sobel
 
-
-@dataclass(frozen=True)
-class ReferenceEdges:
-    """A detector's result: ``mask`` and ``value``, and by how much the decision was made.
-
-    ``margin``: [H, W], the distance of the value from the threshold. Where it is below the rounding error of
-    float32 arithmetic, a float32 detector may decide otherwise.
-    """
-
-    mask: np.ndarray
-    value: np.ndarray
-    margin: np.ndarray
+Edges = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def luma_edges(image: np.ndarray) -> ReferenceEdges:
+def luma_edges(image: np.ndarray) -> Edges:
     """Return the contrast of ``√(0.299 R + 0.587 G + 0.114 B)`` in the 3×3 neighbourhood."""
     red, green, blue = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
     luma = np.sqrt(0.299 * red + 0.587 * green + 0.114 * blue)
@@ -37,11 +27,11 @@ def luma_edges(image: np.ndarray) -> ReferenceEdges:
     return _inside(~(contrast < threshold), contrast, np.abs(contrast - threshold))
 
 
-def sobel_edges(image: np.ndarray) -> ReferenceEdges:
+def sobel_edges(image: np.ndarray) -> Edges:
     """Return the Sobel gradient of ``int(255 (0.07 R + 0.72 G + 0.21 B))``.
 
-    Here ``margin`` is the distance of the nearest grey of the window, before truncation, from a whole number.
-    Next to zero that is no matter, since truncation goes to zero from both sides, and it counts as far away.
+    The margin is the distance of the nearest grey of the window, before truncation, from a whole number. Next
+    to zero, where truncation goes to zero from both sides, it counts as far away.
     """
     red, green, blue = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
     exact = 255 * (0.07 * red + 0.72 * green + 0.21 * blue)
@@ -96,15 +86,18 @@ def corrected_dof(image: np.ndarray, radius: np.ndarray) -> np.ndarray:
     steps = [(dx, dy) for dx in range(-5, 6) for dy in range(-5, 6)]
     padded = np.pad(np.dstack([image, np.ones(radius.shape), radius]), ((5, 5), (5, 5), (0, 0)), mode="edge")
     front, same, behind = np.zeros((3, *radius.shape, 4))
+
+    def disc(radius: np.ndarray, dx: int, dy: int) -> np.ndarray:
+        """Return how much of its light a disc has in a pixel so far away."""
+        cover = [np.clip(radius + 1 - math.hypot(*step), 0, 1) for step in ((dx, dy), *steps)]
+        return np.asarray(cover[0] / sum(cover[1:]))[..., None]
+
     for dx, dy in steps:
         there = padded[5 + dy : 5 + dy + len(radius), 5 + dx : 5 + dx + radius.shape[1]]
         theirs, light, order = np.abs(there[..., 4]), there[..., :4], there[..., 4] - radius
-        own_disc = (_cover(np.abs(radius), dx, dy) / _light(np.abs(radius), steps))[..., None]
-        their_disc = (_cover(theirs, dx, dy) / _light(theirs, steps))[..., None]
-        nearer, level, farther = (
-            np.maximum(part, 0)[..., None]
-            for part in (np.minimum(-order, 1), 1 - abs(order), np.minimum(order, 1))
-        )
+        own_disc, their_disc = disc(np.abs(radius), dx, dy), disc(theirs, dx, dy)
+        parts = np.minimum(-order, 1), 1 - abs(order), np.minimum(order, 1)
+        nearer, level, farther = (np.maximum(part, 0)[..., None] for part in parts)
         wider_behind = ((order > 0) & (theirs > np.abs(radius)))[..., None]
         front += nearer * their_disc * light
         same += level * np.where(wider_behind, own_disc, their_disc) * light
@@ -115,18 +108,8 @@ def corrected_dof(image: np.ndarray, radius: np.ndarray) -> np.ndarray:
     return hidden * colors[0] + (1 - hidden) * (solid * colors[1] + gap * colors[2]) / (solid + gap)
 
 
-def _cover(radius: np.ndarray, dx: int, dy: int) -> np.ndarray:
-    """Return how much of a pixel so far away a disc covers."""
-    return np.clip(radius + 1 - math.hypot(dx, dy), 0, 1)
-
-
-def _light(radius: np.ndarray, steps: Sequence[tuple[int, int]]) -> np.ndarray:
-    """Return the pixels that a disc covers in all."""
-    return np.asarray(sum(_cover(radius, dx, dy) for dx, dy in steps))
-
-
-def _inside(mask: np.ndarray, value: np.ndarray, margin: np.ndarray) -> ReferenceEdges:
+def _inside(mask: np.ndarray, value: np.ndarray, margin: np.ndarray) -> Edges:
     """Return a detector's result; the border, whose windows are not whole, is surely no edge."""
     inner = np.zeros(mask.shape, bool)
     inner[1:-1, 1:-1] = True
-    return ReferenceEdges(mask & inner, np.where(inner, value, 0), np.where(inner, margin, np.inf))
+    return mask & inner, np.where(inner, value, 0), np.where(inner, margin, np.inf)

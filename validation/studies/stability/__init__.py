@@ -1,18 +1,23 @@
-"""``mrt-validate stability``: does float32 hold on stiff and extreme cases, and where must it give out?"""
+"""``mrt-validate stability``: does float32 hold on stiff and extreme cases, and where must it give out?
+
+A case is a row: its name; what is measured; why it is held to its limit, or cannot hold; the figure; the
+limit, if there is one; and the least fault that it shows, if one was made: in words, with the figure that
+came of it, which must be twice the limit. Without one, the least fault is the limit itself.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 from mrt_mitsuba.validation.studies.stability import finite, geometry, reflectance, transport
-from mrt_mitsuba.validation.studies.stability.cases import Case
-from mrt_mitsuba.validation.tools.study import Bound, Study
+from mrt_mitsuba.validation.tools.study import Study
 
 TITLE = "Numerical stability on stiff and extreme cases"
 COLUMNS = ("case", "what", "why", "measured", "bound", "")
 
 # By the name of their table: its title, its cases, and a note
-PARTS: dict[str, tuple[str, Callable[[bool], Iterable[Case]], str]] = {
+PARTS: dict[str, tuple[str, Callable[[bool], Iterable[tuple[Any, ...]]], str]] = {
     "bsdf": ("Reflectance", reflectance.cases, reflectance.NOTE),
     "geometry": ("Geometry", geometry.cases, "A rounding is 2⁻²⁴ = 6e-8. Truth: the same rays in float64."),
     "transport": ("Light transport", transport.cases, transport.NOTE),
@@ -23,21 +28,19 @@ PARTS: dict[str, tuple[str, Callable[[bool], Iterable[Case]], str]] = {
 
 def run(study: Study, *, quick: bool) -> None:
     """Make a table of each part, and hold its cases to their limits."""
-    for name, (title, cases, note) in study.each(TITLE, PARTS.items()):
-        rows = []
-        for case in cases(quick):
-            first, measured = (case.name, case.what, case.why), float(case.measured)
-            if case.limit is None:
-                rows.append((*first, measured, "-", "cannot hold"))
+    for table, (title, cases, note) in study.each(TITLE, PARTS.items()):
+        rows: list[tuple[Any, ...]] = []
+        for name, what, why, measured, *held in cases(quick):
+            if not held:
+                rows.append((name, what, why, float(measured), "-", "cannot hold"))
                 continue
-            least = case.fault[0] if case.fault else f"{case.limit:.3g}" if case.limit else "a single one"
-            why = f"least fault: {least}" if case.at_most else case.why
-            held = [(first, Bound(f"{title}: {case.name}", measured, case.limit, case.at_most, why))]
-            if case.fault:
-                made = (f"{case.name}, its fault", least, "must be seen")
-                limit = 2 * case.limit or 1.0
-                held.append((made, Bound(f"{title}: {made[0]}", float(case.fault[1]), limit, False, "seen")))
-            for words, bound in held:
-                rows.append((*words, bound.measured, f"{bound.sign} {bound.limit:.3g}", bound.verdict))
-                study.bounds.append(bound)
-        study.table(name, title, COLUMNS, rows, note)
+            limit, (fault, seen) = held[0], held[1] if len(held) > 1 else ("", 0)
+            least = fault or (f"{limit:.3g}" if limit else "a single one")
+            study.at_most(f"{title}: {name}", measured, limit, f"least fault: {least}")
+            words = [(name, what, why)]
+            if fault:
+                study.at_least(f"{title}: {name}, its fault", seen, 2 * limit or 1.0, "must be seen")
+                words.append((f"{name}, its fault", fault, "must be seen"))
+            for row, bound in zip(words, study.bounds[-len(words) :], strict=True):
+                rows.append((*row, bound.measured, f"{bound.sign} {bound.limit:.3g}", bound.verdict))
+        study.table(table, title, COLUMNS, rows, note)

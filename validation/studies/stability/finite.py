@@ -12,7 +12,6 @@ import numpy as np
 
 from mrt_mitsuba import filters, runtime
 from mrt_mitsuba.validation.checks.probe import not_finite
-from mrt_mitsuba.validation.studies.stability.cases import Case
 
 # ------------------------------------------------- Filters -------------------------------------------------
 
@@ -26,6 +25,7 @@ EDGES: dict[str, Callable[[np.ndarray, np.ndarray], Any]] = {
     "sobel": lambda image, depth: filters.sobel_edges(image),
     "geometry": lambda image, depth: filters.geometry_edges(image * 0 + UP, depth),
 }
+Case = tuple[Any, ...]
 
 
 def of_filters(quick: bool) -> Iterator[Case]:
@@ -33,8 +33,8 @@ def of_filters(quick: bool) -> Iterator[Case]:
     for variant in (runtime.FAST, runtime.SLOW):
         runtime.use(variant)
         try:
-            for case in (*_blurs(), *_detectors()):
-                yield case._replace(name=f"{case.name} ({variant})")
+            for name, *case in (*_blurs(), *_detectors()):
+                yield f"{name} ({variant})", *case
         finally:
             runtime.use(runtime.FAST)
 
@@ -44,43 +44,33 @@ def _blurred(image: np.ndarray, depth: np.ndarray, mode: str, **focus: Any) -> n
     return np.asarray(filters.gaussian_dof(image, depth, mode=mode, **chosen))
 
 
-def _example(shape: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return a picture of noise, and distances on both sides of the focus, with some misses."""
-    rng = np.random.default_rng(1)
-    depth = rng.uniform(0.1, 12, shape).astype(np.float32)
-    depth[rng.random(shape) < 0.1] = np.inf
-    return rng.random((*shape, 3)).astype(np.float32), depth
-
-
 def _blurs() -> Iterator[Case]:
-    tiny, excess = 0.0, 0.0
+    tiny, excess, damage = 0.0, 0.0, 0
     for shape, mode in product(SHAPES, MODES):
-        image, depth = _example(shape)
+        rng = np.random.default_rng(1)
+        depth = rng.uniform(0.1, 12, shape).astype(np.float32)  # on both sides of the focus
+        depth[rng.random(shape) < 0.1] = np.inf
+        image = rng.random((*shape, 3)).astype(np.float32)
         tiny = max(tiny, np.abs(_blurred(np.full_like(image, 1e-30), depth, mode) / 1e-30 - 1).max())
-        for picture in (
-            np.full_like(image, 1e-25),
-            np.full_like(image, 0.3),
-            1e20 * image - np.float32(3e19),
-        ):
-            out, low, high = _blurred(picture, depth, mode), picture.min(), picture.max()
+        for level in (np.full_like(image, 1e-25), np.full_like(image, 0.3), 1e20 * image - np.float32(3e19)):
+            out, low, high = _blurred(level, depth, mode), level.min(), level.max()
             excess = max(excess, np.maximum(low - out, out - high).max() / max(abs(low), abs(high)))
+        for value in (np.nan, np.inf) if shape == SHAPES[-1] else ():
+            image[20, 15, 1] = value
+            bad = ~np.isfinite(_blurred(image, depth, mode)).all(axis=-1)
+            damage += int(bad.sum()) + 1 - 2 * int(bad[20, 15])
     what = "1×1 … 40×30, constant pictures and noise to 1e20: how far means leave the range of values"
-    yield Case("range of a blur", what, "not at all", excess, MEAN)
+    yield "range of a blur", what, "not at all", excess, MEAN
     why = "the smallest weights are 2⁻³⁰: their products are below the least normal float32 and become 0"
-    yield Case("constant pictures of 1e-30, blur", "relative change", why, tiny)
-    for value in (np.nan, np.inf):
-        image, depth = _example((40, 30))
-        image[20, 15, 1] = value
-        bad = [~np.isfinite(_blurred(image, depth, mode)).all(axis=-1) for mode in MODES]
-        what = "other pixels that are not finite afterwards, and this one where it is hidden"
-        figure = sum(int(b.sum()) + 1 - 2 * b[20, 15] for b in bad)
-        yield Case(f"{value} in a picture, blur", what, "damage stays local, and to be seen", figure, 0)
+    yield "constant pictures of 1e-30, blur", "relative change", why, tiny
+    what = "other pixels that are not finite afterwards, and this one where it is hidden"
+    yield "nan or inf in a picture, blur", what, "damage stays local, and to be seen", damage, 0
     image = (10 ** np.random.default_rng(5).uniform(-38, 34, (20, 20, 3))).astype(np.float32)
     depth = (10 ** np.random.default_rng(6).uniform(-30, 30, (20, 20))).astype(np.float32)
     settings = product(MODES, (1e-30, 1.0, 1e30), (0.0, 1e-30, 1e30, np.inf))
     found = [_blurred(image, depth, mode, focal_distance=f, focal_range=r) for mode, f, r in settings]
     what = "values that are not finite, pictures 1e-38 … 1e34, depths 1e-30 … 1e30"
-    yield Case("huge ranges, blur", what, "means are finite", np.sum(~np.isfinite(found)), 0)
+    yield "huge ranges, blur", what, "means are finite", np.sum(~np.isfinite(found)), 0
 
 
 def _detectors() -> Iterator[Case]:
@@ -90,6 +80,7 @@ def _detectors() -> Iterator[Case]:
     huge = (10 ** rng.uniform(-38, 34, (20, 20, 3)) * rng.choice([-1, 1], (20, 20, 3))).astype(np.float32)
     far = (10 ** rng.uniform(-37, 37, (20, 20))).astype(np.float32)
     for name, find in EDGES.items():
+        wrong = 0
         for value in (np.nan, np.inf):
             image, depth = np.full((12, 10, 3), 0.5, np.float32), np.full((12, 10), 3, np.float32)
             if name == "geometry":
@@ -97,12 +88,13 @@ def _detectors() -> Iterator[Case]:
             else:
                 image[6, 5, 2] = value
             found = find(image, depth)
-            wrong = (np.isinf(np.asarray(found.value)) != expected) | (~np.asarray(found.mask) & expected)
-            what = "pixels not marked in its 3×3, or marked elsewhere"
-            yield Case(f"{value} in a picture, {name}", what, "reported, and local", wrong.sum(), 0)
+            marked = np.isinf(np.asarray(found.value))
+            wrong += ((marked != expected) | (~np.asarray(found.mask) & expected)).sum()
+        what = "pixels not marked in its 3×3, or marked elsewhere"
+        yield f"nan or inf in a picture, {name}", what, "reported, and local", wrong, 0
         bad = np.isnan(np.asarray(find(huge, far).value)).sum()
         what = "NaN among the values, pictures to ±1e34"
-        yield Case(f"huge ranges, {name}", what, "there is none", bad, 0)
+        yield f"huge ranges, {name}", what, "there is none", bad, 0
 
 
 # ------------------------------------------------- Material ------------------------------------------------
@@ -125,59 +117,50 @@ def in_bulk(quick: bool) -> Iterator[Case]:
     count = 10**6 if quick else 10**8
     what = f"{count:.0e} random and adversarial evaluations: values, densities, samples, reflectances"
     for form, visible in (("schlick", True), ("dielectric", True), ("unity", True), ("dielectric", False)):
-        # one trace serves all
-        parts = (Draw(min(AT_ONCE, count), k) for k in range(-(-count // AT_ONCE)))
-        bad, kind = sum(bad_lanes(form, visible, draw) for draw in parts), "visible" if visible else "D's"
-        yield Case(f"mrt_bsdf, {form}, {kind} normals", what, "none is bad", bad, 0)
+        seeds = range(-(-count // AT_ONCE))  # one trace serves all
+        bad = sum(bad_lanes(form, visible, count // len(seeds), seed) for seed in seeds)
+        normals = "visible normals" if visible else "normals by D"
+        yield f"mrt_bsdf, {form}, {normals}", what, "none is bad", bad, 0
 
 
-class Draw:
-    """Random numbers of N lanes; every third is an extreme one."""
+def bad_lanes(form: str, visible: bool, count: int, seed: int) -> int:
+    """Count bad values, densities, samples and mirror reflectances; each lane has its alpha and indices."""
+    generator = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))
 
-    def __init__(self, count: int, seed: int) -> None:
-        self.count, self.seed = count, seed
-        self.generator = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))
-
-    def mixed(self, ordinary: Callable[[Any], Any], extremes: Sequence[float]) -> Any:
-        """Return a function of uniform numbers, or an extreme."""
-        found, table = ordinary(self.generator.next_float32()), mi.Float(np.array(extremes, np.float32))
-        index = mi.UInt32(self.generator.next_float32() * 3 * len(extremes))
+    def mixed(ordinary: Callable[[Any], Any], extremes: Sequence[float]) -> Any:
+        """Return a function of uniform numbers, in every third lane an extreme."""
+        found, table = ordinary(generator.next_float32()), mi.Float(np.array(extremes, np.float32))
+        index = mi.UInt32(generator.next_float32() * 3 * len(extremes))
         extreme = index < len(extremes)
         return dr.select(extreme, dr.gather(mi.Float, table, index, extreme), found)
 
-    def uniform(self) -> Any:
-        return self.mixed(lambda u: u, (0, 6e-8, 0.5, 1 - 6e-8))
+    def uniform() -> Any:
+        return mixed(lambda u: u, (0, 6e-8, 0.5, 1 - 6e-8))
 
-    def log(self, least: float, most: float, extremes: Sequence[float]) -> Any:
-        """Spread over decades."""
-        return self.mixed(lambda u: least * dr.exp(u * float(np.log(most / least))), extremes)
+    def decades(least: float, most: float, extremes: Sequence[float]) -> Any:
+        return mixed(lambda u: least * dr.exp(u * float(np.log(most / least))), extremes)
 
-    def local(self) -> Any:
-        """Return a direction by its cosine to +z."""
-        z = self.mixed(lambda u: 2 * u - 1, COSINES)
-        sine, cosine = dr.sincos(2 * dr.pi * self.uniform())
+    def direction() -> Any:
+        z = mixed(lambda u: 2 * u - 1, COSINES)
+        sine, cosine = dr.sincos(2 * dr.pi * uniform())
         r = dr.sqrt(dr.maximum((1 - z) * (1 + z), 0))
         return mi.Vector3f(r * cosine, r * sine, z)
 
-
-def bad_lanes(form: str, visible: bool, draw: Draw) -> int:
-    """Count bad values, densities, samples and mirror reflectances; each lane has its alpha and indices."""
     bright = {"specular_reflectance": 100.0, "diffuse_reflectance": 2.0}
     bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": form, "sample_visible": visible, **bright})
     parameters = mi.traverse(bsdf)
-    sign = dr.select(draw.uniform() < 0.8, mi.Float(1), -1)
-    parameters["alpha"] = sign * draw.log(1e-9, 1e3, ALPHAS)
-    parameters["int_ior"], parameters["ext_ior"] = draw.log(1e-3, 1e3, IORS), draw.log(0.5, 2, IORS)
+    parameters["alpha"] = dr.select(uniform() < 0.8, mi.Float(1), -1) * decades(1e-9, 1e3, ALPHAS)
+    parameters["int_ior"], parameters["ext_ior"] = decades(1e-3, 1e3, IORS), decades(0.5, 2, IORS)
     parameters.update()
-    si = dr.zeros(mi.SurfaceInteraction3f, draw.count)
-    si.wi = draw.local()
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.wi = direction()
     context = mi.BSDFContext()
-    away = mi.Vector3f(*(draw.mixed(lambda u: 4 * u - 2, NUMBERS) for _ in range(3)))
-    near = mi.Vector3f(-si.wi.x, -si.wi.y, si.wi.z) + 10.0 ** (-9 * draw.uniform()) * away
+    away = mi.Vector3f(*(mixed(lambda u: 4 * u - 2, NUMBERS) for _ in range(3)))
+    near = mi.Vector3f(-si.wi.x, -si.wi.y, si.wi.z) + 10.0 ** (-9 * uniform()) * away
     near = dr.normalize(near)  # where narrow lobes are
-    wo = dr.select((draw.uniform() < 0.5) & dr.all(dr.isfinite(near)), near, draw.local())
+    wo = dr.select((uniform() < 0.5) & dr.all(dr.isfinite(near)), near, direction())
     value, pdf = bsdf.eval_pdf(context, si, wo)
-    drawn, weight = bsdf.sample(context, si, draw.uniform(), mi.Point2f(draw.uniform(), draw.uniform()))
+    drawn, weight = bsdf.sample(context, si, uniform(), mi.Point2f(uniform(), uniform()))
     mirror = bsdf.eval_attribute("mirror_reflectance", si)
     bad = not_finite(value, pdf, weight, drawn.pdf, mirror, least=0) | ~(dr.abs(dr.norm(drawn.wo) - 1) < 1e-5)
     return int(dr.count(bad)[0])

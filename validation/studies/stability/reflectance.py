@@ -1,27 +1,18 @@
-"""The reflectance in float32 against 50 digits, over a grid of stiff and extreme lobes.
-
-Two forms of it, the report's and this project's, take local directions, alpha and the index of refraction as
-float32 arrays. They return ``d``, ``g``, ``value`` (as Mitsuba has it, BSDF times cos θo) and ``pdf`` (of
-visible normals), a number for each pair of directions; the Fresnel term is the exact dielectric one.
-"""
+"""The reflectance in float32 against 50 digits, over a grid of stiff and extreme lobes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from mpmath import mp, mpf
 
 from mrt_mitsuba.plugins import fresnel, microfacet
 from mrt_mitsuba.plugins.quadric_kinds import Columns
-from mrt_mitsuba.validation.checks.probe import Lanes
 from mrt_mitsuba.validation.oracles import exact
-from mrt_mitsuba.validation.studies.stability.cases import Case
 
 ALPHAS = 10.0 ** np.arange(-8, 3)
 COSINES = np.array([1, 0.5, 0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7])
@@ -52,128 +43,60 @@ NOTE = (
     "terms, since their sum passes through zero."
 )
 
+Case = tuple[Any, ...]
+Arrays = dict[str, np.ndarray]
+
 
 def cases(quick: bool) -> Iterator[Case]:
-    """Yield errors of D, G, F, the whole, its density and its gradient."""
-    lobes, truth = lobes_with_truth(2 if quick else 12)
-    count = 60 if quick else 600
-    cosines = np.float32(10 ** np.random.default_rng(4).uniform(-7, 0, count * len(FRESNEL_IORS)))
-    cosines[::count] = 1
-    iors = np.repeat(FRESNEL_IORS, count)
-    angles = cosines, iors, _fresnel(cosines, iors)
-    ours, wrong = (errors(mrt_bsdf, lobes, truth, angles, wrong=w) for w in (1, 1 + 1 / 30_000))
-    for name, (title, usual, everywhere) in QUANTITIES.items():
-        part = slice(None) if name == "f" else lobes.in_bound
+    """Yield errors of D, G, F, the whole, its density and its gradient; then of functions of one cosine."""
+    lobes = lobes_with_truth(2 if quick else 12)
+    ours, wrong = (errors(lobes, 60 if quick else 600, wrong=w) for w in (1, 1 + 1 / 30_000))
+    wi, alpha = lobes["wi"], lobes["alpha"]
+    usual = (alpha > 0.9e-4) & (alpha < 1.1) & (lobes["steepness"] <= IN_BOUND)
+    for name, (title, bound, everywhere) in QUANTITIES.items():
+        part = slice(None) if name == "f" else usual
         where = "cosines 1e-7 … 1, IOR 1e-3 … 1e6" if name == "f" else "alpha 1e-4 … 1, D ≥ 1e-7 of its peak"
         figure, fault = (np.quantile(e[name][part], 0.999) for e in (ours, wrong))
-        yield Case(f"{title}, p99.9", where, "a few roundings", figure, usual, (FAULT, fault))
-        where, why = (
-            "alpha 1e-8 … 100, D ≥ 1e-20 of its peak",
-            "a few roundings, which exp enlarges by up to 46",
-        )
-        yield Case(f"{title}, largest", where, why, ours[name].max(), everywhere, (FAULT, wrong[name].max()))
-    by_report = errors(report, lobes, truth, angles)["d"]
-    nearby = np.nextafter(lobes.wo, np.float32(2))
-    change = np.abs(np.expm1(lobes.steepness - slope2(lobes.wi, nearby) / np.float64(lobes.alpha) ** 2))
-    for alpha in (1e-3, 1e-4, 1e-6):
-        here = np.isclose(lobes.alpha, alpha, atol=0) & (lobes.steepness <= IN_BOUND)
-        if alpha >= 1e-4:
-            what, why = (
-                "relative error of D by cosines of normalised vectors",
-                "lost to cancellation, which must show",
-            )
-            name, figure = f"the report's form, median at alpha {alpha:g}", float(np.median(by_report[here]))
-            yield Case(name, what, why, figure, 10 * BOUND, at_most=False)
-        here &= np.isclose(lobes.wi[:, 2], 0.5)
+        yield f"{title}, p99.9", where, "a few roundings", figure, bound, (FAULT, fault)
+        where, why = "alpha 1e-8 … 100, D ≥ 1e-20 of its peak", "roundings, which exp enlarges by up to 46"
+        yield f"{title}, largest", where, why, ours[name].max(), everywhere, (FAULT, wrong[name].max())
+    moved = slope2(wi, np.nextafter(lobes["wo"], np.float32(2))) / np.float64(alpha) ** 2
+    change = np.abs(np.expm1(lobes["steepness"] - moved))
+    for size in (1e-3, 1e-4, 1e-6):
+        here = np.isclose(alpha, size, atol=0) & (lobes["steepness"] <= IN_BOUND) & np.isclose(wi[:, 2], 0.5)
         what = "largest relative change of D at 60° when x and y of one direction move by one float32 step"
         why = "directions are float32: neighbouring ones, equal to a renderer, have values this far apart"
-        yield Case(f"D of a neighbouring direction, alpha {alpha:g}", what, why, change[here].max())
-    yield from _of_one_variable(quick)
-
-
-def _of_one_variable(quick: bool) -> Iterator[Case]:
+        yield f"D of a neighbouring direction, alpha {size:g}", what, why, change[here].max()
     # where total reflection begins, F ends in a square root: errors are those of g = 0
     iors = np.repeat(np.array([0.5, 0.9, 0.99, 0.9999], np.float32), 81)
     critical = np.float32(np.sqrt((1 - np.float64(iors)) * (1 + np.float64(iors))))
     cosines = (critical.view(np.int32) + np.tile(np.arange(-40, 41, dtype=np.int32), 4)).view(np.float32)
-    found = np.array(fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(iors)), np.float64)
     what = "the 40 float32 cosines on either side of it, IOR 0.5 … 0.9999"
     why = "√ of a rounding: 1 - F is 4 g / (η² cos θ) there, and g² is known to a rounding of cos²"
-    off = np.abs(found / _fresnel(cosines, iors) - 1).max()
-    yield Case("F at the critical angle", what, why, off, 16 * 2.0**-12)
+    yield "F at the critical angle", what, why, fresnel_errors(cosines, iors).max(), 16 * 2.0**-12
     stride = 2**12 if quick else 1
     what = f"largest error in steps of float32, over float32 cosines in [0, 1], 1 in {stride}"
     why = "some dozen roundings, of which squares double some"
     for name, formula in OF_COSINE.items():
-        yield Case(name, what, why, largest_error(formula, stride), 16)
+        yield name, what, why, largest_error(formula, stride), 16
 
 
-def errors(
-    formula: Callable[..., Terms],
-    lobes: Lobes,
-    truth: Terms,
-    angles: tuple[np.ndarray, ...],
-    wrong: float = 1.0,
-) -> Terms:
-    """Return the relative errors [N] by quantity; with alpha and indices ``wrong`` times what they are."""
+def fresnel_errors(cosines: np.ndarray, iors: np.ndarray, wrong: Any = 1) -> np.ndarray:
+    """Return the relative errors of the dielectric term [N]."""
+    truth = [float(exact.fresnel_dielectric(c, 1, n)) for c, n in zip(cosines, iors, strict=True)]
+    found = np.array(fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(iors * wrong)), np.float64)
+    return np.abs(found / truth - 1)
+
+
+def errors(lobes: Arrays, count: int, *, wrong: float) -> Arrays:
+    """Return the relative errors [N] of the plugin and its functions, by quantity.
+
+    Alpha and indices are ``wrong`` times what they are; ``count``: of cosines for each index of refraction.
+    """
     factor = np.float32(wrong)
-    alpha = mi.Float(lobes.alpha * factor)
+    alpha, ior = mi.Float(lobes["alpha"] * factor), mi.Float(lobes["ior"] * factor)
+    wi, wo = mi.Vector3f(lobes["wi"].T), mi.Vector3f(lobes["wo"].T)
     dr.enable_grad(alpha)
-    terms = formula(mi.Vector3f(lobes.wi.T), mi.Vector3f(lobes.wo.T), alpha, mi.Float(lobes.ior * factor))
-    dr.forward(alpha)
-    slope, terms = dr.grad(terms["value"]), {name: np.array(dr.detach(x), float) for name, x in terms.items()}
-    of = {name: np.abs(x / truth[name] - 1) for name, x in terms.items()}
-    of["gradient"] = np.abs(np.array(slope, float) - truth["gradient"]) / truth["slope"]
-    cosines, iors, expected = angles
-    f = fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(iors * factor))
-    of["f"] = np.abs(np.array(f, float) / expected - 1)
-    return {name: np.where(np.isnan(error), np.inf, error) for name, error in of.items()}
-
-
-def _fresnel(cosines: np.ndarray, iors: np.ndarray) -> np.ndarray:
-    return np.array([float(exact.fresnel_dielectric(c, 1, n)) for c, n in zip(cosines, iors, strict=True)])
-
-
-# ---------------------------------------------- The two forms ----------------------------------------------
-
-Terms = dict[str, Any]
-
-
-def report_tan2_theta(v: Any) -> Any:
-    """Return tan² from the cosine of the vector made one unit long."""
-    c2 = dr.square(dr.normalize(v).z)
-    return (1 - c2) / c2
-
-
-def report_smith_g1(v: Any, alpha: Any) -> Any:
-    """Return Smith's G₁ from b = 1 / (alpha tan θ), with tan θ from the cosine."""
-    tan_theta = dr.sqrt(dr.maximum(1 - dr.square(v.z), 0)) / v.z
-    steep = tan_theta * alpha <= 0
-    b = dr.select(steep, 2, 1 / dr.select(steep, 1, alpha * tan_theta))
-    fit = (3.535 * b + 2.181 * b * b) / (1 + 2.276 * b + 2.577 * b * b)
-    return dr.select(b < 1.6, fit, 1)
-
-
-def report_fresnel(cos_theta: Any, ext_ior: Any, int_ior: Any, sin2_theta: Any = None) -> Any:
-    """Return ½(Rs + Rp) from Snell's law; what is known of the sine is not used."""
-    sin2_t = dr.square(ext_ior / int_ior) * (1 - dr.square(cos_theta))
-    total = sin2_t > 1
-    cos_t = dr.sqrt(dr.select(total, 0, 1 - sin2_t))
-    rs = (ext_ior * cos_theta - int_ior * cos_t) / (ext_ior * cos_theta + int_ior * cos_t)
-    rp = (ext_ior * cos_t - int_ior * cos_theta) / (ext_ior * cos_t + int_ior * cos_theta)
-    return dr.select(total, 1, 0.5 * (rs * rs + rp * rp))
-
-
-def report(wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
-    """Return the report's form: everything from cosines, and the half vector made one unit long first."""
-    h = dr.normalize(wi + wo)
-    d, f = microfacet.beckmann_d(report_tan2_theta(h), alpha), report_fresnel(dr.dot(wi, h), 1, ior)
-    g_i, g_o = report_smith_g1(wi, alpha), report_smith_g1(wo, alpha)
-    return {"d": d, "g": g_i * g_o, "value": d * f * g_i * g_o / (4 * wi.z), "pdf": d * g_i / (4 * wi.z)}
-
-
-def mrt_bsdf(wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
-    """Return value and density of the plugin, given one alpha and index a pair, and of its functions."""
     bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": "dielectric", "diffuse_reflectance": 0.0})
     parameters = mi.traverse(bsdf)
     for name, values in (("alpha", alpha), ("int_ior", ior)):
@@ -184,7 +107,15 @@ def mrt_bsdf(wi: Any, wo: Any, alpha: Any, ior: Any) -> Terms:
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(mi.TransportMode.Radiance, 0xFFFFFFFF, 1), si, wo)
     d = microfacet.beckmann_d(microfacet.tan2_theta(wi + wo), alpha)
     g = microfacet.smith_g1(wi, alpha) * microfacet.smith_g1(wo, alpha)
-    return {"d": d, "g": g, "value": value[0], "pdf": pdf}
+    dr.forward(alpha)
+    slope = np.array(dr.grad(value[0]), float)
+    terms = {"d": d, "g": g, "value": value[0], "pdf": pdf}
+    of = {name: np.abs(np.array(dr.detach(x), float) / lobes[name] - 1) for name, x in terms.items()}
+    of["gradient"] = np.abs(slope - lobes["gradient"]) / lobes["slope"]
+    cosines = np.float32(10 ** np.random.default_rng(4).uniform(-7, 0, count * len(FRESNEL_IORS)))
+    cosines[::count] = 1
+    of["f"] = fresnel_errors(cosines, np.repeat(FRESNEL_IORS, count), factor)
+    return {name: np.where(np.isnan(error), np.inf, error) for name, error in of.items()}
 
 
 # --------------------------------------------- Every cosine -----------------------------------------------
@@ -228,22 +159,6 @@ def largest_error(formula: Callable[[Any], Any], stride: int) -> float:
 # ------------------------------------------------- The truth -----------------------------------------------
 
 
-@dataclass(frozen=True)
-class Lobes(Lanes):
-    """N pairs of directions: what their float32 components say, and so the sum that is their half vector."""
-
-    wi: np.ndarray  # float32 [N, 3]
-    wo: np.ndarray  # float32 [N, 3]
-    alpha: np.ndarray  # float32 [N]
-    ior: np.ndarray  # float32 [N]
-    steepness: np.ndarray  # float64 [N], tan²θh / alpha²
-
-    @property
-    def in_bound(self) -> np.ndarray:
-        """Where the first limit applies: alpha from 1e-4 to 1, D at least 1e-7 of its peak. [N]"""
-        return (self.alpha > 0.9e-4) & (self.alpha < 1.1) & (self.steepness <= IN_BOUND)
-
-
 def slope2(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     """Return tan² of the angle of the half vectors [N], exact to a few roundings of float64."""
     h = wi.astype(np.float64) + wo
@@ -251,13 +166,13 @@ def slope2(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=4)
-def lobes_with_truth(per_cell: int, seed: int = 1) -> tuple[Lobes, dict[str, np.ndarray]]:
-    """Return up to ``per_cell`` pairs in every cell of roughness, cosine and steepness, and their truth.
+def lobes_with_truth(per_cell: int) -> Arrays:
+    """Return up to ``per_cell`` pairs of directions in every cell of roughness, cosine and steepness.
 
-    It has 50 digits, rounded to float64: ``d``, ``g``, ``value``, ``pdf``, the ``gradient`` of the value with
-    respect to alpha, and as its ``slope`` the sum of the sizes of the terms of that gradient.
+    Of N pairs ``wi`` and ``wo`` [N, 3], ``alpha``, ``ior``, the ``steepness`` tan²θh / alpha², and what
+    ``_exact`` says of them.
     """
-    rng, cells = np.random.default_rng(seed), np.arange(len(STEEPNESS) - 1)
+    rng, cells = np.random.default_rng(1), np.arange(len(STEEPNESS) - 1)
     grid = np.meshgrid(np.float32(ALPHAS), COSINES, cells, np.arange(2 * per_cell))  # half of them point down
     alpha, cosine, cell, _ = (x.ravel() for x in grid)
     tan = alpha * np.sqrt(rng.uniform(STEEPNESS[cell], STEEPNESS[cell + 1]))
@@ -269,22 +184,26 @@ def lobes_with_truth(per_cell: int, seed: int = 1) -> tuple[Lobes, dict[str, np.
     wi, wo = np.float32(wi), np.float32(2 * (wi * m).sum(axis=1, keepdims=True) * m - wi)
     steepness = slope2(wi, wo) / np.float64(alpha) ** 2
     keep = (wo[:, 2] > 0.5 * COSINES[-1]) & (steepness < STEEPNESS[-1])
-    lobes = Lobes(wi, wo, alpha, rng.choice(IORS, len(alpha)), steepness).only(keep)
-    rows = [_exact(*pair) for pair in zip(lobes.wi, lobes.wo, lobes.alpha, lobes.ior, strict=True)]
-    return lobes, dict(zip(("d", "g", "value", "pdf", "gradient", "slope"), np.array(rows).T, strict=True))
+    lobes = {"wi": wi, "wo": wo, "alpha": alpha, "ior": rng.choice(IORS, len(alpha)), "steepness": steepness}
+    lobes = {name: values[keep] for name, values in lobes.items()}
+    rows = [_exact(*pair) for pair in zip(*list(lobes.values())[:4], strict=True)]
+    names = ("d", "g", "value", "pdf", "gradient", "slope")
+    return lobes | dict(zip(names, np.array(rows).T, strict=True))
 
 
-@mp.workdps(exact.DIGITS)
 def _exact(wi: np.ndarray, wo: np.ndarray, alpha: float, ior: float) -> tuple[float, ...]:
-    a, step = exact.number(alpha), exact.number(alpha) * mpf("1e-20")
+    """Return D, G, the value (BSDF times cos θo), the density of visible normals, the value's derivative with
+    respect to alpha, and the sum of the sizes of the terms of that derivative."""
+    a, step = exact.number(alpha), exact.number(alpha) * exact.mpf("1e-20")
     x, y, z = (exact.number(p) + exact.number(q) for p, q in zip(wi, wo, strict=True))
     tan2 = (x * x + y * y) / (z * z)
     # Components are not rounded again: the cosine between the directions is that of them made one unit long
     sides = zip(exact.unit(list(wi)), exact.unit(list(wo)), strict=True)
-    f = exact.fresnel_dielectric(mp.sqrt(sum((p + q) ** 2 for p, q in sides)) / 2, 1, ior)
+    f = exact.fresnel_dielectric(exact.mp.sqrt(sum((p + q) ** 2 for p, q in sides)) / 2, 1, ior)
 
-    def terms(a: mpf) -> list[mpf]:
-        return [exact.beckmann_d(1 / mp.sqrt(1 + tan2), a), exact.smith_g1(wi, a), exact.smith_g1(wo, a)]
+    def terms(a: Any) -> list[Any]:
+        d = exact.beckmann_d(1 / exact.mp.sqrt(1 + tan2), a)
+        return [d, exact.smith_g1(wi, a), exact.smith_g1(wo, a)]
 
     (d, g_i, g_o), moved = terms(a), terms(a + step)
     value = d * f * g_i * g_o / (4 * exact.number(wi[2]))

@@ -6,17 +6,15 @@ must exceed the bound of the case by a factor of two: so each states, by measure
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.validation.oracles.reference import reference_render
-from mrt_mitsuba.validation.studies.stability.cases import Case
 
 WIDTH, HEIGHT = 64, 48
 
@@ -35,22 +33,6 @@ BALL = Sphere((0, 0.5, 0), 0.5, GREY)
 BASE = Scene(CAMERA, (0.2, 0.3, 0.4), LIGHTS, (BALL,), (FLOOR,))
 # Onto the ball's highlight under a light behind the camera, five thousandths of the ball across
 CLOSE = Camera(CAMERA.position, (0.033259, 0.5, 0.498893), hfov=0.1)
-
-
-class Path(NamedTuple):
-    """A scene that is hard on a path tracer, and one that must not pass for it.
-
-    ``settings`` go to both tracers; ``truth`` is given where the exact picture is defined as that of another
-    scene.
-    """
-
-    name: str
-    what: str
-    scene: Scene
-    fault: Scene | dict[str, Any]
-    limit: float = PLAIN
-    settings: Mapping[str, Any] = MappingProxyType({})
-    truth: Scene | None = None
 
 
 def _ball(**changes: Any) -> Scene:
@@ -91,37 +73,38 @@ def _hall(specular: float, light: float = 1.0, ior: float = 1.5) -> Scene:
 
 FULL, OPEN = {"fresnel": "unity"}, {"clamp": False}
 
-# One line for each case
-PATHS: Sequence[Path] = (
-    Path("facing mirrors", "Ks 0.95, ten bounces", _hall(0.95), _hall(0.9499), 2e-5, FULL),
-    Path("perfect facing mirrors", "Ks 1, ten bounces", _hall(1), {"max_depth": 9}, 2e-5, FULL),
-    Path("facing mirrors, no clamp", "Ks 0.95", _hall(0.95), _hall(0.95, 1.001), 2e-5, {**FULL, **OPEN}),
-    Path("mirrors that add light", "Ks 1.5: 58 times", _hall(1.5), _hall(1.501), 2e-5, FULL),
-    Path("bounce budget", "index 0.57: a bounce costs five of ten", _hall(0.95, ior=0.57),
+# Of each case its name, what it is, a scene that is hard on a path tracer, and one, or settings, that must not
+# pass for it; the limit, settings of both tracers, and the scene whose exact picture it is
+PATHS: Sequence[tuple[Any, ...]] = (
+    ("facing mirrors", "Ks 0.95, ten bounces", _hall(0.95), _hall(0.9499), 2e-5, FULL),
+    ("perfect facing mirrors", "Ks 1, ten bounces", _hall(1), {"max_depth": 9}, 2e-5, FULL),
+    ("facing mirrors, no clamp", "Ks 0.95", _hall(0.95), _hall(0.95, 1.001), 2e-5, {**FULL, **OPEN}),
+    ("mirrors that add light", "Ks 1.5: 58 times", _hall(1.5), _hall(1.501), 2e-5, FULL),
+    ("bounce budget", "index 0.57: a bounce costs five of ten", _hall(0.95, ior=0.57),
          {"max_depth": 11}, 2e-5, FULL),
-    Path("clamp on", "a light of 1e4", _lit((2, 3, 4), 1e4), OPEN),
-    Path("clamp off", "a light of 1e4", _lit((2, 3, 4), 1e4), _lit((2, 3, 4), 10001), PLAIN, OPEN),
-    Path("light inside a ball", "not lit from outside", _lit((0, 0.5, 0)), _lit((0, 0.8, 0.6))),
-    Path("light on the floor", "at height 0", _lit((1.5, 0, 0.5)), _lit((1.5, 0.001, 0.5)), 5e-6),
-    Path("light on the ball", "its top", _lit((0, 1, 0)), _lit((0, 1.01, 0)), 5e-6),
-    Path("light under the ball", "on its lower side", _under(0), _under(1e-3), 5e-6, truth=_under(1e-6)),
-    Path("light at 1e6", "parallel light", _lit((4e5, 6e5, 7e5)), _lit((4.001e5, 6e5, 7e5))),
-    Path("light at the camera", "no shadow", _lit(CAMERA.position), _lit((0.2, 0.501, 3))),
-    Path("black", "Kd = Ks = 0", _ball(specular=(0,) * 3, diffuse=(0,) * 3),
+    ("clamp on", "a light of 1e4", _lit((2, 3, 4), 1e4), OPEN),
+    ("clamp off", "a light of 1e4", _lit((2, 3, 4), 1e4), _lit((2, 3, 4), 10001), PLAIN, OPEN),
+    ("light inside a ball", "not lit from outside", _lit((0, 0.5, 0)), _lit((0, 0.8, 0.6))),
+    ("light on the floor", "at height 0", _lit((1.5, 0, 0.5)), _lit((1.5, 0.001, 0.5)), 5e-6),
+    ("light on the ball", "its top", _lit((0, 1, 0)), _lit((0, 1.01, 0)), 5e-6),
+    ("light under the ball", "on its lower side", _under(0), _under(1e-3), 5e-6, {}, _under(1e-6)),
+    ("light at 1e6", "parallel light", _lit((4e5, 6e5, 7e5)), _lit((4.001e5, 6e5, 7e5))),
+    ("light at the camera", "no shadow", _lit(CAMERA.position), _lit((0.2, 0.501, 3))),
+    ("black", "Kd = Ks = 0", _ball(specular=(0,) * 3, diffuse=(0,) * 3),
          _ball(specular=(1e-3,) * 3), 3e-7),
-    Path("over-bright", "Kd 5, Ks 3", _ball(specular=(3,) * 3, diffuse=(5,) * 3),
+    ("over-bright", "Kd 5, Ks 3", _ball(specular=(3,) * 3, diffuse=(5,) * 3),
          _ball(specular=(3,) * 3, diffuse=(5.001,) * 3), PLAIN, OPEN),
-    Path("diffuse", "Kd 0.3, 0.2, 0.1", BASE, _ball(diffuse=(0.3001, 0.2, 0.1))),
-    Path("roughness 0", "acts as 1e-8", _highlight(0.0), _highlight(1e-3), 1e-9, truth=_highlight(1e-8)),
-    Path("roughness 1e-3", "its highlight from near by", _highlight(1e-3), _highlight(1.001e-3), 3e-4, OPEN),
-    Path("roughness 100", "a lobe of 1e-5", _flat(100.0), _flat(99.0), PLAIN, OPEN),
-    Path("negative roughness", "alpha -0.4", _shiny(alpha=-0.4), _shiny(alpha=0.4), 5e-6, OPEN),
-    Path("index just above 1", "1 + 1e-7", _shiny(ior=1.0000001), _shiny(ior=1.005), 3e-7),
-    Path("index 1e6", "a metal", _shiny(ior=1e6), _shiny(ior=1e4), 1e-5),
-    Path("index 0.95", "total reflection at grazing angles", _shiny(ior=0.95), _shiny(ior=0.9501), 5e-6),
-    Path("no lights", "mirrors of the sky", replace(BASE, lights=()),
+    ("diffuse", "Kd 0.3, 0.2, 0.1", BASE, _ball(diffuse=(0.3001, 0.2, 0.1))),
+    ("roughness 0", "acts as 1e-8", _highlight(0.0), _highlight(1e-3), 1e-9, {}, _highlight(1e-8)),
+    ("roughness 1e-3", "its highlight from near by", _highlight(1e-3), _highlight(1.001e-3), 3e-4, OPEN),
+    ("roughness 100", "a lobe of 1e-5", _flat(100.0), _flat(99.0), PLAIN, OPEN),
+    ("negative roughness", "alpha -0.4", _shiny(alpha=-0.4), _shiny(alpha=0.4), 5e-6, OPEN),
+    ("index just above 1", "1 + 1e-7", _shiny(ior=1.0000001), _shiny(ior=1.005), 3e-7),
+    ("index 1e6", "a metal", _shiny(ior=1e6), _shiny(ior=1e4), 1e-5),
+    ("index 0.95", "total reflection at grazing angles", _shiny(ior=0.95), _shiny(ior=0.9501), 5e-6),
+    ("no lights", "mirrors of the sky", replace(BASE, lights=()),
          replace(BASE, lights=(), sky=(0.2001, 0.3, 0.4))),
-    Path("inside a ball", "camera and lights in it: its back is black",
+    ("inside a ball", "camera and lights in it: its back is black",
          replace(BASE, spheres=(Sphere((0, 0, 0), 9.0, GREY),)), replace(BASE, spheres=())),
 )  # fmt: skip
 
@@ -129,25 +112,21 @@ PATHS: Sequence[Path] = (
 NOTE = "Differences to the float64 tracer, relative to the value plus a thousandth, of 95 % of the pixels."
 
 
-def cases(quick: bool) -> Iterator[Case]:
+def cases(quick: bool) -> Iterator[tuple[Any, ...]]:
     """Yield every case, held to the float64 tracer."""
-    for path in PATHS:
-        settings: dict[str, Any] = {"fresnel": "dielectric", "clamp": True, **path.settings}
-        image = draw(path.scene, settings)
-        scene, changed = (path.scene, path.fault) if isinstance(path.fault, dict) else (path.fault, {})
+    for name, what, scene, fault, *more in PATHS:
+        limit, own, other = (*more, *(PLAIN, {}, scene)[len(more) :])
+        settings: dict[str, Any] = {"fresnel": "dielectric", "clamp": True, **own}
+        described = scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=settings["fresnel"])
+        described["integrator"] = {"type": "mrt_whitted", "clamp": settings["clamp"], "min_contribution": 0.0}
+        image = render(described, aa=1, lattice="report").image
+        changed, setting = (scene, fault) if isinstance(fault, dict) else (fault, {})
         truth, wrong = (
             reference_render(drawn, width=WIDTH, height=HEIGHT, **options).image
-            for drawn, options in ((path.truth or path.scene, settings), (scene, {**settings, **changed}))
+            for drawn, options in ((other, settings), (changed, settings | setting))
         )
-        fault = ("a scene or setting almost the same", difference(wrong, truth))
-        yield Case(path.name, path.what, "roundings", difference(image, truth), path.limit, fault)
-
-
-def draw(scene: Scene, settings: dict[str, Any]) -> np.ndarray:
-    """Return the picture of ``mrt_whitted``, with no path cut short."""
-    described = scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=settings["fresnel"])
-    described["integrator"] = {"type": "mrt_whitted", "clamp": settings["clamp"], "min_contribution": 0.0}
-    return render(described, aa=1, lattice="report").image
+        least = ("a scene or setting almost the same", difference(wrong, truth))
+        yield name, what, "roundings", difference(image, truth), limit, least
 
 
 def difference(image: np.ndarray, truth: np.ndarray) -> float:
