@@ -50,8 +50,8 @@ def reference_render(
     "unity"), ``clamp``, ``max_depth`` and ``bounce_budget`` ("report" or "plain"). Raises ``SceneError`` for
     a texture on anything but triangles, and for one that is not looked up as in the report.
     """
-    camera, things = scene.camera, objects(scene)
-    for thing in things:
+    camera = scene.camera
+    for thing in objects(scene):
         drawn = isinstance(thing, Mesh) and thing.uvs is not None and scene.texturing == "report"
         if thing.material.texture and not drawn:
             raise SceneError("float64 draws textures on triangles only, looked up as in the report")
@@ -66,7 +66,7 @@ def reference_render(
     d = unit(forward + u[:, None] * right + v[:, None] * np.cross(forward, right))
     o = np.broadcast_to(np.array(camera.position, float), d.shape)
     with np.errstate(all="ignore"):
-        layers = _radiance(scene, things, o, d, np.zeros(len(d), int), **settings)
+        layers = _radiance(scene, o, d, np.zeros(len(d), int), **settings)
     return ReferenceResult(*(layer.reshape(height, width, *layer.shape[1:])[::-1] for layer in layers))
 
 
@@ -77,7 +77,6 @@ def objects(scene: Scene) -> list[Any]:
 
 def _radiance(
     scene: Scene,
-    things: Sequence[Any],
     o: Array,
     d: Array,
     spent: Array,
@@ -88,6 +87,7 @@ def _radiance(
     bounce_budget: str = "report",
 ) -> tuple[Array, Array, Array]:
     """Return the light [N, 3] that comes back along rays, and their hashes; ``spent``: of the bounces."""
+    things = objects(scene)
     t, thing, n, diffuse = nearest(things, o, d)
     hit = np.flatnonzero(thing >= 0)
     light, path, lights = np.full(d.shape, scene.sky, float), _mix(thing), np.zeros(len(d), np.uint64)
@@ -124,7 +124,7 @@ def _radiance(
         away = unit(d_in + 2 * cos[:, None] * n)[on]
         settings: dict[str, Any] = {"fresnel": fresnel, "clamp": clamp, "max_depth": max_depth}
         settings["bounce_budget"] = bounce_budget
-        found, their_path, their_lights = _radiance(scene, things, start[on], away, spent[on], **settings)
+        found, their_path, their_lights = _radiance(scene, start[on], away, spent[on], **settings)
         light[hit[on]] += mirrored[on] * found
         path[hit[on]], lights[hit[on]] = _mix(path[hit[on]], their_path), _mix(lights[hit[on]], their_lights)
     return light, path, lights

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.tools.study import Study
@@ -20,86 +20,64 @@ Options = dict[str, Any]
 Points = Mapping[str, Point]
 
 
-class Extent(NamedTuple):
-    """How much to measure: how far the settings go, and scenes by trade."""
-
-    size: tuple[int, int]
-    amounts: Sequence[int]  # aa
-    reference_aa: int  # an even multiple of each: at an odd one, lattices share samples and with them errors
-    spp: Sequence[int]
-    reference_spp: int
-    scenes: Mapping[str, Sequence[int]]
-    repeats: int
-
-    def scene(self, number: int, **options: Any) -> Options:
-        """Return a scene of the report as a dict, of the extent's size."""
-        return mrt.scene_dict(number, width=self.size[0], height=self.size[1], **options)
-
-
-ALL = (0, 1, 2, 3, 4, 7, 9)
-# Under path, scenes of broad highlights: elsewhere rare, very bright paths rule every mean square
-OF_TRADES = {"sampling": ALL, "whitted": ALL, "path": (0, 7, 9)}
-FULL = Extent((240, 180), (1, 2, 4, 8), 48, (1, 4, 16, 64), 2048, OF_TRADES, 5)
-QUICK = Extent((64, 48), (1, 4), 24, (1, 16), 512, dict.fromkeys(OF_TRADES, (0,)), 1)
-
-
-class Trade(NamedTuple):
-    """Settings of one kind on one scene, and the picture they strive for: arguments of ``error_vs_time``."""
-
-    scene: Any
-    title: str
-    truth: str  # what the reference is
-    cases: Mapping[str, Options]
-    reference: Any
-    shared: Options
-    bounds: Sequence[tuple[str, Callable[[Points], float], float, str]]  # what, figure, the most, why
-    judged: str = ""  # the case of least error, if the reference's own must be far below it
-
-
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
-    extent = QUICK if quick else FULL
-    jobs = [(name, number) for name, numbers in extent.scenes.items() for number in numbers]
+    jobs = [(name, number) for name in TRADES for number in ((0,) if quick else SCENES[name])]
     for name, number in study.each("Error against time", jobs):
-        trade, where = TRADES[name](number, extent), f"scene {number}, {name}"
-        options: Options = {"reference": trade.reference, "shared": trade.shared}
-        found = error_vs_time(trade.scene, trade.cases, repeats=extent.repeats, **options)
-        describe(study, found, where, f"Scene {number}: {trade.title}", trade.truth)
+        trade, where = TRADES[name](number, quick), f"scene {number}, {name}"
+        scene, cases, title, truth = (trade.pop(key) for key in ("scene", "cases", "title", "truth"))
+        bounds, judged = trade.pop("bounds"), trade.pop("judged", None)
+        found = error_vs_time(scene, cases, repeats=1 if quick else 5, **trade)
+        describe(study, found, where, f"Scene {number}: {title}", truth)
         if not found.failed:
-            for what, figure, most, why in trade.bounds:
+            if judged:
+                what, least = "error of the reference / least error it judges", found.points[judged].rmse
+                why = (
+                    "then it changes no error by more than an eighth, and the judge is better than the judged"
+                )
+                bounds.append((what, lambda _, f=found, e=least: f.reference_error / e, 0.5, why))
+            for what, figure, most, why in bounds:
                 study.at_most(f"{where}: {what}", figure(found.points), most, why)
-        if trade.judged and not found.failed:
-            what = f"{where}: error of the reference / least error it judges"
-            why = "then it changes no error by more than an eighth, and the judge is better than the judged"
-            study.at_most(what, found.reference_error / found.points[trade.judged].rmse, 0.5, why)
-        del trade, found  # the scenes with them
+        del scene, found  # what holds them is freed with them
 
 
-def sampling(number: int, extent: Extent) -> Trade:
+def _scene(number: int, quick: bool, **options: Any) -> Options:
+    """Return a scene of the report as a dict."""
+    width, height = (40, 30) if quick else (240, 180)
+    return mrt.scene_dict(number, width=width, height=height, **options)
+
+
+# Each returns arguments of ``error_vs_time``; titles of the settings and of the reference; "bounds": what, a
+# figure of the points by case, the most, why; and "judged", the case of least error, by a better reference
+def sampling(number: int, quick: bool) -> Options:
     """Return which pixels get how many samples, and where in the pixel."""
-    most, least, greatest = extent.reference_aa, extent.amounts[0], extent.amounts[-1]
-    few, many = (f"none aa={aa} centered" for aa in (least, greatest))
+    # the reference: an even multiple of each, since odd ones share samples and with them errors
+    amounts, most = ((1, 4), 24) if quick else ((1, 2, 4, 8), 48)
+    least, greatest = amounts[0], amounts[-1]
+    ends = (("none", least), ("none", greatest), ("sobel", greatest))
+    few, many, edges = (f"{mode} aa={aa} centered" for mode, aa in ends)
     why = "an edge of the lattice is known to 1 / aa; twice that: samples that do not help leave 1"
-    what = f"RMSE of {many} / {few}"
-    return Trade(
-        extent.scene(number),
-        "anti-aliasing mode, aa and lattice",
-        f"{most}x{most} centered samples in every pixel; its error: what three quarters of {most} change",
-        {
+    return {
+        "scene": _scene(number, quick),
+        "title": "anti-aliasing mode, aa and lattice",
+        "truth": f"{most}x{most} centered samples a pixel; its error: that of three quarters of {most}",
+        "cases": {
             f"{mode} aa={aa} {lattice}": {"aa": aa, "aamode": mode, "lattice": lattice}
             for lattice in ("report", "centered")
             for mode in MODES
-            for aa in extent.amounts
+            for aa in amounts
             if aa > 1 or mode == "none"
         },
-        [{"aa": aa, "aamode": "none", "lattice": "centered"} for aa in (most, most * 3 // 4)],
-        {},
-        [(what, lambda points: points[many].rmse / points[few].rmse, 2 * least / greatest, why)],
-        many,
-    )
+        "reference": [{"aa": aa, "aamode": "none", "lattice": "centered"} for aa in (most, most * 3 // 4)],
+        "bounds": [
+            (f"RMSE of {case} / {few}", lambda p, c=case: p[c].rmse / p[few].rmse, 2 * least / greatest, why)
+            for case in (many, edges)
+        ],
+        "judged": many,
+    }
 
 
-def whitted(number: int, extent: Extent) -> Trade:
+def whitted(number: int, quick: bool) -> Options:
     """Return cut-off, bounce limit and form of the Fresnel factor, at the same samples."""
 
     def integrator(**parameters: Any) -> Options:
@@ -111,46 +89,48 @@ def whitted(number: int, extent: Extent) -> Trade:
     first, last = (f"max_depth={depth}" for depth in (DEPTHS[0], DEPTHS[-1]))
     why = "half a step of 8 bits, as promised; a cut-off that is 16 times too large leaves more"
     seen = "seen is 6e-4 (scene 9) and above; a limit that has no effect leaves 0"
-    return Trade(
-        extent.scene(number, fresnel="dielectric"),
-        "cut-off, bounce limit, Fresnel form",
-        "no cut-off, max_depth=10, exact Fresnel, the same rays",
-        {**cases, "fresnel=schlick": {"scene": extent.scene(number)}},
-        integrator(min_contribution=0.0),
-        {"aa": 2, "aamode": "none", "lattice": "report"},
-        [
+    return {
+        "scene": _scene(number, quick, fresnel="dielectric"),
+        "title": "cut-off, bounce limit, Fresnel form",
+        "truth": "no cut-off, max_depth=10, exact Fresnel, the same rays",
+        "cases": {**cases, "fresnel=schlick": {"scene": _scene(number, quick)}},
+        "reference": integrator(min_contribution=0.0),
+        "shared": {"aa": 2, "aamode": "none", "lattice": "report"},
+        "bounds": [
             ("largest error of the default cut-off", lambda p: p[default].difference.largest, INVISIBLE, why),
             (f"RMSE of {last} - that of {first}", lambda p: p[last].rmse - p[first].rmse, -3e-4, seen),
         ],
-    )
+    }
 
 
-def path(number: int, extent: Extent) -> Trade:
+def path(number: int, quick: bool) -> Options:
     """Return Mitsuba's path and direct at rising spp, and mrt_whitted, against converged path."""
-    least, greatest = extent.spp[0], extent.spp[-1]
-    few, many = (f"path spp={spp}" for spp in (least, greatest))
+    counts, most = ((1, 16), 256) if quick else ((1, 4, 16, 64), 2048)
+    few, many = (f"path spp={spp}" for spp in (counts[0], counts[-1]))
 
     def off_theory(points: Points) -> float:
-        return abs(points[many].rmse / points[few].rmse * (greatest / least) ** 0.5 - 1)
+        return abs(points[many].rmse / points[few].rmse * (counts[-1] / counts[0]) ** 0.5 - 1)
 
+    kinds = ("path", "direct")
     cases: dict[str, Options] = {
-        f"{kind} spp={spp}": {"integrator": kind, "spp": spp}
-        for kind in ("path", "direct")
-        for spp in extent.spp
+        f"{kind} spp={spp}": {"integrator": kind, "spp": spp} for kind in kinds for spp in counts
     }
     cases["mrt_whitted"] = {}
     cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
     why = "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15"
-    return Trade(
-        extent.scene(number),
-        "Whitted, direct and path at rising spp",
-        f"path with spp={extent.reference_spp}",
-        cases,
-        {"integrator": "path", "spp": extent.reference_spp},
-        {"aa": 1, "aamode": "none"},
-        [(f"|RMSE of {many} / {few} / theory - 1|", off_theory, 0.15, why)],
-        many,
-    )
+    return {
+        "scene": _scene(number, quick),
+        "title": "Whitted, direct and path at rising spp",
+        "truth": f"path with spp={most}",
+        "cases": cases,
+        "reference": {"integrator": "path", "spp": most},
+        "shared": {"aa": 1, "aamode": "none"},
+        "bounds": [(f"|RMSE of {many} / {few} / theory - 1|", off_theory, 0.15, why)],
+        "judged": many,
+    }
 
 
-TRADES: dict[str, Callable[[int, Extent], Trade]] = {"sampling": sampling, "whitted": whitted, "path": path}
+TRADES: dict[str, Callable[[int, bool], Options]] = {"sampling": sampling, "whitted": whitted, "path": path}
+ALL = (0, 1, 2, 3, 4, 7, 9)
+# Under path, scenes of broad highlights: elsewhere rare, very bright paths rule every mean square
+SCENES = {"sampling": ALL, "whitted": ALL, "path": (0, 7, 9)}

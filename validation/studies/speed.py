@@ -17,8 +17,6 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import mitsuba as mi
@@ -26,8 +24,6 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
-from mrt_mitsuba.cores import usable_cores
-from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.studies import roughconductor
 from mrt_mitsuba.validation.tools import renders
 from mrt_mitsuba.validation.tools.renders import load
@@ -38,7 +34,6 @@ TITLE = "Speed: against Mitsuba's own plugins, other ways and smaller tasks"
 
 Run = Callable[..., Any]
 Nodes = dict[str, Any]
-PLAIN: dict[str, Any] = renders.ONE_RAY
 
 
 class Extent(NamedTuple):
@@ -51,13 +46,9 @@ class Extent(NamedTuple):
     repeats: int
     growth: int  # how many times larger the larger task is, and of how many objects crowds are
 
-    def nodes(self, number: int, **options: Any) -> Nodes:
-        """Return a scene of the report as a dict, of the extent's size."""
-        return mrt.scene_dict(number, width=self.width, height=self.height, **options)
-
 
 FULL = Extent(400, 300, 16, (0, 1, 2, 3, 4), 11, 1000)
-QUICK = Extent(96, 72, 16, (0,), 1, 50)
+QUICK = Extent(48, 36, 16, (0,), 1, 16)
 
 
 class Pair(NamedTuple):
@@ -76,15 +67,16 @@ def run(study: Study, *, quick: bool) -> None:
     extent = QUICK if quick else FULL
     runtime.use(runtime.FAST)
     rows: list[dict[str, Any]] = []
-    for pair in study.each("Speed", list(pairs(extent))):
+    # scenes are loaded when the turn of their pair comes
+    for pair in study.each("Speed", [pair for part in PARTS for pair in part(extent)]):
         time, off = compare(pair, extent.repeats)
+        quartiles = f"{time['low']:.3g} to {time['high']:.3g}"
         if not quick:
-            note = f"quartiles {time['low']:.3g} and {time['high']:.3g} of {extent.repeats} ratios"
+            note = f"quartiles {quartiles} of {extent.repeats} ratios"
             study.goal(pair.name, time["ratio"], pair.goal, note, interval=(time["low"], time["high"]))
         if off is not None:
             study.at_most(f"{pair.name}: difference", off, pair.limit, pair.why)
         seconds = {"s": time["seconds"], "other, s": time["other_seconds"], "ratio": time["ratio"]}
-        quartiles = f"{time['low']:.3g} to {time['high']:.3g}"
         rows.append({"what": pair.name, **seconds, "quartiles": quartiles, "goal": pair.goal})
     title = f"Seconds, {extent.width}x{extent.height}, {extent.spp} samples a pixel"
     study.records("speed", title, rows, "Taken in turn, medians of ratios.", first=True)
@@ -100,11 +92,14 @@ def compare(pair: Pair, repeats: int) -> tuple[dict[str, float], float | None]:
     return time, off
 
 
-def pairs(extent: Extent) -> Iterator[Pair]:
-    """Yield all pairs; their scenes are loaded when their turn comes."""
-    yield from against_mitsuba(extent)
-    yield from other_ways(extent)
-    yield from growth(extent)
+def _render(nodes: Nodes, **options: Any) -> Run:
+    return partial(mrt.render, load(nodes), **renders.ONE_RAY | options)
+
+
+def _by_mitsuba(nodes: Nodes, integrator: Nodes | None = None, spp: int = 1) -> Run:
+    scene = load(nodes)
+    chosen = mi.load_dict(integrator) if integrator else scene.integrator()
+    return lambda: np.array(mi.render(scene, integrator=chosen, spp=spp))
 
 
 def against_mitsuba(extent: Extent) -> Iterator[Pair]:
@@ -115,37 +110,35 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
     # random lights and paths leave half a percent at the size of the quick study
     same = 0.03, "the same light, else it would be no comparison; the rest is noise. One light less shows"
 
+    def nodes(number: int, **options: Any) -> Nodes:
+        return mrt.scene_dict(number, width=extent.width, height=extent.height, **options)
+
     def other_light(ours: Run, other: Run, factor: float = 1) -> float:
         means = [float(np.mean(side(), dtype=np.float64)) for side in (ours, other)]
         return abs(means[1] / means[0] / factor - 1)
 
-    def render(nodes: Nodes, integrator: Nodes | None = None) -> Run:
-        scene = load(nodes)
-        chosen = mi.load_dict(integrator) if integrator else scene.integrator()
-        return lambda: np.array(mi.render(scene, integrator=chosen, spp=extent.spp))
-
     def direct(number: int, flavor: str) -> tuple[Run, Run]:
         """Return direct light in the scene of a flavour, but for its lights, which are Mitsuba's."""
-        stock, nodes = (extent.nodes(number, flavor=name) for name in ("stock", flavor))
+        stock, own = (nodes(number, flavor=name) for name in ("stock", flavor))
         lights = {name: node for name, node in stock.items() if name.startswith("light_")}
-        del nodes["sky"]  # direct would sample it, mrt_whitted does not
+        del own["sky"]  # direct would sample it, mrt_whitted does not
         ours = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
         theirs = {"type": "direct", "emitter_samples": len(lights), "bsdf_samples": 0}
-        return render(nodes | lights, ours), render(nodes | lights, theirs)
+        return _by_mitsuba(own | lights, ours, extent.spp), _by_mitsuba(own | lights, theirs, extent.spp)
 
     def materials(number: int) -> tuple[Run, Run]:
         """Return the scene of Mitsuba's plugins, with either material in place of ``roughplastic``."""
-        stock = extent.nodes(number, flavor="stock")
+        stock = nodes(number, flavor="stock")
         plastics = {n: m for n, m in stock.items() if isinstance(m, dict) and m["type"] == "roughplastic"}
         keep = "specular_reflectance"
         ours, theirs = (
             stock | {name: kind(node["alpha"]) | {keep: node[keep]} for name, node in plastics.items()}
             for kind in (roughconductor.ours, roughconductor.theirs)
         )
-        return render(ours), render(theirs)
+        return _by_mitsuba(ours, spp=extent.spp), _by_mitsuba(theirs, spp=extent.spp)
 
     for n in extent.scenes:
-        lights = sum(key.startswith("light_") for key in extent.nodes(n))
+        lights = sum(key.startswith("light_") for key in nodes(n))
         for flavor, whose in (("mrt", "our"), ("stock", "Mitsuba's")):
             name = f"mrt_whitted / direct, scene {n}, {whose} shapes and materials"
             yield Pair(name, partial(direct, n, flavor), 0.9, partial(other_light, factor=lights), *same)
@@ -153,12 +146,11 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
 
 
 def other_ways(extent: Extent) -> Iterator[Pair]:
-    """Yield searches by our tree against Mitsuba's, what a plan leaves out, and a sweep against a loop."""
-    count = extent.growth
+    """Yield searches by our tree against Mitsuba's, and what a plan leaves out."""
     size: dict[str, Any] = {"width": extent.width, "height": extent.height}
 
-    def of_crowd(kind: str, **options: Any) -> Run:
-        return partial(mrt.render, load(renders.crowd(count, kind, **size)), **PLAIN | options)
+    def crowd(kind: str) -> Run:
+        return _render(renders.crowd(extent.growth, kind, **size), layers=["depth"])
 
     def other_hits(ours: Run, other: Run) -> float:
         depths = [np.nan_to_num(side().layers["depth.Z"], posinf=1e6) for side in (ours, other)]
@@ -167,15 +159,9 @@ def other_ways(extent: Extent) -> Iterator[Pair]:
     def off(ours: Run, other: Run) -> float:
         return float(np.abs(ours().image - other().image).max())
 
-    yield Pair(f"{count} cones / spheres", lambda: (of_crowd("cone"), of_crowd("sphere")), 4)
-    yield Pair(
-        f"{count} spheres in our tree / in Mitsuba's",
-        lambda: (of_crowd("group", layers=["depth"]), of_crowd("sphere", layers=["depth"])),
-        4,
-        other_hits,
-        2e-3,
-        "grazing rays may go either way in float32. One object in a thousand lost shows",
-    )
+    why = "grazing rays may go either way in float32. One object in a thousand lost shows"
+    name = f"{extent.growth} spheres in our tree / in Mitsuba's"
+    yield Pair(name, lambda: (crowd("group"), crowd("sphere")), 4, other_hits, 2e-3, why)
     far = {"type": "mrt_cone", "apex": [1e3, 1, 0], "base_center": [1e3, 0, 0], "radius": 0.1}
     uncut = {"integrator": {"type": "mrt_whitted", "min_contribution": 0.0}}
     layers = {"layers": ["depth", "normal", "albedo", "direct", "reflection", "bounces"]}
@@ -185,60 +171,35 @@ def other_ways(extent: Extent) -> Iterator[Pair]:
         ("paths that cannot matter", {}, uncut),
         ("layers", {}, layers),
     ):
-        make = partial(left_out, extent.nodes(0), change, options)
+        make = partial(left_out, mrt.scene_dict(0, **size), change, options)
         yield Pair(f"scene 0 without {what} / with", make, 1.05, off, 0.5 / 255, why)
-    if usable_cores() > 1 and extent.repeats > 1:  # workers take seconds to start
-        key, values = "material_0.alpha", np.linspace(0.02, 0.5, max(3, count // 10)).tolist()
-
-        def sweep() -> None:
-            with TemporaryDirectory() as folder:
-                mrt.sweep(3, folder, grid={key: values}, workers=2, progress=Progress(), aa=2, **size)
-
-        def loop() -> None:
-            with TemporaryDirectory() as folder:
-                for i, value in enumerate(values):
-                    mrt.render(3, params={key: value}, aa=2, **size).save(Path(folder, f"{i}.exr"))
-
-        yield Pair("a sweep by two workers / a loop", lambda: (sweep, loop), 0.6)
 
 
 def left_out(nodes: Nodes, change: Nodes, more: dict[str, Any]) -> tuple[Run, Run]:
     """Return a scene, and the same with what its plan leaves out."""
-    without, forced = load(nodes), load(nodes | change)
-    return partial(mrt.render, without, **PLAIN), partial(mrt.render, forced, **PLAIN, **more)
+    return _render(nodes), _render(nodes | change, **more)
 
 
 def growth(extent: Extent) -> Iterator[Pair]:
     """Yield tasks against smaller ones; the code must not grow with them."""
     times, side = extent.growth, round(extent.growth**0.5)
     small = {"width": 40, "height": 30}
-
-    def of(nodes: Nodes, **options: Any) -> Run:
-        return partial(mrt.render, load(nodes), **PLAIN | options)
-
-    def of_pixels(factor: int) -> Run:
-        return of(mrt.scene_dict(3, width=40 * factor, height=30 * factor))
-
-    def of_lights(factor: int) -> Run:
-        return of(renders.with_lights(16 * factor, **small))
-
-    def of_triangles(factor: int) -> Run:
-        return of(renders.with_triangles(100 * factor, **small), aa=4)
-
-    def both(task: Callable[[int], Run], factor: int) -> tuple[Run, Run]:
-        return task(factor), task(1)
+    tasks: list[tuple[str, Callable[[int], Run], int, int]] = [  # the factor of each, and the goal
+        ("pixels", lambda n: _render(mrt.scene_dict(3, width=40 * n, height=30 * n)), side, side * side),
+        ("lights", lambda n: _render(renders.with_lights(16 * n, **small)), times, times),
+        ("triangles", lambda n: _render(renders.with_triangles(100 * n, **small), aa=4), times, 10),
+    ]
 
     def longer_code(ours: Run, other: Run) -> float:
         return operations(ours) / operations(other) - 1
 
     why = "numbers are data, not code; a loop that is unrolled makes it as many times longer"
-    rows: list[tuple[str, Callable[[int], Run], int, int]] = [
-        ("pixels", of_pixels, side, side * side),
-        ("lights", of_lights, times, times),
-        ("triangles", of_triangles, times, 10),
-    ]
-    for name, task, factor, goal in rows:
-        yield Pair(f"{times} times the {name}", partial(both, task, factor), goal, longer_code, 0.05, why)
+    for name, task, factor, goal in tasks:
+        make = partial(lambda task, factor: (task(factor), task(1)), task, factor)
+        yield Pair(f"{times} times the {name}", make, goal, longer_code, 0.05, why)
+
+
+PARTS = (against_mitsuba, other_ways, growth)
 
 
 def on_device(variant: str, sizes: Sequence[tuple[int, int]], triangles: int) -> Iterator[Pair]:
@@ -251,19 +212,13 @@ def on_device(variant: str, sizes: Sequence[tuple[int, int]], triangles: int) ->
     runtime.use(variant)
 
     def make(nodes: Run, integrator: Nodes) -> tuple[Run, Run]:
-        ours, stock, chosen = load(nodes("mrt")), load(nodes("stock")), mi.load_dict(integrator)
-        return (
-            lambda: mrt.render(ours, **PLAIN).image,
-            lambda: np.array(mi.render(stock, integrator=chosen, spp=1)),
-        )
+        return _render(nodes(flavor="mrt")), _by_mitsuba(nodes(flavor="stock"), integrator)
 
     for width, height in sizes:
         size: dict[str, Any] = {"width": width, "height": height}
-        scenes: dict[str, Run] = {
-            f"scene {n}": lambda flavor, n=n, size=size: mrt.scene_dict(n, flavor=flavor, **size)
-            for n in range(5)
-        }
-        scenes[f"{triangles} triangles"] = lambda _, size=size: renders.with_triangles(triangles, **size)
+        scenes: dict[str, Run] = {f"scene {n}": partial(mrt.scene_dict, n, **size) for n in range(5)}
+        hills = renders.with_triangles(triangles, **size)
+        scenes[f"{triangles} triangles"] = lambda flavor, hills=hills: hills
         for name, nodes in scenes.items():
             for other in ({"type": "direct"}, {"type": "path", "max_depth": 6}):
                 what = f"{name}, {width}x{height}, mrt_whitted / {other['type']}"

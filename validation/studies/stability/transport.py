@@ -73,8 +73,8 @@ def _hall(specular: float, light: float = 1.0, ior: float = 1.5) -> Scene:
 
 FULL, OPEN = {"fresnel": "unity"}, {"clamp": False}
 
-# Of each case its name, what it is, a scene that is hard on a path tracer, and one, or settings, that must not
-# pass for it; the limit, settings of both tracers, and the scene whose exact picture it is
+# Of each case its name, what it is, a scene that is hard on a path tracer, and one, or settings, that must
+# not pass for it; the limit, settings of both tracers, and the scene whose exact picture it is
 PATHS: Sequence[tuple[Any, ...]] = (
     ("facing mirrors", "Ks 0.95, ten bounces", _hall(0.95), _hall(0.9499), 2e-5, FULL),
     ("perfect facing mirrors", "Ks 1, ten bounces", _hall(1), {"max_depth": 9}, 2e-5, FULL),
