@@ -39,13 +39,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.filters.grid import Grid, finite
+from mrt_mitsuba.filters.grid import Grid, check_numbers, dilated, finite
 
 MAX_AMOUNT = 8
 REACH = MAX_AMOUNT  # rows and columns of neighbours that a pixel may depend on, either way
@@ -67,10 +68,9 @@ def blur_amount(depth: Any, *, focal_distance: float | None, focal_range: float 
     """
     grid = Grid(depth)
     distance = grid.flat(depth, (), "depth")
-    focus = _focus(focal_distance, focal_range)
-    if focus == 0:
+    if not _is_on(focal_distance, focal_range):
         return grid.output([dr.zeros(grid.Float, grid.count)])
-    return grid.output([_amount(grid, distance, focus, focal_range)])
+    return grid.output([_amount(grid, distance, focal_distance, focal_range)])
 
 
 def gaussian_dof(
@@ -93,33 +93,25 @@ def gaussian_dof(
     """
     if mode not in MODES:
         raise UsageError(f"unknown depth-of-field mode {mode!r}; use one of {', '.join(MODES)}")
-    focus = _focus(focal_distance, focal_range)
-    if focus == 0:
+    if not _is_on(focal_distance, focal_range):
         return image
     grid = Grid(image)
     planes = grid.planes(image, "image")
     distance = grid.flat(depth, (), "depth")
-    amount = _amount(grid, distance, focus, focal_range)
+    amount = _amount(grid, distance, focal_distance, focal_range)
     if mode == "report":
-        blurred = _report(grid, planes, amount)
-    else:
-        near = (distance > 0) & (distance < grid.opaque(focus))
-        radius = _radius(amount)
-        blurred = _gather_discs(
-            grid, planes, dr.select(near, -radius, radius), max_radius=_radius(MAX_AMOUNT)
-        )
-    return grid.output(blurred, (3,))
+        return grid.output(_pascal(grid, planes, amount), (3,))
+    radius = _radius(amount)
+    near = (distance > 0) & (distance < grid.opaque(focal_distance))
+    return grid.output(_discs(grid, planes, dr.select(near, -radius, radius)), (3,))
 
 
-def _focus(focal_distance: float | None, focal_range: float) -> float:
-    """Return the focal distance, or 0 for a filter that is off."""
-    for name, value in (("focal_distance", focal_distance), ("focal_range", focal_range)):
-        if value is not None and math.isnan(value):
-            raise UsageError(f"{name} is not a number; give one")
-    return max(focal_distance or 0.0, 0.0)
+def _is_on(focal_distance: float | None, focal_range: float) -> bool:
+    check_numbers(focal_distance=focal_distance or 0.0, focal_range=focal_range)
+    return (focal_distance or 0.0) > 0
 
 
-def _amount(grid: Grid, distance: Any, focus: float, focal_range: float) -> Any:
+def _amount(grid: Grid, distance: Any, focus: float | None, focal_range: float) -> Any:
     amount = dr.abs(grid.opaque(focus) - distance) - grid.opaque(focal_range)
     amount = dr.select(amount > 0, dr.minimum(amount, MAX_AMOUNT), 0)  # NaN > 0 is false
     return dr.select((distance <= 0) | (distance == math.inf), MAX_AMOUNT, amount)
@@ -130,7 +122,7 @@ def _radius(amount: Any) -> Any:
     return dr.select(amount < 1, small, dr.sqrt(dr.maximum(2 * amount - 23 / 16, 0)) - 0.5)
 
 
-def _report(grid: Grid, planes: Sequence[Any], amount: Any) -> list[Any]:
+def _pascal(grid: Grid, planes: Sequence[Any], amount: Any) -> list[Any]:
     """Blur with Pascal windows, in one pass along rows and one along columns.
 
     The weights of a window are the product of a row's and a column's, at the borders too, so two passes of 2k
@@ -151,20 +143,24 @@ def _report(grid: Grid, planes: Sequence[Any], amount: Any) -> list[Any]:
     k = dr.gather(grid.Int, k, pixels)
     column, row = grid.coordinates(pixels)
     start, count = _cut(grid.height - 1 - row, k, grid.height)
-    bottom = (grid.height - 1 - start) * grid.width + column
-    vertical = _Taps(grid, (k - 1) * grid.size + bottom, -grid.width, count, k)
-    needed = vertical.touched(MAX_AMOUNT * grid.count)
+    first = (k - 1) * grid.size + (grid.height - 1 - start) * grid.width + column
+    read = dr.zeros(grid.Bool, MAX_AMOUNT * grid.count)
 
+    def mark(j: Any, none: Sequence[Any]) -> Sequence[Any]:
+        dr.scatter(read, grid.Bool(True), first - j * grid.width, active=j < count)
+        return none
+
+    grid.accumulate(count, [], mark)
+    needed = grid.Int(dr.compress(read))
     level = needed // grid.size
-    pixel, k = needed - level * grid.size, level + 1
-    column, row = grid.coordinates(pixel)
-    start, count = _cut(column, k, grid.width)
-    along_rows = _Taps(grid, row * grid.width + start, 1, count, k).sums(sources)
+    column, row = grid.coordinates(needed - level * grid.size)
+    left, number = _cut(column, level + 1, grid.width)
+    along_rows = _weighted(grid, sources, (row * grid.width + left, 1, number, level + 1))
     place = dr.empty(grid.Int, MAX_AMOUNT * grid.count)  # read below only where written here
     dr.scatter(place, dr.arange(grid.Int, dr.width(needed)), needed)
     dr.eval(along_rows, place)
 
-    sums = vertical.sums(along_rows, place)
+    sums = _weighted(grid, along_rows, (first, -grid.width, count, k), place)
     for target, total in zip(blurred, sums[:3], strict=True):
         dr.scatter(target, total / sums[3], pixels)  # not zero: the pixel itself gives
     dr.eval(blurred)
@@ -177,40 +173,24 @@ def _cut(centre: Any, k: Any, size: Any) -> tuple[Any, Any]:
     return start, dr.minimum(centre + k, size) - start
 
 
-class _Taps:
-    """Weighted values in lines: ``count`` from ``first`` on, ``stride`` apart, with the weights of ``k``."""
+def _weighted(
+    grid: Grid, planes: Sequence[Any], line: tuple[Any, Any, Any, Any], place: Any = None
+) -> Sequence[Any]:
+    """Return the weighted sums of each plane's values in lines: from a first value on, so far apart, so many,
+    with the weights of k. ``place``: where in the planes they are."""
+    (first, stride, count, k), weights = line, grid.Float(_PASCAL)
 
-    def __init__(self, grid: Grid, first: Any, stride: Any, count: Any, k: Any) -> None:
-        self._grid, self._first, self._stride, self._count = grid, first, stride, count
-        self._weights, self._line = grid.Float(_PASCAL), (k - 1) * _MOST
+    def add(j: Any, totals: Sequence[Any]) -> list[Any]:
+        weight = dr.gather(grid.Float, weights, (k - 1) * _MOST + j)
+        index, active = first + j * stride, j < count
+        if place is not None:
+            index = dr.gather(grid.Int, place, index, active=active)
+        return [
+            total + weight * dr.gather(grid.Float, plane, index, active=active)
+            for total, plane in zip(totals, planes, strict=True)
+        ]
 
-    def sums(self, planes: Sequence[Any], place: Any = None) -> list[Any]:
-        """Return the weighted sum of each plane's values; ``place``: where in the planes they are."""
-        grid = self._grid
-
-        def add(j: Any, totals: Sequence[Any]) -> list[Any]:
-            weight = dr.gather(grid.Float, self._weights, self._line + j)
-            index, active = self._first + j * self._stride, j < self._count
-            if place is not None:
-                index = dr.gather(grid.Int, place, index, active=active)
-            return [
-                total + weight * dr.gather(grid.Float, plane, index, active=active)
-                for total, plane in zip(totals, planes, strict=True)
-            ]
-
-        zero = dr.zeros(grid.Float, dr.width(self._first))
-        return list(grid.accumulate(self._count, [zero] * len(planes), add))
-
-    def touched(self, size: int) -> Any:
-        """Return the indices of all values in any of the lines, of ``size``, in ascending order."""
-        grid, touched = self._grid, dr.zeros(self._grid.Bool, size)
-
-        def mark(j: Any, none: Sequence[Any]) -> Sequence[Any]:
-            dr.scatter(touched, grid.Bool(True), self._first + j * self._stride, active=j < self._count)
-            return none
-
-        grid.accumulate(self._count, [], mark)
-        return grid.Int(dr.compress(touched))
+    return grid.accumulate(count, [dr.zeros(grid.Float, dr.width(first))] * len(planes), add)
 
 
 _MOST = 2 * MAX_AMOUNT
@@ -218,18 +198,12 @@ _MOST = 2 * MAX_AMOUNT
 _PASCAL = [math.comb(2 * k - 1, j) / 2 ** (2 * k - 1) for k in range(1, MAX_AMOUNT + 1) for j in range(_MOST)]
 
 
-# ---------------------------------- Discs, as behind a lens ----------------------------------
-
-
-def _gather_discs(grid: Grid, planes: Sequence[Any], radius: Any, *, max_radius: float) -> list[Any]:
+def _discs(grid: Grid, planes: Sequence[Any], radius: Any) -> list[Any]:
     """Return the blurred colours, three planes; pixels that no disc of another reaches are not computed.
 
-    A pixel whose colour is no finite number gives nothing to its neighbours and stays as it is.
-
-    Args:
-        planes: red, green and blue.
-        radius: a plane of signed radii in pixels, at most ``max_radius`` either way.
+    ``radius``: a plane of signed radii in pixels.
     """
+    max_radius = _radius(MAX_AMOUNT)
     reach = math.ceil(max_radius + 1) - 1
     steps = range(-reach, reach + 1)
     # the neighbours that a disc of the largest radius covers at least in part
@@ -242,7 +216,8 @@ def _gather_discs(grid: Grid, planes: Sequence[Any], radius: Any, *, max_radius:
     wide = dr.abs(radius) > 0
     blurred = [grid.Float(plane) for plane in planes]
     dr.eval(radius, share, colours, wide, blurred)
-    pixels = grid.Int(dr.compress(good & _near_any(grid, wide, max(dx for dx, _ in offsets))))
+    near = dilated(np.array(wide).reshape(grid.rows, grid.columns), reach)
+    pixels = grid.Int(dr.compress(good & grid.Bool(near.ravel())))
     if dr.width(pixels) == 0:
         return blurred
 
@@ -267,27 +242,6 @@ def _coverage(radius: Any, distance: Any) -> Any:
     return dr.clip(radius + (1 - distance), 0, 1)
 
 
-def _clamped(grid: Grid, column: Any, row: Any, dx: Any, dy: Any) -> Any:
-    """Return the index of a neighbour, with the border pixels repeated outside."""
-    return dr.clip(row + dy, 0, grid.height - 1) * grid.width + dr.clip(column + dx, 0, grid.width - 1)
-
-
-def _near_any(grid: Grid, mask: Any, reach: int) -> Any:
-    """Return where the mask is set within ``reach`` columns and rows, in a pass along either."""
-    column, row = grid.coordinates(grid.index)
-    steps = range(-reach, reach + 1)
-
-    def any_of(mask: Any, neighbour: Callable[[int], Any]) -> Any:
-        result = grid.Bool(False)
-        for step in steps:
-            result |= dr.gather(grid.Bool, mask, neighbour(step))
-        return result
-
-    along_rows = any_of(mask, lambda step: _clamped(grid, column, row, step, 0))
-    dr.eval(along_rows)
-    return any_of(along_rows, lambda step: _clamped(grid, column, row, 0, step))
-
-
 def _gather_layers(
     grid: Grid,
     colours: Sequence[Any],
@@ -305,7 +259,9 @@ def _gather_layers(
 
     def add(j: Any, totals: Sequence[Any]) -> list[Any]:
         dx, dy, distance = (dr.gather(grid.Float, table, j) for table in steps)
-        index = _clamped(grid, column, row, grid.Int(dx), grid.Int(dy))
+        # the border pixels are repeated outside
+        index = dr.clip(row + grid.Int(dy), 0, grid.height - 1) * grid.width
+        index += dr.clip(column + grid.Int(dx), 0, grid.width - 1)
         their_radius = dr.gather(grid.Float, radius, index)
         light = dr.gather(grid.Float, share, index)
         order = their_radius - own_radius

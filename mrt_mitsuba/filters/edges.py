@@ -33,7 +33,7 @@ import drjit as dr
 import numpy as np
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.filters.grid import Grid, finite
+from mrt_mitsuba.filters.grid import Grid, check_numbers, finite
 
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 GREY_WEIGHTS = (0.07, 0.72, 0.21)
@@ -81,26 +81,22 @@ def luma_edges(
     Raises:
         UsageError: for a wrong shape, or a threshold that is NaN.
     """
-    _check_numbers(
-        contrast_offset=contrast_offset,
-        absolute_threshold=absolute_threshold,
-        relative_threshold=relative_threshold,
-    )
+    thresholds = {"absolute_threshold": absolute_threshold, "relative_threshold": relative_threshold}
+    check_numbers(contrast_offset=contrast_offset, **thresholds)
     grid = Grid(image)
-    planes = grid.planes(image, "image")
-    sum_ = _sum(planes, LUMA_WEIGHTS)
+    sum_ = _sum(grid.planes(image, "image"), LUMA_WEIGHTS)
     luma = dr.select(dr.isfinite(sum_), dr.sqrt(dr.maximum(sum_, 0)), math.inf)
     window = _window(grid, luma)
     high, low = functools.reduce(dr.maximum, window), functools.reduce(dr.minimum, window)
     offset = grid.opaque(contrast_offset)
     value = high - low + offset
     if variance is not None:
-        deviation = _deviation(grid, variance, LUMA_WEIGHTS)
+        deviation = _deviation(grid, variance, LUMA_WEIGHTS, noise_sigmas)
         # the last term keeps 0/0 out where the pixel is black and free of noise
         luma_variance = dr.square(deviation) / dr.maximum(dr.maximum(4 * sum_, deviation), 1e-30)
         noise = dr.sqrt(_sum(_window(grid, luma_variance), [1 / 9] * 9))
         # not above zero where the variance is NaN
-        excess = high - low - 2 * _sigmas(grid, noise_sigmas) * noise
+        excess = high - low - 2 * grid.opaque(noise_sigmas) * noise
         value = dr.select(excess > 0, excess + offset, 0)
     value = dr.select(dr.isfinite(high), value, math.inf)
     threshold = dr.maximum(grid.opaque(absolute_threshold), grid.opaque(relative_threshold) * high)
@@ -127,7 +123,7 @@ def sobel_edges(
     Raises:
         UsageError: for a wrong shape, or a threshold that is NaN.
     """
-    _check_numbers(threshold=threshold)
+    check_numbers(threshold=threshold)
     grid = Grid(image)
     grey = 255 * _sum(grid.planes(image, "image"), GREY_WEIGHTS)
     # both sides of a difference are summed alike, so equal sides give 0
@@ -136,10 +132,10 @@ def sobel_edges(
     gy = (w[6] + 2 * w[7] + w[8]) - (w[0] + 2 * w[1] + w[2])
     value = dr.abs(gx) + dr.abs(gy)
     if variance is not None:
-        grey_variance = dr.square(255 * _deviation(grid, variance, GREY_WEIGHTS))
+        grey_variance = dr.square(255 * _deviation(grid, variance, GREY_WEIGHTS, noise_sigmas))
         squares = [2, 4, 2, 4, 0, 4, 2, 4, 2]  # of Gx's and Gy's weights, summed
         noise = dr.sqrt(_sum(_window(grid, grey_variance), squares))
-        excess = value - _sigmas(grid, noise_sigmas) * noise
+        excess = value - grid.opaque(noise_sigmas) * noise
         value = dr.select(excess > 0, dr.trunc(excess), 0)
     value = dr.select(finite(w), value, math.inf)
     return _edge_map(grid, value > grid.opaque(threshold), value)
@@ -168,7 +164,7 @@ def geometry_edges(
     Raises:
         UsageError: for a wrong shape, or a threshold out of its range.
     """
-    _check_numbers(crease_angle=crease_angle, depth_step=depth_step)
+    check_numbers(crease_angle=crease_angle, depth_step=depth_step)
     if not 0 < crease_angle <= 180:
         raise UsageError(f"crease_angle={crease_angle} is out of range; give degrees above 0, at most 180")
     if not depth_step > 0:
@@ -252,18 +248,8 @@ def _sum(values: Sequence[Any], weights: Sequence[float]) -> Any:
     return sum(weight * value for weight, value in zip(weights, values, strict=True) if weight)
 
 
-def _deviation(grid: Grid, variance: Any, weights: Sequence[float]) -> Any:
+def _deviation(grid: Grid, variance: Any, weights: Sequence[float], noise_sigmas: float) -> Any:
     """Return the standard deviation of a weighted sum of fully correlated channels."""
-    return _sum([dr.sqrt(plane) for plane in grid.planes(variance, "variance")], weights)
-
-
-def _sigmas(grid: Grid, noise_sigmas: float) -> Any:
     if not 0 <= noise_sigmas < math.inf:
         raise UsageError(f"noise_sigmas={noise_sigmas} is out of range; give a number from 0 on")
-    return grid.opaque(noise_sigmas)
-
-
-def _check_numbers(**options: float) -> None:
-    for name, value in options.items():
-        if math.isnan(value):
-            raise UsageError(f"{name} is not a number; give one")
+    return _sum([dr.sqrt(plane) for plane in grid.planes(variance, "variance")], weights)

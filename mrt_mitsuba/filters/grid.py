@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
+import math
+import operator
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -133,12 +136,16 @@ def bands(height: int, rows: int, halo: int) -> Iterator[tuple[slice, slice, sli
         yield slice(start, stop), slice(top, bottom), slice(start - top, stop - top)
 
 
+def check_numbers(**options: float) -> None:
+    """Raise ``UsageError`` for an option that is NaN."""
+    for name, value in options.items():
+        if math.isnan(value):
+            raise UsageError(f"{name} is not a number; give one")
+
+
 def finite(planes: Sequence[Any]) -> Any:
     """Return where all of several planes hold finite numbers."""
-    result = dr.isfinite(planes[0])
-    for plane in planes[1:]:
-        result &= dr.isfinite(plane)
-    return result
+    return functools.reduce(operator.and_, map(dr.isfinite, planes))
 
 
 def _shape(array: Any) -> tuple[int, ...]:
