@@ -12,7 +12,7 @@ import warnings
 from mrt_mitsuba.command.options import LEVELS, Options
 from mrt_mitsuba.errors import MrtWarning, printable
 from mrt_mitsuba.interrupts import held
-from mrt_mitsuba.rendering.settings import NOISE
+from mrt_mitsuba.rendering.settings import AA, AAMODE, NOISE
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, is_obj
 
 
@@ -91,8 +91,8 @@ def banner(options: Options) -> str:
         "Scene": options.scene_number if options.scene is None else printable(options.scene),
         "Width": options.width or film or SIZE[0],
         "Height": options.height or film or SIZE[1],
-        "AA": options.aa or ("as noise needs" if aamode == NOISE else film or 4),
-        "AA mode": aamode or film or "sobel",
+        "AA": options.aa or ("as noise needs" if aamode == NOISE else film or AA),
+        "AA mode": aamode or film or AAMODE,
         "F distance": distance or "off",
         "F range": reach if distance else "off",
     }

@@ -113,13 +113,8 @@ class Exposer:
 
     job: Job
     shader: Shader
+    film: Any  #: None for a lattice
     layers: Sequence[str]  #: to expose; on a film, averaged ones, next to the picture
-    on_film: bool = True
-
-    @property
-    def film(self) -> Film:
-        """The film."""
-        return self.shader.film
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -128,13 +123,11 @@ class Exposer:
         layers = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
         return ("R", "G", "B", *own, *self.shader.aovs, *layers)
 
-    def means(
-        self, pixels: Any, places: Places, seed: int
-    ) -> Iterator[tuple[slice, Iterator[tuple[str, int, np.ndarray]]]]:
+    def means(self, pixels: Any, places: Places, seed: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
         """Trace samples of a lattice in pixels, in parts that fit into memory or of one pixel.
 
-        Yields which of the pixels are in a part, and layers, their channels, and the values there: means over
-        the rays of each pixel, or what the first ray hit. They do not depend on the parts.
+        Yields which of the pixels are in a part, and by layer the values there, [pixels, channels]: means
+        over the rays of each pixel, or what the first ray hit. They do not depend on the parts.
         """
         workspace, channels, size = self.job.workspace, channel_count(self.layers), places.size
         width, height = self.shader.width, self.shader.height
@@ -242,7 +235,7 @@ class Exposer:
         """Trace a ray, or one in each lane: return its place on the film, and its values."""
         place, inside, time, sampler = start(pixel, number)
         values, film, found = self.shader.values(inside, time, sampler), self.film, dict[str, Any]()
-        if self.on_film:
+        if film is not None:
             found["image"] = mi.Color3f(mi.luminance(values.image)) if film.grey else values.image
             if film.alpha:
                 found["A"] = dr.select(values.valid, mi.Float(1), 0)
@@ -256,15 +249,22 @@ class Exposer:
         return place, {name: [mi.Float(c) for c in channels] for name, channels in parts.items()}
 
 
-def _by_pixel(values: dict[str, list[Any]], size: int) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Yield of each layer and channel the means over the rays of each pixel, or what the first ray hit."""
+def _by_pixel(values: dict[str, list[Any]], size: int) -> dict[str, np.ndarray]:
+    """Return of each layer the means over the rays of each pixel, or what the first ray hit."""
+
+    def over_rays(plane: Any, first: bool) -> np.ndarray:
+        if first or size == 1:
+            return np.asarray(plane)[::size]
+        if isinstance(plane, np.ndarray):
+            return np.asarray(plane.reshape(-1, size).sum(1))
+        if dr.width(plane) == 1:  # a value of one entry is that of all rays
+            return np.asarray(plane * size)
+        return np.asarray(dr.block_reduce(dr.ReduceOp.Add, plane, size))
+
+    means = dict[str, np.ndarray]()
     for name, planes in values.items():
         first = TABLE[name].source == FIRST_HIT
-        for channel, plane in enumerate(planes):
-            if first:
-                plane = np.asarray(plane)[::size]
-            elif size > 1 and isinstance(plane, np.ndarray):
-                plane = plane.reshape(-1, size).sum(1)
-            elif size > 1:  # a value of one entry is that of all rays
-                plane = dr.block_reduce(dr.ReduceOp.Add, plane, size) if dr.width(plane) > 1 else plane * size
-            yield name, channel, np.asarray(plane, np.float32) * np.float32(1 if first else 1 / size)
+        sums = np.broadcast_arrays(*(over_rays(plane, first) for plane in planes))
+        each = np.stack(sums, -1).astype(np.float32, copy=False)
+        means[name] = each * np.float32(1 if first else 1 / size)
+    return means

@@ -86,23 +86,24 @@ class Passes:
             for name in step.layers:
                 self._add(name)
         flat = {name: self.layers[name].reshape(len(self._pixels), -1) for name in step.layers}
-        exposer = Exposer(self._job, self._shader, [n for n in TABLE if n in step.layers], on_film=False)
+        exposer = Exposer(self._job, self._shader, None, [name for name in TABLE if name in step.layers])
         with self._stage(step, len(pixels)) as advance:
-            for part, planes in exposer.means(pixels, places, seed):
-                for name, channel, plane in planes:
+            for part, means in exposer.means(pixels, places, seed):
+                for name, values in means.items():
                     if refined:
-                        total = places.first * flat[name][edge[part], channel] + places.count * plane
-                        flat[name][edge[part], channel] = total / np.float32(self._plan.samples)
+                        total = places.first * flat[name][edge[part]] + places.count * values
+                        flat[name][edge[part]] = total / np.float32(self._plan.samples)
                     else:
-                        flat[name][part, channel] = plane
+                        flat[name][part] = values
                 advance(part.stop - part.start)
 
     # --------------------------------------------- Films --------------------------------------------
 
     def _expose(self, step: Pass) -> None:
         """Expose every pixel alike, or those at edges further."""
-        exposer, film, plan, seed = self._film_exposer(step), self._shader.film, self._plan, self._seed
-        rays, moments = film.rays_near(step.places.size), "square" in step.layers
+        exposer, plan, seed = self._film_exposer(step), self._plan, self._seed
+        film, moments = self._shader.film, "square" in step.layers
+        rays = film.rays_near(step.places.size)
         if not self._shader.layers:
             from mrt_mitsuba.rendering.whole import Wholes
 
@@ -152,7 +153,7 @@ class Passes:
 
     def _film_exposer(self, step: Pass) -> Exposer:
         layers = step.layers - {"image", "square"}  # the film has its own
-        return Exposer(self._job, self._shader, [name for name in TABLE if name in layers])
+        return Exposer(self._job, self._shader, self._shader.film, [name for name in TABLE if name in layers])
 
     def _develop(self, exposer: Exposer, picture: np.ndarray) -> None:
         """Turn what is exposed, [H, W, channels], into layers."""

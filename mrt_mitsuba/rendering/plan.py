@@ -17,7 +17,16 @@ from mrt_mitsuba.plugins import kernel_plan
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rays.film import Region
 from mrt_mitsuba.rays.starts import Places
-from mrt_mitsuba.rendering.settings import DETECTORS, FILM, MAX_SPP, MIN_SPP, NOISE, RenderSettings
+from mrt_mitsuba.rendering.settings import (
+    AA,
+    AAMODE,
+    DETECTORS,
+    FILM,
+    MAX_SPP,
+    MIN_SPP,
+    NOISE,
+    RenderSettings,
+)
 from mrt_mitsuba.rendering.shading import Shader
 from mrt_mitsuba.scene.open import Source
 
@@ -82,7 +91,6 @@ class Plan:
     seen: Region  #: with the pixels around it that filters look at
     samples: int  #: of a pixel, where they are refined or everywhere
     channels: int  #: float32 ones kept for every pixel: the picture, its layers, and the detector's
-    detector: str | None  #: edge detector; None where every pixel gets all samples at once
     blur: str | None  #: depth-of-field mode
     motion: str | None  #: "frames", "stratified", "film", or None where the camera stands still
     moments: int  #: while the shutter is open
@@ -149,7 +157,6 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
         seen=region.grown(reach, source.width, source.height),
         samples=int(settings.aa or 1) ** 2,
         channels=_channels(returned, passes, shader if on_film else None),
-        detector=detector,
         blur=blur,
         motion=motion,
         moments=moments,
@@ -200,9 +207,9 @@ def _decided(settings: RenderSettings, own: bool, shader: Shader, focaldist: flo
     # Mitsuba's integrators draw random numbers for every ray, and their noise would pass for edges
     plain = (own or whole) and shader.random and settings.aa is None
     if aamode is None:
-        aamode = NOISE if settings.rmse is not None else "none" if plain or whole else "sobel"
+        aamode = NOISE if settings.rmse is not None else "none" if plain or whole else AAMODE
     lattice = settings.lattice or (FILM if own or whole or aamode == NOISE else "report")
-    aa = settings.aa or (1 if aamode == NOISE or (plain and aamode == "none") else 4)
+    aa = settings.aa or (1 if aamode == NOISE or (plain and aamode == "none") else AA)
     spp = settings.spp or (shader.film.rays if own and plain and settings.aamode is None else 1)
     most = settings.maxspp or (MAX_SPP if settings.rmse is not None else None)
     if aamode == NOISE and settings.rmse is None and spp < MIN_SPP:
@@ -213,34 +220,30 @@ def _decided(settings: RenderSettings, own: bool, shader: Shader, focaldist: flo
 
 
 def _check(settings: RenderSettings, shader: Shader, focaldist: float | None) -> None:
-    """Raise ``UsageError`` for options that do not go together: a row for each, and what to do instead."""
-    to_error, on_film = settings.rmse is not None, settings.lattice in (None, FILM)
-    rounds, whole = to_error or settings.aamode == NOISE, not shader.layers
+    """Raise ``UsageError`` for options that do not go together: a row for each rule, with the values that it
+    allows."""
+    to_error, whole = settings.rmse is not None, not shader.layers
+    rounds = to_error or settings.aamode == NOISE
     name = f"target={settings.rmse:g}" if to_error else "aamode=noise"
-    only = "is of use only where rays go in rounds: with target or aamode=noise"
+    only = "{0} is of use only where rays go in rounds: with target or aamode=noise"
+    share = "rounds share rays out over the whole film, at most maxspp of them"
+    both = f"{name} with {{0}}={{1}}: {share}; leave one of them out"
     alone = f"the integrator {shader.name} gives whole pictures, and no single rays"
-    other = f"{alone}; leave it out, or choose another, such as path"
-    aamode, lattice = f"aamode={settings.aamode}", f"lattice={settings.lattice}"
-    rows = [
-        *((not rounds and getattr(settings, given) is not None, f"{given} {only}")
-          for given in ("maxspp", "maxseconds", "on_round")),
-        (to_error and settings.aamode not in (None, NOISE), f"{name} with {aamode}: leave one of them out"),
-        (to_error and settings.spp is not None,
-         f"{name} with spp={settings.spp}: leave one of them out, or bound it by maxspp"),
-        (rounds and settings.aa is not None,
-         f"{name} with aa={settings.aa}: rounds decide it; leave one of them out"),
-        (rounds and not on_film, f"{name} with {lattice}: rounds follow the film; leave lattice out"),
-        (rounds and settings.region is not None,
-         f"{name} with region: rounds share the rays out over the whole picture"),
-        (whole and settings.aamode not in (None, "none", NOISE), f"{aamode}: {other}"),
-        (whole and not on_film, f"{lattice}: {other}"),
-        (whole and settings.motion is not None, f"motion: {other}"),
-        (whole and focaldist is not None,
-         f"focaldist={focaldist}: {alone}; write focaldist=0, or choose another, such as path"),
-    ]  # fmt: skip
-    wrong = next((text for holds, text in rows if holds), None)
-    if wrong is not None:
-        raise UsageError(wrong)
+    other = f"{{0}}={{1}}: {alone}; leave it out, or choose another, such as path"
+    rules: tuple[tuple[bool, tuple[str, ...], tuple[str, ...], str], ...] = (
+        (not rounds, ("maxspp", "maxseconds", "on_round"), (), only),
+        (to_error, ("aamode", "spp"), (NOISE,), both),
+        (rounds, ("aa", "lattice", "region"), (FILM,), both),
+        (whole, ("aamode", "lattice", "motion"), ("none", NOISE, FILM), other),
+    )
+    for holds, options, allowed, text in rules:
+        for option in options if holds else ():
+            value = getattr(settings, option)
+            if value not in (None, *allowed):
+                raise UsageError(text.format(option, value))
+    if whole and focaldist is not None:
+        other = "write focaldist=0, or choose another, such as path"
+        raise UsageError(f"focaldist={focaldist}: {alone}; {other}")
 
 
 def _layers(settings: RenderSettings, shader: Shader) -> tuple[frozenset[str], frozenset[str]]:

@@ -54,10 +54,8 @@ class TerminalProgress(Progress):
         file: TextIO | None = None,
         bar_file: TextIO | None = None,
     ) -> None:
-        self.show_plan = show_plan
-        self.unit = unit
-        self.file = file or sys.stdout
-        self.bar_file = bar_file or sys.stderr
+        self.show_plan, self.unit = show_plan, unit
+        self.file, self.bar_file = file or sys.stdout, bar_file or sys.stderr
 
     def plan(self, plan: object) -> None:
         if self.show_plan:
@@ -72,15 +70,8 @@ class TerminalProgress(Progress):
             return
         from tqdm.auto import tqdm
 
-        with tqdm(
-            total=total,
-            desc=title,
-            unit=self.unit,
-            unit_scale=True,
-            dynamic_ncols=True,
-            leave=False,
-            file=self.bar_file,
-        ) as bar:
+        looks: Any = {"unit": self.unit, "unit_scale": True, "dynamic_ncols": True, "leave": False}
+        with tqdm(total=total, desc=title, file=self.bar_file, **looks) as bar:
             yield bar.update
 
 
@@ -112,10 +103,9 @@ class Job:
     def stage(self, name: str, total: int, message: str = "") -> Iterator[Advance]:
         """Open a stage of the progress, and measure its time."""
         # does the progress want to know which kernels ran in a stage?
-        asked = type(self.progress).kernels is not Progress.kernels
+        asked, start = type(self.progress).kernels is not Progress.kernels, time.perf_counter()
         if asked:
             self.collect()
-        start = time.perf_counter()
         with self.progress.stage(name.capitalize(), total, message) as advance:
 
             def advance_and_collect(steps: int) -> None:

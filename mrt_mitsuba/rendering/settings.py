@@ -33,7 +33,7 @@ from mrt_mitsuba.options import (
 )
 from mrt_mitsuba.output.layers import LAYERS
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE
+from mrt_mitsuba.scene.model import FRESNEL, MODEL_OPTIONS, SIDE, SIZE
 
 if TYPE_CHECKING:
     from mrt_mitsuba.output.error import RoundPicture
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 #: The edge detectors as ``aamode`` names them: ``filters.<name>_edges``, and the layers that each reads, in
 #: the order of its arguments; those of the picture can distinguish noise from edges
 DETECTORS = {"luma": ("image",), "sobel": ("image",), "geometry": ("normal", "depth")}
+AA, AAMODE = 4, "sobel"  # of the report's scenes, where nothing else is asked for
 FILM = "film"  # the lattice by the rules of a scene's film
 NOISE = "noise"  # the aamode that puts rays where the variance is
 MIN_SPP = 16  # rays of a pixel from which its variance is known
@@ -58,13 +59,13 @@ class RenderSettings:
     width: int | None = option(None, SIDE, "image width in pixels, up to 65536", str(SIZE[0]))
     height: int | None = option(None, SIDE, "image height in pixels, up to 65536", str(SIZE[1]))
     aa: int | None = option(
-        None, integer(1, LARGEST_AA), f"anti-aliasing: aa x aa samples per pixel, up to {LARGEST_AA}", "4"
+        None, integer(1, LARGEST_AA), f"anti-aliasing: aa x aa samples per pixel, up to {LARGEST_AA}", str(AA)
     )
     aamode: str | None = option(
         None,
         choice("none", *DETECTORS, NOISE),
         f"refine all pixels, only edges that a detector finds ({', '.join(DETECTORS)}), or where noise is",
-        "sobel",
+        AAMODE,
     )
     target: float | Sequence[float] | None = option(
         None,
@@ -196,9 +197,8 @@ class RenderSettings:
             raise UsageError("camera and target are the same point: move one of them")
         if self.up == (0, 0, 0):
             raise UsageError("up=0,0,0: up must have a length, such as up=0,1,0")
-        names = ("texturing", "camera", "up", "fov", "light")
-        given = {name: getattr(self, name) for name in names} | {"target": None if self.rmse else self.target}
-        return {"convention": self.convention} | {k: v for k, v in given.items() if v is not None}
+        given = {name: getattr(self, name) for name in MODEL_OPTIONS if name != "target" or not self.rmse}
+        return {name: value for name, value in given.items() if value is not None}
 
     def focus(self, distance: float | None, reach: float) -> tuple[float | None, float]:
         """Return the distance that is sharp, None for no depth of field, and half of the sharp range; in a

@@ -250,9 +250,9 @@ def test_errors_are_those_of_the_finished_picture():
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"target": 0.1, "aa": 2}, "target=0.1 with aa=2: rounds decide it"),
-        ({"target": 0.1, "spp": 9}, "target=0.1 with spp=9: leave one of them out, or bound it by maxspp"),
-        ({"target": 0.1, "region": (0, 0, 4, 4)}, "with region: rounds share the rays out"),
+        ({"target": 0.1, "aa": 2}, "target=0.1 with aa=2: rounds share rays out"),
+        ({"target": 0.1, "spp": 9}, "target=0.1 with spp=9: rounds share rays out .* maxspp"),
+        ({"target": 0.1, "region": (0, 0, 4, 4)}, "with region=.*: rounds share rays out"),
         ({"aamode": "noise", "spp": 64, "aa": 2}, "aamode=noise with aa=2"),
         ({"maxspp": 100}, "maxspp is of use only where rays go in rounds"),
         ({"on_round": print}, "on_round is of use only"),
@@ -260,8 +260,8 @@ def test_errors_are_those_of_the_finished_picture():
         ({"progress": 3}, "progress=3: must be a"),
         ({"aamode": "noise"}, "give the mean of a pixel"),
         ({"aamode": "noise", "spp": 8}, "16 or more"),
-        ({"target": 0.1, "aamode": "sobel"}, "target=0.1 with aamode=sobel: leave one of them out"),
-        ({"target": 0.1, "lattice": "centered"}, "rounds follow the film; leave lattice out"),
+        ({"target": 0.1, "aamode": "sobel"}, "target=0.1 with aamode=sobel: .* leave one of them out"),
+        ({"target": 0.1, "lattice": "centered"}, "with lattice=centered: rounds share rays out"),
         ({"layers": ["error"]}, "only rounds estimate them"),
         ({"camera": (0, 0, 1)}, "camera is of use only with an OBJ file"),
         ({"params": {"x": 1}}, "only an XML file declares names"),
