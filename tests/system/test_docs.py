@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 import re
 import shlex
 import shutil
@@ -109,3 +110,16 @@ def test_every_study_and_every_plugin_is_explained() -> None:
     assert sorted(explained) == sorted(cli.STUDIES)
     named = re.findall(r"mrt_mitsuba\.plugins\.(\w+)\.", (DOCS / "plugins.rst").read_text())
     assert set(named) == set(plugins.MODULES)
+
+
+TEXTS = [*PAGES, *sorted(DOCS.glob("*.rst")), README, README.with_name("CONTRIBUTING.md")]
+
+
+@pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.stem)
+def test_what_a_page_names_is_there(page: Path, variant) -> None:
+    text, root = page.read_text(), README.parent
+    for name in re.findall(r"mrt_mitsuba(?:\.\w+)+", text):
+        assert pkgutil.resolve_name(name)
+    for path in re.findall(r"`((?:\w+/)+\w+\.py)`", text):
+        folders = (root / folder for folder in ("", "docs", "mrt_mitsuba", "validation"))
+        assert "NAME" in path or any((folder / path).is_file() for folder in folders), path
