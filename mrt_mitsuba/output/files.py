@@ -189,11 +189,11 @@ def read_channels(path: Path) -> tuple[dict[str, Image], dict[str, dict[str, Any
     if not parts:
         problem = "a deep EXR holds many values in a pixel; flatten it first" if deep else "not a whole EXR"
         raise OutputError(f"cannot read {name}: {problem}")
-    if any(len({values.pixels.shape for values in part.channels.values()}) > 1 for part in parts):
-        raise OutputError(f"cannot read {name}: its channels differ in size; write it without sub-sampling")
     planes: dict[str, Image] = {}
     headers: dict[str, dict[str, Any]] = {}
     for part in parts:
+        if len({values.pixels.shape for values in part.channels.values()}) > 1:
+            raise OutputError(f"cannot read {name}: its channels differ in size; write them all at full size")
         for channel, values in part.channels.items():
             key = channel if len(parts) == 1 else f"{part.name()}.{channel}"
             planes[key], headers[key] = np.asarray(values.pixels, np.float32), dict(part.header)

@@ -2,16 +2,6 @@
 
 from __future__ import annotations
 
-from mrt_mitsuba.scene.model import (
-    Camera,
-    Cone,
-    Cylinder,
-    Light,
-    Material,
-    Mesh,
-    Plane,
-    Scene,
-    Sphere,
-)
+from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Mesh, Plane, Scene, Sphere
 
 __all__ = ["Camera", "Cone", "Cylinder", "Light", "Material", "Mesh", "Plane", "Scene", "Sphere"]

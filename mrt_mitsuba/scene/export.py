@@ -15,7 +15,8 @@ from mrt_mitsuba.memory import Budget
 from mrt_mitsuba.options import check, choice
 from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.scene.loading import rewrite_file
-from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE, Scene, check_model_options, is_obj
+from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE, Scene
+from mrt_mitsuba.scene.open import in_terms
 from mrt_mitsuba.scene.report import report_scene
 
 FLAVORS = ("mrt", "stock")
@@ -42,7 +43,7 @@ def scene_dict(
     given = {"width": (SIDE, width), "height": (SIDE, height), "fresnel": (FRESNEL, fresnel)}
     options = {name: check(name, kind, value) for name, (kind, value) in given.items() if value is not None}
     runtime.use()
-    terms = _in_terms(scene, {})
+    terms = scene if isinstance(scene, Scene) else report_scene(scene)
     result = terms.to_dict(**options)
     return result if flavor == "mrt" else _stock(result, terms)
 
@@ -70,10 +71,10 @@ def write_xml(
     ``render`` raises for a scene or an option.
     """
     check("flavor", choice(*FLAVORS), flavor)
-    check_model_options(scene, model)
+    terms = in_terms(scene, model)
     files: dict[str, bytes] = {}  # of shapes, by their paths
     focus: dict[str, Any] = {}  # what Mitsuba's cameras have no parameters for, and ``render`` reads
-    if isinstance(scene, str | os.PathLike) and not is_obj(scene):
+    if terms is None and isinstance(scene, str | os.PathLike):
         given = {"fresnel": fresnel, "width": width, "height": height, "flavor=stock": flavor == "stock"}
         if useless := [name for name, value in given.items() if value]:
             raise UsageError(f"{useless[0]} is of no use with an XML file, which is written as it is")
@@ -85,7 +86,7 @@ def write_xml(
     elif params:
         raise UsageError(f"params: only an XML file declares names, such as {next(iter(params))}")
     else:
-        terms = _in_terms(scene, model)
+        terms = terms or report_scene(scene)  # type: ignore[arg-type]  # which refuses anything else
         size = {"width": width or SIZE[0], "height": height or SIZE[1]}
         nodes = scene_dict(terms, fresnel=fresnel or "schlick", **size)
         files = _put_into_files(nodes, os.path.splitext(os.fspath(path))[0], flavor)
@@ -99,15 +100,6 @@ def write_xml(
         for stream, content in zip(opened, (*files.values(), text.encode()), strict=True):
             stream.write(content)
     return [*files, os.fspath(path)]
-
-
-def _in_terms(scene: Any, model: Mapping[str, Any]) -> Scene:
-    """Return a scene, a number or the path of an OBJ file in the report's terms."""
-    if is_obj(scene):
-        from mrt_mitsuba.scene.obj import model_scene  # with numpy
-
-        return model_scene(scene, **model)
-    return scene if isinstance(scene, Scene) else report_scene(scene)
 
 
 def _xml(nodes: dict[str, Any]) -> str:

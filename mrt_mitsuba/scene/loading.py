@@ -16,7 +16,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
@@ -49,7 +49,9 @@ def load_dict(
 
     with _loading(name):
         _check_dict(scene, name)
-        return _instantiate(_parse(lambda config: mi.parser.parse_dict(config, scene), name, budget), merge)
+        state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene)
+        _check_nodes(state.nodes, name, budget)
+        return _instantiate(state, merge)
 
 
 def load_file(path: str, budget: Budget | None = None, **parameters: Any) -> tuple[Any, Mapping[str, str]]:
@@ -96,31 +98,28 @@ def _file(
         values, files = _check_xml(path, given)
         if budget is not None:
             budget.inputs.update(files)
-        yield _parse(lambda config: mi.parser.parse_file(config, path, **given), path, budget), values
+        state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), path, **given)
+        _check_nodes(state.nodes, path, budget)
+        yield state, values
 
 
-def _parse(parse: Callable[[Any], Any], name: str, budget: Budget | None) -> Any:
-    """Return Mitsuba's parser state once all that it would load has been looked at."""
-    import mitsuba as mi
-
-    state = parse(mi.parser.ParserConfig(mi.variant()))
+def _check_nodes(nodes: Iterable[Any], name: str, budget: Budget | None) -> None:
+    """Look at all that Mitsuba would load for what it has parsed."""
     mitsuba_first()  # a <path> of the file puts its folder before
-    for node in state.nodes:
+    for node in nodes:
         kind, filename = node.props.plugin_name(), node.props.get("filename", None)
         _check_plugin(kind, name)
         samples = node.props.get("sample_count", 1)
         if isinstance(samples, int) and not 1 <= samples <= MOST_SAMPLES:
-            text = f"{kind}: sample_count is {samples}; give 1 to {MOST_SAMPLES}"
-            raise SceneError(f"cannot load {name}: {text}")
+            wrong = f"{kind}: sample_count is {samples}; give 1 to {MOST_SAMPLES}"
+            raise SceneError(f"cannot load {name}: {wrong}")
         if isinstance(filename, str):
             _check_data(filename)
             found = _resolved(filename)
-            size = picture_size(found) if kind in _PICTURES else None
             if budget is not None:
                 budget.inputs.add(found)
-                if size is not None:
+                if kind in _PICTURES and (size := picture_size(found)):
                     budget.take_texture(found, *size, around=kind == "envmap")
-    return state
 
 
 def _instantiate(state: Any, merge: bool = True) -> Any:
@@ -178,39 +177,30 @@ def _check_data(filename: str) -> None:
         require_file(path)
 
 
-def _check_dict(scene: Mapping[str, Any], name: str) -> None:
+def _check_dict(node: Mapping[str, Any], name: str, place: str = "", depth: int = 1) -> None:
     """Look at every entry. None, cycles and depth would end the process."""
-    waiting = [("", scene, 1)]
-    while waiting:
-        place, node, depth = waiting.pop()
-        if depth > DEEPEST:
-            raise SceneError(f"cannot load {name}: it is nested more than {DEEPEST} levels deep")
-        for key, value in node.items():
-            if value is None:
-                raise SceneError(
-                    f"cannot load {name}: {place}{key} is None; give it a value, or leave it out"
-                )
-            if isinstance(value, dict):
-                waiting.append((f"{place}{key}.", value, depth + 1))
-            elif key == "type" and not isinstance(value, str):
-                raise SceneError(f"cannot load {name}: {place}type is {value!r}; give the name of a plugin")
-            elif key == "type":
-                _check_plugin(value, name)
-            elif key == "filename" and isinstance(value, str):
-                _check_data(value)
+    if depth > DEEPEST:
+        raise SceneError(f"cannot load {name}: it is nested more than {DEEPEST} levels deep")
+    for key, value in node.items():
+        if isinstance(value, dict):
+            _check_dict(value, name, f"{place}{key}.", depth + 1)
+        elif value is None:
+            raise SceneError(f"cannot load {name}: {place}{key} is None; give it a value, or leave it out")
+        elif key == "type" and not isinstance(value, str):
+            raise SceneError(f"cannot load {name}: {place}type is {value!r}; give the name of a plugin")
+        elif key == "type":
+            _check_plugin(value, name)
+        elif key == "filename" and isinstance(value, str):
+            _check_data(value)
 
 
-def _check_xml(path: str, parameters: Mapping[str, str]) -> tuple[Mapping[str, str], set[str]]:
+def _check_xml(path: str, parameters: Mapping[str, str]) -> tuple[Mapping[str, str], list[str]]:
     """Look at an XML file and those that it includes before Mitsuba opens them.
 
     Return its parameters, and the paths of the files.
     """
-    values, waiting, seen = dict(parameters), [path], set[str]()
-    while waiting:
-        file = waiting.pop()
-        if file in seen:
-            continue
-        seen.add(file)
+    values, files = dict(parameters), [path]
+    for file in files:  # which grows
         for tag, attributes in _elements(file):
             if tag == "default":
                 values.setdefault(attributes.get("name", ""), attributes.get("value", ""))
@@ -218,9 +208,10 @@ def _check_xml(path: str, parameters: Mapping[str, str]) -> tuple[Mapping[str, s
                 for name in sorted(values, key=len, reverse=True):  # the longest first, as Mitsuba does
                     filename = filename.replace(f"${name}", values[name]) if name else filename
                 _check_data(filename)
-                if tag == "include" and os.path.isfile(_resolved(filename)):
-                    waiting.append(_resolved(filename))
-    return values, seen
+                found = _resolved(filename)
+                if tag == "include" and os.path.isfile(found) and found not in files:
+                    files.append(found)
+    return values, files
 
 
 def _elements(file: str) -> list[tuple[str, dict[str, str]]]:
@@ -229,18 +220,16 @@ def _elements(file: str) -> list[tuple[str, dict[str, str]]]:
 
     require_file(file)
     found: list[tuple[str, dict[str, str]]] = []
-    depth = 0
+    inside: list[str] = []  # the tags around
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal depth
-        depth += 1
-        if depth > DEEPEST:
-            raise SceneError(f"cannot load {file}: it is nested more than {DEEPEST} levels deep")
+        inside.append(tag)
         found.append((tag, attributes))
+        if len(inside) > DEEPEST:
+            raise SceneError(f"cannot load {file}: it is nested more than {DEEPEST} levels deep")
 
     def end(tag: str) -> None:
-        nonlocal depth
-        depth -= 1
+        inside.pop()
 
     def entity(name: str, *declaration: object) -> None:  # which Mitsuba's parser reads in another way
         raise SceneError(f"cannot load {file}: it declares the entity {name}; write the text in its place")

@@ -55,6 +55,25 @@ class Camera:
     up: Vector = (0, 1, 0)
     hfov: float = 60.0
 
+    def problem(self) -> str:
+        """Return why it can see nothing, or an empty text."""
+        import numpy as np
+
+        for name in ("position", "target", "up"):
+            if not _all_finite(getattr(self, name), 3):
+                value = getattr(self, name)
+                return f"the camera's {name} is {value!r}, but must be three finite numbers up to 3.4e38"
+        if not 0 < self.hfov < 180:
+            return f"the camera's hfov is {self.hfov!r}, but must be more than 0 and less than 180 degrees"
+        forward = np.subtract(self.target, self.position)
+        if not forward.any():
+            return f"camera and target are the same point, {list(self.position)}: move one of them"
+        # Their angle, as a share of its largest sine
+        across = np.linalg.norm(np.cross(forward, self.up))
+        if across <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(self.up):
+            return f"the camera looks along up={list(self.up)}: choose another up, such as up=0,0,1"
+        return ""
+
 
 @dataclass(frozen=True)
 class Material:
@@ -224,7 +243,7 @@ def _all_finite(values: Sequence[float], count: int) -> bool:
 def _check(scene: Scene) -> None:
     """Refuse what Mitsuba would draw as nothing, or as noise, without a word. Materials, lights, planes and
     meshes are checked by their plugins."""
-    if problem := view_problem(scene.camera):
+    if problem := scene.camera.problem():
         raise SceneError(problem)
     if not _all_finite(scene.sky, 3):
         raise SceneError(f"sky is {scene.sky!r}, but must be three finite numbers: red, green and blue")
@@ -235,26 +254,6 @@ def _check(scene: Scene) -> None:
             *points, radius, _ = vars(thing).values()
             if not (all(_all_finite(p, 3) for p in points) and _all_finite([radius], 1) and radius > 0):
                 raise SceneError(f"{kind}s[{i}] is {thing!r}, but must have finite places and a radius > 0")
-
-
-def view_problem(camera: Camera) -> str | None:
-    """Return why a camera can see nothing, or None."""
-    import numpy as np
-
-    for name in ("position", "target", "up"):
-        if not _all_finite(getattr(camera, name), 3):
-            value = getattr(camera, name)
-            return f"the camera's {name} is {value!r}, but must be three finite numbers up to 3.4e38"
-    if not 0 < camera.hfov < 180:
-        return f"the camera's hfov is {camera.hfov!r}, but must be more than 0 and less than 180 degrees"
-    forward = np.subtract(camera.target, camera.position)
-    if not forward.any():
-        return f"camera and target are the same point, {list(camera.position)}: move one of them"
-    # Their angle, as a share of its largest sine
-    along = np.linalg.norm(np.cross(forward, camera.up))
-    if along <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(camera.up):
-        return f"the camera looks along up={list(camera.up)}: choose another up, such as up=0,0,1"
-    return None
 
 
 def _rgb(color: Color) -> dict[str, Any]:

@@ -20,17 +20,7 @@ import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn
-from mrt_mitsuba.scene.model import (
-    BLUE_SKY,
-    Camera,
-    Color,
-    Light,
-    Material,
-    Mesh,
-    Scene,
-    Vector,
-    view_problem,
-)
+from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Color, Light, Material, Mesh, Scene, Vector
 from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, read_mtl
 
 # Numbers of each kind of values that are used: positions may have a weight, a colour or both behind them
@@ -283,9 +273,8 @@ def model_scene(
     """
     lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
     scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)
-    names = {"camera": "position", "target": "target", "up": "up", "fov": "hfov"}
-    given = {names[name]: value for name, value in view.items() if value is not None}
-    camera = replace(scene.camera, **given)
-    if problem := view_problem(camera):
+    fields = {"camera": "position", "fov": "hfov"}
+    camera = replace(scene.camera, **{fields.get(name, name): value for name, value in view.items()})
+    if problem := camera.problem():
         raise UsageError(problem)
     return replace(scene, camera=camera)

@@ -51,7 +51,7 @@ def open_scene(
     ``size``: width and height; ``budget``: memory from which its textures take theirs; ``model``: options of
     ``model_scene``.
     """
-    check_model_options(scene, model or {})
+    terms = in_terms(scene, model or {})
     # a key of mi.traverse has a dot, the name of a parameter of an XML file has none
     keys = {key: value for key, value in (params or {}).items() if "." in key}
     declared = {key: value for key, value in (params or {}).items() if "." not in key}
@@ -59,14 +59,7 @@ def open_scene(
         raise UsageError(
             f"params: {next(iter(declared))} is not a key of mi.traverse, and only an XML file declares names"
         )
-    terms = scene  # or the scene in the report's terms
-    if hasattr(scene, "__index__"):
-        terms = report_scene(operator.index(scene))
-    elif is_obj(scene):
-        from mrt_mitsuba.scene.obj import model_scene
-
-        terms = model_scene(scene, **(model or {}))
-    if isinstance(terms, Scene):
+    if terms is not None:
         if budget is not None:
             budget.inputs.update(terms.files)
         size, fresnel = (size[0] or SIZE[0], size[1] or SIZE[1]), fresnel or "schlick"
@@ -94,8 +87,23 @@ def open_scene(
         focal_distance=distance,
         focal_range=reach,
         fresnel=fresnel,
-        own=not isinstance(terms, Scene),
+        own=terms is None,
     )
+
+
+def in_terms(scene: Any, model: Mapping[str, Any]) -> Scene | None:
+    """Return a number, a ``Scene`` or the path of an OBJ file in the report's terms; None for anything else.
+
+    ``model``: options of ``model_scene``. Raises ``UsageError`` where they are of no use.
+    """
+    check_model_options(scene, model)
+    if is_obj(scene):
+        from mrt_mitsuba.scene.obj import model_scene  # with numpy
+
+        return model_scene(scene, **model)
+    if hasattr(scene, "__index__"):
+        return report_scene(operator.index(scene))
+    return scene if isinstance(scene, Scene) else None
 
 
 def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
@@ -169,8 +177,8 @@ def _check_variant(name: str, thing: Any) -> None:
 def _number(values: Mapping[str, str], name: str, default: Any) -> Any:
     """Return a number that an XML file declares, or the default."""
     try:
-        return max(0.0, float(values[name])) if name in values else default
-    except ValueError:
+        return max(0.0, float(values[name]))
+    except (KeyError, ValueError):
         return default
 
 
@@ -191,16 +199,14 @@ def opened(name: str, scene: Any, sensor: Any, integrator: Any) -> Source:
     """Return the source of a loaded scene of one's own; raise ``SceneError`` if its sensor sees nothing."""
     import mitsuba as mi
 
-    parts = [sensor] if sensor.class_name() != "BatchSensor" else mi.traverse(sensor).hierarchy
-    for part in parts:
+    for part in [sensor] if sensor.class_name() != "BatchSensor" else mi.traverse(sensor).hierarchy:
         if part.class_name() == "IrradianceMeter" and part.get_shape() is None:  # Mitsuba would crash
             raise SceneError(f"{name} has an irradiancemeter outside of a shape: put it into one")
     film = sensor.film()
-    width, height = film.crop_size()
+    (width, height), radius = film.crop_size(), film.rfilter().radius()
     if width < 1 or height < 1:
         raise SceneError(f"{name} brings a film of {width}x{height}: give it one pixel at least")
-    if not 0 <= film.rfilter().radius() <= WIDEST_FILTER:
-        radius = film.rfilter().radius()
+    if not 0 <= radius <= WIDEST_FILTER:
         raise SceneError(f"{name} has a filter of radius {radius:g}: give at most {WIDEST_FILTER} pixels")
     return Source(name, scene, sensor, integrator, int(width), int(height), own=True)
 
