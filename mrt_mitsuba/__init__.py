@@ -8,29 +8,13 @@ from __future__ import annotations
 
 import os as _os
 
+from mrt_mitsuba.errors import MrtError, MrtWarning, OutputError, SceneError, UsageError, VariantError
+
 __version__ = "0.1.0"
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from mrt_mitsuba import filters as filters
-    from mrt_mitsuba.errors import (
-        MrtError as MrtError,
-    )
-    from mrt_mitsuba.errors import (
-        MrtWarning as MrtWarning,
-    )
-    from mrt_mitsuba.errors import (
-        OutputError as OutputError,
-    )
-    from mrt_mitsuba.errors import (
-        SceneError as SceneError,
-    )
-    from mrt_mitsuba.errors import (
-        UsageError as UsageError,
-    )
-    from mrt_mitsuba.errors import (
-        VariantError as VariantError,
-    )
     from mrt_mitsuba.rendering.api import Result as Result
     from mrt_mitsuba.rendering.api import render as render
     from mrt_mitsuba.rendering.prepare import prepare as prepare
@@ -46,13 +30,7 @@ if TYPE_CHECKING:
 
 # Where each public name lives; the module is imported when the name is first used.
 _HOME = {
-    "MrtError": "mrt_mitsuba.errors",
-    "MrtWarning": "mrt_mitsuba.errors",
-    "OutputError": "mrt_mitsuba.errors",
     "Result": "mrt_mitsuba.rendering.api",
-    "SceneError": "mrt_mitsuba.errors",
-    "UsageError": "mrt_mitsuba.errors",
-    "VariantError": "mrt_mitsuba.errors",
     "check_bsdf": "mrt_mitsuba.validation.checks.bsdf",
     "check_scene": "mrt_mitsuba.validation.checks.scene",
     "check_shape": "mrt_mitsuba.validation.checks.shape",
@@ -65,23 +43,21 @@ _HOME = {
     "scene_dict": "mrt_mitsuba.scene.export",
     "sweep": "mrt_mitsuba.sweeps.run",
 }
-_SUBMODULES = ("filters",)
-
-__all__ = ["__version__", *_HOME, *_SUBMODULES]
+__all__ = ["MrtError", "MrtWarning", "OutputError", "SceneError", "UsageError", "VariantError"]
+__all__ += ["__version__", "filters", *_HOME]
 
 
 def __getattr__(name: str) -> object:
     from importlib import import_module
 
-    if name in _HOME:
-        if not _HOME[name].endswith(".errors"):
-            runtime = import_module(f"{__name__}.runtime")
-            runtime.check_start()
-            if ".rendering." in _HOME[name]:
-                runtime.load()
+    if name == "filters":
+        value = import_module("mrt_mitsuba.filters")
+    elif name in _HOME:
+        runtime = import_module("mrt_mitsuba.runtime")
+        runtime.check_start()
+        if ".rendering." in _HOME[name]:
+            runtime.load()
         value = getattr(import_module(_HOME[name]), name)
-    elif name in _SUBMODULES:
-        value = import_module(f"{__name__}.{name}")
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value

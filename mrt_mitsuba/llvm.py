@@ -66,31 +66,31 @@ def choose(
     ``search_path``: folders that may hold installed packages (default ``sys.path``). ``system``: folders to
     search for a system library (default: the usual ones of a Linux system).
     """
-    rejected: list[str] = []
-    named = environ.get(VARIABLE, "")
     wheel, problem = wheel_library(sys.path if search_path is None else search_path)
-    if named and named not in (BLOCKED, wheel):
-        version = version_of(named)
-        if version and version[0] >= OLDEST:
-            return Choice(named, version, f"named by {VARIABLE}", rejected)
+    named = environ.get(VARIABLE, "")
+
+    def candidates() -> Iterator[tuple[str, str, str, str]]:
+        """Yield path, where it is from, how it is called, and what speaks against it."""
+        if named not in ("", BLOCKED, wheel):
+            yield named, f"named by {VARIABLE}", f"{VARIABLE}={named}", ""
+        if wheel:
+            yield wheel, f"from the package {WHEEL}", f"{wheel} of {WHEEL}", problem
+        for path in _libraries(system_folders(environ) if system is None else system):
+            if path != os.path.realpath(wheel):
+                yield path, "the newest of the system", path, ""
+
+    rejected: list[str] = []
+    for path, source, called, objection in candidates():
+        version = version_of(path)
+        if version and version[0] >= OLDEST and not objection:
+            return Choice(path, version, source, rejected)
         what = f"is LLVM {version_text(version)}" if version else "cannot be loaded"
-        rejected.append(f"{VARIABLE}={named} {what}")
-    if wheel:
-        version = version_of(wheel)
-        if version and version[0] >= OLDEST and not problem:
-            return Choice(wheel, version, f"from the package {WHEEL}", rejected)
-        rejected.append(problem or f"{wheel} of {WHEEL} is LLVM {version_text(version)}")
-    folders = system_folders(environ) if system is None else system
-    for version, path in sorted(set(_libraries(folders)), reverse=True):
-        if path != os.path.realpath(wheel or ""):
-            if version[0] >= OLDEST:
-                return Choice(path, version, "the newest of the system", rejected)
-            rejected.append(f"{path} is LLVM {version_text(version)}")
+        rejected.append(objection or f"{called} {what}")
     return Choice(None, None, "none", rejected)
 
 
-def wheel_library(search_path: Iterable[str]) -> tuple[str | None, str | None]:
-    """Return the library of the package karellen-llvm-core and what speaks against it, or None for each.
+def wheel_library(search_path: Iterable[str]) -> tuple[str, str]:
+    """Return the library of the package karellen-llvm-core and what speaks against it, or "" for each.
 
     Its path is taken from the list of files (RECORD) in the package's metadata. ``importlib.metadata`` gives
     the same, but importing it takes 30 ms.
@@ -104,16 +104,14 @@ def wheel_library(search_path: Iterable[str]) -> tuple[str | None, str | None]:
                 files = [line.split(",", 1)[0] for line in lines if "/libLLVM.so." in line]
         except (OSError, UnicodeDecodeError):
             continue
-        paths = (os.path.normpath(os.path.join(folder, file)) for file in files)
-        library = next(filter(os.path.isfile, paths), None)
-        # Symbolic links are made at the next start of Python; without them, libraries it needs are missing
-        unfinished = "symlinks.txt" in _list(info) and "axle.done" not in _list(info)
-        if library:
-            return library, unfinished * (
+        for path in filter(os.path.isfile, (os.path.normpath(os.path.join(folder, file)) for file in files)):
+            # Python makes symbolic links at its next start; without them, libraries it needs are missing
+            unfinished = "symlinks.txt" in _list(info) and "axle.done" not in _list(info)
+            return path, unfinished * (
                 f"the installation of {WHEEL} is unfinished: whoever may write to {info} has to start Python "
                 f"once ({sys.executable} -c '')"
             )
-    return None, None
+    return "", ""
 
 
 def system_folders(environ: Mapping[str, str] = os.environ) -> list[str]:
@@ -125,14 +123,12 @@ def system_folders(environ: Mapping[str, str] = os.environ) -> list[str]:
     return folders + [f"/usr/lib/{name}/lib" for name in _list("/usr/lib") if name.startswith("llvm")]
 
 
-def _libraries(folders: Iterable[str]) -> Iterator[tuple[Version, str]]:
-    """Yield version and path of every libLLVM in ``folders``."""
-    for folder in folders:
-        for name in _list(folder):
-            path = os.path.realpath(os.path.join(folder, name))
-            version = version_in_name(path) if name.startswith("libLLVM") else None
-            if version and os.path.isfile(path):
-                yield version, path
+def _libraries(folders: Iterable[str]) -> list[str]:
+    """Return the path of every libLLVM with a version in its name in ``folders``, the newest first."""
+    names = ((folder, name) for folder in folders for name in _list(folder) if name.startswith("libLLVM"))
+    paths = {os.path.realpath(os.path.join(folder, name)) for folder, name in names}
+    found = ((version_in_name(path), path) for path in filter(os.path.isfile, paths))
+    return [path for _, path in sorted((each for each in found if each[0]), reverse=True)]
 
 
 def _list(folder: str) -> list[str]:

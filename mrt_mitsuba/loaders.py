@@ -87,17 +87,7 @@ def one_by_one(lock: contextlib.AbstractContextManager[Any]) -> None:
 def _mentions_ours(source: Any) -> bool:
     """Return whether a dict, or a file of XML or its text, may have a plugin of this project; Mitsuba itself
     refuses anything else, and reports files that cannot be read."""
-    if isinstance(source, dict):
-        waiting, seen = [source], set()
-        while waiting:
-            node = waiting.pop()
-            if isinstance(node, dict) and id(node) not in seen:
-                seen.add(id(node))
-                if str(node.get("type", "")).startswith("mrt_"):
-                    return True
-                waiting += node.values()
-        return False
-    text = str(source).encode()
-    with contextlib.suppress(OSError, ValueError), open(source, "rb") as file:
+    text = repr(source) if isinstance(source, dict) else str(source)
+    with contextlib.suppress(OSError, ValueError), open(text, encoding="utf-8", errors="ignore") as file:
         text = file.read()
-    return b"mrt_" in text or b"<include" in text
+    return "mrt_" in text or "<include" in text
