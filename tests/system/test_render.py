@@ -3,7 +3,6 @@ how."""
 
 from __future__ import annotations
 
-import dataclasses
 import gc
 import os
 
@@ -13,7 +12,6 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.output import LAYERS
-from mrt_mitsuba.scene.report import report_scene
 
 SMALL = {"width": 80, "height": 60}
 
@@ -33,24 +31,12 @@ def test_none_traces_the_whole_lattice_in_few_kernels(number):
 
 def test_rays_are_counted_as_the_scene_tells():
     """One sphere, one light, nothing reflective: shadow rays only where the light is in front."""
-    scene = dataclasses.replace(report_scene(0), planes=(), lights=report_scene(0).lights[:1])
-    result = mrt.render(
-        _without_reflection(scene), **SMALL, aa=1, aamode="none", count_rays=True, layers=["depth"]
-    )
+    nodes = mrt.scene_dict(0, **SMALL)
+    kept = {name: nodes[name] for name in ("type", "integrator", "sensor", "sky", "light_0")}
+    ball = {**nodes["sphere_0"], "bsdf": {"type": "mrt_bsdf", "specular_reflectance": 0.0}}
+    result = mrt.render({**kept, "ball": ball}, aa=1, aamode="none", count_rays=True, layers=["depth"])
     hits = np.isfinite(result.layers["depth.Z"]).sum()
-    assert result.rays["mirror"] == 0
-    assert 0 < result.rays["shadow"] < hits
-
-
-def _without_reflection(scene):
-    """int_ior 0 is how the report switches reflection off; 1e-4 is as near as a dielectric comes."""
-
-    def dull(thing):
-        return dataclasses.replace(thing, material=dataclasses.replace(thing.material, ior=1e-4))
-
-    return dataclasses.replace(
-        scene, spheres=tuple(map(dull, scene.spheres)), planes=tuple(map(dull, scene.planes))
-    )
+    assert result.rays["mirror"] == 0 and 0 < result.rays["shadow"] < hits
 
 
 def test_slow_variants_are_warned_of_once_in_a_process(run_python):
