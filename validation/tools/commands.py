@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ def diff(a: str, b: str, *, layer: str = "", out: str | None = None, **limits: s
     for name, limit in wanted.items():
         value = found.measures()[name]
         if value is None:
-            raise UsageError(f"{name} cannot be had of these pictures: {UNDEFINED[name]}")
+            raise UsageError(f"{name} is not defined for these pictures: {UNDEFINED[name]}")
         bounds.append(Bound(name, value, limit, name not in AT_LEAST))
     print(*bounds, sep="\n", end="\n" if bounds else "")
     return 0 if all(bound.holds for bound in bounds) else MISSED
@@ -42,40 +43,41 @@ def check(scene: str, *, out: str | None = None, quick: str = "0") -> int:
     if quick not in ("0", "1"):
         raise UsageError(f"quick={quick}: must be 0 or 1")
     from mrt_mitsuba.validation.checks.scene import check_scene
-    from mrt_mitsuba.validation.tools import report
 
-    if out is not None:
-        report.prepare(Path(out), inputs=[scene])
-    try:
-        found = check_scene(_scene(scene), quick=quick == "1", progress=TerminalProgress(unit="plugin"))
-    except SceneError as error:  # nothing was checked
-        raise UsageError(str(error)) from error
-    print(found)
-    if out is not None:
-        found.save(out)
-        print(f"Report: {Path(out) / 'index.html'}")
+    progress = TerminalProgress(unit="plugin")
+    found = _found(lambda: check_scene(_scene(scene), quick=quick == "1", progress=progress), out, scene)
     return 0 if found.passed else MISSED
 
 
 def error_vs_time(scene: str, *, cases: str, out: str = "error-vs-time") -> int:
     """Measure the cases of a TOML file; return 0, or 1 where one of them failed."""
-    from mrt_mitsuba.validation.tools import report, work_precision
+    from mrt_mitsuba.validation.tools import work_precision
 
     settings = read_toml(cases)
     wrong = [f"an unknown entry {name!r}" for name in sorted(settings.keys() - set(KEYS))]
     wrong += [f"no entry {name!r}" for name in KEYS[:2] if name not in settings]
     if wrong:
         raise UsageError(f"{cases} has {wrong[0]}: it holds {', '.join(KEYS)}")
-    report.prepare(Path(out), inputs=[scene, cases])
+    settings["progress"] = TerminalProgress(unit="render")
+    found = _found(lambda: work_precision.error_vs_time(_scene(scene), **settings), out, scene, cases)
+    return MISSED if found.failed else 0
+
+
+def _found(run: Callable[[], Any], out: str | None, *inputs: str) -> Any:
+    """Run what is to report on a scene, show what it finds, and write the page into ``out``."""
+    from mrt_mitsuba.validation.tools import report
+
+    if out is not None:
+        report.prepare(Path(out), inputs=inputs)
     try:
-        progress = TerminalProgress(unit="render")
-        found = work_precision.error_vs_time(_scene(scene), progress=progress, **settings)
-    except SceneError as error:  # of the scene or its reference: nothing was measured
+        found = run()
+    except SceneError as error:  # nothing was done
         raise UsageError(str(error)) from error
     print(found)
-    found.save(out)
-    print(f"Report: {Path(out) / 'index.html'}")
-    return MISSED if found.failed else 0
+    if out is not None:
+        found.save(out)
+        print(f"Report: {Path(out) / 'index.html'}")
+    return found
 
 
 def _scene(text: str) -> Any:

@@ -1,4 +1,4 @@
-"""``error_vs_time``: what settings of ``render`` cost, how far off they are, and which of them are ahead.
+"""``error_vs_time``: what settings of ``render`` cost, how far off they are, and which is the fastest.
 
 Each case is repeated with other seeds. Its pictures x₁ … x_R and two independent halves h₁, h₂ of the
 reference give the matrix G[r, s] = mean (x_r − h₁)(x_s − h₂), in which the reference's own noise cancels. The
@@ -11,7 +11,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from typing import Any
@@ -34,7 +34,6 @@ ERRORS = 4  # that the time is given for, unless they are chosen
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?"
 NOTHING = 1e-15  # an RMSE of 0, as logarithms have it
 LEVEL = 0.95  # of all intervals
-SAME = 0.02  # errors closer than this are the same: no reason to wait longer
 
 Options = Mapping[str, Any]
 Run = Callable[[Options, int], Result]  # a render with options and a seed
@@ -374,46 +373,29 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
     if not found.points:
         return
     points = [point for points in found.families.values() for point in points]  # curve after curve
-    ahead = front(points) if found.repeats > 1 else []
-    caption = ["Down and to the left is better. Bars are 95 % intervals, numbers those of the table."]
-    if names := [f"{p.name} ({p.seconds:.2g} s, RMSE {p.rmse:.2g})" for p in ahead if p.resolved]:
-        caption.append(f"Ahead of the others: {'; '.join(names)}.")
-    caption += [f"Reference: {truth}."] if truth else []
     own = f"about {found.reference_error:.2g}; no claim is made below twice that."
-    unknown = "not known: every RMSE has it in it."
-    caption.append(f"The RMSE of the reference itself is {own if found.reference_error else unknown}")
-    caption += found.verdicts
+    own = own if found.reference_error else "not known: every RMSE includes it."
+    caption = ["Down and to the left is better. Bars are 95 % intervals, numbers those of the table."]
+    caption += [f"Reference: {truth}."] if truth else []
+    caption += [f"The RMSE of the reference itself is {own}", *found.verdicts]
     figure = _diagram(found, points)
     study.picture(f"{prefix}diagram", f"{title}: work and precision", figure, " ".join(caption))
     if found.errors:
-        note = "With 95 % intervals. Between measured cases a curve is straight in logarithms; beyond them "
-        note += "nothing is assumed."
-        rows: dict[str, dict[str, Any]] = {name: {"curve": name} for name in found.families}
+        times: dict[str, dict[str, Any]] = {name: {"curve": name} for name in found.families}
         for error in found.errors:
             for curve, t in found.time_to(error).items():
-                rows[curve][f"RMSE {error:g}"] = _shown(*t) if math.isfinite(t[0]) else "not reached"
-        study.records(
-            f"{prefix}times", f"{title}: seconds to an error", [*rows.values()], note, first=not name
-        )
-    note = "Seconds: medians of warm renders without loading the scene; cold: a first run. Errors in units "
-    note += "of linear light. Ahead: no other case has less error in less time."
-    study.records(f"{prefix}points", f"{title}: every case", _rows(points, ahead), note)
+                times[curve][f"RMSE {error:g}"] = _shown(*t) if math.isfinite(t[0]) else "not reached"
+        what = f"{title}: seconds to an error"
+        note = "With 95 % intervals. Between cases, curves are straight in logarithms; beyond, unknown."
+        study.records(f"{prefix}times", what, [*times.values()], note, first=not name)
+    note = "Medians of warm renders without loading the scene; cold: a first run. Errors in linear light."
+    study.records(f"{prefix}points", f"{title}: every case", _rows(points), note)
     if found.failed:
-        study.table(
-            f"{prefix}failed", f"{title}: cases that failed", ["case", "why"], [*found.failed.items()]
-        )
+        reasons = [*found.failed.items()]
+        study.table(f"{prefix}failed", f"{title}: cases that failed", ["case", "why"], reasons)
 
 
-def front(points: Iterable[Point]) -> list[Point]:
-    """Return the points that gain error over all faster ones, fastest first."""
-    best: list[Point] = []
-    for point in sorted(points, key=lambda p: (p.seconds, p.rmse)):
-        if not best or point.rmse < (1 - SAME) * best[-1].rmse:
-            best.append(point)
-    return best
-
-
-def _rows(points: Sequence[Point], ahead: Sequence[Point]) -> list[dict[str, Any]]:
+def _rows(points: Sequence[Point]) -> list[dict[str, Any]]:
     """Return the table of all cases."""
 
     def interval(ends: Interval) -> str:
@@ -439,7 +421,6 @@ def _rows(points: Sequence[Point], ahead: Sequence[Point]) -> list[dict[str, Any
             "largest": p.difference.largest,
             "FLIP": known(p.difference.flip),
             "rays": sum(p.rays.values()),
-            "ahead": "yes" if p in ahead else "",
         }
         for number, p in enumerate(points, 1)
     ]
