@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,8 @@ def mrt_command(run_command: Callable[..., Any]) -> Callable[..., subprocess.Com
 def start(tmp_path: Path) -> Callable[..., contextlib.AbstractContextManager[subprocess.Popen[str]]]:
     """Start a command in the test's folder: ``with start(*words) as process``; it ends with the block.
 
-    It heeds Ctrl-C, which a shell has ignored in what it runs in the background.
+    It heeds Ctrl-C, which a shell has ignored in what it runs in the background, and is killed after five
+    minutes.
     """
 
     @contextlib.contextmanager
@@ -82,9 +84,12 @@ def start(tmp_path: Path) -> Callable[..., contextlib.AbstractContextManager[sub
         pipes = {name: subprocess.PIPE for name in ("stdout", "stderr")}
         heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
         with subprocess.Popen(words, cwd=tmp_path, text=True, preexec_fn=heed, **pipes | options) as process:
+            limit = threading.Timer(300, process.kill)
+            limit.start()
             try:
                 yield process
             finally:
+                limit.cancel()
                 process.kill()
 
     return started
