@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 from nodes import rgb
 from unit import specimens
+from unit.specimens import exceeded
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.checks.bsdf import LAWS
+from mrt_mitsuba.validation.studies import power
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -51,21 +53,44 @@ def test_a_sound_bsdf_passes_as_a_dict_and_loaded(registered) -> None:
 
 
 @pytest.mark.parametrize("name", [*specimens.MISTAKES, *specimens.CHANGES])
-def test_each_mistake_fails_its_own_laws(name: str, registered, capsys) -> None:
+def test_each_mistake_exceeds_its_own_figures(name: str, registered, capsys) -> None:
     if name in specimens.MISTAKES:
-        given, laws = {"type": "specimen", "mistake": name}, specimens.MISTAKES[name]
+        given, figures = {"type": "specimen", "mistake": name}, specimens.MISTAKES[name]
     else:
-        nested, _, _, laws = specimens.CHANGES[name]
+        nested, _, _, figures = specimens.CHANGES[name]
         given = {"type": "changed", "change": name, "nested": nested}
     # reciprocity and components cost least, and fail for many mistakes by mistake
-    check = mrt.check_bsdf(given, quick=True, only={*laws, "reciprocity", "components"})
-    assert set(check.failed) == laws, str(check)
+    only = {"reciprocity", "components", *(figure.split(".")[0] for figure in figures)}
+    check = mrt.check_bsdf(given, quick=True, only=only)
+    assert exceeded(check) == figures, str(check)
     for law in (check.laws[name] for name in check.failed):
         assert law.why and law.note and not law.skipped
         run(law.snippet)
         assert capsys.readouterr().out
     if name == "detached gradient":
         assert "detached: alpha" in check.laws["gradients"].note
+
+
+OF_BSDFS = [fault for fault in power.FAULTS if fault.kind != "shape"]
+
+
+@pytest.mark.parametrize("fault", OF_BSDFS, ids=[f"{fault.figure}: {fault.what}" for fault in OF_BSDFS])
+def test_faults_three_times_as_large_as_documented_are_found(fault: power.Fault, variant: str) -> None:
+    changes: dict[str, Any] = {}
+    for name in (runtime.SLOW, variant):
+        mi.set_variant(name)
+        mi.register_bsdf("changed", power.changed_bsdf(changes))
+    quick = np.isfinite(fault.quick)
+    found = power.check(fault, 3 * (fault.quick if quick else fault.full), changes, quick=quick)
+    assert fault.figure in exceeded(found), str(found)
+
+
+def test_each_figure_has_a_specimen() -> None:
+    known = set().union(
+        *specimens.MISTAKES.values(), *(figures for *_, figures in specimens.CHANGES.values())
+    )
+    known |= {fault.figure for fault in OF_BSDFS}
+    assert known == {f"{name}.{figure}" for name, law in LAWS.items() for figure in vars(law)["figures"]}
 
 
 # What each of them fails is explained in docs/check_your_plugin.md

@@ -158,13 +158,14 @@ def test_other_variants(variant: str) -> None:
 # Changes of what ``sample_direction`` gives, and of other functions; and the laws that they break
 MISTAKES: dict[str, set[str]] = {
     "none": set(),
-    "density x 1.1": {"density", "weights"},
+    "density x 1.01": {"density", "weights"},
     "pdf_direction x 1.1": {"density", "sampling"},
-    "weight x 1.05": {"weights"},
-    "seen 0.9 times as bright": {"weights"},
-    "eval_direction x 0.9": {"weights"},
+    "weight x 1.01": {"weights"},
+    "seen 0.99 times as bright": {"weights"},
+    "eval_direction x 0.99": {"weights"},
     "half of the sky": {"sampling"},
     "wrong distance": {"sampling"},
+    "direction too long": {"sampling", "finite"},
     "NaN": {"finite"},
     "negative": {"finite", "weights"},
 }
@@ -185,17 +186,18 @@ def test_each_mistake_fails_its_own_laws(mistake: str) -> None:
             return mi.Spectrum(1 + 0.5 * d.z)
 
         def eval(self, si: Any, active: Any = True) -> Any:
-            return if_it_is("seen 0.9 times as bright", 0.9, 1) * self.radiance(-si.wi)
+            return if_it_is("seen 0.99 times as bright", 0.99, 1) * self.radiance(-si.wi)
 
         def sample_direction(self, it: Any, sample: Any, active: Any = True) -> Any:
             half, whole = mi.warp.square_to_uniform_hemisphere, mi.warp.square_to_uniform_sphere
             d = if_it_is("half of the sky", half, whole)(sample)
             ds = dr.zeros(mi.DirectionSample3f)
-            ds.d, ds.p, ds.n = d, it.p + 20 * d, mi.Normal3f(-d)
-            ds.dist = mi.Float(if_it_is("wrong distance", 5, 20))
-            ds.pdf = mi.Float(dr.inv_four_pi * if_it_is("density x 1.1", 1.1, 1))
+            ds.p, ds.n = it.p + 20 * d, mi.Normal3f(-d)
+            ds.d = if_it_is("direction too long", 1.0005, 1) * d
+            ds.dist = mi.Float(if_it_is("wrong distance", 19.9, 20))
+            ds.pdf = mi.Float(dr.inv_four_pi * if_it_is("density x 1.01", 1.01, 1))
             ds.emitter = mi.EmitterPtr(self)
-            factor = if_it_is("weight x 1.05", 1.05, if_it_is("negative", -1, 1))
+            factor = if_it_is("weight x 1.01", 1.01, if_it_is("negative", -1, 1))
             weight = factor * 4 * dr.pi * self.radiance(d)
             return ds, dr.select(if_it_is("NaN", sample.x > 0.99, False), dr.nan, weight)
 
@@ -203,7 +205,7 @@ def test_each_mistake_fails_its_own_laws(mistake: str) -> None:
             return mi.Float(dr.inv_four_pi * if_it_is("pdf_direction x 1.1", 1.1, 1))
 
         def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
-            return if_it_is("eval_direction x 0.9", 0.9, 1) * self.radiance(ds.d)
+            return if_it_is("eval_direction x 0.99", 0.99, 1) * self.radiance(ds.d)
 
         def bbox(self) -> Any:
             return mi.ScalarBoundingBox3f()

@@ -10,10 +10,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from unit.specimens import exceeded
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.checks.shape import LAWS
-from mrt_mitsuba.validation.studies.power import ChangedShape, moved, tilted
+from mrt_mitsuba.validation.checks.shape_case import Case
+from mrt_mitsuba.validation.studies import power
+from mrt_mitsuba.validation.studies.power import ChangedShape, moved
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -67,10 +70,6 @@ def deaf_to_its_limit(si: Any, ray: Any) -> Any:
     return ChangedShape().ray_intersect(mi.Ray3f(ray.o, ray.d))
 
 
-def half(box: Any) -> Any:
-    return mi.BoundingBox3f(0.5 * box.min, 0.5 * box.max)
-
-
 def rounded(si: Any, ray: Any) -> Any:
     """A distance as the difference of two large numbers."""
     si.t = (1000 + si.t) - 1000
@@ -92,60 +91,87 @@ def lost(where: Callable[[Any, Any], Any], value: float = dr.inf) -> dict[str, A
 
 MISTAKES: dict[str, tuple[dict[str, Any], set[str]]] = {
     "none": ({}, set()),
-    "flipped normal": ({"hit": flipped}, {"normals"}),
-    "normal of another length": ({"hit": moved(n=lambda si, ray: 1.01 * si.n)}, {"normals"}),
-    "tilted normal": ({"hit": moved(n=lambda si, ray: tilted(si.n, 0.15))}, {"normals"}),
-    "wrong derivative": ({"hit": moved(dp_du=lambda si, ray: 1.5 * si.dp_du)}, {"normals"}),
-    "normal towards the ray": ({"hit": facing}, {"normals"}),
+    "flipped normal": ({"hit": flipped}, {"normals.outwards"}),
+    "normal towards the ray": ({"hit": facing}, {"normals.turned"}),
+    "shading normal on the other side": (
+        {"hit": moved(shading=lambda si, ray: -si.n)},
+        {"normals.side", "normals.shading"},
+    ),
     # ray_test knows nothing of these two
-    "met from outside only": (lost(lambda si, ray: dr.dot(si.n, ray.d) > 0), {"hits", "watertight"}),
-    "a fixed least distance": (lost(lambda si, ray: si.t < 0.02), {"hits", "surface", "watertight"}),
-    "a box that is too small": ({"bbox": half}, {"bbox"}),
-    "ray_test unlike ray_intersect": ({"test": lambda found, ray: found & (ray.d.x < 0.7)}, {"hits"}),
+    "met from outside only": (
+        lost(lambda si, ray: dr.dot(si.n, ray.d) > 0),
+        {"hits.ray_test", "watertight.blind"},
+    ),
+    "a fixed least distance": (
+        lost(lambda si, ray: si.t < 0.02),
+        {"hits.ray_test", "surface.missed", "watertight.blind"},
+    ),
     "ray_test blind from near by": (
         {"test": lambda found, ray: found & (dr.max(abs(ray.o)) > 1.5)},
-        {"hits"},
+        {"hits.ray_test"},
     ),
     "NaN for a distance along an axis": (
         lost(lambda si, ray: (ray.d.x == 0) & (ray.d.y == 0), dr.nan),
-        {"finite"},
+        {"finite.bad"},
     ),
-    "maxt ignored": ({"hit": deaf_to_its_limit, "test": lambda found, ray: found | (ray.maxt < 0)}, {"hits"}),
-    "hit point below the surface": ({"hit": moved(p=lambda si, ray: si.p - 2e-3 * si.n)}, {"surface"}),
-    "NaN along an axis": (
-        {"hit": moved(uv=lambda si, ray: dr.select(ray.d.x == 0, dr.nan, si.uv))},
-        {"finite"},
+    "maxt ignored": (
+        {"hit": deaf_to_its_limit, "test": lambda found, ray: found | (ray.maxt < 0)},
+        {"hits.ray_intersect"},
     ),
-    "digits lost": ({"hit": rounded}, {"surface", "normals"}),  # differences of hit points suffer as well
+    "hit point below the surface": (
+        {"hit": moved(p=lambda si, ray: si.p - 2e-3 * si.n)},
+        {"surface.on_ray", "surface.near_by", "surface.again", "surface.missed"},
+    ),
+    # differences of hit points suffer as well
+    "digits lost": (
+        {"hit": rounded},
+        {"surface.behind", "surface.noise", "normals.slope", "normals.step"},
+    ),
 }
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_each_mistake_fails_its_own_laws(mistake: str) -> None:
-    changes, laws = MISTAKES[mistake]
+def test_each_mistake_exceeds_its_own_figures(mistake: str) -> None:
+    changes, figures = MISTAKES[mistake]
     check = mrt.check_shape(ChangedShape(**changes), quick=True, only=set(LAWS) - {"sampling"})
-    assert set(check.failed) == laws, str(check)
+    assert exceeded(check) == figures, str(check)
     assert "loaded object" in check.laws["scale"].skipped
 
 
-TOO_FAR = moved(t=lambda si, ray: si.t + 1e-5, p=lambda si, ray: si.p + 1e-5 * ray.d)
+OF_SHAPES = [fault for fault in power.FAULTS if fault.kind == "shape"]
 
 
-@pytest.mark.parametrize(
-    ("changes", "failed"),
-    [
-        ({"area": 1.02}, ["sampling"]),
-        ({"first": 1.03, "given": {"type": "rectangle"}}, ["sampling"]),
-        ({"hit": moved(shading=lambda si, ray: tilted(si.sh_frame.n, 0.01))}, ["normals"]),
-        ({"hit": moved(p=lambda si, ray: si.p + 1e-5 * si.n)}, ["surface"]),
-        ({"hit": TOO_FAR}, ["surface"]),
-        ({}, []),
-    ],
-    ids=["area", "crowded", "shading", "point", "distance", "none"],
-)
-def test_small_faults_are_found_in_full(changes: dict[str, Any], failed: list[str]) -> None:
-    only = failed or ["sampling", "normals", "surface"]
-    assert mrt.check_shape(ChangedShape(**changes), only=only).failed == failed
+@pytest.mark.parametrize("fault", OF_SHAPES, ids=[f"{fault.figure}: {fault.what}" for fault in OF_SHAPES])
+def test_faults_three_times_as_large_as_documented_are_found(fault: power.Fault) -> None:
+    check = power.check(fault, 3 * fault.quick, {}, quick=True)
+    assert fault.figure in exceeded(check), str(check)
+
+
+@pytest.mark.parametrize(("first", "failed"), [(1.03, ["sampling"]), (1, [])])
+def test_small_faults_are_found_in_full(first: float, failed: list[str]) -> None:
+    changed = ChangedShape({"type": "rectangle"}, first=first)
+    assert mrt.check_shape(changed, only=failed or ["sampling", "normals", "surface"]).failed == failed
+
+
+ELSEWHERE: dict[str, dict[str, Any]] = {
+    "answer": lost(lambda si, ray: ray.d.x > 0.99),
+    "distance": {"hit": moved(t=lambda si, ray: 1.001 * si.t)},
+    "off": {"hit": moved(t=lambda si, ray: 1.0001 * si.t)},
+}
+
+
+@pytest.mark.parametrize("figure", ["scale.answer", "scale.off", "variants.answer", "variants.distance"])
+def test_shapes_that_are_otherwise_elsewhere(figure: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sphere that is sound but where it is loaded again."""
+    given, (law, name) = {"type": "sphere"}, figure.split(".")
+    monkeypatch.setattr(Case, "scene", lambda _, **more: ChangedShape(given | more, **ELSEWHERE[name]))
+    assert exceeded(mrt.check_shape(given, quick=True, only=[law])) == {figure}
+
+
+def test_each_figure_has_a_specimen() -> None:
+    known = set().union(*(figures for _, figures in MISTAKES.values()), {fault.figure for fault in OF_SHAPES})
+    known |= {"scale.answer", "scale.off", "variants.answer", "variants.distance"}
+    assert known == {f"{name}.{figure}" for name, law in LAWS.items() for figure in vars(law)["figures"]}
 
 
 def mesh(change: Callable[[np.ndarray], np.ndarray]) -> mi.Mesh:

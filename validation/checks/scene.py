@@ -97,6 +97,7 @@ def check_scene(
     runtime.use()
     source = open_scene(scene, **options)
     kinds, instances = _plugins(source.scene)
+    laws: dict[str, Callable[..., Check]]
     laws = {"BSDF": check_bsdf, "shape": check_shape, "emitter": partial(_check_emitter, source.scene)}
     found: dict[str, Check] = {}
     chosen = {kind: range(0, len(alike), max(len(alike) // ALIKE, 1)) for kind, alike in kinds.items()}

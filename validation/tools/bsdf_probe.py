@@ -60,7 +60,7 @@ def evaluate(bsdf: Any, wi: Array, wo: Array, ctx: Any = None) -> list[Array]:
     return probe.Probe(bsdf).pair(wi, wo, np.zeros((len(wi), 2)), ctx)
 
 
-def draw(bsdf: Any, wi: Array, count: int, ctx: Any = None, *, seed: int = 0) -> probe.Samples:
+def draw(bsdf: Any, wi: Array, count: int, ctx: Any = None, *, seed: int = 0) -> probe.Lanes:
     """Return ``count`` samples for one direction [3]."""
     u = np.random.default_rng(seed).random((count, 3), np.float32)
     return probe.Probe(bsdf).sample(np.asarray(wi), u, np.zeros(2), ctx)
