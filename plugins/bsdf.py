@@ -208,14 +208,6 @@ class MrtBSDF(mi.BSDF):
         f0, index = self._f0_bound(), math.inf if isinstance(int_ior, mi.Texture) else first(int_ior)
         return Mirror(bound * max(1, f0), index, bound * f0)
 
-    def value_bound(self) -> float:
-        """Return an upper bound of f cos θ; inf where a parameter varies."""
-        alpha, f0 = self.parameters["alpha"], self._f0_bound()
-        if isinstance(alpha, mi.Texture):
-            return math.inf
-        bounds = ((largest(self.parameters[lobe.reflectance]), lobe) for lobe in LOBES)
-        return sum(share * lobe.bound(first(alpha), f0) for share, lobe in bounds if share)
-
     def _f0_bound(self) -> float:
         """Return an upper bound of the reflectance at normal incidence."""
         if "f0" in self.parameters:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from typing import Any
 
@@ -14,7 +13,6 @@ from .kernel_plan import Mirror, SceneFacts
 from .lights import brightness, numbers_of, place
 from .materials import lobes_in, material_rows
 from .parameters import ParameterError
-from .quadric_kinds import KINDS
 from .snapshot import Kept, Snapshot
 from .spheres import is_plain_sphere, is_sphere
 from .variants import is_jit, varies
@@ -32,8 +30,7 @@ class Reading:
     Plugins declare by methods what ``mrt_whitted`` may do in place of calling them: a plane by
     ``unit_normal``, ``distance`` and ``tangents``; a mesh that stands for exact quadrics by ``quadrics()``
     (a ``QuadricTable``) and ``moving_frame()``; a light of a table by ``numbers()``; a BSDF with the
-    attributes ``mirror_reflectance`` and ``int_ior`` by ``mirror_bound()`` and ``value_bound()``, one of a
-    table by ``row()``, too.
+    attributes ``mirror_reflectance`` and ``int_ior`` by ``mirror_bound()``, one of a table by ``row()``, too.
     """
 
     def __init__(self, snapshot: Snapshot, kept: Kept) -> None:
@@ -46,7 +43,7 @@ class Reading:
         self.materials, of_materials = kept(
             "material facts", (shapes, materials), lambda: _materials(snapshot)
         )
-        of_shapes, convex = kept("shape facts", shapes, self._read_shapes)
+        of_shapes = kept("shape facts", shapes, self._read_shapes)
         self.lights, self.numbers, of_lights = kept("light facts", lights, lambda: _lights(snapshot))
 
         def touching() -> bool:
@@ -57,12 +54,10 @@ class Reading:
             **of_lights,
             **of_materials,
             **of_shapes,
-            alone=convex and all(hasattr(b, "mirror_bound") for b in snapshot.bsdfs),
             touching=kept("touching", (shapes, lights), touching),
         )
 
-    def _read_shapes(self) -> tuple[dict[str, Any], bool]:
-        """Return the facts about the shapes, and whether there is one only, which is convex."""
+    def _read_shapes(self) -> dict[str, Any]:
         meshes = [s for s in (*self.native, *self.snapshot.inner) if s.is_mesh()]
         for mesh in meshes:
             low, high = (np.array(corner, float).ravel() for corner in (mesh.bbox().min, mesh.bbox().max))
@@ -74,20 +69,18 @@ class Reading:
                     f"{farthest:.3g}; rays meet meshes from {SMALLEST_MESH:g} to {LARGEST_MESH:g}: scale the "
                     "scene"
                 )
-        tables, quadrics = [s.quadrics() for s in self.quadrics], Counter[str]()
-        for table in tables:
+        quadrics = Counter[str]()
+        for table in (s.quadrics() for s in self.quadrics):
             quadrics[table.kind] += len(table.rows)
-        plain = sum(map(is_plain_sphere, self.native))
-        convex = sum(KINDS[t.kind].closed and len(t.rows) == 1 and not t.flipped for t in tables)
         return {
             "vectorised": is_jit(),
             "native_shapes": len(self.native),
             "meshes": len(meshes),
             "spheres": sum(map(is_sphere, self.native)),
-            "plain_spheres": plain,
+            "plain_spheres": sum(map(is_plain_sphere, self.native)),
             "planes": len(self.planes),
             "quadrics": tuple(sorted(quadrics.items())),
-        }, len(self.snapshot.shapes) == 1 and plain + convex + len(self.planes) == 1
+        }
 
 
 def _lights(snapshot: Snapshot) -> tuple[list[Any], list[Any] | None, dict[str, Any]]:
@@ -103,8 +96,6 @@ def _lights(snapshot: Snapshot) -> tuple[list[Any], list[Any] | None, dict[str, 
         "surface_emitters": len(surfaces),
         "environment": environment is not None,
         "sky": 0.0 if environment is None else largest[id(environment)],
-        # Falloff has no limit
-        "arriving": sum(largest[id(e)] if is_steady(e) else math.inf for e in lights),
         "emission": max(surfaces, default=0.0),
         "tabled": numbers is not None,
     }  # fmt: skip
@@ -114,9 +105,7 @@ def _materials(snapshot: Snapshot) -> tuple[list[Any], dict[str, Any]]:
     """Return the materials as rows of a table, none where they have no place in one, and the facts."""
     bsdfs, found = snapshot.bsdfs, material_rows(snapshot.shapes)
     rows, unmergeable = ([], found) if isinstance(found, str) else (found, "")
-    values = [b.value_bound() if hasattr(b, "value_bound") else math.inf for b in bsdfs]
     return rows, {
-        "value": max(values, default=0.0),
         # Those outside the table may have any lobe
         "lobes": tuple((name, bool(unmergeable) or there) for name, there in lobes_in(rows)),
         "mirrors": tuple(
@@ -129,11 +118,6 @@ def _materials(snapshot: Snapshot) -> tuple[list[Any], dict[str, Any]]:
         "two_sided": any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in bsdfs),
         "unmergeable": unmergeable,
     }  # fmt: skip
-
-
-def is_steady(emitter: Any) -> bool:
-    """Return whether a light is as bright far away as near by."""
-    return hasattr(emitter, "numbers") or emitter.class_name() == "DirectionalEmitter"
 
 
 def has_mirror(bsdf: Any) -> bool:

@@ -49,16 +49,13 @@ class SceneFacts:
     plain_spheres: int  #: of the spheres, those that face outwards and do not emit
     planes: int  #: shapes that are infinite planes
     quadrics: tuple[tuple[str, int], ...]  #: kinds of exact quadrics, and how many of each
-    alone: bool  #: is there only one object, convex and reflecting on its outside
     touching: bool  #: is a point light on a surface
     lights: int  #: emitters but for the environment and what is black
     random_lights: int  #: of the lights, those that need random numbers
     surface_emitters: int  #: of the lights, those that are surfaces
     environment: bool  #: is there an environment emitter
     sky: float  #: its largest radiance; inf where that is not known
-    arriving: float  #: the most that arrives from all lights; inf where there is no bound
     emission: float  #: the largest radiance of a surface; inf where that is not known
-    value: float  #: the largest value of a BSDF times the cosine; inf where that is not known
     lobes: tuple[tuple[str, bool], ...]  #: all that mrt_bsdf has, and whether a material has them
     mirrors: tuple[Mirror, ...]  #: of the materials that reflect like a mirror
     oriented: bool  #: does a material depend on tangents: anisotropy, bump and normal maps
@@ -66,23 +63,6 @@ class SceneFacts:
     two_sided: bool  #: is a material lit from behind
     unmergeable: str  #: why the materials cannot be looked up in one table; "" where they can
     tabled: bool  #: can the lights be
-
-
-@dataclass(frozen=True)
-class Settings:
-    """The parameters of the integrator on which its kernels depend."""
-
-    max_depth: int
-    min_contribution: float
-    bounce_budget: str
-    clamp: bool
-    own_sky: float | None  #: largest radiance of ``sky``; inf where that is not known, None without one
-
-    def cost(self, int_ior: float) -> int:
-        """Return what a bounce off a material of this index takes from the bounce budget."""
-        if self.bounce_budget == "plain":
-            return 1
-        return max(10 - int(np.float32(10) * np.float32(min(int_ior, 1))), 1)
 
 
 @dataclass(frozen=True)
@@ -106,8 +86,6 @@ class KernelPlan:
     random: bool  #: random numbers
     emission: bool  #: surfaces that emit
     sky: str  #: "none", "parameter" or "environment"
-    mirror_rays: bool  #: the loop that traces them; else they see the sky
-    guarded: bool  #: throughputs kept within float32
     textures: bool  #: texture coordinates
     shading_frames: bool  #: interpolated normals
     tangents: bool  #: derivatives of the surface by uv, and frames along them
@@ -120,30 +98,34 @@ class KernelPlan:
         return dict(self.reasons).get(name)
 
 
-def _case(facts: SceneFacts, settings: Settings, made: Mapping[str, Any]) -> SimpleNamespace:
+def _case(facts: SceneFacts, tracer: Any, own_sky: float | None, made: Mapping[str, Any]) -> SimpleNamespace:
     """Return what the rules go by: the facts, the decisions ``made`` so far, and what follows from them.
 
-    ``arriving`` bounds the radiance from anywhere, but for what mirrors add: inf where there is no bound.
-    Each light counts for one where its share is clamped to that, and the sky for one at least.
+    ``arriving`` bounds the radiance from anywhere, but for what mirrors add: a light counts for one where its
+    share is clamped to that, and the sky for one at least. inf where there is no bound.
     """
-    sky = facts.sky if settings.own_sky is None else settings.own_sky
-    clamped = settings.clamp or facts.lights == 0
-    lights = facts.lights if clamped else facts.arriving * facts.value
+    sky = facts.sky if own_sky is None else own_sky
+    lights = facts.lights if tracer.clamp or facts.lights == 0 else math.inf
     arriving = lights + max(1, sky) + facts.emission
-    affordable = [m for m in facts.mirrors if settings.cost(m.int_ior) < settings.max_depth]
-    growth = max((m.reflectance for m in affordable), default=0.0)
+    affordable = [m for m in facts.mirrors if bounce_cost(tracer, m.int_ior) < tracer.max_depth]
     return SimpleNamespace(
         facts=facts,
-        settings=settings,
+        tracer=tracer,
         made=made,
         arriving=arriving,
         affordable=affordable,  # mirrors that the bounce budget admits
-        visible=any(m.reflectance * arriving > settings.min_contribution for m in affordable),
-        bounded=growth <= 1 or (settings.max_depth - 1) * math.log10(growth) < 30,  # in float32
-        sky="parameter" if settings.own_sky is not None else "environment" if facts.environment else "none",
+        visible=any(m.reflectance * arriving > tracer.min_contribution for m in affordable),
+        sky="parameter" if own_sky is not None else "environment" if facts.environment else "none",
         lobes=tuple(name for name, there in facts.lobes if there),
         objects=facts.native_shapes + sum(count for _, count in facts.quadrics),
     )
+
+
+def bounce_cost(tracer: Any, int_ior: float) -> int:
+    """Return what a bounce off a material of this index takes from the bounce budget."""
+    if tracer.bounce_budget == "plain":
+        return 1
+    return max(10 - int(np.float32(10) * np.float32(min(int_ior, 1))), 1)
 
 
 def _cut_off(case: SimpleNamespace) -> tuple[float, float]:
@@ -153,10 +135,10 @@ def _cut_off(case: SimpleNamespace) -> tuple[float, float]:
     reflect less than a half there: what is left out at further hits adds less than as much again. Where
     mirrors face each other, it adds up.
     """
-    mirrors, settings = case.affordable if case.made["mirrors"] else [], case.settings
+    mirrors, tracer = case.affordable if case.made["mirrors"] else [], case.tracer
     reflectance, hits = max((m.at_normal for m in mirrors if m.at_normal < math.inf), default=0.0), 1.0
     if reflectance > 0.5:
-        bounces = (settings.max_depth - 2) // min(settings.cost(m.int_ior) for m in mirrors) + 1
+        bounces = (tracer.max_depth - 2) // min(bounce_cost(tracer, m.int_ior) for m in mirrors) + 1
         hits = sum(min(reflectance, 1.0) ** k for k in range(max(bounces, 0) + 1))
     return case.arriving * hits if case.made["mirrors"] else 0.0, case.facts.lights * hits
 
@@ -176,7 +158,6 @@ _SPHERES = {"table": "spheres from a table of centres and radii", "corrected": "
 _LIGHTS = {"unrolled": "unrolled", "loop": "in a loop of calls", "table": "in a loop over a table"}
 _SKY = {"parameter": "the integrator's sky", "environment": "the scene's sky"}
 _OTHERS = "other shapes, or spheres that emit or face inwards"
-_ALONE = "a ray that leaves the only object meets nothing"
 
 
 # In the order in which they are taken: later ones may ask for earlier decisions
@@ -203,11 +184,10 @@ RULES = (
     ),
     Rule(
         "mirrors", "bounce loop",
-        lambda facts, plan: "mirror bounces" if plan.mirror_rays else "mirror images of the sky",
+        lambda facts, plan: "mirror bounces",
         lambda case: {
             "max_depth admits no mirror ray": bool(case.facts.mirrors) and not case.affordable,
             "no material reflects visibly": not case.visible,
-            _ALONE: case.facts.alone and case.sky == "none",
         },
     ),
     Rule(
@@ -283,18 +263,6 @@ RULES = (
         lambda case, free: case.sky,
     ),
     Rule(
-        "mirror_rays", "mirror rays",
-        lambda facts, plan: "",  # told with the mirrors
-        lambda case: {_ALONE: case.made["mirrors"] and case.facts.alone},
-        lambda case, free: case.made["mirrors"] and free,
-    ),
-    Rule(
-        "guarded", "guard against overflow",
-        lambda facts, plan: "throughputs kept within float32",
-        lambda case: {"no path gets that bright": case.made["mirrors"] and case.bounded},
-        lambda case, free: case.made["mirrors"] and free,
-    ),
-    Rule(
         "textures", "textures",
         lambda facts, plan: "textures and their coordinates",
         lambda case: {"every material is uniform": not case.facts.textured},
@@ -327,10 +295,14 @@ RULES = (
 WHAT = {rule.name: rule.what for rule in RULES}
 
 
-def make_plan(facts: SceneFacts, settings: Settings) -> KernelPlan:
-    """Decide what the kernels for a scene hold."""
+def make_plan(facts: SceneFacts, tracer: Any, own_sky: float | None) -> KernelPlan:
+    """Decide what the kernels for a scene hold.
+
+    ``tracer`` has the integrator's parameters; ``own_sky`` is the largest radiance of its ``sky``: inf where
+    that is not known, None without one.
+    """
     made, reasons = dict[str, Any](), list[tuple[str, str]]()
-    case = _case(facts, settings, made)
+    case = _case(facts, tracer, own_sky, made)
     for rule in RULES:
         found = [why for why, holds in rule.against(case).items() if holds]
         reasons += [(rule.name, why) for why in found[:1]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -60,8 +59,7 @@ class Pair:
 # A lobe has a name, the parameter that scales it with its default, the flag of its component among
 # ``mi.BSDFFlags`` and the names of the other parameters that it depends on. ``value`` is f cos θo, and
 # ``density`` that of its samples; ``sample`` draws a direction, and tan² of the angle of the half vector;
-# ``albedo`` is what it reflects of light from ``at.wi``, by which it is chosen; ``bound`` is one of the value
-# for a reflectance of 1
+# ``albedo`` is what it reflects of light from ``at.wi``, by which it is chosen
 
 
 class Diffuse:
@@ -83,9 +81,6 @@ class Diffuse:
 
     def albedo(self, at: Lobes) -> mi.UnpolarizedSpectrum:
         return at.given[self.reflectance]
-
-    def bound(self, alpha: float, f0: float) -> float:
-        return 1 / math.pi
 
 
 class Specular:
@@ -121,15 +116,6 @@ class Specular:
 
     def albedo(self, at: Lobes) -> mi.UnpolarizedSpectrum:
         return at.mirror_reflectance
-
-    def bound(self, alpha: float, f0: float) -> float:
-        """D is largest at tan²θ = 2 α² - 1, else at 0. G₁ / cos θ is 1 / cos θ up to α tan θ = 1/1.6 and at
-        most 3.535 / (α sin θ) beyond. A negative α has |G₁| < 3 in place of 1, twice.
-        """
-        size = min(max(abs(alpha), ALPHA_MIN), ALPHA_MAX)
-        peak = max(1, 4 * size**4 * math.exp(1 / size**2 - 2)) if 2 * size**2 > 1 else 1
-        shadowed = 5.66 * math.sqrt(1 + 0.4 / size**2) * (9 if alpha < 0 else 1)
-        return max(1, f0) * 0.25 * peak / (math.pi * size**2) * shadowed
 
 
 # In the order of the components of the BSDF

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .facts import Reading
-from .kernel_plan import BUDGETS, KernelPlan, SceneFacts, Settings, make_plan
+from .kernel_plan import BUDGETS, KernelPlan, SceneFacts, make_plan
 from .parameters import LARGEST, choice, flag, integer, number, spectrum
 from .scene_data import Hit, SceneData
 from .snapshot import Kept, Snapshot
@@ -144,9 +144,7 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     def kernel_plan(self, facts: SceneFacts) -> KernelPlan:
         """Decide what the kernels for such a scene hold."""
-        own_sky = None if self.sky is None else largest(self.sky)
-        settings = Settings(self.max_depth, self.min_contribution, self.bounce_budget, self.clamp, own_sky)
-        return self._made("plan", (facts, settings), lambda: make_plan(facts, settings))
+        return make_plan(facts, self, None if self.sky is None else largest(self.sky))
 
     def prepare(
         self, scene: mi.Scene, plan: KernelPlan | None = None, reading: Reading | None = None
@@ -175,66 +173,49 @@ class MrtWhitted(mi.SamplingIntegrator):
         """
         data = self.prepare(scene) if data is None else data
 
-        # ------------------------------ The camera ray, first of a peeled loop ------------------------------
-        active, none = mi.Bool(active), mi.UInt32(0)
-        hit = data.intersect(scene, ray, active)
-        one = mi.UnpolarizedSpectrum(1)
-        direct, shadow_rays, reflectance, depth = self._shade(data, scene, sampler, ray, hit, one, active)
-        if not data.plan.mirrors:
-            return Trace(direct, direct, hit, none, shadow_rays)
-        throughput = self._finite(data, reflectance)
-        goes_on = hit.found & self._continues(data, throughput, depth)
-        if not data.plan.mirror_rays:
-            reflected = self._sky(data, data.mirror_ray(ray, hit), goes_on)
-            radiance = direct + dr.select(goes_on, throughput * reflected, 0)
-            return Trace(radiance, direct, hit, none, shadow_rays)
-        state = {
-            "radiance": direct,  # light found so far
-            "throughput": throughput,  # product of the mirror reflectances along the path
-            "ray": data.mirror_ray(ray, hit),  # the next to be traced
-            "depth": depth,  # what the bounces have cost so far
-            "bounces": none,  # mirror rays traced
-            "shadow_rays": shadow_rays,  # shadow rays traced
-            "active": goes_on,  # paths that go on
+        def follow(s: dict) -> tuple[dict, Hit]:
+            """Trace the next ray of each path."""
+            hit = data.intersect(scene, s["ray"], s["active"])
+            radiance, shadow_rays, reflectance, cost = self._shade(
+                data, scene, s["sampler"], s["ray"], hit, s["throughput"], s["active"]
+            )
+            # Finite, as an infinite one times no light would be NaN
+            throughput, depth = dr.minimum(s["throughput"] * reflectance, LARGEST), s["depth"] + cost
+            affordable, brightest = depth < self.max_depth, dr.max(throughput)
+            if data.plan.cut_off[0] == math.inf:
+                goes_on = affordable & (brightest > 0)
+            else:
+                goes_on = affordable & (brightest * data.path_limit > self.min_contribution)
+            return {
+                "radiance": s["radiance"] + s["throughput"] * radiance,
+                "throughput": throughput,
+                "ray": data.mirror_ray(s["ray"], hit),
+                "depth": depth,
+                "bounces": s["bounces"],
+                "shadow_rays": s["shadow_rays"] + shadow_rays,
+                "active": hit.found & goes_on,
+                "sampler": s["sampler"],
+            }, hit
+
+        def bounce(s: dict) -> tuple[dict]:
+            return (follow(s)[0] | {"bounces": s["bounces"] + 1},)
+
+        state: dict[str, Any] = {
+            "radiance": mi.UnpolarizedSpectrum(0),  # light found so far
+            "throughput": mi.UnpolarizedSpectrum(1),  # product of the mirror reflectances along the path
+            "ray": ray,  # the next to be traced
+            "depth": mi.UInt32(0),  # what the bounces have cost so far
+            "bounces": mi.UInt32(0),  # mirror rays traced
+            "shadow_rays": mi.UInt32(0),  # shadow rays traced
+            "active": mi.Bool(active),  # paths that go on
             "sampler": sampler if data.plan.random else None,  # for lights that are no points
         }
-
-        # ------------------------------------------ Mirror bounces ------------------------------------------
-        def bounce(s: dict) -> tuple[dict]:
-            ray, active, throughput = s["ray"], s["active"], s["throughput"]
-            hit = data.intersect(scene, ray, active)
-            radiance, shadow_rays, reflectance, cost = self._shade(
-                data, scene, s["sampler"], ray, hit, throughput, active
-            )
-            radiance = s["radiance"] + dr.select(active, throughput * radiance, 0)
-            throughput, depth = self._finite(data, throughput * reflectance), s["depth"] + cost
-            return (
-                {
-                    "radiance": radiance,
-                    "throughput": throughput,
-                    "ray": data.mirror_ray(ray, hit),
-                    "depth": depth,
-                    "bounces": s["bounces"] + 1,
-                    "shadow_rays": s["shadow_rays"] + shadow_rays,
-                    "active": active & hit.found & self._continues(data, throughput, depth),
-                    "sampler": s["sampler"],
-                },
-            )
-
-        (final,) = dr.while_loop((state,), lambda s: s["active"], bounce, label="mirror bounces")
-        return Trace(final["radiance"], direct, hit, final["bounces"], final["shadow_rays"])
-
-    def _continues(self, data: SceneData, throughput: mi.UnpolarizedSpectrum, depth: mi.UInt32) -> mi.Bool:
-        """Return whether a path of this throughput and depth may still change the picture."""
-        affordable, brightest = depth < self.max_depth, dr.max(throughput)
-        if data.plan.cut_off[0] == math.inf:
-            return affordable & (brightest > 0)
-        return affordable & (brightest * data.path_limit > self.min_contribution)
-
-    @staticmethod
-    def _finite(data: SceneData, throughput: mi.UnpolarizedSpectrum) -> mi.UnpolarizedSpectrum:
-        """Keep a throughput finite: an infinite one times no light would be NaN."""
-        return dr.minimum(throughput, LARGEST) if data.plan.guarded else throughput
+        # The camera ray, which the layers look at, comes before the loop
+        state, hit = follow(state)
+        direct = state["radiance"]
+        if data.plan.mirrors:
+            (state,) = dr.while_loop((state,), lambda s: s["active"], bounce, label="mirror bounces")
+        return Trace(state["radiance"], direct, hit, state["bounces"], state["shadow_rays"])
 
     # ------------------------------------------- Shading -----------------------------------------------
 

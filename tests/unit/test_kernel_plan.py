@@ -24,7 +24,6 @@ MESH = {
 }
 SPHERE: dict[str, Any] = {"type": "sphere", "radius": 0.7, "bsdf": {"type": "mrt_bsdf"}}
 CONE = {"type": "mrt_cone", "apex": [0, 1, 1], "base_center": [0, 0, 1], "radius": 0.4}
-BRIGHT = {**SPHERE, "bsdf": {"type": "mrt_bsdf", "specular_reflectance": 1e5}}
 LIGHT = {"type": "mrt_light", "position": [2, 4, 3]}
 LAMP = {"type": "sphere", "center": [0, 3, 0], "radius": 0.2, "emitter": {"type": "area"}}
 BRUSHED = {"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.4}
@@ -86,9 +85,7 @@ CHOICES = {
     "emission": ({"a": SPHERE, "lamp": LAMP}, False, False),
     "sky": ({"a": SPHERE, "sky": {"type": "constant"}, "light": LIGHT}, "none", False),
     "mirrors": ({"a": SPHERE, "sky": {"type": "constant"}, "light": LIGHT}, False, False),
-    "mirror_rays": ({"a": SPHERE, "sky": {"type": "constant"}}, True, True),
     "cut_off": ({"a": SPHERE, "b": CONE, "sky": {"type": "constant"}}, (math.inf, 9.0), True),
-    "guarded": ({"a": BRIGHT, "b": CONE, "light": LIGHT}, False, True),
     "lobes": ({"a": SPHERE, "light": LIGHT}, ("diffuse",), False),
     "textures": ({"a": {**SPHERE, "bsdf": CHECKED}, "light": LIGHT}, False, False),
     "shading_frames": ({"b": SPHERE, "light": LIGHT}, False, False),
@@ -146,12 +143,6 @@ REASONS = [
     ({"a": SPHERE}, "tangents", "no material depends on the direction of texture coordinates"),
     ({"a": {**SPHERE, "bsdf": BRUSHED}}, "spheres", "a material needs the frame along texture coordinates"),
     ({"a": {**SPHERE, "bsdf": MATTE}}, "lobes", "no material has the specular one"),
-    *(({"a": {**thing, "bsdf": {"type": "mrt_bsdf"}}}, "mirrors",
-       "a ray that leaves the only object meets nothing")
-      for thing in (SPHERE, CONE, {"type": "mrt_plane", "normal": [0, 1, 0]})),
-    ({"a": SPHERE, "sky": {"type": "constant"}}, "mirror_rays",
-     "a ray that leaves the only object meets nothing"),
-    ({"a": SPHERE, "b": CONE, "sky": {"type": "constant"}}, "guarded", "no path gets that bright"),
     ({"a": SPHERE, "b": CONE, "lamp": LAMP, "integrator": {"type": "mrt_whitted", "clamp": False}}, "cut_off",
      "what may still arrive has no known bound"),
     ({"a": SPHERE}, "two_sided", "no material is lit from behind"),
