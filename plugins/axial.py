@@ -37,18 +37,17 @@ class AxialMesh(mi.Mesh):
         self.capped = flag(props, "capped", True)
         self.kind = self.kind if self.capped else f"open {self.kind}"
         self.placement = Placement(props)
-        self.unit = KINDS[self.kind].mesh(segments(props, 256))
+        self.unit = vertices, faces = KINDS[self.kind].mesh(segments(props, 256))
         #: the unit frame in world space, in double precision (see ``intersect``)
         self.exact_frame = self._frame_of(vector64(ends[0]), vector64(ends[1]), radius)
-        sizes = len(self.unit.points), len(self.unit.faces)
-        construct(self, plugin, sizes, props, normals=True, texcoords=True)
-        uvs = self.unit.uvs.astype(np.float32).ravel()
+        construct(self, plugin, (len(vertices), len(faces)), props, normals=True, texcoords=True)
+        uvs = vertices[:, 6:].astype(np.float32).ravel()
         write_buffers(self, vertex_texcoords=uvs, **self.quadrics().stand_in(self.unit))
         self.parameters = {
             **dict(zip(self.ends, map(mi.Point3f, ends), strict=True)),
             "radius": updatable(radius),
         }
-        keep_apart(self, plugin, sizes[1])
+        keep_apart(self, plugin, len(faces))
 
     def _frame_of(self, p0: Any, p1: Any, radius: Any) -> Frame:
         return self.placement(KINDS[self.kind].frame(p0, p1, radius))
@@ -81,7 +80,7 @@ class AxialMesh(mi.Mesh):
     def _follow(self, frame: Frame) -> None:
         """Write positions and normals anew, differentiably with respect to what ``frame`` is made of."""
         frame = Frame(*map(mi.Vector3f, vars(frame).values()))
-        points, gradients = (mi.Vector3f(x.T) for x in (self.unit.points, self.unit.gradients))
+        points, gradients = (mi.Vector3f(x.T) for x in (self.unit[0][:, :3], self.unit[0][:, 3:6]))
         positions = dr.ravel(frame.origin + frame.to_world(points))
         normals = dr.ravel(dr.normalize(frame.gradient(gradients)))
         write_buffers(self, vertex_positions=positions, vertex_normals=normals)

@@ -50,11 +50,11 @@ class MrtGroup(mi.Mesh):
         attributes = {name: _table(props, name) for name in props if name.startswith("face_")}
         self.content = f"kind={kind}, objects={len(numbers)}"
         unit = KINDS[kind].mesh(segments(props, 8))
-        faces = len(unit.faces)
+        vertices, faces = map(len, unit)
         self.table = QuadricTable.of_numbers(
             kind, numbers, faces, Placement(props), flipped=props.get("flip_normals", False)
         )
-        sizes = len(numbers) * len(unit.points), len(numbers) * faces
+        sizes = len(numbers) * vertices, len(numbers) * faces
         construct(self, "mrt_group", sizes, props, normals=True)
         write_buffers(self, **self.table.stand_in(unit))
         for name, values in attributes.items():

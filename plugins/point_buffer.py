@@ -11,7 +11,6 @@ Applications 6(9), 1986.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -36,26 +35,50 @@ _SHORT = 2.0**-9
 class PointBuffer:
     """Lists of objects for each of some points, in ``size`` x ``size`` cells of each face of its cube.
 
-    The cells of a face divide what the objects take up of it.
+    The points lie at ``places`` [m, 3]; the objects, by their ``numbers`` [n], in ``boxes`` [n, 2, 3]. The
+    cells of a face divide what the objects take up of it.
     """
 
-    def __init__(self, points: int, faces: list[_Face], size: int) -> None:
-        # Data: one kernel serves all places and sizes
-        self.size = dr.opaque(mi.UInt32, size)
-        columns = zip(*(f.listed(size) for f in faces), strict=True)
-        cell, objects, near = (np.concatenate(column) for column in columns)
-        order = np.lexsort((near, cell))
-        counts = np.bincount(cell, minlength=6 * points * size**2)
+    def __init__(self, places: np.ndarray, boxes: np.ndarray, numbers: np.ndarray) -> None:
+        faces, size = 6 * len(places), 2 ** int(np.ceil(np.log2(2 * np.sqrt(len(boxes)))))
+        extent = float(max(np.abs(places).max(), np.abs(boxes).max()))
+        # The test of spheres in float32 also finds what passes by, the farther a ray starts, and is to be
+        # obeyed
+        middle, radius = boxes.mean(axis=1), 0.5 * np.diff(boxes, axis=1)[:, 0].min(axis=1)
+        farthest = np.linalg.norm(middle - places[:, None], axis=2) + np.ptp(middle, axis=0).max()
+        slack = np.sqrt(np.minimum(radius**2 + 2.0**-20 * farthest**2, 3 * radius**2)) - radius
+        slack = (slack + 2 * _OFF_PLACE * extent)[..., None]
+        low, high = boxes[:, 0] - places[:, None] - slack, boxes[:, 1] - places[:, None] + slack
+        columns = zip(*(_seen(low, high, side) for side in range(6)), strict=True)
+        face, thing, near, first, last = (np.concatenate(column) for column in columns)
+        start, end = np.full((faces, 2), np.inf), np.full((faces, 2), -np.inf)
+        np.minimum.at(start, face, first)
+        np.maximum.at(end, face, last)
+        start, end = (np.where(start <= end, x, 0).astype(np.float32).astype(float) for x in (start, end))
+        while True:
+            scale = np.divide(size, end - start, out=np.zeros_like(start), where=end > start)
+            cells = np.stack([first - start[face], last - start[face]]) * scale[face, :]
+            cells += np.reshape([-_OFF_CELL, _OFF_CELL], (2, 1, 1))
+            least, most = np.clip(np.floor(cells), 0, size - 1).astype(np.int64)
+            width = most - least + 1
+            areas = width.prod(axis=1)
+            if size == 2 or (faces * size**2 <= MOST_CELLS and areas.sum() <= MOST_LISTED):
+                break
+            size //= 2
+        pair = np.repeat(np.arange(len(areas)), areas)
+        row, column = np.divmod(np.arange(len(pair)) - (np.cumsum(areas) - areas)[pair], width[pair, 0])
+        cell = (face[pair] * size + least[pair, 1] + row) * size + least[pair, 0] + column
+        order = np.lexsort((near[pair], cell))
+        counts = np.bincount(cell, minlength=faces * size**2)
         ends = np.cumsum(counts + (counts > 0))  # of each list, after what ends it: an object at infinity
-        self.starts = aligned(np.where(counts > 0, ends - counts - 1, ends[-1]), np.uint32)
         lists = np.full((ends[-1] + 1, 2), np.inf, np.float32)
         listed = np.ones(len(lists), bool)
         listed[ends[counts > 0] - 1] = listed[-1] = False
-        lists[listed, 0] = near[order]
-        lists.view(np.uint32)[listed, 1] = objects[order]
-        self.lists = aligned(lists)
-        windows = [np.concatenate([f.low, f.scale(size)], axis=1) for f in faces]
-        self.faces = aligned(np.stack(windows, axis=1))
+        lists[listed, 0] = near[pair][order]
+        lists.view(np.uint32)[listed, 1] = numbers[thing[pair]][order]
+        self.lists, self.faces = aligned(lists), aligned(np.concatenate([start, scale], axis=1))
+        self.starts = aligned(np.where(counts > 0, ends - counts - 1, ends[-1]), np.uint32)
+        self.size = dr.opaque(mi.UInt32, size)  # data: one kernel serves all places and sizes
         dr.eval(self.starts, self.lists, self.faces)
 
     def any(self, light: Any, to_light: Any, active: Any, test: Callable[[Any], Any]) -> Any:
@@ -90,72 +113,12 @@ class PointBuffer:
         )[3]
 
 
-def point_buffer(places: np.ndarray, boxes: np.ndarray, numbers: np.ndarray) -> PointBuffer | None:
-    """Return lists for points at ``places`` [m, 3] of objects, by their ``numbers`` [n], in ``boxes``
-    [n, 2, 3]; None where the lists would be too long.
-    """
-    points, least = len(places), 2
-    size = 2 ** int(np.ceil(np.log2(2 * np.sqrt(len(boxes)))))
-    if 6 * points * least**2 > MOST_CELLS:
-        return None
-    extent = float(max(np.abs(places).max(), np.abs(boxes).max()))
-    # The test of spheres in float32 also finds what passes by, the farther a ray starts, and is to be obeyed
-    middle, radius = boxes.mean(axis=1), 0.5 * np.diff(boxes, axis=1)[:, 0].min(axis=1)
-    farthest = np.linalg.norm(middle - places[:, None], axis=2) + np.ptp(middle, axis=0).max()
-    slack = np.sqrt(np.minimum(radius**2 + 2.0**-20 * farthest**2, 3 * radius**2)) - radius
-    slack = (slack + 2 * _OFF_PLACE * extent)[..., None]
-    low, high = boxes[:, 0] - places[:, None] - slack, boxes[:, 1] - places[:, None] + slack
-    faces = [_face(low, high, numbers, side) for side in range(6)]
-    while size >= least:
-        listed = sum(int(f.areas(size).sum()) for f in faces)
-        if 6 * points * size**2 <= MOST_CELLS and listed <= MOST_LISTED:
-            return PointBuffer(points, faces, size)
-        size //= 2
-    return None
+def _seen(low: np.ndarray, high: np.ndarray, side: int) -> tuple[np.ndarray, ...]:
+    """Return pairs of a point and a box that it sees through a face of its cube: the numbers of face and box,
+    the depth where the box begins, and the tangents between which it is seen.
 
-
-@dataclass
-class _Face:
-    """What objects take up of one face of the cubes around all points, along its two axes."""
-
-    side: int
-    point: np.ndarray  # [k], of pairs of a point and an object seen through the face
-    thing: np.ndarray  # [k]
-    near: np.ndarray  # [k], depth: where the object begins
-    first: np.ndarray  # [k, 2], tangents: where it begins and ends
-    last: np.ndarray
-    low: np.ndarray  # [points, 2]: where all objects of a point begin, and over what they extend
-    extent: np.ndarray
-
-    def scale(self, size: int) -> np.ndarray:
-        """Return cells per tangent; 0 where there is nothing."""
-        return np.divide(size, self.extent, out=np.zeros_like(self.extent), where=self.extent > 0)
-
-    def _cells(self, size: int) -> tuple[np.ndarray, np.ndarray]:
-        low, scale = self.low[self.point], self.scale(size)[self.point]
-        first = np.floor((self.first - low) * scale - _OFF_CELL)
-        last = np.floor((self.last - low) * scale + _OFF_CELL)
-        return tuple(np.clip(cells, 0, size - 1).astype(np.int64) for cells in (first, last))
-
-    def areas(self, size: int) -> np.ndarray:
-        """Return how many cells each object takes up."""
-        first, last = self._cells(size)
-        return (last - first + 1).prod(axis=1)
-
-    def listed(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return cells, objects in them, and the depths where these begin."""
-        first, last = self._cells(size)
-        width, areas = last[:, 0] - first[:, 0] + 1, self.areas(size)
-        pair = np.repeat(np.arange(len(areas)), areas)
-        within = np.arange(len(pair)) - np.repeat(np.cumsum(areas) - areas, areas)
-        row, column = first[pair, 1] + within // width[pair], first[pair, 0] + within % width[pair]
-        cell = ((6 * self.point[pair] + self.side) * size + row) * size + column
-        return cell, self.thing[pair], self.near[pair]
-
-
-def _face(low: np.ndarray, high: np.ndarray, numbers: np.ndarray, side: int) -> _Face:
-    """Return what is seen through a face, of x, y and z, first forwards, then backwards, of boxes whose
-    corners are ``low`` and ``high`` [points, n, 3] relative to each point.
+    Sides: those towards x, y and z, each forwards, then backwards. The corners of the boxes are ``low`` and
+    ``high`` [points, n, 3] relative to each point.
     """
     axis, backwards = divmod(side, 2)
     across = [a for a in range(3) if a != axis]
@@ -167,11 +130,5 @@ def _face(low: np.ndarray, high: np.ndarray, numbers: np.ndarray, side: int) -> 
         last = high / np.where(high > 0, near, far) + _OFF_TANGENT
     seen = (far[..., 0] > 0) & ((first < 1) & (last > -1)).all(axis=2)
     point, thing = np.nonzero(seen)
-    first, last = np.clip(first[seen], -1, 1), np.clip(last[seen], -1, 1)
-    least, most = np.full((len(low), 2), np.inf), np.full((len(low), 2), -np.inf)
-    np.minimum.at(least, point, first)
-    np.maximum.at(most, point, last)
-    least, most = (np.where(least <= most, x, 0).astype(np.float32).astype(float) for x in (least, most))
-    return _Face(
-        side, point, numbers[thing], near[seen][:, 0] * (1 - 2.0**-18), first, last, least, most - least
-    )
+    depth = near[seen][:, 0] * (1 - 2.0**-18)
+    return 6 * point + side, thing, depth, np.clip(first[seen], -1, 1), np.clip(last[seen], -1, 1)

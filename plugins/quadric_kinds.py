@@ -33,14 +33,9 @@ Hit = tuple[Any, Any]  # t in units of |d|, inf for a miss, and the part of the 
 SurfacePoint = tuple[Any, Any, Any, Any]  # on the surface; the outward unit normal; texture coordinates u, v
 
 
-@dataclass(frozen=True)
-class UnitMesh:
-    """Vertices in the unit frame, with the gradient that becomes the normal of each."""
-
-    points: np.ndarray  # float64 [N, 3]
-    gradients: np.ndarray  # float64 [N, 3]
-    uvs: np.ndarray  # float64 [N, 2]
-    faces: np.ndarray  # uint32 [M, 3], counter-clockwise seen from outside in a right-handed frame
+# Vertices [n, 8] in the unit frame: place, gradient that becomes the normal, and texture coordinates; faces
+# [m, 3], counter-clockwise seen from outside in a right-handed frame
+UnitMesh = tuple[np.ndarray, np.ndarray]
 
 
 class Sphere:
@@ -90,7 +85,7 @@ class Sphere:
         octants = [(x, y, z) for x in (0, 1) for y in (2, 3) for z in (4, 5)]
         turned = [(sum(octant) % 2) == 1 for octant in octants]  # an odd number of mirrored axes
         faces = [octant[::-1] if turn else octant for octant, turn in zip(octants, turned, strict=True)]
-        return UnitMesh(points, points, np.zeros((6, 2)), np.array(faces, np.uint32))
+        return np.hstack([points, points, np.zeros((6, 2))]), np.array(faces)
 
 
 class Axial:
@@ -165,14 +160,11 @@ class Cone(Axial):
 
     def mesh(self, segments: int) -> UnitMesh:
         """Return a fan from the apex, with a vertex and a normal there for each triangle, and the base."""
-        azimuth = 2 * np.pi * np.arange(segments + 1) / segments
-        middle = 0.5 * (azimuth[1:] + azimuth[:-1])
-        fan = _ring(middle, 0.0, slope=-1.0, v=1.0)
-        apex = UnitMesh(0 * fan.points, fan.gradients, fan.uvs, fan.faces)
-        i = np.arange(segments, dtype=np.uint32)
+        azimuth, i = 2 * np.pi * np.arange(segments + 1) / segments, np.arange(segments)
+        apex = _ring(0.5 * (azimuth[1:] + azimuth[:-1]), 0.0, slope=-1.0, v=1.0, radius=0.0)
         faces = np.stack([i, i + segments + 1, i + 1], axis=1)
-        side = _join([_ring(azimuth, 1.0, slope=-1.0, v=0.0), apex], faces)
-        return _join([side, _disc(segments, 1.0)]) if self.closed else side
+        side = np.concatenate([_ring(azimuth, 1.0, slope=-1.0, v=0.0), apex]), faces
+        return _join(side, _disc(segments, 1.0)) if self.closed else side
 
 
 class Cylinder(Axial):
@@ -186,12 +178,12 @@ class Cylinder(Axial):
 
     def mesh(self, segments: int) -> UnitMesh:
         """Return a strip of quads split in two, and two discs."""
-        azimuth = 2 * np.pi * np.arange(segments + 1) / segments
-        rings = [_ring(azimuth, z, slope=0.0, v=1.0 - z) for z in (0.0, 1.0)]
-        i = np.arange(segments, dtype=np.uint32)
+        azimuth, i = 2 * np.pi * np.arange(segments + 1) / segments, np.arange(segments)
         k = i + segments + 1
-        side = _join(rings, np.concatenate([np.stack([i, i + 1, k], 1), np.stack([i + 1, k + 1, k], 1)]))
-        return _join([side, _disc(segments, 0.0), _disc(segments, 1.0)]) if self.closed else side
+        rings = [_ring(azimuth, z, slope=0.0, v=1.0 - z) for z in (0.0, 1.0)]
+        faces = np.concatenate([np.stack([i, i + 1, k], 1), np.stack([i + 1, k + 1, k], 1)])
+        side = np.concatenate(rings), faces
+        return _join(side, _disc(segments, 0.0), _disc(segments, 1.0)) if self.closed else side
 
 
 KINDS: dict[str, Any] = {
@@ -216,34 +208,27 @@ def _turn(q: Any) -> Any:
     return dr.select(azimuth < 0, azimuth + 1, azimuth)
 
 
-def _ring(azimuth: np.ndarray, z: float, *, slope: float, v: float) -> UnitMesh:
-    x, y = np.cos(azimuth), np.sin(azimuth)
-    points, gradients = (np.stack([x, y, np.full_like(x, c)], axis=1) for c in (z, slope))
-    uvs = np.stack([azimuth / (2 * np.pi), np.full_like(x, v)], axis=1)
-    return UnitMesh(points, gradients, uvs, np.empty((0, 3), np.uint32))
+def _ring(azimuth: np.ndarray, z: float, *, slope: float, v: float, radius: float = 1.0) -> np.ndarray:
+    """Return vertices around the axis."""
+    x, y, one = np.cos(azimuth), np.sin(azimuth), np.ones_like(azimuth)
+    around = azimuth / (2 * np.pi)
+    return np.stack([radius * x, radius * y, z * one, x, y, slope * one, around, v * one], axis=1)
 
 
 def _disc(segments: int, z: float) -> UnitMesh:
     """Return a fan around the centre, facing away from z = 1/2."""
     rim = _ring(2 * np.pi * np.arange(segments) / segments, z, slope=0, v=0)
-    points = np.concatenate([rim.points, [[0, 0, z]]])
-    i = np.arange(segments, dtype=np.uint32)
+    vertices = np.concatenate([rim, [[0, 0, z, 0, 0, 0, 0, 0]]])
+    vertices[:, 3:6], vertices[:, 6:] = (0, 0, 1 if z > 0.5 else -1), 0.5 + 0.5 * vertices[:, :2]
+    i = np.arange(segments)
     faces = np.stack([i, (i + 1) % segments, np.full_like(i, segments)], axis=1)
-    gradients = np.tile([0, 0, 1.0 if z > 0.5 else -1.0], (segments + 1, 1))
-    return UnitMesh(points, gradients, 0.5 + 0.5 * points[:, :2], faces if z > 0.5 else faces[:, ::-1])
+    return vertices, faces if z > 0.5 else faces[:, ::-1]
 
 
-def _join(parts: Sequence[UnitMesh], more_faces: np.ndarray | None = None) -> UnitMesh:
-    """Return one mesh of several; ``more_faces`` index the joined vertices."""
-    first = np.cumsum([0] + [len(p.points) for p in parts])
-    faces = [p.faces + np.uint32(start) for p, start in zip(parts, first, strict=False)]
-    faces += [] if more_faces is None else [more_faces]
-    return UnitMesh(
-        np.concatenate([p.points for p in parts]),
-        np.concatenate([p.gradients for p in parts]),
-        np.concatenate([p.uvs for p in parts]),
-        np.concatenate(faces).astype(np.uint32),
-    )
+def _join(*parts: UnitMesh) -> UnitMesh:
+    first = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
+    faces = [faces + start for (_, faces), start in zip(parts, first, strict=False)]
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
 
 
 @dataclass(frozen=True)
@@ -297,11 +282,12 @@ class QuadricTable:
     def stand_in(self, unit: UnitMesh) -> dict[str, np.ndarray]:
         """Return the buffers of a mesh of all objects, each of them ``unit``; frames may be left-handed."""
         columns = np.linalg.inv(self.rows).transpose(0, 2, 1)
-        positions = unit.points @ columns + self.origins[:, None]
-        normals = unit.gradients[None] @ self.rows
+        vertices, faces = unit
+        positions = vertices[:, :3] @ columns + self.origins[:, None]
+        normals = vertices[:, 3:6] @ self.rows
         normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-        faces = unit.faces if np.linalg.det(self.rows[0]) > 0 else unit.faces[:, ::-1]
-        first = len(unit.points) * np.arange(len(self.rows), dtype=np.uint32)
+        faces = faces if np.linalg.det(self.rows[0]) > 0 else faces[:, ::-1]
+        first = len(vertices) * np.arange(len(self.rows))
         return {
             "faces": (faces[None] + first[:, None, None]).astype(np.uint32).ravel(),
             "vertex_positions": positions.astype(np.float32).ravel(),

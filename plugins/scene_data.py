@@ -18,7 +18,7 @@ from .lights import Lights
 from .lobes import LOBES, Pair
 from .materials import MaterialTable
 from .planes import Planes
-from .point_buffer import point_buffer
+from .point_buffer import PointBuffer
 from .quadrics import Quadrics
 from .snapshot import Kept
 from .spheres import Spheres
@@ -61,17 +61,7 @@ class SceneData:
             lambda: Lights(reading.lights, reading.numbers, plan.lights),
         )
 
-        def light_buffers() -> list[tuple[Any, Any]]:
-            """Return lists of what may be in the way of the lights, with what tests it."""
-            things = [] if self.quadrics is None else [self.quadrics]
-            things += [self.spheres] if plan.bvh else []
-            places = np.array([row[0] for _, row in reading.numbers or ()])
-            pairs = [(point_buffer(places, *thing.boxes()), thing) for thing in things]
-            return [] if any(buffer is None for buffer, _ in pairs) else pairs  # too long
-
-        self.buffers = kept(
-            "buffers", (now.light_part, plan.buffers, *form), lambda: light_buffers() if plan.buffers else []
-        )
+        self.buffers = kept("buffers", (now.light_part, plan.buffers, *form), lambda: self._buffers(reading))
         self.merged = kept(
             "merged",
             (now.shape_part, now.material_part, plan.merged),
@@ -94,6 +84,12 @@ class SceneData:
         rays = self._kept("rays", self._form, lambda: _ray_arrays(self.bvh or scene)) if plan.bvh else []
         own = [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.buffers, self.merged]
         return [*_arrays_in(own), *rays, self.path_limit, sky]
+
+    def _buffers(self, reading: Reading) -> list[tuple[PointBuffer, Any]]:
+        """Return lists of what may be in the way of the lights, with what tests it."""
+        things = [thing for thing in (self.quadrics, self.spheres) if thing is not None and self.plan.buffers]
+        places = np.array([row[0] for _, row in reading.numbers or ()])
+        return [(PointBuffer(places, *thing.boxes()), thing) for thing in things]
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 

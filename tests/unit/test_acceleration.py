@@ -1,4 +1,4 @@
-"""Searches for what a ray meets: trees and lists find the same; the study's crossing point is one."""
+"""Searches for what a ray meets: trees and lists find the same."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-import mrt_mitsuba.plugins.point_buffer as lists_module
-from mrt_mitsuba.plugins.point_buffer import point_buffer
+from mrt_mitsuba.plugins.point_buffer import PointBuffer
 from mrt_mitsuba.plugins.quadrics import Quadrics
 from mrt_mitsuba.plugins.spheres import Spheres
 
@@ -66,8 +65,7 @@ def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: f
         search = partial(things.occluded, active=mi.Bool(True))
     within = starts[0] + 0.97 * radii[0] * np.array([-0.8, 0.36, 0.48])
     places = np.concatenate([size * (np.array(PLACES) + shift), [within]])
-    buffer = point_buffer(places, *things.boxes())
-    assert buffer is not None
+    buffer = PointBuffer(places, *things.boxes())
     for number, place in enumerate(places):
         ray = lit(origins, place)
         test = partial(things.block, ray=ray)
@@ -75,15 +73,3 @@ def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: f
         expected = np.array(search(ray))
         assert 0.02 < expected.mean() <= (0.98 if number < len(PLACES) else 1)
         np.testing.assert_array_equal(found, expected)
-
-
-def test_no_lists_where_they_would_be_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    def lists(points: int, depth: float, count: int) -> Any:
-        box = np.array([[-1, -1, depth - 1], [1, 1, depth + 1]], float)
-        return point_buffer(np.zeros((points, 3)), np.tile(box, (count, 1, 1)), np.arange(count))
-
-    assert lists(3, 5, 50) is not None
-    assert lists(2**17, 5, 50) is None
-    monkeypatch.setattr(lists_module, "MOST_LISTED", 6 * 2**2 * 3 * 50 - 1)
-    assert lists(3, 5, 50) is not None
-    assert lists(3, 0, 50) is None  # the points are in all of them, which are in all cells

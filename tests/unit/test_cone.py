@@ -61,7 +61,7 @@ def test_open_cone_has_no_base() -> None:
 def test_positions_differentiate_with_the_parameters(name: str) -> None:
     """Derivatives of all vertices by automatic differentiation against finite differences."""
     ends = [key for key in SHAPES[name] if key not in ("type", "radius")]
-    weights = mi.Float(np.random.default_rng(4).normal(size=3 * len(shape(name, segments=8).unit.points)))
+    weights = mi.Float(np.random.default_rng(4).normal(size=3 * shape(name, segments=8).vertex_count()))
     steps = [(ends[0], (1, 0, 0)), (ends[0], (0, 1, 0)), (ends[1], (0, 0, 1)), ("radius", 1)]
 
     def weighted_sum(key: str, step: Any, by: Any) -> Any:
