@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import drjit as dr
 import mitsuba as mi
 
-from .lights import PointLight
+from .lights import towards
 from .parameters import spectrum, vector
 from .variants import first, is_jit, pointer, varies
 
@@ -55,29 +55,32 @@ class MrtLight(mi.Emitter):
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         dr.make_opaque(self.position)
 
-    def row(self, it: mi.Interaction3f, active: mi.Bool = True) -> PointLight:
-        """Return the light for points with the wavelengths of ``it``."""
+    def row(self, it: mi.Interaction3f, active: mi.Bool = True) -> list[Any]:
+        """Return position and intensity at the wavelengths of ``it``; more, for other kinds: vectors of
+        three."""
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wavelengths = it.wavelengths
-        return PointLight(self.position, self.intensity.eval(si, active))
+        return [self.position, self.intensity.eval(si, active)]
 
-    def numbers(self) -> tuple[type[PointLight], list[list[float]]] | None:
-        """Return class and numbers of the row; None where they vary, or where derivatives are wanted."""
-        if varies(self.intensity):
+    @staticmethod
+    def arriving(d: mi.Vector3f, intensity: mi.UnpolarizedSpectrum, *more: mi.Vector3f) -> Any:
+        """Return what arrives at a point from which the light is seen along the unit vector ``d``."""
+        return intensity
+
+    def numbers(self) -> list[list[float]] | None:
+        """Return the numbers of the row; None where they vary, or where derivatives are wanted."""
+        row = None if varies(self.intensity) else self.row(dr.zeros(mi.Interaction3f))
+        if row is None or dr.grad_enabled(row):
             return None
-        row = self.row(dr.zeros(mi.Interaction3f))
-        parts = [row.position, row.intensity, *row.more]
-        if dr.grad_enabled(parts):
-            return None
-        # Of a single channel, three
-        return type(row), [(3 * [first(x) for x in part])[:3] for part in parts]
+        return [(3 * [first(x) for x in part])[:3] for part in row]  # of a single channel, three
 
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-        ds, arriving = self.row(it, active).sample_direction(it, sample, active)
+        position, *more = self.row(it, active)
+        ds = towards(position, it)
         ds.emitter = pointer("Emitter", self)
-        return ds, mi.depolarizer(arriving)
+        return ds, mi.depolarizer(self.arriving(ds.d, *more))
 
     def pdf_direction(
         self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
@@ -87,7 +90,7 @@ class MrtLight(mi.Emitter):
     def eval_direction(
         self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
     ) -> mi.Spectrum:
-        return mi.depolarizer(dr.select(active, self.row(it, active).arriving(ds.d), 0))
+        return mi.depolarizer(dr.select(active, self.arriving(ds.d, *self.row(it, active)[1:]), 0))
 
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
         return mi.Spectrum(0)

@@ -1,7 +1,7 @@
 """The lights of a scene, as numbers in place of calls to plugins where they are known.
 
-A light that is tabled is an emitter with ``numbers()``: its class among those below, and its numbers. To
-table another kind, derive it from ``PointLight`` and return it in the ``row`` of its emitter.
+A light that is tabled is an emitter with ``numbers()``, such as ``mrt_light``. Another kind derives from
+that, adds to its ``row`` and overrides ``arriving``.
 """
 
 from __future__ import annotations
@@ -16,34 +16,22 @@ from .lookup import Table
 from .variants import first, is_jit, largest, pointer
 
 
-class PointLight:
-    """A light at a point, as bright far away as near by; its numbers come in threes."""
-
-    def __init__(self, position: mi.Point3f, intensity: mi.UnpolarizedSpectrum, *more: mi.Vector3f) -> None:
-        self.position, self.intensity, self.more = position, intensity, more
-
-    def arriving(self, d: mi.Vector3f) -> mi.UnpolarizedSpectrum:
-        """Return what arrives at a point from which the light is seen along the unit vector ``d``."""
-        return self.intensity
-
-    def sample_direction(
-        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
-    ) -> tuple[mi.DirectionSample3f, mi.UnpolarizedSpectrum]:
-        """Return the direction to the light, with a density of 1, and what arrives from it."""
-        ds = mi.DirectionSample3f()
-        ds.p = self.position
-        ds.d = ds.p - it.p
-        ds.dist = dr.norm(ds.d)
-        # A point on the light itself has no direction to it; any will do, and scalar variants raise on 0/0
-        away = ds.dist > 0
-        ds.d = dr.select(away, ds.d * (1 / dr.select(away, ds.dist, 1)), mi.Vector3f(0, 0, 1))
-        ds.n, ds.uv, ds.time = mi.Normal3f(-ds.d), mi.Point2f(0), it.time
-        ds.pdf, ds.delta = mi.Float(1), mi.Bool(True)
-        return ds, self.arriving(ds.d)
+def towards(position: mi.Point3f, it: mi.Interaction3f) -> mi.DirectionSample3f:
+    """Return the direction from ``it`` to a point, with a density of 1."""
+    ds = mi.DirectionSample3f()
+    ds.p = position
+    ds.d = ds.p - it.p
+    ds.dist = dr.norm(ds.d)
+    # A point on the light itself has no direction to it; any will do, and scalar variants raise on 0/0
+    away = ds.dist > 0
+    ds.d = dr.select(away, ds.d * (1 / dr.select(away, ds.dist, 1)), mi.Vector3f(0, 0, 1))
+    ds.n, ds.uv, ds.time = mi.Normal3f(-ds.d), mi.Point2f(0), it.time
+    ds.pdf, ds.delta = mi.Float(1), mi.Bool(True)
+    return ds
 
 
 def numbers_of(lights: list[Any]) -> list[Any] | None:
-    """Return lights as classes and numbers; None where not all of them are."""
+    """Return the numbers of lights, in threes; None where not all of them have some."""
     if not is_jit() or mi.is_spectral or not all(hasattr(light, "numbers") for light in lights):
         return None
     found = [light.numbers() for light in lights]
@@ -54,45 +42,44 @@ class Lights:
     """The lights of a scene as its kernels have them; ``form`` is that of the plan."""
 
     def __init__(self, lights: list[Any], numbers: list[Any] | None, form: str) -> None:
-        self.each: list[Any] = []  #: those with code of their own
-        self.pointers = pointer("Emitter", lights) if form == "loop" else None
+        self.unrolled = len(lights) if form == "unrolled" else 0  #: those with code of their own
         self.count = dr.opaque(mi.UInt32, len(lights)) if form in ("loop", "table") else None
-        self.columns: list[Table] = []
-        if form == "unrolled":
-            self.each = lights
-            if numbers is not None:
-                self.each = [_light(kind, *(dr.opaque(mi.Vector3f, p) for p in row)) for kind, row in numbers]
-        elif form == "table" and numbers:
-            self.kinds = list(dict.fromkeys(kind for kind, _ in numbers))  # the kernel holds these only
-            parts = max(len(parts) for _, parts in numbers)
-            rows = np.zeros((1 + parts, len(numbers), 3))
-            for k, (kind, row) in enumerate(numbers):
-                rows[0, k], rows[1 : 1 + len(row), k] = self.kinds.index(kind), row
-            self.columns = [Table(mi.Vector3f, part) for part in rows[len(self.kinds) == 1 :]]
+        self.called: Any = lights if numbers is None else None
+        if form == "loop":
+            self.called = pointer("Emitter", lights)
+        elif form != "none" and numbers is not None:
+            kinds = [type(light) for light in lights]
+            self.kinds = list(dict.fromkeys(kinds))  # the kernel holds these only
+            self.kind_of = [self.kinds.index(kind) for kind in kinds]
+            rows = np.zeros((1 + max(map(len, numbers)), len(lights), 3))
+            for k, row in enumerate(numbers):
+                rows[0, k], rows[1 : 1 + len(row), k] = self.kind_of[k], row
+            if form == "table":
+                self.columns = [Table(mi.Vector3f, part) for part in rows]
+            else:
+                self.rows = [[dr.opaque(mi.Vector3f, part) for part in row] for row in numbers]
 
     def sample(
         self, light: Any, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.UnpolarizedSpectrum]:
         """Return the direction from ``it`` to a light, by its number, and what arrives from it."""
-        if self.each:
-            return self.each[light].sample_direction(it, sample, active)
-        if self.pointers is not None:
-            return dr.gather(mi.EmitterPtr, self.pointers, light, active).sample_direction(it, sample, active)
-        parts = [column(light, active) for column in self.columns]
-        if len(self.kinds) == 1:
-            return _light(self.kinds[0], *parts).sample_direction(it, sample, active)
-        number, *parts = parts
-        found = [_light(kind, *parts).sample_direction(it, sample, active) for kind in self.kinds]
-        ds, arriving = found[0]
-        for k, (_, other) in enumerate(found[1:], start=1):
-            arriving = dr.select(number.x == k, other, arriving)
+        kind: Any = None
+        if self.called is not None:
+            one = (
+                self.called[light] if self.unrolled else dr.gather(mi.EmitterPtr, self.called, light, active)
+            )
+            return one.sample_direction(it, sample, active)
+        if self.unrolled:
+            kinds, row = [self.kinds[self.kind_of[light]]], self.rows[light]
+        else:
+            kinds, row = self.kinds, [column(light, active) for column in self.columns[1:]]
+            kind = self.columns[0](light, active).x if len(kinds) > 1 else None
+        ds, channels = towards(mi.Point3f(row[0]), it), dr.size_v(mi.UnpolarizedSpectrum)
+        row = [mi.UnpolarizedSpectrum(list(row[1])[:channels]), *row[2:]]
+        arriving = kinds[0].arriving(ds.d, *row)
+        for k, other in enumerate(kinds[1:], start=1):
+            arriving = dr.select(kind == k, other.arriving(ds.d, *row), arriving)
         return ds, arriving
-
-
-def _light(kind: type[PointLight], position: Any, intensity: Any, *more: Any) -> PointLight:
-    """Return a light by its numbers: three of a colour, whatever colours the variant has."""
-    channels = dr.size_v(mi.UnpolarizedSpectrum)
-    return kind(mi.Point3f(position), mi.UnpolarizedSpectrum(list(intensity)[:channels]), *more)
 
 
 def brightness(emitter: Any) -> float:

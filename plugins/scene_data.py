@@ -88,7 +88,7 @@ class SceneData:
     def _buffers(self, reading: Reading) -> list[tuple[PointBuffer, Any]]:
         """Return lists of what may be in the way of the lights, with what tests it."""
         things = [thing for thing in (self.quadrics, self.spheres) if thing is not None and self.plan.buffers]
-        places = np.array([row[0] for _, row in reading.numbers or ()])
+        places = np.array([row[0] for row in reading.numbers or ()])
         return [(PointBuffer(places, *thing.boxes()), thing) for thing in things]
 
     # ----------------------------------------- Ray queries ---------------------------------------------

@@ -280,7 +280,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             visible = but_not(facing, data.occluded(scene, hit, light, ds, traced))
             return dr.select(visible, value, 0), dr.select(traced, mi.UInt32(1), mi.UInt32(0))
 
-        samples = [sampled(light, sampler) for light in range(len(data.lights.each))]
+        samples = [sampled(light, sampler) for light in range(data.lights.unrolled)]
         values, reflectance, int_ior = data.eval_bsdf(
             hit, [wo for _, wo, _, _ in samples], [facing for *_, facing in samples], plan.mirrors
         )

@@ -13,7 +13,6 @@ import pytest
 from nodes import sensor
 
 from mrt_mitsuba.plugins import plugin
-from mrt_mitsuba.plugins.lights import PointLight
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -81,14 +80,13 @@ def test_light_tracing_is_refused() -> None:
 def test_other_kinds_of_lights_join_the_table() -> None:
     """Next to ``mrt_light``, and by themselves: the picture is that of calls to each."""
 
-    class Leaning(PointLight):
-        def arriving(self, d: Any) -> Any:
-            return self.intensity * dr.clip(2 * dr.dot(d, self.more[0]) - 1, 0, 1)
-
     class LeaningLight(plugin("light").MrtLight):  # type: ignore[misc]
-        def row(self, it: Any, active: Any = True) -> PointLight:
-            light = super().row(it, active)
-            return Leaning(light.position, light.intensity, mi.Vector3f(0.6, 0, 0.8))
+        def row(self, it: Any, active: Any = True) -> list[Any]:
+            return [*super().row(it, active), mi.Vector3f(0.6, 0, 0.8)]
+
+        @staticmethod
+        def arriving(d: Any, intensity: Any, *more: Any) -> Any:
+            return intensity * dr.clip(2 * dr.dot(d, more[0]) - 1, 0, 1)
 
     mi.register_emitter("leaning", LeaningLight)
     for kinds in (["leaning"], ["mrt_light", "leaning"], ["leaning", "mrt_light"]):
