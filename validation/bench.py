@@ -43,13 +43,15 @@ Row = dict[str, float]
 
 def rows(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     """Measure; yield each row with its name."""
+    from mrt_mitsuba import runtime
     from mrt_mitsuba.validation.studies import speed
 
     repeats = 1 if given.quick else given.turns
     if given.device:
-        sizes, triangles = (((80, 60),), 1000) if given.quick else (((800, 600), (4096, 4096)), 10**6)
-        for pair in speed.on_device(given.device, sizes, triangles):
-            yield pair.name, speed.compare(pair, repeats)[0]
+        runtime.use(given.device)
+        for width, height in ((80, 60),) if given.quick else ((800, 600), (4096, 4096)):
+            for pair in speed.against_mitsuba(speed.Extent(width, height, 1, range(5), repeats, 1)):
+                yield f"{pair.name}, {width}x{height}", speed.compare(pair, repeats)[0]
         return
     yield "mrt out 0 / a bare start of Mitsuba", start(repeats)
     yield from cases(given, repeats)

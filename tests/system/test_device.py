@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.studies import speed
+from mrt_mitsuba.validation import bench
 
 SIZE = {"width": 16, "height": 12}
 # Float32 in another order of operations; at edges and in narrow highlights a rounding can turn a pixel
@@ -78,9 +79,8 @@ def test_make_test_gpu_runs_its_selection_where_it_is_told_to(tmp_path: Path) ->
         assert missing.returncode == 1 and "needs an NVIDIA GPU" in missing.stdout + missing.stderr
 
 
-def test_bench_of_a_device_measures_all_pairs() -> None:
-    pairs = list(speed.on_device("llvm_ad_rgb", [(80, 60)], 1000))
-    assert len(pairs) == 2 * 6 and len({pair.name for pair in pairs}) == 12
-    for pair in (pairs[0], pairs[-1]):
-        time, _ = speed.compare(pair, 1)
-        assert time.seconds > 0 and time.other_seconds > 0
+def test_bench_of_a_device_measures_pairs_in_its_variant() -> None:
+    rows = bench.rows(Namespace(device="llvm_ad_spectral", quick=True, turns=1, small=False))
+    name, row = next(rows)
+    assert mi.variant() == "llvm_ad_spectral" and name.endswith("materials, 80x60")
+    assert row["seconds"] > 0 and row["other_seconds"] > 0

@@ -200,26 +200,3 @@ def growth(extent: Extent) -> Iterator[Pair]:
 
 
 PARTS = (against_mitsuba, other_ways, growth)
-
-
-def on_device(variant: str, sizes: Sequence[tuple[int, int]], triangles: int) -> Iterator[Pair]:
-    """Yield the report's scenes and many triangles in a variant, against Mitsuba's ``direct`` and ``path``.
-
-    ``mrt_whitted`` renders with one ray a pixel; the others render the scene of Mitsuba's own plugins (but
-    for the mesh), one sample a pixel. They compute other light: the ratio says what a picture costs, not
-    which is better. Raises ``VariantError`` where there is no device.
-    """
-    runtime.use(variant)
-
-    def make(nodes: Run, integrator: Nodes) -> tuple[Run, Run]:
-        return _render(nodes(flavor="mrt")), _by_mitsuba(nodes(flavor="stock"), integrator)
-
-    for width, height in sizes:
-        size: dict[str, Any] = {"width": width, "height": height}
-        scenes: dict[str, Run] = {f"scene {n}": partial(mrt.scene_dict, n, **size) for n in range(5)}
-        hills = renders.with_triangles(triangles, **size)
-        scenes[f"{triangles} triangles"] = lambda flavor, hills=hills: hills
-        for name, nodes in scenes.items():
-            for other in ({"type": "direct"}, {"type": "path", "max_depth": 6}):
-                what = f"{name}, {width}x{height}, mrt_whitted / {other['type']}"
-                yield Pair(what, partial(make, nodes, other), 1.0)
