@@ -49,6 +49,13 @@ def test_infinite_depths_are_equal_where_both_are() -> None:
     assert mrt.compare(depth, other).mae == np.inf  # one of them hits nothing there
 
 
+def mean_of(rays: np.ndarray, path: Path) -> Path:
+    """Write the mean of rays [N, H, W, C] with its standard error."""
+    error = np.sqrt(rays.var(axis=0, ddof=1).mean(axis=-1) / len(rays))
+    write_exr(path, np.broadcast_to(rays.mean(axis=0), (*error.shape, 3)), {"error": error})
+    return path
+
+
 def test_more_than_noise(tmp_path: Path) -> None:
     """The mean of 16 rays: p is small for one picture 2 % brighter, or one pixel off by 14 deviations."""
     rng = np.random.default_rng(1)
@@ -56,9 +63,7 @@ def test_more_than_noise(tmp_path: Path) -> None:
     def noisy(name: str, scale: float, spot: float = 0) -> Path:
         rays = 0.5 * scale * (1 + 0.1 * rng.normal(size=(16, 24, 32, 3)))
         rays[:, 7, 9] += spot
-        error = np.sqrt(rays.var(axis=0, ddof=1).mean(axis=-1) / 16)
-        write_exr(tmp_path / name, rays.mean(axis=0), {"error": error})
-        return tmp_path / name
+        return mean_of(rays, tmp_path / name)
 
     assert mrt.compare(noisy("a.exr", 1.02), noisy("b.exr", 1)).p_value < 1e-6
     assert mrt.compare(noisy("a.exr", 1.02), 0.5 * np.ones((24, 32, 3))).p_value < 1e-6  # one side exact
@@ -68,13 +73,10 @@ def test_more_than_noise(tmp_path: Path) -> None:
 @pytest.mark.parametrize("share", [0, 0.01])
 def test_p_value_is_uniform_for_equal_pictures(share: float, tmp_path: Path) -> None:
     """Also where 1 % of the rays is bright, and most pixels state far too small an error."""
-    rng = np.random.default_rng(2)
+    rng, size = np.random.default_rng(2), (16, 24, 32, 1)
 
     def noisy(name: str) -> Path:
-        rays = 0.5 + 0.05 * rng.normal(size=(16, 24, 32)) + 50 * (rng.random((16, 24, 32)) < share)
-        layers = {"error": rays.std(axis=0, ddof=1) / 4}
-        write_exr(tmp_path / name, np.repeat(rays.mean(axis=0)[..., None], 3, axis=-1), layers)
-        return tmp_path / name
+        return mean_of(0.5 + 0.05 * rng.normal(size=size) + 50 * (rng.random(size) < share), tmp_path / name)
 
     p = [mrt.compare(noisy("a.exr"), noisy("b.exr")).p_value for _ in range(120)]
     assert stats.kstest(p, "uniform").pvalue > 0.01

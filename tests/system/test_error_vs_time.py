@@ -104,19 +104,6 @@ def test_references_of_other_kinds(variant, tmp_path):
         assert np.isnan(two.efficiency)
 
 
-def test_renders_to_an_error_are_cases_too(scene):
-    """They come to it, and their own estimate is not what they are judged by."""
-    cases = {
-        "target 0.0015": {"integrator": "path", "target": 0.0015, "maxspp": 512},
-        "noise": path(64, aamode="noise"),
-    }
-    found = mrt.error_vs_time(scene, cases, reference=path(4096, **ONE_RAY), repeats=3)
-    assert not found.failed
-    # So few pixels take more rays than the target needs, for fewer do not show what is rare
-    assert 0.2 * 0.0015 < found.points["target 0.0015"].rmse < 1.2 * 0.0015
-    assert found.points["noise"].bias_interval[0] == 0
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -147,6 +134,9 @@ def test_time_to_an_error_is_read_off_the_curve():
     curve = found_of(point("a 1", [1.0] * 3, 0.4), point("a 4", [4.0] * 3, 0.2), point("b", [9.0] * 3, 0.01))
     for error, seconds in ((0.5, 1), (0.4, 1), (0.4 / 2**0.5, 2), (0.2, 4), (0.19, np.inf)):
         assert tuple(curve.time_to(error)["a"]) == pytest.approx((seconds,) * 3)
+    once = found_of(point("a", [1.0]), point("b", [9.0]))
+    assert once.verdicts == ["No verdict on time: a single repeat has no interval."]
+    assert np.isnan([*once.time_to(0.1)["a"][1:], once.points["a"].rmse_interval[1]]).all()
 
 
 NAMED, LIKE, ONLY = "a is the fastest, 1", "no winner, for the intervals overlap: a, b", "only a comes so low"
@@ -164,12 +154,6 @@ NAMED, LIKE, ONLY = "a is the fastest, 1", "no winner, for the intervals overlap
 def test_a_winner_is_named_only_if_intervals_are_apart(times, rmse, errors, verdict):
     found = found_of(point("a", [1.0, 1.1, 0.9, 1.05]), point("b", times, rmse), errors=errors)
     assert verdict in found.verdicts[0] and verdict in str(found)
-
-
-def test_one_repeat_gives_no_verdict_and_no_interval():
-    found = found_of(point("a", [1.0]), point("b", [9.0]))
-    assert found.verdicts == ["No verdict on time: a single repeat has no interval."]
-    assert np.isnan([*found.time_to(0.1)["a"][1:], found.points["a"].rmse_interval[1]]).all()
 
 
 @pytest.mark.parametrize("count", [3, 5, 10])

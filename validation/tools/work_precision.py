@@ -442,7 +442,7 @@ def _diagram(found: Findings, points: Sequence[Point]) -> Any:
         ends = np.array([[p.seconds_interval, p.rmse_interval] for p in curve]).transpose(1, 2, 0)
         x, y = np.nan_to_num(np.maximum(np.stack([places - ends[:, 0], ends[:, 1] - places], axis=1), 0))
         style: dict[str, Any] = {"marker": marker, "markersize": 5, "linewidth": 1, "capsize": 2}
-        axes.errorbar(*places, xerr=x, yerr=y, label=name, **style)
+        axes.errorbar(places[0], places[1], xerr=x, yerr=y, label=name, **style)
     for number, point in enumerate(points, 1):
         place = point.seconds, max(point.rmse, bottom)
         axes.annotate(str(number), place, textcoords="offset points", xytext=(4, 4), fontsize=8)
