@@ -201,9 +201,8 @@ def rendered(study: Study, *, quick: bool) -> None:
         study.at_most(f"share of {SAME}, {at}", found.errors[SAME], 5e-3, why)
         what, why = f"p of the difference with independent numbers, {at}", "pixels, tiles and the picture"
         study.at_least(what, found.errors[P_VALUE], LEVEL, why)
-        study.record(f"relRMSE of the averages, {at}", found.errors[RELATIVE])
-        study.record(f"time, ours over theirs, {at}", found.timings["ratio"])
         one, other, difference = found.images.values()
         sheet = np.concatenate([one, other, 20 * np.abs(difference)], axis=1)
-        caption = f"{found.samples} samples per pixel each, independent: the difference is noise."
+        caption = f"{found.samples} samples per pixel each, independent: the difference is noise, relRMSE "
+        caption += f"{found.errors[RELATIVE]:.2g}. Time, ours over theirs: {found.timings['ratio']:.2f}."
         study.picture(f"pictures-{alpha:g}", f"Ours, Mitsuba's, |difference| × 20; {at}", sheet, caption)

@@ -68,7 +68,6 @@ class Study:
     images: dict[str, dict[str, Any]] = field(default_factory=dict)  # title, content, caption
     bounds: list[Bound] = field(default_factory=list)
     goals: list[Bound] = field(default_factory=list)  # of speed: shown, but the verdict ignores them
-    figures: dict[str, float] = field(default_factory=dict)  # single numbers worth keeping, without a bound
     seconds: float = 0.0  # that it took
     failure: str = ""  # the traceback where it broke off
 
@@ -101,10 +100,6 @@ class Study:
     ) -> None:
         """Show whether a time or a ratio of times is at most so much; a busy machine must fail no study."""
         self.goals.append(Bound(name, float(measured), float(limit), note=note, interval=interval))
-
-    def record(self, name: str, value: float) -> None:
-        """Keep a number in the summary."""
-        self.figures[name] = float(value)
 
     def table(
         self,
@@ -147,7 +142,6 @@ class Study:
             "title": self.title,
             "bounds": [bound.as_dict() for bound in self.bounds],
             "goals": [goal.as_dict() for goal in self.goals],
-            "figures": self.figures,
             "tables": self.tables,
             "passed": self.passed,
             "verdict": self.verdict,
