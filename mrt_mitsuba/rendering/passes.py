@@ -105,12 +105,11 @@ class Passes:
         film, moments = self._shader.film, "square" in step.layers
         rays = film.rays_near(step.places.size)
         if not self._shader.layers:
-            from mrt_mitsuba.rendering.whole import Wholes
+            from mrt_mitsuba.rendering.whole import whole_pictures
 
-            wholes = Wholes(exposer, seed)
-            with self._stage(step, wholes.cost([rays])) as advance:
-                wholes.trace([rays], advance)
-            self._develop(exposer, wholes.mean())
+            with self._stage(step, rays * film.pixels) as advance:
+                counts, pictures = zip(*whole_pictures(exposer, seed, rays, advance), strict=True)
+            self._develop(exposer, np.average(pictures, axis=0, weights=counts))
             return
         marked = np.zeros((plan.height, plan.width), bool)
         if step.name == RENDERING:
@@ -134,17 +133,22 @@ class Passes:
     def _run_rounds(self, step: Pass) -> None:
         """Expose pixels until the noise is as low as was asked for."""
         from mrt_mitsuba.rendering.noise import Halves
-        from mrt_mitsuba.rendering.rounds import Goal, run_rounds
+        from mrt_mitsuba.rendering.rounds import run_rounds
         from mrt_mitsuba.rendering.whole import Wholes
 
         keep_freed_blocks()
         exposer, settings = self._film_exposer(step), self._settings
-        most = int(settings.maxspp or settings.spp or 1)
-        goal = Goal(settings.rmse, most, settings.maxseconds, settings.on_round)
         blurred = self._blurred if self._plan.blur else None
         whole = not self._shader.layers
         halves: Any = Wholes(exposer, self._seed) if whole else Halves(exposer, self._seed, blurred)
-        self.rounds, self.error = run_rounds(halves, self._shader.film.pixels, goal, self._job.stage)
+        self.rounds, self.error = run_rounds(
+            halves,
+            self._job.stage,
+            rays=int(settings.maxspp or settings.spp or 1),
+            target=settings.rmse,
+            seconds=settings.maxseconds,
+            on_round=settings.on_round,
+        )
         self._develop(exposer, halves.mean())
         variance = halves.variance()
         self._set("variance", variance)

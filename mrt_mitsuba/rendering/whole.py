@@ -2,146 +2,95 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.filters.grid import window_means
-from mrt_mitsuba.output.error import ErrorEstimate, tail_shape
+from mrt_mitsuba.output.error import tail_shape
 from mrt_mitsuba.rendering.exposing import Exposer
+from mrt_mitsuba.rendering.noise import HALVES, SCOUTS, Halves, quarter_squares
 
-PICTURES = 4  # two halves, whose mean is the picture, and two scouts, which decide when to stop
-SCOUTING = 1 / 8  # rays of scouts over those of halves
-REACH = 4  # half the width of windows over which squared differences are averaged
 _STRIDE = 0x9E3779B9  # from one seed to the next: the golden ratio in 32 bits
 
 
-class Wholes:
-    """Two half pictures and two scouts, as they grow by rounds; see ``noise.Halves``.
-
-    What to trace in a round: the rays of a pixel in each picture.
-    """
-
-    least = 64  #: mean rays of a pixel that a target takes at least, in a small picture
-    last = False  #: was the last round decided?
-
-    def __init__(self, exposer: Exposer, seed: int) -> None:
-        film = exposer.film
-        if film.bands:
-            raise UsageError(
-                f"the integrator {exposer.shader.name} gives whole pictures, which this film keeps as "
-                f"{', '.join(film.bands)}: use an hdrfilm"
-            )
-        self.film, self._exposer, self._seed, self._runs = film, exposer, seed, 0
-        height, width = (n - 2 * film.border for n in film.shape)
-        self._sums = np.zeros((PICTURES, height, width, len(exposer.names)))
-        self._rays = np.zeros(PICTURES, np.int64)
-
-    def first(self) -> Sequence[int]:
-        """Return the rays of the first round."""
-        return 2, 2, 1, 1
-
-    def cost(self, chosen: Sequence[int]) -> int:
-        """Return the number of rays that pictures take."""
-        return sum(chosen) * self.film.pixels
-
-    def trace(self, chosen: Sequence[int], advance: Callable[[int], object]) -> None:
-        """Render pictures, in parts that fit into memory."""
-        job, channels = self._exposer.job, self._sums.shape[-1]
-        most = max(1, job.workspace.rays_at_once(channels) // self.film.pixels)
-        for picture, rays in enumerate(chosen):
-            for done in range(0, rays, most):
-                count = self.film.rays_near(min(most, rays - done))
-                self._sums[picture] += count * self._rendered(count)
-                self._rays[picture] += count
-                advance(count * self.film.pixels)
-                job.rays["primary"] += count * self.film.pixels
-
-    def _rendered(self, rays: int) -> np.ndarray:
-        """Return the channels of a picture, [H, W, channels], by seeds of its own."""
-        shader, sensor = self._exposer.shader, self._exposer.shader.sensor
-        seed, self._runs = (self._seed + self._runs * _STRIDE) % 2**32, self._runs + 1
+def whole_pictures(
+    exposer: Exposer, seed: int, rays: int, advance: Callable[[int], object]
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield pictures [H, W, channels], which have so many rays a pixel in all and fit into memory, with the
+    rays of each."""
+    job, film, shader = exposer.job, exposer.film, exposer.shader
+    if film.bands:
+        raise UsageError(
+            f"the integrator {shader.name} gives whole pictures, which this film keeps as "
+            f"{', '.join(film.bands)}: use an hdrfilm"
+        )
+    most = max(1, job.workspace.rays_at_once(len(exposer.names)) // film.pixels)
+    for done in range(0, rays, most):
+        count = film.rays_near(min(most, rays - done))
         try:
-            shader.integrator.render(shader.scene, sensor, seed=seed, spp=rays)
+            shader.integrator.render(shader.scene, shader.sensor, seed=seed, spp=count)
         except RuntimeError as error:  # such as a lamp that no ray can start at
             text = " ".join(str(error).split())
             raise SceneError(f"the integrator {shader.name} cannot render this scene: {text}") from error
-        raw = np.array(sensor.film().develop(raw=True), np.float64)  # whatever its pixel format
-        place = 4 if self.film.alpha else 3
+        raw = np.array(shader.sensor.film().develop(raw=True), np.float64)  # whatever its pixel format
+        place = 4 if film.alpha else 3
         weight = raw[..., place]
         found = np.delete(raw, place, -1) / np.where(weight == 0, 1, weight)[..., None]
-        if self.film.grey:
+        if film.grey:
             found[..., :3] = (found[..., :3] @ [0.212671, 0.715160, 0.072169])[..., None]
-        return found
+        yield count, found
+        seed = (seed + _STRIDE) % 2**32
+        advance(count * film.pixels)
+        job.rays["primary"] += count * film.pixels
 
-    def mean(self) -> np.ndarray:
-        """Return the picture, [H, W, channels]."""
-        return np.asarray(self._sums[:2].sum(0) / self._rays[:2].sum())
 
-    def samples(self) -> np.ndarray:
-        """Return the rays of each pixel, those of scouts included, [H, W]."""
-        return np.full(self._sums.shape[1:3], float(self._rays.sum()))
+class Wholes(Halves):
+    """Two half pictures and two scouts of which all pixels get the same rays.
 
-    def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the picture [H, W, 3], and the standard error and the rays of each pixel, [H, W]."""
-        return self.mean()[..., :3], np.sqrt(self.variance().mean(-1)), self.samples()
+    A picture has no single rays, so halves and scouts are compared as they are; what rules rays by their tail
+    rules sums of them, too.
+    """
 
-    def unfit(self) -> str:
-        """Return where the picture is no number; nothing if it is one everywhere."""
-        bad = np.argwhere(~np.isfinite(self._sums[..., :3]).all((0, -1)))
-        if not len(bad):
-            return ""
-        where = f"{len(bad)} pixels, the first at row {bad[0, 0]}, column {bad[0, 1]}"
-        return f"radiance that is no number was met in {where}: they are left out of the error"
+    group = 1
+    begin = (2, 2, 1, 1)
+    scouting = (1 / 8, 1 / 8)
+    least = 64
+
+    def trace(self, chosen: np.ndarray, advance: Callable[[int], object]) -> None:
+        """Render pictures."""
+        border = [(self.film.border,) * 2] * 2
+        for picture, rays in enumerate(chosen[:, 0]):
+            for count, found in whole_pictures(self._exposer, self._seed, int(rays), advance):
+                values = np.pad(count * found, [*border, (0, 0)])
+                self._seed = (self._seed + _STRIDE) % 2**32
+                self._traced[picture] += count
+                self._total[picture] += values[..., :3]
+                if picture in HALVES:
+                    self._sums[picture] += values
+                    self._weights[picture] += count
+                    self._amount[picture] += count
+                    self.rays[picture] += count
+        self._bad = ~np.isfinite(self._total).all((0, -1))
+        self._unfit = self._total[:, self._bad].max(initial=-np.inf)
 
     def variance(self) -> np.ndarray:
-        """Return the estimated variance of each channel in the picture, [H, W, 3]."""
-        return np.moveaxis(window_means(np.moveaxis(self._squares(0), -1, 0), REACH), 0, -1)
+        squares = window_means(np.moveaxis(self._squares(HALVES), -1, 0), 4)
+        return np.moveaxis(squares, 0, -1)
 
-    def rmse(self) -> float:
-        """Return the estimated RMSE of the picture."""
-        return math.sqrt(float(self._squares(0).mean(-1).mean()))  # summed as in ``error``
+    def _decisive(self, *_: list[int]) -> np.ndarray:
+        """Return the variance of a pixel times its rays as the scouts have it, alike in all pixels."""
+        return np.full(self.film.shape, self._squares(SCOUTS).mean() * self._traced[SCOUTS].sum(0)[0])
 
-    def error(self) -> ErrorEstimate:
-        """Return the estimated RMSE of the picture, by the difference of its halves; see ``Halves.error``.
+    def _due(self, rays: np.ndarray, have: np.ndarray) -> np.ndarray:
+        return np.asarray(np.maximum(np.ceil(rays) - have, 0), np.int64)
 
-        Its tail is that of the differences: what rules rays by their tail rules sums of them, too.
-        """
-        squares = self._squares(0).mean(-1)
-        mean = float(squares.mean())
-        if mean == 0:
-            return ErrorEstimate(0.0, 0.0, 0.0, 0.0)
-        spread = math.sqrt(2 * self.film.correlation * float(np.square(squares).sum())) / float(squares.sum())
-        return ErrorEstimate.of(math.sqrt(mean), spread, self._tail(0))
-
-    def forecast(self) -> tuple[float, float]:
-        """Return the RMSE of the picture, and the shape of its tail, as the scouts have them."""
-        share = self._rays[2:].sum() / self._rays[:2].sum()
-        return math.sqrt(float(self._squares(2).mean() * share)), self._tail(2)
-
-    def next(self, most: float, rays: float, target: float | None) -> Sequence[int]:
-        """Return further rays of each picture; see ``Halves.next``."""
-        done, halves = int(self._rays.sum()), int(self._rays[:2].sum())
-        wanted = math.inf if target is None else halves * ((self.forecast()[0] / target) ** 2 - 1)
-        self.last = most >= rays or wanted <= most - done
-        if self.last:
-            half = int(
-                min(math.ceil(max(wanted, 0) / 2) if wanted < math.inf else math.inf, (rays - done) // 2)
-            )
-            return half, half, 0, 0
-        half = int((most - done) / 2 / (1 + SCOUTING))
-        due = max(0, int(SCOUTING * (halves / 2 + half)) - int(self._rays[2]))
-        return half, half, due, due
-
-    def _squares(self, first: int) -> np.ndarray:
-        """Return a quarter of the squared difference of two pictures, [H, W, 3]; 0 where it is no number."""
-        with np.errstate(invalid="ignore", over="ignore"):
-            one, other = (self._sums[i, ..., :3] / self._rays[i] for i in (first, first + 1))
-            found = np.square(one - other) / 4
-        return np.where(np.isfinite(found), found, 0)
-
-    def _tail(self, first: int) -> float:
-        values = np.sqrt(self._squares(first).mean(-1)).ravel()
+    def _tail(self, which: list[int]) -> float:
+        values = np.sqrt(self._squares(which).mean(-1)).ravel()
         return tail_shape(values, np.ones(len(values)))
+
+    def _squares(self, which: list[int]) -> np.ndarray:
+        """Return a quarter of the squared difference of two pictures, [H, W, 3], without the border."""
+        means = self._total[which] / self.rows(self._traced)[which][..., None]
+        return self.film.picture(np.where(self._bad[..., None], 0, quarter_squares(*means)))

@@ -15,7 +15,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.output.error import DOUBTFUL
 from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.rendering.noise import Halves
-from mrt_mitsuba.rendering.rounds import Goal, run_rounds
+from mrt_mitsuba.rendering.rounds import run_rounds
 
 SIDE = 16
 PIXELS = SIDE**2
@@ -57,9 +57,8 @@ class Draws:
 
 def _render(exposer: Draws, seed: int = 0, **goal: Any) -> Any:
     """Return what a render of drawn values has."""
-    aim = Goal(goal.pop("target", None), goal.pop("rays", 64), **goal)
     halves = Halves(exposer, seed)  # type: ignore[arg-type]
-    rounds, error = run_rounds(halves, PIXELS, aim, lambda *_: nullcontext(lambda rays: None))
+    rounds, error = run_rounds(halves, lambda *_: nullcontext(lambda rays: None), **{"rays": 64} | goal)
     image, error_map, samples = halves.maps()
     return SimpleNamespace(
         rounds=rounds, error=error, rays=halves.rays, image=image, map=error_map, samples=samples
