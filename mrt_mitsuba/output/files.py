@@ -110,14 +110,11 @@ def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], heade
     if planes["RGB"].ndim != 3 or planes["RGB"].shape[2] != 3:
         raise OutputError(f"the picture has shape {planes['RGB'].shape}; expected [H, W, 3]")
     for name, array in layers.items():
-        array = np.asarray(array, np.float32)
-        if array.shape[:2] != np.shape(image)[:2] or array.ndim not in (2, 3):
-            raise OutputError(f"layer {name} of shape {array.shape} does not fit the picture")
-        array = np.atleast_3d(array)
+        array = np.atleast_3d(np.asarray(array, np.float32))
         letters = LAYERS[name].letters if name in LAYERS else "RGB" if array.shape[2] == 3 else "Y"
         names = [name] if "." in name or name == "A" else [f"{name}.{letter}" for letter in letters]
-        if len(names) != array.shape[2]:
-            raise OutputError(f"layer {name} has {array.shape[2]} channels in place of {len(names)}")
+        if array.shape != (*planes["RGB"].shape[:2], len(names)):
+            raise OutputError(f"layer {name} of shape {array.shape} is no {' '.join(names)} of the picture")
         planes |= {each: np.ascontiguousarray(array[:, :, index]) for index, each in enumerate(names)}
     texts = {name: v if isinstance(v, str | int | float) else json.dumps(v) for name, v in header.items()}
     kind = compression(image.shape[0] * image.shape[1])
@@ -126,7 +123,7 @@ def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], heade
     # few rows at a time by code in Python: within its own code, and that of Python's files, a signal would
     # wait until all is written.
     stream = SimpleNamespace(tell=file.tell, seek=file.seek, write=lambda rows: file.write(rows))
-    with contextlib.nullcontext() if kind == OpenEXR.NO_COMPRESSION else compressing():
+    with compressing():
         picture.write(stream)
 
 
@@ -156,8 +153,7 @@ def read_exr(path: Path) -> Picture:
     import numpy as np
 
     planes, headers = read_channels(path)
-    missing = [channel for channel in "RGB" if channel not in planes]
-    if missing:
+    if missing := [channel for channel in "RGB" if channel not in planes]:
         raise OutputError(f"cannot read {os.fspath(path)}: it has no channel {missing[0]!r}")
     image = np.stack([planes.pop(channel) for channel in "RGB"], axis=-1)  # [H, W, 3]
     return Picture(image, planes, headers["R"])

@@ -4,10 +4,10 @@ thing and the way out, and no file left behind."""
 from __future__ import annotations
 
 import base64
-import dataclasses
 import math
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -258,6 +258,7 @@ TINY: dict[str, Any] = {"width": 8, "height": 6, "aa": 1}
 MATTE = Material(1.5, 0.1, (0, 0, 0), (0.5, 0.5, 0.5))
 EMPTY = Scene(Camera((0, 0, 5), (0, 0, 0)), BLUE_SKY, ())
 NAN, INFINITE = math.nan, math.inf
+POINTS = np.zeros((3, 3))
 
 
 @pytest.mark.parametrize(
@@ -292,18 +293,15 @@ def test_render_refuses(arguments: dict[str, Any], text: str) -> None:
         ({"type": 3}, "type is 3; give the name of a plugin"),
         ({"type": "scene", "ball": {"type": "sphere", "center": None}}, "ball.center is None; give it a"),
         ({"type": "mrt_bsdf", "alpha": "big"}, "mrt_bsdf: \"alpha\" is 'big', but must be a number"),
-        (dataclasses.replace(EMPTY, sky=(0, NAN, 0)), "sky is (0, nan, 0), but must be three finite"),
-        (dataclasses.replace(EMPTY, texturing="nice"), "texturing is 'nice', but must be report or standard"),
-        (dataclasses.replace(EMPTY, camera=Camera((1, 1, 1), (1, 1, 1))), "are the same point"),
-        (dataclasses.replace(EMPTY, camera=Camera((0, NAN, 0), (0, 0, 0))), "position is (0, nan, 0)"),
-        (dataclasses.replace(EMPTY, camera=Camera((0, 0, 5), (0, 0, 0), hfov=180)), "less than 180 degrees"),
-        (dataclasses.replace(EMPTY, spheres=(Sphere((0, 0, 0), 0, MATTE),)), "spheres[0] is Sphere("),
-        (dataclasses.replace(EMPTY, cones=(Cone((0, 0, INFINITE), (0, 0, 0), 1, MATTE),)), "cones[0] is"),
-        (dataclasses.replace(EMPTY, cylinders=(Cylinder((0, 0, 0), (0, 0, 0), 1, MATTE),)), "two points"),
-        (
-            dataclasses.replace(EMPTY, meshes=(Mesh(np.zeros((3, 3)), np.array([[0, 1, 7]]), MATTE),)),
-            '"faces" holds 7, but there are 3 positions',
-        ),
+        (replace(EMPTY, sky=(0, NAN, 0)), "sky is (0, nan, 0), but must be three finite"),
+        (replace(EMPTY, texturing="nice"), "texturing is 'nice', but must be report or standard"),
+        (replace(EMPTY, camera=Camera((1, 1, 1), (1, 1, 1))), "are the same point"),
+        (replace(EMPTY, camera=Camera((0, NAN, 0), (0, 0, 0))), "position is (0, nan, 0)"),
+        (replace(EMPTY, camera=Camera((0, 0, 5), (0, 0, 0), hfov=180)), "less than 180 degrees"),
+        (replace(EMPTY, spheres=(Sphere((0, 0, 0), 0, MATTE),)), "spheres[0] is Sphere("),
+        (replace(EMPTY, cones=(Cone((0, 0, INFINITE), (0, 0, 0), 1, MATTE),)), "cones[0] is"),
+        (replace(EMPTY, cylinders=(Cylinder((0, 0, 0), (0, 0, 0), 1, MATTE),)), "two points"),
+        (replace(EMPTY, meshes=(Mesh(POINTS, np.array([[0, 1, 7]]), MATTE),)), '"faces" holds 7, but there'),
     ],
     ids=str,
 )
