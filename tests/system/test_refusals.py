@@ -205,7 +205,7 @@ FACE = "f 1 2 3\n"
 # The text, the line that is named, and what is said of it
 BROKEN_OBJ: list[tuple[str, int | None, str]] = [
     ("", None, "has no faces; export the model with its geometry"),
-    (SQUARE + "f 1 2 9\n", 5, "v index 9, but the file has 4"),
+    (SQUARE + 2 * FACE + "f 1 2 9\n", 7, "v index 9, but the file has 4"),
     (SQUARE + "f 1 \\\n2 \\\n3\nf 1 2 9\n", 8, "v index 9"),
     (SQUARE + "f 0 1 2\n", 5, "v index of 0, or before the first; indices count from 1"),
     (SQUARE + UVS + "f 1/1 2/2 3/5\n", 9, "vt index 5, but the file has 4"),
@@ -258,7 +258,7 @@ TINY: dict[str, Any] = {"width": 8, "height": 6, "aa": 1}
 MATTE = Material(1.5, 0.1, (0, 0, 0), (0.5, 0.5, 0.5))
 EMPTY = Scene(Camera((0, 0, 5), (0, 0, 0)), BLUE_SKY, ())
 NAN, INFINITE = math.nan, math.inf
-POINTS = np.zeros((3, 3))
+POINTS, BALL = np.zeros((3, 3)), Sphere((0, 0, 0), 1, MATTE)
 
 
 @pytest.mark.parametrize(
@@ -298,7 +298,7 @@ def test_render_refuses(arguments: dict[str, Any], text: str) -> None:
         (replace(EMPTY, camera=Camera((1, 1, 1), (1, 1, 1))), "are the same point"),
         (replace(EMPTY, camera=Camera((0, NAN, 0), (0, 0, 0))), "position is (0, nan, 0)"),
         (replace(EMPTY, camera=Camera((0, 0, 5), (0, 0, 0), hfov=180)), "less than 180 degrees"),
-        (replace(EMPTY, spheres=(Sphere((0, 0, 0), 0, MATTE),)), "spheres[0] is Sphere("),
+        (replace(EMPTY, spheres=(BALL, replace(BALL, radius=0))), "spheres[1] is Sphere("),
         (replace(EMPTY, cones=(Cone((0, 0, INFINITE), (0, 0, 0), 1, MATTE),)), "cones[0] is"),
         (replace(EMPTY, cylinders=(Cylinder((0, 0, 0), (0, 0, 0), 1, MATTE),)), "two points"),
         (replace(EMPTY, meshes=(Mesh(POINTS, np.array([[0, 1, 7]]), MATTE),)), '"faces" holds 7, but there'),
