@@ -135,7 +135,7 @@ def lanes(call: Callable[..., Any], *columns: tuple[str, Array]) -> list[Array]:
         found = [plain(value) for value in call(*(as_mitsuba(kind, column) for kind, column in columns))]
         dr.eval(found)
     return [
-        np.stack([np.broadcast_to(np.array(x), count) for x in value], axis=-1)
+        np.array([np.broadcast_to(np.array(x), count) for x in value]).T  # sums over channels are quicker so
         if dr.depth_v(value) > 1
         else np.broadcast_to(np.array(value), count)
         for value in found
