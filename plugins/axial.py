@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -60,6 +60,11 @@ class AxialMesh(mi.Mesh):
         """Return the unit frame with its derivatives, None where none are wanted."""
         values = list(self.parameters.values())
         return self._frame_of(*values) if dr.grad_enabled(values) else None
+
+    def looked_at(self) -> tuple[Sequence[Any], Sequence[Any], Sequence[Any]]:
+        """Return what a snapshot compares in place of all attributes: plain values, objects, and arrays."""
+        arrays = [*self.parameters.values(), self.vertex_positions_buffer(), self.faces_buffer()]
+        return [self.kind], [self.exact_frame, self.placement], arrays
 
     def traverse(self, callback: Any) -> None:
         mi.Mesh.traverse(self, callback)

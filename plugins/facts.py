@@ -73,13 +73,13 @@ class Reading:
         for table in (s.quadrics() for s in self.quadrics):
             quadrics[table.kind] += len(table.rows)
         return {
-            "vectorised": is_jit(),
-            "native_shapes": len(self.native),
-            "meshes": len(meshes),
+            "vectorised": is_jit(),  # is the variant one that compiles kernels
+            "native_shapes": len(self.native),  # that only Mitsuba can trace
+            "meshes": len(meshes),  # of the native ones, and of those in groups
             "spheres": sum(map(is_sphere, self.native)),
-            "plain_spheres": sum(map(is_plain_sphere, self.native)),
-            "planes": len(self.planes),
-            "quadrics": tuple(sorted(quadrics.items())),
+            "plain_spheres": sum(map(is_plain_sphere, self.native)),  # that face outwards and do not emit
+            "planes": len(self.planes),  # infinite ones
+            "quadrics": tuple(sorted(quadrics.items())),  # kinds of exact ones, and how many of each
         }
 
 
@@ -91,13 +91,13 @@ def _lights(snapshot: Snapshot) -> tuple[list[Any], list[Any] | None, dict[str, 
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
     surfaces = [largest[id(e)] for e in lights if mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
     return lights, numbers, {
-        "lights": len(lights),
+        "lights": len(lights),  # emitters but for the environment and what is black
         "random_lights": sum(not mi.has_flag(e.flags(), delta) for e in lights),
         "surface_emitters": len(surfaces),
         "environment": environment is not None,
-        "sky": 0.0 if environment is None else largest[id(environment)],
-        "emission": max(surfaces, default=0.0),
-        "tabled": numbers is not None,
+        "sky": 0.0 if environment is None else largest[id(environment)],  # its radiance; inf if not known
+        "emission": max(surfaces, default=0.0),  # the same of the surfaces
+        "tabled": numbers is not None,  # can the lights be
     }  # fmt: skip
 
 
@@ -106,17 +106,17 @@ def _materials(snapshot: Snapshot) -> tuple[list[Any], dict[str, Any]]:
     bsdfs, found = snapshot.bsdfs, material_rows(snapshot.shapes)
     rows, unmergeable = ([], found) if isinstance(found, str) else (found, "")
     return rows, {
-        # Those outside the table may have any lobe
+        # All that mrt_bsdf has, and whether a material has them; those outside the table may have any
         "lobes": tuple((name, bool(unmergeable) or there) for name, there in lobes_in(rows)),
         "mirrors": tuple(
             b.mirror_bound() if hasattr(b, "mirror_bound") else Mirror(1.0, 1.0)
             for b in bsdfs
             if has_mirror(b)
         ),
-        "oriented": any(map(is_oriented, bsdfs)),
-        "textured": bool(unmergeable) and any(map(is_textured, bsdfs)),
-        "two_sided": any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in bsdfs),
-        "unmergeable": unmergeable,
+        "oriented": any(map(is_oriented, bsdfs)),  # does one depend on tangents
+        "textured": bool(unmergeable) and any(map(is_textured, bsdfs)),  # does one vary over its surface
+        "two_sided": any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in bsdfs),  # lit from behind
+        "unmergeable": unmergeable,  # why they have no place in one table; "" where they do
     }  # fmt: skip
 
 

@@ -7,7 +7,8 @@ decide, and the integrator obeys. A plan may be edited (``dataclasses.replace``)
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections import namedtuple
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -29,40 +30,11 @@ VARYING = "a material varies over its surface"
 GRADIENTS = "derivatives are wanted"
 
 
-@dataclass(frozen=True)
-class Mirror:
-    """Bounds of one material's mirror rays; inf where they are not known."""
+#: Bounds of a material's mirror rays: reflectance, index, reflectance at normal incidence; inf if unknown
+Mirror = namedtuple("Mirror", "reflectance int_ior at_normal", defaults=[1.0])
 
-    reflectance: float
-    int_ior: float
-    at_normal: float = 1.0  # its reflectance at normal incidence
-
-
-@dataclass(frozen=True)
-class SceneFacts:
-    """The content of a scene, as far as a kernel depends on it."""
-
-    vectorised: bool  #: is the variant one that compiles kernels
-    native_shapes: int  #: shapes that only Mitsuba can trace
-    meshes: int  #: of the native ones, and of those in groups
-    spheres: int  #: of the native ones
-    plain_spheres: int  #: of the spheres, those that face outwards and do not emit
-    planes: int  #: shapes that are infinite planes
-    quadrics: tuple[tuple[str, int], ...]  #: kinds of exact quadrics, and how many of each
-    touching: bool  #: is a point light on a surface
-    lights: int  #: emitters but for the environment and what is black
-    random_lights: int  #: of the lights, those that need random numbers
-    surface_emitters: int  #: of the lights, those that are surfaces
-    environment: bool  #: is there an environment emitter
-    sky: float  #: its largest radiance; inf where that is not known
-    emission: float  #: the largest radiance of a surface; inf where that is not known
-    lobes: tuple[tuple[str, bool], ...]  #: all that mrt_bsdf has, and whether a material has them
-    mirrors: tuple[Mirror, ...]  #: of the materials that reflect like a mirror
-    oriented: bool  #: does a material depend on tangents: anisotropy, bump and normal maps
-    textured: bool  #: does a material vary over its surface
-    two_sided: bool  #: is a material lit from behind
-    unmergeable: str  #: why the materials cannot be looked up in one table; "" where they can
-    tabled: bool  #: can the lights be
+#: The content of a scene, as far as a kernel depends on it: see ``facts``
+SceneFacts = SimpleNamespace
 
 
 @dataclass(frozen=True)
@@ -143,16 +115,10 @@ def _cut_off(case: SimpleNamespace) -> tuple[float, float]:
     return case.arriving * hits if case.made["mirrors"] else 0.0, case.facts.lights * hits
 
 
-@dataclass(frozen=True)
-class Rule:
-    """One decision about the kernels."""
-
-    name: str  #: of the field of the plan
-    what: str  #: that is decided about, in words
-    held: Callable[[SceneFacts, KernelPlan], str]  #: what the kernels hold then; "" for nothing to be told
-    against: Callable[[Any], Mapping[str, bool]]  #: reasons, and whether they hold; the first that does is it
-    value: Callable[[Any, bool], Any] = lambda case, free: free  #: by whether there is none
-
+#: A decision: the field of the plan; what is decided about, in words; what kernels hold by facts and plan (""
+#: for nothing to be told); reasons against it, the first of which that holds is given; and the value, by the
+#: case and whether there is no reason
+Rule = namedtuple("Rule", "name what held against value", defaults=[lambda case, free: free])
 
 _SPHERES = {"table": "spheres from a table of centres and radii", "corrected": "hits moved onto spheres"}
 _LIGHTS = {"unrolled": "unrolled", "loop": "in a loop of calls", "table": "in a loop over a table"}

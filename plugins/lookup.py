@@ -37,7 +37,7 @@ def shape_ids(shapes: Any) -> mi.UInt32:
 class Table:
     """Rows of numbers, or shapes (``kind`` "Shape"), looked up by index."""
 
-    def __init__(self, kind: Any, rows: Sequence[Any]) -> None:
+    def __init__(self, kind: Any, rows: Any) -> None:
         self.kind, self.rows = kind, rows
         if not is_jit():
             self.rows = rows if kind == "Shape" else [kind([float(x) for x in row]) for row in rows]

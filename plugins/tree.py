@@ -57,7 +57,7 @@ class Tree:
 
         def down(node: Any, waiting: Any, reach: Any) -> tuple[Any, Any, Any]:
             near, far = self._children(node, inverse, shift, rows)
-            meets = [n <= dr.minimum(f, reach) for n, f in zip(near, far, strict=True)]
+            meets = [(n <= f) & (n <= reach) for n, f in zip(near, far, strict=True)]
             second_first = meets[1] & (~meets[0] | (near[1] < near[0]))
             child = (node << 1) | dr.select(second_first, mi.UInt32(1), 0)
             waiting_below = (waiting << 1) | dr.select(meets[0] & meets[1], mi.UInt32(1), 0)
@@ -82,7 +82,8 @@ class Tree:
             going = node != 0
             return going & (state[0] >= reach) if any_hit else going
 
-        start = dr.select(active, mi.UInt32(1), 0), mi.UInt32(0), state
+        known = active & ~dr.any(dr.isnan(mi.Vector3f(shift)))  # NaN would go everywhere
+        start = dr.select(known, mi.UInt32(1), 0), mi.UInt32(0), state
         return dr.while_loop(start, goes_on, to_next_leaf, label="tree")[2]
 
     def _children(self, node: Any, inverse: list, shift: list, rows: list) -> tuple[list, list]:
@@ -91,8 +92,10 @@ class Tree:
         for axis in range(3):
             first0, first1, last0, last1 = dr.gather(mi.Vector4f, self.boxes, 6 * node + rows[axis])
             for child, (first, last) in enumerate(((first0, last0), (first1, last1))):
-                near[child] = dr.maximum(near[child], dr.fma(first, inverse[axis], shift[axis]))
-                far[child] = dr.minimum(far[child], dr.fma(last, inverse[axis], shift[axis]))
+                enter, leave = (dr.fma(plane, inverse[axis], shift[axis]) for plane in (first, last))
+                # One instruction each, where dr.maximum and dr.minimum take more to pass on NaN
+                near[child] = dr.select(enter > near[child], enter, near[child])
+                far[child] = dr.select(leave < far[child], leave, far[child])
         return near, [f * (1 + _SLACK) for f in far]
 
 
