@@ -28,7 +28,7 @@ STUDIES: dict[str, tuple[str, str, int, int]] = {
     "roughconductor": ("roughconductor", "is the material the function that Mitsuba's is", 10, 90),
     "stock": ("stock", "are light, gloss, mirrors and stand-ins what Mitsuba computes", 15, 60),
     "scenes": ("scenes", "are the report's scenes right, with a reason for each pixel off", 10, 60),
-    "filters": ("filters", "is refining edges as good as all, and the blur like a lens", 9, 120),
+    "filters": ("filters", "do detectors chase noise, is the blur like a lens", 9, 120),
     "adaptive": ("adaptive", "are own scenes Mitsuba's, and errors cheap", 6, 60),
     "honest": ("honest", "is the mean right and the error as stated, calm to wild", 20, 1200),
     "stability": ("stability", "where must float32 give out, and where does it not", 8, 180),
