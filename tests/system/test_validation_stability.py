@@ -30,7 +30,7 @@ def test_every_case_holds_and_is_a_row_with_a_mark() -> None:
 
 
 beckmann_d, blur, density = microfacet.beckmann_d, filters.gaussian_dof, lobes.Lobes.density
-schlick = fresnel.fresnel_schlick
+schlick, dielectric = fresnel.fresnel_schlick, fresnel.fresnel_dielectric
 
 
 def report_tan2_theta(v: Any) -> Any:
@@ -39,16 +39,12 @@ def report_tan2_theta(v: Any) -> Any:
     return (1 - c2) / c2
 
 
-def report_fresnel(cos_theta: Any, ext_ior: Any, int_ior: Any, sin2_theta: Any = None) -> Any:
-    """By Snell's law, as in the report; what is known of the sine is not used."""
-    cos_t = dr.sqrt(dr.maximum(1 - dr.square(ext_ior / int_ior) * (1 - dr.square(cos_theta)), 0))
-    rs = (ext_ior * cos_theta - int_ior * cos_t) / (ext_ior * cos_theta + int_ior * cos_t)
-    rp = (ext_ior * cos_t - int_ior * cos_theta) / (ext_ior * cos_t + int_ior * cos_theta)
-    return 0.5 * (rs * rs + rp * rp)
-
-
 def rounded(cos_theta: Any, f0: Any) -> Any:
     return schlick(cos_theta + 8 - 8, f0)
+
+
+def steep(cos_theta: Any, *iors: Any) -> Any:
+    return dielectric(dr.sqrt(1 - dr.square(dr.sqrt(1 - dr.square(cos_theta)))), *iors)
 
 
 def steep_gradient(tan2_theta: Any, alpha: Any) -> Any:
@@ -73,7 +69,7 @@ def dense(self: Any, context: Any, pair: Any) -> Any:
         # with the report's form in the plugin alone, the whole misses its bounds
         ("bsdf", [(lobes, "tan2_theta", report_tan2_theta)],
          ["BSDF cos, p99.9", "pdf, p99.9", "BSDF cos, largest"]),
-        ("bsdf", [(fresnel, "fresnel_dielectric", report_fresnel)], ["F, largest"]),
+        ("bsdf", [(fresnel, "fresnel_dielectric", steep)], ["F, largest", "F at the critical angle"]),
         ("bsdf", [(fresnel, "fresnel_schlick", rounded)], ["Schlick, F0 = 0.04"]),
         ("bsdf", [(microfacet, "beckmann_d", steep_gradient), (lobes, "beckmann_d", steep_gradient)],
          ["gradient in alpha, p99.9"]),
