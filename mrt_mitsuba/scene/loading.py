@@ -47,8 +47,9 @@ def load_dict(
     """
     import mitsuba as mi
 
+    budget = budget or Budget.of(None)
     with _loading(name):
-        _check_dict(scene, name)
+        _check_dict(scene, name, budget.inputs)
         state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene)
         _check_nodes(state.nodes, name, budget)
         return _instantiate(state, merge)
@@ -93,17 +94,16 @@ def _file(
     require_file(path)
     if not path.lower().endswith(".xml"):
         raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
+    budget = budget or Budget.of(None)
     given = {key: str(value) for key, value in parameters.items()}
     with _loading(path, os.path.dirname(path) or "."):
-        values, files = _check_xml(path, given)
-        if budget is not None:
-            budget.inputs.update(files)
+        values = _check_xml(path, given, budget.inputs)
         state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), path, **given)
         _check_nodes(state.nodes, path, budget)
         yield state, values
 
 
-def _check_nodes(nodes: Iterable[Any], name: str, budget: Budget | None) -> None:
+def _check_nodes(nodes: Iterable[Any], name: str, budget: Budget) -> None:
     """Look at all that Mitsuba would load for what it has parsed."""
     mitsuba_first()  # a <path> of the file puts its folder before
     for node in nodes:
@@ -114,12 +114,9 @@ def _check_nodes(nodes: Iterable[Any], name: str, budget: Budget | None) -> None
             wrong = f"{kind}: sample_count is {samples}; give 1 to {MOST_SAMPLES}"
             raise SceneError(f"cannot load {name}: {wrong}")
         if isinstance(filename, str):
-            _check_data(filename)
-            found = _resolved(filename)
-            if budget is not None:
-                budget.inputs.add(found)
-                if kind in _PICTURES and (size := picture_size(found)):
-                    budget.take_texture(found, *size, around=kind == "envmap")
+            found = _check_data(filename, budget.inputs)
+            if kind in _PICTURES and (size := picture_size(found)):
+                budget.take_texture(found, *size, around=kind == "envmap")
 
 
 def _instantiate(state: Any, merge: bool = True) -> Any:
@@ -170,20 +167,25 @@ def _check_plugin(plugin: str, name: str) -> None:
         )
 
 
-def _check_data(filename: str) -> None:
-    """Refuse a pipe, a device or a folder. Mitsuba reports a file that is missing."""
+def _check_data(filename: str, inputs: set[str]) -> str:
+    """Refuse a pipe, a device or a folder; else note the path, and return it. Mitsuba reports a file that is
+    missing."""
     path = _resolved(filename)
     if os.path.exists(path):
         require_file(path)
+    inputs.add(path)
+    return path
 
 
-def _check_dict(node: Mapping[str, Any], name: str, place: str = "", depth: int = 1) -> None:
+def _check_dict(
+    node: Mapping[str, Any], name: str, inputs: set[str], place: str = "", depth: int = 1
+) -> None:
     """Look at every entry. None, cycles and depth would end the process."""
     if depth > DEEPEST:
         raise SceneError(f"cannot load {name}: it is nested more than {DEEPEST} levels deep")
     for key, value in node.items():
         if isinstance(value, dict):
-            _check_dict(value, name, f"{place}{key}.", depth + 1)
+            _check_dict(value, name, inputs, f"{place}{key}.", depth + 1)
         elif value is None:
             raise SceneError(f"cannot load {name}: {place}{key} is None; give it a value, or leave it out")
         elif key == "type" and not isinstance(value, str):
@@ -191,27 +193,28 @@ def _check_dict(node: Mapping[str, Any], name: str, place: str = "", depth: int 
         elif key == "type":
             _check_plugin(value, name)
         elif key == "filename" and isinstance(value, str):
-            _check_data(value)
+            _check_data(value, inputs)
 
 
-def _check_xml(path: str, parameters: Mapping[str, str]) -> tuple[Mapping[str, str], list[str]]:
-    """Look at an XML file and those that it includes before Mitsuba opens them.
-
-    Return its parameters, and the paths of the files.
-    """
+def _check_xml(path: str, parameters: Mapping[str, str], inputs: set[str]) -> Mapping[str, str]:
+    """Look at an XML file and those that it includes before Mitsuba opens them; return its parameters."""
     values, files = dict(parameters), [path]
+    inputs.add(path)
     for file in files:  # which grows
         for tag, attributes in _elements(file):
             if tag == "default":
                 values.setdefault(attributes.get("name", ""), attributes.get("value", ""))
-            elif filename := attributes.get("filename"):
-                for name in sorted(values, key=len, reverse=True):  # the longest first, as Mitsuba does
-                    filename = filename.replace(f"${name}", values[name]) if name else filename
-                _check_data(filename)
-                found = _resolved(filename)
+                continue
+            filename = attributes.get("value" if tag == "path" else "filename", "")
+            for name in sorted(values, key=len, reverse=True):  # the longest first, as Mitsuba does
+                filename = filename.replace(f"${name}", values[name]) if name else filename
+            if tag == "path":
+                mitsuba_first(_resolved(filename))
+            elif filename:
+                found = _check_data(filename, inputs)
                 if tag == "include" and os.path.isfile(found) and found not in files:
                     files.append(found)
-    return values, files
+    return values
 
 
 def _elements(file: str) -> list[tuple[str, dict[str, str]]]:

@@ -189,13 +189,15 @@ def test_deep_nesting_is_refused(variant: str, tmp_path: Path, depth: int) -> No
         "<include filename='p&#105;pe'/>",
         f"<emitter type='envmap'>{PIPE}</emitter>",
         f"<shape type='ply'>{PIPE}</shape>",
-        "<bsdf type='diffuse'><spectrum name='reflectance' filename='pipe'/></bsdf>",
+        "<path value='in'/><bsdf type='diffuse'><spectrum name='reflectance' filename='pipe'/></bsdf>",
         *(TEXTURED.format("diffuse", "reflectance", kind, PIPE) for kind in ("bitmap", "mrt_texture")),
     ],
     ids=range(8),
 )
 def test_pipes_are_refused(variant: str, tmp_path: Path, inside: str) -> None:
-    os.mkfifo(tmp_path / "pipe")
+    folder = tmp_path / ("in" if "path value" in inside else "")
+    folder.mkdir(exist_ok=True)
+    os.mkfifo(folder / "pipe")
     (tmp_path / "a.xml").write_text(scene_xml(inside))
     with pytest.raises(SceneError, match="pipe: it is not a regular file"):
         mrt.render(str(tmp_path / "a.xml"), aa=1)

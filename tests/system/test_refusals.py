@@ -38,6 +38,10 @@ WHITE = base64.b64decode(  # one pixel
 )
 
 
+SPECTRUM = """<shape type='sphere'><bsdf type='diffuse'><spectrum name='reflectance' filename='s.spd'/></bsdf>
+</shape>"""
+
+
 def xml(inside: str, sensor: str = SMALL) -> dict[str, Content]:
     return {"a.xml": f"<scene version='3.0.0'>{sensor}{inside}</scene>"}
 
@@ -88,6 +92,12 @@ OUTPUTS: list[Case] = [
     (textured(WHITE) | {"out.exr": Path("a.mtl")}, "out scene=a.obj", 1, "out.exr: what is written is made"),
     (xml("") | {"l.xml": Path("a.xml")}, "export scene=l.xml --xml ./a.xml", 1, "a.xml: what is written is"),
     (textured(WHITE), "export scene=a.obj --xml a.mtl", 1, "a.mtl: what is written is made from this file"),
+    (
+        xml(SPECTRUM) | {"s.spd": "400 1\n700 1\n"},
+        "export scene=a.xml --xml s.spd",
+        1,
+        "s.spd: what is written",
+    ),
     ({}, "export scene=no.xml --xml b.xml", 1, "cannot read no.xml: there is no such file"),
     (xml(""), "export scene=a.xml --xml b.xml --stock", 2, "flavor=stock is of no use with an XML file"),
     (xml(""), "export scene=a.xml --xml b.xml width=3", 2, "width is of no use with an XML file"),
