@@ -1,4 +1,4 @@
-"""Proofs that a BSDF owes: values, samples, energy, derivatives, variants and messages."""
+"""What a BSDF has to prove: values, samples, energy, derivatives, variants and messages."""
 
 from __future__ import annotations
 
