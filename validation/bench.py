@@ -1,9 +1,9 @@
-"""``make bench``: the times that matter to a user, as JSON, compared with an earlier file or version.
+"""``make bench``: the times that matter to users, as JSON, compared with an earlier file or version.
 
 The start of the command against a bare start of Mitsuba; scenes 0 to 4 at 800x600, many objects, renders to
-an error and small renders; and this project's plugins against Mitsuba's own. Seconds of two machines, or of
-one under another load, do not compare; ratios of the same run do. With ``--before`` every render takes turns
-with an earlier version. Takes some ten minutes.
+an error and small renders; and this project's plugins against Mitsuba's own. Seconds cannot be compared between
+machines or loads; ratios of the same run can. With ``--before``, every render takes turns with an earlier
+version. Takes about ten minutes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ dr.eval(dr.arange(mi.Float, 16) + dr.opaque(mi.Float, 1))
 dr.sync_thread()
 """
 
-# Of a row: "seconds", and where there is another side what ``ratio_of`` says, and the "goal" of the ratio
+# A row has "seconds"; compared with another side, it has what ``ratio_of`` returns, and a "goal" of the ratio
 Row = dict[str, float]
 
 

@@ -1,7 +1,7 @@
 """Seconds of renders, printed as JSON: ``python renders.py CASE ...``.
 
-A script that knows nothing but the public names, so that it also measures an earlier version of the project:
-the bench runs it by the Python of either, in turns.
+A script that uses only public names, so that it can measure earlier versions of the project, too: the bench
+runs it with the Python of either version, in turns.
 """
 
 from __future__ import annotations
@@ -77,9 +77,9 @@ def with_triangles(number: int, **size: Any) -> Nodes:
 
 
 def crowd(number: int, kind: str, **size: Any) -> Nodes:
-    """Return the room of scene 4 with so many spheres, or cones as high and wide, in any direction.
+    """Return the room of scene 4 with this many spheres, or with cones of the same sizes in random directions.
 
-    Of the kind "group", the spheres are one shape.
+    With the kind "group", the spheres are a single shape.
     """
     import mitsuba as mi
 
@@ -112,7 +112,7 @@ def of_scene(nodes: Callable[..., Nodes], size: tuple[int, int], options: dict[s
 
 
 def _with_update(**options: Any) -> Render:
-    """Return a render of a loaded scene of which a colour changes before."""
+    """Return a render of a loaded scene that changes a colour first."""
     import mitsuba as mi
 
     scene = load(mrt.scene_dict(3, **SMALL))
@@ -129,7 +129,7 @@ def _with_update(**options: Any) -> Render:
 
 
 def _prepared() -> Render:
-    """Return a prepared render; of versions that have none, the nearest thing: a render of a loaded scene."""
+    """Return a prepared render, or in versions without ``prepare`` a render of a loaded scene."""
     scene = load(mrt.scene_dict(3, **SMALL))
     prepare: Any = getattr(mrt, "prepare", lambda scene, **options: partial(mrt.render, scene, **options))
     render: Render = prepare(scene, **ONE_RAY)
@@ -155,7 +155,7 @@ def _box(width: int, height: int) -> Nodes:
 REPORT = [partial(mrt.scene_dict, number) for number in range(5)]
 LARGE, MIDDLE, LITTLE, TINY = (800, 600), (400, 300), (160, 120), (64, 48)
 PATH: dict[str, Any] = {"integrator": "path"}
-ROWS: tuple[tuple[str, int, Callable[[], Render]], ...] = (  # how many renders count as one, what makes them
+ROWS: tuple[tuple[str, int, Callable[[], Render]], ...] = (  # how many renders to average, what makes them
     *((f"scene {i}", 1, partial(of_scene, nodes, LARGE, SUPERSAMPLED)) for i, nodes in enumerate(REPORT)),
     ("a million triangles", 2, partial(of_scene, partial(with_triangles, 10**6), MIDDLE, SUPERSAMPLED)),
     ("200 lights", 2, partial(of_scene, partial(with_lights, 200), LITTLE, ONE_RAY)),

@@ -1,6 +1,6 @@
-"""Parts of the scenes that studies render: cameras, rays, other materials; and ten whole ones.
+"""Parts of the scenes that studies render: cameras, rays, other materials; and ten whole scenes.
 
-These are of Mitsuba's own making, such as people bring: lights, lenses, materials, filters, samplers.
+The whole ones use Mitsuba's own lights, lenses, materials, filters and samplers, as users' scenes do.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96) -> Any:
 # ----------------------------------------------- Whole scenes -----------------------------------------------
 
 
-# Where most of the noise is in a part of the picture
+# With most of the noise in one part of the picture
 LOCAL = ("thin_lens", "gloss", "texture_and_sky", "rough_glass")
 
 
