@@ -77,7 +77,7 @@ def with_triangles(number: int, **size: Any) -> Nodes:
 
 
 def crowd(number: int, kind: str, **size: Any) -> Nodes:
-    """Return the room of scene 4 with this many spheres, or with cones of the same sizes in random directions.
+    """Return the room of scene 4 with this many spheres, or cones of the same sizes in random directions.
 
     With the kind "group", the spheres are a single shape.
     """
