@@ -1,9 +1,9 @@
 """``make bench``: the times that matter to users, as JSON, compared with an earlier file or version.
 
 The start of the command against a bare start of Mitsuba; scenes 0 to 4 at 800x600, many objects, renders to
-an error and small renders; and this project's plugins against Mitsuba's own. Seconds of two machines, or under
-two loads, cannot be compared; ratios of the same run can. With ``--before``, every render takes turns with an earlier
-version. Takes about ten minutes.
+an error and small renders; and this project's plugins against Mitsuba's own. You cannot compare seconds from
+two machines, or under two loads, but you can compare ratios of the same run. With ``--before``, every render
+takes turns with an earlier version. Takes about ten minutes.
 """
 
 from __future__ import annotations
