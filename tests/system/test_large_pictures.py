@@ -116,7 +116,7 @@ FILM = """
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs Linux to measure memory")
 @pytest.mark.parametrize(
     ("code", "size", "least", "more"),
-    [(REPORT, 1536, 112, 1.5), (FILM, 720, 780, 0.8)],
+    [(REPORT, 1536, 112, 1.5), (FILM, 512, 470, 0.6)],
     ids=["report", "film"],
 )
 def test_peak_memory_stays_within_the_budget(
