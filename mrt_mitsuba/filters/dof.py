@@ -68,9 +68,10 @@ def blur_amount(depth: Any, *, focal_distance: float | None, focal_range: float 
     """
     grid = Grid(depth)
     distance = grid.flat(depth, (), "depth")
-    if not _is_on(focal_distance, focal_range):
+    focus = _focus(focal_distance, focal_range)
+    if focus == 0:
         return grid.output([dr.zeros(grid.Float, grid.count)])
-    return grid.output([_amount(grid, distance, focal_distance, focal_range)])
+    return grid.output([_amount(grid, distance, focus, focal_range)])
 
 
 def gaussian_dof(
@@ -93,25 +94,27 @@ def gaussian_dof(
     """
     if mode not in MODES:
         raise UsageError(f"unknown depth-of-field mode {mode!r}; use one of {', '.join(MODES)}")
-    if not _is_on(focal_distance, focal_range):
+    focus = _focus(focal_distance, focal_range)
+    if focus == 0:
         return image
     grid = Grid(image)
     planes = grid.planes(image, "image")
     distance = grid.flat(depth, (), "depth")
-    amount = _amount(grid, distance, focal_distance, focal_range)
+    amount = _amount(grid, distance, focus, focal_range)
     if mode == "report":
         return grid.output(_pascal(grid, planes, amount), (3,))
     radius = _radius(amount)
-    near = (distance > 0) & (distance < grid.opaque(focal_distance))
+    near = (distance > 0) & (distance < grid.opaque(focus))
     return grid.output(_discs(grid, planes, dr.select(near, -radius, radius)), (3,))
 
 
-def _is_on(focal_distance: float | None, focal_range: float) -> bool:
+def _focus(focal_distance: float | None, focal_range: float) -> float:
+    """Return the focal distance, or 0 for a filter that is off."""
     check_numbers(focal_distance=focal_distance or 0.0, focal_range=focal_range)
-    return (focal_distance or 0.0) > 0
+    return max(focal_distance or 0.0, 0.0)
 
 
-def _amount(grid: Grid, distance: Any, focus: float | None, focal_range: float) -> Any:
+def _amount(grid: Grid, distance: Any, focus: float, focal_range: float) -> Any:
     amount = dr.abs(grid.opaque(focus) - distance) - grid.opaque(focal_range)
     amount = dr.select(amount > 0, dr.minimum(amount, MAX_AMOUNT), 0)  # NaN > 0 is false
     return dr.select((distance <= 0) | (distance == math.inf), MAX_AMOUNT, amount)

@@ -43,7 +43,7 @@ class Passes:
 
     def __init__(self, job: Job, shader: Shader, plan: Plan, settings: RenderSettings, frame: int) -> None:
         self._job, self._shader, self._plan, self._settings = job, shader, plan, settings
-        self._phase = {"phase": frame / plan.moments} if plan.frames > 1 else {}
+        self._phase: dict[str, Any] = {"phase": frame / plan.moments} if plan.frames > 1 else {}
         self._seed = settings.seed + 2 * frame  # two passes in a frame, each with random numbers of its own
         self._shape = plan.seen.height, plan.seen.width
         self._pixels = plan.seen.pixels(plan.width)
