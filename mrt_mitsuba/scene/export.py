@@ -87,8 +87,8 @@ def write_xml(
         raise UsageError(f"params: only an XML file declares names, such as {next(iter(params))}")
     else:
         terms = terms or report_scene(scene)  # type: ignore[arg-type]  # which refuses anything else
-        size = {"width": width or SIZE[0], "height": height or SIZE[1]}
-        nodes = scene_dict(terms, fresnel=fresnel or "schlick", **size)
+        wide, high = width or SIZE[0], height or SIZE[1]
+        nodes = scene_dict(terms, fresnel=fresnel or "schlick", width=wide, height=high)
         files = _put_into_files(nodes, os.path.splitext(os.fspath(path))[0], flavor)
         text = _xml(_stock(nodes, terms) if flavor == "stock" else nodes)
         if terms.focal_distance is not None:

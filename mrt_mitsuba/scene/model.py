@@ -63,7 +63,7 @@ class Camera:
             if not _all_finite(getattr(self, name), 3):
                 value = getattr(self, name)
                 return f"the camera's {name} is {value!r}, but must be three finite numbers up to 3.4e38"
-        if not 0 < self.hfov < 180:
+        if not _all_finite([self.hfov], 1) or not 0 < self.hfov < 180:
             return f"the camera's hfov is {self.hfov!r}, but must be more than 0 and less than 180 degrees"
         forward = np.subtract(self.target, self.position)
         if not forward.any():

@@ -250,12 +250,12 @@ def c_rand(seed: int = 1) -> Iterator[int]:
 
 
 _BUILDERS = (scene_0, scene_1, scene_2, scene_3, scene_4, scene_5, scene_6, scene_7, scene_8, scene_9)
-NUMBERS = tuple(range(len(_BUILDERS)))
+_SCENES = [cache(builder) for builder in _BUILDERS]
+NUMBERS = tuple(range(len(_SCENES)))
 
 
-@cache
 def report_scene(number: int) -> Scene:
     """Return a scene by its number. Raises ``UsageError`` for one that there is not."""
     if number not in NUMBERS:
         raise UsageError(f"there is no scene {number!r}: choose one of {', '.join(map(str, NUMBERS))}")
-    return _BUILDERS[number]()
+    return _SCENES[number]()
