@@ -149,6 +149,9 @@ class Halves(Stack):
         sets = [self._moments(which) for which in (first, second, first + second)]
         (seen, rays, mean), (measured, others, other), (both, *_) = sets
         mixed = np.tensordot(_mixture(self._around(seen), measured), self._around(both), 1)
+        quiet, also = (window_means(variance, 1) == 0 for variance in (seen, measured))
+        if not (measured[quiet].any() or seen[also].any()):  # where one met no noise, the other met none
+            mixed[quiet & also] = 0
         # Rays of a sequence err less than independent ones; without noise, a window takes the picture's ratio
         squares = quarter_squares(mean, other).mean(-1), both * (1 / rays + 1 / others) / 4
         found, expected = (window_means(v, WINDOWS[-1]) + 0.1 * v.mean() for v in squares)
@@ -255,12 +258,14 @@ def quarter_squares(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _mixture(parts: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """Return the shares, 0 or more, in which parts [parts, H, W] add up to what is nearest to values [H, W].
 
-    Nearest by the divergence of Kullback and Leibler, which keeps the sum; by the steps of expectation and
-    maximization (W. Richardson, 1972; L. Lucy, 1974).
+    By W. Richardson's and L. Lucy's steps (1972, 1974), in which a value weighs the less the more is expected
+    of it, since a variance is as uncertain as it is large.
     """
     step, tiny = max(1, math.isqrt(measured.size // JUDGES)), 1e-6 * measured.mean() + 1e-30
     known = parts[:, ::step, ::step].reshape(len(parts), -1) + tiny
     values, shares = measured[::step, ::step].ravel() + tiny, np.full(len(parts), 1 / len(parts))
     for _ in range(30):
-        shares *= known @ (values / (shares @ known)) / known.sum(1)
+        expected = shares @ known
+        weights = 1 / np.sqrt(expected)
+        shares *= known @ (weights * values / expected) / (known @ weights)
     return shares
