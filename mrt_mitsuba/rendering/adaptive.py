@@ -100,10 +100,8 @@ class MrtAdaptive(mi.SamplingIntegrator):
 
         if 0 < spp < FEWEST:
             warnings.warn(f"mrt_adaptive takes {FEWEST} rays a pixel at least, not spp={spp}", stacklevel=2)
-        number = sensor if isinstance(sensor, int) else 0
-        view = _sensor(scene, sensor)
-        given: Any = seed
-        seed = int(given[0] if dr.is_array_v(given) else given) % 2**32
+        number, view = sensor if isinstance(sensor, int) else 0, _sensor(scene, sensor)
+        seed = int(np.ravel(seed)[0]) % 2**32
         settings = RenderSettings(seed=seed, sensor=number, progress=Progress()).but(**self.options(spp))
         with one_at_a_time, held(), dr.suspend_grad():
             source = opened("a Mitsuba scene", scene, view, self.nested)

@@ -78,9 +78,7 @@ def run_rounds(
             chosen, doubled = picture.next(min(most, 2 * now.spp), rays, None), doubled + 1
         else:
             break
-    late = seconds is not None and now.spp * seconds < LEAST_GROWTH * now.spp * now.seconds
-    limit = f"maxseconds={seconds:g}" if late else f"maxspp={rays}" if now.spp * LEAST_GROWTH > rays else ""
-    found = [picture.unfit(), _doubt(error), target and _missed(target, limit, now, error)]
+    found = [picture.unfit(), _doubt(error), _missed(target, rays, seconds, now, error)]
     if any(found):
         warnings.warn("; ".join(filter(None, found)), MrtWarning, stacklevel=7)  # the caller of render
     return done, error
@@ -97,10 +95,14 @@ def _doubt(error: ErrorEstimate) -> str:
     )
 
 
-def _missed(target: float, limit: str, now: Round, error: ErrorEstimate) -> str:
+def _missed(target: float | None, rays: int, seconds: float | None, now: Round, error: ErrorEstimate) -> str:
     """Return why an error is larger than was asked for; nothing if it is not."""
+    if target is None or now.rmse <= target:
+        return ""
     spent = f"an error of {now.rmse:.3g}, after {now.spp:.1f} rays a pixel and {now.seconds:.1f} s"
-    if limit and now.rmse > target:
+    late = seconds is not None and seconds < LEAST_GROWTH * now.seconds
+    if late or now.spp * LEAST_GROWTH > rays:
+        limit = f"maxseconds={seconds:g}" if late else f"maxspp={rays}"
         return f"target={target:g} is not reached: {limit} ends the render at {spent}"
     if error.low <= target:
         return ""
