@@ -36,7 +36,7 @@ QUANTITIES = {
     "pdf": ("pdf", BOUND, EVERYWHERE),
     "gradient": ("gradient in alpha", BOUND, EVERYWHERE),
 }
-FAULT = "alpha and index 1 in 30,000 too large"
+FAULT = "alpha and index 1 in 30,000 too large: what a quarter of the cases exceed"
 NOTE = (
     "Relative errors at the same float32 numbers against 50 digits. Directions are what their components "
     "say, and the half vector is their sum; the gradient's error is relative to the sum of the sizes of its "
@@ -56,10 +56,10 @@ def cases(quick: bool) -> Iterator[Case]:
     for name, (title, bound, everywhere) in QUANTITIES.items():
         part = slice(None) if name == "f" else usual
         where = "cosines 1e-7 … 1, IOR 1e-3 … 1e6" if name == "f" else "alpha 1e-4 … 1, D ≥ 1e-7 of its peak"
-        figure, fault = (np.quantile(e[name][part], 0.999) for e in (ours, wrong))
-        yield f"{title}, p99.9", where, "a few roundings", figure, bound, (FAULT, fault)
+        figure, fault = np.quantile(ours[name][part], 0.999), (FAULT, np.quantile(wrong[name][part], 0.75))
+        yield f"{title}, p99.9", where, "a few roundings", figure, bound, fault
         where, why = "alpha 1e-8 … 100, D ≥ 1e-20 of its peak", "roundings, which exp enlarges by up to 46"
-        yield f"{title}, largest", where, why, ours[name].max(), everywhere, (FAULT, wrong[name].max())
+        yield f"{title}, largest", where, why, ours[name].max(), everywhere, fault
     moved = slope2(wi, np.nextafter(lobes["wo"], np.float32(2))) / np.float64(alpha) ** 2
     change = np.abs(np.expm1(lobes["steepness"] - moved))
     for size in (1e-3, 1e-4, 1e-6):
