@@ -63,7 +63,7 @@ def beckmann_d(cos_theta_h: Any, alpha: Any) -> Any:
     return mp.exp(-(1 / c**2 - 1) / a**2) / (mp.pi * a**2 * c**4)
 
 
-def smith_g1(v: Sequence[Any], alpha: Any) -> Any:
+def smith_g1(v: Any, alpha: Any) -> Any:
     """Return the rational fit of Walter et al. for a direction above the surface."""
     x, y, z = map(number, v)
     across = number(alpha) * mp.sqrt(x * x + y * y)
@@ -73,7 +73,7 @@ def smith_g1(v: Sequence[Any], alpha: Any) -> Any:
     return (mpf("3.535") * b + mpf("2.181") * b**2) / (1 + mpf("2.276") * b + mpf("2.577") * b**2)
 
 
-def visible_cos(v: Sequence[Any], alpha: Any) -> Any:
+def visible_cos(v: Any, alpha: Any) -> Any:
     """Return (1 + Λ) cos θ of a direction above the surface, with Beckmann's own Λ (Heitz 2014, eq. 72)."""
     x, y, z = map(number, v)
     across = number(alpha) * mp.sqrt(x * x + y * y)

@@ -115,7 +115,8 @@ NOTE = "Differences to the float64 tracer, relative to the value plus a thousand
 def cases(quick: bool) -> Iterator[tuple[Any, ...]]:
     """Yield every case, held to the float64 tracer."""
     for name, what, scene, fault, *more in PATHS:
-        limit, own, other = (*more, *(PLAIN, {}, scene)[len(more) :])
+        others: list[Any] = [PLAIN, {}, scene]
+        limit, own, other = more + others[len(more) :]
         settings: dict[str, Any] = {"fresnel": "dielectric", "clamp": True, **own}
         described = scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=settings["fresnel"])
         described["integrator"] = {"type": "mrt_whitted", "clamp": settings["clamp"], "min_contribution": 0.0}
