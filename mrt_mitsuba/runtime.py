@@ -1,20 +1,22 @@
-"""Start-up of Mitsuba: which variant, which LLVM, and the plugins registered in it."""
+"""Start-up of Mitsuba: which variant, which LLVM, the plugins registered in it, and what is changed in how it
+loads and renders."""
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import os
 import sys
 import threading
 import warnings
-from functools import cache
+from collections.abc import Callable, Iterator
+from functools import cache, wraps
+from typing import Any
 
 from mrt_mitsuba import llvm
-from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtError, MrtWarning, UnknownVariantError, VariantError
 from mrt_mitsuba.interrupts import held
-from mrt_mitsuba.loaders import mitsuba_first, one_by_one, rewriting_later
-from mrt_mitsuba.memory import check_addresses
+from mrt_mitsuba.machine import check_addresses, usable_cores
 
 FAST = "llvm_ad_rgb"
 SLOW = "scalar_rgb"
@@ -161,3 +163,91 @@ def versions() -> dict[str, str]:
 
     found = {"mrt-mitsuba": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__}
     return found | {"llvm": llvm.version_text(llvm.prepare().version)}
+
+
+# ------------------------------------- What is changed in Mitsuba --------------------------------------
+
+
+@contextlib.contextmanager
+def rewriting_later() -> Iterator[None]:
+    """Let functions under ``@dr.syntax`` be rewritten when they are first called.
+
+    Mitsuba has ten of them, in integrators for derivatives; to rewrite them takes 60 ms of each start.
+    """
+    import drjit as dr
+
+    rewrite = dr.syntax
+
+    def later(function: Any = None, **options: Any) -> Any:
+        if function is None or options:
+            return rewrite(function, **options)
+        rewritten = cache(lambda: rewrite(function))
+        return wraps(function)(lambda *args, **given: rewritten()(*args, **given))
+
+    dr.syntax = later
+    try:
+        yield
+    finally:
+        dr.syntax = rewrite
+
+
+def mitsuba_first(folder: str | None = None) -> None:
+    """Let Mitsuba find its own plugins before files of their names in ``folder`` and others."""
+    import mitsuba as mi
+
+    current = mi.file_resolver()
+    others = [str(current[i]) for i in range(len(current))]
+    resolver = mi.FileResolver()
+    resolver.clear()
+    for each in dict.fromkeys([mitsuba_home(), *([folder] if folder else []), *others]):
+        resolver.append(each)
+    mi.set_file_resolver(resolver)
+
+
+@cache
+def mitsuba_home() -> str:
+    """Return the folder in which Mitsuba is installed."""
+    import mitsuba as mi
+
+    return os.path.dirname(os.path.abspath(mi.__file__))
+
+
+def one_by_one(lock: contextlib.AbstractContextManager[Any]) -> None:
+    """Let Mitsuba's loaders make this project's objects one by one, and ``mi.render`` and changes by
+    ``mi.traverse`` hold a lock: done at once, either ends the process.
+
+    Scenes without our plugins, and calls that say ``parallel``, load as before. Idempotent.
+    """
+    import mitsuba as mi
+
+    def in_turn(loader: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(loader)
+        def load(source: Any, parallel: bool | None = None, optimize: bool = True, **parameters: Any) -> Any:
+            parallel = not _mentions_ours(source) if parallel is None else parallel
+            return loader(source, parallel, optimize, **parameters)
+
+        return load
+
+    def guarded(function: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(function)
+        def call(*args: Any, **given: Any) -> Any:
+            with lock:
+                return function(*args, **given)
+
+        return call
+
+    changes = ((mi, "render"), (mi.SceneParameters, "update"), (mi.SceneParameters, "__setitem__"))
+    loaders = ((mi, name) for name in ("load_dict", "load_file", "load_string"))
+    for (owner, name), wrapped in [*((c, guarded) for c in changes), *((f, in_turn) for f in loaders)]:
+        function = getattr(owner, name)
+        if not hasattr(function, "__wrapped__"):
+            setattr(owner, name, wrapped(function))
+
+
+def _mentions_ours(source: Any) -> bool:
+    """Return whether a dict, or a file of XML or its text, may have a plugin of this project; Mitsuba itself
+    refuses anything else, and reports files that cannot be read."""
+    text = repr(source) if isinstance(source, dict) else str(source)
+    with contextlib.suppress(OSError, ValueError), open(text, encoding="utf-8", errors="ignore") as file:
+        text = file.read()
+    return "mrt_" in text or "<include" in text

@@ -13,8 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import SimpleNamespace
 from typing import IO, TYPE_CHECKING, Any
 
-from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
+from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.output.layers import LAYERS
 from mrt_mitsuba.output.replacing import replacing
 

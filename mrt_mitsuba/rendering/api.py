@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.interrupts import held
-from mrt_mitsuba.memory import Budget, Workspace
+from mrt_mitsuba.machine import Budget, Workspace
 from mrt_mitsuba.output import files
 from mrt_mitsuba.output.layers import AVERAGED, TABLE
 from mrt_mitsuba.rendering import settings as table

@@ -18,7 +18,7 @@ import numpy as np
 
 from mrt_mitsuba.filters.grid import dilated
 from mrt_mitsuba.interrupts import heed
-from mrt_mitsuba.memory import BYTES_PER_CHANNEL_OF_RAY
+from mrt_mitsuba.machine import BYTES_PER_CHANNEL_OF_RAY
 from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.output.layers import channels as channel_count
 from mrt_mitsuba.rays.film import Canvas, Film

@@ -15,13 +15,13 @@ import numpy as np
 from mrt_mitsuba import filters
 from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.filters.grid import bands
-from mrt_mitsuba.memory import BYTES_PER_PIXEL_OF_FILTER, keep_freed_blocks
+from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER, keep_freed_blocks
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.film import Region
 from mrt_mitsuba.rendering.exposing import Exposer, Groups, Stack
 from mrt_mitsuba.rendering.plan import BLUR, EDGES, REFINEMENT, RENDERING, ROUNDS, Pass, Plan
 from mrt_mitsuba.rendering.progress import Job
-from mrt_mitsuba.rendering.settings import DETECTORS, RenderSettings
+from mrt_mitsuba.rendering.settings import DETECTORS, FILM, RenderSettings
 from mrt_mitsuba.rendering.shading import Shader
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class Passes:
                 self._blur(step)
             elif step.name == ROUNDS:
                 self._run_rounds(step)
-            elif step.on_film:
+            elif step.places.lattice == FILM:
                 self._expose(step)
             else:
                 self._trace(step)
@@ -178,7 +178,7 @@ class Passes:
         found, samples = self._add("edges")[..., 0], self._add("samples")[..., 0]
         square, detect = self.layers.pop("square", None), getattr(filters, f"{step.mode}_edges")
         first = next(each for each in self._plan.passes if each.name == RENDERING)
-        if square is not None and not first.on_film:  # the mean square of the rays of each pixel
+        if square is not None and not self._plan.film:  # the mean square of the rays of each pixel
             square = np.maximum(square - self.layers["image"] ** 2, 0) / (first.places.size - 1)
         with self._stage(step, len(self._pixels)) as advance:
             for rows, seen, inner in self._bands(edges.REACH):

@@ -49,14 +49,9 @@ class Pass:
     mode: str = ""  #: of a filter, or what rounds go to
     noisy: bool = False  #: does a filter take noise for edges
 
-    @property
-    def on_film(self) -> bool:
-        """Does it expose a film by its own rules, rather than a lattice."""
-        return self.places.lattice == FILM
-
     def __str__(self) -> str:
         count, repeats = self.places.count, self.places.repeats
-        if self.on_film and self.name != ROUNDS:
+        if self.places.lattice == FILM and self.name != ROUNDS:
             where = "a pixel" if self.name == RENDERING else "and more in edge pixels"
             return f"{count * repeats} rays {where}, placed and filtered by the film"
         times = f", {repeats} rays each" if repeats > 1 else ""

@@ -82,7 +82,7 @@ class Prepared:
         if not (
             plain and hasattr(self._integrator, "kernel_plan") and plan.variant == "llvm_ad_rgb"
             and [step.layers for step in plan.passes] == [{"image"}] and not plan.layers and not plan.motion
-            and (plan.passes[0].on_film or places.size == 1)
+            and (plan.film or places.size == 1)
             and (plan.region.width, plan.region.height) == (plan.width, plan.height)
             and sensor.class_name() == "PerspectiveCamera" and sensor.shutter_open_time() == 0
             and (list(film.crop_size()) != size or list(film.size()) == size)

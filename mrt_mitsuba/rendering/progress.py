@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, TextIO
 
 from mrt_mitsuba.interrupts import heed
-from mrt_mitsuba.memory import Workspace
+from mrt_mitsuba.machine import Workspace
 
 log = logging.getLogger(__name__)
 

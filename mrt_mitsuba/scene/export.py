@@ -11,7 +11,7 @@ from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.memory import Budget
+from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import check, choice
 from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.scene.loading import rewrite_file

@@ -8,7 +8,7 @@ parser would end the process are refused as well.
 
 Objects are made one after the other. In parallel, Mitsuba makes Python objects inside each other, to the
 limit of the stack, and Dr.Jit's messages may wait for each other for ever; one by one takes no longer.
-``mrt_mitsuba.loaders.one_by_one`` makes that the default of Mitsuba's own loaders for our plugins.
+``mrt_mitsuba.runtime.one_by_one`` makes that the default of Mitsuba's own loaders for our plugins.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.interrupts import held
-from mrt_mitsuba.loaders import mitsuba_first, mitsuba_home
-from mrt_mitsuba.memory import Budget
+from mrt_mitsuba.machine import Budget
+from mrt_mitsuba.runtime import mitsuba_first, mitsuba_home
 from mrt_mitsuba.scene.files import picture_size, require_file
 
 DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from about 3000 on

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.memory import Budget
+from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, check_model_options, is_obj
 from mrt_mitsuba.scene.report import report_scene

@@ -12,8 +12,8 @@ from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError, one_line
+from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.sweeps import worker
 from mrt_mitsuba.sweeps.jobs import Job
 

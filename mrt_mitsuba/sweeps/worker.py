@@ -12,9 +12,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.cores import affinity, usable_cores
 from mrt_mitsuba.errors import MrtError, one_line
-from mrt_mitsuba.memory import free_memory
+from mrt_mitsuba.machine import affinity, free_memory, usable_cores
 from mrt_mitsuba.options import SMALLEST_MEMORY
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.sweeps.jobs import Job, identify, receive

@@ -13,7 +13,7 @@ import drjit as dr
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba import memory
+from mrt_mitsuba import machine
 
 SIZE = {"width": 131, "height": 97}  # rows and columns that no part divides
 FOCUS = {"focaldist": 2.0, "focalrange": 0.5}
@@ -54,8 +54,8 @@ def test_parts_threads_and_regions_change_no_bit(monkeypatch: pytest.MonkeyPatch
     scene = mrt.scene_dict(3, **SIZE) if "integrator" in options else 3
     options = {**({} if "integrator" in options else SIZE), "aa": 2, "count_rays": True, **options}
     whole, threads = mrt.render(scene, **options), dr.thread_count()
-    monkeypatch.setattr(memory, "MOST_PIXELS", 41 * SIZE["width"])  # of a part of a filter
-    monkeypatch.setattr(memory, "MOST_RAYS", 9_011)
+    monkeypatch.setattr(machine, "MOST_PIXELS", 41 * SIZE["width"])  # of a part of a filter
+    monkeypatch.setattr(machine, "MOST_RAYS", 9_011)
     tiles = TILES if options["aa"] and options.get("lattice") != "film" else []  # a filter may be wide
     dr.set_thread_count(1)
     try:
@@ -148,10 +148,10 @@ sys.modules["mrt_mitsuba.rendering.api"] = types.SimpleNamespace(render=lambda *
 """
 BLURRING = """
 import sys, time
-from mrt_mitsuba import memory
+from mrt_mitsuba import machine
 from mrt_mitsuba.rendering.progress import TerminalProgress
 from contextlib import contextmanager
-memory.MOST_PIXELS = 1
+machine.MOST_PIXELS = 1
 @contextmanager
 def stage(self, title, total, message=""):
     if title == "Depth of field":

@@ -12,7 +12,7 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
-from mrt_mitsuba.memory import Workspace
+from mrt_mitsuba.machine import Workspace
 from mrt_mitsuba.output import read_exr
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.studies import adaptive, honest

@@ -22,8 +22,8 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command import main as cli
-from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
+from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.output.files import read_exr
 
 pytest.importorskip("distributed")

@@ -22,7 +22,7 @@ ALLOWED = {
     "mrt_mitsuba.sweeps.run.sweep",  # each option has a name that editors and ``inspect`` can show
 }
 
-FOUNDATION = {"errors", "interrupts", "loaders", "memory", "options", "runtime"}
+FOUNDATION = {"errors", "interrupts", "machine", "options", "runtime"}
 
 _BRANCH = ast.If | ast.IfExp | ast.For | ast.While | ast.ExceptHandler | ast.match_case | ast.comprehension
 
@@ -146,7 +146,7 @@ def test_imports_make_no_cycle() -> None:
     [
         ("plugins", {"plugins"}),
         ("rays", {"rays"}),
-        ("output", {"output", "cores", "errors", "interrupts"}),
+        ("output", {"output", "machine", "errors", "interrupts"}),
         ("filters", {"filters", "errors", "runtime", "output"}),
         ("scene", {"scene", "plugins", "output", *FOUNDATION}),
         ("rendering", {"rendering", "plugins", "rays", "filters", "scene", "output", *FOUNDATION}),

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from mrt_mitsuba import memory, runtime
-from mrt_mitsuba.cores import affinity, usable_cores
+from mrt_mitsuba import machine, runtime
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.memory import MOST_PIXELS, MOST_RAYS, Budget, Workspace
+from mrt_mitsuba.machine import MOST_PIXELS, MOST_RAYS, Budget, Workspace, affinity, usable_cores
 
 GIB = 2**30
 
@@ -48,7 +47,7 @@ def test_what_a_large_pass_used_is_given_back(monkeypatch, used, flushed):
 
 
 def test_more_than_the_machine_has_is_never_used(monkeypatch):
-    monkeypatch.setattr(memory, "all_memory", lambda: 8 * GIB)
+    monkeypatch.setattr(machine, "all_memory", lambda: 8 * GIB)
     with pytest.raises(UsageError, match=r"and 8\.0 GiB may be used"):
         Workspace.next_to(65536, 65536, 3, budget=Budget.of(10**6 * GIB))
 
@@ -75,8 +74,8 @@ def test_limits_of_control_groups_count(tmp_path, group, base, names, place):
         (found / names[0]).write_text(f"{size}\n")
         (found / names[1]).write_text(f"{GIB // 2}\n")
         (found / "memory.stat").write_text(f"anon 5\ninactive_file {GIB // 4}\n")
-    assert memory.free_memory(tmp_path) == GIB * 3 // 4
-    assert memory.all_memory(tmp_path) == GIB
+    assert machine.free_memory(tmp_path) == GIB * 3 // 4
+    assert machine.all_memory(tmp_path) == GIB
 
 
 def test_textures_are_taken_from_the_budget():

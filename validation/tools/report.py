@@ -21,8 +21,8 @@ import numpy as np
 import PIL.Image
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.cores import usable_cores
 from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.output.files import to_8bit
 from mrt_mitsuba.output.replacing import check_target, replacing
 from mrt_mitsuba.validation.tools.study import Study

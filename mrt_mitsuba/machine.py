@@ -1,16 +1,16 @@
-"""How much memory a render may take: what the picture needs, and how much to do at once with the rest."""
+"""What the machine grants: memory, how much of it to use at once, and cores; by limits and control groups."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mrt_mitsuba.cores import control_groups
 from mrt_mitsuba.errors import UsageError
 
 # For every pixel: what is kept, by channel, and what Pillow needs to write a PNG
@@ -206,3 +206,40 @@ def _group_limits(root: Path) -> Iterator[tuple[int, int]]:
 
 def _text(count: float) -> str:
     return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
+
+
+def usable_cores(root: Path = Path("/")) -> int:
+    """Return the cores of this process's affinity, or what its control groups grant if that is less.
+
+    A quota of one and a half cores counts as two. ``root``: where the system's ``proc`` and ``sys`` are.
+    """
+    counts = [len(affinity())]
+    for folder in control_groups("cpu", root):
+        for files in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):  # versions 2 and 1
+            with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
+                quota, period = map(float, " ".join((folder / file).read_text() for file in files).split())
+                counts += [math.ceil(quota / period)] if quota > 0 and period > 0 else []
+    return min(counts)
+
+
+def affinity() -> tuple[int, ...]:
+    """Return the numbers of the cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return tuple(sorted(os.sched_getaffinity(0)))
+    return tuple(range(os.cpu_count() or 1))
+
+
+def control_groups(controller: str, root: Path = Path("/")) -> Iterator[Path]:
+    """Yield the folders of the control groups that this process is in, and of those above them."""
+    try:
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
+    except OSError:  # not Linux
+        return
+    for line in lines:
+        _, names, path = line.split(":", 2)
+        if names and controller not in names.split(","):
+            continue
+        group = Path(path.lstrip("/"))
+        for base in {names, controller if names else ""}:  # version 2 of the interface has no names
+            for folder in (group, *group.parents):
+                yield root / "sys/fs/cgroup" / base / folder
