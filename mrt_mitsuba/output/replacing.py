@@ -1,4 +1,4 @@
-"""Putting files in the place of others: all of one result, or none, and never one that was read for it.
+"""Replacing files: all those of one result or none, and never one that the result was made from.
 
 New files are written next to the old ones under temporary names. Once all are complete and on the disk, they
 take the places of the old; if anything goes wrong before, they disappear. What a killed process left
@@ -31,7 +31,7 @@ _tidied: set[str] = set()  # folders
 
 
 def check_target(path: Path, inputs: Iterable[Path] = ()) -> None:
-    """Raise ``OutputError`` if ``path`` cannot be written; to be asked before the work. Leaves no trace.
+    """Raise ``OutputError`` if ``path`` cannot be written; for use before the work. Leaves no trace.
 
     ``inputs``: files that the work reads; none of them is written, by whatever path or link.
     """
@@ -41,7 +41,7 @@ def check_target(path: Path, inputs: Iterable[Path] = ()) -> None:
 
 @contextlib.contextmanager
 def replacing(*paths: Path, inputs: Iterable[Path] = ()) -> Iterator[list[IO[bytes]]]:
-    """Give binary files to write to, which take the places of ``paths``, all of them, when all went well.
+    """Give binary files to write to, which replace ``paths``, all of them, once all has gone well.
 
     A symbolic link stays and its target is replaced. Whatever is raised inside, the old files stay as they
     were and no temporary file remains; an ``OSError`` becomes an ``OutputError``. ``inputs``: as in
@@ -68,7 +68,7 @@ def replacing(*paths: Path, inputs: Iterable[Path] = ()) -> Iterator[list[IO[byt
 
 
 def discard_unfinished() -> None:
-    """Remove the temporary files of this process; for one about to end by force."""
+    """Remove the temporary files of this process, which is about to be ended by force."""
     for temporary in tuple(_unfinished):
         with contextlib.suppress(OSError):
             os.unlink(temporary)

@@ -1,4 +1,4 @@
-"""Reading the text files of a model: bytes, lines, and where a file that they name lies."""
+"""Reading the text files of a model: bytes, lines, and where the files they name are."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ MISSING = "is missing or may not be read in"  # what messages say about a file t
 
 
 def require_file(path: str | os.PathLike[str]) -> None:
-    """Raise ``SceneError`` unless ``path`` is a file that may be read. Pipes and devices have no end to wait
-    for."""
+    """Raise ``SceneError`` unless ``path`` is a file that may be read. Pipes and devices may never
+    end."""
     name = os.fspath(path)
     try:
         mode = os.stat(path).st_mode
@@ -65,7 +65,7 @@ def read_text(path: Path) -> bytes:
 
 
 def decode(data: bytes) -> str:
-    """Return text of unknown encoding: UTF-8, else the Latin letters that older exporters wrote."""
+    """Return text of unknown encoding: UTF-8, or else the Latin-1 that older exporters wrote."""
     try:
         return data.decode()
     except UnicodeDecodeError:
@@ -73,7 +73,7 @@ def decode(data: bytes) -> str:
 
 
 def find(name: str, folders: list[Path]) -> Path | None:
-    """Return the file ``name`` of the first folder that has it and where it may be read, or None.
+    """Return the file ``name`` in the first folder where it exists and may be read, or None.
 
     Backslashes may separate folders.
     """
@@ -106,7 +106,7 @@ def picture_size(path: str) -> tuple[int, int] | None:
 
 
 def warn(findings: Mapping[str, list[str]]) -> None:
-    """Show what a reading found, by the plural of what it is about: the first, and how many more."""
+    """Warn of what was found, by kind in the plural: of the first, with the number of the others."""
     for kind, texts in findings.items():
         more = f" (and so do {len(texts) - 1} more {kind})" if texts[1:] else ""
         if texts:

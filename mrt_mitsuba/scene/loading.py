@@ -1,4 +1,4 @@
-"""Loading dicts and XML files with Mitsuba, after a look at what they would make it do.
+"""Loading dicts and XML files with Mitsuba, after checking what they would make it do.
 
 Mitsuba takes a plugin from ``plugins/NAME.so`` in the first folder of its file resolver that has one, and the
 folders of a scene and of the process come before its own: a file that lies there would run as native code.
@@ -56,7 +56,7 @@ def load_dict(
 
 
 def load_file(path: str, budget: Budget | None = None, **parameters: Any) -> tuple[Any, Mapping[str, str]]:
-    """Return the scene of an XML file, and its ``$parameters`` with the values given or by default.
+    """Return the scene of an XML file, and its ``$parameters`` with the values given, or the defaults.
 
     Raises ``SceneError``, and ``UsageError`` for another kind of file or a texture too large for the budget.
     """
@@ -77,8 +77,7 @@ def rewrite_file(path: str, budget: Budget, **parameters: Any) -> tuple[str, Map
 
 def declared(path: str) -> dict[str, str]:
     """Return the parameters that an XML file declares, with their defaults. Raises ``SceneError``."""
-    found = [attributes for tag, attributes in _elements(path) if tag == "default"]
-    return {each.get("name", ""): each.get("value", "") for each in found}
+    return {a.get("name", ""): a.get("value", "") for tag, a in _elements(path) if tag == "default"}
 
 
 # ---------------------------------------------- Mitsuba's parser ---------------------------------------
@@ -88,7 +87,7 @@ def declared(path: str) -> dict[str, str]:
 def _file(
     path: str, budget: Budget | None, parameters: Mapping[str, Any]
 ) -> Iterator[tuple[Any, Mapping[str, str]]]:
-    """Parse an XML file; its folder serves for data within the block."""
+    """Parse an XML file; within the block, its folder is searched for data."""
     import mitsuba as mi
 
     require_file(path)
@@ -125,7 +124,7 @@ def _instantiate(state: Any, merge: bool = True) -> Any:
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel, config.merge_meshes = False, merge
     mi.parser.transform_all(config, state)
-    with held():  # an interrupt leaves plugins half made, at which later renders crash
+    with held():  # an interrupt would leave plugins half made, and later renders would crash
         return mi.parser.instantiate(config, state)
 
 
@@ -157,7 +156,7 @@ def _resolved(path: str) -> str:
 
 
 def _check_plugin(plugin: str, name: str) -> None:
-    """Refuse a native plugin that lies outside Mitsuba's folder. Mitsuba reports a name that it knows not."""
+    """Refuse a native plugin outside Mitsuba's folder. Mitsuba itself reports unknown names."""
     file = os.path.join("plugins", f"{plugin}.so")
     known = "/" not in plugin and os.path.isfile(os.path.join(mitsuba_home(), file))
     if plugin != "scene" and not known and os.path.exists(_resolved(file)):  # "scene" is never looked up
@@ -168,8 +167,8 @@ def _check_plugin(plugin: str, name: str) -> None:
 
 
 def _check_data(filename: str, inputs: set[str]) -> str:
-    """Refuse a pipe, a device or a folder; else note the path, and return it. Mitsuba reports a file that is
-    missing."""
+    """Refuse a pipe, a device or a folder; otherwise note the path and return it. Mitsuba itself reports a
+    missing file."""
     path = _resolved(filename)
     if os.path.exists(path):
         require_file(path)

@@ -296,7 +296,7 @@ def _mesh(m: Mesh, texturing: str) -> dict[str, Any]:
 
 
 # An index of zero switches reflection off in the report's files. The formulas reflect everything there, as
-# they do, to float32, at this index, of which a BSDF can make sense
+# they do, to float32, at this index, which a BSDF can handle
 _SMALLEST_IOR = 1e-8
 
 

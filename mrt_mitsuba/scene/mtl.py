@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,8 @@ CONVENTIONS = ("report", "standard")
 DEFAULT_MATERIAL = Material(
     ior=1.1022, alpha=0.0579, specular=(0.286, 0.235, 0.128), diffuse=(1.0, 0.766, 0.762)
 )
+
+_STANDARD = Material(ior=1.0, alpha=1.0, specular=(0.0, 0.0, 0.0), diffuse=(0.8, 0.8, 0.8))
 
 # What exporters write of statements that are not used, where it changes nothing; numbers without their zeros
 _WITHOUT_EFFECT = {"d 1", "Tr 0", "illum 0", "illum 1", "illum 2", "sharpness 60", "Ke 0 0 0", "Tf 1 1 1"}
@@ -69,13 +70,12 @@ def read_mtl(
     materials = {}
     for name, block in blocks.items():
         if convention == "standard":
-            alpha = math.sqrt(2 / (block.get("Ns", 0.0) + 2))
-            found = Material(block.get("Ni", 1.0), alpha, (0.0, 0.0, 0.0), (0.8, 0.8, 0.8))
+            base, ior, alpha = _STANDARD, block.get("Ni", 1.0), math.sqrt(2 / (block.get("Ns", 0.0) + 2))
         else:
-            ior = block["Ka"][0] if "Ka" in block else DEFAULT_MATERIAL.ior
-            found = replace(DEFAULT_MATERIAL, ior=ior, alpha=block.get("Ni", DEFAULT_MATERIAL.alpha))
-        colours = {"specular": block.get("Ks", found.specular), "diffuse": block.get("Kd", found.diffuse)}
-        materials[name] = replace(found, **colours, texture=block.get("map_Kd"))
+            base = DEFAULT_MATERIAL
+            ior, alpha = block.get("Ka", (base.ior,))[0], block.get("Ni", base.alpha)
+        colors = block.get("Ks", base.specular), block.get("Kd", base.diffuse)
+        materials[name] = Material(ior, alpha, *colors, block.get("map_Kd"))
     return materials
 
 

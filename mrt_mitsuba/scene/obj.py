@@ -39,7 +39,7 @@ _IGNORED = frozenset(_UNUSED.split())
 _GAP, _END = rb"[ \t]{1,99}", rb"[ \t]{0,99}\n"
 _REAL = rb"[-+]?(?:\d{1,99}(?:\.\d{0,99})?|\.\d{1,99})(?:[eE][-+]?\d{1,9})?"
 _INDEX = rb"[-+]?\d{1,18}"  # what fits 64 bits
-# Forms of a corner: the pattern, and of which of the values its indices are
+# Forms of a corner: the pattern, and the columns of ``_USED`` that its indices refer to
 _CORNERS = {
     "c": (_INDEX, [0]),
     "t": (_INDEX + b"/" + _INDEX, [0, 1]),

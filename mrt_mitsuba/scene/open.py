@@ -76,7 +76,7 @@ def open_scene(
         name, loaded, values = _loaded(scene, budget, declared)
         if keys and loaded is scene:
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
-        # of write_xml
+        # as write_xml writes them
         distance, reach = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
     set_parameters(loaded, keys)
     source = opened(name, loaded, _sensor(name, loaded, sensor), _integrator(integrator, loaded))
@@ -128,7 +128,7 @@ def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
 
 @contextmanager
 def sized(source: Source) -> Iterator[None]:
-    """Give the film of a source's sensor the source's size for the block; another size has no crop window."""
+    """Give the film the source's size within the block; a film of another size loses its crop window."""
     import mitsuba as mi
 
     size = [source.width, source.height]
@@ -196,7 +196,7 @@ def _sensor(name: str, scene: Any, number: int) -> Any:
 
 
 def opened(name: str, scene: Any, sensor: Any, integrator: Any) -> Source:
-    """Return the source of a loaded scene of one's own; raise ``SceneError`` if its sensor sees nothing."""
+    """Return the source of someone's own loaded scene; raise ``SceneError`` if its sensor sees nothing."""
     import mitsuba as mi
 
     for part in [sensor] if sensor.class_name() != "BatchSensor" else mi.traverse(sensor).hierarchy:

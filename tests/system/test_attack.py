@@ -220,7 +220,7 @@ VARIANTS = ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral_polarized", "llvm_ad_
 
 
 def odd_scenes() -> list[str]:
-    """Return what stands beside a ball and a sky: each plugin alone, in others, and with odd numbers."""
+    """Return what is put next to a ball and a sky: each plugin alone, in others, and with odd numbers."""
     node = "<{0} type='{1}'>{{}}</{0}>"
     found = [node.format(kind, name) for kind, names in KINDS.items() for name in names.split()]
     outer = ["{}"] + [node.format(*each.split(":")) for each in AROUND.split()]

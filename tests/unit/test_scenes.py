@@ -39,7 +39,7 @@ def test_there_are_ten_scenes_each_read_once_and_no_others() -> None:
 
 @pytest.mark.parametrize("number", range(10))
 def test_watertight_triangles_are_asked_for_where_there_are_any(number: int) -> None:
-    """The report's own scenes hold none, and their pictures shall not change by a bit."""
+    """The report's own scenes have none, and their pictures must not change by a bit."""
     flag = mrt.scene_dict(number).get("embree_use_robust_intersections", False)
     assert flag is (number in (5, 6, 7, 8))
 
