@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba import filters, plugins
+from mrt_mitsuba import filters
 from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation import cli
 from mrt_mitsuba.validation.oracles.reference import reference_render
-from mrt_mitsuba.validation.studies import error_vs_time, roughconductor, scenes, speed, stock
+from mrt_mitsuba.validation.studies import error_vs_time, roughconductor, scenes, speed
 from mrt_mitsuba.validation.studies import filters as filter_study
 from mrt_mitsuba.validation.tools.scenery import sensor, with_materials
 from mrt_mitsuba.validation.tools.study import Study, findings
@@ -90,25 +90,6 @@ def of_type(kind: str, **parameters: Callable[[Any], Any]) -> Fault:
 of_bsdf = partial(of_type, "mrt_bsdf")
 
 
-def in_bsdf(change: Callable[..., Any]) -> Fault:
-    """Put ``change(method, self, ctx, si, wo)`` in the place of eval and eval_pdf."""
-
-    def plant(patch: Patch) -> None:
-        kind = plugins.plugin("bsdf").MrtBSDF
-        for name in ("eval", "eval_pdf"):
-            method = getattr(kind, name)
-            patch.setattr(kind, name, lambda *given, method=method: change(method, *given[:4]))
-
-    return plant
-
-
-def turned(method: Any, self: Any, ctx: Any, si: Any, wo: Any) -> Any:
-    """The normal points to the other side."""
-    other = type(si)(si)
-    other.wi = -si.wi
-    return method(self, ctx, other, -wo)
-
-
 BRIGHT = of_bsdf(specular_reflectance=lambda _: 1.02)
 ROUGH = of_bsdf(alpha=lambda alpha: 1.05 * alpha if isinstance(alpha, float) else alpha)
 SCHLICK = of_bsdf(fresnel=lambda form: "schlick" if form == "dielectric" else form or "schlick")
@@ -146,11 +127,6 @@ def wrong_cases(trade: str, where: dict[str, Any], change: dict[str, Any]) -> Fa
     return plant
 
 
-def schlick_alone(patch: Patch) -> None:
-    SCHLICK(patch)
-    patch.setattr(stock, "MISTAKES", {})
-
-
 FAULTS: list[tuple[str, Fault, str]] = [
     ("filters:noise", wrapped(filters, "sobel_edges", lambda f, image, **_: f(image)), "share of flat"),
     ("filters:depth_of_field", wrapped(filters, "gaussian_dof", moved_blur), "corrected / report"),
@@ -163,9 +139,7 @@ FAULTS: list[tuple[str, Fault, str]] = [
     ("stock:mesh_cones", of_type("mrt_cone", segments=lambda n: 128), "mean error"),
     ("stock:mesh_cones", of_type("mrt_cone", capped=lambda _: False), "another part"),
     ("stock:direct", wrapped(mrt, "render", mirrors_too), "share of pixels off"),
-    ("stock:whole_scenes", schlick_alone, "scene 0"),
     ("roughconductor:pointwise", ROUGH, "value"),
-    ("roughconductor:pointwise", in_bsdf(turned), "value"),
     ("bsdf_laws:known", SCHLICK, "published albedos"),
 ]
 
