@@ -11,7 +11,9 @@ import contextlib
 import fcntl
 import logging
 import os
+import shutil
 import stat
+import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path as Folder
@@ -26,7 +28,7 @@ Path = str | os.PathLike[str]
 
 _TEMPORARY = ".mrt-{}.tmp"
 _OLD = 10.0  # seconds after which a file that nobody has locked has been left behind
-_unfinished: set[str] = set()  # temporary files of this process
+_unfinished: set[str] = set()  # temporary files and folders of this process
 _tidied: set[str] = set()  # folders
 
 
@@ -68,10 +70,23 @@ def replacing(*paths: Path, inputs: Iterable[Path] = ()) -> Iterator[list[IO[byt
 
 
 def discard_unfinished() -> None:
-    """Remove the temporary files of this process, which is about to be ended by force."""
+    """Remove the temporary files and folders of this process, which is about to be ended by force."""
     for temporary in tuple(_unfinished):
         with contextlib.suppress(OSError):
             os.unlink(temporary)
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def temporary_folder(folder: Path) -> Iterator[str]:
+    """Give a new folder in another, which is removed at the end."""
+    name = tempfile.mkdtemp(prefix=".mrt-", dir=folder)
+    _unfinished.add(name)
+    try:
+        yield name
+    finally:
+        shutil.rmtree(name, ignore_errors=True)
+        _unfinished.discard(name)
 
 
 @contextlib.contextmanager

@@ -6,10 +6,10 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
 from itertools import chain
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from mrt_mitsuba.errors import OutputError, UsageError
+from mrt_mitsuba.output.replacing import temporary_folder
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
 from mrt_mitsuba.sweeps.cluster import check_engine, connected, inspect, outcomes
 from mrt_mitsuba.sweeps.jobs import Job, check_parameters, jobs, points
@@ -74,13 +74,15 @@ def sweep(
         raise OutputError(f"cannot make the folder {out!s}: {reason}") from error
     table = Table(folder, named)
     shown = TerminalProgress(unit=" pictures") if progress is None else progress
-    with TemporaryDirectory(prefix=".mrt-", dir=folder, ignore_cleanup_errors=True) as scratch:
+    with temporary_folder(folder) as scratch:
         planned = jobs(scene, named, options, scratch)
         fresh = [is_fresh(job, folder, png, job.file in table.earlier) for job in planned]
         missing = [job for job, whole in zip(planned, fresh, strict=True) if not (whole and resume)]
         parts = {job.name: [job] if tiles is None else cut(job, tiles) for job in missing}
         pictures = {part.name: job for job in missing for part in parts[job.name]}
         every = list(chain(*parts.values()))
+        for own in {os.path.dirname(os.path.join(scratch, part.name)) for part in every}:
+            os.makedirs(own, exist_ok=True)  # of tiles
         # Tiles of an earlier sweep, which has kept no facts of them
         kept = {tile.name: tile for tile in every if tiles is not None and is_fresh(tile, folder) and resume}
         rest = [part for part in every if part.name not in kept]

@@ -66,7 +66,6 @@ def render_job(
         return
     worker, own = get_worker(), os.path.join(scratch, job.name)
     facts = {"attempts": facts["attempts"] + 1, "worker": worker.address}
-    os.makedirs(os.path.dirname(own), exist_ok=True)  # tiles have a folder of their own
     _note(own, facts)
     try:
         with runtime.one_at_a_time:

@@ -26,7 +26,7 @@ from mrt_mitsuba.errors import MrtError, OutputError, UsageError
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.output.files import read_exr
 
-pytest.importorskip("distributed")
+Client = pytest.importorskip("distributed").Client
 pytestmark = pytest.mark.attack
 
 SMALL = {"width": 64, "height": 48, "aa": 1}
@@ -58,12 +58,20 @@ class Cluster:
         file = self.folder / "scheduler.json"
         file.unlink(missing_ok=True)
         self.scheduler = self._start("scheduler", "--port", port)
-        wait_for(lambda: file.exists() and file.read_text().endswith("}"), "a scheduler")
+
+        def ready() -> bool:
+            if self.scheduler.poll() is not None:  # its port was taken, for a moment
+                self.scheduler = self._start("scheduler", "--port", port)
+            return file.exists() and file.read_text().endswith("}")
+
+        wait_for(ready, "a scheduler")
         self.address = json.loads(file.read_text())["address"]
 
     def start_workers(self) -> None:
         own = ["--nthreads", "1", "--local-directory", str(self.folder), "--preload", "preload.py"]
         self.workers += [self._start("worker", *own, *self.words) for _ in range(2)]
+        with Client(self.address, timeout=PATIENCE, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=PATIENCE)
 
     def _start(self, *words: str) -> subprocess.Popen[bytes]:
         environ = os.environ | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
@@ -240,7 +248,19 @@ def test_a_file_of_the_users_own_is_refused_by_name(address: str, tmp_path: Path
     assert contents() == before
 
 
-def test_a_scene_file_counts_by_its_contents(address: str, in_background, tmp_path: Path) -> None:
+# What each worker runs first: it changes a scene file that it has rendered
+CHANGES = """
+from mrt_mitsuba.rendering import api
+def render(scene, alone=api.render, **options):
+    result = alone(scene, **options)
+    with open(scene, "a") as file:
+        file.write("<!-- changed -->")
+    return result
+api.render = render
+"""
+
+
+def test_a_scene_file_counts_by_its_contents(address: str, mortal, tmp_path: Path) -> None:
     """Two versions in one folder after each other, two at a time, and a change while it is rendered."""
     scene, out = tmp_path / "mine.xml", tmp_path / "out"
     assert cli.main(["export", "0", "--xml", str(scene)]) == 0
@@ -255,11 +275,8 @@ def test_a_scene_file_counts_by_its_contents(address: str, in_background, tmp_pa
     assert read_exr(out / "picture.exr").image.tobytes() == mrt.render(scene, **SMALL).image.tobytes()
     with pytest.raises(UsageError, match="2 jobs would write the same file scene=mine"):
         mrt.sweep(None, out, grid={"scene": [str(scene), str(tmp_path / "other" / "mine.xml")]}, **options)
-    sweep = in_background(scene, tmp_path / "late", cluster=address, grid={"seed": range(3)}, **SLOW)
-    wait_for(lambda: (tmp_path / "late").exists() and pictures(tmp_path / "late"), "a picture")
-    scene.write_text(text)
-    errors = [row["error"] for row in sweep.get(PATIENCE).rows]
-    assert "mine.xml has changed since the sweep began" in errors[-1]
+    (row,) = mrt.sweep(scene, tmp_path / "late", cluster=mortal(CHANGES).address, **SMALL).failed
+    assert "mine.xml has changed since the sweep began" in row["error"]
 
 
 # ------------------------------------------- What is refused -------------------------------------------
@@ -322,8 +339,6 @@ def test_a_table_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
 
 # -------------------------------------------- What is survived --------------------------------------------
 
-SLOW = {"width": 400, "height": 300, "aa": 6, "aamode": "none"}  # half a second each
-
 # What each worker runs first: seed 1 fails, 2 costs the first worker that takes it, 3 every worker, and 4
 # takes more memory than there is; workers die with what they would report of 1 and 5
 SPOILED = """
@@ -377,19 +392,40 @@ def test_workers_with_other_software_are_refused(mortal, tmp_path: Path, preload
     assert "\n" not in str(caught.value) and not pictures(tmp_path / "out")
 
 
-def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(in_background, tmp_path: Path) -> None:
+# What each worker runs first: seed 1 costs the first worker that takes it, and from 2 on jobs wait
+WAITING = """
+import os, pathlib, time
+from mrt_mitsuba.rendering import api
+def render(*scene, seed=0, alone=api.render, **options):
+    if seed == 1 and not pathlib.Path("died").exists():
+        pathlib.Path("died").touch()
+        os._exit(1)
+    while seed > 1 and not pathlib.Path("go").exists():
+        time.sleep(0.05)
+    return alone(*scene, seed=seed, **options)
+api.render = render
+"""
+
+
+@pytest.fixture
+def waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets the workers of this machine run ``WAITING`` first, in a folder of their own."""
+    (tmp_path / "waiting.py").write_text(WAITING)
+    monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__PRELOAD", repr([str(tmp_path / "waiting.py")]))
+    monkeypatch.chdir(tmp_path)
+
+
+def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(waiting, tmp_path: Path) -> None:
     import psutil
 
-    def workers() -> list[psutil.Process]:
-        started = psutil.Process().children(recursive=True)
-        return [p for p in started if "spawn_main" in " ".join(p.cmdline())]
+    def children() -> list[psutil.Process]:
+        return psutil.Process().children(recursive=True)
 
-    others = workers()
-    sweep = in_background(3, tmp_path, workers=1, grid={"seed": range(3)}, **SLOW)
-    wait_for(lambda: pictures(tmp_path), "a picture")
-    (worker,) = set(workers()) - set(others)
-    worker.kill()
-    assert [row["error"] for row in sweep.get(PATIENCE).rows] == [""] * 3 and workers() == others
+    before = children()
+    (tmp_path / "go").touch()
+    table = mrt.sweep(3, tmp_path / "out", workers=1, grid={"seed": range(3)}, **SMALL)
+    assert [row["error"] for row in table.rows] == [""] * 3 and table.rows[1]["attempts"] == 2
+    assert set(children()) <= set(before)
 
 
 @pytest.mark.parametrize("back", [True, False][:ROUNDS])
@@ -397,9 +433,11 @@ def test_a_scheduler_killed_ends_the_sweep_and_a_second_run_finishes_it(
     mortal, in_background, tmp_path: Path, back: bool
 ) -> None:
     """Also where one comes back at once under its address, without its workers."""
-    cluster, out = mortal(), tmp_path / "out"
-    sweep = in_background(3, out, cluster=cluster.address, grid={"seed": range(6)}, **SLOW)
-    wait_for(lambda: out.exists() and pictures(out), "a picture")
+    cluster, out = mortal(WAITING), tmp_path / "out"
+    (cluster.folder / "died").touch()
+    options: dict[str, Any] = {"grid": {"seed": range(6)}, **SMALL}
+    sweep = in_background(3, out, cluster=cluster.address, **options)
+    wait_for(lambda: out.exists() and "seed=1.exr" in pictures(out), "two pictures")
     cluster.scheduler.kill()
     cluster.scheduler.wait()
     if back:
@@ -407,34 +445,34 @@ def test_a_scheduler_killed_ends_the_sweep_and_a_second_run_finishes_it(
     with pytest.raises(MrtError, match="the scheduler is gone"):
         sweep.get(PATIENCE)
     first = {path.name: path.stat().st_mtime_ns for path in out.glob("*.exr")}
-    assert 0 < len(first) < 6 and {row["file"] for row in written(out)} <= first.keys()
+    assert len(first) == 2 and {row["file"] for row in written(out)} <= first.keys()
+    (cluster.folder / "go").touch()
     if back:
         cluster.start_workers()
-    address = cluster.address if back else mortal().address
-    table = mrt.sweep(3, out, cluster=address, grid={"seed": range(6)}, **SLOW)
+    table = mrt.sweep(3, out, cluster=cluster.address if back else mortal().address, **options)
     assert len(table.rows) == 6 and not table.failed and not left_over(out)
     assert {name: (out / name).stat().st_mtime_ns for name in first} == first
 
 
 SWEEP = """
 scene = 3
-width = 400
-height = 300
-aamode = "none"
-aa = 8
+width = 64
+height = 48
+aa = 1
 
 [grid]
 seed = [0, 1, 2, 3, 4, 5]
 """
 
 
-def test_interrupted_from_the_keyboard(start, tmp_path: Path) -> None:
+def test_interrupted_from_the_keyboard(start, waiting, tmp_path: Path) -> None:
     """The whole group of processes gets the signal, as from a terminal."""
     (tmp_path / "sweep.toml").write_text(SWEEP)
+    (tmp_path / "died").touch()
     out = tmp_path / "out"
     words = ["-m", "mrt_mitsuba.command.main", "sweep", "out", "sweep.toml", "workers=2"]
     with start(sys.executable, *words, start_new_session=True) as process:
-        wait_for(lambda: out.exists() and pictures(out), "a picture")
+        wait_for(lambda: (out / "table.csv").exists(), "a row of the table")
         os.killpg(process.pid, signal.SIGINT)
         process.wait(PATIENCE)
         errors = process.stderr.read()
@@ -442,11 +480,11 @@ def test_interrupted_from_the_keyboard(start, tmp_path: Path) -> None:
     done = pictures(out)
     assert 0 < len(done) < 6 and {row["file"] for row in written(out)} <= set(done) and not left_over(out)
     for name in done:
-        assert read_exr(out / name).image.shape == (300, 400, 3)
+        assert read_exr(out / name).image.shape == (48, 64, 3)
 
 
 def test_the_command(tmp_path: Path, capsys) -> None:
-    (tmp_path / "sweep.toml").write_text(SWEEP.replace("aa = 8", "aa = 1"))
+    (tmp_path / "sweep.toml").write_text(SWEEP)
     assert cli.main(["sweep", str(tmp_path / "out"), str(tmp_path / "sweep.toml"), "workers=1"]) == 0
     assert capsys.readouterr().out.endswith(f"6 of 6 pictures in {tmp_path / 'out'}\n")
     assert {row["attempts"] for row in written(tmp_path / "out")} == {"1"}
@@ -464,7 +502,6 @@ def test_a_gpu_is_pinned_to_each_worker(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_threads_are_shared_out(address: str, tmp_path: Path) -> None:
     """Two workers on this machine: half of its cores each."""
-    from distributed import Client
 
     def threads() -> int:
         return dr.thread_count()

@@ -39,8 +39,7 @@ def test_orderly_end_is_left_alone() -> None:
     """A program that ends by itself in time is not ended by force: this very process goes on."""
     called = []
     with pytest.raises(Terminated), ending_soon(lambda: called.append("by force")):
-        os.kill(os.getpid(), signal.SIGTERM)
-        signal.pause()
+        signal.raise_signal(signal.SIGTERM)
     assert called == []
 
 
@@ -51,8 +50,7 @@ def test_error_that_a_library_makes_of_it_is_undone(number: signal.Signals, kind
     """Dr.Jit raises ``RuntimeError`` where it is interrupted while it records a loop."""
     with pytest.raises(KeyboardInterrupt) as found, ending_soon(lambda: None):
         try:
-            os.kill(os.getpid(), number)
-            signal.pause()
+            signal.raise_signal(number)
         except KeyboardInterrupt as error:
             raise RuntimeError("encountered an exception") from error
     assert found.type is kind
