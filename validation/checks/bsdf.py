@@ -15,21 +15,11 @@ import numpy as np
 from scipy import stats
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.checks import bsdf_case, noise
+from mrt_mitsuba.validation.checks import bsdf_case, noise, probe
 from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, live, narrow, parameters
 from mrt_mitsuba.validation.checks.bsdf_gradients import gradients
 from mrt_mitsuba.validation.checks.law import LEVEL, RARE, SIGMAS, TIMEOUT, Check, Law, Skip, examine, figures
-from mrt_mitsuba.validation.checks.probe import (
-    BEYOND,
-    ROUNDED,
-    Array,
-    Probe,
-    context,
-    direction,
-    excess,
-    is_scalar,
-    unit,
-)
+from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Probe, context, excess, is_scalar
 from mrt_mitsuba.validation.checks.sphere import DEPTH, Cells, chi_square, encode, integrate
 from mrt_mitsuba.validation.checks.subject import VALUES, elsewhere, other_kind
 from mrt_mitsuba.validation.tools.image_tests import sidak
@@ -117,9 +107,8 @@ def sampling(law: Law, case: Case) -> None:
             beyond[i] = max(abs(view.share - found.mean.sum()) - SIGMAS * off, 0)
     if not tests:
         raise Skip(f"{UNRESOLVED} at every angle")
-    chances = stats.chi2.sf(
-        *np.moveaxis([*tests, np.sum(tests, axis=0)], 2, 0)
-    )  # of all angles together, too
+    by_angle = np.array([*tests, np.sum(tests, axis=0)])  # and of all angles together
+    chances = stats.chi2.sf(by_angle[..., 0], by_angle[..., 1])
     names = worst[int(chances[:-1].min(axis=1).argmin())]
     law.hold("cells", sidak(float(chances.min()), chances.size), **names, angles=len(tests))
     law.hold("integral", beyond, **case.incidence)
@@ -199,7 +188,7 @@ def energy(law: Law, case: Case) -> None:
     """
     # that surely reached near the horizon, where lobes peak, by samples alone
     count, albedos, apart = case.count(2**12, 2**14), [], []
-    wi = direction(np.cos(np.radians(GRAZING)), case.rng.uniform(0, 2 * np.pi, len(GRAZING)))
+    wi = probe.direction(np.cos(np.radians(GRAZING)), case.rng.uniform(0, 2 * np.pi, len(GRAZING)))
     uv = case.uniform(len(GRAZING), 2)
     for i, t in zip(wi, uv, strict=True):
         mean, error = _mean(case.sample(i, case.uniform(count, 3), t, context(importance=True)).weight)
@@ -304,7 +293,7 @@ EITHER_WAY = "light can be followed either way; transmitted radiance scales by t
     swapped=("most", f"f(wi, wo) against f(wo, wi), {BEYOND}", POINTWISE, EITHER_WAY, RECIPROCITY),
     modes=("most", f"f in the mode of radiance against that of importance, {BEYOND}", POINTWISE, EITHER_WAY,
            RECIPROCITY),
-    medium=("most", "index of refraction of reflected samples, less 1", ROUNDED, "one medium", SAMPLE),
+    medium=("most", "index of refraction of reflected samples, less 1", probe.ROUNDED, "one medium", SAMPLE),
     returns=("at least", "share of single directions (delta) that the way back returns to", 0.05,
              "light can be followed either way; of several directions, the way back may draw another",
              THERE_AND_BACK),
@@ -350,11 +339,11 @@ def _delta_either_way(law: Law, case: Case) -> None:
     wi, uv = case.units(count), case.uniform(count, 2)
     u, v = case.uniform(count, 3), case.uniform(count, 3)
     there = case.sample(wi, u, uv)
-    wo = unit(np.where(np.isfinite(there.wo), there.wo, 1))
+    wo = probe.unit(np.where(np.isfinite(there.wo), there.wo, 1))
     back = case.sample(wo, v, uv)
     same = there.delta & (there.type == back.type) & (there.component == back.component)
     same &= np.abs(wi[:, 2] * wo[:, 2]) > 1e-3
-    returned = (np.abs(unit(back.wo) - wi) < 1e-3).all(axis=1)
+    returned = (np.abs(probe.unit(back.wo) - wi) < 1e-3).all(axis=1)
     if same.sum() < 20:
         return
     names, lost = {"wi": wi, "uv": uv, "u": u, "back": v}, int((same & ~returned).argmax())
@@ -389,7 +378,9 @@ WRONG, SPOILS = "results not finite, or negative{where}: {faults}", "one such nu
 def finite(law: Law, case: Case) -> None:
     """No NaN, no infinity, nothing negative: extreme directions, random numbers and parameters."""
     cosines = np.array([s * c for c in COSINES for s in (1, -1)])
-    pool = direction(np.repeat(cosines, 6), np.tile([0, np.pi / 2, np.pi, -np.pi / 2, 0.7, 4], len(cosines)))
+    pool = probe.direction(
+        np.repeat(cosines, 6), np.tile([0, np.pi / 2, np.pi, -np.pi / 2, 0.7, 4], len(cosines))
+    )
     rng, count = case.rng, case.count(2**14, 2**17)
     wi, any_ = pool[rng.integers(len(pool), size=(2, count))]
     wo = np.choose(
@@ -464,7 +455,9 @@ def roundoff(law: Law, case: Case) -> None:
         raise Skip("too few pairs of directions with a value")
 
     def on_spheres(x: Array) -> Array:
-        return np.concatenate([unit(x[:, :3].astype(np.float64)), unit(x[:, 3:].astype(np.float64))], axis=1)
+        return np.concatenate(
+            [probe.unit(x[:, :3].astype(np.float64)), probe.unit(x[:, 3:].astype(np.float64))], axis=1
+        )
 
     inputs = np.concatenate([few.wi, few.wo], axis=1)
     for name, function in (("eval", lambda *at: case.eval(*at).max(axis=1)), ("pdf", case.pdf)):

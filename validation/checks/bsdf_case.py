@@ -13,18 +13,9 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.law import Skip
-from mrt_mitsuba.validation.checks.probe import (
-    ROUNDED,
-    Array,
-    Lanes,
-    Probe,
-    direction,
-    is_scalar,
-    joined,
-    spread,
-    unit,
-)
+from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Lanes, Probe, is_scalar, joined, unit
 from mrt_mitsuba.validation.checks.sphere import DEPTH, POINTS, Cells, encode, integrate
 from mrt_mitsuba.validation.checks.subject import Subject
 
@@ -57,7 +48,7 @@ class Case(Subject, Probe):
         """
         found = []
         for angle in QUICK_ANGLES if self.quick else ANGLES:
-            wi = direction(np.cos(np.radians(angle)), self.rng.uniform(0, 2 * np.pi))
+            wi = probe.direction(np.cos(np.radians(angle)), self.rng.uniform(0, 2 * np.pi))
             uv, u = self.uniform(2), self.uniform(self.count(2**16, 2**19), 3)
             samples = self.sample(wi, u, uv)
             value, pdf = self.both(wi, samples.wo, uv)
@@ -161,7 +152,7 @@ class Case(Subject, Probe):
 
     def spread(self, quantity: Any, wi: Array, wo: Array, uv: Array, *others: Array) -> Array:
         """Return the largest change of ``quantity(wi, wo, uv, …)`` as directions move by a rounding."""
-        return spread(lambda i, o: quantity(i, o, uv, *others), (wi, wo), self.rng)
+        return probe.spread(lambda i, o: quantity(i, o, uv, *others), (wi, wo), self.rng)
 
 
 def live(wi: Array, s: Lanes, value: Array, pdf: Array) -> Array:

@@ -8,18 +8,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.bsdf_case import Case, changed, copied, live, narrow, parameters
 from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip, figures
-from mrt_mitsuba.validation.checks.probe import (
-    ROUNDED,
-    Array,
-    Probe,
-    as_mitsuba,
-    context,
-    excess,
-    interaction,
-    is_scalar,
-)
+from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
 IN_THE_MEAN = 5e-2  # where outlines of lobes move, derivatives of samples miss them
@@ -75,7 +67,7 @@ print("after an update to {number}:", bsdf.eval(ctx, si, wo), "should be", {valu
 )  # fmt: skip
 def gradients(law: Law, case: Case) -> None:
     """∂/∂π of the mean value, by forward derivatives, against differences, for every parameter π."""
-    if is_scalar() or "_ad_" not in mi.variant():
+    if probe.is_scalar() or "_ad_" not in mi.variant():
         raise Skip(f"{mi.variant()} has no derivatives")
     case.need_smooth()
     if not len(case.lit.wi):
@@ -144,7 +136,7 @@ def _sampled(law: Law, case: Case, key: str) -> None:
     shift = mi.Float(0)
     dr.enable_grad(shift)
     with changed(case, key, lambda old: _moved(old, shift)):
-        si = interaction(as_mitsuba("Vector3f", wi), as_mitsuba("Point2f", uv))
+        si = probe.interaction(as_mitsuba("Vector3f", wi), as_mitsuba("Point2f", uv))
         first, second = as_mitsuba("Float", u[:, 0]), as_mitsuba("Point2f", u[:, 1:])
         bs, weight = case.plugin.sample(context(), si, first, second)
         value, pdf = case.plugin.eval_pdf(context(), si, dr.detach(bs.wo))
@@ -202,7 +194,7 @@ def _values(case: Case) -> Any:
     """Return values at pairs as a Dr.Jit array with derivatives, each over what it is without a change."""
     few = case.lit
     wi, wo = (as_mitsuba("Vector3f", x) for x in (few.wi, few.wo))
-    si = interaction(wi, as_mitsuba("Point2f", few.uv))
+    si = probe.interaction(wi, as_mitsuba("Point2f", few.uv))
     scale = np.maximum(few.value.max(axis=1), 1e-3 * few.value.max())
     return _total(case.plugin.eval(context(), si, wo)) / as_mitsuba("Float", scale)
 

@@ -115,24 +115,16 @@ class ChangedShape:
 
 
 def moved(**values: Callable[..., Any]) -> Callable[[Any, Any], Any]:
-    """Return a change of hits: members are functions of the hit and the ray. ``shading`` is that normal."""
+    """Return a change of hits or samples: members are functions of it, and of the ray or the random numbers.
 
-    def change(si: Any, ray: Any) -> Any:
+    ``shading`` is that normal.
+    """
+
+    def change(found: Any, source: Any) -> Any:
         for name, value in values.items():
-            place, member = (si.sh_frame, "n") if name == "shading" else (si, name)
-            setattr(place, member, value(si, ray))
-        return si
-
-    return change
-
-
-def sampled(**values: Callable[..., Any]) -> Callable[[Any, Any], Any]:
-    """Return a change of samples: members are functions of the sample and its random numbers."""
-
-    def change(sample: Any, u: Any) -> Any:
-        for name, value in values.items():
-            setattr(sample, name, value(sample, u))
-        return sample
+            place, member = (found.sh_frame, "n") if name == "shading" else (found, name)
+            setattr(place, member, value(found, source))
+        return found
 
     return change
 
@@ -186,8 +178,8 @@ FAULTS: Sequence[Fault] = (
           lambda s: lambda bs, weight, u, ctx: (scaled(bs, pdf=1 - s), weight), {"type": "conductor"}),
     Fault("eval_pdf.value", "value of eval_pdf() too large in one channel", 1e-4, 1e-4, "pair",
           lambda s: lambda pair, ctx, wi, wo: (pair[0] * mi.Color3f(1 + s, 1, 1), pair[1])),
-    Fault("eval_pdf.density", "density of eval_pdf() too large", 1e-4, 1e-4, "pair",
-          lambda s: lambda pair, ctx, wi, wo: (pair[0], (1 + s) * pair[1])),
+    Fault("eval_pdf.density", "density of eval_pdf() too large", 2e-4, 2e-4, "pair",
+          lambda s: lambda pair, ctx, wi, wo: (pair[0], (1 + s) * pair[1]), GLOSS),
     Fault("energy.largest", "albedo above 1", 0.01, 0.01, "value",
           lambda s: lambda value, ctx, wi, wo: 2 * (1 + s) * value),
     Fault("energy.apart", "value of eval() too large", 0.02, 0.02, "eval",
@@ -257,7 +249,7 @@ FAULTS: Sequence[Fault] = (
           lambda s: {"hit": moved(uv=lambda si, ray: dr.select(dr.abs(ray.d.x) < s, dr.nan, si.uv))}),
     Fault("sampling.crossings", "area too large, and the density of positions too small", 0.02, 0.01, "shape",
           lambda s: {"area": lambda area: (1 + s) * area, "pdf_position": lambda pdf: pdf / (1 + s),
-                     "position": sampled(pdf=lambda ps, u: ps.pdf / (1 + s))}),
+                     "position": moved(pdf=lambda ps, u: ps.pdf / (1 + s))}),
     Fault("sampling.area", "surface_area() too large", 3e-3, 3e-3, "shape",
           lambda s: {"area": lambda area: (1 + s) * area}),
     Fault("sampling.position", "pdf_position() too large", 3e-3, 3e-3, "shape",
@@ -266,18 +258,20 @@ FAULTS: Sequence[Fault] = (
           "shape",
           lambda s: {"first": 1 + s}, {"type": "rectangle"}),
     Fault("sampling.off", "positions off the surface, in sizes", 1e-5, 1e-5, "shape",
-          lambda s: {"position": sampled(p=lambda ps, u: ps.p + SIZE * s * ps.n)}),
+          lambda s: {"position": moved(p=lambda ps, u: ps.p + SIZE * s * ps.n)}),
     Fault("sampling.normal", "normals of positions tilted, in radians", 0.1, 0.1, "shape",
-          lambda s: {"position": sampled(n=lambda ps, u: tilted(ps.n, s))}),
+          lambda s: {"position": moved(n=lambda ps, u: tilted(ps.n, s))}),
     Fault("sampling.direction", "pdf_direction() too large", 0.02, 0.02, "shape",
           lambda s: {"pdf_direction": lambda pdf: (1 + s) * pdf}),
     Fault("sampling.misses", "distances too short for this share of directions", 0.02, 0.02, "shape",
-          lambda s: {"direction": sampled(dist=lambda ds, u: ds.dist * dr.select(u.x < s, 0.99, 1))}),
+          lambda s: {"direction": moved(dist=lambda ds, u: ds.dist * dr.select(u.x < s, 0.99, 1))}),
     Fault("sampling.angle", "density of directions too small", 0.1, 0.03, "shape",
           lambda s: {"pdf_direction": lambda pdf: pdf / (1 + s),
-                     "direction": sampled(pdf=lambda ds, u: ds.pdf / (1 + s))}),
-    Fault("bbox.outside", "a box too small, in sizes", 3e-5, 3e-5, "shape",
-          lambda s: {"bbox": lambda box: mi.BoundingBox3f((1 - 2 * s) * box.min, (1 - 2 * s) * box.max)}),
+                     "direction": moved(pdf=lambda ds, u: ds.pdf / (1 + s))}),
+    Fault("bbox.outside", "a box too small above, in sizes", 3e-5, 3e-5, "shape",
+          lambda s: {"bbox": lambda box: mi.BoundingBox3f(box.min, (1 - 2 * s) * box.max)}),
+    Fault("bbox.outside", "a box too small below, in sizes", 3e-5, 3e-5, "shape",
+          lambda s: {"bbox": lambda box: mi.BoundingBox3f((1 - 2 * s) * box.min, box.max)}),
 )  # fmt: skip
 
 
