@@ -198,12 +198,15 @@ class Halves(Stack):
         """
         room, self.last = most * self.film.pixels - self._traced.sum(), most >= rays
         if target is not None:
-            wanted = self._share(0, self._scouted, math.inf, target)
-            self.last = self.last or self.group * wanted.sum() <= room / 2
+            deviation = np.sqrt(self._scouted.ravel())
+            wanted = np.maximum(deviation * deviation.mean() / (2 * target**2) - self.rays[0], 0)
+            self.last = self.last or wanted.sum() <= room / 2
         if not self.last:
             scouting = self.scouting[self._shape >= SUSPECT]
             half = self._share(0, self._scouted, room / 2 / (1 + scouting), None)
-            scouts = self._due(scouting * (self.rays[0] + self.group * half), self._traced[2])
+            scouts = self._due(
+                scouting * (self.rays[0] + self.group * half), self._traced[2], self._rounding()
+            )
             return np.stack([half, half, scouts, scouts])
         room += (rays - most) * self.film.pixels
         views = [self._decisive([1 - half], SCOUTS) for half in HALVES]
@@ -214,34 +217,36 @@ class Halves(Stack):
         """Return groups for a half: what a target takes, if the other half is like this one, or nearly, but
         no more than, what there is room for. Rays are a multiple of the deviation, or what there is."""
         have, deviation = self.rays[half], np.sqrt(variance.ravel() + 1e-30)
-        low, high = 0.0, (room + have.sum()) / deviation.sum()
+        low, high, best = 0.0, (room + have.sum()) / deviation.sum(), np.zeros(len(have), np.int64)
         if target is not None:
             high = min(high, deviation.mean() / (2 * target**2))
-        for _ in range(14):
-            factor = (low + high) / 2
-            groups = self._due(factor * deviation, have)
-            left = float(np.mean(np.square(deviation) / (have + self.group * groups))) / 2
-            if self._fills(groups, room) or (target is not None and left < target**2):
-                high = factor
-            else:
+        rounding, factor = self._rounding(), high
+        for _ in range(12):
+            groups = self._due(factor * deviation, have, rounding)
+            fits = self.group * self.widened(groups[None]).sum() <= room
+            best = groups if fits else best
+            if fits and (
+                target is None or np.mean(variance.ravel() / (have + self.group * groups)) > 2 * target**2
+            ):
                 low = factor
-        groups = self._due(high * deviation, have)
-        return self._due(low * deviation, have) if self._fills(groups, room) else groups
+            else:
+                high = factor
+            factor = (low + high) / 2
+        return best
 
-    def _fills(self, groups: np.ndarray, room: float) -> bool:
-        """Return whether groups of a half take more rays than there is room for."""
-        return self.group * int(self.widened(groups[None]).sum()) > room
-
-    def _due(self, rays: np.ndarray, have: np.ndarray) -> np.ndarray:
-        """Return the groups that make of the rays there are so many, rounded at random, alike in a tile.
-
-        To multiples of a power of two, about half of the number: rays of a sequence err least then.
-        """
+    def _rounding(self) -> np.ndarray:
+        """Return random numbers to add before rounding down, alike in a tile."""
         rows, columns = (np.arange(n) // self._tile for n in self.film.shape)
         random = np.random.default_rng((self._seed, int(self._traced.sum())))
-        rounding = random.random((rows[-1] + 1, columns[-1] + 1))[rows[:, None], columns].ravel()
-        rays = np.clip(rays, 0, 2.0**40)
-        step = np.exp2(np.floor(np.log2(np.maximum(rays, 4))) - 1)
+        return random.random((rows[-1] + 1, columns[-1] + 1))[rows[:, None], columns].ravel()
+
+    def _due(self, rays: np.ndarray, have: np.ndarray, rounding: np.ndarray) -> np.ndarray:
+        """Return the groups that make of the rays there are so many.
+
+        Or a multiple of a power of two near it, a quarter to half of it: rays of a sequence err least then.
+        """
+        rays = np.minimum(rays, 2.0**40)
+        step = np.ldexp(0.25, np.maximum(np.frexp(rays)[1], 3))
         due = np.floor(rays / step + rounding) * step - have
         return np.asarray(np.maximum(due, 0) // self.group, np.int64)
 

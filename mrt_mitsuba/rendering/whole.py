@@ -83,7 +83,7 @@ class Wholes(Halves):
         """Return the variance of a pixel times its rays as the scouts have it, alike in all pixels."""
         return np.full(self.film.shape, self._squares(SCOUTS).mean() * self._traced[SCOUTS].sum(0)[0])
 
-    def _due(self, rays: np.ndarray, have: np.ndarray) -> np.ndarray:
+    def _due(self, rays: np.ndarray, have: np.ndarray, _: np.ndarray) -> np.ndarray:
         return np.asarray(np.maximum(np.ceil(rays) - have, 0), np.int64)
 
     def _tail(self, which: list[int]) -> float:
