@@ -169,7 +169,7 @@ def _check_plugin(plugin: str, name: str) -> None:
 def _check_data(filename: str, inputs: set[str]) -> str:
     """Refuse a pipe, a device or a folder; otherwise note the path and return it. Mitsuba itself reports a
     missing file."""
-    path = _resolved(filename)
+    path = _resolved(filename) if filename else ""
     if os.path.exists(path):
         require_file(path)
     inputs.add(path)
