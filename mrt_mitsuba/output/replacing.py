@@ -137,7 +137,7 @@ def _temporary(folder: str) -> Iterator[IO[bytes]]:
     """Give a new file in a folder, locked, with the rights of the user's umask; remove it at the end."""
     if folder not in _tidied:
         _tidied.add(folder)
-        for left in Folder(folder).glob(_TEMPORARY.format("*")):  # by killed processes
+        for left in Folder(folder).glob(_TEMPORARY.format(16 * "[0-9a-f]")):  # by killed processes
             with contextlib.suppress(OSError):
                 found = left.lstat()
                 if stat.S_ISREG(found.st_mode) and time.time() - found.st_mtime > _OLD:

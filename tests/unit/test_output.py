@@ -194,14 +194,15 @@ def test_interrupt_leaves_all_files_old_or_makes_all_new(
 
 
 def test_leftovers_of_killed_processes_are_removed(tmp_path: Path, image: np.ndarray) -> None:
-    left, alive, recent = (tmp_path / f".mrt-{name}.tmp" for name in ("left", "alive", "recent"))
+    names = (16 * "0", 16 * "1", 16 * "2", "a-file-of-the-user")
+    left, alive, recent, own = (tmp_path / f".mrt-{name}.tmp" for name in names)
     with alive.open("wb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        for path, made in ((left, 0), (alive, 0), (recent, 2**32)):
+        for path, made in ((left, 0), (alive, 0), (recent, 2**32), (own, 0)):
             path.touch()
             os.utime(path, (made, made))
         output.save(tmp_path / "a.png", image)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [alive.name, recent.name, "a.png"]
+    assert sorted(tmp_path.iterdir()) == [alive, recent, own, tmp_path / "a.png"]
 
 
 def test_link_stays_and_its_target_is_replaced(tmp_path: Path, image: np.ndarray) -> None:
