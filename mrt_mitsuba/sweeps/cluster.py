@@ -7,7 +7,7 @@ import logging
 import os
 import subprocess
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, Any
@@ -150,7 +150,7 @@ def inspect(client: Client, scratch: str) -> dict[str, Any]:
 
 def outcomes(
     client: Client, jobs: Sequence[Job], retries: int, scratch: str, **setting: Any
-) -> Iterator[tuple[Job, dict[str, Any]]]:
+) -> Generator[tuple[Job, dict[str, Any]], None, None]:
     """Let workers render jobs, and yield each as it ends, with its facts or its "error".
 
     One that lost its worker, or failed by accident, is handed over again. ``setting``: of ``render_job``.
@@ -183,13 +183,11 @@ def outcomes(
             ):
                 hand_over(job)
                 continue
-            error = future.exception()
-            if not ended and isinstance(error, KilledWorker):
-                facts["error"] = (
-                    "every worker that rendered it died, perhaps for want of memory: give each more"
-                )
-            elif not ended:
-                facts["error"] = one_line(f"{type(error).__name__}: {error}")
+            if not ended:
+                error = future.exception()
+                text = "every worker that rendered it died, perhaps for want of memory: give each more"
+                alive = not isinstance(error, KilledWorker)
+                facts["error"] = one_line(f"{type(error).__name__}: {error}") if alive else text
             future.release()  # what no one needs is not computed again when its worker goes
             yield job, facts
     finally:

@@ -81,8 +81,8 @@ def sweep(
         parts = {job.name: [job] if tiles is None else cut(job, tiles) for job in missing}
         pictures = {part.name: job for job in missing for part in parts[job.name]}
         every = list(chain(*parts.values()))
-        for own in {os.path.dirname(os.path.join(scratch, part.name)) for part in every}:
-            os.makedirs(own, exist_ok=True)  # of tiles
+        for place in {os.path.dirname(os.path.join(scratch, part.name)) for part in every}:
+            os.makedirs(place, exist_ok=True)  # of tiles
         # Tiles of an earlier sweep, which has kept no facts of them
         kept = {tile.name: tile for tile in every if tiles is not None and is_fresh(tile, folder) and resume}
         rest = [part for part in every if part.name not in kept]
