@@ -27,8 +27,6 @@ from mrt_mitsuba.rendering.shading import Shader
 if TYPE_CHECKING:
     from mrt_mitsuba.output.error import ErrorEstimate, Round
 
-SAID = {REFINEMENT: "Computing Anti aliasing..", BLUR: "Computing depth of field.."}
-
 
 class Passes:
     """A picture in the making. ``layers``: by name, [H, W, channels] float32, with the film's and the
@@ -69,9 +67,6 @@ class Passes:
             self._add("samples")[:] = self._plan.samples
         return self.layers
 
-    def _stage(self, step: Pass, total: int) -> Any:
-        return self._job.stage(step.name, total, SAID.get(step.name, ""))
-
     # ------------------------------------------- Lattices -------------------------------------------
 
     def _trace(self, step: Pass) -> None:
@@ -87,7 +82,7 @@ class Passes:
                 self._add(name)
         flat = {name: self.layers[name].reshape(len(self._pixels), -1) for name in step.layers}
         exposer = Exposer(self._job, self._shader, None, [name for name in TABLE if name in step.layers])
-        with self._stage(step, len(pixels)) as advance:
+        with self._job.stage(step.name, len(pixels)) as advance:
             for part, means in exposer.means(pixels, places, seed):
                 for name, values in means.items():
                     if refined:
@@ -107,7 +102,7 @@ class Passes:
         if not self._shader.layers:
             from mrt_mitsuba.rendering.whole import whole_pictures
 
-            with self._stage(step, rays * film.pixels) as advance:
+            with self._job.stage(step.name, rays * film.pixels) as advance:
                 counts, pictures = zip(*whole_pictures(exposer, seed, rays, advance), strict=True)
             self._develop(exposer, np.average(pictures, axis=0, weights=counts))
             return
@@ -121,7 +116,7 @@ class Passes:
             seed, marked[self._seen] = seed + 1, self.layers["samples"][..., 0] > 1
             chosen = np.pad(marked, film.border).reshape(1, -1)
             pixels = np.flatnonzero(self._stack.widened(chosen)[0])
-        with self._stage(step, len(pixels) * rays) as advance:
+        with self._job.stage(step.name, len(pixels) * rays) as advance:
             exposed = exposer.expose(Groups(rays, pixels), seed, moments=moments, advance=advance)
             self._stack.add(exposed, chosen)
         if moments:
@@ -180,7 +175,7 @@ class Passes:
         first = next(each for each in self._plan.passes if each.name == RENDERING)
         if square is not None and not self._plan.film:  # the mean square of the rays of each pixel
             square = np.maximum(square - self.layers["image"] ** 2, 0) / (first.places.size - 1)
-        with self._stage(step, len(self._pixels)) as advance:
+        with self._job.stage(step.name, len(self._pixels)) as advance:
             for rows, seen, inner in self._bands(edges.REACH):
                 read = [self.layers[name][seen] for name in DETECTORS[step.mode]]
                 read = [layer if layer.shape[-1] > 1 else layer[..., 0] for layer in read]
@@ -193,7 +188,7 @@ class Passes:
         """Blur the picture, and note by how much."""
         distance, reach = self._plan.focus
         amount = self._add("blur") if "blur" in self._plan.layers else None
-        with self._stage(step, len(self._pixels)) as advance:
+        with self._job.stage(step.name, len(self._pixels)) as advance:
             for rows in self._blurring(self.layers["image"]):
                 if amount is not None:
                     depth = self.layers["depth"][rows, :, 0]

@@ -17,6 +17,8 @@ from mrt_mitsuba.machine import Workspace
 log = logging.getLogger(__name__)
 
 SECONDS = 0.1  # between two looks at what kernels took
+# What the original program prints before a stage
+SAID = {"anti-aliasing": "Computing Anti aliasing..", "depth of field": "Computing depth of field.."}
 
 Advance = Callable[[int], object]
 
@@ -106,7 +108,7 @@ class Job:
         asked, start = type(self.progress).kernels is not Progress.kernels, time.perf_counter()
         if asked:
             self.collect()
-        with self.progress.stage(name.capitalize(), total, message) as advance:
+        with self.progress.stage(name.capitalize(), total, message or SAID.get(name, "")) as advance:
 
             def advance_and_collect(steps: int) -> None:
                 advance(steps)
