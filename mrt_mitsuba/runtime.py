@@ -247,7 +247,17 @@ def one_by_one(lock: contextlib.AbstractContextManager[Any]) -> None:
 def _mentions_ours(source: Any) -> bool:
     """Return whether a dict, or a file of XML or its text, may have a plugin of this project; Mitsuba itself
     refuses anything else, and reports files that cannot be read."""
-    text = repr(source) if isinstance(source, dict) else str(source)
+    if isinstance(source, dict):  # as text, it would have Dr.Jit evaluate what lies in it
+        waiting, seen = [source], set[int]()  # a dict may lie in itself
+        while waiting:
+            node = waiting.pop()
+            if isinstance(node, dict) and id(node) not in seen:
+                seen.add(id(node))
+                if str(node.get("type", "")).startswith("mrt_"):
+                    return True
+                waiting += node.values()
+        return False
+    text = str(source)
     with contextlib.suppress(OSError, ValueError), open(text, encoding="utf-8", errors="ignore") as file:
         text = file.read()
     return "mrt_" in text or "<include" in text
