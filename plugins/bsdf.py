@@ -155,12 +155,6 @@ class MrtBSDF(mi.BSDF):
     ) -> mi.Float:
         return self.lobes(si, active).density(ctx, Pair.above(si.wi, wo, active))
 
-    def eval_pdf(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> tuple[mi.Spectrum, mi.Float]:
-        lobes, pair = self.lobes(si, active), Pair.above(si.wi, wo, active)
-        return mi.depolarizer(lobes.value(ctx, pair)), lobes.density(ctx, pair)
-
     def sample(
         self,
         ctx: mi.BSDFContext,

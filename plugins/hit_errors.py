@@ -19,14 +19,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
-import drjit.scalar
 import mitsuba as mi
 import numpy as np
 
 from .intersect import Frame
 from .lookup import ByShape
 from .mesh_api import triangles
-from .quadric_kinds import KINDS, QuadricTable
+from .quadric_kinds import KINDS, Columns, QuadricTable
 from .spheres import center_and_radius, is_sphere
 
 # What a curved surface's hit, projection and ray test lose, in roundings of the largest coordinate
@@ -38,9 +37,6 @@ FLAT = 16 * 2.0**-24
 
 # A level triangle at height zero has no error at all, but a ray that starts on it exactly may meet it
 LEAST = 2.0**-12
-
-# Objects of a group that are looked at for a light: of those whose boxes hold it, which are few
-MOST_LOOKED_AT = 64
 
 
 class HitErrors:
@@ -108,13 +104,13 @@ def any_touching(shapes: Sequence[Any], points: Sequence[tuple[float, ...]]) -> 
     if len(balls):
         tables.append(QuadricTable.of_numbers("sphere", balls, 0, lambda frame: frame, flipped=False))
     others = [s for s in shapes if not (is_sphere(s) or hasattr(s, "quadrics"))]
-    return any(_on_quadrics(table, p) for table in tables) or any(_on_other(s, p) for s in others)
+    return any(_on_quadrics(t, q) for t in tables for q in p) or any(_on_other(s, p) for s in others)
 
 
 def _on_other(shape: Any, points: np.ndarray) -> bool:
     if hasattr(shape, "unit_normal"):
         heights = np.abs(points @ shape.unit_normal + shape.distance)
-        return bool((heights <= CURVED * np.maximum(abs(shape.distance), _sizes(points))).any())
+        return bool((heights <= CURVED * np.maximum(abs(shape.distance), np.abs(points).max(axis=1))).any())
     box = np.array([[list(shape.bbox().min), list(shape.bbox().max)]], float).reshape(1, 2, 3)
     known = np.isfinite(box).all()  # merged rectangles have none
     inside = [p for p in points if not known or _holding(box, p)[0].any()]
@@ -122,29 +118,24 @@ def _on_other(shape: Any, points: np.ndarray) -> bool:
     return corners is not None and any(_on_triangles(corners, p) for p in inside)
 
 
-def _sizes(values: np.ndarray) -> np.ndarray:
-    """Return the largest coordinates [n] of values [n, ...]."""
-    return np.asarray(np.abs(values).reshape(len(values), -1).max(axis=1))
-
-
 def _holding(boxes: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which boxes [n, 2, 3] hold a point, and the slack [n] that they have for it."""
-    slack = CURVED * np.maximum(_sizes(boxes), np.abs(p).max())
+    """Return which boxes [n, 2, 3] hold a point, or that of each, and the slack [n] that they have for it."""
+    slack = CURVED * np.maximum(np.abs(boxes).max(axis=(1, 2)), np.abs(p).max(axis=-1))
     low, high = boxes[:, 0] - slack[:, None], boxes[:, 1] + slack[:, None]
     return ((p >= low) & (p <= high)).all(axis=1), slack
 
 
-def _on_quadrics(table: QuadricTable, points: np.ndarray) -> bool:
-    boxes, kind, vector = table.boxes(), KINDS[table.kind], drjit.scalar.Array3f64
-    for p in points:
-        near, slack = _holding(boxes, p)
-        for k in np.flatnonzero(near)[:MOST_LOOKED_AT]:
-            frame = Frame(*(vector(row.tolist()) for row in (table.origins[k], *table.rows[k])))
-            feet = np.array([kind.surface(vector(p.tolist()), part, frame)[0] for part in kind.parts])
-            # A part goes on beyond the object, but not within its box, or nearly so
-            there = [_holding(boxes[k : k + 1], foot)[0][0] for foot in feet]
-            if (there & (np.linalg.norm(feet - p, axis=1) <= slack[k])).any():
-                return True
+def _on_quadrics(table: QuadricTable, p: np.ndarray) -> bool:
+    boxes, kind = table.boxes(), KINDS[table.kind]
+    near, slack = _holding(boxes, p)
+    rows = table.origins, *table.rows.swapaxes(0, 1)
+    frame, points = Frame(*(Columns.of(r[near]) for r in rows)), np.tile(p, (near.sum(), 1))
+    for part in kind.parts if near.any() else ():
+        feet = kind.surface(Columns.of(points), part, frame)[0].array()
+        # A part goes on beyond the object, but not within its box, or nearly so
+        there = _holding(boxes[near], feet)[0]
+        if (there & (np.linalg.norm(feet - p, axis=1) <= slack[near])).any():
+            return True
     return False
 
 
