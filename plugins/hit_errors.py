@@ -19,13 +19,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
+import drjit.scalar
 import mitsuba as mi
 import numpy as np
 
 from .intersect import Frame
 from .lookup import ByShape
 from .mesh_api import triangles
-from .quadric_kinds import KINDS, Columns, QuadricTable
+from .quadric_kinds import KINDS, QuadricTable
 from .spheres import center_and_radius, is_sphere
 
 # What a curved surface's hit, projection and ray test lose, in roundings of the largest coordinate
@@ -37,6 +38,9 @@ FLAT = 16 * 2.0**-24
 
 # A level triangle at height zero has no error at all, but a ray that starts on it exactly may meet it
 LEAST = 2.0**-12
+
+# Objects of a group that are looked at for a light: of those whose boxes hold it, which are few
+MOST_LOOKED_AT = 64
 
 
 class HitErrors:
@@ -119,23 +123,22 @@ def _on_other(shape: Any, points: np.ndarray) -> bool:
 
 
 def _holding(boxes: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which boxes [n, 2, 3] hold a point, or that of each, and the slack [n] that they have for it."""
+    """Return which boxes [n, 2, 3] hold a point, and the slack [n] that they have for it."""
     slack = CURVED * np.maximum(np.abs(boxes).max(axis=(1, 2)), np.abs(p).max(axis=-1))
     low, high = boxes[:, 0] - slack[:, None], boxes[:, 1] + slack[:, None]
     return ((p >= low) & (p <= high)).all(axis=1), slack
 
 
 def _on_quadrics(table: QuadricTable, p: np.ndarray) -> bool:
-    boxes, kind = table.boxes(), KINDS[table.kind]
+    boxes, kind, vector = table.boxes(), KINDS[table.kind], drjit.scalar.Array3f64
     near, slack = _holding(boxes, p)
-    rows = table.origins, *table.rows.swapaxes(0, 1)
-    frame, points = Frame(*(Columns.of(r[near]) for r in rows)), np.tile(p, (near.sum(), 1))
-    for part in kind.parts if near.any() else ():
-        feet = kind.surface(Columns.of(points), part, frame)[0].array()
-        # A part goes on beyond the object, but not within its box, or nearly so
-        there = _holding(boxes[near], feet)[0]
-        if (there & (np.linalg.norm(feet - p, axis=1) <= slack[near])).any():
-            return True
+    for k in np.flatnonzero(near)[:MOST_LOOKED_AT]:
+        frame = Frame(*(vector(row.tolist()) for row in (table.origins[k], *table.rows[k])))
+        for part in kind.parts:
+            foot = np.array(kind.surface(vector(p.tolist()), part, frame)[0])
+            # A part goes on beyond the object, but not within its box, or nearly so
+            if _holding(boxes[[k]], foot)[0].all() and np.linalg.norm(foot - p) <= slack[k]:
+                return True
     return False
 
 

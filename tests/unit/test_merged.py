@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from nodes import rgb, sensor
 
-from mrt_mitsuba.plugins import lookup
 from mrt_mitsuba.plugins.lobes import Lobes
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -67,18 +65,3 @@ def test_a_scene_without_shapes_is_the_sky() -> None:
     del scene["floor"]
     image = picture(mi.load_dict(scene))
     assert image == pytest.approx(0.3, rel=1e-6)
-
-
-def test_tables_are_read_in_one_go() -> None:
-    """Whatever the address of the array that they are made from: else the kernel depends on it."""
-    index = dr.arange(mi.UInt32, 100) % 8
-    kernels = set()
-    for shift in range(16):  # one of them lies at a multiple of 64 bytes, the others do not
-        values = np.arange(48, dtype=np.float32)[shift : shift + 32]
-        row = dr.gather(mi.Vector4f, lookup.aligned(values), index)
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            dr.eval(row)
-            kernels.update(entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT]))
-        assert np.array_equal(np.array(row)[:, :8], values.reshape(8, 4).T)
-    assert len(kernels) == 1
