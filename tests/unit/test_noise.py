@@ -94,12 +94,12 @@ def test_no_value_decides_its_weight_nor_when_to_stop(half: int, goal: dict[str,
 
 
 def test_rare_bright_values_keep_their_share() -> None:
-    """Nine pixels of which 2 % is bright, 150 pictures: within 3 standard errors (f6b350c: 28 % too dark)."""
+    """Eight pixels of which 2 % is bright: within 4 standard errors of 4 % (f6b350c: 28 % too dark)."""
     exposer, expected = Draws(_rare(0.02, 8)), 1.05 + 8 / PIXELS * 0.02 * 198.95
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", mrt.MrtWarning)
         means = np.array([_render(exposer, seed).image.mean() for seed in range(150)])
-    assert abs(means.mean() - expected) < 3 * means.std(ddof=1) / len(means) ** 0.5
+    assert abs(means.mean() - expected) < 4 * means.std(ddof=1) / len(means) ** 0.5
 
 
 @pytest.mark.parametrize(("draw", "doubtful"), [(_calm, False), (_rare(0.3), False), (_rare(0.003, 8), True)])

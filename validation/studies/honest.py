@@ -52,6 +52,7 @@ def run(study: Study, *, quick: bool) -> None:
     """Render to the error of so many rays a pixel, with many seeds; compare with the converged picture."""
     cases = QUICK if quick else [(ball, lamp) for ball in BALLS for lamp in LAMPS]
     seeds, truth_rays = (10, 2**13) if quick else (100, 2**17)
+    least, most = (0.7, 6) if quick else (0.9, 3.5)  # 6 of 10 hold once in a thousand times
     rows: list[tuple[Any, ...]] = []
     for ball, lamp in study.each("Renders to an error", cases):
         rows.append((f"{ball}, {lamp} lamp", *_measured(scene(ball, lamp), seeds, truth_rays)))
@@ -73,15 +74,16 @@ def run(study: Study, *, quick: bool) -> None:
         first=True,
     )
     why = "an interval of 95 %, and what the picture to compare with has of noise"
-    study.at_least("stated errors that hold, or are doubted: worst scene", min(r[1] for r in rows), 0.9, why)
+    study.at_least(
+        "stated errors that hold, or are doubted: worst scene", min(r[1] for r in rows), least, why
+    )
     calm = [r[2] for r in rows if r[0].startswith(CALM) and "small" not in r[0]]
     study.at_most("calm scenes that are doubted", max(calm), 0.02, "nothing there is rare")
     pairs = "p-values of pairs are uniform: least p of Kolmogorov and Smirnov's test"
     study.at_least(pairs, min(r[7] for r in rows), 0.001, "the least of 21 is that small once in 50 times")
     off = max(abs(r[3]) / r[4] for r in rows)
-    study.at_most(
-        "means off, in standard errors", off, 3.5, "the largest of 21 is 3.5 once in a hundred times"
-    )
+    why = "the largest of 21 is 3.5 once in a hundred times"
+    study.at_most("means off, in standard errors", off, most, why)
 
 
 def _measured(scene: Any, seeds: int, truth_rays: int) -> tuple[float, ...]:
@@ -90,6 +92,7 @@ def _measured(scene: Any, seeds: int, truth_rays: int) -> tuple[float, ...]:
     truth = np.mean(pictures, axis=0, dtype=np.float64)
     own = np.std([p.mean() for p in pictures], ddof=1) / len(pictures) ** 0.5  # of its mean
     noise = np.var(pictures, axis=0, ddof=1).mean(-1) / len(pictures)  # squared error of the truth
+    rounding = (1e-5 * truth.mean()) ** 2  # where nothing is noisy
     target = float(np.sqrt(noise.mean() * truth_rays / SPP))
     held, doubted, means, stated, true, p = 0, 0, [], [], [], []
     last = None
@@ -106,8 +109,8 @@ def _measured(scene: Any, seeds: int, truth_rays: int) -> tuple[float, ...]:
         doubted += doubt
         means.append(result.image.mean(dtype=np.float64))
         if not doubt:
-            stated.append(np.square(result.layers["error.Y"]))
-            true.append(squares)
+            stated.append(np.square(result.layers["error.Y"]) + rounding)
+            true.append(squares + rounding)
     ratios = [np.nan]
     if stated:
         order = np.array_split(np.argsort(stated, axis=None), 10)
