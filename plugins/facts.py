@@ -51,10 +51,7 @@ class Reading:
             return any_touching(snapshot.shapes, [point for point in places if point is not None])
 
         self.facts = SceneFacts(
-            **of_lights,
-            **of_materials,
-            **of_shapes,
-            touching=kept("touching", (shapes, lights), touching),
+            **of_lights, **of_materials, **of_shapes, touching=kept("touching", (shapes, lights), touching)
         )
 
     def _read_shapes(self) -> dict[str, Any]:

@@ -135,13 +135,7 @@ def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> tupl
     near_part = dr.select(enter_base > near, BASE, LATERAL)
     far_part = dr.select(leave_base < far, BASE, LATERAL)
     return _first_boundary(
-        t_of,
-        inside,
-        dr.maximum(near, enter_base),
-        near_part,
-        dr.minimum(far, leave_base),
-        far_part,
-        capped,
+        t_of, inside, dr.maximum(near, enter_base), near_part, dr.minimum(far, leave_base), far_part, capped
     )
 
 

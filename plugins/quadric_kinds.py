@@ -16,15 +16,7 @@ import drjit as dr
 import drjit.scalar
 import numpy as np
 
-from .intersect import (
-    BASE,
-    LATERAL,
-    TOP,
-    Frame,
-    intersect_cone,
-    intersect_cylinder,
-    intersect_sphere,
-)
+from .intersect import BASE, LATERAL, TOP, Frame, intersect_cone, intersect_cylinder, intersect_sphere
 
 POINT, DISC, BALL = (0, 0, 0), (1, 1, 0), (1, 1, 1)
 """What the ends of a quadric are, by the squared semi-axes of their unit frame that span them."""

@@ -13,14 +13,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies import bsdf_laws
 from mrt_mitsuba.validation.studies.roughconductor import POINTWISE, compare_pointwise
-from mrt_mitsuba.validation.tools.bsdf_probe import (
-    at_angle,
-    draw,
-    evaluate,
-    interaction,
-    lobe_pairs,
-    rgb,
-)
+from mrt_mitsuba.validation.tools.bsdf_probe import at_angle, draw, evaluate, interaction, lobe_pairs, rgb
 
 pytestmark = pytest.mark.usefixtures("variant")
 

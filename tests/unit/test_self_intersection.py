@@ -16,10 +16,7 @@ from mrt_mitsuba.rendering.api import render
 @pytest.mark.parametrize("kind", ["sphere", "cylinder"])
 def test_large_surfaces_near_the_origin_have_no_dark_spots(variant: str, kind: str) -> None:
     """What a hit is off by goes with the coordinates of the shape, not with its own, which are near zero."""
-    numbers = {
-        "sphere": [[0, -1000, 0, 1000]],
-        "cylinder": [[-900, -1000, 0, 900, -1000, 0, 1000]],
-    }[kind]
+    numbers = {"sphere": [[0, -1000, 0, 1000]], "cylinder": [[-900, -1000, 0, 900, -1000, 0, 1000]]}[kind]
     scene = {
         "type": "scene",
         "sensor": sensor([0.3, 2, 3], [0, 0, 0], (160, 120), fov=20),
