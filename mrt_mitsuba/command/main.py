@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import signal
@@ -101,6 +102,10 @@ def _say(message: str, code: int) -> int:
 def _end_by_force() -> None:
     from mrt_mitsuba.output.replacing import discard_unfinished
 
+    if psutil := sys.modules.get("psutil"):  # Dask has loaded it: workers of a sweep would stay
+        for worker in psutil.Process().children(recursive=True):
+            with contextlib.suppress(psutil.Error):
+                worker.kill()
     discard_unfinished()
     newline = "\n" if sys.stderr.isatty() else ""  # below the progress bar
     print(f"{newline}mrt: interrupted", file=sys.stderr)

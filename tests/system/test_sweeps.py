@@ -465,8 +465,7 @@ def test_interrupted_from_the_keyboard(start, waiting, tmp_path: Path) -> None:
     with start(sys.executable, *words, start_new_session=True) as process:
         wait_for(lambda: (out / "table.csv").exists(), "a row of the table")
         os.killpg(process.pid, signal.SIGINT)
-        process.wait(PATIENCE)
-        errors = process.stderr.read()
+        _, errors = process.communicate(timeout=PATIENCE)  # also the workers have ended
     assert process.returncode == 130 and errors == "mrt: interrupted\n"
     done = pictures(out)
     assert 0 < len(done) < 6 and {row["file"] for row in written(out)} <= set(done) and not left_over(out)
