@@ -64,7 +64,7 @@ class Result:
     kernel_launches: int  #: how many kernels ran
     options: Mapping[str, Any]  #: the values in force
     versions: Mapping[str, str]  #: of what decides about pixels
-    camera: Mapping[str, np.ndarray]  #: float64 [4, 4], see ``rendering.view``
+    camera: Mapping[str, np.ndarray]  #: float64 [4, 4], see ``shading.camera_matrices``
     inputs: frozenset[str] = frozenset()  #: paths of the files that the scene was read from
     error: ErrorEstimate | None = None  #: to the converged picture; None where nothing was estimated
     rounds: tuple[Round, ...] = ()  #: what was known after each: the error over the time of this render
