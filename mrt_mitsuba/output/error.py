@@ -28,13 +28,6 @@ class ErrorEstimate:
     high: float  #: infinite where the tail is too heavy to say
     tail: float = 0.0  #: Pareto shape k of the largest contributions of rays, see ``DOUBTFUL``
 
-    @classmethod
-    def of(cls, rmse: float, spread: float, tail: float) -> ErrorEstimate:
-        """Return an error whose square has this relative deviation."""
-        width = 1.96 * spread / 2
-        high = rmse * math.exp(width * (1 + spread)) if tail <= DOUBTFUL else math.inf
-        return cls(rmse, rmse * math.exp(-width), high, tail)
-
     def __str__(self) -> str:
         return f"{self.rmse:.3g} (95 %: {self.low:.3g} to {self.high:.3g})"
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from mrt_mitsuba.filters.dof import REACH
 from mrt_mitsuba.filters.grid import dilated, window_means
-from mrt_mitsuba.output.error import ErrorEstimate, tail_shape
+from mrt_mitsuba.output.error import DOUBTFUL, ErrorEstimate, tail_shape
 from mrt_mitsuba.rendering.exposing import Exposer, Groups, Stack
 
 HALVES, SCOUTS = [0, 1], [2, 3]
@@ -117,13 +117,15 @@ class Halves(Stack):
         if self._blurred is not None:
             halves = np.stack([self._blurred(half) for half in halves])
         squares = np.where(self._inside(self._unknown), 0, quarter_squares(*halves).mean(-1))
-        mean = float(squares.mean())
+        rmse, tail = math.sqrt(float(squares.mean())), self._tail(HALVES)
         if self._blurred is not None:  # pixels are as good as one in a window of the blur's reach
             correlation = 1.0
             for axis in (0, 1):
                 squares = np.add.reduceat(squares, range(0, squares.shape[axis], 2 * REACH), axis)
         spread = math.sqrt(2 * correlation * float(np.square(squares).sum())) / max(squares.sum(), 1e-300)
-        return ErrorEstimate.of(math.sqrt(mean), spread, self._tail(HALVES))
+        width = 1.96 * spread / 2
+        high = rmse * math.exp(width * (1 + spread)) if tail <= DOUBTFUL else math.inf
+        return ErrorEstimate(rmse, rmse * math.exp(-width), high, tail)
 
     def forecast(self) -> tuple[float, float]:
         """Return the RMSE of the picture, and the shape of its tail, as the scouts have them."""
