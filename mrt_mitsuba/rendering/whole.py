@@ -72,7 +72,7 @@ class Wholes(Halves):
                     self._weights[picture] += count
                     self._amount[picture] += count
                     self.rays[picture] += count
-        self._bad = ~np.isfinite(self._total).all((0, -1))
+        self._bad = np.asarray(~np.isfinite(self._total).all((0, -1)))
         self._unfit = self._total[:, self._bad].max(initial=-np.inf)
 
     def variance(self) -> np.ndarray:

@@ -112,10 +112,9 @@ def test_files_and_the_command_know_it(tmp_path: Path, monkeypatch: pytest.Monke
     assert list(mi.Bitmap("out.exr").size()) == [24, 16]
 
 
-NAMES = ["prb", "prb_basic", "prbvolpath", "direct_projective", "prb_projective", "ptracer"]
-
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", ["prb", "prb_basic", "prbvolpath", "direct_projective", "prb_projective", "ptracer"]
+)
 def test_every_integrator_gives_pictures_with_their_error(name: str) -> None:
     scene, integrator = scene_with(), mi.load_dict({"type": name})
     stock = np.array(mi.render(scene, integrator=integrator, spp=1024))[..., :3]
