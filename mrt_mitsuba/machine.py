@@ -48,7 +48,7 @@ LEAST_ROWS = 24
 
 @dataclass
 class Budget:
-    """Bytes that a render may use, of which its scene has taken some for textures."""
+    """Bytes that a render may use, and how many its scene has taken for textures."""
 
     size: int
     taken: int = 0

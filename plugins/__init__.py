@@ -49,8 +49,8 @@ def register_modules(package: str, names: Sequence[str]) -> None:
 def plugin(name: str, package: str = __name__) -> ModuleType:
     """Return the module ``name`` (e.g. "whitted") for the current variant, to which its classes belong.
 
-    It is executed once for each variant, as its classes derive from Mitsuba's, of which each variant has its
-    own. Each copy gets a module name of its own; relative imports still resolve, because the package is the
+    It is executed once for each variant, as its classes derive from Mitsuba's, and each variant has its own.
+    Each copy gets a module name of its own; relative imports still resolve, because the package is the
     same.
     """
     import mitsuba as mi

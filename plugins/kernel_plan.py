@@ -115,8 +115,8 @@ def _cut_off(case: SimpleNamespace) -> tuple[float, float]:
     return case.arriving * hits if case.made["mirrors"] else 0.0, case.facts.lights * hits
 
 
-#: A decision: the field of the plan; what is decided about, in words; what kernels hold by facts and plan (""
-#: for nothing to be told); reasons against it, the first of which that holds is given; and the value, by the
+#: A decision: the field of the plan; what is decided, in words; what kernels hold by facts and plan ("" if
+#: there is nothing to tell); reasons against it, the first that holds being given; and the value, by the
 #: case and whether there is no reason
 Rule = namedtuple("Rule", "name what held against value", defaults=[lambda case, free: free])
 

@@ -121,7 +121,7 @@ class Specular:
 # In the order of the components of the BSDF
 LOBES: tuple[Any, ...] = (Diffuse(), Specular())
 
-# Numbers, of which a table of materials has up to four
+# Numbers of materials; their table has up to four columns
 TABLED = ("alpha", "int_ior", "ext_ior")
 
 

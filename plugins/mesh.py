@@ -20,7 +20,7 @@ class MrtMesh(mi.Mesh):
     ============= =========== ========== ==============================================================
     ``positions`` ``Bitmap``  required   float32 [1, N, 3], scene units
     ``faces``     ``Bitmap``  required   uint32 [1, M, 3], corners counter-clockwise seen from outside
-    ``texcoords`` ``Bitmap``             float32 [1, N, 2 or 3], of which two are used
+    ``texcoords`` ``Bitmap``             float32 [1, N, 2 or 3]; two are used
     ``normals``   ``Bitmap``             float32 [1, N, 3], of smooth triangles; without, they are flat
     ``to_world``  transform   identity   any invertible affine transform
     ============= =========== ========== ==============================================================

@@ -87,7 +87,7 @@ class Snapshot:
         """Look at a scene; parts that have not changed since ``before`` are taken from there."""
         # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed
         self.shapes, self.emitters, self.environment = scene.shapes(), scene.emitters(), scene.environment()
-        # Groups are traced through their instances, which don't say of which group they are
+        # Groups are traced through their instances, which don't say what group they belong to
         inside = [value for _, value, _ in parameters_of(scene) if isinstance(value, mi.Shape)]
         self.groups = [shape for shape in inside if shape.class_name().startswith("ShapeGroup")]
         #: the shapes of the groups

@@ -57,7 +57,7 @@ ALL = {
 
 
 def split(words: Iterable[str]) -> tuple[list[str], dict[str, str]]:
-    """Return plain words, and those of the form ``name=value`` by name, of which each may be given once."""
+    """Return plain words, and those of the form ``name=value`` by name; each name may be given once."""
     plain: list[str] = []
     given: dict[str, str] = {}
     for word in words:

@@ -100,7 +100,7 @@ def doctor() -> int:
                 print(f"  not {family}_*: {reason}")
         variant = runtime.use()
         image = np.asarray(render(0, width=16, height=12, aa=1, aamode="none").image)
-        # the sky, exact but for float32, above spheres and a plane, which differ in every channel
+        # the sky, exact to float32, above spheres and a plane, which differ in every channel
         if not (np.allclose(image[0], report_scene(0).sky, atol=1e-6) and np.ptp(image[-1]) > 0.01):
             raise MrtError(f"scene 0 has {image[0, 0]} at the top, {image[-1, 0]} to {image[-1, -1]} below")
     except (ImportError, MrtError, RuntimeError) as error:

@@ -71,7 +71,7 @@ def luma_edges(
     as 0.
 
     With ``variance``, ``max − min`` shrinks by ``noise_sigmas`` standard deviations of L at either end, and a
-    neighbourhood of which nothing remains is left alone, dark ones included. L's variance is ``σ²/(4 Y)``, at
+    neighbourhood where nothing remains is left alone, dark ones included. L's variance is ``σ²/(4 Y)``, at
     most σ (the change of √Y for a change σ from zero), where σ is the deviation of ``Y = L²``.
 
     Args:

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 Path = str | os.PathLike[str]
 
 _TEMPORARY = ".mrt-{}.tmp"
-_OLD = 10.0  # seconds after which a file that nobody has locked has been left behind
+_OLD = 10.0  # seconds after which a file that nobody has locked was left over
 _unfinished: set[str] = set()  # temporary files and folders of this process
 _tidied: set[str] = set()  # folders
 

@@ -175,7 +175,7 @@ class Exposer:
         return canvas
 
     def _on_film(self, groups: Groups, seed: int, before: int, progressive: bool) -> Start:
-        """Return where rays of groups start, ``before`` of which were traced already."""
+        """Return where rays of groups start; ``before``: how many were traced already."""
         film, size, scalar = self.film, groups.size, mi.variant().startswith("scalar")
         sequence = progressive and not scalar
         independent = scalar or film.sampler == "IndependentSampler"

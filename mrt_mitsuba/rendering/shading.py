@@ -102,7 +102,7 @@ class Shader:
     facts: SceneFacts | None = None  #: what its kernels depend on; None where it does not say
     kernel: KernelPlan | None = None  #: what its kernels hold
     random = True  #: does it draw random numbers
-    layers = named(FIRST_HIT)  #: names of those that can be traced, but for internal ones
+    layers = named(FIRST_HIT)  #: names of those that can be traced, without internal ones
 
     def __init__(self, source: Source, motion: Sequence[float] | None) -> None:
         integrator = source.integrator

@@ -29,7 +29,7 @@ DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from ab
 MOST_SAMPLES = 2**24  # of a pixel; some samplers divide by none, or never end at 2^31
 _PICTURES = ("mrt_texture", "bitmap", "envmap")  # plugins that read one
 
-# The lines of a traceback, which are indented but for the first, and the type of this project's error
+# The lines of a traceback, all indented except the first, and the type of this project's error
 _TRACEBACK = re.compile(
     r"Traceback \(most recent call last\):\n(?:[ \t][^\n]*\n|\n)*(?:\w*ParameterError: )?"
 )

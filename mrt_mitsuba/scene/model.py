@@ -224,7 +224,7 @@ class Scene:
         }
 
 
-# The plugins of objects; the fields but for the material, which is the last, are their parameters
+# The plugins of objects; all fields except the material, which comes last, are their parameters
 PLUGINS = {"sphere": "sphere", "cone": "mrt_cone", "cylinder": "mrt_cylinder", "plane": "mrt_plane"}
 # More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape
 # and more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of

@@ -472,7 +472,7 @@ def roundoff(law: Law, case: Case) -> None:
         if not law.parts[-1].holds:
             law.notes.append(
                 f"{name}(): noise of {np.nanquantile(found.noise, 0.9):.3g} roundings (2^-24), "
-                f"of which directions explain {np.median(found.explained):.3g}"
+                f"directions explain {np.median(found.explained):.3g}"
             )
 
 
@@ -535,7 +535,7 @@ def components(law: Law, case: Case) -> None:
 
 
 def _allowed(flags: int, wi: Array, wo: Array, *, smooth: bool) -> Array:
-    """Return where flags allow light; ``smooth``: but for single directions."""
+    """Return where flags allow light; ``smooth``: except in single directions."""
     f = mi.BSDFFlags
     allowed = flags & ~int(f.Delta) if smooth else flags
     same, other = (bool(allowed & int(kind)) for kind in (f.Reflection, f.Transmission))

@@ -58,7 +58,7 @@ print("meets the surface at", scene.ray_intersect(ray).t)
 ray.maxt = float("{maxt}")
 print("up to", ray.maxt, "ray_test():", scene.ray_test(ray), "ray_intersect():", scene.ray_intersect(ray).t)
 """
-ONE = "one question, one answer; rays that graze are left out, but for those that just miss"
+ONE = "one question, one answer; of rays that graze, only those that just miss count"
 
 
 @figures(
@@ -66,7 +66,7 @@ ONE = "one question, one answer; rays that graze are left out, but for those tha
     ray_intersect=("share", "share of rays {rays} on which ray_intersect() is wrong", 0, ONE, MAXT),
 )  # fmt: skip
 def hits(law: Law, case: Case) -> None:
-    """``ray_test`` and ``ray_intersect`` agree, and heed ``maxt``, from outside and from the surface."""
+    """``ray_test`` and ``ray_intersect`` agree, and respect ``maxt``, from outside and from the surface."""
     _, _, met = case.met
     away = case.units(len(met.t))
     start = leave(met.p, met.n, away)
@@ -170,8 +170,8 @@ PARTED = "extrapolated to no step; edges may part neighbours"
               "a closed shape has an outside; what edges hide is left room for", RAY),
     length=("most", "length of a normal less 1", NORMAL, "a square root and a quotient", RAY),
     side=("none", "shading normals on the other side than the geometric one", 0, "one surface", RAY),
-    shading=(0.9, "shading normal against the geometric one, but for smoothed meshes, 9 in 10",
-             TILTED, "the same, but for some roundings", RAY),
+    shading=(0.9, "shading normal against the geometric one, except on smoothed meshes, 9 in 10",
+             TILTED, "the same, within some roundings", RAY),
     turned=("share", "share of normals that turn where the same point is met from behind", 1e-3,
             "a surface has one normal; thin parts are left room for", RAY),
     slant=("most", "cosine between the normal and a partial derivative of the point", 1e-3,
@@ -468,7 +468,7 @@ def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
     """Random lines cross a surface in proportion to its area, whatever its form (Crofton)."""
 
     def doubled(p: Array, n: Array) -> Array:
-        """Return where two parts of the surface coincide, of which lines meet one."""
+        """Return where two parts of the surface coincide: a line there meets only one of them."""
         n = unit(n)
         one, other = (trace(case.target, leave(p, n, side * n), -side * n) for side in (1, -1))
         return one.found & other.found & (one.part != other.part) & near(p, one.p) & near(p, other.p)

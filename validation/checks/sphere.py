@@ -35,7 +35,7 @@ class Cells(Lanes):
 
     @staticmethod
     def around(codes: Array, most: int, coarsest: int = 4) -> Cells:
-        """Return cells of which none holds more than ``most`` of the directions, unless it is the finest."""
+        """Return cells that hold at most ``most`` of the directions each; only the finest may hold more."""
         codes, done = np.sort(codes), []
         start = np.arange(2 * 4**coarsest) * 4 ** (DEPTH - coarsest)
         cells = Cells(start=start, level=np.full(len(start), coarsest))

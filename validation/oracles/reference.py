@@ -44,7 +44,7 @@ class ReferenceResult(NamedTuple):
 def reference_render(
     scene: Scene, *, width: int, height: int, displacement: Sequence[float] = (0, 0), **settings: Any
 ) -> ReferenceResult:
-    """Render a scene with one ray through each pixel, exactly but for the rounding of float64.
+    """Render a scene with one ray through each pixel, exactly to the rounding of float64.
 
     ``displacement``: of the rays, in pixels, y upwards. ``settings``: ``fresnel`` ("dielectric", "schlick" or
     "unity"), ``clamp``, ``max_depth`` and ``bounce_budget`` ("report" or "plain"). Raises ``SceneError`` for

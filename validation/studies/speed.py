@@ -118,7 +118,7 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
         return abs(means[1] / means[0] / factor - 1)
 
     def direct(number: int, flavor: str) -> tuple[Run, Run]:
-        """Return direct light in the scene of a flavour, but for its lights, which are Mitsuba's."""
+        """Return direct light in the scene of a flavour, with Mitsuba's lights in place of ours."""
         stock, own = (nodes(number, flavor=name) for name in ("stock", flavor))
         lights = {name: node for name, node in stock.items() if name.startswith("light_")}
         del own["sky"]  # direct would sample it, mrt_whitted does not

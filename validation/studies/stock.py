@@ -22,7 +22,7 @@ TITLE = "Against Mitsuba's own integrators, lights, materials and meshes"
 # Pixel by pixel, relative to 1 + value: a few dozen float32 roundings
 DIRECT_TOLERANCE = 1e-5
 NEAR = 40.0  # the mesh that stands in for a plane ends at 50
-RENDERS = 8  # of which a mean and its variance are taken
+RENDERS = 8  # enough for a mean and its variance
 # Probability that a comparison calls equal pictures different; seeds are fixed, so it stays passed
 LEVEL = 1e-3
 
@@ -170,7 +170,7 @@ MISTAKES: dict[str, Callable[[Nodes], Nodes]] = {
 
 
 def whole_scenes(study: Study, *, quick: bool) -> None:
-    """Compare the report's scenes under path, black but for their gloss; with mistakes they must differ."""
+    """Compare the report's scenes under path, with their gloss alone; with mistakes they must differ."""
     size: dict[str, Any] = {"width": 64, "height": 48} if quick else {"width": 120, "height": 90}
     options: dict[str, Any] = {"integrator": {"type": "path", "max_depth": 4}, "spp": 16 if quick else 64}
     rows = []
@@ -183,7 +183,7 @@ def whole_scenes(study: Study, *, quick: bool) -> None:
     for number in study.each("Whole scenes", (0, 1, 3) if quick else (0, 1, 2, 3, 4)):
         scene = physical(report_scene(number))
         stock = mrt.scene_dict(scene, flavor="stock", **size)
-        # Ours, but for the lights and finite planes of the other
+        # Ours, with the lights and finite planes of the other
         kept = {name: node for name, node in stock.items() if name.startswith(("light_", "plane_"))}
         ours, theirs = mrt.scene_dict(scene, fresnel="dielectric", **size) | kept, renders(stock, 1000)
         for mistake in ("", *MISTAKES) if number == 0 else ("",):

@@ -76,7 +76,7 @@ def cases(quick: bool) -> Iterator[Case]:
     yield "F at the critical angle", what, why, fresnel_errors(cosines, iors).max(), 16 * 2.0**-12
     stride = 2**12 if quick else 1
     what = f"largest error in steps of float32, over float32 cosines in [0, 1], 1 in {stride}"
-    why = "some dozen roundings, of which squares double some"
+    why = "about a dozen roundings, some of them doubled by squares"
     for name, formula in OF_COSINE.items():
         yield name, what, why, largest_error(formula, stride), 16
 
