@@ -174,42 +174,40 @@ def test_kernels_do_not_depend_on_numbers() -> None:
 
 
 def test_a_plugin_of_one_variant_only_that_never_ends_and_changes_flags() -> None:
-    class Once(mi.BSDF):
-        endless = False
+    endless: list[bool] = []
 
-        def __init__(self, props: Any) -> None:
-            mi.BSDF.__init__(self, props)
+    def answer(value: Any, *_: Any) -> Any:
+        dr.set_flag(dr.JitFlag.SymbolicCalls, False)
+        while endless:
+            time.sleep(0.001)
+        return value
 
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            dr.set_flag(dr.JitFlag.SymbolicCalls, False)
-            while self.endless:
-                time.sleep(0.001)
-            return mi.Spectrum(0)
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return mi.Float(0)
-
-        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
-            return dr.zeros(mi.BSDFSample3f), mi.Spectrum(0)
-
-    mi.register_bsdf("once", Once)
-    law = mrt.check_bsdf({"type": "once"}, quick=True, only=["variants"]).laws["variants"]
+    mi.register_bsdf("once", power.changed_bsdf({"": ({}, "eval", answer)}))
+    once = {"type": "once", "change": "", "nested": {"type": "diffuse"}}
+    law = mrt.check_bsdf(once, quick=True, only=["variants"]).laws["variants"]
     assert "does not know the plugin" in law.skipped
     assert dr.flag(dr.JitFlag.SymbolicCalls)
-    Once.endless = True
-    check = mrt.check_bsdf({"type": "once"}, quick=True, only=["weights", "finite"], timeout=0.2)
+    endless.append(True)
+    check = mrt.check_bsdf(once, quick=True, only=["weights", "finite"], timeout=0.2)
     assert check.failed == ["weights"] and "took longer than 0.2 s" in check.laws["weights"].note
     assert "a law before it took longer" in check.laws["finite"].skipped
     assert dr.flag(dr.JitFlag.SymbolicCalls)
 
 
-def test_wrong_usage() -> None:
-    with pytest.raises(mrt.UsageError, match="is not a BSDF"):
-        mrt.check_bsdf(mi.load_dict({"type": "sphere"}))
-    with pytest.raises(mrt.UsageError, match="unknown law 'colour'"):
-        mrt.check_bsdf({"type": "diffuse"}, only=["colour"])
-    with pytest.raises(mrt.SceneError, match=r'cannot load the nonsense: .* "nonsense" not found'):
-        mrt.check_bsdf({"type": "nonsense"})
+@pytest.mark.parametrize(
+    ("check", "kind", "options", "message"),
+    [
+        (mrt.check_bsdf, "sphere", None, "is not a BSDF"),
+        (mrt.check_shape, "diffuse", None, "is not a shape"),
+        (mrt.check_bsdf, "diffuse", {"only": ["colour"]}, "unknown law 'colour'"),
+        (mrt.check_bsdf, "nonsense", {}, 'cannot load the nonsense: .* "nonsense" not found'),
+        (mrt.check_shape, "mrt_cone", {}, 'cannot load the mrt_cone: .*"apex" is missing'),
+    ],
+)
+def test_wrong_usage(check: Any, kind: str, options: dict[str, Any] | None, message: str) -> None:
+    given = mi.load_dict({"type": kind}) if options is None else {"type": kind}
+    with pytest.raises(mrt.SceneError if options == {} else mrt.UsageError, match=message):
+        check(given, **options or {})
 
 
 def test_what_a_check_leaves(tmp_path: Path) -> None:
