@@ -11,10 +11,10 @@ import numpy as np
 from .hit_errors import any_touching
 from .kernel_plan import Mirror, SceneFacts
 from .lights import brightness, numbers_of, place
-from .materials import lobes_in, material_rows
+from .lobes import lobes_in, material_rows
 from .parameters import ParameterError
+from .simple_shapes import is_plain_sphere, is_sphere
 from .snapshot import Kept, Snapshot
-from .spheres import is_plain_sphere, is_sphere
 from .variants import is_jit, varies
 
 # Beyond these sizes, Embree's products of three lengths leave float32

@@ -15,13 +15,11 @@ from .facts import Reading, has_mirror
 from .hit_errors import CURVED, HitErrors
 from .kernel_plan import KernelPlan
 from .lights import Lights
-from .lobes import LOBES, Pair
-from .materials import MaterialTable
-from .planes import Planes
+from .lobes import LOBES, MaterialTable, Pair
 from .point_buffer import PointBuffer
 from .quadrics import Quadrics
+from .simple_shapes import Planes, Spheres
 from .snapshot import Kept
-from .spheres import Spheres
 from .variants import but_not, is_jit
 
 # Where a light lies on a surface, shadow rays end by this share of their way short of it: it shines to both

@@ -12,7 +12,7 @@ import pytest
 
 from mrt_mitsuba.plugins.point_buffer import PointBuffer
 from mrt_mitsuba.plugins.quadrics import Quadrics
-from mrt_mitsuba.plugins.spheres import Spheres
+from mrt_mitsuba.plugins.simple_shapes import Spheres
 
 pytestmark = pytest.mark.usefixtures("variant")
 
