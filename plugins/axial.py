@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from .intersect import Frame
-from .mesh_api import Placement, construct, keep_apart, write_buffers
+from .mesh_api import Placement, keep_apart, write_buffers
 from .parameters import ParameterError, flag, number, segments, vector
 from .quadric_kinds import KINDS, QuadricTable
 from .variants import first, is_jit, updatable
@@ -40,7 +40,8 @@ class AxialMesh(mi.Mesh):
         self.unit = vertices, faces = KINDS[self.kind].mesh(segments(props, 256))
         #: the unit frame in world space, in double precision (see ``intersect``)
         self.exact_frame = self._frame_of(vector64(ends[0]), vector64(ends[1]), radius)
-        construct(self, plugin, (len(vertices), len(faces)), props, normals=True, texcoords=True)
+        buffers = {"has_vertex_normals": True, "has_vertex_texcoords": True}
+        mi.Mesh.__init__(self, plugin, len(vertices), len(faces), props, **buffers)
         uvs = vertices[:, 6:].astype(np.float32).ravel()
         write_buffers(self, vertex_texcoords=uvs, **self.quadrics().stand_in(self.unit))
         self.parameters = {

@@ -199,17 +199,14 @@ class MrtBSDF(mi.BSDF):
     def mirror_bound(self) -> Mirror:
         """Return upper bounds of ``mirror_reflectance``, and ``int_ior``; inf for what varies."""
         bound, int_ior = largest(self.parameters["specular_reflectance"]), self.parameters["int_ior"]
-        f0, index = self._f0_bound(), math.inf if isinstance(int_ior, mi.Texture) else first(int_ior)
-        return Mirror(bound * max(1, f0), index, bound * f0)
-
-    def _f0_bound(self) -> float:
-        """Return an upper bound of the reflectance at normal incidence."""
+        indices = self.parameters["ext_ior"], int_ior
+        f0 = 1.0
         if "f0" in self.parameters:
-            return largest(self.parameters["f0"])
-        indices = self.parameters["ext_ior"], self.parameters["int_ior"]
-        if self.fresnel == "unity" or any(isinstance(index, mi.Texture) for index in indices):
-            return 1.0
-        return f0_from_ior(*map(first, indices))
+            f0 = largest(self.parameters["f0"])
+        elif self.fresnel != "unity" and not any(isinstance(index, mi.Texture) for index in indices):
+            f0 = f0_from_ior(*map(first, indices))
+        index = math.inf if isinstance(int_ior, mi.Texture) else first(int_ior)
+        return Mirror(bound * max(1, f0), index, bound * f0)
 
     def to_string(self) -> str:
         parameters = self.parameters | {"f0": self.parameters.get("f0")}

@@ -13,7 +13,7 @@ from .kernel_plan import Mirror, SceneFacts
 from .lights import brightness, numbers_of, place
 from .lobes import lobes_in, material_rows
 from .parameters import ParameterError
-from .simple_shapes import is_plain_sphere, is_sphere
+from .simple_shapes import is_sphere
 from .snapshot import Kept, Snapshot
 from .variants import is_jit, varies
 
@@ -66,6 +66,7 @@ class Reading:
                     f"{farthest:.3g}; rays meet meshes from {SMALLEST_MESH:g} to {LARGEST_MESH:g}: scale the "
                     "scene"
                 )
+        spheres = [s for s in self.native if is_sphere(s)]
         quadrics = Counter[str]()
         for table in (s.quadrics() for s in self.quadrics):
             quadrics[table.kind] += len(table.rows)
@@ -73,8 +74,9 @@ class Reading:
             "vectorised": is_jit(),  # is the variant one that compiles kernels
             "native_shapes": len(self.native),  # that only Mitsuba can trace
             "meshes": len(meshes),  # of the native ones, and of those in groups
-            "spheres": sum(map(is_sphere, self.native)),
-            "plain_spheres": sum(map(is_plain_sphere, self.native)),  # that face outwards and do not emit
+            "spheres": len(spheres),
+            # Those that face outwards and do not emit
+            "plain_spheres": sum(not (s.has_flipped_normals() or s.is_emitter()) for s in spheres),
             "planes": len(self.planes),  # infinite ones
             "quadrics": tuple(sorted(quadrics.items())),  # kinds of exact ones, and how many of each
         }

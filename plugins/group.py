@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .mesh_api import Placement, construct, keep_apart, write_buffers
+from .mesh_api import Placement, keep_apart, write_buffers
 from .parameters import ParameterError, choice, segments
 from .quadric_kinds import KINDS, QuadricTable
 
@@ -55,7 +55,7 @@ class MrtGroup(mi.Mesh):
             kind, numbers, faces, Placement(props), flipped=props.get("flip_normals", False)
         )
         sizes = len(numbers) * vertices, len(numbers) * faces
-        construct(self, "mrt_group", sizes, props, normals=True)
+        mi.Mesh.__init__(self, "mrt_group", *sizes, props, has_vertex_normals=True)
         write_buffers(self, **self.table.stand_in(unit))
         for name, values in attributes.items():
             if len(values) != len(numbers):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .mesh_api import Placement, construct, write_buffers
+from .mesh_api import Placement, write_buffers
 from .parameters import ParameterError
 
 # What vertices may have, and numbers for each in the bitmap: so many are used, or more given
@@ -59,7 +59,8 @@ class MrtMesh(mi.Mesh):
             lengths = np.linalg.norm(extras["normals"], axis=1, keepdims=True)
             extras["normals"] = extras["normals"] / np.where(lengths == 0, 1, lengths)
         sizes = len(positions), len(faces)
-        construct(self, "mrt_mesh", sizes, props, **{name: name in extras for name in _EXTRAS})
+        buffers = {f"has_vertex_{name}": name in extras for name in _EXTRAS}
+        mi.Mesh.__init__(self, "mrt_mesh", *sizes, props, **buffers)
         arrays = {"positions": positions, **extras}
         flat = {f"vertex_{name}": array.astype(np.float32).ravel() for name, array in arrays.items()}
         write_buffers(self, **flat, faces=faces.astype(np.uint32).ravel())

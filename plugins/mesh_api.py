@@ -13,19 +13,6 @@ from .parameters import ParameterError
 from .variants import is_jit
 
 
-def construct(
-    mesh: Any,
-    name: str,
-    sizes: tuple[int, int],
-    props: Any,
-    *,
-    normals: bool = False,
-    texcoords: bool = False,
-) -> None:
-    """Construct the base class of a mesh with room for ``sizes``: numbers of vertices and of faces."""
-    mi.Mesh.__init__(mesh, name, *sizes, props, has_vertex_normals=normals, has_vertex_texcoords=texcoords)
-
-
 def keep_apart(mesh: Any, name: str, faces: int) -> None:
     """Keep Mitsuba from merging the mesh with others of its BSDF: it leaves those with attributes alone."""
     mesh.add_attribute(f"face_{name}", 1, [0.0] * faces)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .mesh_api import construct, keep_apart, write_buffers
+from .mesh_api import keep_apart, write_buffers
 from .parameters import ParameterError, number, vector
 
 
@@ -56,7 +56,7 @@ class MrtPlane(mi.Mesh):
         s = np.cross(np.eye(3)[np.argmin(np.abs(self.unit_normal))], self.unit_normal)
         s /= np.linalg.norm(s)
         self.tangents = np.array([s, np.cross(self.unit_normal, s)])  # [2, 3]
-        construct(self, "mrt_plane", (4, 2), props, texcoords=True)
+        mi.Mesh.__init__(self, "mrt_plane", 4, 2, props, has_vertex_texcoords=True)
         corners = 0.5 * extent * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # [4, 2]
         positions = corners @ self.tangents - self.distance * self.unit_normal  # [4, 3]
         write_buffers(

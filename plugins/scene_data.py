@@ -59,7 +59,14 @@ class SceneData:
             lambda: Lights(reading.lights, reading.numbers, plan.lights),
         )
 
-        self.buffers = kept("buffers", (now.light_part, plan.buffers, *form), lambda: self._buffers(reading))
+        # Lists of what may be in the way of the lights, with what tests it
+        things = [thing for thing in (self.quadrics, self.spheres) if thing is not None and plan.buffers]
+        places = np.array([row[0] for row in reading.numbers or ()])
+        self.buffers: list[tuple[PointBuffer, Any]] = kept(
+            "buffers",
+            (now.light_part, plan.buffers, *form),
+            lambda: [(PointBuffer(places, *thing.boxes()), thing) for thing in things],
+        )
         self.merged = kept(
             "merged",
             (now.shape_part, now.material_part, plan.merged),
@@ -82,12 +89,6 @@ class SceneData:
         rays = self._kept("rays", self._form, lambda: _ray_arrays(self.bvh or scene)) if plan.bvh else []
         own = [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.buffers, self.merged]
         return [*_arrays_in(own), *rays, self.path_limit, sky]
-
-    def _buffers(self, reading: Reading) -> list[tuple[PointBuffer, Any]]:
-        """Return lists of what may be in the way of the lights, with what tests it."""
-        things = [thing for thing in (self.quadrics, self.spheres) if thing is not None and self.plan.buffers]
-        places = np.array([row[0] for row in reading.numbers or ()])
-        return [(PointBuffer(places, *thing.boxes()), thing) for thing in things]
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 

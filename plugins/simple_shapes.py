@@ -158,11 +158,6 @@ def is_sphere(shape: Any) -> bool:
     return shape.shape_type() == +mi.ShapeType.Sphere
 
 
-def is_plain_sphere(shape: Any) -> bool:
-    """Return whether a shape is a sphere that faces outwards and does not emit."""
-    return is_sphere(shape) and not (shape.has_flipped_normals() or shape.is_emitter())
-
-
 def center_and_radius(shape: Any) -> list[float]:
     """Return those of a sphere, zeros for another shape."""
     if not is_sphere(shape):

@@ -245,7 +245,12 @@ class MrtWhitted(mi.SamplingIntegrator):
         # A branch, because packets whose rays all miss are many
         state = hit, throughput, sampler if data.plan.random else None
         (radiance, *others), _ = dr.if_stmt(state, hit.found, at_surface, nowhere, label="surface")
-        return radiance + self._sky(data, ray, but_not(active, hit.found)), *others
+        if data.plan.sky != "none":
+            si, missed = dr.zeros(mi.SurfaceInteraction3f), but_not(active, hit.found)
+            si.wi, si.wavelengths = -ray.d, ray.wavelengths
+            sky = self.sky if data.plan.sky == "parameter" else data.environment
+            radiance += dr.select(missed, mi.unpolarized_spectrum(sky.eval(si, missed)), 0)
+        return radiance, *others
 
     def _shade_surface(
         self,
@@ -303,14 +308,6 @@ class MrtWhitted(mi.SamplingIntegrator):
         if self.bounce_budget == "report":
             cost = mi.UInt32(dr.maximum(10 - mi.Int32(dr.minimum(10 * int_ior, 10)), 1))
         return radiance, shadow_rays, reflectance, cost
-
-    def _sky(self, data: SceneData, ray: mi.Ray3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        if data.plan.sky == "none":
-            return mi.UnpolarizedSpectrum(0)
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        si.wi, si.wavelengths = -ray.d, ray.wavelengths
-        sky = self.sky if data.plan.sky == "parameter" else data.environment
-        return dr.select(active, mi.unpolarized_spectrum(sky.eval(si, active)), 0)
 
 
 mi.register_integrator(MrtWhitted.plugin_name, MrtWhitted)
