@@ -6,10 +6,21 @@ from collections.abc import Sequence
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 
 def rgb(*values: float) -> dict[str, Any]:
     return {"type": "rgb", "value": list(values)}
+
+
+def mesh(positions: Any, faces: Any, **more: Any) -> dict[str, Any]:
+    """Triangles, and ``texcoords`` or ``normals`` of their corners."""
+    arrays = {name: mi.Bitmap(np.float32([a])) for name, a in {"positions": positions, **more}.items()}
+    return {"type": "mrt_mesh", "faces": mi.Bitmap(np.uint32([faces])), **arrays}
+
+
+def group(numbers: Any, **more: Any) -> dict[str, Any]:
+    return {"type": "mrt_group", "numbers": mi.Bitmap(np.float32(numbers)), **more}
 
 
 def sensor(

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import group
 
 from mrt_mitsuba.plugins.point_buffer import PointBuffer
 from mrt_mitsuba.plugins.quadrics import Quadrics
@@ -17,18 +18,7 @@ from mrt_mitsuba.plugins.simple_shapes import Spheres
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def lit(origins: np.ndarray, place: np.ndarray) -> mi.Ray3f:
-    """Rays from points to a light."""
-    o = mi.Point3f(origins.T)
-    ray = mi.Ray3f(o, mi.Point3f(place.tolist()) - o, 1, 0, [])
-    dr.eval(ray)
-    return ray
-
-
 PLACES = [(0.1, 0.2, 0.3), (0, 0, 0), (1.02, 1.02, 1.02), (5, 0, 0), (-40, 3, 2), (0, -2000, 0)]
-
-
-SCALES = pytest.mark.parametrize(("size", "shift"), [(1, 0), (1e6, 0), (1e-6, 0), (1, 300)])
 
 
 def crowd(size: float, shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -41,12 +31,7 @@ def crowd(size: float, shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return starts, ends, radii, points
 
 
-def group(kind: str, *columns: np.ndarray) -> mi.Shape:
-    numbers = np.column_stack(columns).astype(np.float32)
-    return mi.load_dict({"type": "mrt_group", "kind": kind, "numbers": mi.Bitmap(numbers)})
-
-
-@SCALES
+@pytest.mark.parametrize(("size", "shift"), [(1, 0), (1e6, 0), (1e-6, 0), (1, 300)])
 @pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder"])
 def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: float) -> None:
     """Spheres: to the bit what Embree finds; quadrics: what the tree does. Lights are inside and far off.
@@ -61,13 +46,15 @@ def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: f
         things: Any = Spheres(scene.shapes())
         search = scene.ray_test
     else:
-        things = Quadrics([group(kind, starts, ends, radii)])
+        things = Quadrics([mi.load_dict(group(np.column_stack([starts, ends, radii]), kind=kind))])
         search = partial(things.occluded, active=mi.Bool(True))
     within = starts[0] + 0.97 * radii[0] * np.array([-0.8, 0.36, 0.48])
     places = np.concatenate([size * (np.array(PLACES) + shift), [within]])
     buffer = PointBuffer(places, *things.boxes())
+    o = mi.Point3f(origins.T)
     for number, place in enumerate(places):
-        ray = lit(origins, place)
+        ray = mi.Ray3f(o, mi.Point3f(place.tolist()) - o, 1, 0, [])
+        dr.eval(ray)
         test = partial(things.block, ray=ray)
         found = np.array(buffer.any(mi.UInt32(number), ray.d, mi.Bool(True), test))
         expected = np.array(search(ray))

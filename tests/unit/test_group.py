@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import group
 
 from mrt_mitsuba.scene import model as scene
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
@@ -15,25 +16,16 @@ pytestmark = pytest.mark.usefixtures("variant")
 def crowd(kind: str, count: int, materials: int) -> Scene:
     """Objects of one kind over a glossy plane, of as many materials."""
     rng = np.random.default_rng(1)
-    table = [
-        Material(
-            float(rng.uniform(1, 2)),
-            float(rng.uniform(0.05, 0.5)),
-            tuple(rng.random(3)),
-            tuple(rng.random(3)),
-        )
-        for _ in range(materials)
-    ]
+    numbers = rng.uniform((1, 0.05, *[0] * 6), (2, 0.5, *[1] * 6), (materials, 8)).tolist()
+    table = [Material(ior, alpha, tuple(rest[:3]), tuple(rest[3:])) for ior, alpha, *rest in numbers]
     places = rng.uniform(-2, 2, (count, 3)) + np.array([0, 2.2, 0])
-    radii = rng.uniform(0.1, 0.3, count).tolist()
-    objects = []
-    for k, (place, radius) in enumerate(zip(places, radii, strict=True)):
-        end, material = tuple((place + rng.normal(size=3) * 0.3).tolist()), table[k % materials]
-        place = tuple(place.tolist())
-        if kind == "sphere":
-            objects.append(Sphere(place, radius, material))
-        else:
-            objects.append({"cone": Cone, "cylinder": Cylinder}[kind](place, end, radius, material))
+    ends = places + rng.normal(size=(count, 3)) * 0.3
+    make, points = {"sphere": (Sphere, [places]), "cone": (Cone, [places, ends]),
+                    "cylinder": (Cylinder, [places, ends])}[kind]  # fmt: skip
+    objects = [
+        make(*map(tuple, np.stack(points)[:, k].tolist()), radius, table[k % materials])
+        for k, radius in enumerate(rng.uniform(0.1, 0.3, count).tolist())
+    ]
     return Scene(
         camera=Camera((6, 4, 5), (0, 1.5, 0)),
         sky=(0.2, 0.3, 0.7),
@@ -43,9 +35,8 @@ def crowd(kind: str, count: int, materials: int) -> Scene:
     )
 
 
-def picture(content: Scene, width: int = 120, height: int = 90) -> np.ndarray:
-    loaded = mi.load_dict(content.to_dict(width=width, height=height))
-    return np.array(mi.render(loaded, spp=1, seed=0))
+def picture(content: Scene) -> np.ndarray:
+    return np.array(mi.render(mi.load_dict(content.to_dict(width=120, height=90)), spp=1, seed=0))
 
 
 @pytest.mark.parametrize(("kind", "materials"), [("sphere", 1), ("sphere", 7), ("cone", 7), ("cylinder", 7)])
@@ -83,9 +74,8 @@ def test_ten_thousand_materials_take_one_bsdf() -> None:
 
 
 def test_stand_in_encloses_the_right_volume() -> None:
-    numbers = np.array([[0, 0, 0, 1, 0, 0, 0.5], [3, 1, 0, 3, 0, 0, 0.2]], np.float32)
-    cones = mi.load_dict({"type": "mrt_group", "kind": "cone", "numbers": mi.Bitmap(numbers), "segments": 64})
-    buffers = mi.traverse(cones)
+    numbers = [[0, 0, 0, 1, 0, 0, 0.5], [3, 1, 0, 3, 0, 0, 0.2]]
+    buffers = mi.traverse(mi.load_dict(group(numbers, kind="cone", segments=64)))
     vertices = buffers["vertex_positions"].numpy().reshape(-1, 3)[buffers["faces"].numpy().reshape(-1, 3)]
     volume = np.einsum("ij,ij->i", vertices[:, 0], np.cross(vertices[:, 1], vertices[:, 2])).sum() / 6
     assert volume == pytest.approx(np.pi / 3 * (0.25 + 0.04), rel=2e-3)  # 64 sides for a circle: 1.6e-3
@@ -95,10 +85,10 @@ def test_texture_coordinates_of_a_sphere_are_mitsubas() -> None:
     rng = np.random.default_rng(3)
     d = rng.normal(size=(3, 500))
     ray = mi.Ray3f(mi.Point3f(-5 * d), mi.Vector3f(d))
-    group = {"type": "mrt_group", "numbers": mi.Bitmap(np.array([[0.1, 0.2, 0.3, 1]], np.float32))}
-    scene = mi.load_dict({"type": "scene", "group": group})
+    scene = mi.load_dict({"type": "scene", "group": group([[0.1, 0.2, 0.3, 1]])})
     hit = mi.load_dict({"type": "mrt_whitted"}).trace(scene, None, ray).hit
     sphere = mi.load_dict({"type": "scene", "sphere": {"type": "sphere", "center": [0.1, 0.2, 0.3]}})
-    found, expected = np.array(hit.si.uv), np.array(sphere.ray_intersect(ray).uv)
-    assert np.array(hit.found).mean() > 0.9
-    np.testing.assert_allclose(found[:, np.array(hit.found)], expected[:, np.array(hit.found)], atol=1e-3)
+    met = np.array(hit.found)
+    assert met.mean() > 0.9
+    found, expected = (np.array(si.uv)[:, met] for si in (hit.si, sphere.ray_intersect(ray)))
+    np.testing.assert_allclose(found, expected, atol=1e-3)

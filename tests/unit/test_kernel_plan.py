@@ -10,18 +10,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from nodes import sensor
+from nodes import group, mesh, sensor
 
 from mrt_mitsuba.plugins.kernel_plan import RULES, KernelPlan, held
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 TEXTURE = {"type": "checkerboard", "color0": 0.2, "color1": 0.8}
-MESH = {
-    "type": "mrt_mesh",
-    "positions": mi.Bitmap(np.array([[(-1, 0, -1), (1, 0, -1), (0, 1, -1)]], np.float32)),
-    "faces": mi.Bitmap(np.array([[(0, 1, 2)]], np.uint32)),
-}
+CORNERS = [(-1, 0, -1), (1, 0, -1), (0, 1, -1)]
+MESH = mesh(CORNERS, [(0, 1, 2)])
+SMOOTH = mesh(CORNERS, [(0, 1, 2)], normals=[(-0.6, 0, 0.8), (0.6, 0, 0.8), (0, 0, 1)])
 SPHERE: dict[str, Any] = {"type": "sphere", "radius": 0.7, "bsdf": {"type": "mrt_bsdf"}}
 CONE = {"type": "mrt_cone", "apex": [0, 1, 1], "base_center": [0, 0, 1], "radius": 0.4}
 LIGHT = {"type": "mrt_light", "position": [2, 4, 3]}
@@ -31,35 +29,17 @@ GLASS = {"type": "sphere", "radius": 0.7, "bsdf": {"type": "dielectric"}}
 CROWD = {
     f"ball_{i}": {**SPHERE, "center": [i % 8 - 4, i // 8 - 4, -(i % 3)], "radius": 0.3} for i in range(64)
 }
-GROUP = {
-    "type": "mrt_group",
-    "numbers": mi.Bitmap(np.array([[i % 8 - 4, i // 8 - 4, -(i % 3), 0.3] for i in range(64)], np.float32)),
-    "face_gloss": mi.Bitmap(np.linspace(0.1, 0.9, 64, dtype=np.float32)[:, None]),
-    "bsdf": {"type": "mrt_bsdf", "specular_reflectance": {"type": "mesh_attribute", "name": "face_gloss"}},
-}
+GROUP = group(
+    [[*ball["center"], 0.3] for ball in CROWD.values()],
+    face_gloss=mi.Bitmap(np.linspace(0.1, 0.9, 64, dtype=np.float32)[:, None]),
+    bsdf={"type": "mrt_bsdf", "specular_reflectance": {"type": "mesh_attribute", "name": "face_gloss"}},
+)
 MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
-
-
-def smooth_mesh() -> mi.Mesh:
-    """A triangle whose corners have normals of their own."""
-    mesh = mi.Mesh("smooth", 3, 1, has_vertex_normals=True)
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = mi.Float([-1, 0, -1, 1, 0, -1, 0, 1, -1])
-    parameters["vertex_normals"] = mi.Float([-0.6, 0, 0.8, 0.6, 0, 0.8, 0, 0, 1])
-    parameters["faces"] = mi.UInt32([0, 1, 2])
-    parameters.update()
-    return mesh
 
 
 def scene(**content: Any) -> mi.Scene:
     view = sensor([0, 1, 6], [0, 0.4, 0], (24, 16), rfilter="gaussian", fov=40)
     return mi.load_dict({"type": "scene", "integrator": {"type": "mrt_whitted"}, "sensor": view, **content})
-
-
-def plan_of(**content: Any) -> KernelPlan:
-    loaded = scene(**content)
-    integrator = loaded.integrator()
-    return integrator.kernel_plan(integrator.scene_facts(loaded))
 
 
 def kernel(loaded: mi.Scene) -> tuple[np.ndarray, list[str]]:
@@ -88,7 +68,7 @@ CHOICES = {
     "cut_off": ({"a": SPHERE, "b": CONE, "sky": {"type": "constant"}}, (math.inf, 9.0), True),
     "lobes": ({"a": SPHERE, "light": LIGHT}, ("diffuse",), False),
     "textures": ({"a": {**SPHERE, "bsdf": CHECKED}, "light": LIGHT}, False, False),
-    "shading_frames": ({"b": SPHERE, "light": LIGHT}, False, False),
+    "shading_frames": ({"a": SMOOTH, "b": SPHERE, "light": LIGHT}, False, False),
     "tangents": ({"a": {**SPHERE, "bsdf": BRUSHED}, "light": LIGHT}, False, False),
     "merged": ({"a": SPHERE, "b": {**CONE, "bsdf": {"type": "mrt_bsdf"}}, "light": LIGHT}, False, True),
     "two_sided": ({"a": GLASS, "light": LIGHT}, False, True),
@@ -103,7 +83,6 @@ def test_every_decision_is_tried() -> None:
 @pytest.mark.parametrize("name", CHOICES)
 def test_kernel_obeys(name: str) -> None:
     content, other, same = CHOICES[name]
-    content = content | ({"a": smooth_mesh()} if name == "shading_frames" else {})
     loaded = scene(**content)
     integrator = loaded.integrator()
     plan = integrator.prepare(loaded).plan
@@ -113,10 +92,8 @@ def test_kernel_obeys(name: str) -> None:
         return
     assert getattr(plan, name) != other
     image, kernels = kernel(loaded)
-    turned = replace(plan, **{name: other})
-    assert held(turned, facts := integrator.scene_facts(loaded)) != held(
-        plan, facts
-    )  # as ``plan=show`` tells
+    turned, facts = replace(plan, **{name: other}), integrator.scene_facts(loaded)
+    assert held(turned, facts) != held(plan, facts)  # as ``plan=show`` tells
     integrator.kernel_plan = lambda facts: turned
     changed, other_kernels = kernel(loaded)
     assert kernels != other_kernels
@@ -154,7 +131,8 @@ REASONS = [
 
 @pytest.mark.parametrize(("content", "name", "reason"), REASONS)
 def test_reasons(content: dict[str, Any], name: str, reason: str) -> None:
-    assert plan_of(**content).reason(name) == reason
+    loaded = scene(**content)
+    assert loaded.integrator().prepare(loaded).plan.reason(name) == reason
 
 
 def test_no_light_buffers_where_they_would_be_too_long() -> None:

@@ -10,14 +10,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from nodes import sensor
+from nodes import mesh, sensor
 
 from mrt_mitsuba.plugins import plugin
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-VARIANTS = ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized", "scalar_rgb"]
-in_variants = pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+in_variants = pytest.mark.parametrize(
+    "variant",
+    ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized", "scalar_rgb"],
+    indirect=True,
+)
 
 POSITION = (1.0, -2.0, 3.0)
 
@@ -35,12 +38,8 @@ def point_at(p: Any) -> mi.SurfaceInteraction3f:
     return si
 
 
-def entries(vector: Any) -> np.ndarray:
-    return np.array(vector).ravel()
-
-
 def spectrum(value: Any) -> np.ndarray:
-    return entries(mi.unpolarized_spectrum(value))
+    return np.ravel(mi.unpolarized_spectrum(value))
 
 
 def stock_spectrum(intensity: Any) -> np.ndarray:
@@ -57,19 +56,19 @@ def test_colour_does_not_depend_on_the_distance(variant: str) -> None:
             point_at(-distance * towards), mi.Point2f(0.5)
         )
         np.testing.assert_allclose(spectrum(weight), stock_spectrum(2.5), rtol=1e-6)
-        np.testing.assert_allclose(entries(ds.d), towards, rtol=1e-6)
-        np.testing.assert_allclose(entries(ds.n), -towards, rtol=1e-6)
+        np.testing.assert_allclose(np.ravel(ds.d), towards, rtol=1e-6)
+        np.testing.assert_allclose(np.ravel(ds.n), -towards, rtol=1e-6)
         assert np.array(ds.dist) == pytest.approx(distance, rel=1e-6)
         assert np.array(ds.pdf) == 1 and dr.all(ds.delta)
         assert np.array(ds.time) == 0.25
     it, one = light(intensity=2.0), point_at(np.array(POSITION) - towards)
     ds, _ = it.sample_direction(one, mi.Point2f(0.5))
-    np.testing.assert_array_equal(entries(ds.p), POSITION)
+    np.testing.assert_array_equal(np.ravel(ds.p), POSITION)
     np.testing.assert_allclose(spectrum(it.eval_direction(one, ds)), stock_spectrum(2.0), rtol=1e-6)
     assert np.array(it.pdf_direction(one, ds)) == 0 and (spectrum(it.eval(one)) == 0).all()
     assert mi.has_flag(it.flags(), mi.EmitterFlags.DeltaPosition) and not it.is_environment()
     ds, _ = light().sample_direction(point_at(POSITION), mi.Point2f(0.5))
-    assert np.linalg.norm(entries(ds.d)) == pytest.approx(1)  # there is none, and any will do
+    assert np.linalg.norm(np.ravel(ds.d)) == pytest.approx(1)  # there is none, and any will do
 
 
 def test_light_tracing_is_refused() -> None:
@@ -119,7 +118,7 @@ def test_parameters_can_be_updated(variant: str) -> None:
         parameters["intensity.value"] = 4.0
     parameters.update()
     ds, weight = it.sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
-    np.testing.assert_allclose(entries(ds.d), [0, 0, 1])
+    np.testing.assert_allclose(np.ravel(ds.d), [0, 0, 1])
     np.testing.assert_allclose(spectrum(weight), stock_spectrum(1.0 if mi.is_spectral else 4.0), rtol=1e-6)
     assert list(it.bbox().min) == [0, 0, 2]
 
@@ -135,9 +134,8 @@ def board(s: float) -> dict[str, Any]:
 
 
 def wedge(s: float) -> dict[str, Any]:
-    corners = s * np.array([[(-1, 0, 1), (1, 0, 1), (0, 1, 0), (0, 0, -1)]])
-    faces = np.array([[(0, 1, 2), (1, 3, 2), (3, 0, 2)]], np.uint32)
-    return {"type": "mrt_mesh", "positions": mi.Bitmap(np.float32(corners)), "faces": mi.Bitmap(faces)}
+    corners = s * np.array([(-1, 0, 1), (1, 0, 1), (0, 1, 0), (0, 0, -1)])
+    return mesh(corners, [(0, 1, 2), (1, 3, 2), (3, 0, 2)])
 
 
 # A shape of size s, where on it the light is, and the direction off it

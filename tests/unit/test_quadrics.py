@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import group
 
 from mrt_mitsuba.plugins import intersect
 from mrt_mitsuba.plugins.intersect import BASE, LATERAL, TOP
@@ -161,8 +162,7 @@ def crowd(count: int, place: str, kind: str, rays: int = 8_000) -> tuple[np.ndar
 def test_search_against_float64(kind: str, count: int, scale: float, place: str) -> None:
     ends, radii, o, d = crowd(count, place, kind)
     o, d, ends, radii = (np.float32(x) for x in (o * scale, d, ends * scale, radii * scale))
-    numbers = mi.Bitmap(np.concatenate([ends.reshape(-1, 6), radii[:, None]], axis=1))
-    quadrics = Quadrics([mi.load_dict({"type": "mrt_group", "kind": kind, "numbers": numbers})])
+    quadrics = Quadrics([mi.load_dict(group(np.column_stack([ends.reshape(-1, 6), radii]), kind=kind))])
     ray = mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T), dr.opaque(mi.Float, 2.0**127), 0, [])
     t = np.array(quadrics.intersect(ray, mi.Bool(True))[0], float)
     t[t > 1e38] = INF

@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from nodes import sensor
+from nodes import group, mesh, sensor
 
 from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.rendering.api import render
@@ -21,7 +21,7 @@ def test_large_surfaces_near_the_origin_have_no_dark_spots(variant: str, kind: s
         "type": "scene",
         "sensor": sensor([0.3, 2, 3], [0, 0, 0], (160, 120), fov=20),
         "light": {"type": "mrt_light", "position": [0.3, 2, 3]},
-        "large": {"type": "mrt_group", "kind": kind, "numbers": mi.Bitmap(np.array(numbers, np.float32))},
+        "large": group(numbers, kind=kind),
     }
     assert (render(scene, aa=1, lattice="report").image > 0.02).all()
 
@@ -30,9 +30,7 @@ def floor(kind: str, half: float, turn: mi.ScalarTransform4f) -> dict[str, Any]:
     if kind == "rectangle":
         return {"type": "rectangle", "to_world": turn.scale([half, half, 1])}
     corners = half * np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
-    faces = np.array([[(0, 1, 2), (0, 2, 3)]], np.uint32)
-    positions = mi.Bitmap(corners[np.newaxis].astype(np.float32))
-    return {"type": "mrt_mesh", "positions": positions, "faces": mi.Bitmap(faces), "to_world": turn}
+    return mesh(corners, [(0, 1, 2), (0, 2, 3)]) | {"to_world": turn}
 
 
 @pytest.mark.parametrize("kind", ["rectangle", "mesh"])
@@ -72,18 +70,17 @@ def test_meshes_that_rays_cannot_meet_are_refused(variant: str, size: float) -> 
 def test_meshes_are_drawn_at_every_size_that_is_taken(variant: str, size: float) -> None:
     """The picture is that at size 1, with triangles in all directions."""
     rng = np.random.default_rng(1)
-    corners = rng.normal(size=(1, 60, 3))
-    faces = rng.permuted(np.tile(np.arange(60, dtype=np.uint32), (40, 1)), axis=1)[np.newaxis, :, :3]
+    corners = rng.normal(size=(60, 3))
+    faces = rng.permuted(np.tile(np.arange(60), (40, 1)), axis=1)[:, :3]
 
     def picture(s: float) -> np.ndarray:
         clips = {"near_clip": 0.01 * s, "far_clip": 1e4 * s}
-        mesh = {"type": "mrt_mesh", "positions": mi.Bitmap((corners * s).astype(np.float32))}
         scene = {
             "type": "scene",
             "embree_use_robust_intersections": True,
             "sensor": sensor([0, 0, 6 * s], [0, 0, 0], (48, 36), fov=30, **clips),
             "light": {"type": "mrt_light", "position": [2 * s, 3 * s, 5 * s]},
-            "mesh": {**mesh, "faces": mi.Bitmap(np.ascontiguousarray(faces)), "bsdf": {"type": "mrt_bsdf"}},
+            "mesh": {**mesh(corners * s, faces), "bsdf": {"type": "mrt_bsdf"}},
         }
         return render(scene, aa=1).image
 

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from nodes import sensor
+from nodes import group, mesh, sensor
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 CHECKERS = {"type": "checkerboard", "color0": 0.1, "color1": 0.9}
-SPHERE = {"type": "sphere"}
-DIRECT = {"type": "direct"}
-SQUARE = {"type": "rectangle"}
+BOTH = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}, {"type": "direct"}
 
 
-def pictures(shape: dict[str, Any], material: dict[str, Any], **options: Any) -> list[np.ndarray]:
+def pictures(shape: dict[str, Any], material: dict[str, Any]) -> list[np.ndarray]:
     """The scene by ``mrt_whitted`` and by ``direct``."""
     scene = mi.load_dict({
         "type": "scene",
@@ -26,8 +23,7 @@ def pictures(shape: dict[str, Any], material: dict[str, Any], **options: Any) ->
         "light": {"type": "point", "position": [2, 4, 5], "intensity": 10.0},
         "shape": {**shape, "bsdf": material},
     })  # fmt: skip
-    ours = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0, **options}
-    return [np.array(mi.render(scene, integrator=mi.load_dict(i), spp=1)) for i in (ours, DIRECT)]
+    return [np.array(mi.render(scene, integrator=mi.load_dict(i), spp=1)) for i in BOTH]
 
 
 @pytest.mark.parametrize(
@@ -44,59 +40,40 @@ def pictures(shape: dict[str, Any], material: dict[str, Any], **options: Any) ->
 )
 def test_textures_of_stock_materials(material: dict[str, Any]) -> None:
     """Mitsuba's materials do not say by their flags that they vary over the surface."""
-    ours, direct = pictures(SPHERE, material)
+    ours, direct = pictures({"type": "sphere"}, material)
     assert direct.std() > 5e-3
     assert np.abs(ours - direct).max() < 1e-6  # roundings of values below 0.2
 
 
-def waves(height: int, width: int) -> np.ndarray:
-    y, x = np.mgrid[:height, :width]
-    return np.sin(0.5 * x) * np.cos(0.4 * y)
+def waves(size: int, *, tilted: bool) -> dict[str, Any]:
+    """A texture of heights, or of normals."""
+    y, x = np.mgrid[:size, :size]
+    wave = np.sin(0.5 * x) * np.cos(0.4 * y)
+    texels = [0.5 + 0.2 * wave, 0.5 + 0.2 * wave.T, 0 * wave + 0.9] if tilted else [0.5 + 0.5 * wave]
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.dstack(texels).astype(np.float32)), "raw": True}
 
 
-def bump() -> dict[str, Any]:
-    heights = (0.5 + 0.5 * waves(64, 64)).astype(np.float32)[..., np.newaxis]
-    texture = {"type": "bitmap", "bitmap": mi.Bitmap(heights), "raw": True}
-    return {"type": "bumpmap", "texture": texture, "scale": 0.1, "inner": {"type": "mrt_bsdf", "alpha": 0.3}}
-
-
-def normals() -> dict[str, Any]:
-    tilt = 0.5 + 0.2 * waves(32, 32)
-    colors = np.dstack([tilt, tilt.T, np.full_like(tilt, 0.9)]).astype(np.float32)
-    texture = {"type": "bitmap", "bitmap": mi.Bitmap(colors), "raw": True}
-    return {"type": "normalmap", "normalmap": texture, "inner": {"type": "roughplastic", "alpha": 0.3}}
-
-
-def brushed() -> dict[str, Any]:
-    return {"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.4}
-
-
-CORNERS = np.array([[(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]], np.float32)
+TURNING = [
+    {"type": "bumpmap", "t": waves(64, tilted=False), "scale": 0.1, "b": {"type": "mrt_bsdf", "alpha": 0.3}},
+    {"type": "normalmap", "normalmap": waves(32, tilted=True), "b": {"type": "roughplastic", "alpha": 0.3}},
+    {"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.4},
+]
+CORNERS = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
 PLACES = {
-    "sphere": SPHERE,
-    "rectangle": SQUARE,
+    "sphere": {"type": "sphere"},
+    "rectangle": {"type": "rectangle"},
     "cone": {"type": "mrt_cone", "apex": [0, 1.2, 0], "base_center": [0, -1, 0], "segments": 1024},
     "cylinder": {"type": "mrt_cylinder", "p0": [0, 1, 0], "p1": [0.1, -1, 0.2], "segments": 1024},
     "plane": {"type": "mrt_plane", "normal": [0, 1, 0.2], "distance": 1.0},
-    "group": {
-        "type": "mrt_group",
-        "kind": "cylinder",
-        "numbers": mi.Bitmap(np.array([[0, 1, 0, 0, -1, 0, 0.5], [1, 1, 0, 1, -1, 0, 0.3]], np.float32)),
-        "segments": 512,
-    },
-    "mesh": {
-        "type": "mrt_mesh",
-        "positions": mi.Bitmap(CORNERS),
-        "faces": mi.Bitmap(np.array([[(0, 1, 2), (0, 2, 3)]], np.uint32)),
-        "texcoords": mi.Bitmap((CORNERS + 1) / 2),
-    },
+    "group": group([[0, 1, 0, 0, -1, 0, 0.5], [1, 1, 0, 1, -1, 0, 0.3]], kind="cylinder", segments=512),
+    "mesh": mesh(CORNERS, [(0, 1, 2), (0, 2, 3)], texcoords=(CORNERS + 1) / 2),
 }
 
 
-@pytest.mark.parametrize("material", [bump, normals, brushed])
+@pytest.mark.parametrize("material", TURNING, ids=lambda material: material["type"])
 @pytest.mark.parametrize("name", [name for name in PLACES if name != "group"])
-def test_materials_that_turn_with_the_surface(name: str, material: Callable[[], dict[str, Any]]) -> None:
-    ours, direct = pictures(PLACES[name], material())
+def test_materials_that_turn_with_the_surface(name: str, material: dict[str, Any]) -> None:
+    ours, direct = pictures(PLACES[name], material)
     assert np.isfinite(ours).all()
     # The triangles of a cone's mesh, which ``direct`` sees, do not narrow their uv towards the apex: the
     # slope of a bump is another there. Elsewhere a mesh of so many sides is off by a thousandth
@@ -121,10 +98,8 @@ def test_normals_of_corners_stay_across_the_surface() -> None:
     points = np.random.default_rng(2).normal(size=(3, 3))
     points = np.float32(points / np.linalg.norm(points, axis=1, keepdims=True))
     to_world = mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 40).scale([1, 2, -0.5])
-    arrays = {"positions": points, "normals": points, "faces": np.array([[0, 1, 2]], np.uint32)}
-    bitmaps = {name: mi.Bitmap(a[np.newaxis]) for name, a in arrays.items()}
-    mesh = mi.load_dict({"type": "mrt_mesh", **bitmaps, "to_world": to_world})
-    normals = np.array(mi.traverse(mesh)["vertex_normals"]).reshape(3, 3)
+    ball = mi.load_dict(mesh(points, [(0, 1, 2)], normals=points) | {"to_world": to_world})
+    normals = np.array(mi.traverse(ball)["vertex_normals"]).reshape(3, 3)
     expected = np.array([list(to_world @ mi.ScalarNormal3f(n.tolist())) for n in points])
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     np.testing.assert_allclose(normals, expected, atol=1e-6)
