@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from nodes import sensor
+from nodes import mesh, sensor
 
 import mrt_mitsuba as mrt
 
@@ -20,30 +20,17 @@ MIRROR = {"type": "mrt_bsdf", "fresnel": "unity", "diffuse_reflectance": 0.0, "a
 FLOOR = {"type": "mrt_plane", "normal": [0, 0, 1]}
 
 
-@dataclass(frozen=True)
-class Traced:
-    """The findings of the integrator along N rays."""
-
-    radiance: np.ndarray  # [N, 3]
-    found: np.ndarray  # [N]
-    t: np.ndarray  # [N]
-    p: np.ndarray  # [N, 3]
-    n: np.ndarray  # [N, 3]
-
-
-def trace(nodes: dict[str, Any], o: Any, d: Any, **integrator: Any) -> Traced:
-    """Trace rays [N, 3] through a scene."""
+def trace(nodes: dict[str, Any], o: Any, d: Any, **integrator: Any) -> Any:
+    """What the integrator finds along rays [N, 3] through a scene."""
     scene = mi.load_dict({"type": "scene", **nodes})
-    tracer = mi.load_dict({**WHITTED, **integrator})
     rays = mi.Ray3f(mi.Point3f(np.atleast_2d(o).T), mi.Vector3f(np.atleast_2d(d).T))
-    found = tracer.trace(scene, None, rays)
-    si = found.hit.si
-    points = (np.array(v).T for v in (si.p, si.n))
-    return Traced(np.array(found.radiance).T, np.array(found.hit.found), np.array(si.t), *points)
+    found = mi.load_dict({**WHITTED, **integrator}).trace(scene, None, rays)
+    dr.eval(found.radiance, found.bounces, found.hit.found, found.hit.si)  # while the scene is there
+    return found
 
 
-def radiance(nodes: dict[str, Any], o: Any, d: Any, **integrator: Any) -> np.ndarray:
-    return trace(nodes, o, d, **integrator).radiance
+def radiance(*arguments: Any, **integrator: Any) -> np.ndarray:
+    return np.array(trace(*arguments, **integrator).radiance).T
 
 
 @pytest.mark.parametrize("count", [8, 9])
@@ -74,31 +61,26 @@ def test_hits_lie_on_their_sphere(others: dict[str, Any]) -> None:
     d = rng.normal(size=(2000, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     sphere = {"type": "sphere", "center": center.tolist(), "radius": radius}
-    found = trace({"sphere": sphere, **others}, center - 5000 * d + 0.2 * rng.normal(size=(2000, 3)), d)
-    distance = np.linalg.norm(found.p - center, axis=1)
-    met = found.found & (distance < 1)
+    hit = trace({"sphere": sphere, **others}, center - 5000 * d + 0.2 * rng.normal(size=(2000, 3)), d).hit
+    from_center, n = np.array(hit.si.p).T - center, np.array(hit.si.n).T
+    distance = np.linalg.norm(from_center, axis=1)
+    met = np.array(hit.found) & (distance < 1)
     assert met.mean() > 0.5
     few = 8 * 2.0**-24 * 3.5  # some roundings of coordinates below 3.5
     assert np.abs(distance - radius)[met].max() < few
     # The normal is the direction from the centre; that of a hit 5000 away is known to 5000 roundings of it
-    outwards = (found.p - center)[met] / distance[met, None]
-    assert np.abs(found.n[met] - outwards).max() < (few / radius if not others else 1e-3)
+    outwards = from_center[met] / distance[met, None]
+    assert np.abs(n[met] - outwards).max() < (few / radius if not others else 1e-3)
 
 
 def test_mirrors_follow_the_interpolated_normal() -> None:
     """A flat triangle whose normals lean by 30°, seen from above, shows what is at 60° from the zenith."""
-    mesh = mi.Mesh("leaning", 3, 1, has_vertex_normals=True)
-    parameters = mi.traverse(mesh)
-    lean = np.radians(30)
-    parameters["vertex_positions"] = [-1.0, -1, 0, 3, -1, 0, -1, 3, 0]
-    parameters["vertex_normals"] = [np.sin(lean), 0.0, np.cos(lean)] * 3
-    parameters["faces"] = [0, 1, 2]
-    parameters.update()
-    mesh.set_bsdf(mi.load_dict(MIRROR))
+    corners, lean = [(-1, -1, 0), (3, -1, 0), (-1, 3, 0)], [(0.5, 0, 0.75**0.5)] * 3
+    leaning = mesh(corners, [(0, 1, 2)], normals=lean) | {"bsdf": MIRROR}
     # Two walls: the mirror ray at 60° towards +x meets the nearer one where it is lit by its own light
     wall = {"type": "mrt_plane", "normal": [-1, 0, 0], "distance": 2.0, "bsdf": MATTE}
     light = {"type": "mrt_light", "position": [1, 0, 2 / np.tan(np.radians(60))]}
-    found = radiance({"mesh": mesh, "wall": wall, "light": light}, (0, 0, 5), (0, 0, -1))
+    found = radiance({"mesh": leaning, "wall": wall, "light": light}, (0, 0, 5), (0, 0, -1))
     # straight across from the light: cos 0, the diffuse part alone
     np.testing.assert_allclose(found, 0.5 / np.pi, rtol=1e-4)
 
@@ -106,7 +88,7 @@ def test_mirrors_follow_the_interpolated_normal() -> None:
 @pytest.mark.parametrize("scale", [1.0, 1e4])
 def test_a_plane_hides_lights_behind_it_only(scale: float) -> None:
     floor = {**FLOOR, "bsdf": MATTE}
-    for height, lit in ((0.5, False), (1.5, True)):
+    for height, lit in ((0.5, False), (0.9999, False), (1.5, True)):
         wall = {"type": "mrt_plane", "normal": [0, 0, -1], "distance": height * scale}
         light = {"type": "mrt_light", "position": [0, 0, scale]}
         d = np.array([1, 0, -0.2])
@@ -146,17 +128,18 @@ def test_a_bounce_costs_what_the_index_leaves_of_ten(ior: float, bounces: int) -
     """Straight between two mirrors: max(1, 10 - int(10 ior)) of a budget of ten for each."""
     mirror = {**MIRROR, "int_ior": ior}
     walls = {f"wall{k}": {**FLOOR, "normal": [0, 0, k], "distance": 1.0, "bsdf": mirror} for k in (1, -1)}
-    scene = mi.load_dict({"type": "scene", **walls})
-    tracer = mi.load_dict({**WHITTED, "bounce_budget": "report", "sky": 1.0})
-    ray = mi.Ray3f(mi.Point3f(0, 0, 0.5), mi.Vector3f(0, 0, -1))
-    assert np.array(tracer.trace(scene, None, ray).bounces).item() == bounces
+    found = trace(walls, (0, 0, 0.5), (0, 0, -1), bounce_budget="report", sky=1.0)
+    assert np.array(found.bounces).item() == bounces
+
+
+def test_a_scene_without_shapes_is_the_sky() -> None:
+    view, sky = sensor([0, 0, 5], [0, 0, 0], (8, 6)), {"type": "constant", "radiance": 0.3}
+    scene = mi.load_dict({"type": "scene", "integrator": WHITTED, "sensor": view, "sky": sky})
+    assert np.array(mi.render(scene, spp=4)) == pytest.approx(0.3, rel=1e-6)
 
 
 def test_mirror_rays_are_counted_where_there_are_none() -> None:
-    scene = {
-        "type": "scene",
-        "sensor": sensor([0, 0, 5], [0, 0, 0], (8, 6)),
-        "floor": {**FLOOR, "bsdf": MATTE},
-    }
+    view = sensor([0, 0, 5], [0, 0, 0], (8, 6))
+    scene = {"type": "scene", "sensor": view, "floor": {**FLOOR, "bsdf": MATTE}}
     result = mrt.render(scene, integrator=WHITTED, aa=2, aamode="none", lattice="report", layers=["bounces"])
     assert result.layers["bounces.Y"].shape == (6, 8) and not result.layers["bounces.Y"].any()

@@ -10,9 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from nodes import group, mesh, sensor
+from nodes import group, mesh, rgb, sensor
 
 from mrt_mitsuba.plugins.kernel_plan import RULES, KernelPlan, held
+from mrt_mitsuba.plugins.lobes import Lobes
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -35,6 +36,14 @@ GROUP = group(
     bsdf={"type": "mrt_bsdf", "specular_reflectance": {"type": "mesh_attribute", "name": "face_gloss"}},
 )
 MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
+GLOSSY = {
+    "type": "mrt_bsdf",
+    "alpha": 0.4,
+    "int_ior": 1.2,
+    "ext_ior": 1.1,
+    "diffuse_reflectance": rgb(0.1, 0.5, 0.9),
+    "specular_reflectance": rgb(0.9, 0.3, 0.7),
+}
 
 
 def scene(**content: Any) -> mi.Scene:
@@ -70,7 +79,7 @@ CHOICES = {
     "textures": ({"a": {**SPHERE, "bsdf": CHECKED}, "light": LIGHT}, False, False),
     "shading_frames": ({"a": SMOOTH, "b": SPHERE, "light": LIGHT}, False, False),
     "tangents": ({"a": {**SPHERE, "bsdf": BRUSHED}, "light": LIGHT}, False, False),
-    "merged": ({"a": SPHERE, "b": {**CONE, "bsdf": {"type": "mrt_bsdf"}}, "light": LIGHT}, False, True),
+    "merged": ({"a": SPHERE, "b": {**CONE, "bsdf": GLOSSY}, "light": LIGHT}, False, True),
     "two_sided": ({"a": GLASS, "light": LIGHT}, False, True),
 }
 
@@ -143,3 +152,17 @@ def test_no_light_buffers_where_they_would_be_too_long() -> None:
     assert integrator.kernel_plan(facts).buffers
     facts.lights += 1
     assert integrator.kernel_plan(facts).reason("buffers") == "too many lights and objects"
+
+
+def test_merged_materials_are_recorded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    value, calls = Lobes.value, []
+    monkeypatch.setattr(Lobes, "value", lambda *arguments: calls.append(1) or value(*arguments))
+    counts = []
+    for count in (2, 30):
+        balls = [
+            {**SPHERE, "center": [k, 0, 0], "bsdf": {**GLOSSY, "alpha": 0.1 + k / 99}} for k in range(count)
+        ]
+        calls.clear()
+        kernel(scene(light=LIGHT, **{f"ball{k}": ball for k, ball in enumerate(balls)}))
+        counts.append(len(calls))
+    assert counts[0] == counts[1] > 0
