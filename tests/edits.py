@@ -16,6 +16,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from nodes import group, mesh, rgb, sensor
 
 import mrt_mitsuba as mrt  # before mitsuba: it chooses the LLVM library
 
@@ -29,7 +30,7 @@ Edit = tuple[str, Any]
 
 
 def _color(rng: random.Random) -> dict[str, Any]:
-    return {"type": "rgb", "value": [round(rng.uniform(0.1, 0.9), 2) for _ in range(3)]}
+    return rgb(*(round(rng.uniform(0.1, 0.9), 2) for _ in range(3)))
 
 
 def _texture(rng: random.Random, kind: str) -> dict[str, Any]:
@@ -75,20 +76,18 @@ SHAPES = ["cube", "rectangle", "disk", "cylinder", "sdfgrid", "mrt_cone", "mrt_c
 def _shape(rng: random.Random) -> dict[str, Any]:
     kind = rng.choice([*["sphere"] * 3, *SHAPES])
     if kind == "mrt_mesh":
-        points = np.array([[rng.uniform(-1, 1) for _ in range(3)] for _ in range(6)], np.float32)
-        faces = np.array([[0, 1, 2], [3, 4, 5], [0, 2, 4]], np.uint32)
-        return {"type": "mrt_mesh", "positions": mi.Bitmap(points[None]), "faces": mi.Bitmap(faces[None])}
+        points = [[rng.uniform(-1, 1) for _ in range(3)] for _ in range(6)]
+        return mesh(points, [(0, 1, 2), (3, 4, 5), (0, 2, 4)])
     if kind == "group":
-        numbers = np.array([[rng.uniform(0.1, 1) for _ in range(7)] for _ in range(3)], np.float32)
-        return {"type": "mrt_group", "kind": "cone", "numbers": mi.Bitmap(numbers[..., None])}
+        return group([[rng.uniform(0.1, 1) for _ in range(7)] for _ in range(3)], kind="cone")
+    form: dict[str, Any] = {}
     if kind in ("mrt_cone", "mrt_cylinder"):
         ends = {"mrt_cone": ("apex", "base_center"), "mrt_cylinder": ("p0", "p1")}[kind]
         form = {ends[0]: [0, 1, 0], ends[1]: [0, 0, 0], "radius": 0.5, "segments": 16}
-        return {"type": kind, **form, "to_world": _place(rng)}
     if kind == "sdfgrid":
         grid = np.linalg.norm(np.indices((6, 6, 6)) - 2.5, axis=0)[..., None] / 5 - rng.uniform(0.2, 0.4)
-        return {"type": kind, "grid": mi.TensorXf(grid.astype(np.float32)), "to_world": _place(rng)}
-    return {"type": kind, "to_world": _place(rng)}
+        form = {"grid": mi.TensorXf(grid.astype(np.float32))}
+    return {"type": kind, **form, "to_world": _place(rng)}
 
 
 def scene_of(rng: random.Random) -> dict[str, Any]:
@@ -97,7 +96,7 @@ def scene_of(rng: random.Random) -> dict[str, Any]:
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "mrt_whitted", "max_depth": rng.choice([1, 10]), "clamp": rng.random() < 0.5},
-        "camera": {"type": "perspective", "to_world": look, "film": _FILM},
+        "camera": sensor([0, 1.5, 5], [0, 0, 0], (16, 12)),
         "lamp": {"type": "mrt_light", "position": [2, 4, 3], "intensity": _color(rng)},
     }
     for i in range(rng.randint(1, 3)):
@@ -126,9 +125,6 @@ def scene_of(rng: random.Random) -> dict[str, Any]:
     ]  # fmt: skip
     scene |= {f"l{i}": light for i, light in enumerate(rng.sample(more, rng.randint(0, 2)))}
     return scene
-
-
-_FILM = {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
 
 
 def _changed(value: Any, rng: random.Random) -> Any:

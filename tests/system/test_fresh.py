@@ -12,6 +12,7 @@ import edits
 import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import rgb, sensor
 
 import mrt_mitsuba as mrt
 
@@ -19,19 +20,16 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 ROUNDS = int(os.environ.get("MRT_ATTACK_ROUNDS", "0"))  # of 504 pictures: 5,040 by make attack
 
-RED, GREEN = ({"type": "mrt_bsdf", "diffuse_reflectance": {"type": "rgb", "value": c}} for c in
-              ([0.8, 0.1, 0.1], [0.1, 0.8, 0.1]))  # fmt: skip
+COLORS = rgb(0.8, 0.1, 0.1), rgb(0.1, 0.8, 0.1)
+RED, GREEN = ({"type": "mrt_bsdf", "diffuse_reflectance": color} for color in COLORS)
 
 
-def content(plane: bool, fresnel: str = "schlick") -> dict[str, Any]:
-    look = mi.ScalarTransform4f().look_at([0, 2, 7], [0, 0.5, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 12, "height": 9, "rfilter": {"type": "box"}}
+def content(fresnel: str) -> dict[str, Any]:
     inside = {"type": "shapegroup", "box": {"type": "cube", "bsdf": {"type": "diffuse"}}}
     place = mi.ScalarTransform4f().translate([2.5, 0.5, 0]).scale(0.4)
-    floor = {"floor": {"type": "mrt_plane", "normal": [0, 1, 0], "bsdf": {**RED, "fresnel": fresnel}}}
     return {
         "type": "scene",
-        "sensor": {"type": "perspective", "to_world": look, "film": film},
+        "sensor": sensor([0, 2, 7], [0, 0.5, 0], (12, 9)),
         "light": {"type": "mrt_light", "position": [3, 5, 4]},
         "sky": {"type": "constant", "radiance": 0.3},
         **{f"s{k}": {"type": "sphere", "center": [1.2 * k - 2, 0.5, 0], "radius": 0.5,
@@ -40,7 +38,7 @@ def content(plane: bool, fresnel: str = "schlick") -> dict[str, Any]:
         "mesh": {"type": "cube", "to_world": mi.ScalarTransform4f().translate([-2, 2, -1]).scale(0.5)},
         "group": inside,
         "instance": {"type": "instance", "to_world": place, "of": {"type": "ref", "id": "group"}},
-        **(floor if plane else {}),
+        "floor": {"type": "mrt_plane", "normal": [0, 1, 0], "bsdf": {**RED, "fresnel": fresnel}},
     }  # fmt: skip
 
 
@@ -71,7 +69,7 @@ def test_edited_scenes_are_drawn_as_scenes_made_anew(part: int, variant: str, tm
 def test_an_integrator_may_serve_several_scenes() -> None:
     """Of the same loaded objects, or alike but for a property that is no array."""
     integrator = mi.load_dict({"type": "mrt_whitted"})
-    schlick, exact = (mi.load_dict(content(True, name)) for name in ("schlick", "dielectric"))
+    schlick, exact = (mi.load_dict(content(name)) for name in ("schlick", "dielectric"))
     both = {f"shape{k}": shape for k, shape in enumerate(exact.shapes()) if shape.class_name() == "Sphere"}
     again = mi.load_dict({"type": "scene", "sensor": exact.sensors()[0], "sky": exact.environment(), **both})
     for scene in (schlick, exact, again, exact, schlick, again):

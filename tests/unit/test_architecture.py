@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
-from graphlib import CycleError, TopologicalSorter
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -35,18 +35,11 @@ class WithoutTypes(ast.NodeTransformer):
         return None if isinstance(test, ast.Name) and test.id == "TYPE_CHECKING" else self.generic_visit(node)
 
 
-def sources() -> dict[str, str]:
-    """Return the text of all modules, by name."""
-    found = {}
-    for folder, package in FOLDERS.items():
-        for file in sorted((ROOT / folder).rglob("*.py")):
-            parts = file.relative_to(ROOT / folder).with_suffix("").parts
-            name = ".".join([package, *(part for part in parts if part != "__init__")])
-            found[name] = file.read_text()
-    return found
-
-
-SOURCES = sources()
+SOURCES = {}
+for folder, package in FOLDERS.items():
+    for file in sorted((ROOT / folder).rglob("*.py")):
+        parts = file.relative_to(ROOT / folder).with_suffix("").parts
+        SOURCES[".".join([package, *(part for part in parts if part != "__init__")])] = file.read_text()
 MODULES = {name: ast.parse(text) for name, text in SOURCES.items()}
 MODULES["mrt_mitsuba"] = WithoutTypes().visit(MODULES["mrt_mitsuba"])
 PACKAGES = {name for name in MODULES if any(other.startswith(f"{name}.") for other in MODULES)}
@@ -101,8 +94,8 @@ def lines_of_code(function: ast.FunctionDef, source: str) -> int:
 
 def parameters(function: ast.FunctionDef, source: str) -> int:
     """Number of parameters but for self and cls."""
-    every = [a.arg for a in (*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs)]
-    return len([name for name in every if name not in ("self", "cls")])
+    every = (*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs)
+    return sum(a.arg not in ("self", "cls") for a in every)
 
 
 def branches(function: ast.FunctionDef, source: str) -> int:
@@ -122,15 +115,6 @@ def graph() -> dict[str, set[str]]:
     return {name: {source for source, _ in imported(name) if source in MODULES} - {name} for name in MODULES}
 
 
-def cycle(edges: dict[str, set[str]]) -> str:
-    """A cycle of imports as text; "" where there is none."""
-    try:
-        TopologicalSorter(edges).prepare()
-    except CycleError as error:
-        return " <- ".join(error.args[1])
-    return ""
-
-
 def test_every_module_imported_is_there() -> None:
     """Inside functions as well, where nothing else would notice until they run."""
     named = {(name, source) for name in MODULES for source, _ in imported(name)}
@@ -138,7 +122,7 @@ def test_every_module_imported_is_there() -> None:
 
 
 def test_imports_make_no_cycle() -> None:
-    assert cycle(graph()) == ""
+    TopologicalSorter(graph()).prepare()  # a CycleError names them
 
 
 @pytest.mark.parametrize(
@@ -155,10 +139,8 @@ def test_imports_make_no_cycle() -> None:
 def test_a_room_knows_only(room: str, others: set[str]) -> None:
     """A room imports only what its data flows through; see docs/architecture.md."""
     package = f"mrt_mitsuba.{room}"
-    known = set().union(
-        *(sources for name, sources in graph().items() if f"{name}.".startswith(f"{package}."))
-    )
-    assert {source.split(".")[1] for source in known if source != "mrt_mitsuba"} <= others
+    known = [known for name, known in graph().items() if f"{name}.".startswith(f"{package}.")]
+    assert {source.split(".")[1] for source in set().union(*known) - {"mrt_mitsuba"}} <= others
 
 
 def test_private_names_stay_at_home() -> None:
@@ -182,11 +164,9 @@ def test_functions_stay_within(measure, limit: int) -> None:
 
 
 def test_these_checks_can_fail() -> None:
-    assert cycle({"a": {"b"}, "b": {"a"}})
-    assert any(source == "mrt_mitsuba.output.layers" for source, _ in imported("mrt_mitsuba.rendering.plan"))
-    assert any(
-        source == "mrt_mitsuba.plugins.variants" for source, _ in imported("mrt_mitsuba.plugins.light")
-    )
+    edges = graph()
+    assert "mrt_mitsuba.output.layers" in edges["mrt_mitsuba.rendering.plan"]
+    assert "mrt_mitsuba.plugins.variants" in edges["mrt_mitsuba.plugins.light"]
     body = "\n    ".join(f"if a{i}: pass" for i in range(50))
     text = f"def f({', '.join(f'a{i}' for i in range(9))}):\n    'Doc.'\n    # why\n\n    {body}"
     function = ast.parse(text).body[0]

@@ -36,14 +36,8 @@ GROUP = group(
     bsdf={"type": "mrt_bsdf", "specular_reflectance": {"type": "mesh_attribute", "name": "face_gloss"}},
 )
 MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
-GLOSSY = {
-    "type": "mrt_bsdf",
-    "alpha": 0.4,
-    "int_ior": 1.2,
-    "ext_ior": 1.1,
-    "diffuse_reflectance": rgb(0.1, 0.5, 0.9),
-    "specular_reflectance": rgb(0.9, 0.3, 0.7),
-}
+GLOSSY = {"type": "mrt_bsdf", "alpha": 0.4, "int_ior": 1.2, "ext_ior": 1.1}
+GLOSSY |= {"diffuse_reflectance": rgb(0.1, 0.5, 0.9), "specular_reflectance": rgb(0.9, 0.3, 0.7)}
 
 
 def scene(**content: Any) -> mi.Scene:
@@ -159,10 +153,8 @@ def test_merged_materials_are_recorded_once(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(Lobes, "value", lambda *arguments: calls.append(1) or value(*arguments))
     counts = []
     for count in (2, 30):
-        balls = [
-            {**SPHERE, "center": [k, 0, 0], "bsdf": {**GLOSSY, "alpha": 0.1 + k / 99}} for k in range(count)
-        ]
+        materials = [{**GLOSSY, "alpha": 0.1 + k / 99} for k in range(count)]
         calls.clear()
-        kernel(scene(light=LIGHT, **{f"ball{k}": ball for k, ball in enumerate(balls)}))
+        kernel(scene(light=LIGHT, **{f"ball{k}": {**SPHERE, "bsdf": m} for k, m in enumerate(materials)}))
         counts.append(len(calls))
     assert counts[0] == counts[1] > 0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mrt_mitsuba.scene.model import Camera, Light, Material, Mesh, Scene
+from mrt_mitsuba.scene.model import Camera, Material, Scene, Sphere
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -65,32 +65,16 @@ def test_other_kinds_of_pictures(tmp_path: Path, mode: str) -> None:
     np.testing.assert_allclose(got[:, 0] * 255, np.array(image.convert("L")).ravel(), atol=1e-4)
 
 
-# A square of side 2 in the plane z = 0, facing +z, whose texture coordinates run along x and y
-SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
-SQUARE_UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
-FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
-
-
-def square_scene(texture: str | None, texturing: str = "report") -> Scene:
-    material = Material(1.0, 0.5, (0, 0, 0), (0.5, 0.5, 0.5), texture)
-    return Scene(
-        camera=Camera((0, 0, 2), (0, 0, 0), (0, 1, 0), hfov=50),
-        sky=(0, 0, 0),
-        lights=(Light((0, 0, 1e4), (1, 1, 1)),),
-        meshes=(Mesh(SQUARE, FACES, material, SQUARE_UV),),
-        texturing=texturing,
-    )
-
-
 def test_standard_texturing_is_bilinear_and_decodes_srgb(picture) -> None:
     path, values = picture
-    shape = mi.load_dict(square_scene(str(path), "standard").to_dict(width=8, height=8)).shapes()[0]
+    ball = Sphere((0, 0, 0), 1.0, Material(1.0, 0.5, (0, 0, 0), (0.5, 0.5, 0.5), str(path)))
+    scene = Scene(Camera((0, 0, 2), (0, 0, 0)), (0, 0, 0), (), spheres=(ball,), texturing="standard")
+    shape = mi.load_dict(scene.to_dict()).shapes()[0]
     stored = values / 255
     decoded = np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
     si = dr.zeros(mi.SurfaceInteraction3f, 1)
     si.uv = mi.Point2f(1 / 7, 0.5)  # between two texels of the middle row
     si.shape = mi.ShapePtr(shape)
     between = shape.bsdf().eval_diffuse_reflectance(si).numpy()[:, 0]
-    np.testing.assert_allclose(
-        between, decoded[2, :2].mean(axis=0), atol=2e-3
-    )  # texels in half precision or 8 bits
+    # texels in half precision or 8 bits
+    np.testing.assert_allclose(between, decoded[2, :2].mean(axis=0), atol=2e-3)
