@@ -52,6 +52,13 @@ def test_more_than_the_machine_has_is_never_used(monkeypatch):
         Workspace.next_to(65536, 65536, 3, budget=Budget.of(10**6 * GIB))
 
 
+def show(root: Path, groups: str, files: dict[str, str]) -> None:
+    """Write control groups, and their limits, as the system shows them."""
+    for name, text in ({"proc/self/cgroup": groups} | files).items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+
+
 V1, V2 = ("memory.limit_in_bytes", "memory.usage_in_bytes"), ("memory.max", "memory.current")
 
 
@@ -66,14 +73,13 @@ V1, V2 = ("memory.limit_in_bytes", "memory.usage_in_bytes"), ("memory.max", "mem
 )
 def test_limits_of_control_groups_count(tmp_path, group, base, names, place):
     """Limits as the system shows them: in the group itself, in one above, or in a container's only one."""
-    (tmp_path / "proc/self").mkdir(parents=True)
-    (tmp_path / "proc/self/cgroup").write_text(f"9:pids:/x\n{group}\n")
-    for folder, size in (("", "max"), ("a", "max"), ("a/b", "max"), (place, str(GIB))):
-        found = tmp_path / "sys/fs/cgroup" / base / folder
-        found.mkdir(parents=True, exist_ok=True)
-        (found / names[0]).write_text(f"{size}\n")
-        (found / names[1]).write_text(f"{GIB // 2}\n")
-        (found / "memory.stat").write_text(f"anon 5\ninactive_file {GIB // 4}\n")
+    files = {"memory.stat": f"anon 5\ninactive_file {GIB // 4}\n", names[1]: f"{GIB // 2}\n"}
+    for folder in ("", "a", "a/b"):
+        limit = {names[0]: f"{GIB if folder == place else 'max'}\n"}
+        folder = f"sys/fs/cgroup/{base}/{folder}/"
+        show(
+            tmp_path, f"9:pids:/x\n{group}\n", {folder + name: text for name, text in (files | limit).items()}
+        )
     assert machine.free_memory(tmp_path) == GIB * 3 // 4
     assert machine.all_memory(tmp_path) == GIB
 
@@ -111,14 +117,8 @@ ALL = len(affinity())
     ],
 )
 def test_quotas_of_control_groups(tmp_path: Path, membership: str, files: dict[str, str], cores: int) -> None:
-    (tmp_path / "proc/self").mkdir(parents=True)
-    (tmp_path / "proc/self/cgroup").write_text(membership)
-    for name, text in files.items():
-        file = tmp_path / "sys/fs/cgroup" / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text)
-        if name.endswith("quota_us"):
-            file.with_name("cpu.cfs_period_us").write_text("100000")
+    periods = {name.replace("quota", "period"): "100000" for name in files if "quota" in name}
+    show(tmp_path, membership, {f"sys/fs/cgroup/{name}": text for name, text in (periods | files).items()})
     assert usable_cores(tmp_path) == cores
 
 
