@@ -28,18 +28,28 @@ def different(a: np.ndarray, b: np.ndarray) -> float:
     return float((np.abs(a - b).max(axis=-1) > NOISE * (1 + np.abs(b).max(axis=-1))).mean())
 
 
+LAYERS = {"layers": ["depth", "bounces"]}
+MOVING = {"motion": (0.3, 0.1, 0.4), "motionsamples": 4, "motionmode": "stratified"}
+
+
 @pytest.mark.parametrize(
-    ("variant", "number"),
-    [("llvm_ad_rgb", 3), ("llvm_ad_rgb", 4), ("llvm_ad_rgb", 9), ("llvm_ad_spectral", 3)],
+    ("variant", "number", "more"),
+    [
+        *(("llvm_ad_rgb", number, LAYERS) for number in (3, 4, 9)),
+        ("llvm_ad_spectral", 3, {}),
+        (
+            "llvm_ad_rgb",
+            0,
+            {"integrator": "path", "spp": 2, "seed": 3, **MOVING},
+        ),  # by random numbers and times
+    ],
     indirect=["variant"],
 )
 @pytest.mark.filterwarnings("ignore:scalar_:mrt_mitsuba.MrtWarning")
-def test_pictures_are_those_of_the_scalar_variant(number: int, variant: str) -> None:
-    options: dict[str, Any] = {"aa": 1, "aamode": "none", "focaldist": 0}
-    options |= {} if "spectral" in variant else {"layers": ["depth", "bounces"]}
-    result = mrt.render(number, variant=variant, **SIZE, **options)
-    scalar = "scalar_spectral" if "spectral" in variant else "scalar_rgb"
-    truth = mrt.render(number, variant=scalar, **SIZE, **options)
+def test_pictures_are_those_of_the_scalar_variant(number: int, variant: str, more: dict[str, Any]) -> None:
+    options = {"aa": 1, "aamode": "none", "focaldist": 0, **SIZE, **more}
+    result = mrt.render(number, variant=variant, **options)
+    truth = mrt.render(number, variant="scalar_" + variant.split("_")[-1], **options)
     assert different(result.image, truth.image) <= TURNED
     for name, layer in truth.layers.items():
         assert different(result.layers[name][..., None], layer[..., None]) <= TURNED

@@ -85,30 +85,22 @@ def test_what_the_integrator_does_not_say_is_not_made_up() -> None:
 @pytest.mark.parametrize(
     ("options", "passes"),
     [
-        ({"aamode": "none", "focaldist": 0}, ["16 samples a pixel"]),
-        (
-            {"aamode": "none", "lattice": "centered"},
-            [
-                "first hits: 1 ray through the centre of a pixel, with depth",
-                "16 samples a pixel",
-                "depth of field: report",
-            ],
-        ),
-        ({"aamode": "none"}, ["16 samples a pixel, with depth", "depth of field: report"]),
-        ({"focaldist": 0, "aa": 2}, ["1 sample a pixel", "edges: sobel", "3 further samples in edge pixels"]),
-        (
-            {"focaldist": 0, "aa": 2, "lattice": "centered", "aamode": "geometry"},
-            ["1 sample a pixel, with depth, normal", "edges: geometry", "4 further samples in edge pixels"],
-        ),
-        ({"focaldist": 0, "aa": 1}, ["1 sample a pixel"]),
-        ({"focaldist": 0, "aa": 1, "layers": ["edges"]}, ["1 sample a pixel", "edges: sobel"]),
+        ({"aamode": "none", "focaldist": 0}, "16 samples a pixel"),
+        ({"aamode": "none"}, "16 samples a pixel, with depth; depth of field: report"),
+        ({"aamode": "none", "lattice": "centered"},
+         "first hits: 1 ray through the centre of a pixel, with depth; 16 samples a pixel; "
+         "depth of field: report"),
+        ({"focaldist": 0, "aa": 2}, "1 sample a pixel; edges: sobel; 3 further samples in edge pixels"),
+        ({"focaldist": 0, "aa": 2, "lattice": "centered", "aamode": "geometry"},
+         "1 sample a pixel, with depth, normal; edges: geometry; 4 further samples in edge pixels"),
+        ({"focaldist": 0, "aa": 1}, "1 sample a pixel"),
+        ({"focaldist": 0, "aa": 1, "layers": ["edges"]}, "1 sample a pixel; edges: sobel"),
     ],
-)
-def test_the_plan_shows_the_passes_that_run(options: dict[str, Any], passes: list[str]) -> None:
+)  # fmt: skip
+def test_the_plan_shows_the_passes_that_run(options: dict[str, Any], passes: str) -> None:
     result = mrt.render(3, width=16, height=12, **options)
-    assert [
-        line.removeprefix("  pass    ") for line in str(result.plan).splitlines() if "  pass" in line
-    ] == passes
+    lines = str(result.plan).splitlines()
+    assert "; ".join(line.removeprefix("  pass    ") for line in lines if "  pass" in line) == passes
     assert list(result.timings.passes) == [step.name for step in result.plan.passes]
 
 
