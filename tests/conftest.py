@@ -29,15 +29,20 @@ settings.load_profile("short")
 def run_command(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
     """Run a command in a process and a folder of its own: ``run_command(*words, VARIABLE=value)``.
 
-    A variable set to None is taken out of the environment. ``DRJIT_LIBLLVM_PATH`` is out unless given.
+    It must end with ``code``, if not None. A variable set to None is taken out of the environment.
+    ``DRJIT_LIBLLVM_PATH`` is out unless given.
     """
 
-    def run(*words: object, **variables: str | None) -> subprocess.CompletedProcess[str]:
+    def run(
+        *words: object, code: int | None = 0, **variables: str | None
+    ) -> subprocess.CompletedProcess[str]:
         given = os.environ | {"DRJIT_LIBLLVM_PATH": None} | variables
         environ = {key: value for key, value in given.items() if value is not None}
-        return subprocess.run(
+        done = subprocess.run(
             words, cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=120, check=False
         )
+        assert code in (None, done.returncode), done.stdout + done.stderr
+        return done
 
     return run
 

@@ -8,6 +8,14 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
+SENSOR = "<sensor type='perspective'><film type='hdrfilm'>{}</film></sensor>"
+SMALL = SENSOR.format("<integer name='width' value='4'/><integer name='height' value='3'/>")
+
+
+def scene_xml(inside: str, sensor: str = SMALL) -> str:
+    return f"<scene version='3.0.0'>{sensor}{inside}</scene>"
+
 
 def rgb(*values: float) -> dict[str, Any]:
     return {"type": "rgb", "value": list(values)}

@@ -20,8 +20,7 @@ TINY = ("width=16", "height=12", "quiet=1", "format=exr")
 def test_picture_and_its_two_files_of_the_same_bytes_each_time(mrt_command, tmp_path: Path) -> None:
     for name in "ab":
         done = mrt_command(name, "1", "width=64", "height=48", "aa=2", "layers=depth,normal")
-        assert (done.returncode, done.stderr) == (0, ""), done.stderr
-        assert done.stdout.splitlines()[-1].startswith("Render time: ")
+        assert not done.stderr and done.stdout.splitlines()[-1].startswith("Render time: ")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.exr", "a.png", "b.exr", "b.png"]
     for ending in ("png", "exr"):
         assert (tmp_path / f"a.{ending}").read_bytes() == (tmp_path / f"b.{ending}").read_bytes()
@@ -38,20 +37,6 @@ def test_picture_and_its_two_files_of_the_same_bytes_each_time(mrt_command, tmp_
         np.testing.assert_array_equal(np.asarray(png), np.clip(np.trunc(exr.image * 255), 0, 255))
 
 
-def test_model_is_seen_from_where_the_camera_is_put(mrt_command, tmp_path: Path) -> None:
-    """A square that covers the right half of the picture from in front, and lies behind from the back."""
-    (tmp_path / "t.obj").write_text("v 0 -9 0\nv 9 -9 0\nv 9 9 0\nv 0 9 0\nf 1 2 3 4\n")
-    words = ("width=64", "height=48", "aa=1", "format=exr", "target=0,0,0", "light=0,0,3", "quiet=1")
-    covered = []
-    for name, z in (("front", 4), ("back", -4)):
-        done = mrt_command(name, "scene=t.obj", *words, f"camera=0,0,{z}", "fov=40")
-        assert (done.returncode, done.stderr) == (0, "")
-        image = read_exr(tmp_path / f"{name}.exr").image
-        covered.append(np.abs(image - image[0, 0]).max(axis=2) > 0.02)
-    assert sorted((covered[0][:, :32].all(), covered[0][:, 33:].all())) == [False, True]
-    assert not np.array_equal(*covered)
-
-
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 @pytest.mark.parametrize(
     ("words", "code", "errors", "left"),
@@ -64,9 +49,8 @@ def test_model_is_seen_from_where_the_camera_is_put(mrt_command, tmp_path: Path)
     ],
 )
 def test_output_that_cannot_be_printed(run_command, tmp_path: Path, words, code, errors, left) -> None:
-    done = run_command("sh", "-c", f"{MRT} {words}")
-    assert (done.returncode, done.stderr[: len(errors)]) == (code, errors)
-    assert done.stderr.count("\n") == bool(errors)
+    done = run_command("sh", "-c", f"{MRT} {words}", code=code)
+    assert done.stderr.startswith(errors) and done.stderr.count("\n") == bool(errors)
     assert [path.name for path in tmp_path.iterdir()] == left
     if left:
         assert read_exr(tmp_path / "out.exr").image.shape == (6, 8, 3)
@@ -76,37 +60,32 @@ def test_kernels_that_cannot_be_read_back_or_kept_are_made_anew(mrt_command, tmp
     """Where there is no place for them, Dr.Jit says so in one line."""
     home = tmp_path / "home"
     home.mkdir()
-    assert mrt_command("good", "0", *TINY, HOME=str(home)).returncode == 0
+    mrt_command("good", "0", *TINY, HOME=str(home))
     kernels = sorted((home / ".drjit").iterdir())
     for k, kernel in enumerate(kernels):
         kernel.write_bytes(b"rubbish" * 999 if k % 2 else kernel.read_bytes()[:10])
-    done = mrt_command("after", "0", *TINY, HOME=str(home))
-    assert kernels and (done.returncode, done.stderr) == (0, "")
+    assert kernels and not mrt_command("after", "0", *TINY, HOME=str(home)).stderr
     (tmp_path / "file").write_text("")
-    done = mrt_command("without", "0", *TINY, HOME=str(tmp_path / "file"))
-    assert done.returncode == 0 and done.stderr.count("\n") <= 1
+    assert mrt_command("without", "0", *TINY, HOME=str(tmp_path / "file")).stderr.count("\n") <= 1
     good, *others = (read_exr(tmp_path / f"{name}.exr").image for name in ("good", "after", "without"))
     np.testing.assert_array_equal(others, [good, good])
 
 
 def test_exported_scene_renders(mrt_command, tmp_path: Path) -> None:
     done = mrt_command("export", "0", "--xml", "zero.xml", "--stock", "width=20", "height=10")
-    assert (done.returncode, done.stdout, done.stderr) == (0, "Wrote zero.xml\n", "")
+    assert (done.stdout, done.stderr) == ("Wrote zero.xml\n", "")
     text = (tmp_path / "zero.xml").read_text()
     assert "roughplastic" in text and "mrt_" not in text
-    done = mrt_command("out", "scene=zero.xml", "aa=1", "aamode=none", "format=exr")
-    assert done.returncode == 0, done.stderr
+    mrt_command("out", "scene=zero.xml", "aa=1", "aamode=none", "format=exr")
     image = read_exr(tmp_path / "out.exr").image
     assert image.shape == (10, 20, 3)
     np.testing.assert_allclose(image[0, 0], (0.1, 0.3, 0.5), atol=1e-6)  # the sky of scene 0, in float32
 
 
 def test_doctor(mrt_command) -> None:
-    done = mrt_command("doctor")
-    assert done.returncode == 0, done.stdout
-    assert "self-test: scene 0 at 16x12 in llvm_ad_rgb: passed" in done.stdout
-    assert "LLVM" in done.stdout and "variants: scalar_rgb" in done.stdout
-    assert "not installed" not in done.stdout
+    said = mrt_command("doctor").stdout
+    assert "self-test: scene 0 at 16x12 in llvm_ad_rgb: passed" in said
+    assert "LLVM" in said and "variants: scalar_rgb" in said and "not installed" not in said
 
 
 def test_levels_log_more_and_more(mrt_command) -> None:

@@ -56,18 +56,15 @@ def dist(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def wheel_of(folder: Path) -> Path:
+def content(folder: Path) -> dict[str, bytes]:
+    """The files in the wheel of a folder."""
     (wheel,) = folder.glob("*.whl")
-    return wheel
-
-
-def content(wheel: Path) -> dict[str, bytes]:
     with zipfile.ZipFile(wheel) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
 def test_wheel_holds_every_file_of_the_packages(dist: Path, source: Path) -> None:
-    names = set(content(wheel_of(dist)))
+    names = set(content(dist))
     wanted = set()
     for folder, place in FOLDERS.items():
         files = [path for path in (source / folder).rglob("*") if path.is_file()]
@@ -80,7 +77,7 @@ def test_wheel_holds_every_file_of_the_packages(dist: Path, source: Path) -> Non
 
 def test_wheel_built_without_the_sdist_is_the_same(dist: Path, source: Path, tmp_path: Path) -> None:
     run(sys.executable, "-m", "build", "--wheel", "--outdir", tmp_path, source, cwd=tmp_path)
-    assert content(wheel_of(tmp_path)) == content(wheel_of(dist))
+    assert content(tmp_path) == content(dist)
 
 
 def test_sdist_brings_what_the_tests_need(dist: Path) -> None:
@@ -100,7 +97,7 @@ def installed(dist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     environment = tmp_path_factory.mktemp("clean") / "venv"
     run(sys.executable, "-m", "venv", environment, cwd=dist)
     programs = environment / "bin"
-    run(programs / "python", "-m", "pip", "install", "--quiet", wheel_of(dist), cwd=dist)
+    run(programs / "python", "-m", "pip", "install", "--quiet", *dist.glob("*.whl"), cwd=dist)
     return programs
 
 

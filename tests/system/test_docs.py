@@ -44,23 +44,19 @@ README_COMMANDS = re.findall(r"^mrt ([^#\n]*)", "".join(blocks(README, "sh")), f
 
 @pytest.mark.parametrize("words", README_COMMANDS)
 def test_commands_of_the_readme_run(words: str, mrt_command, tmp_path: Path) -> None:
-    done = mrt_command(*shlex.split(words))
-    assert done.returncode == 0, done.stderr
+    mrt_command(*shlex.split(words))
     if words.startswith("picture"):
         assert {path.name for path in tmp_path.iterdir()} == {"picture.png", "picture.exr"}
 
 
-@pytest.mark.parametrize("example", blocks(README, "python"), ids=lambda example: example.splitlines()[0])
-def test_examples_of_the_readme_run(example: str, run_python) -> None:
-    done = run_python(example)
-    assert done.returncode == 0, done.stderr
+EXAMPLES = [(example.splitlines()[0], example) for example in blocks(README, "python")]
+EXAMPLES += [(path.stem, code(path)) for path in PAGES if code(path)]
 
 
-@pytest.mark.parametrize("path", [p for p in PAGES if code(p)], ids=lambda path: path.stem)
-def test_pages_run(path: Path, run_python, examples: Path) -> None:
-    done = run_python(code(path), PYTHONPATH=str(examples))
-    assert done.returncode == 0, done.stderr
-    if path.stem == "tutorial":  # whose scene is the file's, but for the rounding of its camera's matrix
+@pytest.mark.parametrize(("name", "text"), EXAMPLES, ids=[name for name, _ in EXAMPLES])
+def test_pages_run(name: str, text: str, run_python, examples: Path) -> None:
+    run_python(text, PYTHONPATH=str(examples))
+    if name == "tutorial":  # whose scene is the file's, but for the rounding of its camera's matrix
         written = read_exr(examples.parent / "mine.exr").image
         same = render(examples / "mine.xml", aa=3, aamode="sobel", focaldist=4.5, focalrange=0.5).image
         assert written.shape == (300, 400, 3) and abs(written - same).mean() < 1e-6
@@ -69,7 +65,6 @@ def test_pages_run(path: Path, run_python, examples: Path) -> None:
 def test_the_worked_example_passes_its_tests(run_command, examples: Path) -> None:
     words = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", examples)
     done = run_command(sys.executable, *words, examples / "test_matte.py", PYTEST_ADDOPTS=None)
-    assert done.returncode == 0, done.stdout
     assert " passed" in done.stdout and "skipped" not in done.stdout
 
 

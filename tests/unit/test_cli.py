@@ -162,16 +162,6 @@ def test_signal_leaves_the_old_file_and_does_not_wait_for_the_kernel(
     assert (tmp_path / "out.png").read_bytes() == b"old"
 
 
-def test_wrong_usage_starts_nothing_heavy(run_python) -> None:
-    code = """
-import sys
-from mrt_mitsuba.command import main as cli
-code = cli.main(["out", "width=0"])
-print(code, [name for name in ("drjit", "mitsuba", "numpy", "OpenEXR", "PIL", "tqdm") if name in sys.modules])
-"""
-    assert run_python(code).stdout == "2 []\n"
-
-
 def test_bar_on_a_terminal_shows_the_time_left(monkeypatch) -> None:
     messages, bars = io.StringIO(), io.StringIO()
     for stream in (messages, bars):

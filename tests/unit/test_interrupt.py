@@ -58,18 +58,14 @@ def test_error_that_a_library_makes_of_it_is_undone(number: signal.Signals, kind
 
 def test_a_held_interrupt_comes_at_the_end_of_the_block() -> None:
     """Raised while Mitsuba is imported, it ended the process in nanobind's code."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     done = []
-    try:
-        with pytest.raises(KeyboardInterrupt), interrupts.held():
-            signal.raise_signal(signal.SIGINT)
-            done.append("all of the block")
-        assert done and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        with interrupts.held():
-            signal.raise_signal(signal.SIGINT)  # ignored before, and still
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with pytest.raises(KeyboardInterrupt), interrupts.held():
+        signal.raise_signal(signal.SIGINT)
+        done.append("all of the block")
+    assert done and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with interrupts.held():
+        signal.raise_signal(signal.SIGINT)  # ignored before, and still
 
 
 def test_a_held_interrupt_is_heeded_at_safe_places_and_a_second_one_anywhere(monkeypatch) -> None:

@@ -135,23 +135,17 @@ try:
 except mrt_mitsuba.VariantError as error:
     print(error)
 """
-    done = run_python(HIDE + code)
-    assert done.returncode == 0, done.stderr
-    first, loaded, refused = done.stdout.splitlines()
-    assert first.startswith(
-        "scalar_rgb scalar_rgb 1 rendering in the slow variant scalar_rgb: no usable LLVM 17"
-    )
-    assert "pip install karellen-llvm-core" in first and "pip install karellen-llvm-core" in refused
-    assert loaded == "False"
+    first, loaded, refused = run_python(HIDE + code).stdout.splitlines()
+    assert first.startswith("scalar_rgb scalar_rgb 1 rendering in the slow variant scalar_rgb: ")
+    assert "no usable LLVM 17" in first and loaded == "False"
+    assert all("pip install karellen-llvm-core" in text for text in (first, refused))
 
 
 def test_old_library_named_by_the_user_is_refused_with_a_warning(run_python, tmp_path: Path) -> None:
     old = library(tmp_path, "libLLVM-15.so.1")
-    done = run_python(
-        "import mrt_mitsuba, os; print(os.environ['DRJIT_LIBLLVM_PATH'])", DRJIT_LIBLLVM_PATH=old
-    )
-    assert done.returncode == 0 and old not in done.stdout
-    assert f"{llvm.VARIABLE}={old} is LLVM 15" in done.stderr
+    code = "import mrt_mitsuba, os; print(os.environ['DRJIT_LIBLLVM_PATH'])"
+    done = run_python(code, DRJIT_LIBLLVM_PATH=old)
+    assert old not in done.stdout and f"{llvm.VARIABLE}={old} is LLVM 15" in done.stderr
 
 
 def test_importing_drjit_too_early_warns(run_python) -> None:
@@ -164,6 +158,5 @@ except mrt_mitsuba.VariantError as error:
     print(error)
 """
     done = run_python(code, DRJIT_LIBLLVM_PATH=llvm.BLOCKED)
-    assert done.returncode == 0, done.stderr
-    assert "Import mrt_mitsuba before mitsuba and drjit" in done.stdout
-    assert "Import mrt_mitsuba before mitsuba and drjit" in done.stderr
+    for text in (done.stdout, done.stderr):
+        assert "Import mrt_mitsuba before mitsuba and drjit" in text

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import mrt_mitsuba as mrt
 from mrt_mitsuba.command import options, tools
 from mrt_mitsuba.command.options import Options, parse
 from mrt_mitsuba.errors import UsageError
@@ -151,8 +150,3 @@ def test_usage_names_every_option_with_its_default() -> None:
     assert [entry.partition("=")[0] for entry in entries] == list(options.TABLE)
     assert all(re.search(r"\(default:\s+[^)]+\)$", entry) for entry in entries)
     assert "(default: 800)" in text and "(default: from the scene)" in text
-
-
-def test_unknown_options_are_refused_with_the_nearest():
-    with pytest.raises(TypeError, match=r"'widht' is not an option of render: did you mean width\?"):
-        mrt.render(3, widht=8)

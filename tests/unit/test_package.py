@@ -43,22 +43,22 @@ import importlib, mrt_mitsuba
 for name in ("plugins", "validation", "scenes_xml"):
     print(importlib.import_module(f"mrt_mitsuba.{name}").__file__)
 """
-    done = run_python(code, str(ROOT))
     files = [str(ROOT / name / "__init__.py") for name in ("plugins", "validation", "scenes_xml")]
-    assert done.stdout.splitlines() == files, done.stderr
+    assert run_python(code, str(ROOT)).stdout.splitlines() == files
 
 
-def test_import_loads_nothing_heavy(run_python) -> None:
-    """Importing the package starts neither Mitsuba nor anything that takes as long."""
-    heavy = "drjit mitsuba numpy OpenEXR PIL tqdm matplotlib scipy importlib.metadata dataclasses"
-    code = f"""
-import re
-import sys
-before = set(sys.modules)
-import mrt_mitsuba
-print([name for name in {heavy.split()} if name in set(sys.modules) - before])
-"""
-    assert run_python(code).stdout == "[]\n"
+HEAVY = "drjit mitsuba numpy OpenEXR PIL tqdm matplotlib scipy"
+WRONG = "from mrt_mitsuba.command import main as cli; assert cli.main(['out', 'width=0']) == 2"
+
+
+@pytest.mark.parametrize(
+    ("code", "more"), [("import mrt_mitsuba", " importlib.metadata dataclasses"), (WRONG, "")]
+)
+def test_import_and_wrong_usage_load_nothing_heavy(run_python, code: str, more: str) -> None:
+    """They start neither Mitsuba nor anything that takes as long."""
+    found = f"print([name for name in {(HEAVY + more).split()} if name in set(sys.modules) - before])"
+    start = "import re, sys; before = set(sys.modules)"
+    assert run_python("\n".join((start, code, found))).stdout == "[]\n"
 
 
 def test_no_function_has_the_name_of_a_module() -> None:
