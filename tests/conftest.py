@@ -115,7 +115,8 @@ def variant(request: pytest.FixtureRequest) -> Iterator[str]:
     """A Mitsuba variant with the plugins: ``llvm_ad_rgb``, or what a test asks for by an indirect parameter;
     of ``MRT_DEVICE`` in place of LLVM.
 
-    Skips where it cannot run here. Afterwards the variant before is back, or this one if there was none.
+    Skips where it cannot run here. Afterwards the variant before is back; the fast one if there was none, so
+    that tests without this fixture meet it, whichever test came first.
     """
     import mitsuba as mi
 
@@ -123,6 +124,6 @@ def variant(request: pytest.FixtureRequest) -> Iterator[str]:
     problem = runtime.obstacle(name)
     if problem:
         pytest.skip(problem)
-    before = mi.variant()
+    before = mi.variant() or runtime.FAST.replace("llvm", DEVICE)
     yield runtime.use(name)
-    runtime.use(before or name)
+    runtime.use(name if runtime.obstacle(before) else before)

@@ -284,17 +284,13 @@ print(found[:4] == found[4:], len(set(found)))
 
 
 @pytest.mark.parametrize("attempt", range(ROUNDS))
-def test_log_of_every_kernel_does_not_stop_the_command(tmp_path: Path, attempt: int) -> None:
+def test_log_of_every_kernel_does_not_stop_the_command(start, tmp_path: Path, attempt: int) -> None:
     """Side by side, without a cache of kernels: one in thirty waited for itself for ever."""
     command = [MRT, "out", "3", "width=32", "height=24", "aa=2", "log=debug", "format=png"]
-    environ = os.environ | {"HOME": str(tmp_path)}
-    options: dict[str, Any] = {"cwd": tmp_path, "env": environ, "stdout": subprocess.DEVNULL}
-    both = [subprocess.Popen(command, stderr=subprocess.DEVNULL, **options) for _ in range(2)]
-    try:
-        assert [process.wait(timeout=120) for process in both] == [0, 0]
-    finally:
-        for process in both:
-            process.kill()
+    nowhere = {name: subprocess.DEVNULL for name in ("stdout", "stderr")}
+    nowhere["env"] = os.environ | {"HOME": str(tmp_path)}
+    with start(*command, **nowhere) as one, start(*command, **nowhere) as other:
+        assert (one.wait(timeout=120), other.wait(timeout=120)) == (0, 0)
 
 
 # The command as its script starts it, with a line once Python has left its own start behind

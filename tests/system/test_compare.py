@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+from PIL import Image
 from scipy import stats
 
 import mrt_mitsuba as mrt
@@ -153,8 +154,6 @@ def test_difference_is_written(files, tmp_path: Path, capsys) -> None:
     written = read_exr(tmp_path / "d.exr")
     np.testing.assert_array_equal(written.image, spotted() - GREY)
     assert float(written.header["rmse"]) == pytest.approx(0.1 / GREY.size**0.5, rel=1e-6)
-    from PIL import Image
-
     shown = np.asarray(Image.open(tmp_path / "d.png")).astype(int).sum(axis=-1)
     assert np.unravel_index(shown.argmax(), shown.shape) == (3, 5) and (shown < 20).sum() == shown.size - 1
     assert main(["diff", files["a"], files["b"], f"out={tmp_path}/no/such/place"]) == 2

@@ -1,8 +1,4 @@
-"""Wheel and sdist as ``make package`` builds and tries them: what they hold, and that a clean install works.
-
-Left out of a plain ``make test``: it takes a minute or two, most of it for fetching Mitsuba into a place
-of its own.
-"""
+"""Wheel and sdist as ``make package`` builds and tries them: what they hold, and a clean install."""
 
 from __future__ import annotations
 

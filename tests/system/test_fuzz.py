@@ -1,7 +1,4 @@
-"""Random scene files, pictures and plugin parameters: each is read, or refused with one clear error.
-
-``make fuzz`` runs ten thousand inputs each, with the parsers' own tests of this kind.
-"""
+"""Random scene files, pictures and plugin parameters: each is read, or refused with one clear error."""
 
 from __future__ import annotations
 

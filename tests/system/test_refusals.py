@@ -1,5 +1,4 @@
-"""What is refused, by the command, from Python, in files and by plugins: an error of one line that names the
-thing and the way out, and no file left behind."""
+"""What is refused, by every door: an error of one line that names the thing and the way out, and no file."""
 
 from __future__ import annotations
 
@@ -34,8 +33,6 @@ PICTURE = "newmtl m\nKd 1 1 1\nmap_Kd p.png\n"
 WHITE = base64.b64decode(  # one pixel
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4//8/AAX+Av4N70a4AAAAAElFTkSuQmCC"
 )
-
-
 SPECTRUM = """<shape type='sphere'><bsdf type='diffuse'><spectrum name='reflectance' filename='s.spd'/></bsdf>
 </shape>"""
 

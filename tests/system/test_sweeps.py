@@ -113,13 +113,9 @@ def mortal(tmp_path: Path) -> Iterator[Callable[..., Cluster]]:
         cluster.stop()
 
 
-def pictures(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.glob("*.exr"))
-
-
 def made(folder: Path) -> dict[str, int]:
     """Pictures, and when each was written."""
-    found = (path for path in folder.iterdir() if path.suffix in (".exr", ".png"))
+    found = (path for path in folder.glob("*.*") if path.suffix in (".exr", ".png"))
     return {path.name: path.stat().st_mtime_ns for path in found}
 
 
@@ -130,9 +126,6 @@ def left_over(folder: Path) -> list[str]:
 def written(folder: Path) -> list[dict[str, str]]:
     with open(folder / "table.csv", newline="") as file:
         return list(csv.DictReader(file))
-
-
-# --------------------------------------------- What comes out ---------------------------------------------
 
 
 def test_pictures_are_those_of_render_alone(address: str, tmp_path: Path) -> None:
@@ -158,8 +151,6 @@ def test_pictures_are_those_of_render_alone(address: str, tmp_path: Path) -> Non
 
 
 PLACES = [[[0.5, 0, 0, x], [0, 0.5, 0, 1], [0, 0, 0.5, 1], [0, 0, 0, 1]] for x in (1.0, 2.0)]
-
-
 ZIPPED = {"sphere_0.to_world": PLACES, "focaldist": [1.0, 2.0]}
 CROSSED = {"params": [{"resx": 40}, {"resx": 50}], "material_0.alpha": [0.1]}
 
@@ -282,9 +273,6 @@ def test_a_scene_file_counts_by_its_contents(address: str, mortal, tmp_path: Pat
     assert "mine.xml has changed since the sweep began" in row["error"]
 
 
-# ------------------------------------------- What is refused -------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("grid", "options", "message"),
     [
@@ -334,8 +322,6 @@ def test_a_broken_grid_is_refused_before_anything_is_rendered(
     assert not list(tmp_path.rglob("*.*"))
 
 
-# -------------------------------------------- What is survived --------------------------------------------
-
 # What each worker runs first: seed 1 fails, 2 costs the first worker that takes it, 3 every worker, and 4
 # takes more memory than there is; workers die with what they would report of 1 and 5
 SPOILED = """
@@ -371,7 +357,7 @@ def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path: Pa
     assert errors[3] == errors[4] and "every worker that rendered it died, perhaps for want of" in errors[3]
     attempts = [row["attempts"] for row in table.rows]
     assert attempts[1] == 2 <= attempts[2] and attempts[5] == 1
-    assert len(pictures(out)) == 17 and not left_over(out) and str(table).startswith("17 of 20 pictures")
+    assert len(made(out)) == 17 and not left_over(out) and str(table).startswith("17 of 20 pictures")
     assert all(row["file"] == "" for row in table.failed)
 
 
@@ -386,7 +372,7 @@ def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path: Pa
 def test_workers_with_other_software_are_refused(mortal, tmp_path: Path, preload: str, message: str) -> None:
     with pytest.raises(MrtError, match=f"(?s){message}.*install") as caught:
         mrt.sweep(3, tmp_path / "out", cluster=mortal(preload).address, **SMALL)
-    assert "\n" not in str(caught.value) and not pictures(tmp_path / "out")
+    assert "\n" not in str(caught.value) and not made(tmp_path / "out")
 
 
 # What each worker runs first: seed 1 costs the first worker that takes it, and from 2 on jobs wait
@@ -435,7 +421,7 @@ def test_a_scheduler_killed_ends_the_sweep_and_a_second_run_finishes_it(
     options: dict[str, Any] = {"grid": {"seed": range(6)}, **SMALL}
     with ThreadPool(1) as pool:
         sweep = pool.apply_async(mrt.sweep, (3, out), {"cluster": cluster.address, **options})
-        wait_for(lambda: len(pictures(out)) == 2, "two pictures")
+        wait_for(lambda: len(made(out)) == 2, "two pictures")
         cluster.scheduler.kill()
         cluster.scheduler.wait()
         if back:
@@ -455,7 +441,7 @@ def test_a_scheduler_killed_ends_the_sweep_and_a_second_run_finishes_it(
 SWEEP = "scene = 3\nwidth = 64\nheight = 48\naa = 1\n[grid]\nseed = [0, 1, 2, 3, 4, 5]\n"
 
 
-def test_the_command_interrupted_from_the_keyboard_and_again(start, waiting, tmp_path: Path, capfd) -> None:
+def test_the_command_interrupted_from_the_keyboard_and_again(start, waiting, tmp_path: Path, capsys) -> None:
     """The whole group of processes gets the signal, as from a terminal."""
     (tmp_path / "sweep.toml").write_text(SWEEP)
     (tmp_path / "died").touch()
@@ -466,13 +452,13 @@ def test_the_command_interrupted_from_the_keyboard_and_again(start, waiting, tmp
         os.killpg(process.pid, signal.SIGINT)
         _, errors = process.communicate(timeout=PATIENCE)  # also the workers have ended
     assert process.returncode == 130 and errors == "mrt: interrupted\n"
-    done = pictures(out)
-    assert 0 < len(done) < 6 and {row["file"] for row in written(out)} <= set(done) and not left_over(out)
+    done = made(out)
+    assert 0 < len(done) < 6 and {row["file"] for row in written(out)} <= done.keys() and not left_over(out)
     for name in done:
         assert read_exr(out / name).image.shape == (48, 64, 3)
     (tmp_path / "go").touch()
     assert cli.main([*words, "workers=1"]) == 0
-    assert capfd.readouterr().out.endswith("6 of 6 pictures in out\n")
+    assert capsys.readouterr().out.endswith(f"6 of 6 pictures in {out}\n")
     assert [row["attempts"] for row in written(out)] == ["1"] * 6
 
 
@@ -484,9 +470,6 @@ def test_a_gpu_is_pinned_to_each_worker(tmp_path: Path, monkeypatch: pytest.Monk
     with connected(None, 9, None, None, "cuda_ad_rgb") as client:
         found = client.run(os.getenv, "CUDA_VISIBLE_DEVICES")
     assert sorted(found.values()) == ["5", "GPU-7"]
-
-
-# ------------------------------------------------- Tiles -------------------------------------------------
 
 
 @pytest.mark.parametrize(

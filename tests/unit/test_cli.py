@@ -19,6 +19,7 @@ import pytest
 
 from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.command import options, registry
+from mrt_mitsuba.command.render import banner
 from mrt_mitsuba.errors import MrtWarning, SceneError
 from mrt_mitsuba.rendering import api
 from mrt_mitsuba.rendering.progress import TerminalProgress
@@ -55,8 +56,6 @@ def test_render_writes_and_says_what_the_report_says(tmp_path: Path, capsys) -> 
     ],
 )
 def test_banner_names_what_is_in_force(words: str, line: str) -> None:
-    from mrt_mitsuba.command.render import banner
-
     assert line in banner(options.parse(["out", *words.split()])).splitlines()
 
 
