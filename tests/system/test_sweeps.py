@@ -459,7 +459,7 @@ def test_the_command_interrupted_from_the_keyboard_and_again(start, waiting, tmp
     (tmp_path / "go").touch()
     assert cli.main([*words, "workers=1"]) == 0
     assert capsys.readouterr().out.endswith(f"6 of 6 pictures in {out}\n")
-    assert [row["attempts"] for row in written(out)] == ["1"] * 6
+    assert [row["error"] for row in written(out)] == [""] * 6
 
 
 def test_a_gpu_is_pinned_to_each_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
