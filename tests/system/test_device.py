@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from argparse import Namespace
 from pathlib import Path
@@ -70,22 +68,15 @@ def test_filters_and_updates_on_a_device(variant: str) -> None:
     assert np.isfinite(after).all() and not np.array_equal(after, before[0])
 
 
-def test_make_test_gpu_runs_its_selection_where_it_is_told_to(tmp_path: Path) -> None:
+def test_make_test_gpu_runs_its_selection_where_it_is_told_to(run_command) -> None:
     """And ends with an error where the device is not there."""
-
-    def run(device: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "device", "--co"]
-        tests = [str(Path(__file__)), str(Path(__file__).parents[1] / "unit" / "test_parameters.py")]
-        environment = os.environ | {"MRT_DEVICE": device}
-        return subprocess.run(
-            [*command, *tests], env=environment, capture_output=True, text=True, timeout=120, check=False
-        )
-
-    found = run("llvm")
+    tests = (Path(__file__), Path(__file__).parents[1] / "unit" / "test_parameters.py")
+    words = (sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "device", "--co", *tests)
+    found = run_command(*words, MRT_DEVICE="llvm")
     assert found.returncode == 0 and "test_light_buffers_follow_the_light" in found.stdout
     assert "test_make_test_gpu" not in found.stdout  # no picture, no device
     if "cuda_ad_rgb" not in mi.variants() or runtime.obstacle("cuda_ad_rgb"):
-        missing = run("cuda")
+        missing = run_command(*words, MRT_DEVICE="cuda")
         assert missing.returncode == 1 and "needs an NVIDIA GPU" in missing.stdout + missing.stderr
 
 

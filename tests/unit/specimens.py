@@ -78,60 +78,36 @@ def _switched(*variants):
 # Sound BSDFs whose answers are changed: the BSDF, what is changed and how, and the figures that this exceeds
 CHANGES = {
     # then it is no reciprocal value, and what sample() and eval() disagree on shows in the energy as well
-    "missing cosine": (
-        DIFFUSE,
-        *("eval", lambda value, ctx, wi, wo: value / abs(wo.z)),
-        {"weights.weight", "energy.apart", "reciprocity.swapped"},
-    ),
-    "weights missing": (
-        DIFFUSE,
-        *_sample(lambda bs, weight, u, ctx: dr.select(bs.wo.x > 0, 0, weight)),
-        {"weights.weight", "energy.apart"},
-    ),
-    "NaN at grazing": (
-        DIFFUSE,
-        *_value(lambda value, wi, wo: dr.select(wo.z < 1e-3, dr.nan, value)),
-        {"finite.values"},
-    ),
-    "no eta^2 in single directions": (
-        GLASS,
-        *_sample(_unscaled),
-        {"reciprocity.single", "reciprocity.single_modes"},
-    ),
-    "eta inverted": (
-        GLASS,
-        *_member("eta", lambda eta: 1 / eta),
-        {"reciprocity.single", "reciprocity.single_modes"},
-    ),
+    "missing cosine": (DIFFUSE, "eval", lambda value, ctx, wi, wo: value / abs(wo.z),
+                       {"weights.weight", "energy.apart", "reciprocity.swapped"}),
+    "weights missing": (DIFFUSE, *_sample(lambda bs, weight, u, ctx: dr.select(bs.wo.x > 0, 0, weight)),
+                        {"weights.weight", "energy.apart"}),
+    "NaN at grazing": (DIFFUSE, *_value(lambda value, wi, wo: dr.select(wo.z < 1e-3, dr.nan, value)),
+                       {"finite.values"}),
+    "no eta^2 in single directions": (GLASS, *_sample(_unscaled),
+                                      {"reciprocity.single", "reciprocity.single_modes"}),
+    "eta inverted": (GLASS, *_member("eta", lambda eta: 1 / eta),
+                     {"reciprocity.single", "reciprocity.single_modes"}),
     "eta of 0": (GLOSS, *_member("eta", lambda eta: 0 * eta), {"reciprocity.medium"}),
     "directions not of length 1": (MIRROR, *_member("wo", lambda wo: 1.01 * wo), {"finite.samples"}),
     "mirror turned": (MIRROR, *_member("wo", _turned), {"reciprocity.returns"}),
-    "mirror called glossy": (
-        MIRROR,
-        *_member("sampled_type", lambda kind: kind - DELTA + GLOSSY),
-        {"weights.density", "weights.weight", "energy.apart", "components.samples"},
-    ),
+    "mirror to the other side": (MIRROR, *_member("wo", lambda wo: wo * mi.Vector3f(1, 1, -1)),
+                                 {"reciprocity.single", "components.samples"}),
+    "mirror called glossy": (MIRROR, *_member("sampled_type", lambda kind: kind - DELTA + GLOSSY),
+                             {"weights.density", "weights.weight", "energy.apart", "components.samples"}),
     "next component": (DIFFUSE, *_member("sampled_component", lambda i: i + 1), {"components.samples"}),
     "albedo 1.02 near the horizon": (DIFFUSE, *_value(_brighter), {"energy.largest"}),
     "stairs": (GLOSS, *_value(_stairs), {"roundoff.lost"}),
     "cancelling half vector": (GLOSS, *_value(_cancelling), {"roundoff.lost"}),
     "NaN at the least roughness": (
-        GLOSS,
-        *_value(lambda value, wi, wo: dr.select(value > 1e5, dr.nan, value)),
-        {"finite.values"},
-    ),
+        GLOSS, *_value(lambda value, wi, wo: dr.select(value > 1e5, dr.nan, value)), {"finite.values"}),
     "detached gradient": (GLOSS, *_value(lambda value, wi, wo: dr.detach(value)), {"gradients.values"}),
     # of directions that move with the roughness
     "derivative of the density in weights": (
         GLOSS,
         *_sample(lambda bs, weight, u, ctx: weight * dr.select(bs.pdf > 0, bs.pdf / dr.detach(bs.pdf), 1)),
-        {"gradients.mean"},
-    ),
-    "derivatives that are NaN": (
-        GLOSS,
-        *_value(_steep),
-        {"gradients.values", "gradients.broken"},
-    ),
+        {"gradients.mean"}),
+    "derivatives that are NaN": (GLOSS, *_value(_steep), {"gradients.values", "gradients.broken"}),
     "black back": (DIFFUSE, "flags", +mi.BSDFFlags.BackSide, {"components.dark"}),
     "a flag of no component": (DIFFUSE, "whole", +mi.BSDFFlags.Null, {"components.flags"}),
     "a component more with each update": (DIFFUSE, "update", None, {"components.updated"}),
@@ -139,11 +115,8 @@ CHANGES = {
     "density through the surface": (DIFFUSE, "pdf", _across, {"sampling.cells", "sampling.integral"}),
     "light through the surface": (DIFFUSE, "eval", _across, {"components.values"}),
     "another value after each switch": (
-        DIFFUSE,
-        *_value(lambda value, wi, wo: value * (1 + 1e-3 * (SWITCHES[0] % 4))),
-        {"switch.same"},
-    ),
-}
+        DIFFUSE, *_value(lambda value, wi, wo: value * (1 + 1e-3 * (SWITCHES[0] % 4))), {"switch.same"}),
+}  # fmt: skip
 
 
 def exceeded(check):

@@ -99,15 +99,11 @@ STOCK = {
     "roughconductor": ({"distribution": "ggx"}, set()),
     "roughplastic": ({}, {"sampling", "finite", "gradients"}),
     "twosided": ({"nested": {"type": "diffuse"}}, {"components"}),
-    "mask": (
-        {"opacity": {"type": "checkerboard"}, "nested": {"type": "roughconductor", "alpha": 0.3}},
-        {"components"},
-    ),
-    "blendbsdf": (
-        {"weight": 0.3, "a": {"type": "diffuse"}, "b": {"type": "dielectric"}},
-        {"weights", "gradients", "components"},
-    ),
-}
+    "mask": ({"opacity": {"type": "checkerboard"}, "nested": {"type": "roughconductor", "alpha": 0.3}},
+             {"components"}),
+    "blendbsdf": ({"weight": 0.3, "a": {"type": "diffuse"}, "b": {"type": "dielectric"}},
+                  {"weights", "gradients", "components"}),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", STOCK)

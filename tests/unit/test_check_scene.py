@@ -99,19 +99,6 @@ def test_a_light_that_is_no_number_and_instances() -> None:
     assert mrt.check_shape(instance, quick=True).failed == ["scale"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["3", "fast=1"], "unknown option 'fast'"),
-        (["99"], "99"),
-        (["scene=none.xml"], "no such file"),
-    ],
-)
-def test_wrong_usage(arguments: list[str], message: str, capsys) -> None:
-    assert cli.main(["check", *arguments]) == 2
-    assert message in capsys.readouterr().err
-
-
 SUN = np.random.default_rng(0).random((32, 64, 3), np.float32)
 SUN[10, 20] = 1e4
 STOCK: dict[str, dict[str, Any]] = {

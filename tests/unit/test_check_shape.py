@@ -92,41 +92,24 @@ MISTAKES: dict[str, tuple[dict[str, Any], set[str]]] = {
     "none": ({}, set()),
     "flipped normal": ({"hit": flipped}, {"normals.outwards"}),
     "normal towards the ray": ({"hit": facing}, {"normals.turned"}),
-    "shading normal on the other side": (
-        {"hit": moved(shading=lambda si, ray: -si.n)},
-        {"normals.side", "normals.shading"},
-    ),
+    "shading normal on the other side": ({"hit": moved(shading=lambda si, ray: -si.n)},
+                                         {"normals.side", "normals.shading"}),
     # ray_test knows nothing of these two
-    "met from outside only": (
-        lost(lambda si, ray: dr.dot(si.n, ray.d) > 0),
-        {"hits.ray_test", "watertight.blind"},
-    ),
-    "a fixed least distance": (
-        lost(lambda si, ray: si.t < 0.02),
-        {"hits.ray_test", "surface.missed", "watertight.blind"},
-    ),
-    "ray_test blind from near by": (
-        {"test": lambda found, ray: found & (dr.max(abs(ray.o)) > 1.5)},
-        {"hits.ray_test"},
-    ),
-    "NaN for a distance along an axis": (
-        lost(lambda si, ray: (ray.d.x == 0) & (ray.d.y == 0), dr.nan),
-        {"finite.bad"},
-    ),
-    "maxt ignored": (
-        {"hit": deaf_to_its_limit, "test": lambda found, ray: found | (ray.maxt < 0)},
-        {"hits.ray_intersect"},
-    ),
-    "hit point below the surface": (
-        {"hit": moved(p=lambda si, ray: si.p - 2e-3 * si.n)},
-        {"surface.on_ray", "surface.near_by", "surface.again", "surface.missed"},
-    ),
+    "met from outside only": (lost(lambda si, ray: dr.dot(si.n, ray.d) > 0),
+                              {"hits.ray_test", "watertight.blind"}),
+    "a fixed least distance": (lost(lambda si, ray: si.t < 0.02),
+                               {"hits.ray_test", "surface.missed", "watertight.blind"}),
+    "ray_test blind from near by": ({"test": lambda found, ray: found & (dr.max(abs(ray.o)) > 1.5)},
+                                    {"hits.ray_test"}),
+    "NaN for a distance along an axis": (lost(lambda si, ray: (ray.d.x == 0) & (ray.d.y == 0), dr.nan),
+                                         {"finite.bad"}),
+    "maxt ignored": ({"hit": deaf_to_its_limit, "test": lambda found, ray: found | (ray.maxt < 0)},
+                     {"hits.ray_intersect"}),
+    "hit point below the surface": ({"hit": moved(p=lambda si, ray: si.p - 2e-3 * si.n)},
+                                    {"surface.on_ray", "surface.near_by", "surface.again", "surface.missed"}),
     # differences of hit points suffer as well
-    "digits lost": (
-        {"hit": rounded},
-        {"surface.behind", "surface.noise", "normals.slope", "normals.step"},
-    ),
-}
+    "digits lost": ({"hit": rounded}, {"surface.behind", "surface.noise", "normals.slope", "normals.step"}),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
