@@ -17,7 +17,6 @@ from typing import Any
 import mitsuba as mi
 import pytest
 from nodes import TRIANGLE, scene_xml
-from PIL import Image
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import SceneError
@@ -129,22 +128,6 @@ def test_time_to_read_a_model_grows_with_its_size(run_python) -> None:
     assert all(len(line) < 200 for line in lines)
 
 
-PIPE = "<string name='filename' value='pipe'/>"
-TEXTURED = "<bsdf type='{}'><texture name='{}' type='{}'>{}</texture></bsdf>"
-REFLECTANCES = (("mrt_bsdf", "diffuse_reflectance"), ("diffuse", "reflectance"))
-
-
-@pytest.mark.parametrize("bsdf", REFLECTANCES)
-@pytest.mark.parametrize("kind", ["mrt_texture", "bitmap"])
-def test_textures_count(variant: str, tmp_path: Path, bsdf: tuple[str, str], kind: str) -> None:
-    """6 kB of compressed black are 0.7 GB of texels at work."""
-    Image.new("1", (4000, 4000)).save(tmp_path / "black.png")
-    texture = TEXTURED.format(*bsdf, kind, PIPE.replace("pipe", "black.png"))
-    (tmp_path / "a.xml").write_text(scene_xml(f"<shape type='sphere'>{texture}</shape>"))
-    with pytest.raises(mrt.UsageError, match=r"black\.png of 4000x4000 texels, .* 64 MiB may .* memory="):
-        mrt.render(str(tmp_path / "a.xml"), aa=1, memory="64M")
-
-
 @pytest.mark.parametrize("megabytes", [300] if ROUNDS == 1 else range(200, 1000, 50))
 def test_limited_addresses_end_in_a_message(run_command, megabytes: int) -> None:
     command = f"{MRT} out 3 width=1500 height=1500 aa=1 quiet=1"
@@ -164,29 +147,6 @@ def test_deep_nesting_is_refused(variant: str, tmp_path: Path, depth: int) -> No
     for what in (str(tmp_path / "deep.xml"), str(tmp_path / "outer.xml"), scene):
         with pytest.raises(SceneError, match="nested more than 256 levels"):
             mrt.render(what, aa=1)
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
-@pytest.mark.parametrize(
-    "inside",
-    [
-        "<include filename='pipe'/>",
-        "<default name='p' value='pipe'/><include filename='$p'/>",
-        "<include filename='p&#105;pe'/>",
-        f"<emitter type='envmap'>{PIPE}</emitter>",
-        f"<shape type='ply'>{PIPE}</shape>",
-        "<path value='in'/><bsdf type='diffuse'><spectrum name='reflectance' filename='pipe'/></bsdf>",
-        *(TEXTURED.format("diffuse", "reflectance", kind, PIPE) for kind in ("bitmap", "mrt_texture")),
-    ],
-    ids=range(8),
-)
-def test_pipes_are_refused(variant: str, tmp_path: Path, inside: str) -> None:
-    folder = tmp_path / ("in" if "path value" in inside else "")
-    folder.mkdir(exist_ok=True)
-    os.mkfifo(folder / "pipe")
-    (tmp_path / "a.xml").write_text(scene_xml(inside))
-    with pytest.raises(SceneError, match="pipe: it is not a regular file"):
-        mrt.render(str(tmp_path / "a.xml"), aa=1)
 
 
 KINDS = {

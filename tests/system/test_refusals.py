@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import math
 import os
 import re
@@ -143,7 +144,29 @@ MODELS: list[Case] = [
     ({"a.obj": TRIANGLE}, "out scene=a.obj camera=0,9,0 target=0,0,0", 2, "choose another up"),
 ]
 
-CASES = OUTPUTS + SIZES + FILES + SCENES + TABLES + MODELS
+NAMED = "<string name='filename' value='{}'/>"
+TEXTURED = "<shape type='sphere'><bsdf type='{}'><texture name='{}' type='{}'>{}</texture></bsdf></shape>"
+TEXTURES = [
+    TEXTURED.format(*bsdf, kind, NAMED)
+    for bsdf in (("mrt_bsdf", "diffuse_reflectance"), ("diffuse", "reflectance"))
+    for kind in ("mrt_texture", "bitmap")
+]
+READ = [
+    *("<include filename='{}'/>", "<default name='p' value='{}'/><include filename='$p'/>"),
+    "<include filename='p&#105;pe'/>",
+    *(f"<emitter type='envmap'>{NAMED}</emitter>", f"<shape type='ply'>{NAMED}</shape>"),
+    f"<path value='in'/>{SPECTRUM.replace('s.spd', 'spectrum')}",
+]
+PIPES = {"in": None, "pipe": PIPE, "in/spectrum": PIPE}
+BLACK = io.BytesIO()  # 6 kB, and 0.7 GB of texels at work
+Image.new("1", (4000, 4000)).save(BLACK, "PNG")
+LARGE_TEXTURE, SAID = {"b.png": BLACK.getvalue()}, "b.png of 4000x4000 texels, "
+HOSTILE: list[Case] = [
+    *((xml(t.format("pipe")) | PIPES, "out scene=a.xml", 1, "not a regular file") for t in READ + TEXTURES),
+    *((xml(t.format("b.png")) | LARGE_TEXTURE, "out scene=a.xml memory=64M", 2, SAID) for t in TEXTURES),
+]
+
+CASES = OUTPUTS + SIZES + FILES + SCENES + TABLES + MODELS + HOSTILE
 
 
 def put(path: Path, content: Content) -> None:
@@ -176,7 +199,8 @@ def test_command_refuses(
     found, message = refusal(capfd, words.split(" "))
     assert text in message
     assert found == code
-    assert {path.name for path in tmp_path.iterdir()} == files.keys(), "files were left behind"
+    left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")}
+    assert left == files.keys(), "files were left behind"
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read anything")
