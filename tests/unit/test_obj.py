@@ -22,8 +22,9 @@ from mrt_mitsuba.scene.obj import model_scene, obj_scene, read_obj
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 UVS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
 NORMALS = "vn 0 0 1\n"
-MTL = "newmtl red\nKd 1.9 0.1 0.1 # bright\nKs 0.2 0.3 0.4\nKa 1.2 0 0\nNi 0.25\nNs 98\n"
-MTL += "newmtl painted\nKd 0.5\n"
+MTL = """newmtl red\nKd 1.9 0.1 0.1 # bright\nKs 0.2 0.3 0.4\nKa 1.2 0 0\nNi 0.25\nNs 98
+newmtl painted\nKd 0.5
+"""
 PAINTED = MTL + "map_Kd picture.png\n"
 USE_PAINTED = "mtllib model.mtl\n" + SQUARE + UVS + "usemtl painted\nf 1/1 2/2 3/3\n"
 
