@@ -92,11 +92,11 @@ def _shape(rng: random.Random) -> dict[str, Any]:
 
 def scene_of(rng: random.Random) -> dict[str, Any]:
     """Return a scene, and draw from ``rng`` what it is made of."""
-    look = mi.ScalarTransform4f().look_at([0, 1.5, 5], [0, 0, 0], [0, 1, 0])
+    view = sensor([0, 1.5, 5], [0, 0, 0], (16, 12))
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "mrt_whitted", "max_depth": rng.choice([1, 10]), "clamp": rng.random() < 0.5},
-        "camera": sensor([0, 1.5, 5], [0, 0, 0], (16, 12)),
+        "camera": view,
         "lamp": {"type": "mrt_light", "position": [2, 4, 3], "intensity": _color(rng)},
     }
     for i in range(rng.randint(1, 3)):
@@ -117,8 +117,8 @@ def scene_of(rng: random.Random) -> dict[str, Any]:
     more = [
         {"type": "point", "position": [-2, 3, 2], "intensity": _color(rng)},
         {"type": "directional", "direction": [0, -1, -0.3], "irradiance": _color(rng)},
-        {"type": "spot", "to_world": look, "intensity": _color(rng)},
-        {"type": "projector", "to_world": look, "irradiance": _texture(rng, "bitmap")},
+        {"type": "spot", "to_world": view["to_world"], "intensity": _color(rng)},
+        {"type": "projector", "to_world": view["to_world"], "irradiance": _texture(rng, "bitmap")},
         sky,
         {"type": "sphere", "center": [0, 3, 0], "radius": 0.2,
          "emitter": {"type": "area", "radiance": _color(rng)}},

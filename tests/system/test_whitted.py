@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 WHITTED = {"type": "mrt_whitted", "clamp": False, "min_contribution": 0.0, "bounce_budget": "plain"}
 MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
 MIRROR = {"type": "mrt_bsdf", "fresnel": "unity", "diffuse_reflectance": 0.0, "alpha": 0.01}
-FLOOR = {"type": "mrt_plane", "normal": [0, 0, 1]}
+FLOOR = {"type": "mrt_plane", "normal": [0, 0, 1], "bsdf": MATTE}
 
 
 def trace(nodes: dict[str, Any], o: Any, d: Any, **integrator: Any) -> Any:
@@ -40,20 +40,16 @@ def test_every_light_counts(count: int) -> None:
         f"light_{k}": {"type": "mrt_light", "position": [k - 3, 1, 2], "intensity": 0.5 + 0.1 * k}
         for k in range(count)
     }
-    floor, ray = {**FLOOR, "bsdf": MATTE}, ((0.3, 0.2, 5), (0, 0, -1))
-    each = [radiance({"floor": floor, name: light}, *ray) for name, light in lights.items()]
+    ray = (0.3, 0.2, 5), (0, 0, -1)
+    each = [radiance({"floor": FLOOR, name: light}, *ray) for name, light in lights.items()]
     assert min(values.min() for values in each) > 1e-3
-    np.testing.assert_allclose(radiance({"floor": floor, **lights}, *ray), sum(each), rtol=1e-5)
+    np.testing.assert_allclose(radiance({"floor": FLOOR, **lights}, *ray), sum(each), rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "others",
-    [
-        {},
-        {"other": {"type": "rectangle"}},
-        {"other": {"type": "mrt_cylinder", "p0": [9] * 3, "p1": [9, 9, 10]}},
-    ],
-)
+CYLINDER = {"type": "mrt_cylinder", "p0": [9, 9, 9], "p1": [9, 9, 10]}
+
+
+@pytest.mark.parametrize("others", [{}, {"other": {"type": "rectangle"}}, {"other": CYLINDER}])
 def test_hits_lie_on_their_sphere(others: dict[str, Any]) -> None:
     """Hits from 1e4 radii away, alone and with other shapes, are as near as float32 can write them."""
     center, radius = np.array([0.1, 0.2, -3.0]), 0.5
@@ -87,12 +83,11 @@ def test_mirrors_follow_the_interpolated_normal() -> None:
 
 @pytest.mark.parametrize("scale", [1.0, 1e4])
 def test_a_plane_hides_lights_behind_it_only(scale: float) -> None:
-    floor = {**FLOOR, "bsdf": MATTE}
     for height, lit in ((0.5, False), (0.9999, False), (1.5, True)):
         wall = {"type": "mrt_plane", "normal": [0, 0, -1], "distance": height * scale}
         light = {"type": "mrt_light", "position": [0, 0, scale]}
         d = np.array([1, 0, -0.2])
-        found = radiance({"floor": floor, "wall": wall, "light": light}, -0.1 * scale * d, d)
+        found = radiance({"floor": FLOOR, "wall": wall, "light": light}, -0.1 * scale * d, d)
         assert (found > 0.1).all() if lit else (found == 0).all()
 
 
@@ -104,7 +99,7 @@ def test_a_lamp_is_not_in_its_own_shadow(variant: str, kind: str) -> None:
         "type": "scene",
         "integrator": WHITTED,
         "sensor": sensor([0, 0, 1], [0, 0, 0], (32, 24)),
-        "floor": {**FLOOR, "bsdf": MATTE},
+        "floor": FLOOR,
         "lamp": {"type": kind, "to_world": place, "emitter": {"type": "area", "radiance": 1.0}},
     })  # fmt: skip
     assert (np.array(mi.render(scene, spp=1)) > 1e-3).all()
@@ -117,9 +112,8 @@ def test_schlick_mirrors_at_grazing_angles_whatever_is_reflected_at_normal_incid
     sky = {"type": "constant", "radiance": 0.5}
     cos = np.array([0.05, 0.2, 0.5])
     d = np.stack([np.sqrt(1 - cos**2), np.zeros(3), -cos], axis=1)
-    found = radiance(
-        {"floor": floor, "sky": sky}, np.tile([0.0, 0, 1], (3, 1)), d, min_contribution=1 / 16 / 255
-    )
+    nodes, start = {"floor": floor, "sky": sky}, np.tile([0.0, 0, 1], (3, 1))
+    found = radiance(nodes, start, d, min_contribution=1 / 16 / 255)
     np.testing.assert_allclose(found[:, 0], 0.5 * (f0 + (1 - f0) * (1 - cos) ** 5), rtol=1e-4)
 
 
@@ -140,6 +134,6 @@ def test_a_scene_without_shapes_is_the_sky() -> None:
 
 def test_mirror_rays_are_counted_where_there_are_none() -> None:
     view = sensor([0, 0, 5], [0, 0, 0], (8, 6))
-    scene = {"type": "scene", "sensor": view, "floor": {**FLOOR, "bsdf": MATTE}}
+    scene = {"type": "scene", "sensor": view, "floor": FLOOR}
     result = mrt.render(scene, integrator=WHITTED, aa=2, aamode="none", lattice="report", layers=["bounces"])
     assert result.layers["bounces.Y"].shape == (6, 8) and not result.layers["bounces.Y"].any()

@@ -32,7 +32,7 @@ def bsdf(**parameters: Any) -> mi.BSDF:
 
 
 def colored(**parameters: Any) -> mi.BSDF:
-    return bsdf(**{"diffuse_reflectance": rgb(KD), "specular_reflectance": rgb(KS), **parameters})
+    return bsdf(diffuse_reflectance=rgb(KD), specular_reflectance=rgb(KS), **parameters)
 
 
 @pytest.mark.parametrize("name", bsdf_laws.MATERIALS)
@@ -200,11 +200,10 @@ def test_parameters_can_be_updated(variant: str) -> None:
 @pytest.mark.parametrize("form", FORMS)
 def test_mirror_reflectance_is_ks_times_fresnel(form: str) -> None:
     b = colored(int_ior=1.7, fresnel=form)
-    for degrees in (0, 40, 89):
-        wi = at_angle(degrees)
+    for wi in map(at_angle, (0, 40, 89)):
         f = float(exact.fresnel(form, wi[2], 1, 1.7))
         found = np.array(b.eval_attribute("mirror_reflectance", interaction(wi)))[:, 0]
         np.testing.assert_allclose(found, f * np.array(KS), rtol=1e-5)
     assert max(KS) >= b.mirror_bound().reflectance >= max(KS) * 0.999
-    bright = bsdf(f0=rgb((3, 1, 1)))
-    assert bright.mirror_bound().reflectance >= 2.99  # an F₀ above 1 is allowed, and the bound knows
+    # an F₀ above 1 is allowed, and the bound knows
+    assert bsdf(f0=rgb((3, 1, 1))).mirror_bound().reflectance >= 2.99

@@ -5,8 +5,7 @@ Each render has a scene and an integrator of its own: what one has kept must not
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from typing import Any
 
 import drjit as dr
@@ -62,40 +61,31 @@ def mean(image: Any) -> float:
     return float(np.array(image, np.float64).mean())
 
 
-def difference(key: str, step: float, make: Callable[[], mi.Scene] = scene) -> float:
+def difference(key: str, step: float, **more: Any) -> float:
     means = []
     for sign in (1, -1):
-        loaded = make()
+        loaded = scene(**more)
         parameters = mi.traverse(loaded)
         moved(parameters, key, sign * step)
         means.append(mean(mi.render(loaded, **RAYS)))
     return (means[0] - means[1]) / (2 * step)
 
 
-def rendered(key: str, others: tuple[str, ...] = (), make: Callable[[], mi.Scene] = scene) -> tuple:
-    """A picture, a number that moves the parameter, and what Mitsuba needs alive until it has differentiated.
-
-    Derivatives of others are wanted, too.
-    """
-    loaded = make()
+def derivative(way: str, key: str, **more: Any) -> float:
+    """By a number that moves the parameter; perhaps of another parameter as well."""
+    loaded = scene(**more)
     parameters, by = mi.traverse(loaded), mi.Float(0)
     dr.enable_grad(by)
-    for other in others:
+    if way == "backward of two":
+        other = "ball.bsdf.alpha" if key.startswith("light.intensity") else "light.intensity.value"
         dr.enable_grad(parameters[other])
     moved(parameters, key, by)
-    return mi.render(loaded, parameters, **WITH_GRADIENTS), by, parameters
-
-
-def backward(*arguments: Any) -> float:
-    image, by, _alive = rendered(*arguments)
+    image = mi.render(loaded, parameters, **WITH_GRADIENTS)
+    if way == "forward":
+        dr.forward(by)
+        return mean(dr.grad(image))
     dr.backward(dr.mean(image.array))
     return float(dr.grad(by)[0])
-
-
-def forward(*arguments: Any) -> float:
-    image, by, _alive = rendered(*arguments)
-    dr.forward(by)
-    return mean(dr.grad(image))
 
 
 def material(**change: Any) -> dict[str, Any]:
@@ -132,13 +122,11 @@ TEXTURE = {"type": "checkerboard", "color0": 0.2, "color1": 0.4}
     ],
 )
 def test_derivatives_are_those_of_finite_differences(key: str, step: float, more: dict[str, Any]) -> None:
-    make = partial(scene, **more)
-    exact = difference(key, step, make)
+    exact = difference(key, step, **more)
     assert abs(exact) > 1e-4
-    other = "ball.bsdf.alpha" if key.startswith("light.intensity") else "light.intensity.value"
-    for found in (backward(key, (), make), backward(key, (other,), make), forward(key, (), make)):
+    for way in ("forward", "backward", "backward of two"):
         # The error of a central difference falls with the square of the step: below 0.5 % here
-        assert found == pytest.approx(exact, rel=1e-2)
+        assert derivative(way, key, **more) == pytest.approx(exact, rel=1e-2)
 
 
 @pytest.mark.parametrize("update", [True, False])

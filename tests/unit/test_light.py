@@ -52,15 +52,13 @@ def stock_spectrum(intensity: Any) -> np.ndarray:
 def test_colour_does_not_depend_on_the_distance(variant: str) -> None:
     towards = np.array([2, 3, 6]) / 7
     for distance in (1e-6, 1, 1e6):
-        ds, weight = light(position=[0, 0, 0], intensity=2.5).sample_direction(
-            point_at(-distance * towards), mi.Point2f(0.5)
-        )
+        it = light(position=[0, 0, 0], intensity=2.5)
+        ds, weight = it.sample_direction(point_at(-distance * towards), mi.Point2f(0.5))
         np.testing.assert_allclose(spectrum(weight), stock_spectrum(2.5), rtol=1e-6)
         np.testing.assert_allclose(np.ravel(ds.d), towards, rtol=1e-6)
         np.testing.assert_allclose(np.ravel(ds.n), -towards, rtol=1e-6)
         assert np.array(ds.dist) == pytest.approx(distance, rel=1e-6)
-        assert np.array(ds.pdf) == 1 and dr.all(ds.delta)
-        assert np.array(ds.time) == 0.25
+        assert np.array(ds.pdf) == 1 and dr.all(ds.delta) and np.array(ds.time) == 0.25
     it, one = light(intensity=2.0), point_at(np.array(POSITION) - towards)
     ds, _ = it.sample_direction(one, mi.Point2f(0.5))
     np.testing.assert_array_equal(np.ravel(ds.p), POSITION)
@@ -89,16 +87,13 @@ def test_other_kinds_of_lights_join_the_table() -> None:
 
     mi.register_emitter("leaning", LeaningLight)
     for kinds in (["leaning"], ["mrt_light", "leaning"], ["leaning", "mrt_light"]):
-        lights = {
-            f"light{k}": {"type": kinds[k % len(kinds)], "position": [k - 4, 0, 3], "intensity": 0.1}
-            for k in range(9)
-        }
+        used = [kinds[k % len(kinds)] for k in range(9)]
         scene = mi.load_dict({
             "type": "scene",
             "integrator": {"type": "mrt_whitted", "max_depth": 1, "min_contribution": 0.0},
             "sensor": sensor([0, 0, 5], [0, 0, 0], (32, 24)),
             "floor": {"type": "mrt_plane", "normal": [0, 0, 1], "bsdf": {"type": "mrt_bsdf"}},
-            **lights,
+            **{f"light{k}": light(type=t, position=[k - 4, 0, 3], intensity=0.1) for k, t in enumerate(used)},
         })  # fmt: skip
         image, integrator = np.array(mi.render(scene, spp=1)), scene.integrator()
         plan = integrator.prepare(scene).plan
@@ -128,61 +123,58 @@ def upright(kind: str) -> Callable[[float], dict[str, Any]]:
     return lambda s: {"type": f"mrt_{kind}", ends[0]: [0, s, 0], ends[1]: [0, 0, 0], "radius": s}
 
 
-def board(s: float) -> dict[str, Any]:
-    turn = mi.ScalarTransform4f().rotate([1, 0, 0], -60)
-    return {"type": "rectangle", "to_world": turn.scale(s)}
-
-
 def wedge(s: float) -> dict[str, Any]:
     corners = s * np.array([(-1, 0, 1), (1, 0, 1), (0, 1, 0), (0, 0, -1)])
     return mesh(corners, [(0, 1, 2), (1, 3, 2), (3, 0, 2)])
 
 
+def ball(s: float) -> dict[str, Any]:
+    return {"type": "sphere", "radius": s}
+
+
 # A shape of size s, where on it the light is, and the direction off it
 SURFACES: dict[str, tuple[Callable[[float], dict[str, Any]], list[float], list[float]]] = {
-    "sphere": (
-        lambda s: {"type": "sphere", "radius": s},
-        [-0.26726124, -0.53452248, -0.80178373],
-        [-0.27, -0.53, -0.8],
-    ),
+    "sphere": (ball, [-0.26726124, -0.53452248, -0.80178373], [-0.27, -0.53, -0.8]),
     "cone apex": (upright("cone"), [0, 1, 0], [0, 1, 0]),
     "cone base": (upright("cone"), [0.3, 0, 0.2], [0, -1, 0]),
     "cone side": (upright("cone"), [-0.3, 0.5, -0.4], [-0.42, 0.71, -0.57]),
     "cylinder end": (upright("cylinder"), [0.3, 1, 0.2], [0, 1, 0]),
     "cylinder side": (upright("cylinder"), [-0.6, 0.5, -0.8], [-0.6, 0, -0.8]),
-    "plane": (lambda s: {"type": "sphere", "radius": s}, [2, -2, 1], [0, 1, 0]),
-    "rectangle": (board, [0.3, 0.1, 3**0.5 * -0.1], [0, 0.75**0.5, 0.5]),
+    "plane": (ball, [2, -2, 1], [0, 1, 0]),
+    "rectangle": (
+        lambda s: {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -60).scale(s)},
+        [0.3, 0.1, 3**0.5 * -0.1],
+        [0, 0.75**0.5, 0.5],
+    ),
     "triangle": (wedge, [0.1, 0.4, 0.6], [0, 0.71, 0.71]),
     "corner": (wedge, [0, 1, 0], [0, 1, 0]),
 }
 
 
-def lit_from_a_surface(name: str, s: float, lift: float = 0.0, size: tuple = (96, 72)) -> dict[str, Any]:
-    """A shape of size s over a floor, before two walls; its light lies on it, or so many sizes above it."""
+def lit_from_a_surface(name: str, s: float, lift: float = 0.0) -> np.ndarray:
+    """Where it is lit: a shape over a floor, before two walls; its light is on it, or so many sizes above."""
     shape, position, out = SURFACES[name]
     clips = {"near_clip": 0.01 * s, "far_clip": 1e4 * s}
     place = s * (np.array(position) + lift * np.array(out))
-    return {
+    scene = mi.load_dict({
         "type": "scene", "shape": shape(s),
-        "sensor": sensor([2 * s, 3 * s, 6 * s], [0, 0.3 * s, 0], size, fov=40, **clips),
+        "sensor": sensor([2 * s, 3 * s, 6 * s], [0, 0.3 * s, 0], (96, 72), fov=40, **clips),
         "integrator": {"type": "mrt_whitted", "max_depth": 1},
         "light": {"type": "mrt_light", "position": place.tolist()},
         "floor": {"type": "mrt_plane", "normal": [0, 1, 0], "distance": 2 * s},
         "wall": {"type": "mrt_plane", "normal": [1, 0, 0], "distance": 4 * s},
         "back": {"type": "mrt_plane", "normal": [0, 0, 1], "distance": 4 * s},
-    }  # fmt: skip
+    })  # fmt: skip
+    return np.array(mi.render(scene, spp=1)) > 1e-3
 
 
 @pytest.mark.parametrize("name", SURFACES)
 def test_a_light_on_a_surface_shines_at_every_scale(name: str) -> None:
     """Both sides are lit, as by one a thousandth above and one below, without speckles, in any unit."""
-
-    def picture(s: float, lift: float = 0.0) -> np.ndarray:
-        return np.array(mi.render(mi.load_dict(lit_from_a_surface(name, s, lift)), spp=1)) > 1e-3
-
-    image = picture(1.0)
+    image, above, below = (lit_from_a_surface(name, 1.0, lift) for lift in (0.0, 1e-3, -1e-3))
     assert 0.1 < image.mean() < 0.95
     for scale in (0.37, 1e-4, 7e5):
-        assert (picture(scale) != image).any(axis=-1).mean() < 1e-3  # a pixel at a shadow's edge
+        other = lit_from_a_surface(name, scale)
+        assert (other != image).any(axis=-1).mean() < 1e-3  # a pixel at a shadow's edge
     # From that much higher, the sphere's horizon is 0.045 radii away
-    assert (picture(1.0, lift=1e-3) | picture(1.0, lift=-1e-3) != image).any(axis=-1).mean() < 0.03
+    assert (above | below != image).any(axis=-1).mean() < 0.03

