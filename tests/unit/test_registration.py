@@ -58,7 +58,6 @@ try:
     plugins.register()
 except RuntimeError as error:
     print("no-variant" if "no Mitsuba variant is set" in str(error) else error)
-mi.set_variant("llvm_ad_rgb")
 for _ in range(3):
     mrt_mitsuba.register()
     plugins.register()
