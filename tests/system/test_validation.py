@@ -117,10 +117,7 @@ def wrong_cases(trade: str, where: dict[str, Any], change: dict[str, Any]) -> Fa
         def broken(*given: Any) -> Any:
             made = make(*given)
             cases = {name: wrong(options) for name, options in made["cases"].items()}
-            return made | {
-                "cases": cases,
-                "reference": wrong(made["reference"]) if where else made["reference"],
-            }
+            return made | {"cases": cases} | ({"reference": wrong(made["reference"])} if where else {})
 
         patch.setattr(error_vs_time, "TRADES", {trade: broken})
 
@@ -166,7 +163,7 @@ PAIRS: list[tuple[str, Any, str, Callable[..., Any]]] = [
         "in our tree",
         speed.renders,
         "crowd",
-        lambda f, n, kind, **size: f(n - (kind == "group"), kind, **size),
+        lambda f, n, kind, **more: f(n - (kind == "group"), kind, **more),
     ),
     ("roughconductor", roughconductor, "ours", lambda ours, alpha: ours(alpha) | {"fresnel": "schlick"}),
 ]
@@ -185,7 +182,6 @@ def test_sides_that_do_not_agree_are_noticed(
 # --------------------------------- Scenes: the least mistakes, every mode ---------------------------------
 
 SIZE = (80, 60)
-PLACES = {"width": 80, "height": 60}
 
 
 def altered(**changes: Callable[[Any], Any]) -> Callable[[Scene], Scene]:
@@ -200,10 +196,8 @@ def altered(**changes: Callable[[Any], Any]) -> Callable[[Scene], Scene]:
 def moved(scene: Scene) -> Scene:
     """One sphere by a tenth of a pixel or less."""
     first, second, *others = scene.spheres
-    x, y, z = second.center
-    return dataclasses.replace(
-        scene, spheres=(first, dataclasses.replace(second, center=(x, y + 1e-3, z)), *others)
-    )
+    second = dataclasses.replace(second, center=tuple(np.add(second.center, (0, 1e-3, 0))))
+    return dataclasses.replace(scene, spheres=(first, second, *others))
 
 
 MISTAKES: dict[str, Callable[[Scene], Scene]] = {
@@ -235,7 +229,7 @@ def test_small_mistakes_are_seen() -> None:
 def test_every_pixel_that_is_off_has_one_reason() -> None:
     """A picture shifted by half a displacement is off at silhouettes and shadows only, and judged so."""
     scene = report_scene(1)
-    shifted = reference_render(scene, displacement=(2e-2, 0), **PLACES).image
+    shifted = reference_render(scene, displacement=(2e-2, 0), width=SIZE[0], height=SIZE[1]).image
     error, reason = scenes.judge(shifted, scene, displacement=2e-2)
     counts = {name: int(np.sum(reason == i)) for i, name in enumerate(scenes.REASONS)}
     assert sum(counts.values()) == np.sum(error > scenes.STEP) > 5
@@ -321,7 +315,7 @@ def test_comparison_sees_a_broken_bsdf(monkeypatch: Patch) -> None:
     assert found.errors["pixels that differ, with the same random numbers"] > 0.1
 
 
-def test_roughness_out_of_range_is_refused() -> None:
-    for alpha in (0, 1.5, float("nan")):
-        with pytest.raises(mrt.UsageError, match="alpha="):
-            mrt.compare_roughconductor(alpha)
+@pytest.mark.parametrize("alpha", [0, 1.5, float("nan")])
+def test_roughness_out_of_range_is_refused(alpha: float) -> None:
+    with pytest.raises(mrt.UsageError, match="alpha="):
+        mrt.compare_roughconductor(alpha)

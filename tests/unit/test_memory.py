@@ -74,12 +74,10 @@ V1, V2 = ("memory.limit_in_bytes", "memory.usage_in_bytes"), ("memory.max", "mem
 def test_limits_of_control_groups_count(tmp_path, group, base, names, place):
     """Limits as the system shows them: in the group itself, in one above, or in a container's only one."""
     files = {"memory.stat": f"anon 5\ninactive_file {GIB // 4}\n", names[1]: f"{GIB // 2}\n"}
-    for folder in ("", "a", "a/b"):
-        limit = {names[0]: f"{GIB if folder == place else 'max'}\n"}
-        folder = f"sys/fs/cgroup/{base}/{folder}/"
-        show(
-            tmp_path, f"9:pids:/x\n{group}\n", {folder + name: text for name, text in (files | limit).items()}
-        )
+    for above in ("", "a", "a/b"):
+        limit = {names[0]: f"{GIB if above == place else 'max'}\n"}
+        group_files = {f"sys/fs/cgroup/{base}/{above}/{name}": text for name, text in (files | limit).items()}
+        show(tmp_path, f"9:pids:/x\n{group}\n", group_files)
     assert machine.free_memory(tmp_path) == GIB * 3 // 4
     assert machine.all_memory(tmp_path) == GIB
 
@@ -124,11 +122,12 @@ def test_quotas_of_control_groups(tmp_path: Path, membership: str, files: dict[s
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity") or ALL < 2, reason="needs two cores and affinity")
 def test_affinity() -> None:
-    os.sched_setaffinity(0, affinity()[:1])
+    before = affinity()
+    os.sched_setaffinity(0, before[:1])
     try:
         assert usable_cores() == 1
     finally:
-        os.sched_setaffinity(0, range(os.cpu_count() or 1))
+        os.sched_setaffinity(0, before)
 
 
 def test_drjit_has_no_more_threads_than_cores(monkeypatch: pytest.MonkeyPatch, variant: str) -> None:
