@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
 from itertools import chain
 from typing import Any
 
+from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import OutputError, UsageError
 from mrt_mitsuba.output.replacing import temporary_folder
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
@@ -65,6 +67,9 @@ def sweep(
     check_engine(cluster, workers=workers, retries=retries, dashboard=dashboard)
     if tiles is not None and png:
         raise UsageError("tiles: pictures in tiles are written as EXR only; leave out png")
+    current = getattr(sys.modules.get("mitsuba"), "variant", str)()
+    if current not in (None, "", runtime.FAST) and "variant" not in (grid or {}):
+        options.setdefault("variant", current)  # workers use the variant that ``render`` would
     named = points({} if grid is None else grid, zipped)
     try:
         folder = os.path.abspath(os.fsdecode(out))

@@ -106,7 +106,7 @@ def _render(
     arguments = dict(job.arguments)
     if limit:  # other workers need theirs
         arguments.setdefault("memory", max(min(free_memory(), limit) // 2, SMALLEST_MEMORY))
-    runtime.use(arguments.get("variant"))
+    runtime.use(arguments.get("variant") or runtime.default_variant())  # whatever an earlier sweep used
     result = render(receive(job.scene), progress=Progress(), **arguments)
     if identify(job.scene) != job.identity:
         raise MrtError(f"{job.scene} has changed since the sweep began: run it again")

@@ -150,6 +150,12 @@ def test_pictures_are_those_of_render_alone(address: str, tmp_path: Path) -> Non
     assert [row["file"] for row in written(tmp_path / "out")] == [row["file"] for row in table.rows]
 
 
+@pytest.mark.parametrize("variant", ["scalar_rgb"], indirect=True)
+def test_workers_use_the_callers_variant(variant: str, address: str, tmp_path: Path) -> None:
+    mrt.sweep(3, tmp_path, cluster=address, width=8, height=6)
+    assert read_exr(tmp_path / "picture.exr").header["mrt:variant"] == variant
+
+
 PLACES = [[[0.5, 0, 0, x], [0, 0.5, 0, 1], [0, 0, 0.5, 1], [0, 0, 0, 1]] for x in (1.0, 2.0)]
 ZIPPED = {"sphere_0.to_world": PLACES, "focaldist": [1.0, 2.0]}
 CROSSED = {"params": [{"resx": 40}, {"resx": 50}], "material_0.alpha": [0.1]}
