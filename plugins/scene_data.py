@@ -53,12 +53,8 @@ class SceneData:
         self.bvh, self.planes, self.quadrics, self.errors, self.spheres = kept(
             "traced", form, lambda: _trace(reading, plan)
         )
-        self.lights: Lights = kept(
-            "lights",
-            (now.light_part, plan.lights),
-            lambda: Lights(reading.lights, reading.numbers, plan.lights),
-        )
-
+        lit = now.light_part, plan.lights
+        self.lights: Lights = kept("lights", lit, lambda: Lights(reading.lights, reading.numbers, lit[1]))
         # Lists of what may be in the way of the lights, with what tests it
         things = [thing for thing in (self.quadrics, self.spheres) if thing is not None and plan.buffers]
         places = np.array([row[0] for row in reading.numbers or ()])
