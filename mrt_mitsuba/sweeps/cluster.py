@@ -173,7 +173,7 @@ def outcomes(
             hand_over(job)
         for future in coming:
             job = calls.pop(future)
-            if future.status not in ("finished", "error"):
+            if future.status == "cancelled":  # as all are where the scheduler goes; "lost": with its worker
                 raise CancelledError
             facts = worker.outcome(job, scratch)
             ended = "error" in facts or "file" in facts
@@ -184,9 +184,9 @@ def outcomes(
                 hand_over(job)
                 continue
             if not ended:
-                error = future.exception()
+                error = future.exception() if future.status == "error" else None
                 text = "every worker that rendered it died, perhaps for want of memory: give each more"
-                alive = not isinstance(error, KilledWorker)
+                alive = error is not None and not isinstance(error, KilledWorker)
                 facts["error"] = one_line(f"{type(error).__name__}: {error}") if alive else text
             future.release()  # what no one needs is not computed again when its worker goes
             yield job, facts

@@ -25,6 +25,7 @@ from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.rendering.progress import Progress
 
 Client = pytest.importorskip("distributed").Client
 pytestmark = pytest.mark.attack
@@ -329,9 +330,9 @@ def test_a_broken_grid_is_refused_before_anything_is_rendered(
 
 
 # What each worker runs first: seed 1 fails, 2 costs the first worker that takes it, 3 every worker, and 4
-# takes more memory than there is; workers die with what they would report of 1 and 5
+# takes more memory than there is; workers die with what they would report of 1 and 5, and have reported of 6
 SPOILED = """
-import os, pathlib, time
+import os, pathlib, threading, time
 from distributed.batched import BatchedSend
 from mrt_mitsuba.rendering import api
 def render(*scene, seed=0, alone=api.render, **options):
@@ -350,14 +351,25 @@ def send(self, *messages, alone=BatchedSend.send):
         ended = message.get("op") in ("task-finished", "task-erred")
         if ended and message["key"].split()[1] in ("seed=1", "seed=5"):
             os._exit(1)
+        if ended and message["key"].split()[1] == "seed=6":  # a moment after it was reported
+            threading.Timer(0.05, os._exit, [1]).start()
     alone(self, *messages)
 api.render, BatchedSend.send = render, send
 """
 
 
+class Slow(Progress):
+    """Looks at each outcome so late that its worker may have died since."""
+
+    @contextlib.contextmanager
+    def stage(self, *words: Any) -> Iterator[Callable[[int], None]]:
+        yield lambda steps: time.sleep(0.2)
+
+
 def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path: Path) -> None:
     out, cluster = tmp_path / "out", mortal(SPOILED, "--memory-limit", "1200MB")
-    table = mrt.sweep(3, out, grid={"seed": range(20)}, cluster=cluster.address, retries=1, **SMALL)
+    options = {"cluster": cluster.address, "retries": 1, "progress": Slow(), **SMALL}
+    table = mrt.sweep(3, out, grid={"seed": range(20)}, **options)
     errors = {row["seed"]: row["error"] for row in table.failed}
     assert errors.keys() == {1, 3, 4} and errors[1] == "RuntimeError: out of luck"
     assert errors[3] == errors[4] and "every worker that rendered it died, perhaps for want of" in errors[3]
