@@ -67,7 +67,9 @@ def connected(
         try:
             client = cluster
             if not isinstance(cluster, Client):
-                client = stack.enter_context(Client(cluster, timeout=CONNECTING, set_as_default=False))
+                client = Client.__new__(Client)
+                stack.callback(_close, client)
+                Client.__init__(client, cluster, timeout=CONNECTING, set_as_default=False)
             client.wait_for_workers(count, timeout=patience)
         except Exception as error:  # whatever the engine makes of an address, or of a client that is closed
             raise ClusterError(
@@ -80,6 +82,13 @@ def connected(
             raise ClusterError(
                 "the scheduler is gone: start it and its workers, then run the same sweep again; it continues"
             ) from error
+
+
+def _close(client: Client) -> None:
+    """Close a client, also one that could not connect: left to the garbage collector, which may come while
+    Dask holds a lock, it waits for ever."""
+    with suppress(Exception):
+        client.close()
 
 
 def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
