@@ -305,7 +305,7 @@ ARGUMENTS: list[tuple[type[Exception], dict[str, Any], str]] = [
         for scene, text in [
             ("", "cannot read '': there is no such file"),
             ("a\nb.xml", "cannot read a\\nb.xml: there is no such file"),
-            ("a\0b.xml", "embedded null byte"),
+            ("a\0b.xml", "embedded null"),
             ({"type": "scene"}, "a dict has no sensor: add one"),
             ({"type": "potato"}, 'Plugin "potato" not found'),
             ({"type": "sphere"}, "a dict is a Shape, not a scene: put it into one"),
