@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-# The golden ratio in 32 bits: seeds that follow each other must not meet those of later rays
+# The golden ratio in 32 bits: numbers that follow each other, times this, lie far apart
 _STRIDE = 0x9E3779B9
 # Sobol's second coordinate: bit i of the index takes part where Pascal's triangle is odd, in five doublings
 _PASCAL = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))
@@ -181,7 +181,7 @@ def _classes(variant: str) -> tuple[type, type]:
 
         def _shuffled(self, active: Any) -> tuple[Any, Any, Any]:
             """Return the index, shuffled for this dimension and with its first bit lowest, and two hashes."""
-            a = _mixed(self.key + self.dimension * 0x9E3779B9)
+            a = _mixed(self.key + self.dimension * _STRIDE)
             b = _mixed(a)
             self.dimension = dr.select(active, self.dimension + 1, self.dimension)
             return dr.brev(_scrambled(self.index, a, b)), a, b
