@@ -14,7 +14,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.validation.checks import scene as checks
 from mrt_mitsuba.validation.checks.law import Check
-from mrt_mitsuba.validation.studies.power import changed_bsdf, moved
+from mrt_mitsuba.validation.studies.power import changed_bsdf, put
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -147,18 +147,17 @@ def upwards(d: Any) -> Any:
 # Changes of a sky: of the "direction" and "weight" of its samples, and of other answers; the laws they break
 MISTAKES: dict[str, tuple[dict[str, Any], set[str]]] = {
     "none": ({}, set()),
-    "density x 1.01": ({"direction": moved(pdf=lambda ds, u: 1.01 * ds.pdf)}, {"density", "weights"}),
+    "density x 1.01": ({"direction": lambda ds, u: put(ds, pdf=1.01 * ds.pdf)}, {"density", "weights"}),
     "pdf_direction x 1.1": ({"pdf": lambda pdf: 1.1 * pdf}, {"density", "sampling"}),
     "weight x 1.01": ({"weight": lambda weight, u: 1.01 * weight}, {"weights"}),
     "seen 0.99 times as bright": ({"seen": lambda light: 0.99 * light}, {"weights"}),
     "eval_direction x 0.99": ({"value": lambda light: 0.99 * light}, {"weights"}),
     "half of the sky": (
-        {"direction": moved(p=lambda ds, u: ds.p + ds.dist * (upwards(ds.d) - ds.d),
-                            d=lambda ds, u: upwards(ds.d))},
+        {"direction": lambda ds, u: put(ds, p=ds.p + ds.dist * (upwards(ds.d) - ds.d), d=upwards(ds.d))},
         {"sampling"},
     ),
-    "wrong distance": ({"direction": moved(dist=lambda ds, u: 0.995 * ds.dist)}, {"sampling"}),
-    "direction too long": ({"direction": moved(d=lambda ds, u: 1.0005 * ds.d)}, {"sampling", "finite"}),
+    "wrong distance": ({"direction": lambda ds, u: put(ds, dist=0.995 * ds.dist)}, {"sampling"}),
+    "direction too long": ({"direction": lambda ds, u: put(ds, d=1.0005 * ds.d)}, {"sampling", "finite"}),
     "NaN": ({"weight": lambda weight, u: dr.select(u.x > 0.99, dr.nan, weight)}, {"finite"}),
     "negative": ({"weight": lambda weight, u: -weight}, {"finite", "weights"}),
 }  # fmt: skip
