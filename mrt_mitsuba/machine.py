@@ -6,8 +6,10 @@ import contextlib
 import functools
 import math
 import os
+import re
+import resource
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -55,11 +57,10 @@ class Budget:
     inputs: set[str] = field(default_factory=set)  #: paths of the files that the scene is read from
 
     @classmethod
-    def of(cls, memory: int | None) -> Budget:
+    def of(cls, wanted: int | None) -> Budget:
         """Return what was asked for, by default half of what is free; never more than the machine has."""
-        moment = int(time.monotonic())
-        wanted = _look(free_memory, moment) // 2 if memory is None else memory
-        return cls(min(wanted, _look(all_memory, moment)))
+        free, most = _look(memory, int(time.monotonic()))
+        return cls(min(free // 2 if wanted is None else wanted, most))
 
     def take_texture(self, path: str, width: int, height: int, *, around: bool = False) -> None:
         """Take the memory of a picture used as a texture; ``around``: as a map of the surroundings.
@@ -76,9 +77,9 @@ class Budget:
         self.taken += stays
 
 
-@functools.lru_cache(maxsize=2)
-def _look(function: Callable[[], int], moment: int) -> int:
-    """Return what a function does, looked up once a second: that takes milliseconds."""
+@functools.lru_cache(maxsize=1)
+def _look(function: Callable[[], tuple[int, int]], moment: int) -> tuple[int, int]:
+    """Return what a function returns, looked up once a second."""
     return function()
 
 
@@ -149,26 +150,25 @@ def keep_freed_blocks() -> None:
     np.empty(2**25 - 2**16, np.uint8)
 
 
-def free_memory(root: Path = Path("/")) -> int:
-    """Return the bytes that are free without swapping; where the system does not say, all there are.
+def memory(root: Path = Path("/")) -> tuple[int, int]:
+    """Return the bytes that are free without swapping, and all that there are, within the limits of control
+    groups and of addresses.
 
     ``root``: where the system's folders ``proc`` and ``sys`` are.
     """
-    free = [all_memory(root), *(limit - used for limit, used in _group_limits(root))]
-    with contextlib.suppress(OSError, KeyError, ValueError):
-        fields = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
-        free.append(int(fields["MemAvailable"].split()[0]) * 1024)
-    return max(0, min(free))
-
-
-def all_memory(root: Path = Path("/")) -> int:
-    """Return the bytes that the machine has, or that control groups and the limit of addresses leave."""
-    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    limits = [machine, *(limit for limit, _ in _group_limits(root))]
+    limits, free = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")], []
+    for names in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
+        for limit, used, statistics in control_groups("memory", (*names, "memory.stat"), root):
+            with contextlib.suppress(ValueError):  # "max"
+                limits.append(int(limit))
+                inactive = re.search(r"^inactive_file (\d+)", statistics, re.MULTILINE)
+                free.append(limits[-1] - int(used) + int(inactive[1] if inactive else 0))
     addresses = _free_addresses()
     if addresses is not None:
         limits.append(max(0, addresses - ADDRESSES_AT_WORK - (os.cpu_count() or 1) * ADDRESSES_PER_THREAD))
-    return min(limits)
+    with contextlib.suppress(OSError, IndexError):  # a container may hide it
+        free.append(int(re.findall(r"MemAvailable: *(\d+) kB", Path("/proc/meminfo").read_text())[0]) * 1024)
+    return max(0, min(limits + free)), min(limits)
 
 
 def check_addresses() -> None:
@@ -183,25 +183,10 @@ def check_addresses() -> None:
 
 def _free_addresses() -> int | None:
     """Return the bytes of addresses that are left, or None without a limit."""
-    try:
-        import resource
-
-        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if limit == resource.RLIM_INFINITY:
-            return None
-        return limit - int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    except (ImportError, OSError, ValueError):
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY:
         return None
-
-
-def _group_limits(root: Path) -> Iterator[tuple[int, int]]:
-    """Yield limit and use, in bytes, of each control group that this process is in."""
-    for folder in control_groups("memory", root):
-        for names in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
-            with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
-                limit, used = (int((folder / name).read_text()) for name in names)
-                statistics = dict(s.split() for s in (folder / "memory.stat").read_text().splitlines())
-                yield limit, used - int(statistics.get("inactive_file", 0))
+    return limit - int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def _text(count: float) -> str:
@@ -213,33 +198,28 @@ def usable_cores(root: Path = Path("/")) -> int:
 
     A quota of one and a half cores counts as two. ``root``: where the system's ``proc`` and ``sys`` are.
     """
-    counts = [len(affinity())]
-    for folder in control_groups("cpu", root):
-        for files in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):  # versions 2 and 1
-            with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
-                quota, period = map(float, " ".join((folder / file).read_text() for file in files).split())
+    counts = [len(os.sched_getaffinity(0))]
+    for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):  # versions 2 and 1
+        for texts in control_groups("cpu", names, root):
+            with contextlib.suppress(ValueError):  # "max"
+                quota, period = map(float, " ".join(texts).split())
                 counts += [math.ceil(quota / period)] if quota > 0 and period > 0 else []
     return min(counts)
 
 
-def affinity() -> tuple[int, ...]:
-    """Return the numbers of the cores this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return tuple(sorted(os.sched_getaffinity(0)))
-    return tuple(range(os.cpu_count() or 1))
-
-
-def control_groups(controller: str, root: Path = Path("/")) -> Iterator[Path]:
-    """Yield the folders of the control groups that this process is in, and of those above them."""
+def control_groups(controller: str, names: Sequence[str], root: Path) -> Iterator[list[str]]:
+    """Yield the texts of some files of each control group that this process is in, and of those above it,
+    where they are all there."""
     try:
         lines = (root / "proc/self/cgroup").read_text().splitlines()
-    except OSError:  # not Linux
+    except OSError:  # a container may hide it
         return
     for line in lines:
-        _, names, path = line.split(":", 2)
-        if names and controller not in names.split(","):
+        _, controllers, path = line.split(":", 2)
+        if controllers and controller not in controllers.split(","):
             continue
         group = Path(path.lstrip("/"))
-        for base in {names, controller if names else ""}:  # version 2 of the interface has no names
+        for base in {controllers, controller if controllers else ""}:  # version 2 of the interface has none
             for folder in (group, *group.parents):
-                yield root / "sys/fs/cgroup" / base / folder
+                with contextlib.suppress(OSError):
+                    yield [(root / "sys/fs/cgroup" / base / folder / name).read_text() for name in names]

@@ -13,7 +13,7 @@ from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError, one_line
-from mrt_mitsuba.machine import affinity, free_memory, usable_cores
+from mrt_mitsuba.machine import memory, usable_cores
 from mrt_mitsuba.options import SMALLEST_MEMORY
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.sweeps.jobs import Job, identify, receive
@@ -33,7 +33,7 @@ def describe(folder: str, dask_worker: Any = None) -> dict[str, Any]:
     found = {**runtime.versions(), "python": f"{sys.version_info[0]}.{sys.version_info[1]}"}
     return {
         "versions": ", ".join(f"{name} {version}" for name, version in found.items()),
-        "cores": f"{socket.gethostname()} {affinity()}",
+        "cores": f"{socket.gethostname()} {sorted(os.sched_getaffinity(0))}",
         "sees": os.access(folder, os.W_OK),
     }
 
@@ -105,7 +105,7 @@ def _render(
         dr.set_thread_count(threads)
     arguments = dict(job.arguments)
     if limit:  # other workers need theirs
-        arguments.setdefault("memory", max(min(free_memory(), limit) // 2, SMALLEST_MEMORY))
+        arguments.setdefault("memory", max(min(memory()[0], limit) // 2, SMALLEST_MEMORY))
     runtime.use(arguments.get("variant") or runtime.default_variant())  # whatever an earlier sweep used
     result = render(receive(job.scene), progress=Progress(), **arguments)
     if identify(job.scene) != job.identity:
