@@ -11,7 +11,7 @@ from typing import Any
 
 from mrt_mitsuba.command.registry import split
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.options import choice, either, from_text, option, path, switch, table
+from mrt_mitsuba.options import PATH, check, choice, either, option, switch, table
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.model import check_model_options
@@ -33,7 +33,7 @@ class Options(RenderSettings):
 
     filename: str
     scene_number: int = 0
-    scene: str | None = option(None, path(), "XML or OBJ file to render in place of a numbered scene", "none")
+    scene: str | None = option(None, PATH, "XML or OBJ file to render in place of a numbered scene", "none")
     format: str = option("both", choice("png", "exr", "both"), "files to write")
     tonemap: str = option(
         "report", choice("report", "srgb"), "values in the PNG: linear as in the report, or sRGB"
@@ -63,20 +63,24 @@ def parse(arguments: Sequence[str]) -> Options:
     plain, given = split(arguments[1:])
     if len(plain) > 1:
         raise UsageError(f"unexpected argument {plain[-1]!r}: options are written name=value")
-    if plain:
-        values["scene_number"] = _scene_number(plain[0])
+    for text in plain:
         if "scene" in given:
-            raise UsageError(f"both SCENE {plain[0]} and scene={given['scene']}: give one of them")
+            raise UsageError(f"both SCENE {text} and scene={given['scene']}: give one of them")
+        if text not in map(str, NUMBERS):
+            known = either([*map(str, NUMBERS)])
+            raise UsageError(f"SCENE {text}: must be {known} ('mrt scenes' lists them); a file is scene=PATH")
+        values["scene_number"] = int(text)
     if "motion" not in given and (idle := given.keys() & {"motionsamples", "motionmode"}):
         raise UsageError(f"{min(idle)} is of use only with motion=dx,dy,dz")
-    values |= {name: from_text(TABLE[name], text) for name, text in given.items() if name in TABLE}
-    params = {name: text for name, text in given.items() if name not in TABLE}
+    params = {name: given.pop(name) for name in [*given] if name not in TABLE}
+    values |= {n: check(n, TABLE[n].metadata["kind"], text, text=True) for n, text in given.items()}
     if params:
         from mrt_mitsuba.scene.loading import declared
 
         scene = values.get("scene", "")
         known = declared(scene) if scene.lower().endswith(".xml") else {}
-        for strange in (name for name in params if name not in known):
+        if unknown := params.keys() - known.keys():
+            strange = min(unknown)
             close = difflib.get_close_matches(strange.lstrip("-").lower(), [*TABLE, *known], n=1)
             hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
             raise UsageError(f"unknown option {strange!r}.{hint}")
@@ -96,12 +100,3 @@ def _filename(text: str) -> str:
     if not os.path.basename(text).strip(".") or "\0" in text:
         raise UsageError(f"FILENAME {text!r} names no file")
     return text
-
-
-def _scene_number(text: str) -> int:
-    if text not in map(str, NUMBERS):
-        file = "." in text or os.path.exists(text)
-        hint = f" For a file of your own, write scene={text}" if file else ""
-        known = either([str(number) for number in NUMBERS])
-        raise UsageError(f"SCENE {text}: must be {known} ('mrt scenes' lists them).{hint}")
-    return int(text)

@@ -22,11 +22,10 @@ from mrt_mitsuba.options import (
     TARGET,
     VECTOR,
     Kind,
-    checked,
+    check,
     choice,
     integer,
     option,
-    require,
     subset,
     switch,
     table,
@@ -154,8 +153,7 @@ class RenderSettings:
         Kind(
             "",
             "a rendering.progress.Progress",
-            str,
-            lambda value: require(isinstance(value, Progress), value),
+            lambda value: isinstance(value, Progress),
         ),
         "receives the plan, the stages and their progress",
     )
@@ -164,7 +162,7 @@ class RenderSettings:
         values = vars(self)
         for field in dataclasses.fields(self):
             if field.metadata and values[field.name] is not field.default:
-                values[field.name] = checked(field, values[field.name])
+                values[field.name] = check(field.name, field.metadata["kind"], values[field.name])
         self.model()  # checks what shows nothing
 
     @classmethod

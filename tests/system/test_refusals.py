@@ -53,7 +53,7 @@ def textured(picture: Content) -> dict[str, Content]:
 Case = tuple[dict[str, Content], str, int, str]
 
 WRONG = """
-out width=0 -> width must be a whole number; out 17 -> SCENE 17: must be; 3 -> FILENAME is missing
+out width=0 -> width=0: must be a whole number; out 17 -> SCENE 17: must be; 3 -> FILENAME is missing
 doctr -> did you mean mrt doctor; exprot --xml a.xml -> mrt export
 doctor now -> unexpected argument 'now' after mrt doctor; scenes all -> unexpected argument
 help me -> unexpected; export -> PATH is missing; export 3 -> --xml PATH; export 3 --xml -> --xml PATH
