@@ -157,20 +157,16 @@ def window_means(values: np.ndarray, reach: int) -> np.ndarray:
 
     Sums of 1, 2, 4, ... neighbours are each formed of the last ones, without differences that would cancel.
     """
-    for axis in (-2, -1):
-        count = values.shape[axis]
-        wide = np.moveaxis(values, axis, 0)
-        nothing = np.zeros_like(wide[:1]).repeat(reach, 0)
-        wide = sums = np.concatenate([nothing, wide, nothing])
-        step = 1
+    shape = values.shape[-2:]
+    wide = np.zeros((*values.shape[:-2], *(count + 2 * reach for count in shape)), values.dtype)
+    wide[..., reach:-reach, reach:-reach] = values
+    for count in shape[::-1]:  # along rows, then, turned, along columns
+        sums, step = wide, 1
         while step <= reach:
-            sums, step = sums[:-step] + sums[step:], 2 * step
-        sums = sums[:count] + wide[2 * reach :]
-        place = np.arange(count)
-        counts = np.minimum(place + reach, count - 1) - np.maximum(place - reach, 0) + 1
-        sums /= counts.astype(values.dtype).reshape(-1, *[1] * (sums.ndim - 1))
-        values = np.moveaxis(sums, 0, axis)
-    return values
+            sums, step = sums[..., :-step] + sums[..., step:], 2 * step
+        wide = (sums[..., :count] + wide[..., 2 * reach :]).swapaxes(-2, -1)
+    near = [np.minimum(np.arange(count), reach) for count in shape]
+    return wide / np.outer(*(before + before[::-1] + 1 for before in near)).astype(values.dtype)
 
 
 def dilated(mask: np.ndarray, reach: int) -> np.ndarray:

@@ -14,7 +14,7 @@ what other rays measure.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -27,7 +27,7 @@ HALVES, SCOUTS = [0, 1], [2, 3]
 SUSPECT = 0.5  # shape of a tail where rare rays may rule
 TILE = 16  # pixels that round alike, under a filter: it has rays traced around all that need some
 WINDOWS = (1, 2, 4, 8)  # half the widths of windows that pixels borrow from
-JUDGES = 2**13  # pixels, about, that choose the mixture
+JUDGES = 2**11  # pixels, about, that choose the mixture
 
 
 class Halves(Stack):
@@ -50,7 +50,7 @@ class Halves(Stack):
         self._exposer, self._seed, self._blurred = exposer, seed, blurred
         self._tile = TILE if film.reach else 1
         self._traced = np.zeros((4, film.pixels))
-        self._total = np.zeros((4, *film.shape, 3), np.float32)
+        self._total = np.zeros((3, 4, *film.shape), np.float32)
         self._square = np.zeros((4, *film.shape))  # mean of colours, as the next
         self._peak = np.zeros((4, *film.shape), np.float32)
         self._bad, self._unfit = np.zeros(film.shape, bool), 0.0
@@ -80,7 +80,7 @@ class Halves(Stack):
             for values in (exposed.total, exposed.square, exposed.peak):
                 values[bad] = 0
         self._traced += exposed.rays
-        self._total += exposed.total
+        self._total += np.moveaxis(exposed.total, -1, 0)
         self._square += exposed.square.mean(-1)
         np.maximum(self._peak, exposed.peak[..., 0], out=self._peak)
         with np.errstate(invalid="ignore"):
@@ -148,39 +148,41 @@ class Halves(Stack):
         Pixels that met no rare bright ray look quiet, so each borrows from windows around it, and from the
         picture: in the mixture of the first set that explains best what the second measures.
         """
-        sets = [self._moments(which) for which in (first, second, first + second)]
-        (seen, rays, mean), (measured, others, other), (both, *_) = sets
-        mixed = np.tensordot(_mixture(self._around(seen), measured), self._around(both), 1)
-        quiet, also = (window_means(variance, 1) == 0 for variance in (seen, measured))
+        one, another = self._gathered(first), self._gathered(second)
+        seen, measured, both = map(
+            _variance, (one, another, [a + b for a, b in zip(one, another, strict=True)])
+        )
+        parts, more = self._around(np.stack([seen, both]))
+        mixed = np.tensordot(_mixture(parts, measured), more, 1)
+        quiet, also = window_means(np.stack([seen, measured]), 1) == 0
         if not (measured[quiet].any() or seen[also].any()):  # where one met no noise, the other met none
             mixed[quiet & also] = 0
         # Rays of a sequence err less than independent ones; without noise, a window takes the picture's ratio
-        squares = quarter_squares(mean, other).mean(-1), both * (1 / rays + 1 / others) / 4
-        found, expected = (window_means(v, WINDOWS[-1]) + 0.1 * v.mean() for v in squares)
+        found = quarter_squares(*(total / rays for rays, total, _ in (one, another))).mean(0)
+        near = window_means(np.stack([found, both * (1 / one[0] + 1 / another[0]) / 4]), WINDOWS[-1])
+        found, expected = near + 0.1 * near.mean((-2, -1), keepdims=True)
         return np.asarray(mixed * found / np.maximum(expected, 1e-30) * self.film.averaging)
 
     def _around(self, values: np.ndarray) -> np.ndarray:
-        """Return values [H, W], their means in windows, and the mean of all, [parts, H, W]."""
-        own = [] if self.film.reach else [values]
-        means = [window_means(values, width) for width in WINDOWS if width >= self.film.reach]
-        return np.stack([*own, *means, np.full_like(values, values.mean())])
+        """Return values [..., H, W], their means in windows, and the mean of all, [..., parts, H, W]."""
+        parts = [values * 0 + values.mean((-2, -1), keepdims=True)] + ([] if self.film.reach else [values])
+        parts += [window_means(values, width) for width in WINDOWS if width >= self.film.reach]
+        return np.stack(parts, -3)
 
-    def _moments(self, which: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the variance of a ray's value, the rays, [H, W], and the mean, [H, W, 3]."""
-        rays, total = self.rows(self._traced)[which].sum(0), self._total[which].sum(0)
-        square, mean = self._square[which].sum(0), total / rays[..., None]
-        variance = (square - np.square(total, dtype=np.float64).mean(-1) / rays) / np.maximum(rays - 1, 1)
-        return np.where(variance * rays > 1e-6 * square, variance, 0), rays, mean
+    def _gathered(self, which: list[int]) -> list[np.ndarray]:
+        """Return the rays of some pictures together, [H, W], the sums of their colours, [3, H, W], and those
+        of squares, [H, W]."""
+        return [v[..., which, :, :].sum(-3) for v in (self.rows(self._traced), self._total, self._square)]
 
     def _tail(self, which: list[int]) -> float:
         """Return the Pareto shape of what single rays contribute to the pixels of some pictures.
 
         Of each pixel the brightest ray is known; the others are taken for alike, given all squares.
         """
-        rays = self.rows(self._traced)[which]
-        variances = np.stack([self._moments([picture])[0] for picture in which])
-        most = np.maximum(self._peak[which] - self._total[which].mean(-1) / rays, 0)
-        others = np.sqrt(np.maximum(variances - most**2 / np.maximum(rays - 1, 1), 0))
+        sums = self.rows(self._traced)[which], self._total[:, which], self._square[which]
+        rays, total, _ = sums
+        most = np.maximum(self._peak[which] - total.mean(0) / rays, 0)
+        others = np.sqrt(np.maximum(_variance(sums) - most**2 / np.maximum(rays - 1, 1), 0))
         values, counts = np.stack([most, others]) / rays, np.stack([np.ones_like(rays), rays - 1])
         return tail_shape(values.ravel(), counts.ravel())
 
@@ -250,7 +252,7 @@ class Halves(Stack):
         rays = np.minimum(rays, 2.0**40)
         step = np.ldexp(0.25, np.maximum(np.frexp(rays)[1], 3))
         due = np.floor(rays / step + rounding) * step - have
-        return np.asarray(np.maximum(due, 0) // self.group, np.int64)
+        return np.asarray(np.maximum(due, 0) / self.group, np.int64)
 
     def _inside(self, values: np.ndarray) -> np.ndarray:
         return self.film.picture(values[..., None])[..., 0]
@@ -260,6 +262,13 @@ def quarter_squares(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return a quarter of the squared difference of pictures; what is no number is left out later."""
     with np.errstate(invalid="ignore", over="ignore"):
         return np.asarray(np.square(first - second, dtype=np.float64) / 4)
+
+
+def _variance(sums: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the variance of a ray's value, the mean of its colours, given sums as of ``_gathered``."""
+    rays, total, square = sums
+    variance = (square - np.square(total, dtype=np.float64).mean(0) / rays) / np.maximum(rays - 1, 1)
+    return np.where(variance * rays > 1e-6 * square, variance, 0)
 
 
 def _mixture(parts: np.ndarray, measured: np.ndarray) -> np.ndarray:

@@ -66,14 +66,14 @@ class Wholes(Halves):
                 values = np.pad(count * found, [*border, (0, 0)])
                 self._seed = (self._seed + _STRIDE) % 2**32
                 self._traced[picture] += count
-                self._total[picture] += values[..., :3]
+                self._total[:, picture] += np.moveaxis(values[..., :3], -1, 0)
                 if picture in HALVES:
                     self._sums[picture] += values
                     self._weights[picture] += count
                     self._amount[picture] += count
                     self.rays[picture] += count
-        self._bad = np.asarray(~np.isfinite(self._total).all((0, -1)))
-        self._unfit = self._total[:, self._bad].max(initial=-np.inf)
+        self._bad = np.asarray(~np.isfinite(self._total).all((0, 1)))
+        self._unfit = self._total[..., self._bad].max(initial=-np.inf)
 
     def variance(self) -> np.ndarray:
         squares = window_means(np.moveaxis(self._squares(HALVES), -1, 0), 4)
@@ -92,5 +92,5 @@ class Wholes(Halves):
 
     def _squares(self, which: list[int]) -> np.ndarray:
         """Return a quarter of the squared difference of two pictures, [H, W, 3], without the border."""
-        means = self._total[which] / self.rows(self._traced)[which][..., None]
-        return self.film.picture(np.where(self._bad[..., None], 0, quarter_squares(*means)))
+        first, second = np.moveaxis(self._total / self.rows(self._traced), 0, -1)[which]
+        return self.film.picture(np.where(self._bad[..., None], 0, quarter_squares(first, second)))
