@@ -23,9 +23,19 @@ from typing import Any
 PATIENCE = 1.0  # seconds; who sends a second signal after that does not want to wait
 GRACE = 1.0  # seconds; more than an orderly end takes without a kernel, and well under the two promised
 
-_HELD = ("SIGTERM", "SIGHUP", "SIGINT")
 _handlers: dict[int, Callable[..., Any]] = {}  # of the signals that are held, as they were before
 _waiting: list[tuple[int, float]] = []  # signals, and when they came
+
+
+class Terminated(KeyboardInterrupt):
+    """The termination signal, or the end of the terminal, raised wherever the program is."""
+
+
+SIGNALS: dict[int, type[KeyboardInterrupt]] = {
+    signal.SIGINT: KeyboardInterrupt,
+    signal.SIGTERM: Terminated,
+    signal.SIGHUP: Terminated,
+}
 
 
 @contextlib.contextmanager
@@ -39,9 +49,8 @@ def held() -> Iterator[None]:
         yield
         return
     try:
-        for number in [getattr(signal, name) for name in _HELD if hasattr(signal, name)]:
-            handler = signal.getsignal(number)
-            if callable(handler):
+        for number in SIGNALS:
+            if callable(handler := signal.getsignal(number)):
                 _handlers[number] = handler
                 signal.signal(number, _note)
         yield
@@ -50,17 +59,12 @@ def held() -> Iterator[None]:
         _handlers.clear()
         for number, handler in before.items():
             signal.signal(number, handler)
-        _heed(before)
+        heed(before)
 
 
-def heed() -> None:
+def heed(handlers: dict[int, Callable[..., Any]] = _handlers) -> None:
     """Act on the signals that wait; called where an exception does no harm."""
-    if _waiting and threading.current_thread() is threading.main_thread():
-        _heed(_handlers)
-
-
-def _heed(handlers: dict[int, Callable[..., Any]]) -> None:
-    while _waiting:
+    while _waiting and threading.current_thread() is threading.main_thread():
         number = _waiting[0][0]
         _waiting[:] = [each for each in _waiting if each[0] != number]  # twice counts once
         if number in handlers:
@@ -75,25 +79,16 @@ def _note(number: int, frame: FrameType | None) -> None:
         _waiting.append((number, now))
 
 
-class Terminated(KeyboardInterrupt):
-    """The termination signal, raised wherever the program is."""
-
-
-SIGNALS: dict[int, type[KeyboardInterrupt]] = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
-if hasattr(signal, "SIGHUP"):
-    SIGNALS[signal.SIGHUP] = Terminated  # the terminal is gone
-
-
 @contextlib.contextmanager
 def ending_soon(clean_up: Callable[[], object]) -> Iterator[None]:
     """Raise ``Terminated`` on SIGTERM and SIGHUP in the block; the process ends within ``GRACE`` seconds.
 
     The block raises it at last, whatever Mitsuba and Dr.Jit make of it on the way. ``clean_up`` is called
     before the process is ended by force; its exit code is 128 + the number of the signal. Without effect
-    outside the main thread, where Python sets no handlers, and without POSIX signals. A signal that is
-    ignored, as in the background of a shell or under nohup, stays so.
+    outside the main thread, where Python sets no handlers. A signal that is ignored, as in the background of
+    a shell or under nohup, stays so.
     """
-    if os.name != "posix" or threading.current_thread() is not threading.main_thread():
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
     raised: list[KeyboardInterrupt] = []

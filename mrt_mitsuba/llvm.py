@@ -11,6 +11,7 @@ a few milliseconds and loads nothing: versions are read from file names.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import sys
@@ -69,23 +70,25 @@ def choose(
     wheel, problem = wheel_library(sys.path if search_path is None else search_path)
     named = environ.get(VARIABLE, "")
 
-    def candidates() -> Iterator[tuple[str, str, str, str]]:
-        """Yield path, where it is from, how it is called, and what speaks against it."""
+    def candidates() -> Iterator[tuple[str, str, str]]:
+        """Yield path, where it is from, and what speaks against it."""
         if named not in ("", BLOCKED, wheel):
-            yield named, f"named by {VARIABLE}", f"{VARIABLE}={named}", ""
+            yield named, f"named by {VARIABLE}", ""
         if wheel:
-            yield wheel, f"from the package {WHEEL}", f"{wheel} of {WHEEL}", problem
-        for path in _libraries(system_folders(environ) if system is None else system):
-            if path != os.path.realpath(wheel):
-                yield path, "the newest of the system", path, ""
+            yield wheel, f"from the package {WHEEL}", problem
+        folders = system_folders(environ) if system is None else system
+        paths = {os.path.realpath(path) for path in _matching(folders, "libLLVM")} - {os.path.realpath(wheel)}
+        versions = {path: version for path in paths if (version := version_in_name(path))}
+        for path in sorted(filter(os.path.isfile, versions), key=lambda path: (versions[path], path))[::-1]:
+            yield path, "of the system", ""
 
     rejected: list[str] = []
-    for path, source, called, objection in candidates():
+    for path, source, objection in candidates():
         version = version_of(path)
         if version and version[0] >= OLDEST and not objection:
             return Choice(path, version, source, rejected)
         what = f"is LLVM {version_text(version)}" if version else "cannot be loaded"
-        rejected.append(objection or f"{called} {what}")
+        rejected.append(objection or f"{path}, {source}, {what}")
     return Choice(None, None, "none", rejected)
 
 
@@ -95,18 +98,15 @@ def wheel_library(search_path: Iterable[str]) -> tuple[str, str]:
     Its path is taken from the list of files (RECORD) in the package's metadata. ``importlib.metadata`` gives
     the same, but importing it takes 30 ms.
     """
-    prefix = WHEEL.replace("-", "_") + "-"
-    found = ((folder, name) for folder in search_path for name in _list(folder) if name.startswith(prefix))
-    for folder, name in found:
-        info = os.path.join(folder, name)
+    for info in _matching(search_path, WHEEL.replace("-", "_") + "-"):
         try:
-            with open(os.path.join(info, "RECORD"), encoding="utf-8") as lines:
+            with open(f"{info}/RECORD", encoding="utf-8") as lines:
                 files = [line.split(",", 1)[0] for line in lines if "/libLLVM.so." in line]
         except (OSError, UnicodeDecodeError):
             continue
-        for path in filter(os.path.isfile, (os.path.normpath(os.path.join(folder, file)) for file in files)):
+        for path in filter(os.path.isfile, (os.path.normpath(f"{info}/../{file}") for file in files)):
             # Python makes symbolic links at its next start; without them, libraries it needs are missing
-            unfinished = "symlinks.txt" in _list(info) and "axle.done" not in _list(info)
+            unfinished = os.path.exists(f"{info}/symlinks.txt") and not os.path.exists(f"{info}/axle.done")
             return path, unfinished * (
                 f"the installation of {WHEEL} is unfinished: whoever may write to {info} has to start Python "
                 f"once ({sys.executable} -c '')"
@@ -118,24 +118,16 @@ def system_folders(environ: Mapping[str, str] = os.environ) -> list[str]:
     """Return the folders in which a Linux system keeps libLLVM."""
     folders = [folder for folder in environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
     folders.append(os.path.join(sys.prefix, "lib"))  # conda
-    machine = os.uname().machine
-    folders += ["/usr/local/lib", f"/usr/lib/{machine}-linux-gnu", "/usr/lib64", "/usr/lib"]
-    return folders + [f"/usr/lib/{name}/lib" for name in _list("/usr/lib") if name.startswith("llvm")]
+    folders += ["/usr/local/lib", f"/usr/lib/{os.uname().machine}-linux-gnu", "/usr/lib64", "/usr/lib"]
+    return folders + [f"{folder}/lib" for folder in _matching(["/usr/lib"], "llvm")]
 
 
-def _libraries(folders: Iterable[str]) -> list[str]:
-    """Return the path of every libLLVM with a version in its name in ``folders``, the newest first."""
-    names = ((folder, name) for folder in folders for name in _list(folder) if name.startswith("libLLVM"))
-    paths = {os.path.realpath(os.path.join(folder, name)) for folder, name in names}
-    found = ((version_in_name(path), path) for path in filter(os.path.isfile, paths))
-    return [path for _, path in sorted((each for each in found if each[0]), reverse=True)]
-
-
-def _list(folder: str) -> list[str]:
-    try:
-        return sorted(os.listdir(folder or "."))
-    except OSError:
-        return []
+def _matching(folders: Iterable[str], prefix: str) -> Iterator[str]:
+    """Yield the path of everything in folders, if they can be read, whose name begins with a prefix."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            names = sorted(os.listdir(folder or "."))
+            yield from (os.path.join(folder, name) for name in names if name.startswith(prefix))
 
 
 def version_in_name(path: str) -> Version | None:
@@ -194,7 +186,7 @@ def prepare() -> Choice:
         _drjit_came_first = "drjit" in sys.modules
         os.environ[VARIABLE] = choice.path or BLOCKED
         problem = too_early()
-        if not _drjit_came_first and choice.rejected and choice.rejected[0].startswith(VARIABLE):
+        if not _drjit_came_first and choice.rejected and VARIABLE in choice.rejected[0]:
             problem = f"{choice.rejected[0]}, which Dr.Jit cannot use; it needs {OLDEST} or newer. "
             problem += f"Instead: {choice.describe()}"
         if problem:

@@ -67,7 +67,7 @@ def use(variant: str | None = None) -> str:
         from mrt_mitsuba import plugins
 
         mitsuba_first()
-        one_by_one(one_at_a_time)
+        one_by_one()
         plugins.register()
         plugins.register_modules("mrt_mitsuba.rendering", ["adaptive"])
         _used = variant
@@ -212,9 +212,9 @@ def mitsuba_home() -> str:
     return os.path.dirname(os.path.abspath(mi.__file__))
 
 
-def one_by_one(lock: contextlib.AbstractContextManager[Any]) -> None:
+def one_by_one() -> None:
     """Let Mitsuba's loaders make this project's objects one by one, and ``mi.render`` and changes by
-    ``mi.traverse`` hold a lock: done at once, either ends the process.
+    ``mi.traverse`` wait for each other: done at once, either ends the process.
 
     Scenes without our plugins, and calls that say ``parallel``, load as before. Idempotent.
     """
@@ -222,26 +222,29 @@ def one_by_one(lock: contextlib.AbstractContextManager[Any]) -> None:
 
     def in_turn(loader: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(loader)
-        def load(source: Any, parallel: bool | None = None, optimize: bool = True, **parameters: Any) -> Any:
-            parallel = not _mentions_ours(source) if parallel is None else parallel
-            return loader(source, parallel, optimize, **parameters)
+        def load(source: Any, *flags: bool, **given: Any) -> Any:
+            if not flags:
+                given.setdefault("parallel", not _mentions_ours(source))
+            return loader(source, *flags, **given)
 
         return load
 
     def guarded(function: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(function)
         def call(*args: Any, **given: Any) -> Any:
-            with lock:
+            with one_at_a_time:
                 return function(*args, **given)
 
         return call
 
-    changes = ((mi, "render"), (mi.SceneParameters, "update"), (mi.SceneParameters, "__setitem__"))
-    loaders = ((mi, name) for name in ("load_dict", "load_file", "load_string"))
-    for (owner, name), wrapped in [*((c, guarded) for c in changes), *((f, in_turn) for f in loaders)]:
-        function = getattr(owner, name)
-        if not hasattr(function, "__wrapped__"):
-            setattr(owner, name, wrapped(function))
+    for wrapped, owner, names in (
+        (guarded, mi, ("render",)),
+        (guarded, mi.SceneParameters, ("update", "__setitem__")),
+        (in_turn, mi, ("load_dict", "load_file", "load_string")),
+    ):
+        for name in names:
+            if not hasattr(function := getattr(owner, name), "__wrapped__"):
+                setattr(owner, name, wrapped(function))
 
 
 def _mentions_ours(source: Any) -> bool:

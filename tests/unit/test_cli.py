@@ -6,7 +6,6 @@ import importlib
 import inspect
 import io
 import json
-import os
 import re
 import signal
 import sys
@@ -135,7 +134,6 @@ KERNEL = """
     """
 
 
-@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 @pytest.mark.parametrize(
     ("work", "number", "code"),
     [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -11,8 +10,6 @@ import pytest
 
 from mrt_mitsuba import interrupts
 from mrt_mitsuba.interrupts import Terminated, ending_soon
-
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 
 
 @pytest.fixture(autouse=True)
