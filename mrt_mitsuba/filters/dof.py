@@ -68,10 +68,7 @@ def blur_amount(depth: Any, *, focal_distance: float | None, focal_range: float 
     """
     grid = Grid(depth)
     distance = grid.flat(depth, (), "depth")
-    focus = _focus(focal_distance, focal_range)
-    if focus == 0:
-        return grid.output([dr.zeros(grid.Float, grid.count)])
-    return grid.output([_amount(grid, distance, focus, focal_range)])
+    return grid.output([_amount(grid, distance, focal_distance or 0.0, focal_range)])
 
 
 def gaussian_dof(
@@ -94,28 +91,24 @@ def gaussian_dof(
     """
     if mode not in MODES:
         raise UsageError(f"unknown depth-of-field mode {mode!r}; use one of {', '.join(MODES)}")
-    focus = _focus(focal_distance, focal_range)
-    if focus == 0:
+    if focal_distance is None or focal_distance <= 0:
         return image
     grid = Grid(image)
     planes = grid.planes(image, "image")
     distance = grid.flat(depth, (), "depth")
-    amount = _amount(grid, distance, focus, focal_range)
+    amount = _amount(grid, distance, focal_distance, focal_range)
     if mode == "report":
         return grid.output(_pascal(grid, planes, amount), (3,))
     radius = _radius(amount)
-    near = (distance > 0) & (distance < grid.opaque(focus))
+    near = (distance > 0) & (distance < grid.opaque(focal_distance))
     return grid.output(_discs(grid, planes, dr.select(near, -radius, radius)), (3,))
 
 
-def _focus(focal_distance: float | None, focal_range: float) -> float:
-    """Return the focal distance, or 0 for a filter that is off."""
-    check_numbers(focal_distance=focal_distance or 0.0, focal_range=focal_range)
-    return max(focal_distance or 0.0, 0.0)
-
-
-def _amount(grid: Grid, distance: Any, focus: float, focal_range: float) -> Any:
-    amount = dr.abs(grid.opaque(focus) - distance) - grid.opaque(focal_range)
+def _amount(grid: Grid, distance: Any, focal_distance: float, focal_range: float) -> Any:
+    check_numbers(focal_distance=focal_distance, focal_range=focal_range)
+    if focal_distance <= 0:
+        return dr.zeros(grid.Float, grid.count)
+    amount = dr.abs(grid.opaque(focal_distance) - distance) - grid.opaque(focal_range)
     amount = dr.select(amount > 0, dr.minimum(amount, MAX_AMOUNT), 0)  # NaN > 0 is false
     return dr.select((distance <= 0) | (distance == math.inf), MAX_AMOUNT, amount)
 
@@ -210,9 +203,10 @@ def _discs(grid: Grid, planes: Sequence[Any], radius: Any) -> list[Any]:
     reach = math.ceil(max_radius + 1) - 1
     steps = range(-reach, reach + 1)
     # the neighbours that a disc of the largest radius covers at least in part
-    offsets = [(dx, dy) for dy in steps for dx in steps if math.hypot(dx, dy) < max_radius + 1]
-    distances = sorted(Counter(math.hypot(dx, dy) for dx, dy in offsets).items())
-    spread = sum(number * _coverage(dr.abs(radius), distance) for distance, number in distances)
+    offsets = [(dx, dy, math.hypot(dx, dy)) for dy in steps for dx in steps]
+    offsets = [offset for offset in offsets if offset[2] < max_radius + 1]
+    distances = sorted(Counter(distance for _, _, distance in offsets).items())
+    spread = sum(number * _coverage(radius, distance) for distance, number in distances)
     good = finite(planes)
     share = dr.select(good, 1 / spread, 0)  # what a covered pixel gets of a disc's light
     colours = [dr.select(good, plane, 0) for plane in planes]
@@ -224,52 +218,22 @@ def _discs(grid: Grid, planes: Sequence[Any], radius: Any) -> list[Any]:
     if dr.width(pixels) == 0:
         return blurred
 
-    totals = _gather_layers(grid, colours, radius, share, pixels, offsets)
-    front, same, behind = totals[:4], totals[4:8], totals[8:]
-    # the layers laid over each other; the same layer holds the pixel itself, so its weight is not zero
-    covered, solid = dr.minimum(front[3], 1), dr.minimum(same[3], 1)
-    gap = dr.minimum(1 - solid, behind[3])
-    per_front = dr.select(front[3] > 0, covered / front[3], 0)
-    per_same = solid / same[3] / (solid + gap)
-    per_behind = dr.select(behind[3] > 0, gap / behind[3], 0) / (solid + gap)
-    values = [
-        per_front * front[c] + (1 - covered) * (per_same * same[c] + per_behind * behind[c]) for c in range(3)
-    ]
-    for target, value in zip(blurred, values, strict=True):
-        dr.scatter(target, value, pixels)
-    dr.eval(blurred)
-    return blurred
-
-
-def _coverage(radius: Any, distance: Any) -> Any:
-    return dr.clip(radius + (1 - distance), 0, 1)
-
-
-def _gather_layers(
-    grid: Grid,
-    colours: Sequence[Any],
-    radius: Any,
-    share: Any,
-    pixels: Any,
-    offsets: Sequence[tuple[int, int]],
-) -> Sequence[Any]:
-    """Return the weighted sums of red, green, blue and 1: in front, in the same layer, behind."""
     column, row = grid.coordinates(pixels)
     own_radius = dr.gather(grid.Float, radius, pixels)
     own_share = dr.gather(grid.Float, share, pixels)
-    triples = [(dx, dy, math.hypot(dx, dy)) for dx, dy in offsets]
-    steps = [grid.Float(list(step)) for step in zip(*triples, strict=True)]
+    tables = [grid.Float(list(values)) for values in zip(*offsets, strict=True)]
 
     def add(j: Any, totals: Sequence[Any]) -> list[Any]:
-        dx, dy, distance = (dr.gather(grid.Float, table, j) for table in steps)
+        """Add the weighted red, green, blue and 1 of a neighbour: in front, in the same layer, behind."""
+        dx, dy, distance = (dr.gather(grid.Float, table, j) for table in tables)
         # the border pixels are repeated outside
         index = dr.clip(row + grid.Int(dy), 0, grid.height - 1) * grid.width
         index += dr.clip(column + grid.Int(dx), 0, grid.width - 1)
         their_radius = dr.gather(grid.Float, radius, index)
         light = dr.gather(grid.Float, share, index)
         order = their_radius - own_radius
-        seen = dr.select(light > 0, _coverage(dr.abs(own_radius), distance) * own_share, 0)
-        reaching = _coverage(dr.abs(their_radius), distance) * light
+        seen = dr.select(light > 0, _coverage(own_radius, distance) * own_share, 0)
+        reaching = _coverage(their_radius, distance) * light
         narrower = (order > 0) & (dr.abs(own_radius) < dr.abs(their_radius))
         weights = (
             reaching * dr.clip(-order, 0, 1),
@@ -280,4 +244,20 @@ def _gather_layers(
         terms = [weight * value for weight in weights for value in values]
         return [total + term for total, term in zip(totals, terms, strict=True)]
 
-    return grid.accumulate(len(offsets), [dr.zeros(grid.Float, dr.width(pixels))] * 12, add)
+    totals = grid.accumulate(len(offsets), [dr.zeros(grid.Float, dr.width(pixels))] * 12, add)
+    front, same, behind = totals[:4], totals[4:8], totals[8:]
+    # the layers laid over each other; the same layer holds the pixel itself, so its weight is not zero
+    covered, solid = dr.minimum(front[3], 1), dr.minimum(same[3], 1)
+    gap = dr.minimum(1 - solid, behind[3])
+    per_front = dr.select(front[3] > 0, covered / front[3], 0)
+    per_same = solid / same[3] / (solid + gap)
+    per_behind = dr.select(behind[3] > 0, gap / behind[3], 0) / (solid + gap)
+    for c, target in enumerate(blurred):
+        under = per_same * same[c] + per_behind * behind[c]
+        dr.scatter(target, per_front * front[c] + (1 - covered) * under, pixels)
+    dr.eval(blurred)
+    return blurred
+
+
+def _coverage(radius: Any, distance: Any) -> Any:
+    return dr.clip(dr.abs(radius) + (1 - distance), 0, 1)

@@ -164,7 +164,6 @@ def geometry_edges(
     Raises:
         UsageError: for a wrong shape, or a threshold out of its range.
     """
-    check_numbers(crease_angle=crease_angle, depth_step=depth_step)
     if not 0 < crease_angle <= 180:
         raise UsageError(f"crease_angle={crease_angle} is out of range; give degrees above 0, at most 180")
     if not depth_step > 0:

@@ -7,7 +7,7 @@ import importlib
 import math
 import operator
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -15,8 +15,6 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
-
-_MODULES = {dr.JitBackend.LLVM: "drjit.llvm", dr.JitBackend.CUDA: "drjit.cuda"}
 
 
 class Grid:
@@ -32,23 +30,18 @@ class Grid:
     """
 
     def __init__(self, image: Any) -> None:
-        shape = _shape(image)
+        shape = np.shape(image)
         if len(shape) < 2:
-            raise UsageError(
-                f"image has shape {shape}; expected [rows, columns] or [rows, columns, channels]"
-            )
-        mitsuba = sys.modules.get("mitsuba")
-        variant = mitsuba.variant() if mitsuba else None
+            raise UsageError(f"image has shape {shape}; expected [rows, columns] or more")
         if dr.is_tensor_v(image):
-            name = _MODULES.get(dr.backend_v(image), "drjit.scalar")
-        elif variant is not None:
-            name = f"drjit.{variant.partition('_')[0]}"
+            name = {dr.JitBackend.LLVM: "llvm", dr.JitBackend.CUDA: "cuda"}.get(dr.backend_v(image), "scalar")
+        elif variant := (mitsuba := sys.modules.get("mitsuba")) and mitsuba.variant():
+            name = variant.partition("_")[0]
         else:
-            name = "drjit.scalar" if runtime.obstacle(runtime.FAST) else "drjit.llvm"
-        module = importlib.import_module(name)
-        self._tensor = module.TensorXf
+            name = "scalar" if runtime.obstacle(runtime.FAST) else "llvm"
+        self._tensor = importlib.import_module(f"drjit.{name}").TensorXf
         self._kind = type(image) if dr.is_tensor_v(image) else np.ndarray
-        self.Float: Any = dr.array_t(module.TensorXf)
+        self.Float: Any = dr.array_t(self._tensor)
         self.Int: Any = dr.int32_array_t(self.Float)
         self.Bool: Any = dr.mask_t(self.Float)
         self.rows, self.columns = shape[:2]
@@ -64,9 +57,9 @@ class Grid:
         Raises ``UsageError`` under the name ``name`` if the shape is another one.
         """
         wanted = (self.rows, self.columns, *channels)
-        if _shape(array) != wanted or self.count == 0:
+        if np.shape(array) != wanted or self.count == 0:
             expected = "at least one pixel" if 0 in wanted else f"[{', '.join(map(str, wanted))}]"
-            raise UsageError(f"{name} has shape {_shape(array)}; expected {expected}")
+            raise UsageError(f"{name} has shape {np.shape(array)}; expected {expected}")
         if dr.is_tensor_v(array):
             return self._tensor(dr.detach(array, preserve_type=False)).array
         return self.Float(np.ascontiguousarray(array, dtype=np.float32).ravel())
@@ -122,20 +115,6 @@ class Grid:
         return theirs(ours(flat, shape))
 
 
-def bands(height: int, rows: int, halo: int) -> Iterator[tuple[slice, slice, slice]]:
-    """Yield a picture's bands from top to bottom: the rows of each, those to read, and its own among these.
-
-    A filter that reads only some rows above and below a pixel, its halo, gives the same bits for a band with
-    its halo as for the whole picture. A band reads at most ``rows`` rows, or three halos; the halo ends at
-    the borders of the picture.
-    """
-    step = height if height <= rows else max(rows - 2 * halo, halo, 1)
-    for start in range(0, height, step):
-        stop = min(start + step, height)
-        top, bottom = max(start - halo, 0), min(stop + halo, height)
-        yield slice(start, stop), slice(top, bottom), slice(start - top, stop - top)
-
-
 def check_numbers(**options: float) -> None:
     """Raise ``UsageError`` for an option that is NaN."""
     for name, value in options.items():
@@ -146,10 +125,6 @@ def check_numbers(**options: float) -> None:
 def finite(planes: Sequence[Any]) -> Any:
     """Return where all of several planes hold finite numbers."""
     return functools.reduce(operator.and_, map(dr.isfinite, planes))
-
-
-def _shape(array: Any) -> tuple[int, ...]:
-    return tuple(array.shape) if hasattr(array, "shape") else np.shape(array)
 
 
 def window_means(values: np.ndarray, reach: int) -> np.ndarray:
@@ -171,10 +146,8 @@ def window_means(values: np.ndarray, reach: int) -> np.ndarray:
 
 def dilated(mask: np.ndarray, reach: int) -> np.ndarray:
     """Return where a mask is true within so many pixels along both axes."""
-    for axis in (-2, -1):
-        mask, near = mask.copy(), np.moveaxis(mask, axis, 0)
-        wide = np.moveaxis(mask, axis, 0)  # a view
-        for step in range(1, reach + 1):
-            wide[step:] |= near[:-step]
-            wide[:-step] |= near[step:]
+    for count in mask.shape[:-3:-1]:  # along rows, then, turned, along columns
+        wide = np.pad(mask, [(0, 0)] * (mask.ndim - 1) + [(reach, reach)])
+        near = (wide[..., step : step + count] for step in range(2 * reach + 1))
+        mask = functools.reduce(np.logical_or, near).swapaxes(-2, -1)
     return mask

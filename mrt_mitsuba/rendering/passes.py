@@ -14,7 +14,6 @@ import numpy as np
 
 from mrt_mitsuba import filters
 from mrt_mitsuba.filters import dof, edges
-from mrt_mitsuba.filters.grid import bands
 from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER, keep_freed_blocks
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.film import Region
@@ -222,10 +221,17 @@ class Passes:
         return picture
 
     def _bands(self, halo: int) -> Iterator[tuple[slice, slice, slice]]:
-        """Yield the rows of each band, those that a filter sees, and where the first are among these."""
-        height, width = self._shape
-        yield from bands(height, self._rows_at_once, halo)
-        self._job.workspace.give_back(min(self._rows_at_once, height) * width * BYTES_PER_PIXEL_OF_FILTER)
+        """Yield the rows of each band from top to bottom, those to read, and where the first are among these.
+
+        A filter that reads only some rows above and below a pixel, its halo, gives the same bits for a band
+        with its halo as for the whole picture.
+        """
+        (height, width), most = self._shape, self._rows_at_once
+        step = height if height <= most else max(most - 2 * halo, halo, 1)
+        for start in range(0, height, step):
+            stop, top = min(start + step, height), max(start - halo, 0)
+            yield slice(start, stop), slice(top, min(stop + halo, height)), slice(start - top, stop - top)
+        self._job.workspace.give_back(min(most, height) * width * BYTES_PER_PIXEL_OF_FILTER)
 
     # -------------------------------------------- Layers --------------------------------------------
 
