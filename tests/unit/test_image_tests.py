@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from mrt_mitsuba import UsageError
-from mrt_mitsuba.validation.tools.image_tests import p_values
+from mrt_mitsuba.validation.tools.compare import p_values
 
 SHAPE = (24, 32, 3)
 Y, X = np.mgrid[:24, :32] / 24

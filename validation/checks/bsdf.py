@@ -22,7 +22,7 @@ from mrt_mitsuba.validation.checks.law import LEVEL, RARE, SIGMAS, TIMEOUT, Chec
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Probe, context, excess, is_scalar
 from mrt_mitsuba.validation.checks.sphere import DEPTH, Cells, chi_square, encode, integrate
 from mrt_mitsuba.validation.checks.subject import VALUES, elsewhere, other_kind
-from mrt_mitsuba.validation.tools.image_tests import sidak
+from mrt_mitsuba.validation.tools.compare import sidak
 
 
 def check_bsdf(

@@ -15,7 +15,7 @@ from mrt_mitsuba.validation.checks.law import LEVEL, RARE, Law, Skip, figures
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, excess, lanes
 from mrt_mitsuba.validation.checks.sphere import Cells, chi_square, encode, integrate
 from mrt_mitsuba.validation.checks.subject import Subject, reason
-from mrt_mitsuba.validation.tools.image_tests import sidak
+from mrt_mitsuba.validation.tools.compare import sidak
 
 SAME = 1e-3  # relative: the same formula, evaluated once more
 TURNED = 4 * probe.ROUNDED  # a direction passes through angles, a transform, and back

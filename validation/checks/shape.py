@@ -19,7 +19,7 @@ from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import Array, lanes, unit
 from mrt_mitsuba.validation.checks.shape_case import FLAT, Case, dot, leave, near, offset, trace, walk
 from mrt_mitsuba.validation.checks.subject import Kept, elsewhere, other_kind, reason
-from mrt_mitsuba.validation.tools.image_tests import sidak
+from mrt_mitsuba.validation.tools.compare import sidak
 
 HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
 TYPICAL = 16  # roundings: twice the most that was measured of sound shapes

@@ -19,8 +19,7 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.output.files import write_exr
 from mrt_mitsuba.validation.checks.probe import is_scalar
 from mrt_mitsuba.validation.tools.bsdf_probe import evaluate, largest, lobe_pairs, relative_error
-from mrt_mitsuba.validation.tools.compare import compare
-from mrt_mitsuba.validation.tools.image_tests import p_values
+from mrt_mitsuba.validation.tools.compare import compare, p_values
 from mrt_mitsuba.validation.tools.scenery import ball_scene
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.timing import in_turns, timed

@@ -13,7 +13,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Cone, Material, Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles.reference import nearest, unit
-from mrt_mitsuba.validation.tools.image_tests import p_values
+from mrt_mitsuba.validation.tools.compare import p_values
 from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, rays, with_materials
 from mrt_mitsuba.validation.tools.study import Study
 

@@ -1,4 +1,4 @@
-"""Two pictures of the same thing: how far one is from the other, in the measures in use."""
+"""Two pictures of the same thing: how far one is from the other, and whether noise alone explains it."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mrt_mitsuba.errors import OutputError, UsageError
 from mrt_mitsuba.output.error import exceedance
 from mrt_mitsuba.output.files import read_channels, write_exr, write_png
 from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.api import Result
-from mrt_mitsuba.validation.tools.image_tests import ROUNDING, cell_sums
 
-ORDER = {letter: index for index, letter in enumerate("RGBXYZUVA")}  # of channels within a layer
+ORDER = "RGBXYZUVA"  # of channels within a layer; others follow
+ROUNDING = 1e-5  # relative size of differences that are float32's: sums in another order, fused operations
 EPSILON = 0.01  # keeps black pixels, which no relative error describes, from ruling it
 CELL = 16  # pixels, a side of the cells whose means are compared
 BLOCKS = 64  # at most, along a side of the picture, whose signs are changed at a time
 FLIPS, TAIL = 500, 25  # changes of the signs, and how many of the largest results tell an exponential law
 MEASURES = ("mae", "rmse", "rel_mse", "psnr", "largest", "flip", "p_value")
-# Why a measure may be None
-UNDEFINED = {
+UNDEFINED = {  # why a measure may be None
     "flip": "FLIP needs three channels, finite and not negative, a reference that is not black, and the "
     "package flip-evaluator",
     "p_value": 'neither has a layer "error" next to its picture',
@@ -84,9 +84,8 @@ class Difference:
         write_exr(f"{stem}.exr", shown, header={k: str(v) for k, v in self.measures().items()})
         size = np.abs(values).max(axis=2)
         scale = np.max(size, initial=0, where=np.isfinite(size)) or 1
-        write_png(
-            f"{stem}.png", colormaps["inferno"](np.minimum(size / scale, 1))[..., :3].astype(np.float32)
-        )
+        colors = colormaps["inferno"](np.minimum(size / scale, 1))
+        write_png(f"{stem}.png", colors[..., :3].astype(np.float32))
 
     def __str__(self) -> str:
         lines = [f"{name:<8} {'-' if v is None else f'{v:.4g}'}" for name, v in self.measures().items()]
@@ -113,7 +112,7 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
     sides = [read_layer(side, layer, name) for side, name in ((a, "a"), (b, "b"))]
     (first, _, window), (second, _, other) = sides
     if first.shape != second.shape:
-        sizes = " and ".join(f"{s.shape[1]}x{s.shape[0]} with {s.shape[2]} channels" for s in (first, second))
+        sizes = " and ".join("{1}x{0} with {2} channels".format(*side[0].shape) for side in sides)
         raise UsageError(f"cannot compare pictures of {sizes}: their sizes must be the same")
     if window and other and window != other:
         raise UsageError(
@@ -121,20 +120,17 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
             "column and row: the pictures show other places"
         )
     with np.errstate(all="ignore"):
-        difference = np.where(first == second, 0, first.astype(np.float64) - second)  # inf where both are
-        square = difference**2
-        relative = np.where(
-            np.isinf(square), np.inf, square / (np.square(second, dtype=np.float64) + EPSILON)
-        )
-        mse = square.mean()
-        psnr = 20 * np.log10(peak) - 10 * np.log10(mse)
-    row, column, channel = np.unravel_index(np.argmax(np.abs(difference)), difference.shape)
+        difference = np.where(first == second, 0, first - second)  # inf where both are
+        size, square = np.abs(difference), difference**2
+        relative = np.where(np.isinf(square), np.inf, square / (second**2 + EPSILON))
+        psnr = 20 * np.log10(peak) - 10 * np.log10(square.mean())
+    row, column, _ = np.unravel_index(size.argmax(), size.shape)
     return Difference(
-        mae=float(np.abs(difference).mean()),
-        rmse=float(mse**0.5),
+        mae=float(size.mean()),
+        rmse=float(square.mean() ** 0.5),
         rel_mse=float(relative.mean()),
         psnr=float(psnr),
-        largest=float(np.abs(difference[row, column, channel])),
+        largest=float(size.max()),
         place=(int(row), int(column)),
         p_value=_p_value(sides),
         difference=difference.astype(np.float32),
@@ -143,7 +139,7 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
     )
 
 
-# A picture or layer [H, W, C]; the variance of its mean [H, W, 1], if it is known; and of an EXR
+# A picture or layer [H, W, C] in float64; the variance of its mean [H, W, 1], if it is known; and of an EXR
 # the first column and row, and the last ones
 Layer = tuple[np.ndarray, np.ndarray | None, tuple[int, ...]]
 
@@ -165,7 +161,7 @@ def read_layer(source: Any, layer: str = "", name: str = "the picture") -> Layer
         values = np.asarray(source, np.float32)
         if values.ndim not in (2, 3) or not values.size:
             raise UsageError(f"{name} has the shape {values.shape}: a picture is [H, W] or [H, W, C]")
-        found = np.atleast_3d(values), None, ()
+        found = np.atleast_3d(values).astype(np.float64), None, ()
     bad = np.argwhere(np.isnan(found[0]).any(axis=-1))
     if len(bad):
         place = f"row {bad[0][0]}, column {bad[0][1]}"
@@ -175,25 +171,21 @@ def read_layer(source: Any, layer: str = "", name: str = "the picture") -> Layer
 
 def _layer_of(channels: Mapping[str, np.ndarray], headers: Mapping[str, Any], layer: str, name: str) -> Layer:
     """Return a layer of channels by name, with what is known of its variance and window."""
-
-    def chosen(layer: str) -> list[str]:
-        """Return the channels of a layer, or the one of that name, in order."""
-        found = [key for key in channels if layer in (key, key.rpartition(".")[0])]
-        return sorted(found, key=lambda key: (ORDER.get(key.rpartition(".")[2], len(ORDER)), key))
-
-    def stacked(keys: Sequence[str]) -> np.ndarray:
-        return np.stack([channels[key] for key in keys], axis=-1)
-
-    keys = (
-        chosen(layer) if layer else [c for c in "RGB" if c in channels] or [c for c in "Y" if c in channels]
-    )
+    groups: dict[str, list[str]] = {}  # channels by layer, in order
+    for key in sorted(channels, key=lambda key: ((ORDER + key[-1]).index(key[-1]), key)):
+        groups.setdefault(key.rpartition(".")[0] or key, []).append(key)
+    picture = [c for c in "RGB" if c in channels] or [c for c in "Y" if c in channels]
+    keys = picture if not layer else [layer] if layer in channels else groups.get(layer)
     if not keys:
-        named = sorted({key.rpartition(".")[0] or key for key in channels})
-        raise UsageError(f"{name} has no layer {layer or 'R, G, B'!r}; it has {', '.join(named)}")
-    errors = [] if layer else chosen("error")
-    variance = stacked(errors).astype(np.float64) ** 2 if errors else None
+        raise UsageError(f"{name} has no layer {layer or 'R, G, B'!r}; it has {', '.join(sorted(groups))}")
     corners = headers[keys[0]]["dataWindow"] if headers else ()
-    return stacked(keys), variance, tuple(int(n) for corner in corners for n in corner)
+    window = tuple(int(n) for corner in corners for n in corner)
+
+    def stacked(names: Sequence[str]) -> np.ndarray:
+        return np.stack([channels[each] for each in names], axis=-1, dtype=np.float64)
+
+    known = not layer and "error" in groups
+    return stacked(keys), stacked(groups["error"]) ** 2 if known else None, window
 
 
 def _p_value(sides: Sequence[Layer]) -> float | None:
@@ -206,7 +198,7 @@ def _p_value(sides: Sequence[Layer]) -> float | None:
     variances = [variance.mean(axis=2) for _, variance, _ in sides if variance is not None]
     if not variances:
         return None
-    values = [picture.astype(np.float64).mean(axis=2) for picture, _, _ in sides]
+    values = [picture.mean(axis=2) for picture, _, _ in sides]
     brightness = np.maximum(*np.abs(values))
     rounding = ROUNDING * (brightness + brightness.mean())
     difference = values[0] - values[1]
@@ -243,3 +235,47 @@ def _p_of_means(difference: np.ndarray) -> float:
     if surprise[0] > others[TAIL] and tail.any():
         return float(TAIL / FLIPS * np.exp((others[TAIL] - surprise[0]) / tail.mean()))
     return float(np.mean(others >= surprise[0]))
+
+
+# ------------------------------------------ Sets of renders ------------------------------------------
+
+
+def p_values(ours: ArrayLike, theirs: ArrayLike, *, tile: int = 16) -> dict[str, float]:
+    """Compare two sets of two or more independent renders [N, H, W, C].
+
+    Return the p values of three questions, each with power where the others have little: does any single
+    "pixel" differ (a dropped light, a flipped normal), does any "tile" of ``tile`` × ``tile`` pixels (a wrong
+    roughness), does the whole "image" (a scale of 1.02)? By Welch's t-test with Šidák's correction for
+    all that is asked: of equal pictures, the least of the three is below a level as often as the level says.
+    Differences of a relative size of ``ROUNDING`` do not count.
+    """
+    from scipy import stats
+
+    sides = [np.asarray(renders, np.float64) for renders in (ours, theirs)]
+    if any(s.ndim != 4 or len(s) < 2 or s.shape[1:] != sides[0].shape[1:] for s in sides):
+        shapes = " and ".join(str(s.shape) for s in sides)
+        raise UsageError(f"renders of shape {shapes}: give two or more of each, [N, H, W, C], of one size")
+    if not all(np.isfinite(s).all() for s in sides):
+        raise UsageError("renders hold infinite or undefined values")
+    light = np.maximum(*(np.abs(s.mean(axis=0)) for s in sides))
+    sizes, found = {"pixel": 1, "tile": tile, "image": max(light.shape)}, {}
+    for name, size in sizes.items():
+        floor = ROUNDING * cell_sums(light + light.mean(), size) + 1e-30
+        of_each: list[Any] = []  # mean, standard deviation, count
+        for s in (cell_sums(side, size) for side in sides):
+            of_each += [s.mean(axis=0), np.sqrt(s.var(axis=0, ddof=1) + len(s) / 2 * floor**2), len(s)]
+        p = stats.ttest_ind_from_stats(*of_each, equal_var=False).pvalue
+        found[name] = sidak(float(p.min()), p.size * len(sizes))
+    return found
+
+
+def sidak(p: float, count: int) -> float:
+    """Return the probability 1 - (1 - p)^count that the smallest of ``count`` p values is ``p`` or less."""
+    return 1.0 if p >= 1 else float(-np.expm1(count * np.log1p(-p)))
+
+
+def cell_sums(values: np.ndarray, size: int) -> np.ndarray:
+    """Return the sums [..., rows, columns, C] over cells of ``size`` × ``size`` pixels."""
+    for axis in (-3, -2):
+        values = np.add.reduceat(values, np.arange(0, values.shape[axis], size), axis=axis)
+    return values

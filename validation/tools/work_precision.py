@@ -13,7 +13,7 @@ import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import cycle
+from itertools import chain, count, cycle
 from typing import Any
 
 import numpy as np
@@ -31,13 +31,12 @@ TITLE = "Error against time"
 REFERENCE_SEEDS = (2**20 + 1, 2**20 + 2)  # far from those of the repeats
 RESOLVED = 2.0  # an error is known from this many times the reference's own error on
 ERRORS = 4  # that the time is given for, unless they are chosen
-NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?"
+NUMBER = r"=?[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?"
 NOTHING = 1e-15  # an RMSE of 0, as logarithms have it
 LEVEL = 0.95  # of all intervals
 
 Options = Mapping[str, Any]
 Run = Callable[[Options, int], Result]  # a render with options and a seed
-Halves = tuple[np.ndarray, np.ndarray]  # two independent pictures, or the same one twice
 Interval = tuple[float, float]
 
 
@@ -90,7 +89,7 @@ class Point:
     @property
     def family(self) -> str:
         """The name without its numbers: cases that differ in these alone are one curve."""
-        return " ".join(re.sub(f"=?{NUMBER}", " ", self.name).split()) or self.name
+        return " ".join(re.sub(NUMBER, " ", self.name).split()) or self.name
 
     @property
     def resolved(self) -> bool:
@@ -124,12 +123,12 @@ class Findings:
 
         The interval is from where the lower ends of all intervals come so low to where the upper ends do.
         """
-        found = {}
-        for name, points in self.families.items():
-            times = np.array([(p.seconds, *p.seconds_interval) for p in points]).T
-            errors = np.array([(p.rmse, *p.rmse_interval) for p in points]).T
-            found[name] = tuple(_crossing(*curve, error) for curve in zip(times, errors, strict=True))
-        return found
+
+        def crossings(points: Sequence[Point]) -> tuple[float, ...]:
+            curves = [[(p.seconds, *p.seconds_interval), (p.rmse, *p.rmse_interval)] for p in points]
+            return tuple(_crossing(*curve, error) for curve in np.transpose(curves, (2, 1, 0)))
+
+        return {name: crossings(points) for name, points in self.families.items()}
 
     @property
     def verdicts(self) -> list[str]:
@@ -140,16 +139,16 @@ class Findings:
         for error in self.errors:
             reached = {name: t for name, t in self.time_to(error).items() if math.isfinite(t[0])}
             best, *others = sorted(reached, key=lambda name: reached[name][0]) or [""]
-            if not reached:
-                verdict = "no case comes so low"
-            elif like := [name for name in others if not reached[best][2] < reached[name][1]]:
+            like = [name for name in others if not reached[best][2] < reached[name][1]]
+            if like:
                 verdict = f"no winner, for the intervals overlap: {', '.join([best, *like])}"
-            elif not others:
+            elif others:
+                longer = f"{reached[others[0]][0] / reached[best][0]:.2g} times as long"
+                verdict = f"{best} is the fastest, {_shown(*reached[best])} s; {others[0]} takes {longer}"
+            elif best:
                 verdict = f"only {best} comes so low, in {_shown(*reached[best])} s"
             else:
-                longer = reached[others[0]][0] / reached[best][0]
-                verdict = f"{best} is the fastest, {_shown(*reached[best])} s; {others[0]} takes "
-                verdict += f"{longer:.2g} times as long"
+                verdict = "no case comes so low"
             sentences.append(f"RMSE of {error:g}: {verdict}.")
         return sentences
 
@@ -202,6 +201,8 @@ def _crossing(seconds: np.ndarray, errors: np.ndarray, error: float) -> float:
 
 
 def _shown(value: float, low: float, high: float) -> str:
+    if math.isinf(value):
+        return "not reached"
     return f"{value:.3g}" if math.isnan(low) else f"{value:.3g} ({low:.3g} to {high:.3g})"
 
 
@@ -236,21 +237,21 @@ def error_vs_time(
     A case that fails is kept, with the reason. Raises ``UsageError`` for wrong arguments, and what
     ``render`` raises for the reference.
     """
-    start = time.perf_counter()
+    start, shared = time.perf_counter(), shared or {}
     if not cases or repeats < 1:
         raise UsageError("error_vs_time needs at least one case and one repeat")
-    taken = [name for name, options in {"shared": shared or {}, **cases}.items() if "seed" in options]
-    if taken:
-        raise UsageError(f"{taken[0]} sets a seed: repeats have seeds of their own; leave it out")
-    run = _runner(scene, dict(shared or {}))
-    halves, own_error = _reference(reference, run)
-    low = [e for e in errors or () if not e > RESOLVED * own_error]
-    if low:
-        raise UsageError(
-            f"no claim can be made about an RMSE of {low[0]:g}: the reference's own error is "
-            f"{own_error:.2g}, and only errors above twice that stand out; take a better reference"
-        )
-    runs, failed = _measure(run, cases, halves[0].shape, repeats, progress or Progress())
+    for name, options in {"shared": shared, **cases}.items():
+        if "seed" in options:
+            raise UsageError(f"{name} sets a seed: repeats have seeds of their own; leave it out")
+    run = _runner(scene, shared)
+    *halves, own_error = _reference(reference, run)
+    for error in errors or ():
+        if not error > RESOLVED * own_error:
+            raise UsageError(
+                f"no claim can be made about an RMSE of {error:g}: the reference's own error is "
+                f"{own_error:.2g}, and only errors above twice that stand out; take a better reference"
+            )
+    runs, failed = _measure(run, cases, halves[0], repeats, progress or Progress())
     points = {name: _point(name, found, halves, own_error) for name, found in runs.items()}
     known = [p.rmse for p in points.values() if p.resolved and p.rmse > 1e-9]
     if errors is None and known:  # rounded up, so that there is a case that comes so low
@@ -260,7 +261,7 @@ def error_vs_time(
         scene=next((found[0].plan.scene for found in runs.values()), "scene"),
         points=points,
         failed=failed,
-        reference=(halves[0] + halves[1]) / 2,
+        reference=np.mean(halves, axis=0),
         reference_error=own_error,
         repeats=repeats,
         errors=list(errors or ()),
@@ -271,7 +272,7 @@ def error_vs_time(
 def _runner(scene: Any, shared: Options) -> Run:
     """Return what renders cases, each scene loaded once where it can be."""
     variant = runtime.use(shared.get("variant"))
-    loaded: dict[int, tuple[Any, Any]] = {}  # by the id of a scene, which is kept with it
+    loaded: dict[int, Any] = {}  # by the id of what a scene is loaded from, which the caller holds
 
     def run(options: Options, seed: int) -> Result:
         given = {"scene": scene, "variant": variant, **shared, **options, "seed": seed}
@@ -279,43 +280,41 @@ def _runner(scene: Any, shared: Options) -> Run:
         can_be_loaded = isinstance(one, dict) or str(one).lower().endswith(".xml")
         if can_be_loaded and given["variant"] == variant and "params" not in given:
             if id(one) not in loaded:
-                loaded[id(one)] = (one, open_scene(one).scene)
-            one = loaded[id(one)][1]
+                loaded[id(one)] = open_scene(one).scene
+            one = loaded[id(one)]
         return render(one, **given)
 
     return run
 
 
-def _reference(reference: Any, run: Run) -> tuple[Halves, float]:
+def _reference(reference: Any, run: Run) -> tuple[np.ndarray, np.ndarray, float]:
     """Return two independent halves of the reference, or twice the same picture; and its own error."""
     if isinstance(reference, Mapping):
         spp = {"spp": int(reference["spp"]) // 2} if reference.get("spp", 1) > 1 else {}
         results = [run({**reference, **spp}, seed) for seed in REFERENCE_SEEDS]
         first, second = map(_picture, results)
-        if (first == second).all() and (aa := results[0].options["aa"]) > 1:
-            coarser = _picture(run({**reference, "aa": aa - 1}, REFERENCE_SEEDS[0]))
-            return (first, first), compare(first, coarser).rmse
-        return (first, second), compare(first, second).rmse / 2
+        aa = results[0].options["aa"]
+        if aa == 1 or (first != second).any():
+            return first, second, compare(first, second).rmse / 2
+        reference = reference, {**reference, "aa": aa - 1}
     if isinstance(reference, Sequence) and not isinstance(reference, str):
         first, second = (_picture(run(r, s)) for r, s in zip(reference, REFERENCE_SEEDS, strict=True))
-        return (first, first), compare(first, second).rmse
-    values, variance, _ = read_layer(reference)
-    picture = values.astype(np.float64)
-    return (picture, picture), 0.0 if variance is None else float(variance.mean()) ** 0.5
+        return first, first, compare(first, second).rmse
+    picture, variance, _ = read_layer(reference)
+    return picture, picture, 0.0 if variance is None else float(variance.mean()) ** 0.5
 
 
 def _picture(result: Result) -> np.ndarray:
-    image = np.asarray(result.image, np.float64)
-    bad = np.argwhere(~np.isfinite(image).all(axis=-1))
+    bad = np.argwhere(~np.isfinite(result.image).all(axis=-1))
     if len(bad):
         raise MrtError(f"{len(bad)} pixels are NaN or infinite, the first at {tuple(bad[0].tolist())}")
-    return image
+    return np.asarray(result.image, np.float64)
 
 
 def _measure(
-    run: Run, cases: Mapping[str, Options], shape: tuple[int, ...], repeats: int, progress: Progress
+    run: Run, cases: Mapping[str, Options], truth: np.ndarray, repeats: int, progress: Progress
 ) -> tuple[dict[str, list[Result]], dict[str, str]]:
-    """Return the results of cases, the cold run first, and why others failed.
+    """Return the results of cases, the cold and the warm run first, and why others failed.
 
     Each runs cold, warm, and ``repeats`` times in turn, so that a load on the machine meets all alike.
     """
@@ -324,41 +323,35 @@ def _measure(
     failed: dict[str, str] = {}
     runs: dict[str, list[Result]] = {name: [] for name in cases}
     with progress.stage(TITLE, len(cases) * (repeats + 2)) as advance:
-        for turn in range(-2, repeats):  # cold, warm, and those that count
-            for name in cases:
-                advance(1)
-                if name in failed:
-                    continue
+        for turn in range(-2, repeats):
+            for name in list(runs):
                 try:
                     if turn == -2:
                         dr.flush_kernel_cache()
-                    result = run(cases[name], max(turn, 0))
-                    if (image := _picture(result)).shape != shape:
-                        both = (f"{i[1]}x{i[0]}" for i in (image.shape, shape))
-                        sizes = " and the reference ".join(both)
-                        raise UsageError(f"it has {sizes} pixels: their sizes must be the same")
+                    runs[name].append(run(cases[name], max(turn, 0)))
+                    compare(_picture(runs[name][-1]), truth)  # raises for another size
                 except Exception as error:
                     failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())}"
-                    continue
-                runs[name] += [result] if turn != -1 else []
-    return {name: found for name, found in runs.items() if name not in failed}, failed
+                    del runs[name]
+                advance(1)
+    return runs, failed
 
 
-def _point(name: str, runs: Sequence[Result], halves: Halves, own_error: float) -> Point:
-    """Return the figures of a case; its first run was cold."""
-    images = [result.image for result in runs[1:]]
-    errors = [np.stack([(image - half).ravel() for image in images]) for half in halves]
+def _point(name: str, runs: Sequence[Result], halves: Sequence[np.ndarray], own_error: float) -> Point:
+    """Return the figures of a case; its first run was cold, its second is not counted."""
+    image, pictures = runs[2].image, np.array([result.image for result in runs[2:]], np.float64)
+    errors = [(pictures - half).reshape(len(pictures), -1) for half in halves]
     gram = errors[0] @ errors[1].T / errors[0].shape[1]
     seconds = np.array([result.timings.total - result.timings.load for result in runs])
     return Point.of(
         name,
-        seconds[1:],
+        seconds[2:],
         (gram + gram.T) / 2,
         cold=float(seconds[0]),
         compile=runs[0].timings.compile,
-        rays=dict(runs[1].rays),
-        image=images[0],
-        difference=compare(images[0], (halves[0] + halves[1]) / 2),
+        rays=dict(runs[2].rays),
+        image=image,
+        difference=compare(image, np.mean(halves, axis=0)),
         reference_error=own_error,
     )
 
@@ -370,39 +363,34 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
     """Add the diagram, the answers and the tables to a study; ``truth`` says what the reference is."""
     prefix, where = (f"{name}-", f"{name}: ") if name else ("", "")
     study.at_most(f"{where}cases that failed", len(found.failed), 0, "each of them could be rendered")
+    if found.failed:
+        reasons = [{"case": case, "why": why} for case, why in found.failed.items()]
+        study.records(f"{prefix}failed", f"{title}: cases that failed", reasons)
     if not found.points:
         return
-    points = [point for points in found.families.values() for point in points]  # curve after curve
     own = f"about {found.reference_error:.2g}; no claim is made below twice that."
     own = own if found.reference_error else "not known: every RMSE includes it."
     caption = ["Down and to the left is better. Bars are 95 % intervals, numbers those of the table."]
     caption += [f"Reference: {truth}."] if truth else []
     caption += [f"The RMSE of the reference itself is {own}", *found.verdicts]
-    figure = _diagram(found, points)
-    study.picture(f"{prefix}diagram", f"{title}: work and precision", figure, " ".join(caption))
+    study.picture(f"{prefix}diagram", f"{title}: work and precision", _diagram(found), " ".join(caption))
     if found.errors:
-        times: dict[str, dict[str, Any]] = {name: {"curve": name} for name in found.families}
-        for error in found.errors:
-            for curve, t in found.time_to(error).items():
-                times[curve][f"RMSE {error:g}"] = _shown(*t) if math.isfinite(t[0]) else "not reached"
-        what = f"{title}: seconds to an error"
+        reached = {f"RMSE {error:g}": found.time_to(error) for error in found.errors}
+        times = [
+            {"curve": curve} | {what: _shown(*t[curve]) for what, t in reached.items()}
+            for curve in found.families
+        ]
         note = "With 95 % intervals. Between cases, curves are straight in logarithms; beyond, unknown."
-        study.records(f"{prefix}times", what, [*times.values()], note, first=not name)
+        study.records(f"{prefix}times", f"{title}: seconds to an error", times, note, first=not name)
     note = "Medians of warm renders without loading the scene; cold: a first run. Errors in linear light."
-    study.records(f"{prefix}points", f"{title}: every case", _rows(points), note)
-    if found.failed:
-        reasons = [*found.failed.items()]
-        study.table(f"{prefix}failed", f"{title}: cases that failed", ["case", "why"], reasons)
+    study.records(f"{prefix}points", f"{title}: every case", _rows(found), note)
 
 
-def _rows(points: Sequence[Point]) -> list[dict[str, Any]]:
-    """Return the table of all cases."""
+def _rows(found: Findings) -> list[dict[str, Any]]:
+    """Return the table of all cases, curve after curve."""
 
     def interval(ends: Interval) -> str:
         return f"{ends[0]:.3g} to {ends[1]:.3g}" if np.isfinite(ends[0]) else "one repeat"
-
-    def known(value: float | None) -> float | str:
-        return "–" if value is None or np.isnan(value) else value
 
     return [
         {
@@ -414,19 +402,19 @@ def _rows(points: Sequence[Point]) -> list[dict[str, Any]]:
             "of it compiling, s": p.compile,
             "RMSE": p.rmse if p.resolved else "at the floor",
             "interval": interval(p.rmse_interval) if p.resolved else "",
-            "|bias|": known(p.bias),
+            "|bias|": p.bias,
             "interval of it": interval(p.bias_interval),
-            "1 / (variance × s)": known(p.efficiency),
+            "1 / (variance × s)": p.efficiency,
             "relMSE": p.difference.rel_mse,
             "largest": p.difference.largest,
-            "FLIP": known(p.difference.flip),
+            "FLIP": p.difference.flip,
             "rays": sum(p.rays.values()),
         }
-        for number, p in enumerate(points, 1)
+        for number, p in enumerate(chain(*found.families.values()), 1)
     ]
 
 
-def _diagram(found: Findings, points: Sequence[Point]) -> Any:
+def _diagram(found: Findings) -> Any:
     """Return the work-precision diagram: RMSE against seconds, both with intervals, and the floor.
 
     Points have the numbers of the table next to them.
@@ -434,21 +422,20 @@ def _diagram(found: Findings, points: Sequence[Point]) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 6), layout="constrained")
-    axes, floor = figure.subplots(), found.reference_error
-    errors = [p.rmse for p in points if p.rmse > 0] + ([floor] if floor else [])
+    axes, floor, numbers = figure.subplots(), found.reference_error, count(1)
+    errors = [e for e in (floor, *(p.rmse for p in found.points.values())) if e > 0]
     bottom = 0.4 * min(errors, default=1e-6)  # where cases without error are drawn
     for (name, curve), marker in zip(found.families.items(), cycle("osD^vP*X<>hp"), strict=False):
         places = np.array([[p.seconds, max(p.rmse, bottom)] for p in curve]).T
         ends = np.array([[p.seconds_interval, p.rmse_interval] for p in curve]).transpose(1, 2, 0)
         x, y = np.nan_to_num(np.maximum(np.stack([places - ends[:, 0], ends[:, 1] - places], axis=1), 0))
         style: dict[str, Any] = {"marker": marker, "markersize": 5, "linewidth": 1, "capsize": 2}
-        axes.errorbar(places[0], places[1], xerr=x, yerr=y, label=name, **style)
-    for number, point in enumerate(points, 1):
-        place = point.seconds, max(point.rmse, bottom)
-        axes.annotate(str(number), place, textcoords="offset points", xytext=(4, 4), fontsize=8)
+        axes.errorbar(*places, xerr=x, yerr=y, label=name, **style)
+        for place in places.T:
+            axes.annotate(next(numbers), place, textcoords="offset points", xytext=(4, 4), fontsize=8)
     if floor:
         axes.axhspan(bottom / 10, floor, color="0.9", zorder=0, label="within the reference's error")
-    if any(p.rmse == 0 for p in points):
+    if any(p.rmse == 0 for p in found.points.values()):
         axes.axhline(bottom, color="0.9", linewidth=8, zorder=0, label="no error")
     axes.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="RMSE")
     axes.set_ylim(bottom=0.8 * bottom)
