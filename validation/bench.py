@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.validation.tools import renders
@@ -28,6 +29,7 @@ from mrt_mitsuba.validation.tools.study import Bound
 from mrt_mitsuba.validation.tools.timing import in_turns, ratio_of, timed
 
 START_GOAL = 1.7
+DEVICE_SIZES = (800, 600), (4096, 4096)
 # What any program on Mitsuba waits for: import, variant, one kernel
 BARE = """
 from mrt_mitsuba import llvm
@@ -43,20 +45,18 @@ Row = dict[str, float]
 
 def rows(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     """Measure; yield each row with its name."""
-    from mrt_mitsuba import runtime
     from mrt_mitsuba.validation.studies import speed
 
-    repeats = 1 if given.quick else given.turns
     if given.device:
         runtime.use(given.device)
-        for width, height in ((80, 60),) if given.quick else ((800, 600), (4096, 4096)):
-            for pair in speed.against_mitsuba(speed.Extent(width, height, 1, range(5), repeats, 1)):
-                yield f"{pair.name}, {width}x{height}", speed.compare(pair, repeats)[0]
+        for width, height in DEVICE_SIZES:
+            for pair in speed.against_mitsuba(speed.Extent(width, height, 1, range(5), given.turns, 1)):
+                yield f"{pair.name}, {width}x{height}", speed.compare(pair, given.turns)[0]
         return
-    yield "mrt out 0 / a bare start of Mitsuba", start(repeats)
-    yield from cases(given, repeats)
-    for pair in () if given.small else speed.against_mitsuba(speed.QUICK if given.quick else speed.FULL):
-        yield pair.name, speed.compare(pair, repeats)[0] | {"goal": pair.goal}
+    yield "mrt out 0 / a bare start of Mitsuba", start(given.turns)
+    yield from cases(given)
+    for pair in () if given.small else speed.against_mitsuba(speed.FULL):
+        yield pair.name, speed.compare(pair, given.turns)[0] | {"goal": pair.goal}
 
 
 def start(turns: int) -> Row:
@@ -74,9 +74,9 @@ def start(turns: int) -> Row:
         return ratio_of(*in_turns(sides, turns)) | {"goal": START_GOAL}
 
 
-def cases(given: argparse.Namespace, turns: int) -> Iterator[tuple[str, Row]]:
+def cases(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     """Yield the cases of ``renders``, each side in a process of its own, in turns."""
-    names = [name for name in renders.CASES if "small" in name or not (given.small or given.quick)]
+    names = [name for name in renders.CASES if "small" in name or not given.small]
 
     def measure(python: str, turn: int) -> dict[str, float]:
         command = [python, str(renders.__file__), *names]
@@ -85,7 +85,7 @@ def cases(given: argparse.Namespace, turns: int) -> Iterator[tuple[str, Row]]:
         return found
 
     pythons = [sys.executable, *([given.before] if given.before else [])]
-    found = in_turns([partial(measure, python) for python in pythons], turns)
+    found = in_turns([partial(measure, python) for python in pythons], given.turns)
     for name in names:
         times = [[run[name] for run in side] for side in found]
         yield name, ratio_of(*times) if given.before else {"seconds": statistics.median(times[0])}
@@ -119,7 +119,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("--out", type=Path, default=Path("bench.json"), help="file to write (default: bench.json)")
     add("--compare", type=Path, help="a file of the same options; ratios above 1 are slower than then")
-    add("--quick", action="store_true", help="small pictures, one turn: a trial, not a measurement")
     add("--small", action="store_true", help="the start of the command and small renders alone")
     add("--before", metavar="PYTHON", help="a Python that has an earlier version, to take turns with")
     add("--turns", type=int, default=7, help="how often each side is measured (default: 7)")
@@ -138,8 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MrtError as error:
         print(f"make bench: {error}", file=sys.stderr)
         return error.exit_code
-    options = {name: getattr(given, name) for name in ("quick", "device", "turns")}
-    now = {"machine": machine(), "options": options, "rows": found}
+    now = {"machine": machine(), "options": {"device": given.device, "turns": given.turns}, "rows": found}
     with replacing(given.out) as (file,):
         file.write(json.dumps(now, indent=2).encode() + b"\n")
     return 0

@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from itertools import count
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ import mrt_mitsuba as mrt
 SMALL: dict[str, Any] = {"width": 64, "height": 48}
 ONE_RAY: dict[str, Any] = {"aamode": "none", "aa": 1, "lattice": "report", "focaldist": 0}
 SUPERSAMPLED: dict[str, Any] = ONE_RAY | {"aa": 4}
-FILTERS: dict[str, Any] = {"lattice": "report", "focaldist": 2.0}  # those of scene 3 by its number
 
 Nodes = dict[str, Any]
 Render = Callable[..., Any]
@@ -38,21 +36,13 @@ def load(nodes: Nodes) -> Any:
     return mi.load_dict(nodes)
 
 
-def _without(nodes: Nodes, *kinds: str) -> Nodes:
-    return {name: node for name, node in nodes.items() if not name.startswith(kinds)}
-
-
 def with_lights(number: int, **size: Any) -> Nodes:
     """Return scene 4 with its light from points above, each of its own brightness."""
-    nodes = _without(mrt.scene_dict(4, **size), "light_")
-    for i in range(number):
-        a, b, c = i * 0.754877666 % 1, i * 0.569840296 % 1, i * 0.362378 % 1  # evenly in the room
-        value = (6 / number) * (0.5 + a)
-        nodes[f"light_{i}"] = {
-            "type": "mrt_light",
-            "position": [10 * a, 4 + 16 * b, 10 * c],
-            "intensity": {"type": "rgb", "value": [value, value, value]},
-        }
+    nodes = mrt.scene_dict(4, **size)
+    places = np.outer(np.arange(number), (0.754877666, 0.569840296, 0.362378)) % 1  # evenly in the room
+    for i, (a, b, c) in enumerate(places.tolist()):  # also in the places of its own three
+        light = {"type": "mrt_light", "position": [10 * a, 4 + 16 * b, 10 * c]}
+        nodes[f"light_{i}"] = light | {"intensity": {"type": "rgb", "value": 6 / number * (0.5 + a)}}
     return nodes
 
 
@@ -67,13 +57,14 @@ def with_triangles(number: int, **size: Any) -> Nodes:
     first = np.stack([corner, corner + cells + 1, corner + 1], axis=1)
     second = np.stack([corner + 1, corner + cells + 1, corner + cells + 2], axis=1)
     faces = np.concatenate([first, second])[None].astype(np.uint32)
-    hills = {
+    nodes = mrt.scene_dict(0, **size)
+    nodes["plane_0"] = {
         "type": "mrt_mesh",
         "positions": mi.Bitmap(np.ascontiguousarray(positions, np.float32)),
         "faces": mi.Bitmap(np.ascontiguousarray(faces)),
         "bsdf": {"type": "ref", "id": "material_4"},
     }
-    return _without(mrt.scene_dict(0, **size), "plane_") | {"hills": hills}
+    return nodes
 
 
 def crowd(number: int, kind: str, **size: Any) -> Nodes:
@@ -83,23 +74,19 @@ def crowd(number: int, kind: str, **size: Any) -> Nodes:
     """
     import mitsuba as mi
 
-    nodes = _without(mrt.scene_dict(4, **size), "sphere_", "spheres")
-    material = next(name for name in nodes if name.startswith("material_"))
+    nodes = {name: node for name, node in mrt.scene_dict(4, **size).items() if not name.startswith("sphere")}
+    bsdf = {"type": "ref", "id": "material_0"}
     rng = np.random.default_rng(5)
     centers, radii = rng.uniform((1, 0, 1), (7.5, 6.5, 7.5), (number, 3)), rng.uniform(0.05, 0.25, number)
     if kind == "group":
-        numbers = np.column_stack([centers, radii]).astype(np.float32)
-        bsdf = {"type": "ref", "id": material}
-        group = {"type": "mrt_group", "kind": "sphere", "numbers": mi.Bitmap(numbers), "bsdf": bsdf}
-        return nodes | {"crowd": group}
+        numbers = mi.Bitmap(np.column_stack([centers, radii]).astype(np.float32))
+        return nodes | {"crowd": {"type": "mrt_group", "kind": "sphere", "numbers": numbers, "bsdf": bsdf}}
     half = rng.normal(size=(number, 3))
     half *= (radii / np.linalg.norm(half, axis=1))[:, None]
     for i, (center, radius, up) in enumerate(zip(centers, radii.tolist(), half, strict=True)):
-        place: Nodes = {"type": "sphere", "center": center.tolist()}
-        if kind == "cone":
-            ends = {"apex": (center + up).tolist(), "base_center": (center - up).tolist()}
-            place = {"type": "mrt_cone", **ends}
-        nodes[f"{kind}_{i}"] = {**place, "radius": radius, "bsdf": {"type": "ref", "id": material}}
+        ball = {"type": "sphere", "center": center.tolist()}
+        cone = {"type": "mrt_cone", "apex": (center + up).tolist(), "base_center": (center - up).tolist()}
+        nodes[f"{kind}_{i}"] = {**(cone if kind == "cone" else ball), "radius": radius, "bsdf": bsdf}
     return nodes
 
 
@@ -111,19 +98,18 @@ def of_scene(nodes: Callable[..., Nodes], size: tuple[int, int], options: dict[s
     return partial(mrt.render, load(nodes(width=size[0], height=size[1])), **options)
 
 
-def _with_update(**options: Any) -> Render:
+def _with_update() -> Render:
     """Return a render of a loaded scene that changes a colour first."""
     import mitsuba as mi
 
     scene = load(mrt.scene_dict(3, **SMALL))
     parameters = mi.traverse(scene)
     key = next(name for name in list(parameters.keys()) if name.endswith("diffuse_reflectance.value"))
-    turns = count()
 
     def render() -> Any:
-        parameters[key] = mi.Color3f(0.3 + 0.001 * (next(turns) % 100), 0.2, 0.1)
+        parameters[key] = mi.Color3f(time.perf_counter() % 1, 0.2, 0.1)  # another each time
         parameters.update()
-        return mrt.render(scene, **options)
+        return mrt.render(scene, **ONE_RAY)
 
     return render
 
@@ -155,29 +141,26 @@ def _box(width: int, height: int) -> Nodes:
 REPORT = [partial(mrt.scene_dict, number) for number in range(5)]
 LARGE, MIDDLE, LITTLE, TINY = (800, 600), (400, 300), (160, 120), (64, 48)
 PATH: dict[str, Any] = {"integrator": "path"}
-ROWS: tuple[tuple[str, int, Callable[[], Render]], ...] = (  # how many renders to average, what makes them
-    *((f"scene {i}", 1, partial(of_scene, nodes, LARGE, SUPERSAMPLED)) for i, nodes in enumerate(REPORT)),
-    ("a million triangles", 2, partial(of_scene, partial(with_triangles, 10**6), MIDDLE, SUPERSAMPLED)),
-    ("200 lights", 2, partial(of_scene, partial(with_lights, 200), LITTLE, ONE_RAY)),
-    ("a thousand cones", 2, partial(of_scene, partial(crowd, 1000, "cone"), MIDDLE, SUPERSAMPLED)),
-    ("to an error", 1, partial(of_scene, _box, (96, 96), PATH | {"target": 0.02})),
-    ("aamode=noise", 1, partial(of_scene, _box, (96, 96), PATH | {"aamode": "noise", "spp": 64})),
-    ("small, prepared", 100, _prepared),
-    ("small, loaded", 100, partial(of_scene, REPORT[3], TINY, ONE_RAY)),
-    ("small, with an update", 100, partial(_with_update, **ONE_RAY)),
-    ("small, from its number", 100, lambda: partial(mrt.render, 3, **SMALL, **ONE_RAY)),
-    ("small, film", 100, partial(of_scene, REPORT[3], TINY, {"aamode": "none", "aa": 1})),
-    ("small, filters", 50, partial(of_scene, REPORT[3], TINY, FILTERS)),
-    ("small, with an update, filters", 50, partial(_with_update, **FILTERS)),
-    ("small, from its number, filters", 50, lambda: partial(mrt.render, 3, **SMALL)),
-    ("small, mi.render", 100, _by_mitsuba),
-)
-CASES = {name: (make, number) for name, number, make in ROWS}
+CASES: dict[str, tuple[int, Callable[[], Render]]] = {  # how many renders to average, what makes them
+    **{f"scene {i}": (1, partial(of_scene, nodes, LARGE, SUPERSAMPLED)) for i, nodes in enumerate(REPORT)},
+    "a million triangles": (2, partial(of_scene, partial(with_triangles, 10**6), MIDDLE, SUPERSAMPLED)),
+    "200 lights": (2, partial(of_scene, partial(with_lights, 200), LITTLE, ONE_RAY)),
+    "a thousand cones": (2, partial(of_scene, partial(crowd, 1000, "cone"), MIDDLE, SUPERSAMPLED)),
+    "to an error": (1, partial(of_scene, _box, (96, 96), PATH | {"target": 0.02})),
+    "aamode=noise": (1, partial(of_scene, _box, (96, 96), PATH | {"aamode": "noise", "spp": 64})),
+    "small, prepared": (100, _prepared),
+    "small, loaded": (100, partial(of_scene, REPORT[3], TINY, ONE_RAY)),
+    "small, with an update": (100, _with_update),
+    "small, from its number": (100, lambda: partial(mrt.render, 3, **SMALL, **ONE_RAY)),
+    "small, film": (100, partial(of_scene, REPORT[3], TINY, {"aamode": "none", "aa": 1})),
+    "small, filters": (50, partial(of_scene, REPORT[3], TINY, {"lattice": "report", "focaldist": 2.0})),
+    "small, mi.render": (100, _by_mitsuba),
+}
 
 
 def seconds(name: str) -> float:
     """Return the mean seconds of warm renders of a case."""
-    make, number = CASES[name]
+    number, make = CASES[name]
     render = make()
     for _ in range(1 if number < 10 else 3):
         render()
