@@ -25,7 +25,6 @@ from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.validation.tools import renders
 from mrt_mitsuba.validation.tools.report import machine, prepare
-from mrt_mitsuba.validation.tools.study import Bound
 from mrt_mitsuba.validation.tools.timing import in_turns, ratio_of, timed
 
 START_GOAL = 1.7
@@ -39,7 +38,9 @@ dr.eval(dr.arange(mi.Float, 16) + dr.opaque(mi.Float, 1))
 dr.sync_thread()
 """
 
-# A row has "seconds"; compared with another side, it has what ``ratio_of`` returns, and a "goal" of the ratio
+# A row has "seconds"; compared with another side, it has those of ``ratio_of``, and a "goal" of the ratio.
+# "to then": how many times the ratio, or else the seconds, are those of an earlier file
+COLUMNS = ("seconds", "other_seconds", "ratio", "low", "high", "goal", "to then")
 Row = dict[str, float]
 
 
@@ -91,18 +92,9 @@ def cases(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
         yield name, ratio_of(*times) if given.before else {"seconds": statistics.median(times[0])}
 
 
-def line(name: str, row: Row, before: Row | None = None) -> str:
-    """Return a row as text; with an earlier one, its figure is followed by the ratio to then."""
-    key = "ratio" if "ratio" in row else "seconds"
-    earlier = f" ({row[key] / before[key]:.2f}x)" if before and key in before else ""
-    text = f"{name:<62}{1000 * row['seconds']:>10.2f}"
-    if key == "seconds":
-        return text + earlier
-    low, high = row["low"], row["high"]
-    text += f"{1000 * row['other_seconds']:>10.2f}{row['ratio']:>8.2f}{earlier}  {low:.2f} to {high:.2f}"
-    if "goal" not in row:
-        return text
-    return f"{text}  {row['goal']:g} {Bound(name, row['ratio'], row['goal'], interval=(low, high)).verdict}"
+def line(name: str, row: Row) -> str:
+    """Return a row as text, in ``COLUMNS``."""
+    return f"{name:<62}" + "".join(f"{row[c]:>14.4g}" if c in row else 14 * " " for c in COLUMNS).rstrip()
 
 
 def read(path: Path) -> dict[str, Row]:
@@ -127,11 +119,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         before = read(given.compare) if given.compare else {}
         prepare(given.out.parent, given.out.name)
-        print(f"{'milliseconds':<62}{'now':>10}{'other':>10}{'ratio':>8}  quartiles")
+        print(62 * " " + "".join(f"{column:>14}" for column in COLUMNS))
         found: dict[str, Row] = {}
         for name, row in rows(given):
-            found[name] = row
-            print(line(name, row, before.get(name)), flush=True)
+            key = "ratio" if "ratio" in row else "seconds"
+            then = before.get(name, {}).get(key)
+            found[name] = row | ({"to then": row[key] / then} if then else {})
+            print(line(name, found[name]), flush=True)
     except UsageError as error:
         parser.error(str(error))
     except MrtError as error:

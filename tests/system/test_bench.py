@@ -52,15 +52,17 @@ def test_both_sides_take_turns(monkeypatch, tmp_path):
     assert rows["small"]["ratio"] == 1 and rows["small"]["other_seconds"] == rows["small"]["seconds"] > 0
 
 
-def test_comparison_prints_ratios(found):
+def test_comparison_prints_ratios(found, tmp_path, monkeypatch, capsys):
     before = bench.read(found)
-    *_, name = before
-    small, row = before["small, loaded"], before[name] | {"ratio": 3 * before[name]["ratio"], "goal": 0.0}
-    assert "(2.00x)" in bench.line("small, loaded", small | {"seconds": 1.0}, small)
-    text = bench.line(name, row, before[name])
-    assert "(3.00x)" in text and text.endswith("0 slower")
-    assert "x)" not in bench.line(name, row)
-    assert bench.line(name, row | {"low": 0.9, "high": 1.1, "goal": 1.0}).endswith("1 open")
+    twice = [
+        (name, row | {k: 2 * row[k] for k in row if k in ("seconds", "ratio")})
+        for name, row in before.items()
+    ]
+    monkeypatch.setattr(bench, "rows", lambda given: iter([*twice, ("new", {"seconds": 1.0})]))
+    assert bench.main(["--compare", str(found), "--out", str(tmp_path / "b.json")]) == 0
+    *_, columns, start, _, _, _, _, new = capsys.readouterr().out.splitlines()
+    assert columns.endswith("to then") and start.split()[-2:] == ["1.7", "2"] and new.endswith(" 1")
+    assert bench.read(tmp_path / "b.json")["small, loaded"] == {"seconds": 1.0, "to then": 2.0}
 
 
 @pytest.mark.parametrize("text", ["{}", "[1]", "no json", '{"rows": 3}'])

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies import bsdf_laws
 from mrt_mitsuba.validation.studies.roughconductor import POINTWISE, compare_pointwise
-from mrt_mitsuba.validation.tools.bsdf_probe import at_angle, draw, evaluate, interaction, lobe_pairs, rgb
+from mrt_mitsuba.validation.tools.bsdf_probe import at_angle, evaluate, lobe_pairs, rgb
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -33,6 +34,16 @@ def bsdf(**parameters: Any) -> mi.BSDF:
 
 def colored(**parameters: Any) -> mi.BSDF:
     return bsdf(diffuse_reflectance=rgb(KD), specular_reflectance=rgb(KS), **parameters)
+
+
+def interaction(wi: np.ndarray, uv: Any = (0, 0)) -> Any:
+    """A surface point seen from directions [N, 3] or [3], at texture coordinates [N, 2] or [2]."""
+    columns = (np.array(np.transpose(x), np.float32, order="C") for x in (wi, uv))
+    return probe.interaction(*(kind(x) for kind, x in zip((mi.Vector3f, mi.Point2f), columns, strict=True)))
+
+
+def draw(bsdf: mi.BSDF, wi: np.ndarray, count: int) -> probe.Lanes:
+    return probe.Probe(bsdf).sample(wi, np.random.default_rng(0).random((count, 3), np.float32), np.zeros(2))
 
 
 @pytest.mark.parametrize("name", bsdf_laws.MATERIALS)

@@ -1,19 +1,16 @@
-"""Questions put to a BSDF in its local frame: values, densities, samples and albedos, as numpy arrays.
+"""Questions put to a BSDF in its local frame, in the current variant: values, densities and albedos.
 
-Directions are unit vectors [N, 3] or [3], used in float32; the normal is +z. Everything works on the current
-variant; what draws samples needs a vectorised one.
+Directions are unit vectors [N, 3] or [3], used in float32; the normal is +z.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.validation.checks import probe
-from mrt_mitsuba.validation.checks.probe import Array, unit
+from mrt_mitsuba.validation.checks.probe import Array, Probe, unit
 
 
 def rgb(value: float | Sequence[float]) -> dict[str, Any]:
@@ -48,25 +45,12 @@ def lobe_pairs(count: int, alpha: float, *, least_cos: float = 0.02, seed: int =
     return unit(wi[:count]), unit(wo[:count])
 
 
-def interaction(wi: Array, uv: Array | None = None) -> Any:
-    """Return a surface point seen from directions [N, 3] or [3], at texture coordinates [N, 2] or [2]."""
-    uv = np.zeros(2) if uv is None else uv
-    columns = (np.ascontiguousarray(np.transpose(x), np.float32) for x in (wi, uv))
-    return probe.interaction(*(kind(x) for kind, x in zip((mi.Vector3f, mi.Point2f), columns, strict=True)))
-
-
-def evaluate(bsdf: Any, wi: Array, wo: Array, ctx: Any = None) -> list[Array]:
+def evaluate(bsdf: Any, wi: Array, wo: Array) -> list[Array]:
     """Return f cos θo [N, channels] and density [N] of pairs of directions [N, 3]."""
-    return probe.Probe(bsdf).pair(wi, wo, np.zeros((len(wi), 2)), ctx)
+    return Probe(bsdf).pair(wi, wo, np.zeros(2))
 
 
-def draw(bsdf: Any, wi: Array, count: int, ctx: Any = None, *, seed: int = 0) -> probe.Lanes:
-    """Return ``count`` samples for one direction [3]."""
-    u = np.random.default_rng(seed).random((count, 3), np.float32)
-    return probe.Probe(bsdf).sample(np.asarray(wi), u, np.zeros(2), ctx)
-
-
-def albedo(bsdf: Any, wi: Array, ctx: Any = None, *, resolution: int = 700) -> Array:
+def albedo(bsdf: Any, wi: Array, *, resolution: int = 700) -> Array:
     """Return ∫ f cos θo dωo [channels] by the midpoint rule in cos θo and φo, finer at the mirror azimuth.
 
     With 700² points the error is below 1e-4 for alpha >= 0.1.
@@ -77,16 +61,10 @@ def albedo(bsdf: Any, wi: Array, ctx: Any = None, *, resolution: int = 700) -> A
     phi = np.arctan2(-wi[1], -wi[0]) + np.pi * s * np.abs(s)
     sin = np.sqrt(1 - cos**2)
     wo = np.stack([sin * np.cos(phi), sin * np.sin(phi), cos], axis=-1).reshape(-1, 3).astype(np.float32)
-    value, _ = evaluate(bsdf, np.broadcast_to(wi, wo.shape), wo, ctx)
+    value, _ = evaluate(bsdf, wi, wo)
     # dω = d cos dφ, dφ = 2π |s| ds, ds = 2 dv
     weight = np.broadcast_to(4 * np.pi * np.abs(s), (resolution, resolution)).ravel() / resolution**2
     return (value.astype(np.float64) * weight[:, None]).sum(axis=0)
-
-
-def largest(values: Iterable[float]) -> float:
-    """Return the largest number; NaN without any, or if one is NaN, which Python's ``max`` would overlook."""
-    found = np.fromiter(values, float)
-    return float(found.max()) if len(found) else float("nan")
 
 
 def relative_error(found: Array, expected: Array) -> Array:

@@ -10,10 +10,8 @@ import json
 import os
 import platform
 import re
-import tempfile
 from collections.abc import Sequence
 from datetime import datetime, timezone
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,6 @@ from mrt_mitsuba.output.files import to_8bit
 from mrt_mitsuba.output.replacing import check_target, replacing
 from mrt_mitsuba.validation.tools.study import Study
 
-DOTS_PER_INCH = 110
 # Pictures this many times wider than high, and plots of so many inches, have a row of the page to themselves
 BROAD, COLUMN = 2, 6.5
 VALIDATION = "Validation of mrt-mitsuba"
@@ -35,10 +32,10 @@ VALIDATION = "Validation of mrt-mitsuba"
 
 def machine() -> dict[str, Any]:
     """Return everything that bears on speed or accuracy, without the name of the machine."""
-    found: dict[str, Any] = dict(runtime.versions())
+    versions = dict(runtime.versions())
     return {
-        "version": found.pop("mrt-mitsuba"),
-        **found,
+        "version": versions.pop("mrt-mitsuba"),
+        **versions,
         "python": platform.python_version(),
         "cores": usable_cores(),
         "system": f"{platform.system()} {platform.machine()}",
@@ -78,22 +75,35 @@ def save(
 ) -> None:
     """Write every file of the report into a folder, made if need be; ``title`` heads the page.
 
-    A figure is drawn once: the file and the page hold the same bytes. Raises ``OutputError``.
+    Raises ``OutputError``.
     """
+    prepare(Path(folder))
+    for name, data in _files(studies, title, quick).items():
+        with replacing(Path(folder) / name) as (file,):
+            file.write(data)
+
+
+def notebook(study: Study, *, title: str) -> str:
+    """Return the page of a study as a frame for a notebook, whose own style it leaves alone."""
+    page = html.escape(_files([study], title)["index.html"].decode())
+    return f'<iframe srcdoc="{page}" style="width: 100%; height: 40rem; border: 0"></iframe>'
+
+
+def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[str, bytes]:
+    """Return every file of the report by name. A figure is drawn once, for its file and for the page."""
     import jinja2
 
-    place = Path(folder)
-    prepare(place)
+    files: dict[str, bytes] = {}
     images = {study.name: {n: _drawn(i["content"]) for n, i in study.images.items()} for study in studies}
     for study in studies:
-        files = {f"{name}.png": image["data"] for name, image in images[study.name].items()}
+        parts = {f"{name}.png": image["data"] for name, image in images[study.name].items()}
         for name, table in study.tables.items():
             text = io.StringIO()
             csv.writer(text, lineterminator="\n").writerows([table["columns"], *table["rows"]])
-            files[f"{name}.csv"] = text.getvalue().encode()
-        for name, data in files.items():
+            parts[f"{name}.csv"] = text.getvalue().encode()
+        for name, data in parts.items():
             words = (re.sub(r"[^A-Za-z0-9.]+", "-", n).strip("-.").lower() for n in (study.name, name))
-            _write(place / "-".join(words), data)
+            files["-".join(words)] = data
     result = {
         **machine(),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -101,20 +111,15 @@ def save(
         "passed": all(study.passed for study in studies),
         "studies": {study.name: study.summary() for study in studies},
     }
-    _write(place / "summary.json", json.dumps(result, indent=2, allow_nan=False).encode() + b"\n")
-    template = (resources.files(__package__) / "templates" / "report.html").read_text("utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    environment.filters |= {"cell": cell, "base64": lambda data: base64.b64encode(data).decode()}
+    loader = jinja2.FileSystemLoader(Path(__file__).parent / "templates")
+    pages = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
+    pages.filters |= {"cell": cell, "base64": lambda data: base64.b64encode(data).decode()}
     shown = {**result, "studies": studies, "images": images, "title": title, "explain": title == VALIDATION}
-    _write(place / "index.html", environment.from_string(template).render(shown).encode())
-
-
-def notebook(study: Study, *, title: str) -> str:
-    """Return the page of a study as a frame for a notebook, whose own style it leaves alone."""
-    with tempfile.TemporaryDirectory() as folder:
-        save(folder, study, title=title)
-        page = (Path(folder) / "index.html").read_text("utf-8")
-    return f'<iframe srcdoc="{html.escape(page)}" style="width: 100%; height: 40rem; border: 0"></iframe>'
+    page = pages.get_template("report.html").render(shown)
+    summary = json.dumps(result, indent=2, allow_nan=False) + "\n"
+    return files | {"summary.json": summary.encode(), "index.html": page.encode()}
 
 
 def _drawn(content: Any) -> dict[str, Any]:
@@ -125,17 +130,14 @@ def _drawn(content: Any) -> dict[str, Any]:
         PIL.Image.fromarray(to_8bit(content.astype(np.float32), "srgb")).save(buffer, format="PNG")
     else:
         kind, broad = "plot", content.get_figwidth() > COLUMN
-        content.savefig(buffer, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight", facecolor="white")
+        content.savefig(buffer, format="png", dpi=110, bbox_inches="tight", facecolor="white")
     return {"data": buffer.getvalue(), "kind": kind, "broad": broad}
 
 
 def cell(value: Any) -> str:
-    """Return a value as people read it: floats to four digits, the rest as it is."""
+    """Return a value as people read it: floats to four digits, a dash for what is not known."""
+    if value is None or value != value:
+        return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.4g}" if isinstance(value, float | np.floating) else str(value)
-
-
-def _write(path: Path, data: bytes) -> None:
-    with replacing(path) as (file,):
-        file.write(data)
