@@ -187,7 +187,7 @@ class RenderSettings:
         return self.target if isinstance(self.target, float) else None
 
     def model(self) -> dict[str, Any]:
-        """Return what is given about a model and its view, as ``obj.model_scene`` takes it.
+        """Return what is given about a model and its view, as ``obj.obj_scene`` takes it.
 
         Raises ``UsageError`` for a view that shows nothing.
         """

@@ -14,7 +14,7 @@ from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import check, choice
 from mrt_mitsuba.output.replacing import replacing
-from mrt_mitsuba.scene.loading import rewrite_file
+from mrt_mitsuba.scene.loading import load_file
 from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE, Scene
 from mrt_mitsuba.scene.open import in_terms
 from mrt_mitsuba.scene.report import report_scene
@@ -40,11 +40,10 @@ def scene_dict(
     flavor that cannot be had.
     """
     check("flavor", choice(*FLAVORS), flavor)
-    given = {"width": (SIDE, width), "height": (SIDE, height), "fresnel": (FRESNEL, fresnel)}
-    options = {name: check(name, kind, value) for name, (kind, value) in given.items() if value is not None}
+    width, height = check("width", SIDE, width), check("height", SIDE, height)
     runtime.use()
     terms = scene if isinstance(scene, Scene) else report_scene(scene)
-    result = terms.to_dict(**options)
+    result = terms.to_dict(width=width, height=height, fresnel=check("fresnel", FRESNEL, fresnel))
     return result if flavor == "mrt" else _stock(result, terms)
 
 
@@ -80,7 +79,7 @@ def write_xml(
             raise UsageError(f"{useless[0]} is of no use with an XML file, which is written as it is")
         runtime.use()
         budget = Budget.of(None)
-        text, values = rewrite_file(os.fspath(scene), budget, **params or {})
+        text, values = load_file(os.fspath(scene), params or {}, budget, as_text=True)
         focus = {name: values[name] for name in ("focaldist", "focalrange") if name in values}
         inputs: Iterable[str] = budget.inputs
     elif params:
@@ -90,7 +89,13 @@ def write_xml(
         wide, high = width or SIZE[0], height or SIZE[1]
         nodes = scene_dict(terms, fresnel=fresnel or "schlick", width=wide, height=high)
         files = _put_into_files(nodes, os.path.splitext(os.fspath(path))[0], flavor)
-        text = _xml(_stock(nodes, terms) if flavor == "stock" else nodes)
+        nodes = _stock(nodes, terms) if flavor == "stock" else nodes
+        import mitsuba as mi
+
+        variant = runtime.use()
+        runtime.use("scalar_rgb")  # where the writer looks plugins up, whatever the current variant
+        runtime.use(variant)
+        text = mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(variant), nodes))
         if terms.focal_distance is not None:
             focus = {"focaldist": terms.focal_distance, "focalrange": terms.focal_range}
         inputs = terms.files
@@ -100,15 +105,6 @@ def write_xml(
         for stream, content in zip(opened, (*files.values(), text.encode()), strict=True):
             stream.write(content)
     return [*files, os.fspath(path)]
-
-
-def _xml(nodes: dict[str, Any]) -> str:
-    import mitsuba as mi
-
-    variant = runtime.use()
-    runtime.use("scalar_rgb")  # where the writer looks plugins up, whatever the current variant
-    runtime.use(variant)
-    return str(mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(variant), nodes)))
 
 
 def _put_into_files(nodes: dict[str, Any], stem: str, flavor: str) -> dict[str, bytes]:
@@ -126,8 +122,7 @@ def _put_into_files(nodes: dict[str, Any], stem: str, flavor: str) -> dict[str, 
         if kind == "mrt_mesh" or (kind == "mrt_cone" and flavor == "stock"):
             file, bsdf, stream = f"{stem}_{name}.ply", node.pop("bsdf"), mi.MemoryStream()
             mi.load_dict(node).write_ply(stream)
-            stream.seek(0)
-            files[file] = bytes(stream.read(stream.size()))
+            files[file] = stream.raw_buffer()
             flat = {"face_normals": True} if kind == "mrt_mesh" else {}
             nodes[name] = {"type": "ply", "filename": os.path.basename(file), **flat, "bsdf": bsdf}
     return files
@@ -145,12 +140,11 @@ def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
             result[name] = _stock_bsdf(node)
         elif kind == "mrt_light":  # with falloff, of the same irradiance at the camera's target
             squared = sum((a - b) ** 2 for a, b in zip(node["position"], scene.camera.target, strict=True))
-            color = {**node["intensity"], "value": _times(squared, node["intensity"]["value"])}
-            result[name] = {**node, "type": "point", "intensity": color}
+            value = [squared * c for c in node["intensity"]["value"]]
+            result[name] = {**node, "type": "point", "intensity": {"type": "rgb", "value": value}}
         elif kind == "mrt_plane":
-            square = _facing(
-                _times(-node["distance"], _unit(node["normal"])), node["normal"], STOCK_EXTENT / 2
-            )
+            foot = [-node["distance"] * c for c in _unit(node["normal"])]
+            square = _facing(foot, node["normal"], STOCK_EXTENT / 2)
             result[name] = {"type": "rectangle", "to_world": square, "bsdf": node["bsdf"]}
         elif kind == "mrt_cylinder":  # an open tube, and at each end a disc that faces away from the other
             result[f"{name}_tube"] = {**result.pop(name), "type": "cylinder"}
@@ -166,25 +160,16 @@ def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
 
 def _stock_bsdf(node: dict[str, Any]) -> dict[str, Any]:
     """Return ``roughplastic``, or ``diffuse`` where nothing is reflected; no colour exceeds 1."""
-    colors = {}
-    for name in ("diffuse_reflectance", "specular_reflectance"):
-        color = node[name]
+    colors = {name: dict(node[name]) for name in ("diffuse_reflectance", "specular_reflectance")}
+    for color in colors.values():
         if color["type"] == "rgb":
-            color = {**color, "value": [min(c, 1.0) for c in color["value"]]}
-        elif color["type"] == "mrt_texture":
-            # The nearest texel as stored; half a texel off the report's look-up, which shrinks the picture so
-            # far
-            stored = {"raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
-            color = {"type": "bitmap", "filename": color["filename"], **stored}
-        colors[name] = color
-    if node["specular_reflectance"].get("value") == [0.0, 0.0, 0.0]:
+            color["value"] = [min(c, 1.0) for c in color["value"]]
+        elif color["type"] == "mrt_texture":  # the nearest texel as stored, half a texel off the report's
+            color |= {"type": "bitmap", "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+    if colors["specular_reflectance"].get("value") == [0.0, 0.0, 0.0]:
         return {"type": "diffuse", "reflectance": colors["diffuse_reflectance"]}
     rough = {"alpha": max(abs(node["alpha"]), 1e-4), "int_ior": node["int_ior"], "ext_ior": 1.0}
     return {"type": "roughplastic", "distribution": "beckmann", **rough, **colors}
-
-
-def _times(factor: float, vector: list[float]) -> list[float]:
-    return [factor * c for c in vector]
 
 
 def _unit(vector: list[float]) -> list[float]:
@@ -199,4 +184,4 @@ def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
     normal = _unit(normal)
     up = [0, 0, 1] if abs(normal[2]) < 0.9 else [1, 0, 0]
     to_world = mi.ScalarTransform4f().look_at(center, list(map(operator.add, center, normal)), up)
-    return to_world @ mi.ScalarTransform4f().scale([half_size, half_size, 1])
+    return to_world.scale([half_size, half_size, 1])

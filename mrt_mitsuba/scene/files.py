@@ -22,19 +22,18 @@ def require_file(path: str | os.PathLike[str]) -> None:
     name = os.fspath(path)
     try:
         mode = os.stat(path).st_mode
-        if stat.S_ISDIR(mode):
-            problem = "it is a folder; name a file in it"
-        elif not stat.S_ISREG(mode):
-            problem = "it is not a regular file; copy its content into one"
-        elif not os.access(path, os.R_OK):
-            problem = f"permission denied; try chmod +r {name}"
-        else:
-            return
+        problems = {
+            "it is a folder; name a file in it": stat.S_ISDIR(mode),
+            "it is not a regular file; copy its content into one": not stat.S_ISREG(mode),
+            f"permission denied; try chmod +r {name}": not os.access(path, os.R_OK),
+        }
+        problem = next((problem for problem, holds in problems.items() if holds), "")
     except (FileNotFoundError, NotADirectoryError):
         problem = f"there is no such file in {os.path.dirname(os.path.abspath(name))}"
     except (OSError, ValueError) as error:  # also of a zero byte in the name
         problem = getattr(error, "strerror", None) or str(error)
-    raise SceneError(f"cannot read {name or repr(name)}: {problem}")
+    if problem:
+        raise SceneError(f"cannot read {name or repr(name)}: {problem}")
 
 
 def read_text(path: Path) -> bytes:
@@ -44,10 +43,7 @@ def read_text(path: Path) -> bytes:
     Raises ``SceneError`` if the file cannot be read as text.
     """
     require_file(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SceneError(f"cannot read {path}: {error.strerror or error}") from None
+    data = path.read_bytes()
     if b"\0" in data:
         raise SceneError(f"{path}: is not a text file (it holds a zero byte); export it as OBJ or MTL text")
     data = re.sub(rb"\r\n?", b"\n", data).removeprefix(b"\xef\xbb\xbf") + b"\n"
@@ -77,12 +73,8 @@ def find(name: str, folders: list[Path]) -> Path | None:
 
     Backslashes may separate folders.
     """
-    for form in (name, name.replace("\\", "/")):
-        for folder in folders:
-            candidate = os.path.join(folder, form)
-            if os.path.isfile(candidate) and os.access(candidate, os.R_OK):
-                return Path(candidate)
-    return None
+    places = (folder / form for form in (name, name.replace("\\", "/")) for folder in folders)
+    return next((place for place in places if os.path.isfile(place) and os.access(place, os.R_OK)), None)
 
 
 def picture_size(path: str) -> tuple[int, int] | None:

@@ -29,12 +29,12 @@ DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from ab
 MOST_SAMPLES = 2**24  # of a pixel; some samplers divide by none, or never end at 2^31
 _PICTURES = ("mrt_texture", "bitmap", "envmap")  # plugins that read one
 
-# The lines of a traceback, all indented except the first, and the type of this project's error
-_TRACEBACK = re.compile(
+# A traceback, all indented except its first line, with the type of this project's error; and the place in
+# Mitsuba's own sources where an error was raised
+_ORIGIN = re.compile(
     r"Traceback \(most recent call last\):\n(?:[ \t][^\n]*\n|\n)*(?:\w*ParameterError: )?"
+    r"|\[\w+\.(?:cpp|h):\d+\] "
 )
-# Where in Mitsuba's own sources an error was raised
-_CODE_PLACE = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
 
 
 def load_dict(
@@ -55,20 +55,27 @@ def load_dict(
         return _instantiate(state, merge)
 
 
-def load_file(path: str, budget: Budget | None = None, **parameters: Any) -> tuple[Any, Mapping[str, str]]:
+def load_file(
+    path: str, parameters: Mapping[str, Any], budget: Budget | None = None, *, as_text: bool = False
+) -> tuple[Any, Mapping[str, str]]:
     """Return the scene of an XML file, and its ``$parameters`` with the values given, or the defaults.
 
+    ``as_text``: return it as XML, with includes and parameters filled in, and files by their whole path.
     Raises ``SceneError``, and ``UsageError`` for another kind of file or a texture too large for the budget.
     """
-    with _file(path, budget, parameters) as (state, values):
-        return _instantiate(state), values
-
-
-def rewrite_file(path: str, budget: Budget, **parameters: Any) -> tuple[str, Mapping[str, str]]:
-    """Return what ``load_file`` does as XML: includes and parameters filled in, files by their whole path."""
     import mitsuba as mi
 
-    with _file(path, budget, parameters) as (state, values):
+    require_file(path)
+    if not path.lower().endswith(".xml"):
+        raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
+    budget = budget or Budget.of(None)
+    given = {key: str(value) for key, value in parameters.items()}
+    with _loading(path, os.path.dirname(path) or "."):
+        values = _check_xml(path, given, budget.inputs)
+        state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), path, **given)
+        _check_nodes(state.nodes, path, budget)
+        if not as_text:
+            return _instantiate(state), values
         for node in state.nodes:
             if isinstance(node.props.get("filename", None), str):
                 node.props["filename"] = os.path.abspath(_resolved(node.props["filename"]))
@@ -81,25 +88,6 @@ def declared(path: str) -> dict[str, str]:
 
 
 # ---------------------------------------------- Mitsuba's parser ---------------------------------------
-
-
-@contextlib.contextmanager
-def _file(
-    path: str, budget: Budget | None, parameters: Mapping[str, Any]
-) -> Iterator[tuple[Any, Mapping[str, str]]]:
-    """Parse an XML file; within the block, its folder is searched for data."""
-    import mitsuba as mi
-
-    require_file(path)
-    if not path.lower().endswith(".xml"):
-        raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
-    budget = budget or Budget.of(None)
-    given = {key: str(value) for key, value in parameters.items()}
-    with _loading(path, os.path.dirname(path) or "."):
-        values = _check_xml(path, given, budget.inputs)
-        state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), path, **given)
-        _check_nodes(state.nodes, path, budget)
-        yield state, values
 
 
 def _check_nodes(nodes: Iterable[Any], name: str, budget: Budget) -> None:
@@ -139,9 +127,8 @@ def _loading(name: str, folder: str | None = None) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        # Mitsuba quotes the traceback, too, where the plugin is written in Python
-        text = _CODE_PLACE.sub("", _TRACEBACK.sub("", str(error)))
-        raise SceneError(f"cannot load {name}: {' '.join(text.split())}") from error
+        text = " ".join(_ORIGIN.sub("", str(error)).split())
+        raise SceneError(f"cannot load {name}: {text}") from error
     finally:
         mi.set_file_resolver(before)
 
@@ -230,14 +217,12 @@ def _elements(file: str) -> list[tuple[str, dict[str, str]]]:
         if len(inside) > DEEPEST:
             raise SceneError(f"cannot load {file}: it is nested more than {DEEPEST} levels deep")
 
-    def end(tag: str) -> None:
-        inside.pop()
-
     def entity(name: str, *declaration: object) -> None:  # which Mitsuba's parser reads in another way
         raise SceneError(f"cannot load {file}: it declares the entity {name}; write the text in its place")
 
     parser = expat.ParserCreate("utf-8")
-    parser.StartElementHandler, parser.EndElementHandler, parser.EntityDeclHandler = start, end, entity
+    parser.StartElementHandler, parser.EntityDeclHandler = start, entity
+    parser.EndElementHandler = lambda tag: inside.pop()
     try:
         with open(file, "rb") as stream:
             parser.ParseFile(stream)

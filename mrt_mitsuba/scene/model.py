@@ -60,8 +60,7 @@ class Camera:
         import numpy as np
 
         for name in ("position", "target", "up"):
-            if not _all_finite(getattr(self, name), 3):
-                value = getattr(self, name)
+            if not _all_finite(value := getattr(self, name), 3):
                 return f"the camera's {name} is {value!r}, but must be three finite numbers up to 3.4e38"
         if not _all_finite([self.hfov], 1) or not 0 < self.hfov < 180:
             return f"the camera's hfov is {self.hfov!r}, but must be more than 0 and less than 180 degrees"
@@ -187,10 +186,6 @@ class Scene:
                 shapes[f"{kind}s"] = {**shape, "bsdf": own or bsdf(grouped[0].material)}
         for i, m in enumerate(self.meshes):
             shapes[f"mesh_{i}"] = {**_mesh(m, self.texturing), "bsdf": bsdf(m.material)}
-        lights = {
-            f"light_{i}": {"type": "mrt_light", "position": list(p.position), "intensity": _rgb(p.color)}
-            for i, p in enumerate(self.lights)
-        }
         return {
             "type": "scene",
             # by default, Embree lets rays through between slivers
@@ -198,7 +193,10 @@ class Scene:
             "integrator": {"type": "mrt_whitted"},
             "sensor": self._sensor(width, height),
             "sky": {"type": "constant", "radiance": _rgb(self.sky)},
-            **lights,
+            **{
+                f"light_{i}": {"type": "mrt_light", "position": list(p.position), "intensity": _rgb(p.color)}
+                for i, p in enumerate(self.lights)
+            },
             **{name: _mrt_bsdf(material, fresnel, self.texturing) for material, name in names.items()},
             **shapes,
         }
@@ -208,9 +206,7 @@ class Scene:
 
         camera = self.camera
         reach = math.dist(camera.position, camera.target)  # of scenes far smaller or larger than the report's
-        # The original's picture is mirrored left to right against a right-handed camera
         to_world = mi.ScalarTransform4f().look_at(list(camera.position), list(camera.target), list(camera.up))
-        to_world = to_world @ mi.ScalarTransform4f().scale([-1, 1, 1])
         film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb"}
         return {
             "type": "perspective",
@@ -218,7 +214,8 @@ class Scene:
             "fov_axis": "x",
             "near_clip": 0.01 * min(1.0, reach),
             "far_clip": 1e5 * max(1.0, reach / 10),
-            "to_world": to_world,
+            # the original's picture is mirrored left to right against a right-handed camera
+            "to_world": to_world.scale([-1, 1, 1]),
             "film": {**film, "component_format": "float32", "rfilter": {"type": "box"}},
             "sampler": {"type": "independent", "sample_count": 16},
         }
@@ -268,15 +265,18 @@ def _group(kind: str, objects: list, fresnel: str) -> tuple[dict[str, Any], dict
     own = [each.material for each in objects]
     places = [vars(each).values() for each in objects]
     tables: dict[str, list] = {"numbers": [[*chain(*points), radius] for *points, radius, _ in places]}
-    attributes: dict[str, Any] = {}
+    bsdf: dict[str, Any] | None = None
     if len(set(own)) > 1:
-        tables["face_alpha"] = [(m.alpha,) for m in own]
-        tables["face_int_ior"] = [(max(m.ior, _SMALLEST_IOR),) for m in own]
-        tables["face_diffuse_reflectance"] = [m.diffuse for m in own]
-        tables["face_specular_reflectance"] = [m.specular for m in own]
-        attributes = {n.removeprefix("face_"): {"type": "mesh_attribute", "name": n} for n in [*tables][1:]}
+        values = {
+            "alpha": [(m.alpha,) for m in own],
+            "int_ior": [(max(m.ior, _SMALLEST_IOR),) for m in own],
+            "diffuse_reflectance": [m.diffuse for m in own],
+            "specular_reflectance": [m.specular for m in own],
+        }
+        tables |= {f"face_{name}": rows for name, rows in values.items()}
+        by_object = {name: {"type": "mesh_attribute", "name": f"face_{name}"} for name in values}
+        bsdf = {"type": "mrt_bsdf", "fresnel": fresnel, **by_object}
     bitmaps = {name: mi.Bitmap(np.array(rows, np.float32)) for name, rows in tables.items()}
-    bsdf = {"type": "mrt_bsdf", "fresnel": fresnel, **attributes} if attributes else None
     return {"type": "mrt_group", "kind": kind, **bitmaps}, bsdf
 
 

@@ -65,8 +65,11 @@ _BLOCKS = re.compile(b"|".join(_RUNS) + rb"|(?P<line>[^\n]*\n)")
 _NUMBERS_ONLY = bytes(32 if chr(i) in "vtnf/\n" else i for i in range(256))
 
 
-def read_obj(path: str | os.PathLike[str], *, convention: str = "report") -> tuple[Mesh, ...]:
-    """Return the meshes of an OBJ file, one for each material that is used.
+def read_obj(
+    path: str | os.PathLike[str], *, convention: str = "report"
+) -> tuple[tuple[Mesh, ...], frozenset[str]]:
+    """Return the meshes of an OBJ file, one for each material that is used, and the paths of all files that
+    belong to the model, used or not.
 
     Faces are ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``, with positive or negative indices. One with more than
     three corners is cut into a fan around its first corner, which is right for convex faces. Normals are used
@@ -78,20 +81,13 @@ def read_obj(path: str | os.PathLike[str], *, convention: str = "report") -> tup
     Raises ``SceneError`` with file and line for what cannot be read, ``UsageError`` for an unknown
     convention.
     """
-    return read_model(path, convention=convention)[0]
-
-
-def read_model(
-    path: str | os.PathLike[str], *, convention: str = "report"
-) -> tuple[tuple[Mesh, ...], frozenset[str]]:
-    """Return what ``read_obj`` does, and the paths of all files that belong to the model, used or not."""
     if convention not in CONVENTIONS:
         raise UsageError(f"convention={convention!r}: must be {' or '.join(CONVENTIONS)}")
     reader = _Reader(Path(path), convention)
     for block in _BLOCKS.finditer(read_text(reader.path)):
         reader.read(block)
         reader.line += block[0].count(b"\n")
-    textures = {material.texture for material in reader.materials.values() if material.texture is not None}
+    textures = filter(None, (material.texture for material in reader.materials.values()))
     return reader.meshes(), frozenset({os.fspath(path), *reader.libraries, *textures})
 
 
@@ -223,58 +219,40 @@ def obj_scene(
     *,
     convention: str = "report",
     texturing: str | None = None,
-    camera: Camera | None = None,
+    light: Vector | None = None,
     lights: Sequence[Light] | None = None,
     sky: Color = BLUE_SKY,
+    **view: Any,
 ) -> Scene:
     """Return a scene of an OBJ file; camera and lights that are not given are placed by the model's size.
 
     The camera stands in front, towards +z, a little above and to the right, and sees all of it; a light is up
-    on each side, the right one brighter. ``texturing`` follows ``convention`` unless given. Raises as
-    ``read_obj`` does.
+    on each side, the right one brighter. ``texturing`` follows ``convention`` unless given; ``light`` is the
+    place of a white light in place of ``lights``; ``view``: ``camera``, ``target`` and ``up``, vectors, and
+    ``fov``, horizontal, in degrees. Raises ``UsageError`` for a camera that sees nothing, and what
+    ``read_obj`` raises.
     """
-    meshes, files = read_model(path, convention=convention)
+    meshes, files = read_obj(path, convention=convention)
     low = np.min([m.vertices.min(axis=0) for m in meshes], axis=0).astype(float)
     high = np.max([m.vertices.max(axis=0) for m in meshes], axis=0).astype(float)
-    center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
-
-    def place(x: float, y: float, z: float) -> Vector:
-        """Return a point in radii from the centre."""
-        px, py, pz = (center + radius * np.array([x, y, z])).tolist()
-        return px, py, pz
-
-    if lights is None:
-        lights = Light(place(4, 5, 4), (2.5, 2.5, 2.5)), Light(place(-4, 3, 5), (1.0, 1.0, 1.2))
+    radius = float(np.linalg.norm(high - low)) / 2 or 1.0
+    # a ball of radius 1 fills a view of 45° height, that of 60° width in a 4:3 picture, from 2.6 away
+    radii = np.array([(0, 0, 0), (1.0, 0.8, 2.4), (4, 5, 4), (-4, 3, 5)])
+    center, eye, right, left = map(tuple, ((low + high) / 2 + radius * radii).tolist())
+    if light is not None:
+        lights = [Light(light, (2.5, 2.5, 2.5))]
+    elif lights is None:
+        lights = Light(right, (2.5, 2.5, 2.5)), Light(left, (1.0, 1.0, 1.2))
+    names = {"camera": "position", "fov": "hfov"}
+    camera = replace(Camera(eye, center), **{names.get(name, name): value for name, value in view.items()})
+    if problem := camera.problem():
+        raise UsageError(problem)
     return Scene(
         title=os.path.basename(path),
-        # a ball of radius 1 fills a view of 45° height, that of 60° width in a 4:3 picture, from 2.6 away
-        camera=camera or Camera(place(1.0, 0.8, 2.4), place(0, 0, 0)),
+        camera=camera,
         sky=sky,
         lights=tuple(lights),
         meshes=meshes,
         texturing=texturing or convention,
         files=files,
     )
-
-
-def model_scene(
-    path: str | os.PathLike[str],
-    *,
-    light: Vector | None = None,
-    convention: str = "report",
-    texturing: str | None = None,
-    **view: Any,
-) -> Scene:
-    """Return the scene of an OBJ file as the options of ``render`` show it; ``obj_scene`` places the rest.
-
-    ``light`` is the place of a white light; ``view``: ``camera``, ``target`` and ``up``, vectors, and
-    ``fov``, horizontal, in degrees. Raises ``UsageError`` for a camera that sees nothing, and what
-    ``obj_scene`` raises.
-    """
-    lights = None if light is None else (Light(light, (2.5, 2.5, 2.5)),)
-    scene = obj_scene(path, convention=convention, texturing=texturing, lights=lights)
-    fields = {"camera": "position", "fov": "hfov"}
-    camera = replace(scene.camera, **{fields.get(name, name): value for name, value in view.items()})
-    if problem := camera.problem():
-        raise UsageError(problem)
-    return replace(scene, camera=camera)

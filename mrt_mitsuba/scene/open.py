@@ -49,7 +49,7 @@ def open_scene(
     """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``.
 
     ``size``: width and height; ``budget``: memory from which its textures take theirs; ``model``: options of
-    ``model_scene``.
+    ``obj_scene``.
     """
     terms = in_terms(scene, model or {})
     # a key of mi.traverse has a dot, the name of a parameter of an XML file has none
@@ -94,13 +94,13 @@ def open_scene(
 def in_terms(scene: Any, model: Mapping[str, Any]) -> Scene | None:
     """Return a number, a ``Scene`` or the path of an OBJ file in the report's terms; None for anything else.
 
-    ``model``: options of ``model_scene``. Raises ``UsageError`` where they are of no use.
+    ``model``: options of ``obj_scene``. Raises ``UsageError`` where they are of no use.
     """
     check_model_options(scene, model)
     if is_obj(scene):
-        from mrt_mitsuba.scene.obj import model_scene  # with numpy
+        from mrt_mitsuba.scene.obj import obj_scene  # with numpy
 
-        return model_scene(scene, **model)
+        return obj_scene(scene, **model)
     if hasattr(scene, "__index__"):
         return report_scene(operator.index(scene))
     return scene if isinstance(scene, Scene) else None
@@ -131,18 +131,17 @@ def sized(source: Source) -> Iterator[None]:
     """Give the film the source's size within the block; a film of another size loses its crop window."""
     import mitsuba as mi
 
-    size = [source.width, source.height]
-    if list(source.sensor.film().crop_size()) == size:
-        yield
-        return
-    parameters = mi.traverse(source.sensor)
-    names = ("film.size", "film.crop_size", "film.crop_offset")
-    before = [list(parameters[name]) for name in names]
+    size, before = [source.width, source.height], {}
+    if list(source.sensor.film().crop_size()) != size:
+        parameters = mi.traverse(source.sensor)
+        wanted = {"film.size": size, "film.crop_size": size, "film.crop_offset": [0, 0]}
+        before = {name: list(parameters[name]) for name in wanted}
+        parameters.update(wanted)
     try:
-        parameters.update(dict(zip(names, (size, size, [0, 0]), strict=True)))
         yield
     finally:
-        parameters.update(dict(zip(names, before, strict=True)))
+        if before:
+            parameters.update(before)
 
 
 def _loaded(
@@ -155,7 +154,7 @@ def _loaded(
         return "a dict", load_dict(scene, budget=budget), {}
     if isinstance(scene, str | os.PathLike):
         path = os.fspath(scene)
-        return os.path.basename(path), *load_file(path, budget, **declared)
+        return os.path.basename(path), *load_file(path, declared, budget)
     if isinstance(scene, mi.Scene):
         return "a Mitsuba scene", scene, {}
     _check_variant("scene", scene)

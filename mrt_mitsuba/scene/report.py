@@ -150,7 +150,7 @@ def _with_model(name: str, **parts: Any) -> Scene:
     """Return a scene with the meshes of an OBJ file, in the report's reading."""
     from mrt_mitsuba.scene.obj import read_obj  # with numpy, which the other scenes do without
 
-    return Scene(meshes=read_obj(Path(__file__).parent / "assets" / name), **parts)
+    return Scene(meshes=read_obj(Path(__file__).parent / "assets" / name)[0], **parts)
 
 
 # Surfaces of index 0, as in the report's files, have no mirror reflection
@@ -249,8 +249,9 @@ def c_rand(seed: int = 1) -> Iterator[int]:
             yield words[-1] >> 1
 
 
-_BUILDERS = (scene_0, scene_1, scene_2, scene_3, scene_4, scene_5, scene_6, scene_7, scene_8, scene_9)
-_SCENES = [cache(builder) for builder in _BUILDERS]
+_SCENES = [
+    *map(cache, (scene_0, scene_1, scene_2, scene_3, scene_4, scene_5, scene_6, scene_7, scene_8, scene_9))
+]
 NUMBERS = tuple(range(len(_SCENES)))
 
 

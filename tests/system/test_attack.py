@@ -113,7 +113,7 @@ for text in (
     with open("a.obj", "wb") as file:
         file.write(points + text)
     try:
-        print(len(read_obj("a.obj")))
+        print(len(read_obj("a.obj")[0]))
     except Exception as error:
         print(type(error).__name__, error)
 """

@@ -17,7 +17,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtWarning, SceneError
 from mrt_mitsuba.scene.model import Camera, Mesh
 from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL
-from mrt_mitsuba.scene.obj import model_scene, obj_scene, read_obj
+from mrt_mitsuba.scene.obj import obj_scene, read_obj
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 UVS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -38,7 +38,7 @@ def model(tmp_path: Path):
             (tmp_path / "model.mtl").write_text(mtl)
         path = tmp_path / "model.obj"
         path.write_bytes(obj if isinstance(obj, bytes) else obj.encode())
-        return read_obj(path, **options)
+        return read_obj(path, **options)[0]
 
     return read
 
@@ -178,8 +178,10 @@ def test_view_as_asked_for(tmp_path) -> None:
     path = tmp_path / "a.obj"
     path.write_text(SQUARE + "f 1 2 3\n")
     placed = obj_scene(path)
-    assert model_scene(path).camera == placed.camera and model_scene(path).lights == placed.lights
-    view = model_scene(path, camera=(0, 0, 5), fov=30, light=(1, 2, 3), texturing="standard")
+    radius, (right, _) = math.sqrt(0.5), placed.lights
+    assert placed.camera.position == pytest.approx((0.5 + radius, 0.5 + 0.8 * radius, 2.4 * radius))
+    assert right.position == pytest.approx((0.5 + 4 * radius, 0.5 + 5 * radius, 4 * radius))
+    view = obj_scene(path, camera=(0, 0, 5), fov=30, light=(1, 2, 3), texturing="standard")
     assert view.camera == Camera((0, 0, 5), placed.camera.target, hfov=30)
     assert [light.position for light in view.lights] == [(1, 2, 3)] and view.texturing == "standard"
 
