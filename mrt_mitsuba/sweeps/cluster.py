@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError, one_line
 from mrt_mitsuba.machine import usable_cores
+from mrt_mitsuba.options import check, integer
 from mrt_mitsuba.sweeps import worker
 from mrt_mitsuba.sweeps.jobs import Job
 
@@ -33,10 +34,8 @@ def check_engine(cluster: Any, **numbers: Any) -> None:
     """Raise ``UsageError`` where the engine is not installed or is asked for what it cannot be."""
     if importlib.util.find_spec("distributed") is None:
         raise UsageError("a sweep needs Dask: pip install 'mrt-mitsuba[cluster]'")
-    for name, number in numbers.items():
-        least = 1 if name == "workers" else 0
-        if number is not None and (type(number) is not int or number < least):
-            raise UsageError(f"{name}={number!r}: must be a whole number, {least} or more")
+    for name in (name for name, number in numbers.items() if number is not None):
+        check(name, integer(int(name == "workers"), 65535), numbers[name])
     if numbers["workers"] is not None and cluster is not None:
         raise UsageError("workers are for this machine, and a cluster brings its own: give one of them")
 
@@ -112,8 +111,8 @@ def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
     workers = {}
     for number in range(count):
         pinned = {"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]} if devices else {}
-        settings = {"worker_kwargs": options | {"env": kernels | pinned}}
-        workers[number] = {"cls": SubprocessWorker, "options": settings}
+        own = options | {"env": kernels | pinned}
+        workers[number] = {"cls": SubprocessWorker, "options": {"worker_kwargs": own}}
     scheduler = {
         "allowed_failures": 0,  # ``outcomes`` hands over again a job that lost its worker
         "host": "127.0.0.1",
@@ -126,20 +125,18 @@ def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
 def gpus() -> list[str]:
     """Return the GPUs this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if named is not None:
-        return [name for name in named.split(",") if name]
-    with suppress(OSError, subprocess.SubprocessError):
-        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=30, check=True)
-        return [str(number) for number, _ in enumerate(listed.stdout.splitlines())]
-    return []
+    if named is None:
+        with suppress(OSError, subprocess.SubprocessError):
+            listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, timeout=30, check=True)
+            return list(map(str, range(listed.stdout.count(b"\n"))))
+    return [name for name in (named or "").split(",") if name]
 
 
-def inspect(client: Client, scratch: str) -> dict[str, Any]:
-    """Check all workers; return the versions of their software, and how many share cores (``render_job``).
+def inspect(client: Client, scratch: str, here: str) -> dict[str, int]:
+    """Check all workers, whose versions must be those ``here``; return how many share cores (``render_job``).
 
     Raises ``ClusterError`` or ``OutputError`` if they cannot be used.
     """
-    here = worker.describe(scratch)["versions"]
     try:
         found = client.run(worker.describe, scratch)
     except Exception as error:  # whatever another Python or another version makes of it
@@ -154,7 +151,7 @@ def inspect(client: Client, scratch: str) -> dict[str, Any]:
                 f"the worker {name} has {facts['versions']} and this process {here}: install the same "
                 "everywhere"
             )
-    return {"versions": here, "sharing": dict(Counter(facts["cores"] for facts in found.values()))}
+    return dict(Counter(facts["cores"] for facts in found.values()))
 
 
 def outcomes(
@@ -194,9 +191,11 @@ def outcomes(
                 continue
             if not ended:
                 error = future.exception() if future.status == "error" else None
-                text = "every worker that rendered it died, perhaps for want of memory: give each more"
-                alive = error is not None and not isinstance(error, KilledWorker)
-                facts["error"] = one_line(f"{type(error).__name__}: {error}") if alive else text
+                facts["error"] = (
+                    "every worker that rendered it died, perhaps for want of memory: give each more"
+                )
+                if error is not None and not isinstance(error, KilledWorker):
+                    facts["error"] = one_line(f"{type(error).__name__}: {error}")
             future.release()  # what no one needs is not computed again when its worker goes
             yield job, facts
     finally:

@@ -10,9 +10,9 @@ import operator
 import os
 import pickle
 import re
-import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex
 
 from mrt_mitsuba.errors import SceneError, UsageError
@@ -70,7 +70,9 @@ def points(grid: Any, zipped: bool) -> dict[str, dict[str, Any]]:
         raise UsageError(f"the grid has more than {MOST_JOBS} jobs: make several sweeps of it")
     if zipped:  # as programs for films expect them
         return {f"frame_{number:04}": point for number, point in enumerate(found)}
-    names = [_name(point) for point in found]
+    names = [
+        ",".join(f"{word(key)}={word(value)}" for key, value in point.items()) or "picture" for point in found
+    ]
     counts = Counter(map(str.casefold, names))  # some file systems ignore case
     for name in names:
         if (count := counts[name.casefold()]) > 1:
@@ -91,10 +93,6 @@ def _axis(key: Any, values: Any) -> list[Any]:
     if not found:
         raise UsageError(f"grid: {key} is an empty list; give it values, or leave it out")
     return [value.tolist() if hasattr(value, "tolist") else value for value in found]
-
-
-def _name(point: Mapping[str, Any]) -> str:
-    return ",".join(f"{word(key)}={word(value)}" for key, value in point.items()) or "picture"
 
 
 def word(value: Any) -> str:
@@ -152,8 +150,7 @@ def check_parameters(jobs: Sequence[Job]) -> None:
         if params and which not in loaded:
             use()
             loaded[which] = open_scene(receive(job.scene), params=declared).scene
-        if params.keys() > declared.keys():
-            set_parameters(loaded[which], {key: params[key] for key in params.keys() - declared.keys()})
+        set_parameters(loaded.get(which), {key: params[key] for key in params.keys() - declared.keys()})
 
 
 # ------------------------------------- Scenes on their way to workers ------------------------------------
@@ -165,28 +162,22 @@ def _send(scene: Any, path: str) -> Any:
     if isinstance(scene, SupportsIndex):
         report_scene(number := operator.index(scene))
         return number
-    with open(path, "wb") as file:
-        file.write(_encode(scene))
+    Path(path).write_bytes(_encode(scene))
     return path
 
 
 def receive(scene: Any) -> Any:
     """Return the scene that was sent; needs a variant, as it may hold Mitsuba's types."""
-    if isinstance(scene, str) and scene.endswith(SENT):
-        with open(scene, "rb") as file:
-            return pickle.load(file)
-    return scene
+    sent = isinstance(scene, str) and scene.endswith(SENT)
+    return pickle.loads(Path(scene).read_bytes()) if sent else scene
 
 
 def identify(sent: Any) -> str:
     """Return the fingerprint of a scene that was sent; of a file by its contents, not by those of the files
     that it names. Raises ``SceneError`` for a file that cannot be read.
     """
-    if not isinstance(sent, str):
-        return fingerprint(sent)
     try:
-        with open(sent, "rb") as file:
-            return fingerprint(file.read())
+        return fingerprint(Path(sent).read_bytes() if isinstance(sent, str) else sent)
     except OSError as error:
         raise SceneError(f"cannot read {os.path.relpath(sent)}: {error.strerror}") from error
 
@@ -202,8 +193,10 @@ def _encode(value: Any) -> bytes:
     Raises ``UsageError`` for what lives in this process only, such as a loaded Mitsuba scene.
     """
     stream = io.BytesIO()
+    pickler = _Pickler(stream, protocol=5)
+    pickler.fast = True  # no references to what came before: they would distinguish equal from identical
     try:
-        _Pickler(stream).dump(value)
+        pickler.dump(value)
     except (TypeError, AttributeError, pickle.PicklingError, RecursionError) as error:
         raise UsageError(
             f"what lives in this process only cannot be sent to others ({error}): give the scene as a "
@@ -213,30 +206,18 @@ def _encode(value: Any) -> bytes:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickles Mitsuba's transforms and bitmaps by their numbers, and equal things to equal bytes."""
-
-    def __init__(self, file: io.BytesIO) -> None:
-        super().__init__(file, protocol=5)
-        self.fast = True  # no references to what came before: they would distinguish equal from identical
+    """Pickles Mitsuba's transforms and bitmaps by their numbers, too."""
 
     def reducer_override(self, value: Any) -> Any:
+        import mitsuba as mi
         import numpy as np
 
-        mi = sys.modules.get("mitsuba")
-        if mi is not None and "Transform4" in type(value).__name__:
-            return rebuilt, (np.array(value.matrix, np.float64).reshape(4, 4), None)
-        if mi is not None and isinstance(value, mi.Bitmap):
-            return rebuilt, (np.array(value), value.srgb_gamma())
+        if "Transform4" in type(value).__name__:
+            return mi.ScalarTransform4f, (np.array(value.matrix, np.float64).reshape(4, 4),)
+        if isinstance(value, mi.Bitmap):
+            return mi.Bitmap, (np.array(value),), value.srgb_gamma(), None, None, _set_gamma
         return NotImplemented
 
 
-def rebuilt(numbers: Any, srgb: bool | None) -> Any:
-    """Return Mitsuba's bitmap of pixels [H, W, C] (``srgb``: are they encoded so), or else the transform
-    with a matrix [4, 4]."""
-    import mitsuba as mi
-
-    if srgb is None:
-        return mi.ScalarTransform4f(numbers)
-    found = mi.Bitmap(numbers)
-    found.set_srgb_gamma(srgb)
-    return found
+def _set_gamma(bitmap: Any, srgb: bool) -> None:
+    bitmap.set_srgb_gamma(srgb)

@@ -6,6 +6,7 @@ picture is written some rows at a time, so that no process ever holds it.
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import itertools
 import json
@@ -14,6 +15,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
+from mrt_mitsuba.output.files import compressing, compression, silenced
+from mrt_mitsuba.output.replacing import replacing
+from mrt_mitsuba.runtime import use
+from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.sweeps.jobs import Job, receive
 
 MADE_WITH = "mrt:sweep"  # in the header of each picture: its job's ``made_with``
@@ -29,9 +34,7 @@ def mark(path: str, whole: bool = False) -> str | None:
     import OpenEXR
     from PIL import Image
 
-    from mrt_mitsuba.output.files import silenced
-
-    if not os.path.isfile(path):
+    if not os.path.isfile(path):  # a pipe has no end to wait for
         return None
     try:
         if path.endswith(".png"):
@@ -42,8 +45,7 @@ def mark(path: str, whole: bool = False) -> str | None:
         with silenced():
             found = str(OpenEXR.File(path, header_only=True).header().get(MADE_WITH, ""))
             if whole and found:
-                for _ in _strips(OpenEXR.InputFile(path)):
-                    pass
+                collections.deque(_strips(OpenEXR.InputFile(path)), maxlen=0)
             return found
     except (OSError, RuntimeError, ValueError, TypeError, SyntaxError):  # what libraries raise for files
         return None
@@ -72,58 +74,52 @@ def cut(job: Job, tiles: Any) -> list[Job]:
 
     ``tiles``: the numbers of rows and of columns. Raises ``UsageError`` if the picture cannot be cut so.
     """
-    pair = isinstance(tiles, list | tuple) and [type(number) for number in tiles] == [int, int]
-    if not (pair and min(tiles) > 0):
+    if not (isinstance(tiles, list | tuple) and [*map(type, tiles)] == [int, int] and min(tiles) > 0):
         raise UsageError(f"tiles={tiles!r}: give rows and columns, such as (4, 4)")
     if job.arguments.get("target") or job.arguments.get("aamode") == "noise":
         raise UsageError("tiles: target and aamode=noise share the rays out over the whole picture")
-    width, height = job.arguments.get("width"), job.arguments.get("height")
-    if not (width and height):  # only the scene knows
-        from mrt_mitsuba import runtime
-        from mrt_mitsuba.scene.open import open_scene
-
-        runtime.use()
-        source = open_scene(receive(job.scene), size=(width, height))
+    width, height = size = job.arguments.get("width"), job.arguments.get("height")
+    if None in size:  # only the scene knows
+        use()
+        source = open_scene(receive(job.scene), size=size)
         width, height = source.width, source.height
     rows, columns = tiles
     if rows > height or columns > width:
         raise UsageError(f"tiles={tiles}: a picture of {width}x{height} pixels has fewer rows or columns")
     found = []
     for row, column in itertools.product(range(rows), range(columns)):
-        left, right = (width * number // columns for number in (column, column + 1))
-        top, bottom = (height * number // rows for number in (row, row + 1))
-        region = (left, top, right - left, bottom - top)
+        left, top = width * column // columns, height * row // rows
+        region = left, top, width * (column + 1) // columns - left, height * (row + 1) // rows - top
         memory = max(LEAST_MEMORY, BYTES_PER_PIXEL * region[2] * region[3])
         arguments = {"memory": memory, **job.arguments, "region": region}
         found.append(job._replace(name=f"{job.name}.tiles/{row},{column}", arguments=arguments))
     return found
 
 
-def join(job: Job, tiles: Sequence[Job], found: Sequence[Mapping[str, Any]], folder: str) -> dict[str, Any]:
-    """Write a picture from its tiles, and remove these; return its facts, given theirs."""
-    for facts in found:
-        if "error" in facts:
-            return {"error": facts["error"]}
+def join(job: Job, parts: Sequence[Job], found: Sequence[Mapping[str, Any]], folder: str) -> dict[str, Any]:
+    """Return the facts of a picture, given those of its parts; tiles are put together and removed."""
+    if parts == [job]:
+        return dict(found[0])
+    attempts = max(facts.get("attempts", 1) for facts in found)
+    if error := next((facts["error"] for facts in found if "error" in facts), ""):
+        return {"error": error, "attempts": attempts}
     own = os.path.join(folder, f"{job.name}.tiles")
     try:
-        _write_rows(job, tiles, folder)
+        _write_rows(job, parts, folder)
         for tile in (os.path.join(own, name) for name in os.listdir(own)):
             if mark(tile):  # also those of another number of tiles
                 os.unlink(tile)
         with contextlib.suppress(OSError):  # something of the user's own is in there
             os.rmdir(own)
     except (MrtError, OSError, RuntimeError) as error:
-        return {"error": f"cannot put {job.name} together: {error}"}
+        return {"error": f"cannot put {job.name} together: {error}", "attempts": attempts}
     sums = {name: sum(facts[name] for facts in found) if all(found) else None for name in ("seconds", "rays")}
-    return {"file": job.file, **sums}
+    return {"file": job.file, "attempts": attempts, **sums}
 
 
 def _write_rows(job: Job, tiles: Sequence[Job], folder: str) -> None:
     import numpy as np
     import OpenEXR
-
-    from mrt_mitsuba.output.files import compressing, compression
-    from mrt_mitsuba.output.replacing import replacing
 
     files = [OpenEXR.InputFile(os.path.join(folder, tile.file)) for tile in tiles]
     regions = [tile.arguments["region"] for tile in tiles]

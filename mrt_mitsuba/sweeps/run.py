@@ -75,22 +75,19 @@ def sweep(
         folder = os.path.abspath(os.fsdecode(out))
         os.makedirs(folder, exist_ok=True)
     except (OSError, TypeError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
+        reason = getattr(error, "strerror", None) or error
         raise OutputError(f"cannot make the folder {out!s}: {reason}") from error
     table = Table(folder, named)
     shown = TerminalProgress(unit=" pictures") if progress is None else progress
     with temporary_folder(folder) as scratch:
         planned = jobs(scene, named, options, scratch)
-        fresh = [is_fresh(job, folder, png, job.file in table.earlier) for job in planned]
-        missing = [job for job, whole in zip(planned, fresh, strict=True) if not (whole and resume)]
+        whole = {job.name for job in planned if is_fresh(job, folder, png, job.file in table.earlier)}
+        missing = [job for job in planned if not (job.name in whole and resume)]
         parts = {job.name: [job] if tiles is None else cut(job, tiles) for job in missing}
         pictures = {part.name: job for job in missing for part in parts[job.name]}
         every = list(chain(*parts.values()))
-        for place in {os.path.dirname(os.path.join(scratch, part.name)) for part in every}:
-            os.makedirs(place, exist_ok=True)  # of tiles
         # Tiles of an earlier sweep, which has kept no facts of them
         kept = {tile.name: tile for tile in every if tiles is not None and is_fresh(tile, folder) and resume}
-        rest = [part for part in every if part.name not in kept]
         check_parameters(missing)
         versions = describe(scratch)["versions"]
         for job in planned:
@@ -99,21 +96,22 @@ def sweep(
                 table.add(job.name, known | {"file": job.file, "error": "", "versions": versions})
         made: dict[str, dict[str, Any]] = {}
         ending: Iterator[tuple[Job, dict[str, Any]]] = iter(())
-        variant = options.get("variant") or ""
         with ExitStack() as stack:
             if missing:
+                variant = options.get("variant") or ""
                 client = stack.enter_context(connected(cluster, len(every), workers, dashboard, variant))
-                setting = {"scratch": scratch, "folder": folder, "png": png, **inspect(client, scratch)}
-                ending = stack.enter_context(closing(outcomes(client, rest, retries, **setting)))
+                setting = {"folder": folder, "png": png, "versions": versions}
+                setting["sharing"] = inspect(client, scratch, versions)
+                rest = [part for part in every if part.name not in kept]
+                ending = stack.enter_context(closing(outcomes(client, rest, retries, scratch, **setting)))
             stack.callback(table.write)
             advance = stack.enter_context(shown.stage("Sweep", len(every)))
             for part, facts in chain(((tile, {}) for tile in kept.values()), ending):
                 made[part.name] = facts
-                job, own = pictures[part.name], parts[pictures[part.name].name]
+                job = pictures[part.name]
+                own = parts[job.name]
                 if all(each.name in made for each in own):
                     found = [made[each.name] for each in own]
-                    facts = facts if own == [job] else join(job, own, found, folder)
-                    begun = max(each.get("attempts", 1) for each in found)
-                    table.add(job.name, facts | {"attempts": begun, "versions": versions})
+                    table.add(job.name, join(job, own, found, folder) | {"versions": versions})
                 advance(1)
     return table

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import json
 import os
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.output.replacing import check_target, replacing
 from mrt_mitsuba.sweeps.jobs import word
 
-FACTS = {
-    "file": str,
-    "error": str,
-    "seconds": float,
-    "rays": int,
-    "rmse": float,
-    "attempts": int,
-    "worker": str,
-    "versions": str,
-}
+FACTS = {"file": str, "error": str, "seconds": float, "rays": int, "rmse": float, "attempts": int}
+FACTS |= {"worker": str, "versions": str}
 PAUSE = 1.0  # seconds from one writing to the next, so that short jobs do not rewrite it all the time
 
 
@@ -92,17 +84,14 @@ def _read(path: str) -> dict[str, dict[str, Any]]:
     """Return the facts of an earlier table by the name of the file."""
     if not os.path.exists(path):
         return {}
-    rows, columns = [], []
-    with (
-        contextlib.suppress(OSError, ValueError, csv.Error),
-        open(path, encoding="utf-8", newline="") as file,
-    ):
-        columns, *rows = csv.reader(file)
-    if columns[-len(FACTS) :] != [*FACTS]:
+    rows: list[list[str]] = []
+    with suppress(OSError, ValueError, csv.Error), open(path, encoding="utf-8", newline="") as file:
+        rows = [row[-len(FACTS) :] for row in csv.reader(file)]
+    if rows[:1] != [[*FACTS]]:
         raise OutputError(f"{path} is not the table of a sweep: move it away, or choose another folder")
     found: dict[str, dict[str, Any]] = {}
-    for row in (row[-len(FACTS) :] for row in rows if len(row) == len(columns)):
+    for row in filter(None, rows[1:]):
         found[row[0]] = {}
-        with contextlib.suppress(ValueError):  # it was edited
+        with suppress(ValueError):  # it was edited
             found[row[0]] = {name: FACTS[name](text) for name, text in zip(FACTS, row, strict=True) if text}
     return found

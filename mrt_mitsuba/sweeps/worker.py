@@ -15,6 +15,8 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError, one_line
 from mrt_mitsuba.machine import memory, usable_cores
 from mrt_mitsuba.options import SMALLEST_MEMORY
+from mrt_mitsuba.output.files import save, to_8bit
+from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.sweeps.jobs import Job, identify, receive
 from mrt_mitsuba.sweeps.pictures import MADE_WITH
@@ -65,6 +67,7 @@ def render_job(
     if facts.get("file"):  # Dask repeats what it cannot get the result of
         return
     worker, own = get_worker(), os.path.join(scratch, job.name)
+    os.makedirs(os.path.dirname(own), exist_ok=True)  # of tiles
     facts = {"attempts": facts["attempts"] + 1, "worker": worker.address}
     _note(own, facts)
     try:
@@ -97,8 +100,6 @@ def _render(
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
-    from mrt_mitsuba.output.files import save, to_8bit
-    from mrt_mitsuba.output.replacing import check_target
     from mrt_mitsuba.rendering.api import render
 
     if dr.thread_count() != threads:
