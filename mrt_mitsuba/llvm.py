@@ -12,6 +12,7 @@ a few milliseconds and loads nothing: versions are read from file names.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import re
 import sys
@@ -171,42 +172,38 @@ print(*(number.value for number in numbers))
 """
 
 
-_prepared: Choice | None = None
-_drjit_came_first = False
-
-
+@functools.cache
 def prepare() -> Choice:
     """Choose once per process and set Dr.Jit's environment variable; return the choice.
 
     Warns where the user's own setting is not followed, and where Dr.Jit was imported before the choice.
     """
-    global _prepared, _drjit_came_first
-    if _prepared is None:
-        _prepared = choice = choose()
-        _drjit_came_first = "drjit" in sys.modules
-        os.environ[VARIABLE] = choice.path or BLOCKED
-        problem = too_early()
-        if not _drjit_came_first and choice.rejected and VARIABLE in choice.rejected[0]:
-            problem = f"{choice.rejected[0]}, which Dr.Jit cannot use; it needs {OLDEST} or newer. "
-            problem += f"Instead: {choice.describe()}"
-        if problem:
-            import warnings
+    choice, early, text = choose(), "drjit" in sys.modules, None
+    os.environ[VARIABLE] = choice.path or BLOCKED
+    if early and choice.path:
+        text = problem(choice)
+    elif choice.rejected and VARIABLE in choice.rejected[0]:
+        text = f"{choice.rejected[0]}; Dr.Jit needs LLVM {OLDEST} or newer. Instead: {choice.describe()}"
+    if text:
+        import warnings
 
-            from mrt_mitsuba.errors import MrtWarning
+        from mrt_mitsuba.errors import MrtWarning
 
-            warnings.warn(problem, MrtWarning, stacklevel=3)
-    return _prepared
+        warnings.warn(text, MrtWarning, stacklevel=2)
+    return choice
 
 
-def too_early() -> str | None:
-    """Return what is wrong if Dr.Jit was imported before the choice was made and has no good LLVM."""
-    if not _drjit_came_first or _prepared is None or _prepared.path is None:
-        return None
-    loaded = sys.modules["drjit"].detail.llvm_version()[0]
+def problem(choice: Choice) -> str | None:
+    """Return what keeps Dr.Jit from using LLVM, with the fix, or None if nothing does."""
+    if choice.path is None:
+        return choice.describe()
+    import drjit as dr
+
+    loaded = dr.detail.llvm_version()[0]
     if loaded >= OLDEST:
         return None
-    found = f"loaded LLVM {loaded}, with which it would abort" if loaded > 0 else "found no LLVM"
+    found = f"LLVM {loaded}, with which it would abort," if loaded > 0 else "no LLVM"
     return (
-        f"Dr.Jit was imported before mrt_mitsuba and {found}. Import mrt_mitsuba before mitsuba and drjit, "
-        f"or set {VARIABLE}={_prepared.path}"
+        f"Dr.Jit loaded {found} in place of {choice.path}. Import mrt_mitsuba before mitsuba and drjit, or set "
+        f"{VARIABLE} to a libLLVM of version {OLDEST} or newer."
     )

@@ -114,24 +114,15 @@ def default_variant() -> str:
 
 def obstacle(variant: str) -> str | None:
     """Return why a known variant cannot run here, with the fix, or None if nothing speaks against it."""
-    if not variant.startswith(("llvm", "cuda")):
+    if variant.startswith("llvm"):
+        return llvm.problem(llvm.prepare())
+    if not variant.startswith("cuda"):
         return None
-    choice = llvm.prepare()
+    llvm.prepare()
     import drjit as dr
 
-    if variant.startswith("cuda"):
-        none = f"it needs an NVIDIA GPU with its driver, and none was found. Use {FAST} or {SLOW}."
-        return None if dr.has_backend(dr.JitBackend.CUDA) else none
-    if early := llvm.too_early():
-        return early
-    if choice.path is None:
-        return choice.describe()
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        return f"Dr.Jit could not load {choice.path}. {llvm.HELP}"
-    loaded = dr.detail.llvm_version()
-    if loaded[0] < llvm.OLDEST:
-        return f"Dr.Jit loaded LLVM {llvm.version_text(loaded)}, with which it would abort. {llvm.HELP}"
-    return None
+    none = f"it needs an NVIDIA GPU with its driver, and none was found. Use {FAST} or {SLOW}."
+    return None if dr.has_backend(dr.JitBackend.CUDA) else none
 
 
 def warn_if_slow() -> None:
