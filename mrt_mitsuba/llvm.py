@@ -204,6 +204,6 @@ def problem(choice: Choice) -> str | None:
         return None
     found = f"LLVM {loaded}, with which it would abort," if loaded > 0 else "no LLVM"
     return (
-        f"Dr.Jit loaded {found} in place of {choice.path}. Import mrt_mitsuba before mitsuba and drjit, or set "
-        f"{VARIABLE} to a libLLVM of version {OLDEST} or newer."
+        f"Dr.Jit loaded {found} in place of {choice.path}. Import mrt_mitsuba before mitsuba and drjit, or "
+        f"set {VARIABLE} to a libLLVM of version {OLDEST} or newer."
     )

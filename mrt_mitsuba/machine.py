@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 import os
 import re
 import resource
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -59,7 +57,7 @@ class Budget:
     @classmethod
     def of(cls, wanted: int | None) -> Budget:
         """Return what was asked for, by default half of what is free; never more than the machine has."""
-        free, most = _look(memory, int(time.monotonic()))
+        free, most = memory()
         return cls(min(free // 2 if wanted is None else wanted, most))
 
     def take_texture(self, path: str, width: int, height: int, *, around: bool = False) -> None:
@@ -75,12 +73,6 @@ class Budget:
                 f"memory, and {_text(self.size)} may be used: choose a smaller picture or a larger memory="
             )
         self.taken += stays
-
-
-@functools.lru_cache(maxsize=1)
-def _look(function: Callable[[], tuple[int, int]], moment: int) -> tuple[int, int]:
-    """Return what a function returns, looked up once a second."""
-    return function()
 
 
 @dataclass(frozen=True)
@@ -136,18 +128,6 @@ class Workspace:
 
         if used > self.size // 4:
             dr.flush_malloc_cache()
-
-
-@functools.cache
-def keep_freed_blocks() -> None:
-    """Let the C library keep freed blocks for reuse, in place of returning them and clearing fresh pages.
-
-    glibc keeps blocks as large as the largest that was freed, up to 32 MiB, and twice as much in all
-    (mallopt(3), M_MMAP_THRESHOLD). This one is never written to, and takes no memory.
-    """
-    import numpy as np
-
-    np.empty(2**25 - 2**16, np.uint8)
 
 
 def memory(root: Path = Path("/")) -> tuple[int, int]:

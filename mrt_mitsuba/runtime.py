@@ -24,7 +24,7 @@ SLOW = "scalar_rgb"
 # Held while Mitsuba is set up and while it renders: neither it nor Dr.Jit is safe with several Python threads
 one_at_a_time = threading.RLock()
 
-_warned: set[str] = set()
+_warned = False  # that variants are slow
 _used: str | None = None  # the variant that was made current last
 
 
@@ -104,12 +104,9 @@ def register() -> None:
 def default_variant() -> str:
     """Return ``llvm_ad_rgb`` if LLVM works here, else ``scalar_rgb`` with one warning per process."""
     problem = obstacle(FAST)
-    if problem is None:
-        return FAST
-    if problem not in _warned:
-        _warned.add(problem)
-        warnings.warn(f"rendering in the slow variant {SLOW}: {problem}", MrtWarning, stacklevel=4)
-    return SLOW
+    if problem:
+        _warn_once(f"rendering in the slow variant {SLOW}: {problem}")
+    return SLOW if problem else FAST
 
 
 def obstacle(variant: str) -> str | None:
@@ -129,11 +126,17 @@ def warn_if_slow() -> None:
     """Say once in a process that the current variant is slow, if it is."""
     import mitsuba as mi
 
-    variant = mi.variant()
-    if variant.startswith("scalar") and not _warned:
-        _warned.add(variant)
-        message = f"{variant} traces one ray at a time in Python: use it for small pictures only, else {FAST}"
-        warnings.warn(message, MrtWarning, stacklevel=3)
+    if mi.variant().startswith("scalar"):
+        _warn_once(
+            f"{mi.variant()} traces one ray at a time in Python: use it for small pictures, else {FAST}"
+        )
+
+
+def _warn_once(text: str) -> None:
+    global _warned
+    if not _warned:
+        _warned = True
+        warnings.warn(text, MrtWarning, stacklevel=4)
 
 
 def usable_variants() -> list[str]:

@@ -57,8 +57,6 @@ TABLE = table(Options)
 
 def parse(arguments: Sequence[str]) -> Options:
     """Turn ``FILENAME [SCENE] [name=value ...]`` into options; raise ``UsageError`` naming what is wrong."""
-    if not arguments:
-        raise UsageError(f"FILENAME is missing: {FORM}")
     values: dict[str, Any] = {"filename": _filename(arguments[0])}
     plain, given = split(arguments[1:])
     if len(plain) > 1:

@@ -65,12 +65,8 @@ def show_log(level: str) -> None:
     import mitsuba as mi
 
     ours, mitsubas, drjits = LEVELS[level]
-    logger = logging.getLogger("mrt_mitsuba")
-    logger.setLevel(ours)
-    if not logger.handlers:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-        logger.addHandler(handler)
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    logging.getLogger("mrt_mitsuba").setLevel(ours)
     mi.set_log_level(getattr(mi.LogLevel, mitsubas))
     dr.set_log_level(getattr(dr.LogLevel, drjits))
     if level == "error":

@@ -14,7 +14,7 @@ import numpy as np
 
 from mrt_mitsuba import filters
 from mrt_mitsuba.filters import dof, edges
-from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER, keep_freed_blocks
+from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.film import Region
 from mrt_mitsuba.rendering.exposing import Exposer, Groups, Stack
@@ -130,7 +130,9 @@ class Passes:
         from mrt_mitsuba.rendering.rounds import run_rounds
         from mrt_mitsuba.rendering.whole import Wholes
 
-        keep_freed_blocks()
+        # glibc keeps freed blocks up to the size of the largest that was freed, in place of clearing fresh
+        # pages (mallopt(3), M_MMAP_THRESHOLD); this one is never written to, and takes no memory
+        np.empty(2**25 - 2**16, np.uint8)
         exposer, settings = self._film_exposer(step), self._settings
         blurred = self._blurred if self._plan.blur else None
         whole = not self._shader.layers

@@ -85,7 +85,6 @@ BAD = [
     ("scene=a.obj up=0,0,0", "up must have a length"),
     ("scene=a.obj camera=1,2,3 target=1,2,3", "camera and target are the same point"),
     ("three", "('mrt scenes' lists them); a file is scene=PATH"),
-    ([], "FILENAME is missing"),
     (["width=3"], "FILENAME is missing before width=3"),
     (["out.png"], "FILENAME has no extension: write out format=png"),
     (["--fast"], "unknown option --fast"),
