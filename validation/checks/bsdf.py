@@ -21,7 +21,6 @@ from mrt_mitsuba.validation.checks.bsdf_gradients import gradients
 from mrt_mitsuba.validation.checks.law import LEVEL, RARE, SIGMAS, TIMEOUT, Check, Law, Skip, examine, figures
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Probe, context, excess, is_scalar
 from mrt_mitsuba.validation.checks.sphere import DEPTH, Cells, chi_square, encode, integrate
-from mrt_mitsuba.validation.checks.subject import VALUES, elsewhere, other_kind
 from mrt_mitsuba.validation.tools.compare import sidak
 
 
@@ -96,27 +95,23 @@ def sampling(law: Law, case: Case) -> None:
     in one place at any incidence.
     """
     case.need_smooth()
-    tests, worst, beyond = [], [], np.zeros(len(case.views))
-    for i, (view, found) in enumerate(zip(case.views, case.densities, strict=True)):
-        if found is not None:
-            count = len(view.density) - view.pilot
-            by_width, cell = chi_square(found, view.codes, count, 0.5 * FIT)
-            tests.append(by_width)
-            worst.append({"wi": view.wi, "uv": view.uv, "cell": cell})
-            off = np.sqrt(view.share * (1 - view.share) / count + found.variance.sum())
-            beyond[i] = max(abs(view.share - found.mean.sum()) - SIGMAS * off, 0)
-    if not tests:
+    judged = [(view, cells) for view, cells in zip(case.views, case.densities, strict=True) if cells]
+    if not judged:
         raise Skip(f"{UNRESOLVED} at every angle")
+    tests, worst = zip(*(chi_square(c, v.codes, v.count, 0.5 * FIT) for v, c in judged), strict=True)
     by_angle = np.array([*tests, np.sum(tests, axis=0)])  # and of all angles together
     chances = stats.chi2.sf(by_angle[..., 0], by_angle[..., 1])
-    names = worst[int(chances[:-1].min(axis=1).argmin())]
-    law.hold("cells", sidak(float(chances.min()), chances.size), **names, angles=len(tests))
-    law.hold("integral", beyond, **case.incidence)
+    i, chance = int(chances[:-1].min(axis=1).argmin()), sidak(float(chances.min()), chances.size)
+    wi, uv = (np.array([vars(view)[name] for view, _ in judged]) for name in ("wi", "uv"))
+    law.hold("cells", chance, wi=wi[i], uv=uv[i], cell=worst[i], angles=len(judged))
+    off = [np.sqrt(v.share * (1 - v.share) / v.count + c.variance.sum()) for v, c in judged]
+    beyond = np.abs([v.share - c.mean.sum() for v, c in judged]) - SIGMAS * np.array(off)
+    law.hold("integral", np.maximum(beyond, 0), wi=wi, uv=uv)
     views = [view for view in case.views if 0 < view.density.max() < BROAD]
     if views and not case.quick and not is_scalar():
         _in_small_cells(law, case, views)
-    if len(tests) < len(case.views):
-        law.notes.append(f"{UNRESOLVED} at {len(case.views) - len(tests)} angles, which are left out")
+    if len(judged) < len(case.views):
+        law.notes.append(f"{UNRESOLVED} at {len(case.views) - len(judged)} angles, which are left out")
 
 
 def _in_small_cells(law: Law, case: Case, views: list[SimpleNamespace]) -> None:
@@ -163,8 +158,8 @@ def weights(law: Law, case: Case) -> None:
             law.hold(name, np.where(counts, error, 0), **names)
     off = []
     for i, s in enumerate(view.samples for view in case.views):
-        for kind in np.unique(s.component[s.delta & s.lit] * 4096 + s.type[s.delta & s.lit]):
-            here = s.delta & (s.component * 4096 + s.type == kind)
+        lobe = s.component * 4096 + s.type
+        for here in (s.delta & (lobe == one) for one in np.unique(lobe[s.delta & s.lit])):
             stated = float(np.nan_to_num(s.pdf[here].mean()))
             sigma = np.sqrt(max(stated * (1 - stated), 0) / len(here))
             off.append((max(abs(here.mean() - stated) - SIGMAS * sigma, 0), i))
@@ -197,8 +192,8 @@ def energy(law: Law, case: Case) -> None:
         albedo, off = _albedo(case, view, cells)
         albedos.append(albedo)
         apart.append(off)
-    wi, uv = np.concatenate([wi, case.incidence["wi"]]), np.concatenate([uv, case.incidence["uv"]])
-    law.hold("largest", albedos, wi=wi, uv=uv)
+    at = {"wi": wi, "uv": uv}
+    law.hold("largest", albedos, **{n: np.concatenate([at[n], x]) for n, x in case.incidence.items()})
     if not np.isnan(apart).all():
         law.hold("apart", np.nan_to_num(apart), **case.incidence)
 
@@ -372,8 +367,8 @@ WRONG, SPOILS = "results not finite, or negative{where}: {faults}", "one such nu
 
 
 @figures(
-    values=("at most", WRONG, 0, SPOILS, VALUE),
-    samples=("at most", WRONG, 0, SPOILS, SAMPLE),
+    values=("none", WRONG, 0, SPOILS, VALUE),
+    samples=("none", WRONG, 0, SPOILS, SAMPLE),
 )  # fmt: skip
 def finite(law: Law, case: Case) -> None:
     """No NaN, no infinity, nothing negative: extreme directions, random numbers and parameters."""
@@ -389,26 +384,23 @@ def finite(law: Law, case: Case) -> None:
     u = np.where(rng.random((count, 3)) < 0.6, rng.choice(UNIFORM, (count, 3)), case.uniform(count, 3))
     uv = np.where(rng.random((count, 2)) < 0.3, rng.integers(0, 2, (count, 2)), rng.random((count, 2)))
     extremes = wi, wo, u.astype(np.float32), uv.astype(np.float32)
-    known = _finite(law, case, extremes, np.zeros((6, count), bool))
+    known = _finite(law, case, extremes)
     for key, value in parameters(case):
         # the ends of its likely range, one at a time
         number, name = float(np.mean(np.array(value))), key.removesuffix(".value").removesuffix(".values")
+        ends = (0.0, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)
         if name.split(".")[-1] in INDICES and (number <= 1 or key.endswith(".values")):
             ends = 0.5 * number, 2.0 * number  # of metals: 0 makes no sense there
-        else:
-            ends = (0.0, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)
         for end in ends:
             copy = case.copy()
             with bsdf_case.changed(copy, key, lambda old, end=end: type(old)(old * 0 + end)):
                 _finite(law, copy, extremes, known, (key, end))
-    law.parts = [part for part in law.parts if not part.holds] or law.parts[:1]
 
 
-def _finite(law: Law, case: Case, extremes: tuple, known: Array, setting: tuple | None = None) -> Array:
-    """Count faults that are not known yet; return where they are, by kind. [6, N]"""
+def _finite(law: Law, case: Case, extremes: tuple, known: Any = False, setting: tuple | None = None) -> Array:
+    """Hold faults that are not known yet; return where they are, by kind. [6, N]"""
     wi, wo, u, uv = extremes
-    value, pdf = case.both(wi, wo, uv)
-    together, s = case.pair(wi, wo, uv), case.sample(wi, u, uv)
+    (value, pdf), together, s = case.both(wi, wo, uv), case.pair(wi, wo, uv), case.sample(wi, u, uv)
     length = np.linalg.norm(s.wo.astype(np.float64), axis=1)
 
     def bad(values: Array) -> Array:
@@ -423,15 +415,14 @@ def _finite(law: Law, case: Case, extremes: tuple, known: Array, setting: tuple 
         "directions of samples": s.lit & ~(np.abs(length - 1) < 1e-3),
     }
     faults = np.array(list(kinds.values()))
-    new = faults & ~known
-    kind, i = np.unravel_index(int(new.argmax()), new.shape)
-    named = [f"{name} {n}" for name, n in zip(kinds, new.sum(axis=1), strict=True) if n]
-    names = {
-        **{"wi": wi[i], "uv": uv[i], "wo": wo[i], "u": u[i], "setting": setting},
-        "where": f" with {setting[0]} = {setting[1]:g}" if setting else "",
-        "faults": ", ".join(named) or "none",
-    }
-    law.hold("samples" if kind > 2 else "values", new.sum(), **names)
+    values, samples = np.split(faults & ~known, 2)
+    name, new = ("samples", samples) if samples.any() and not values.any() else ("values", values)
+    counts = zip(kinds, [*values.sum(axis=1), *samples.sum(axis=1)], strict=True)
+    words = ", ".join(f"{kind} {n}" for kind, n in counts if n)
+    if words or not setting:
+        where = f" with {setting[0]} = {setting[1]:g}" if setting else ""
+        named = {"setting": setting, "where": where, "faults": words or "none"}
+        law.hold(name, new.any(axis=0), wi=wi, uv=uv, wo=wo, u=u, **named)
     return faults
 
 
@@ -454,26 +445,21 @@ def roundoff(law: Law, case: Case) -> None:
     if len(few.pdf) < 20:
         raise Skip("too few pairs of directions with a value")
 
-    def on_spheres(x: Array) -> Array:
-        return np.concatenate(
-            [probe.unit(x[:, :3].astype(np.float64)), probe.unit(x[:, 3:].astype(np.float64))], axis=1
-        )
-
     inputs = np.concatenate([few.wi, few.wo], axis=1)
     for name, function in (("eval", lambda *at: case.eval(*at).max(axis=1)), ("pdf", case.pdf)):
 
         def at(x: Array, function: Any = function) -> Array:
             return function(x[:, :3], x[:, 3:], np.tile(few.uv, (len(x) // len(few.uv), 1)))
 
-        found = noise.measure(at, inputs, seed=case.seed, project=on_spheres)
+        found = noise.measure(at, inputs, seed=case.seed, project=_on_spheres)
         if np.isnan(found.noise).mean() > 0.25:
             raise Skip("values change too fast for float32 steps to tell noise")
         law.hold("lost", found.lost, function=name, stride=found.stride, **vars(few))
-        if not law.parts[-1].holds:
-            law.notes.append(
-                f"{name}(): noise of {np.nanquantile(found.noise, 0.9):.3g} roundings (2^-24), "
-                f"directions explain {np.median(found.explained):.3g}"
-            )
+
+
+def _on_spheres(x: Array) -> Array:
+    """Return pairs of directions [N, 6], each made one unit long."""
+    return probe.unit(x.reshape(-1, 2, 3).astype(np.float64)).reshape(-1, 6)
 
 
 # --------------------------------------------- Components ------------------------------------------------
@@ -507,12 +493,9 @@ def components(law: Law, case: Case) -> None:
     flags = [int(bsdf.flags(i)) for i in range(bsdf.component_count())]
     law.hold("flags", bin(np.bitwise_or.reduce(flags or [0]) ^ int(bsdf.flags())).count("1"))
     if case.description is not None:
-        copy, keys = case.load(), [key for key, _ in parameters(case)]
-        params = mi.traverse(copy)
-        for key, value in parameters(case):
-            params[key] = type(value)(value)
-        params.update()
-        law.hold("updated", abs(copy.component_count() - len(flags)), keys=keys)
+        copy, old = case.load(), dict(parameters(case))
+        mi.traverse(copy).update({key: type(value)(value) for key, value in old.items()})
+        law.hold("updated", abs(copy.component_count() - len(flags)), keys=list(old))
     parts, dark = [case.eval(p.wi, p.wo, p.uv, context(i)) for i in range(len(flags))], 0
     law.hold("sum", excess(np.sum(parts, axis=0), p.value, p.value_off), **vars(p))
     for i, (flag, value) in enumerate(zip(flags, parts, strict=True)):
@@ -547,13 +530,13 @@ def _allowed(flags: int, wi: Array, wo: Array, *, smooth: bool) -> Array:
 
 
 @figures(same=("most", "value and density in {other} against {here}, relative, beyond rounding", POINTWISE,
-               "the same formula", VALUES))  # fmt: skip
+               "the same formula", VALUE))  # fmt: skip
 def variants(law: Law, case: Case) -> None:
     """Values in the scalar variant, and in the spectral one where colours are grey."""
     here = mi.variant()
     case.with_()
     few = case.pairs.only(np.isfinite(case.pairs.value).all(axis=1)).only(slice(0, case.count(200, 800)))
-    others = [other_kind()] if other_kind() in mi.variants() else []
+    others = [case.other_kind]
     if here.endswith("_rgb"):
         if np.ptp(few.value, axis=1).max() <= 1e-5 * few.value.max():
             others.append(here.replace("_rgb", "_spectral"))
@@ -561,7 +544,7 @@ def variants(law: Law, case: Case) -> None:
             law.notes.append("coloured: a spectral variant need not agree")
     for other in others:
         try:
-            value, pdf = elsewhere(other, lambda: Probe(case.load()).both(few.wi, few.wo, few.uv))
+            value, pdf = case.elsewhere(other, lambda: Probe(case.load()).both(few.wi, few.wo, few.uv))
         except Skip as reason:
             law.notes.append(str(reason))
             continue
@@ -571,11 +554,11 @@ def variants(law: Law, case: Case) -> None:
         error = np.maximum(excess(value, expected, allowed), excess(pdf, few.pdf, few.pdf_off))
         law.hold("same", error, variants=(here, other), other=other, here=here, **vars(few))
     if not law.parts:
-        raise Skip("; ".join(law.notes) or "no other variant to compare with")
+        raise Skip("; ".join(law.notes))
 
 
 @figures(same=("most", "values of the BSDF {which} after a switch to {other} and back, relative, beyond "
-               "rounding", 1e-4, "the same formula with the same numbers", VALUES))  # fmt: skip
+               "rounding", 1e-4, "the same formula with the same numbers", VALUE))  # fmt: skip
 def switch(law: Law, case: Case) -> None:
     """Values after a switch to another variant and back, of the BSDF as it was and loaded anew."""
     here, few = mi.variant(), case.pairs.only(slice(0, case.count(1000, 1000)))
@@ -585,27 +568,15 @@ def switch(law: Law, case: Case) -> None:
     mi.set_variant(other)
     mi.set_variant(here)
     candidates = {"that was loaded before": case.plugin}
-    if case.description is not None:
-        candidates["loaded anew"] = case.load()
-    else:
+    if case.description is None:
         law.notes.append("a loaded BSDF was given: it was not loaded anew")
+    else:
+        candidates["loaded anew"] = case.load()
     for which, bsdf in candidates.items():
         value, pdf = Probe(bsdf).both(few.wi, few.wo, few.uv)
         error = np.maximum(excess(value, few.value, few.value_off), excess(pdf, few.pdf, few.pdf_off))
         law.hold("same", error, which=which, other=other, variants=(here, other, here), **vars(few))
 
 
-_LAWS = (
-    sampling,
-    weights,
-    eval_pdf,
-    energy,
-    reciprocity,
-    finite,
-    roundoff,
-    gradients,
-    components,
-    variants,
-    switch,
-)
-LAWS = {law.__name__: law for law in _LAWS}
+LAWS = {law.__name__: law for law in (sampling, weights, eval_pdf, energy, reciprocity, finite, roundoff,
+                                      gradients, components, variants, switch)}  # fmt: skip

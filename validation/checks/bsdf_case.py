@@ -14,10 +14,9 @@ import numpy as np
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.checks import probe
-from mrt_mitsuba.validation.checks.law import Skip
+from mrt_mitsuba.validation.checks.law import Skip, Subject
 from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Lanes, Probe, is_scalar, joined, unit
 from mrt_mitsuba.validation.checks.sphere import DEPTH, POINTS, Cells, encode, integrate
-from mrt_mitsuba.validation.checks.subject import Subject
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
 QUICK_ANGLES = (0, 50, 85, 140)
@@ -43,8 +42,8 @@ class Case(Subject, Probe):
         """Directions of incidence ``wi`` at all angles, each at a ``uv``, and ``samples`` drawn with ``u``.
 
         ``density``: pdf() at the samples that count, of lobes with a width and not refused; 0 elsewhere. The
-        first ones (``pilot``) make the cells in which the others are judged, by their ``codes``; ``share``
-        of these count.
+        first quarter (``pilot``, directions) makes the cells in which the other ``count`` are judged, by the
+        ``codes`` of those that count and their ``share``.
         """
         found = []
         for angle in QUICK_ANGLES if self.quick else ANGLES:
@@ -52,20 +51,20 @@ class Case(Subject, Probe):
             uv, u = self.uniform(2), self.uniform(self.count(2**16, 2**19), 3)
             samples = self.sample(wi, u, uv)
             value, pdf = self.both(wi, samples.wo, uv)
-            density, pilot = np.where(live(wi, samples, value, pdf), pdf, 0), len(u) // 4
-            alive = density[pilot:] > 0
-            codes, share = encode(samples.wo[pilot:][alive]), float(alive.mean())
-            view = {"wi": wi, "uv": uv, "u": u, "samples": samples, "density": density, "pilot": pilot}
-            found.append(SimpleNamespace(**view, codes=codes, share=share))
+            density, first = np.where(live(wi, samples, value, pdf), pdf, 0), len(u) // 4
+            pilot, rest = (samples.wo[part][density[part] > 0] for part in np.s_[:first, first:])
+            known = {"wi": wi, "uv": uv, "u": u, "samples": samples, "density": density, "pilot": pilot}
+            count = len(u) - first
+            found.append(SimpleNamespace(**known, codes=encode(rest), count=count, share=len(rest) / count))
         return found
 
     @cached_property
     def drawn(self) -> tuple[Lanes, dict[str, Array]]:
         """The first samples of all views, and what they were drawn with."""
-        each = self.count(2**12, 2**13)
-        names = {name: np.repeat(rows, each, axis=0) for name, rows in self.incidence.items()}
-        names["u"] = np.concatenate([view.u[:each] for view in self.views])
-        return joined([view.samples.only(slice(0, each)) for view in self.views]), names
+        few = slice(0, self.count(2**12, 2**13))
+        names = {name: np.repeat(rows, few.stop, axis=0) for name, rows in self.incidence.items()}
+        names["u"] = np.concatenate([view.u[few] for view in self.views])
+        return joined([view.samples.only(few) for view in self.views]), names
 
     @cached_property
     def incidence(self) -> dict[str, Array]:
@@ -78,30 +77,25 @@ class Case(Subject, Probe):
         return [self._integrals(view) for view in self.views]
 
     def _integrals(self, view: SimpleNamespace) -> Cells | None:
-        pilot, density = (
-            view.samples.wo[: view.pilot][view.density[: view.pilot] > 0],
-            view.density[view.pilot :],
-        )
         # around the mirror direction at all scales, where lobes may be that are not sampled
         around = 10 ** self.rng.uniform(-4, 0, (600, 1)) * self.rng.normal(size=(600, 3))
-        seeds = encode(np.concatenate([pilot, unit(view.wi * [-1, -1, 1] + around)]))
-        most = max(view.pilot // 1000, 8)
+        seeds = encode(np.concatenate([view.pilot, unit(view.wi * [-1, -1, 1] + around)]))
+        most = max(len(view.u) // 4000, 8)
         cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
-        if len(pilot):
-            held = np.bincount(cells.find(encode(pilot)), minlength=len(cells.start))[cells.level == DEPTH]
-            # at the normal, all azimuths of the finest cells are one place
-            centre = (np.hypot(*pilot.T[:2]) < np.sqrt(2) * 0.5**DEPTH).sum()
-            if max(held[held > 4 * most].sum(), centre) > 0.01 * len(pilot):
-                return None
+        held = np.bincount(cells.find(encode(view.pilot)), minlength=len(cells.start))[cells.level == DEPTH]
+        # at the normal, all azimuths of the finest cells are one place
+        centre = (np.hypot(*view.pilot.T[:2]) < np.sqrt(2) * 0.5**DEPTH).sum()
+        if max(held[held > 4 * most].sum(), centre) > 0.01 * len(view.pilot):
+            return None
 
         def pdf(wo: Array) -> Array:
             return np.maximum(self.pdf(view.wi, wo, view.uv), 0)
 
-        found = integrate(pdf, cells, self.rng, view.codes, np.ones(len(view.codes)), len(density))
+        found = integrate(pdf, cells, self.rng, view.codes, np.ones(len(view.codes)), view.count)
         # samples in cells of whose points less than two are expected where the lobe is
-        cell = found.find(view.codes)
-        covered = np.bincount(cell, 1 / (len(density) * density[density > 0]), minlength=len(found.start))
-        overlooked = (covered * POINTS < 2 * found.solid_angle)[cell].sum() / len(density)
+        cell, density = found.find(view.codes), view.density[-view.count :]
+        covered = np.bincount(cell, 1 / (view.count * density[density > 0]), minlength=len(found.start))
+        overlooked = (covered * POINTS < 2 * found.solid_angle)[cell].sum() / view.count
         return found if found.mean.sum() > view.share or overlooked < OVERLOOKED else None
 
     def copy(self) -> Case:
@@ -128,20 +122,18 @@ class Case(Subject, Probe):
         """
         count = self.count(2**13, 2**15)
         wi, uv = self.units(count), self.uniform(count, 2)
-        samples = self.sample(wi, self.uniform(count, 3), uv)
-        usable = np.isfinite(samples.wo).all(axis=1) & ~samples.delta & samples.lit
-        usable &= (self.rng.random(count) < 0.75) & ~narrow(wi, samples)
-        wo = unit(np.where(usable[:, None], samples.wo, self.units(count)))
-        crosses, eta = wi[:, 2] * wo[:, 2] < 0, np.ones(count)
-        across = usable & crosses
+        s = self.sample(wi, self.uniform(count, 3), uv)
+        usable = np.isfinite(s.wo).all(axis=1) & ~s.delta & s.lit
+        usable &= (self.rng.random(count) < 0.75) & ~narrow(wi, s)
+        wo = unit(np.where(usable[:, None], s.wo, self.units(count)))
+        crosses, eta = wi[:, 2] * wo[:, 2] < 0, np.where(usable, s.eta, np.nan)
         for side in (wi[:, 2] > 0, wi[:, 2] < 0):
-            known = across & side & np.isfinite(samples.eta)
-            eta[side & crosses] = np.median(samples.eta[known]) if known.any() else 1
-        eta = np.where(across, samples.eta, eta)
+            there = eta[side & crosses & np.isfinite(eta)]
+            eta[side & crosses & ~usable] = np.median(there) if len(there) else 1
         value, pdf = self.both(wi, wo, uv)
         off = self.spread(lambda *at: np.column_stack(self.both(*at)), wi, wo, uv)
         known = {"value": value, "pdf": pdf, "value_off": off[:, :-1], "pdf_off": off[:, -1]}
-        return Lanes(wi=wi, wo=wo, uv=uv, eta=eta, **known)
+        return Lanes(wi=wi, wo=wo, uv=uv, eta=np.where(crosses, eta, 1), **known)
 
     @cached_property
     def lit(self) -> Lanes:
@@ -161,10 +153,8 @@ def live(wi: Array, s: Lanes, value: Array, pdf: Array) -> Array:
     Weight 0 is how ``sample`` refuses: its direction is then any, or on the wrong side. It may also be that
     the value is 0 there, or that the weight is wrong; but then the stated density is that of the direction.
     """
-    reflection, transmission = (
-        s.type & int(kind) for kind in (mi.BSDFFlags.Reflection, mi.BSDFFlags.Transmission)
-    )
-    astray = np.where(wi[..., 2] * s.wo[:, 2] < 0, reflection, transmission) != 0
+    f, crosses = mi.BSDFFlags, wi[..., 2] * s.wo[:, 2] < 0
+    astray = (s.type & np.where(crosses, int(f.Reflection), int(f.Transmission))) != 0
     dark = ~s.lit & (value != 0).any(axis=1)
     refused = dark & (astray | ~np.isclose(s.pdf, pdf, rtol=1e-3))
     return ~s.delta & np.isfinite(pdf) & (pdf > 0) & ~refused
@@ -175,8 +165,7 @@ def narrow(wi: Array, s: Lanes) -> Array:
     drawn, found = ~s.delta & (s.pdf > 0), np.zeros(len(s.pdf), bool)
     # a lobe of width w along the plane of incidence is w cos θ wide across: density 1 / (w² cos θ)
     sharpness = s.pdf / np.abs(wi[..., 2])
-    for component in np.unique(s.component[drawn]):
-        part = drawn & (s.component == component)
+    for part in (drawn & (s.component == component) for component in np.unique(s.component[drawn])):
         found |= part & (np.median(sharpness[part]) > NARROW**-2)
     return found
 
@@ -197,19 +186,15 @@ def parameters(case: Case) -> list[tuple[str, Any]]:
 
 
 @contextmanager
-def changed(case: Case, key: str, change: Any) -> Iterator[Any]:
+def changed(case: Case, key: str, change: Any) -> Iterator[None]:
     """Change a parameter for a while."""
     params = mi.traverse(case.plugin)
-    before = copied(params[key])
+    value = params[key]
+    before = value if isinstance(value, float) else type(value)(value)  # else it changes with the BSDF
     params[key] = change(before)
     params.update()
     try:
-        yield params[key]
+        yield
     finally:
         params[key] = before
         params.update()
-
-
-def copied(value: Any) -> Any:
-    """Return a parameter that no longer changes with the BSDF."""
-    return value if isinstance(value, float) else type(value)(value)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
@@ -9,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks import probe
-from mrt_mitsuba.validation.checks.bsdf_case import Case, changed, copied, live, narrow, parameters
+from mrt_mitsuba.validation.checks.bsdf_case import Case, changed, live, narrow, parameters
 from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip, figures
 from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
 
@@ -79,10 +81,8 @@ def gradients(law: Law, case: Case) -> None:
         raise Skip("traverse() marks no parameter as differentiable")
     for key in keys:
         number = float(np.mean(np.array(params[key])))
-        # away from the ends of its range, so that it can be varied both ways
-        with changed(
-            case, key, lambda old, n=number: type(old)(old * 0.9 if n == 1 else old + 0.1 * (n == 0))
-        ):
+        inside = 0.9 if number == 1 else 1, 0.1 * (number == 0)  # so that it can be varied both ways
+        with changed(case, key, lambda old, by=inside: type(old)(old * by[0] + by[1])):
             if _attached(law, case, key):
                 _sampled(law, case, key)
     if not law.parts:
@@ -91,13 +91,11 @@ def gradients(law: Law, case: Case) -> None:
 
 def _attached(law: Law, case: Case, key: str) -> bool:
     """Hold the derivative by one parameter to differences; return False where it is detached, and wrong."""
-    few, shift = case.lit, mi.Float(0)
-    dr.enable_grad(shift)
-    with changed(case, key, lambda old: _moved(old, shift)):
-        (found,), (attached,) = _forward(shift, len(few.wi), _values(case))
+    few = case.lit
+    with _shifted(case, key) as shift:
+        (found,), attached = _forward(shift, len(few.wi), _values(case))
     broken, found = ~np.isfinite(found), np.nan_to_num(found, posinf=0, neginf=0)
-    with changed(case, key, lambda old: old):
-        slope, error = _differences(case, key)
+    slope, error = _differences(case, key)
     if not attached and not slope.any():
         law.notes.append(f"{key} changes no value")
         _reached(law, case, key)
@@ -116,13 +114,21 @@ def _attached(law: Law, case: Case, key: str) -> bool:
     return attached or measured <= GRADIENT
 
 
-def _forward(shift: Any, count: int, *values: Any) -> tuple[list[Array], list[bool]]:
-    """Return the derivatives [N] of each of several arrays by one number, and which of them have one."""
-    attached = [dr.grad_enabled(value) for value in values]
-    if any(attached):
+@contextmanager
+def _shifted(case: Case, key: str) -> Iterator[Any]:
+    """Add a number with derivatives to a parameter for a while."""
+    shift = mi.Float(0)
+    dr.enable_grad(shift)
+    with changed(case, key, lambda old: _moved(old, shift)):
+        yield shift
+
+
+def _forward(shift: Any, count: int, *values: Any) -> tuple[Array, bool]:
+    """Return the derivatives [K, N] of K arrays by one number, and whether any of them has one."""
+    attached = any(map(dr.grad_enabled, values))
+    if attached:
         dr.forward(shift)
-    grads = [np.array(dr.grad(value), np.float64) for value in values]  # 0 where there is none
-    return [np.broadcast_to(grad, count) for grad in grads], attached
+    return np.array([np.broadcast_to(np.array(dr.grad(v), np.float64), count) for v in values]), attached
 
 
 def _sampled(law: Law, case: Case, key: str) -> None:
@@ -133,9 +139,7 @@ def _sampled(law: Law, case: Case, key: str) -> None:
     """
     count = case.count(2**14, 2**16)
     wi, u, uv = case.units(count), case.uniform(count, 3), case.uniform(count, 2)
-    shift = mi.Float(0)
-    dr.enable_grad(shift)
-    with changed(case, key, lambda old: _moved(old, shift)):
+    with _shifted(case, key) as shift:
         si = probe.interaction(as_mitsuba("Vector3f", wi), as_mitsuba("Point2f", uv))
         first, second = as_mitsuba("Float", u[:, 0]), as_mitsuba("Point2f", u[:, 1:])
         bs, weight = case.plugin.sample(context(), si, first, second)
@@ -148,20 +152,18 @@ def _sampled(law: Law, case: Case, key: str) -> None:
     counts = live(wi, s, *case.both(wi, np.nan_to_num(s.wo), uv)) & ~narrow(wi, s)
     counts &= np.isfinite(found) & np.isfinite(expected) & (np.abs(wi[:, 2]) > 0.05)
     counts &= (np.abs(s.wo[:, 2]) > 0.05) & (s.pdf < (1024 * ROUNDED) ** -2)  # a rounding shows
-    if not any(attached) or counts.sum() < 100:
+    if not attached or counts.sum() < 100:
         return
-    off = np.where(counts, np.abs(found - expected), 0)
+    apart = np.where(counts, found - expected, 0)
+    i, known = int(np.abs(apart).argmax()), apart[counts]
     size = max(np.abs(expected[counts]).mean(), 1e-3 * np.abs(s.weight[counts]).mean(), 1e-30)
-    i = int(off.argmax())
-    names = {"wi": wi[i], "uv": uv[i], "u": u[i], "key": key}
     if moves:
-        apart = (found - expected)[counts]
-        apart = np.clip(apart, *np.quantile(apart, (1e-3, 1 - 1e-3)))
-        beyond = max(abs(apart.mean()) - SIGMAS * apart.std() / np.sqrt(len(apart)), 0)
-        law.hold("mean", beyond / size, **names)
+        known = np.clip(known, *np.quantile(known, (1e-3, 1 - 1e-3)))
+        off = max(abs(known.mean()) - SIGMAS * known.std() / np.sqrt(len(known)), 0)
     else:
-        usual = counts & (off <= np.quantile(off[counts], 0.98))
-        law.hold("weights", off[usual].sum() / (size * usual.sum()), **names)
+        known = np.abs(known)
+        off = known[known <= np.quantile(known, 0.98)].mean()
+    law.hold("mean" if moves else "weights", off / size, wi=wi[i], uv=uv[i], u=u[i], key=key)
 
 
 def _total(spectrum: Any) -> Any:
@@ -172,9 +174,9 @@ def _total(spectrum: Any) -> Any:
 def _reached(law: Law, case: Case, key: str) -> None:
     """A parameter whose updates change no value should change none where it is loaded, either."""
     name, few = key.removesuffix(".value"), case.lit
+    number = 0.8 * float(np.mean(np.array(mi.traverse(case.plugin)[key]))) or 0.5
     if case.description is None or "." in name:
         return
-    number = 0.8 * float(np.mean(np.array(mi.traverse(case.plugin)[key]))) or 0.5
     try:
         other = Probe(case.load(**{name: number}))
     except RuntimeError:  # what is loaded goes by another name, or takes other numbers
@@ -205,15 +207,11 @@ def _differences(case: Case, key: str) -> tuple[Array, Array]:
     That is what the next larger width says otherwise, the rounding of values, and half of what the slopes to
     either side are apart: where a value has a kink, as at the end of a range, either one is a derivative.
     Where a lobe is so narrow that it moves away within every width, differences say nothing: infinity.
-    The parameter is left changed.
     """
-    params = mi.traverse(case.plugin)
-    base = copied(params[key])
 
     def at(shift: float) -> Array:
-        params[key] = _moved(base, dr.opaque(mi.Float, shift))
-        params.update()
-        return np.array(_values(case), np.float64)
+        with changed(case, key, lambda old: _moved(old, dr.opaque(mi.Float, shift))):
+            return np.array(_values(case), np.float64)
 
     here = at(0.0)
     ends = np.array([(at(step), at(-step)) for step in WIDTHS])

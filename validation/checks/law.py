@@ -1,4 +1,8 @@
-"""A law that a plugin must obey, and the result of checking several: figures, limits, reasons, snippets."""
+"""A plugin under examination, the laws that it must obey, and the result of checking several.
+
+A law's ``snippet`` is a program in plain Mitsuba with the numbers of its worst case. Each law has the body
+next to it; ``_SETUP`` comes before it, for the names that are known.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +12,10 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from textwrap import indent
 from typing import Any, TypeVar
 
 import drjit as dr
@@ -19,6 +24,8 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.scene.loading import load_dict
+from mrt_mitsuba.validation.checks.probe import Array, is_scalar, unit
 from mrt_mitsuba.validation.tools import report
 from mrt_mitsuba.validation.tools.study import Bound, Study
 
@@ -26,12 +33,14 @@ TITLE = "Laws of plugins"
 LEVEL = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction
 RARE = "one false alarm in a million checks"
 SIGMAS = 6  # the same for a normal distribution: 2e-9
-LawFunction = TypeVar("LawFunction", bound=Callable[..., None])
+Called = TypeVar("Called", bound=Callable[..., None])
+Found = TypeVar("Found")
+SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
 TIMEOUT = 120.0  # seconds for each law: sound plugins take a few, those of scalar variants a dozen
 
 
 class Skip(Exception):
-    """Raised by the check of a law that makes no sense for its subject; the text is the reason."""
+    """Raised by the check of a law that makes no sense: the text says why, and an error that it is from."""
 
 
 class TimedOut(BaseException):
@@ -45,23 +54,15 @@ class Part(Bound):
     figure: str = ""  # its name in the law
     snippet: str = ""
 
-    @property
-    def severity(self) -> float:
-        """Return how much of the limit is used: above 1 it is exceeded."""
-        over, under = (self.measured, self.limit) if self.at_most else (self.limit, self.measured)
-        if math.isnan(self.measured) or under <= 0 < over - under:
-            return math.inf
-        return over / under if under > 0 else 0.0
 
-
-def figures(**rows: tuple[Any, ...]) -> Callable[[LawFunction], LawFunction]:
+def figures(**rows: tuple[Any, ...]) -> Callable[[Called], Called]:
     """Give a law its figures, by name: how, what is held to which limit, why that, and a snippet's body.
 
     How: a number "at most" or "at least"; or of N errors the "most", "none" or a "share" of those that are
     bad, or a quantile, NaN left out.
     """
 
-    def mark(law: LawFunction) -> LawFunction:
+    def mark(law: Called) -> Called:
         vars(law)["figures"] = rows
         return law
 
@@ -102,8 +103,14 @@ class Law:
     @property
     def worst(self) -> Part:
         """Return the figure that uses most of its limit."""
-        none = Part("", math.nan, math.nan)
-        return max(self.parts, key=lambda part: (not part.holds, part.severity), default=none)
+
+        def used(part: Part) -> float:
+            over, under = part.measured, part.limit
+            if not part.at_most:
+                over, under = under, over
+            return math.inf if not part.holds else over / under if under > 0 else 0.0
+
+        return max(self.parts, key=used, default=Part("", math.nan, math.nan))
 
     measured = property(lambda self: self.worst.measured)
     limit = property(lambda self: self.worst.limit)
@@ -174,6 +181,144 @@ class Check:
         return report.notebook(self.study(), title=TITLE)
 
 
+@dataclass(frozen=True, repr=False)
+class Kept:
+    """A tensor or transform of a dict: loading uses up the one, and the other's type is the variant's."""
+
+    kind: str  # what makes it: "TensorXf" or "ScalarTransform4f"
+    values: np.ndarray
+
+    def __repr__(self) -> str:
+        """Return it as Python; there is none of large ones."""
+        array = f"np.array({self.values.tolist()}, np.float32)"
+        return f"mi.{self.kind}({array})" if self.values.size <= 64 else "<many numbers>"
+
+
+class Subject:
+    """A plugin under examination, given by its dict or loaded, and how thorough to be."""
+
+    word = "plugin"  # what snippets call it
+
+    def __init__(self, given: Any, quick: bool, seed: int) -> None:
+        self.quick, self.seed, self.rng = quick, seed, np.random.default_rng(seed)
+        self.description: dict[str, Any] | None = None  # None where a loaded object was given
+        if isinstance(given, dict):
+            self.description = _kept(given)
+            self.name = str(given.get("type", "dict"))
+            self.plugin = load_dict(_made(self.description), f"the {self.name}")
+        else:
+            self.name, self.plugin = class_name(given), given
+
+    def with_(self, **changes: Any) -> dict[str, Any]:
+        """Return the dict with other values of some parameters. Raises ``Skip`` without one."""
+        if self.description is None:
+            raise Skip("a loaded object was given: this needs the dict that it is made from")
+        return {**self.description, **_kept(changes)}
+
+    def load(self, **changes: Any) -> Any:
+        """Load it in the current variant, with other values of some parameters. Raises ``Skip`` as well."""
+        return mi.load_dict(_made(self.with_(**changes)))
+
+    def scene(self, **changes: Any) -> Any:
+        """Load a scene that holds the shape alone, or an instance with its group. Raises ``Skip`` as well."""
+        given = self.with_(**changes)
+        nodes: dict[str, Any] = {"shape": given}
+        for key, value in given.items():
+            if given["type"] == "instance" and isinstance(value, dict) and value["type"] == "shapegroup":
+                nodes = {"group": value, "shape": {**given, key: {"type": "ref", "id": "group"}}}
+        return mi.load_dict({"type": "scene", **_made(nodes)})
+
+    def units(self, count: int) -> Array:
+        """Return directions over the whole sphere."""
+        return unit(self.rng.normal(size=(count, 3)))
+
+    def uniform(self, *size: int) -> Array:
+        return self.rng.random(size, np.float32)
+
+    def count(self, quick: int, full: int) -> int:
+        """Return how many lanes to use."""
+        number = quick if self.quick else full
+        return max(int(number * SCALAR_SHARE), 64) if is_scalar() else number
+
+    def program(self, body: str, **names: Any) -> str:
+        """Return a program that loads the plugin and runs ``body``, filled with ``names``."""
+        word, variant, given = self.word, mi.variant(), repr(self.description)
+        text = "".join(setup for name, setup in _SETUP.items() if names.get(name) is not None) + "\n" + body
+        if "variants" in names:
+            each = f"    mi.set_variant(variant)\n    print(variant)\n    {word} = load()\n"
+            text = "for variant in {variants}:\n" + each + indent(text, "    ")
+        if "PCG32(n)" in text:
+            variant = variant.replace("scalar_", "llvm_ad_")
+        ours, load = "'mrt_" in given, f"# {word}: the object that was checked\nload = lambda: {word}\n"
+        with suppress(Exception):  # of what some dicts hold there is no source
+            if eval(given, {"mi": mi, "np": np}):
+                known = ours or type(self.plugin).__module__.startswith("mitsuba")
+                load = "" if known else f"# register {self.name!r} here\n"
+                load += f"\ndef load(**more):\n    return mi.load_dict({{**{given}, **more}})\n"
+                load += f"\n{word} = load()\n"
+        start = "import mrt_mitsuba as mrt  # before mitsuba\n" if ours else ""
+        start += "import drjit as dr\nimport mitsuba as mi\nimport numpy as np\n\n"
+        start += f"mi.set_variant({variant!r})\n" + ("mrt.register()\n" if ours else "")
+        numbers = {name: _written(value) for name, value in names.items()}
+        return start + load + text.format(**numbers)
+
+    def elsewhere(self, other: str, call: Callable[[], Found]) -> Found:
+        """Return what a function gives in another variant. Raises ``Skip`` where there is none."""
+        if other not in mi.variants() or runtime.obstacle(other):
+            raise Skip(f"{other} cannot run here")
+        here = mi.variant()
+        try:
+            runtime.use(other)
+            return call()
+        except RuntimeError as problem:
+            if "not found" not in str(problem):
+                raise
+            register = "register it there (mi.detail.add_variant_callback)"
+            raise Skip(f"{other} does not know the plugin: {register}") from None
+        finally:
+            mi.set_variant(here)
+
+    @property
+    def other_kind(self) -> str:
+        """The scalar variant of a vectorised one, or the other way around."""
+        here = mi.variant()
+        return here.replace("scalar_", "llvm_ad_") if is_scalar() else f"scalar_{here.split('_', 2)[-1]}"
+
+
+def class_name(plugin: Any) -> str:
+    """Return the name of a plugin's class: Mitsuba calls all those in Python by that of their base."""
+    python = type(plugin).__module__.split(".")[0] != "mitsuba"
+    return type(plugin).__name__ if python or not hasattr(plugin, "class_name") else plugin.class_name()
+
+
+def _reason(problem: BaseException) -> str:
+    """Return the line of an error that says what happened: the last of a traceback that Mitsuba quotes."""
+    text = str(problem).strip()
+    return text.splitlines()[-1 if "Traceback (most recent" in text else 0] if text else ""
+
+
+def _kept(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _kept(entry) for key, entry in value.items()}
+    if hasattr(value, "matrix") and hasattr(value, "inverse_transpose"):
+        return Kept("ScalarTransform4f", np.array(value.matrix, np.float64))
+    return Kept("TensorXf", np.array(value)) if type(value).__name__.startswith("TensorX") else value
+
+
+def _made(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _made(entry) for key, entry in value.items()}
+    return getattr(mi, value.kind)(value.values) if isinstance(value, Kept) else value
+
+
+def _written(value: Any) -> str:
+    """Return a value as Python text; float32 in the fewest digits that give it back."""
+    if isinstance(value, np.ndarray):
+        inner = ", ".join(str(x) for x in value.astype(np.float32))
+        return inner if value.dtype == np.float32 and len(value) in (2, 3) else f"[{inner}]"
+    return value if isinstance(value, str) else repr(value.item() if isinstance(value, np.generic) else value)
+
+
 def examine(
     kind: Callable[[Any, bool, int], Any],
     given: Any,
@@ -197,23 +342,19 @@ def examine(
     with settings_restored():
         case = kind(given, quick, seed)
     for name in (name for name in laws if name in chosen):
-        figures = vars(laws[name]).get("figures", {})
-        law = found[name] = Law(name, figures=figures, program=case.program)
+        law = found[name] = Law(name, figures=vars(laws[name])["figures"], program=case.program)
         try:
             with settings_restored(), _limited(timeout):
                 if late:
                     raise Skip(f"a law before it {late}")
                 laws[name](law, case)
-        except Skip as reason:
-            law.skipped = str(reason)
+        except Skip as why:
+            law.skipped = f"{why}: {_reason(why.__cause__)}" if why.__cause__ else str(why)
         except TimedOut:
             late = f"took longer than {timeout:g} s"
             law.parts.append(Part(f"it {late}", math.inf, timeout, note="a plugin must come to an end"))
         except Exception as error:
-            lines = str(error).strip().splitlines() or [""]
-            # Mitsuba quotes the traceback of an error in a Python plugin, with the error last
-            line = lines[-1] if lines[0].startswith("Traceback") else lines[0]
-            what = f"it raised {type(error).__name__}: {line}"
+            what = f"it raised {type(error).__name__}: {_reason(error)}"
             law.parts.append(Part(what, math.inf, 0, note="a plugin must not raise"))
         law.program = None
     return Check(case.name, variant, found, time.perf_counter() - start, quick)
@@ -248,7 +389,39 @@ def _limited(seconds: float) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # Mitsuba passes on what a Python plugin raises as an error of its own
-        raise (TimedOut if time.perf_counter() - start > seconds else error) from error
+        if time.perf_counter() - start > seconds:
+            raise TimedOut from error
+        raise
     finally:
         timer.cancel()
         timer.join()  # if it is about to interrupt: then it does here, and not later
+
+
+_SETUP = {
+    "wi": """
+si = dr.zeros(mi.SurfaceInteraction3f)
+si.n, si.t, si.p = mi.Normal3f(0, 0, 1), 1, mi.Point3f(0, 0, 0)
+si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+si.sh_frame = mi.Frame3f(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+if mi.is_spectral:
+    si.wavelengths = type(si.wavelengths)(450, 500, 550, 600)
+si.uv = mi.Point2f({uv})
+si.wi = mi.Vector3f({wi})
+dr.make_opaque(si.wi)  # numbers, not parts of the program: they are computed with otherwise
+ctx = mi.BSDFContext()
+""",
+    "setting": """
+key, number = {setting}
+params = mi.traverse(bsdf)
+params[key] = type(params[key])(params[key] * 0 + number)
+params.update()
+""",
+    "component": "ctx.component = {component}\n",
+    "wo": "wo = mi.Vector3f({wo})\ndr.make_opaque(wo)\n",
+    "u": "u = {u}\nbs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))\n",
+    "o": """
+scene = mi.load_dict({{"type": "scene", "shape": shape}})
+o, d = mi.Point3f({o}), mi.Vector3f({d})
+dr.make_opaque(o, d)
+""",
+}

@@ -70,9 +70,9 @@ def measure(
 ) -> Lanes:
     """Estimate the noise of ``function([M, K]) -> [M]`` at float32 inputs [N, K].
 
-    Return the ``noise`` found by differences and what rounding of the inputs alone would do (``explained``),
-    both in roundings (2⁻²⁴) of the value; the noise over what inputs, rounded twice, and ``ALLOWANCE`` other
-    roundings explain (``lost``); and the most float32 steps between points of a line (``stride``).
+    Return the ``noise`` found by differences in roundings (2⁻²⁴) of the value; the noise over what inputs,
+    rounded twice, and ``ALLOWANCE`` other roundings explain (``lost``); and the most float32 steps between
+    points of a line (``stride``).
 
     ``size`` [N]: what roundings are of, the value itself if left out. ``strides``: the most float32 steps
     between points of a line, in ascending order; the first counts along which the value changes at half of
@@ -112,6 +112,5 @@ def measure(
         small, large = np.minimum(stairs[:-1], stairs[1:]), np.maximum(stairs[:-1], stairs[1:])
         both = np.where((large <= ALIKE * small) & (small > TABLES * unit), small, 0).max(axis=0)
         noise = np.where(np.nan_to_num(noise) < both, both, noise)
-    noise, explained = noise / unit, explained / unit
-    lost = np.nan_to_num(noise / np.hypot(2 * explained, ALLOWANCE), posinf=0)
-    return Lanes(noise=noise, explained=explained, lost=lost, stride=np.take(strides, chosen))
+    lost = np.nan_to_num(noise / unit / np.hypot(2 * explained / unit, ALLOWANCE), posinf=0)
+    return Lanes(noise=noise / unit, lost=lost, stride=np.take(strides, chosen))

@@ -20,10 +20,9 @@ from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.validation.checks import emitter
 from mrt_mitsuba.validation.checks.bsdf import check_bsdf
-from mrt_mitsuba.validation.checks.law import TITLE, Check, examine
+from mrt_mitsuba.validation.checks.law import TITLE, Check, class_name, examine
 from mrt_mitsuba.validation.checks.probe import not_finite
 from mrt_mitsuba.validation.checks.shape import check_shape
-from mrt_mitsuba.validation.checks.subject import class_name
 from mrt_mitsuba.validation.tools import report
 from mrt_mitsuba.validation.tools.study import Study
 

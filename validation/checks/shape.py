@@ -18,7 +18,6 @@ from mrt_mitsuba.validation.checks.law import LEVEL, RARE, SIGMAS, TIMEOUT, Chec
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import Array, lanes, unit
 from mrt_mitsuba.validation.checks.shape_case import FLAT, Case, dot, leave, near, offset, trace, walk
-from mrt_mitsuba.validation.checks.subject import Kept, elsewhere, other_kind, reason
 from mrt_mitsuba.validation.tools.compare import sidak
 
 HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
@@ -283,8 +282,7 @@ print("scaled, t over the scale:", scene.ray_intersect(mi.Ray3f(o * 2.0**{power}
 )  # fmt: skip
 def scale(law: Law, case: Case) -> None:
     """A millionth and a million times the size: the same, scaled. Powers of two leave no roundings."""
-    given = case.with_().get("to_world")
-    matrix = given.values if isinstance(given, Kept) else np.eye(4)
+    matrix = getattr(case.with_().get("to_world"), "values", np.eye(4))
     few = slice(0, case.count(2**12, 2**14))
     o, d, seen = case.seen[0][few], case.seen[1][few], case.seen[2].only(few)
     for power in (-20, -10, 10, 20):
@@ -292,7 +290,7 @@ def scale(law: Law, case: Case) -> None:
         try:
             box = case.load(to_world=mi.ScalarTransform4f(larger)).bbox()
         except RuntimeError as problem:
-            raise Skip(f"to_world is not accepted: {reason(problem)}") from problem
+            raise Skip("to_world is not accepted") from problem
         grown = np.linalg.norm(np.ravel(np.array(box.max, np.float64) - np.array(box.min, np.float64)))
         if not np.isclose(grown, 2.0**power * case.size, rtol=1e-3):
             raise Skip("to_world does not scale all of it (of curves, the radius stays)")
@@ -385,9 +383,9 @@ def bbox(law: Law, case: Case) -> None:
 def variants(law: Law, case: Case) -> None:
     """Hits in the scalar variant against those in the vectorised one."""
     case.with_()
-    few, other = slice(0, case.count(500, 2000)), other_kind()
+    few, other = slice(0, case.count(500, 2000)), case.other_kind
     o, d, seen = case.seen[0][few], case.seen[1][few], case.seen[2].only(few)
-    there = elsewhere(other, lambda: trace(case.scene(), o, d))
+    there = case.elsewhere(other, lambda: trace(case.scene(), o, d))
     law.hold("answer", (there.found != seen.found) & (seen.steep | ~seen.found), o=o, d=d, other=other)
     error = np.abs(there.t - seen.t) / (ROUNDING * (np.abs(o).max(axis=1) + seen.t))
     law.hold("distance", np.where(there.found & seen.steep, error, 0), o=o, d=d, other=other)
@@ -442,7 +440,7 @@ def sampling(law: Law, case: Case) -> None:
         p, n, pdf, again = lanes(positions, ("Point2f", u))
         area = float(np.ravel(np.array(case.plugin.surface_area()))[0])
     except RuntimeError as problem:
-        raise Skip(f"positions cannot be sampled: {reason(problem)}") from problem
+        raise Skip("positions cannot be sampled") from problem
     law.hold("position", np.abs(pdf / again - 1))
     law.hold("area", abs(np.mean(1 / pdf) / area - 1))
     few = slice(0, case.count(2**14, 2**17))

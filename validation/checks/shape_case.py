@@ -10,10 +10,9 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.checks.law import Skip
+from mrt_mitsuba.validation.checks.law import Skip, Subject
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import Array, Lanes, lanes, unit
-from mrt_mitsuba.validation.checks.subject import Subject
 
 OFFSET = 1500 * ROUNDING  # of the origin of a spawned ray from its surface, over 1 + max |p|
 FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
