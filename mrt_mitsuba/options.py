@@ -58,13 +58,6 @@ def subset(known: Iterable[str]) -> Kind:
     )
 
 
-def switch(form: str = "1|0") -> Kind:
-    """Return the kind of yes or no."""
-    words = {"1": True, "0": False, "yes": True, "no": False, "true": True, "false": False}
-    fits = (False, True).__contains__
-    return Kind(form, "1 or 0", fits, from_text=lambda text: words.get(text.lower()))
-
-
 def _whole(value: Any) -> int:
     if isinstance(value, bool):
         raise TypeError
@@ -114,6 +107,8 @@ BYTES = Kind(
     lambda count: count >= SMALLEST_MEMORY,
     _bytes,
 )
+WORDS = {"1": True, "0": False, "yes": True, "no": False, "true": True, "false": False}
+SWITCH = Kind("1|0", "1 or 0", (False, True).__contains__, from_text=lambda text: WORDS.get(text.lower()))
 NAME = Kind("NAME", "a name such as llvm_ad_rgb or scalar_rgb", str.isidentifier)
 PATH = Kind("PATH", "the path of a file", lambda path: path and "\0" not in path, os.fspath)
 ANYTHING = Kind("", "anything", lambda value: True)  # checked where it is used

@@ -11,7 +11,7 @@ from typing import Any
 
 from mrt_mitsuba.command.registry import split
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.options import PATH, check, choice, either, option, switch, table
+from mrt_mitsuba.options import PATH, SWITCH, check, choice, either, option, table
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.model import check_model_options
@@ -39,7 +39,7 @@ class Options(RenderSettings):
         "report", choice("report", "srgb"), "values in the PNG: linear as in the report, or sRGB"
     )
     plan: str = option("hide", choice("show", "hide"), "print what will run and what is left out, and why")
-    quiet: bool = option(False, switch(), "print errors only", "0")
+    quiet: bool = option(False, SWITCH, "print errors only", "0")
     log: str = option("warn", choice(*LEVELS), "what to print: warnings; times; every kernel")
 
     def render_arguments(self) -> dict[str, Any]:

@@ -100,7 +100,7 @@ def gaussian_dof(
     if mode == "report":
         return grid.output(_pascal(grid, planes, amount), (3,))
     radius = _radius(amount)
-    near = (distance > 0) & (distance < grid.opaque(focal_distance))
+    near = (distance > 0) & (distance < dr.opaque(grid.Float, focal_distance))
     return grid.output(_discs(grid, planes, dr.select(near, -radius, radius)), (3,))
 
 
@@ -108,7 +108,7 @@ def _amount(grid: Grid, distance: Any, focal_distance: float, focal_range: float
     check_numbers(focal_distance=focal_distance, focal_range=focal_range)
     if focal_distance <= 0:
         return dr.zeros(grid.Float, grid.count)
-    amount = dr.abs(grid.opaque(focal_distance) - distance) - grid.opaque(focal_range)
+    amount = dr.abs(dr.opaque(grid.Float, focal_distance) - distance) - dr.opaque(grid.Float, focal_range)
     amount = dr.select(amount > 0, dr.minimum(amount, MAX_AMOUNT), 0)  # NaN > 0 is false
     return dr.select((distance <= 0) | (distance == math.inf), MAX_AMOUNT, amount)
 

@@ -88,7 +88,7 @@ def luma_edges(
     luma = dr.select(dr.isfinite(sum_), dr.sqrt(dr.maximum(sum_, 0)), math.inf)
     window = _window(grid, luma)
     high, low = functools.reduce(dr.maximum, window), functools.reduce(dr.minimum, window)
-    offset = grid.opaque(contrast_offset)
+    offset = dr.opaque(grid.Float, contrast_offset)
     value = high - low + offset
     if variance is not None:
         deviation = _deviation(grid, variance, LUMA_WEIGHTS, noise_sigmas)
@@ -96,10 +96,12 @@ def luma_edges(
         luma_variance = dr.square(deviation) / dr.maximum(dr.maximum(4 * sum_, deviation), 1e-30)
         noise = dr.sqrt(_sum(_window(grid, luma_variance), [1 / 9] * 9))
         # not above zero where the variance is NaN
-        excess = high - low - 2 * grid.opaque(noise_sigmas) * noise
+        excess = high - low - 2 * dr.opaque(grid.Float, noise_sigmas) * noise
         value = dr.select(excess > 0, excess + offset, 0)
     value = dr.select(dr.isfinite(high), value, math.inf)
-    threshold = dr.maximum(grid.opaque(absolute_threshold), grid.opaque(relative_threshold) * high)
+    threshold = dr.maximum(
+        dr.opaque(grid.Float, absolute_threshold), dr.opaque(grid.Float, relative_threshold) * high
+    )
     return _edge_map(grid, ~(value < threshold), value)
 
 
@@ -135,10 +137,10 @@ def sobel_edges(
         grey_variance = dr.square(255 * _deviation(grid, variance, GREY_WEIGHTS, noise_sigmas))
         squares = [2, 4, 2, 4, 0, 4, 2, 4, 2]  # of Gx's and Gy's weights, summed
         noise = dr.sqrt(_sum(_window(grid, grey_variance), squares))
-        excess = value - grid.opaque(noise_sigmas) * noise
+        excess = value - dr.opaque(grid.Float, noise_sigmas) * noise
         value = dr.select(excess > 0, dr.trunc(excess), 0)
     value = dr.select(finite(w), value, math.inf)
-    return _edge_map(grid, value > grid.opaque(threshold), value)
+    return _edge_map(grid, value > dr.opaque(grid.Float, threshold), value)
 
 
 def geometry_edges(
@@ -186,8 +188,8 @@ def geometry_edges(
         dot = sum(window[4] * window[k] for window in windows)
         both = (centre > 0) & (near[k] > 0)
         crease = dr.maximum(crease, dr.select(both, 1 - dot, 0))
-    step /= grid.opaque(depth_step)
-    crease /= grid.opaque(1 - math.cos(math.radians(crease_angle)))
+    step /= dr.opaque(grid.Float, depth_step)
+    crease /= dr.opaque(grid.Float, 1 - math.cos(math.radians(crease_angle)))
     value = dr.select(finite(near), dr.maximum(step, crease), math.inf)
     return _edge_map(grid, value > 1, value)
 

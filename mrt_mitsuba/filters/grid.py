@@ -26,7 +26,7 @@ class Grid:
     The backend is that of ``image`` if it is a Dr.Jit tensor. For anything else it is that of the current
     Mitsuba variant, or without one LLVM where that works and else ``drjit.scalar``.
 
-    Sizes are opaque to Dr.Jit, so a new size makes no new kernel.
+    Sizes, and the options of filters, are opaque to Dr.Jit: a new value makes no new kernel.
     """
 
     def __init__(self, image: Any) -> None:
@@ -68,10 +68,6 @@ class Grid:
         """Return an array [rows, columns, 3] as three flat planes."""
         flat = self.flat(array, (3,), name)
         return [dr.gather(self.Float, flat, 3 * self.index + channel) for channel in range(3)]
-
-    def opaque(self, value: float) -> Any:
-        """Return a number as an array that is no literal in a kernel: a new value makes no new kernel."""
-        return dr.opaque(self.Float, value)
 
     def coordinates(self, index: Any) -> tuple[Any, Any]:
         """Return column and row of pixels given by their index."""

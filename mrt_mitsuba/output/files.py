@@ -117,33 +117,26 @@ def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], heade
             raise OutputError(f"layer {name} of shape {array.shape} is no {' '.join(names)} of the picture")
         planes |= {each: np.ascontiguousarray(array[:, :, index]) for index, each in enumerate(names)}
     texts = {name: v if isinstance(v, str | int | float) else json.dumps(v) for name, v in header.items()}
-    kind = compression(image.shape[0] * image.shape[1])
-    picture = OpenEXR.File({**texts, "compression": kind, "type": OpenEXR.scanlineimage}, planes)
     # The library does not report a full disk when it opens the file itself, so the file is ours. It writes a
     # few rows at a time by code in Python: within its own code, and that of Python's files, a signal would
     # wait until all is written.
     stream = SimpleNamespace(tell=file.tell, seek=file.seek, write=lambda rows: file.write(rows))
-    with compressing():
-        picture.write(stream)
-
-
-def compression(pixels: int) -> Any:
-    """Return how an EXR of so many pixels is compressed, as the library names it."""
-    import OpenEXR
-
-    return OpenEXR.ZIP_COMPRESSION if pixels >= COMPRESSED else OpenEXR.NO_COMPRESSION
+    with compressing(image.shape[0] * image.shape[1]) as kind:
+        OpenEXR.File({**texts, "compression": kind, "type": OpenEXR.scanlineimage}, planes).write(stream)
 
 
 @contextlib.contextmanager
-def compressing() -> Iterator[None]:
-    """Let the EXR library compress in threads, to the same file. They are gone afterwards: a process that is
-    forked while it has some waits for them for ever."""
+def compressing(pixels: int) -> Iterator[Any]:
+    """Let the EXR library compress in threads, to the same file, and give how, as it names it.
+
+    The threads are gone afterwards: a process that is forked while it has some waits for them for ever.
+    """
     import OpenEXR
 
     before = OpenEXR.global_thread_count()
     OpenEXR.set_global_thread_count(usable_cores())
     try:
-        yield
+        yield OpenEXR.ZIP_COMPRESSION if pixels >= COMPRESSED else OpenEXR.NO_COMPRESSION
     finally:
         OpenEXR.set_global_thread_count(before)
 

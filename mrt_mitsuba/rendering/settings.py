@@ -19,6 +19,7 @@ from mrt_mitsuba.options import (
     NUMBER,
     PARAMETERS,
     RECTANGLE,
+    SWITCH,
     TARGET,
     VECTOR,
     Kind,
@@ -27,7 +28,6 @@ from mrt_mitsuba.options import (
     integer,
     option,
     subset,
-    switch,
     table,
 )
 from mrt_mitsuba.output.layers import LAYERS
@@ -141,7 +141,7 @@ class RenderSettings:
         "rays for each sample, where the integrator is random; aamode=noise: mean of a pixel",
         "1",
     )
-    count_rays: bool = option(False, switch(form=""), "count mirror and shadow rays")
+    count_rays: bool = option(False, SWITCH._replace(form=""), "count mirror and shadow rays")
     params: Mapping[str, Any] | None = option(
         None, PARAMETERS, "values for the $names that an XML file declares, and by keys of mi.traverse"
     )

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
-from mrt_mitsuba.output.files import compressing, compression, silenced
+from mrt_mitsuba.output.files import compressing, silenced
 from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.runtime import use
 from mrt_mitsuba.scene.open import open_scene
@@ -125,8 +125,6 @@ def _write_rows(job: Job, tiles: Sequence[Job], folder: str) -> None:
     regions = [tile.arguments["region"] for tile in tiles]
     own, (left, top, wide, high) = files[0].header(), regions[-1]
     header: dict[str, Any] = OpenEXR.Header(left + wide, top + high)
-    kind = compression((left + wide) * (top + high))
-    header["compression"] = type(header["compression"])(int(kind))  # an older type of the library
     header |= {name: value for name, value in own.items() if name not in header and name != "type"}
     options = {name: value for name, value in json.loads(own["mrt:options"]).items() if name != "region"}
     header["channels"] = own["channels"]
@@ -134,7 +132,10 @@ def _write_rows(job: Job, tiles: Sequence[Job], folder: str) -> None:
     header[MADE_WITH] = job.made_with.encode()
     columns = [region[1] for region in regions].count(0)  # those in the first row
     with replacing(os.path.join(folder, job.file)) as (file,):
-        with compressing(), contextlib.closing(OpenEXR.OutputFile(file.name, header)) as picture:
+        with contextlib.ExitStack() as stack:
+            kind = stack.enter_context(compressing((left + wide) * (top + high)))
+            header["compression"] = type(header["compression"])(int(kind))  # an older type of the library
+            picture = stack.enter_context(contextlib.closing(OpenEXR.OutputFile(file.name, header)))
             for first in range(0, len(files), columns):
                 for parts in zip(*map(_strips, files[first : first + columns]), strict=True):
                     planes, rows = {}, 0
