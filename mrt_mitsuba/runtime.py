@@ -69,6 +69,7 @@ def use(variant: str | None = None) -> str:
         mitsuba_first()
         one_by_one()
         plugins.register()
+        plugins.register_modules("mrt_mitsuba.rays", ["samplers"])
         plugins.register_modules("mrt_mitsuba.rendering", ["adaptive"])
         _used = variant
     return variant

@@ -20,9 +20,6 @@ from .variants import but_not, construct_quietly, largest
 # average over the report's scenes below 1e-5
 MIN_CONTRIBUTION = 1 / 16 / 255
 
-# What ``trace`` returns, by the names of the layers that are made of it
-LAYERS = frozenset({"depth", "normal", "albedo", "direct", "reflection", "bounces", "shadow_rays"})
-
 
 @dataclass
 class Trace:
@@ -78,6 +75,8 @@ class MrtWhitted(mi.SamplingIntegrator):
     """
 
     plugin_name = "mrt_whitted"
+    #: names of the layers of which ``trace`` returns what they need, next to those of the first hit
+    provided_layers = frozenset({"direct", "reflection", "bounces", "shadow_rays"})
 
     def __init__(self, props: mi.Properties) -> None:
         construct_quietly(self, props)
@@ -129,32 +128,22 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     # ------------------------------------------- Plan --------------------------------------------------
 
-    def provided_layers(self) -> frozenset[str]:
-        """Return the names of the layers that ``trace`` knows."""
-        return LAYERS
-
-    def read(self, scene: mi.Scene) -> Reading:
-        """Read a scene as it is now; cheap where nothing has changed since the last call."""
-        self._snapshot = Snapshot(scene, self._snapshot)
-        return Reading(self._snapshot, self._made)
-
     def scene_facts(self, scene: mi.Scene) -> SceneFacts:
         """Return what the kernels depend on."""
-        return self.read(scene).facts
+        return self.prepare(scene).facts
 
     def kernel_plan(self, facts: SceneFacts) -> KernelPlan:
         """Decide what the kernels for such a scene hold."""
         return make_plan(facts, self, None if self.sky is None else largest(self.sky))
 
-    def prepare(
-        self, scene: mi.Scene, plan: KernelPlan | None = None, reading: Reading | None = None
-    ) -> SceneData:
-        """Make the data of the kernels for ``trace``; cheap where nothing has changed since the last call.
+    def prepare(self, scene: mi.Scene, plan: KernelPlan | None = None) -> SceneData:
+        """Read a scene as it is now, and make the data of the kernels for ``trace``.
 
-        Without a ``plan`` of one's own, that of ``kernel_plan``. ``reading``: what ``read(scene)`` has just
-        returned.
+        Cheap where nothing has changed since the last call. Without a ``plan`` of one's own, that of
+        ``kernel_plan``.
         """
-        reading = self.read(scene) if reading is None else reading
+        self._snapshot = Snapshot(scene, self._snapshot)
+        reading = Reading(self._snapshot, self._made)
         return SceneData(reading, plan or self.kernel_plan(reading.facts), self._made)
 
     # ------------------------------------------- Tracing -----------------------------------------------

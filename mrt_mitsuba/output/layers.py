@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
-from collections.abc import Iterable
 
 FIRST_HIT = "first hit"  # of the first ray of a pixel; a mean would name no point
 AVERAGED = "averaged"  # over the rays of a pixel, as the picture is
@@ -62,13 +61,3 @@ _ROWS = (
 TABLE = {layer.name: layer for layer in _ROWS}
 #: The layers that can be asked for, by name
 LAYERS = {name: layer for name, layer in TABLE.items() if not layer.internal}
-
-
-def named(source: str) -> frozenset[str]:
-    """Return the names of all layers from a source."""
-    return frozenset(name for name, layer in TABLE.items() if layer.source == source)
-
-
-def channels(layers: Iterable[str]) -> int:
-    """Return the number of float32 values that layers take in a pixel."""
-    return sum(len(TABLE[name].letters) for name in layers)

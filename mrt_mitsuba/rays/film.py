@@ -1,20 +1,46 @@
-"""A film's rules: where the rays through its pixels start, and how their values become a picture; and the
-part of a picture that is rendered."""
+"""Where and when rays start, by a lattice or a film's rules, and how a film turns values into a picture."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.rays.starts import divide, opaque
-
 STEPS = 32  # of a pixel, where integrals over a filter are summed
+
+
+def opaque(number: float) -> Any:
+    """Return a number as data of a kernel, so that another needs no other kernel."""
+    variant = mi.variant()
+    if variant.startswith("scalar"):
+        return number
+    return _data(variant, "UInt32" if isinstance(number, int) else "Float", number)
+
+
+def divide(n: Any, divisor: int) -> tuple[Any, Any]:
+    """Return quotient and remainder of whole numbers below 2³².
+
+    A processor divides the integers of a packet one after the other, which takes as long as tracing the ray;
+    so vectorised variants multiply by the inverse in double precision. The half added keeps n/d away from
+    whole numbers by 1/(2 d), and rounding moves it by less than n/d / 2⁵² < 1/(2 d).
+    """
+    variant = mi.variant()
+    if variant.startswith("scalar"):
+        return divmod(n, divisor)
+    quotient = mi.UInt32((mi.Float64(n) + 0.5) * _data(variant, "Float64", 1 / divisor))
+    return quotient, n - quotient * _data(variant, "UInt32", divisor)
+
+
+@lru_cache(maxsize=64)
+def _data(variant: str, kind: str, number: float) -> Any:
+    return dr.opaque(getattr(mi, kind), number)
 
 
 class Region(NamedTuple):
@@ -42,6 +68,67 @@ class Region(NamedTuple):
         """Return its rows and columns in an array of another region's pixels."""
         top, left = self.y - other.y, self.x - other.x
         return slice(top, top + self.height), slice(left, left + self.width)
+
+
+@dataclass(frozen=True)
+class Places:
+    """Samples ``first`` to ``first + count − 1`` in each pixel, each traced ``repeats`` times.
+
+    They lie on a lattice of aa × aa. ``report``: sample (i, j) is at (0.5 + i/aa, 0.5 + j/aa), y upwards, as
+    in the original. Sample 0 is the pixel's centre and the others reach into the next pixels, which shifts
+    the picture by up to half a pixel. ``centered``: samples are the centres of aa × aa equal cells. ``film``:
+    no grid, but as many places that the sampler of a scene draws, see ``Film``.
+
+    The shutter is open from time 0 to 1, which is divided into ``moments`` equal parts; successive rays of a
+    pixel go to different parts, far from each other, so that place and time do not correlate. ``phase`` says
+    where in its part a ray is, 0 to 1. None stands for a random place, the same for all rays of a pixel and
+    another for the next pixel, which turns steps into noise.
+    """
+
+    lattice: str = "report"
+    aa: int = 1  #: of the report's lattice, the pixel's centre alone
+    first: int = 0
+    count: int = 1
+    repeats: int = 1
+    moments: int = 0  #: 0: all rays start at time 0
+    phase: float | None = 0.0
+    seed: int = 0  #: of random phases
+
+    @property
+    def size(self) -> int:
+        """Number of rays of a pixel."""
+        return self.count * self.repeats
+
+    @property
+    def holds_centre(self) -> bool:
+        """Return whether the pixel's centre is one of the lattice's samples; it then comes first."""
+        return self.lattice == "report" or (self.lattice == "centered" and self.aa % 2 == 1)
+
+    def at(self, pixel: Any, ray: Any, width: int, height: int) -> tuple[Any, Any]:
+        """Return where and when a ray of a pixel starts: its place in a picture of this size, [0, 1]², x to
+        the right and y down, and its time."""
+        row, column = divide(pixel, width)
+        sample = divide(ray, self.repeats)[0] + opaque(self.first)
+        if self.lattice == "centered" and self.holds_centre:
+            # start from the middle one, so that sample 0 is the centre
+            sample = (sample + self.aa**2 // 2) % self.aa**2
+        i, j = (mi.Float(number) for number in divide(sample, self.aa))
+        n = mi.Float(opaque(self.aa))
+        x, y = (0.5 + i / n, 0.5 - j / n) if self.lattice == "report" else ((i + 0.5) / n, (j + 0.5) / n)
+        size = mi.Float(opaque(width)), mi.Float(opaque(height))
+        place = mi.Point2f((mi.Float(column) + x) / size[0], (mi.Float(row) + y) / size[1])
+        if not self.moments:
+            return place, mi.Float(0)
+        phase = (
+            mi.sample_tea_float32(pixel, opaque(self.seed))
+            if self.phase is None
+            else opaque(float(self.phase))
+        )
+        # from one ray to the next, so many parts: coprime to their number, near its golden section
+        golden = max(round(self.moments * (math.sqrt(5) - 1) / 2), 1)
+        stride = next(s for s in range(golden, self.moments + 2) if math.gcd(s, self.moments) <= 1)
+        part = mi.UInt64(ray) * mi.UInt64(opaque(stride)) % mi.UInt64(opaque(self.moments))
+        return place, (mi.Float(part) + phase) / mi.Float(mi.UInt64(opaque(self.moments)))
 
 
 class Film:

@@ -24,12 +24,12 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.machine import Budget, Workspace
 from mrt_mitsuba.output import files
-from mrt_mitsuba.output.layers import AVERAGED, TABLE
-from mrt_mitsuba.rendering import settings as table
+from mrt_mitsuba.output.layers import AVERAGED
+from mrt_mitsuba.output.layers import TABLE as LAYER_TABLE
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import Plan, make_plan
 from mrt_mitsuba.rendering.progress import Job, Progress, TerminalProgress
-from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.rendering.settings import TABLE, RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import Source, open_scene, sized
 
@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 Image = NDArray[np.float32]
 Options = ParamSpec("Options")
+
+# The options that a result names: those that shape a picture
+_IN_FORCE = (*(name for name in TABLE if name != "memory"), "params", "region", "integrator")
 
 
 @dataclass(frozen=True)
@@ -201,7 +204,6 @@ def _render(source: Source, settings: RenderSettings, budget: Budget, start: flo
     in_notebook = settings.progress is None and "ipykernel" in sys.modules
     job = Job(TerminalProgress() if in_notebook else settings.progress or Progress(), workspace)
     job.progress.plan(plan)
-    shader.prepare(plan.kernel)
     load = time.perf_counter() - start
     log.info("scene %s loaded in %.3f s for %s", source.name, load, plan.variant)
     total = dict[str, np.ndarray]()
@@ -210,7 +212,7 @@ def _render(source: Source, settings: RenderSettings, budget: Budget, start: flo
         found = passes.run()
         total = total or found
         for name in found if plan.frames > 1 else ():
-            if name in TABLE and TABLE[name].source != AVERAGED:
+            if name in LAYER_TABLE and LAYER_TABLE[name].source != AVERAGED:
                 continue  # those of the first frame stay
             if frame:
                 total[name] += found[name]
@@ -218,9 +220,9 @@ def _render(source: Source, settings: RenderSettings, budget: Budget, start: flo
                 total[name] /= np.float32(plan.frames)
     inside = plan.region.inside(plan.seen)
     # views of the region [H, W] by EXR channel, first those of the film and the integrator
-    channels = {name: values[inside][..., 0] for name, values in total.items() if name not in TABLE}
+    channels = {name: values[inside][..., 0] for name, values in total.items() if name not in LAYER_TABLE}
     for name in sorted(total.keys() & plan.layers):
-        for index, letter in enumerate(TABLE[name].letters):
+        for index, letter in enumerate(LAYER_TABLE[name].letters):
             channels[f"{name}.{letter}"] = total[name][inside][..., index]
     job.collect()
     log.info("%d kernels: compiled in %.3f s, ran for %.3f s", job.launches, job.compiling, job.running)
@@ -232,26 +234,10 @@ def _render(source: Source, settings: RenderSettings, budget: Budget, start: flo
         Timings(seconds, load, job.compiling, job.running, job.passes),
         job.rays,
         job.launches,
-        _in_force(settings, plan, source),
+        {name: value for name in _IN_FORCE if (value := getattr(settings, name)) is not None},
         runtime.versions(),
         camera_matrices(source.sensor),
         frozenset(map(os.path.abspath, budget.inputs)),
         passes.error,
         tuple(passes.rounds),
     )
-
-
-def _in_force(settings: RenderSettings, plan: Plan, source: Source) -> dict[str, Any]:
-    """Return the options that shaped the picture, with what was decided about them."""
-    names = (*(name for name in table.TABLE if name != "memory"), "params", "region")
-    values = {name: getattr(settings, name) for name in names} | {
-        "width": plan.width,
-        "height": plan.height,
-        "fresnel": source.fresnel,
-        "focaldist": plan.focus[0] or 0.0,
-        "focalrange": plan.focus[1],
-        "variant": plan.variant,
-        "integrator": plan.integrator,
-        "layers": tuple(name for name in settings.layers if name in plan.layers),
-    }
-    return {name: value for name, value in values.items() if value is not None}

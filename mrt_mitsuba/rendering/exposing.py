@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import logging
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Set
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -20,9 +19,7 @@ from mrt_mitsuba.filters.grid import dilated
 from mrt_mitsuba.interrupts import heed
 from mrt_mitsuba.machine import BYTES_PER_CHANNEL_OF_RAY
 from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
-from mrt_mitsuba.output.layers import channels as channel_count
-from mrt_mitsuba.rays.film import Canvas, Film
-from mrt_mitsuba.rays.starts import Places, divide, opaque, pixel_sequence, ray_sampler
+from mrt_mitsuba.rays.film import Canvas, Film, Places, divide, opaque
 from mrt_mitsuba.rendering.progress import Job
 from mrt_mitsuba.rendering.shading import Shader
 
@@ -107,21 +104,20 @@ class Stack:
         return values.reshape(-1, *self.film.shape, *values.shape[2:])
 
 
-@dataclass
 class Exposer:
-    """A shader that exposes pixels of a lattice, or of its film."""
+    """A shader that exposes pixels of a film or, without one, of a lattice.
 
-    job: Job
-    shader: Shader
-    film: Any  #: None for a lattice
-    layers: Sequence[str]  #: to expose; on a film, averaged ones, next to the picture
+    ``layers``: by name, those to expose; of a film next to the picture. ``names``: of all channels, of a film
+    first R, G, B, its own, and the integrator's.
+    """
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Channels of the film: R, G, B, its own, the integrator's, and the layers'."""
-        own = (*(("A",) if self.film.alpha else ()), *self.film.bands)
-        layers = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
-        return ("R", "G", "B", *own, *self.shader.aovs, *layers)
+    def __init__(self, job: Job, shader: Shader, film: Film | None, layers: Set[str]) -> None:
+        self.job, self.shader, self.film = job, shader, film
+        own = ("image", "square") if film else ()  # which a film knows by itself
+        self.layers = [name for name in TABLE if name in layers and name not in own]
+        self.names = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
+        if film:
+            self.names = [*"RGB", *"A" * film.alpha, *film.bands, *shader.aovs, *self.names]
 
     def means(self, pixels: Any, places: Places, seed: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
         """Trace samples of a lattice in pixels, in parts that fit into memory or of one pixel.
@@ -129,20 +125,35 @@ class Exposer:
         Yields which of the pixels are in a part, and by layer the values there, [pixels, channels]: means
         over the rays of each pixel, or what the first ray hit. They do not depend on the parts.
         """
-        workspace, channels, size = self.job.workspace, channel_count(self.layers), places.size
+        workspace, channels, size = self.job.workspace, len(self.names), places.size
         width, height = self.shader.width, self.shader.height
         random = self.shader.random or mi.is_spectral or self.shader.sensor.needs_aperture_sample()
-        sampler = ray_sampler() if random else None
+        sampler = _sampler("mrt_rays") if random else None
 
         def start(pixel: Any, number: Any) -> tuple[Any, Any, Any, Any]:
             if sampler is not None:
                 sampler.start(seed, mi.UInt64(pixel) * mi.UInt64(opaque(size)) + mi.UInt64(number))
             return None, *places.at(pixel, number, width, height), sampler
 
+        def over_rays(plane: Any, first: bool) -> np.ndarray:
+            if first or size == 1:
+                return np.asarray(plane)[::size]
+            if isinstance(plane, np.ndarray):
+                return np.asarray(plane.reshape(-1, size).sum(1))
+            if dr.width(plane) == 1:  # a value of one entry is that of all rays
+                return np.asarray(plane * size)
+            return np.asarray(dr.block_reduce(dr.ReduceOp.Add, plane, size))
+
         most = workspace.rays_at_once(channels)
         log.debug("tracing %d rays, at most %d at once", len(pixels) * size, most)
         for part, groups in Groups(size, pixels).parts(max(1, most // size), width):
-            yield part, _by_pixel(self._trace(groups, start)[1], size)
+            means = dict[str, np.ndarray]()
+            for name, planes in self._trace(groups, start)[1].items():
+                first = TABLE[name].source == FIRST_HIT
+                sums = np.broadcast_arrays(*(over_rays(plane, first) for plane in planes))
+                means[name] = np.stack(sums, -1).astype(np.float32, copy=False)
+                means[name] *= np.float32(1 if first else 1 / size)
+            yield part, means
         workspace.give_back(min(most, len(pixels) * size) * channels * BYTES_PER_CHANNEL_OF_RAY)
 
     def expose(
@@ -179,7 +190,7 @@ class Exposer:
         film, size, scalar = self.film, groups.size, mi.variant().startswith("scalar")
         sequence = progressive and not scalar
         independent = scalar or film.sampler == "IndependentSampler"
-        sampler = pixel_sequence() if sequence else ray_sampler()
+        sampler = _sampler("mrt_sequence" if sequence else "mrt_rays")
         if not (sequence or independent):
             sampler = film.sensor.sampler().clone()
             sampler.set_sample_count(size)
@@ -249,22 +260,6 @@ class Exposer:
         return place, {name: [mi.Float(c) for c in channels] for name, channels in parts.items()}
 
 
-def _by_pixel(values: dict[str, list[Any]], size: int) -> dict[str, np.ndarray]:
-    """Return of each layer the means over the rays of each pixel, or what the first ray hit."""
-
-    def over_rays(plane: Any, first: bool) -> np.ndarray:
-        if first or size == 1:
-            return np.asarray(plane)[::size]
-        if isinstance(plane, np.ndarray):
-            return np.asarray(plane.reshape(-1, size).sum(1))
-        if dr.width(plane) == 1:  # a value of one entry is that of all rays
-            return np.asarray(plane * size)
-        return np.asarray(dr.block_reduce(dr.ReduceOp.Add, plane, size))
-
-    means = dict[str, np.ndarray]()
-    for name, planes in values.items():
-        first = TABLE[name].source == FIRST_HIT
-        sums = np.broadcast_arrays(*(over_rays(plane, first) for plane in planes))
-        each = np.stack(sums, -1).astype(np.float32, copy=False)
-        means[name] = each * np.float32(1 if first else 1 / size)
-    return means
+def _sampler(plugin: str) -> Any:
+    """Return a sampler of ``rays.samplers``; call ``start`` for the rays that it is to serve."""
+    return mi.PluginManager.instance().create_object(mi.Properties(plugin))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -11,12 +10,10 @@ import mitsuba as mi
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.filters import dof, edges
-from mrt_mitsuba.output import layers
 from mrt_mitsuba.output.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.plugins import kernel_plan
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
-from mrt_mitsuba.rays.film import Region
-from mrt_mitsuba.rays.starts import Places
+from mrt_mitsuba.rays.film import Places, Region
 from mrt_mitsuba.rendering.settings import (
     AA,
     AAMODE,
@@ -119,14 +116,12 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
 
     Raises ``UsageError`` for options that do not go together, and for layers that nothing provides.
     """
-    focus = settings.focus(source.focal_distance, source.focal_range)
-    settings = _decided(settings, source.own, shader, focus[0])
+    settings = _decided(settings, source, shader)
     on_film, film = settings.lattice == FILM, shader.film
     asked, possible = _layers(settings, shader)
-    detector = settings.aamode if settings.aamode in DETECTORS else None
-    if settings.aa == 1 and "edges" not in asked:
-        detector = None
-    blur = settings.dof if focus[0] else None
+    refining = settings.aamode in DETECTORS and (settings.aa != 1 or "edges" in asked)
+    detector = settings.aamode if refining else None
+    blur = settings.dof if settings.focaldist else None
     motion = (FILM if on_film else settings.motionmode) if settings.motion else None
     moments = settings.motionsamples if motion else 1
     frames = moments if motion == "frames" and (detector or blur) else 1
@@ -143,7 +138,7 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
         integrator=shader.name,
         width=source.width,
         height=source.height,
-        focus=focus,
+        focus=settings.focus(None, 0.0),
         film=f"{film.rfilter}, {film.pixel_format or 'spectral bands'}" if on_film else "",
         bands=film.bands,
         kernel=shader.kernel,
@@ -151,7 +146,7 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
         region=region,
         seen=region.grown(reach, source.width, source.height),
         samples=int(settings.aa or 1) ** 2,
-        channels=_channels(returned, passes, shader if on_film else None),
+        channels=_channels(traced | returned, ROUNDS in made, shader if on_film else None),
         blur=blur,
         motion=motion,
         moments=moments,
@@ -160,7 +155,7 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
         passes=tuple(passes),
         left_out=_left_out(traced, made, source.own, shader, settings),
     )
-    return plan, settings
+    return plan, settings.but(layers=tuple(name for name in settings.layers if name in returned))
 
 
 def _region(source: Source, settings: RenderSettings) -> Region:
@@ -171,11 +166,11 @@ def _region(source: Source, settings: RenderSettings) -> Region:
     return region
 
 
-def _channels(returned: frozenset[str], passes: Sequence[Pass], on_film: Shader | None) -> int:
+def _channels(kept: frozenset[str], rounds: bool, on_film: Shader | None) -> int:
     """Return how many float32 values are kept for every pixel."""
-    channels = layers.channels(returned.union(*(step.layers for step in passes)))
+    channels = sum(len(TABLE[name].letters) for name in kept)
     if on_film:  # sums by pixel, in double precision, while it is exposed
-        channels += ROUND_CHANNELS if any(step.name == ROUNDS for step in passes) else FILM_CHANNELS
+        channels += ROUND_CHANNELS if rounds else FILM_CHANNELS
         channels += OWN_CHANNELS * len(on_film.film.bands + on_film.aovs)
     return channels
 
@@ -194,11 +189,12 @@ def _traced(
     return frozenset(traced)
 
 
-def _decided(settings: RenderSettings, own: bool, shader: Shader, focaldist: float | None) -> RenderSettings:
+def _decided(settings: RenderSettings, source: Source, shader: Shader) -> RenderSettings:
     """Return the settings in force: someone's own scene is rendered as Mitsuba renders it, the report's
     scenes as the report does."""
-    whole, aamode = not shader.layers, settings.aamode
-    _check(settings, shader, focaldist)
+    own, whole, aamode = source.own, not shader.layers, settings.aamode
+    distance, reach = settings.focus(source.focal_distance, source.focal_range)
+    _check(settings, shader, distance)
     # Mitsuba's integrators draw random numbers for every ray, and their noise would pass for edges
     plain = (own or whole) and shader.random and settings.aa is None
     if aamode is None:
@@ -211,7 +207,20 @@ def _decided(settings: RenderSettings, own: bool, shader: Shader, focaldist: flo
         raise UsageError(
             f"aamode=noise: give the mean of a pixel's rays as spp, {MIN_SPP} or more, or a target"
         )
-    return settings.but(aa=aa, aamode=aamode, lattice=lattice, spp=spp, maxspp=most)
+    return settings.but(
+        aa=aa,
+        aamode=aamode,
+        lattice=lattice,
+        spp=spp,
+        maxspp=most,
+        width=source.width,
+        height=source.height,
+        fresnel=source.fresnel,
+        focaldist=distance or 0.0,
+        focalrange=reach,
+        variant=str(mi.variant()),
+        integrator=shader.name,
+    )
 
 
 def _check(settings: RenderSettings, shader: Shader, focaldist: float | None) -> None:
@@ -243,7 +252,8 @@ def _check(settings: RenderSettings, shader: Shader, focaldist: float | None) ->
 
 def _layers(settings: RenderSettings, shader: Shader) -> tuple[frozenset[str], frozenset[str]]:
     """Return the layers that are asked for, and those that can be made."""
-    made, asked = shader.layers | layers.named(DERIVED), frozenset(settings.layers)
+    derived, asked = {name for name in TABLE if TABLE[name].source == DERIVED}, frozenset(settings.layers)
+    made = shader.layers | derived
     possible = made - ({"error", "variance"} if settings.aamode != NOISE else set())
     possible -= {"edges"} if settings.aamode not in DETECTORS else set()
     if asked == LAYERS.keys():
@@ -287,7 +297,8 @@ def _passes(
             return replace(whole, first=first, count=count, repeats=rays, moments=count * rays, phase=None)
         return replace(centre, lattice=whole.lattice, aa=aa, first=first, count=count)
 
-    passes, at_centre = list[Pass](), traced & layers.named(FIRST_HIT)
+    passes = list[Pass]()
+    at_centre = frozenset(filter(lambda name: TABLE[name].source == FIRST_HIT, traced))
     if at_centre and (film or (detector is None and not whole.holds_centre)):
         # layers of the first hit belong to the pixel's centre
         passes.append(Pass(FIRST_HITS, at_centre, Places(moments=int(moments > 0))))

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError
-from mrt_mitsuba.output.layers import FIRST_HIT, named
+from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.plugins.lookup import ByShape
 from mrt_mitsuba.plugins.parameters import ParameterError
@@ -22,16 +22,24 @@ from mrt_mitsuba.scene.open import Source
 class RayValues:
     """Values along camera rays, for the rows of the table of layers; what no row reads costs nothing.
 
-    ``trace``: what an integrator with a ``kernel_plan`` found; None of any other, where Mitsuba finds the
+    ``valid``: did the integrator find anything, Mitsuba's alpha; ``aovs``: channels of the integrator's own;
+    ``trace``: what an integrator with a ``kernel_plan`` found, None of any other, where Mitsuba finds the
     first hit.
     """
 
-    valid: Any = None  #: did the integrator find anything; Mitsuba's alpha
-    aovs: Sequence[Any] = ()  #: channels of the integrator's own
-
-    def __init__(self, shader: Shader, ray: Any, weight: Any, radiance: Any, trace: Any = None) -> None:
+    def __init__(
+        self,
+        shader: Shader,
+        ray: Any,
+        weight: Any,
+        radiance: Any,
+        valid: Any,
+        *,
+        aovs: Any = (),
+        trace: Any = None,
+    ) -> None:
         self.shader, self.scene, self.ray, self.trace = shader, shader.scene, ray, trace
-        self.weight = mi.unpolarized_spectrum(weight)
+        self.weight, self.valid, self.aovs = mi.unpolarized_spectrum(weight), valid, aovs
         self.spectrum = radiance * self.weight  #: radiance with the sensor's weight
         self.image = to_rgb(self.spectrum, ray)
 
@@ -102,35 +110,29 @@ class Shader:
     facts: SceneFacts | None = None  #: what its kernels depend on; None where it does not say
     kernel: KernelPlan | None = None  #: what its kernels hold
     random = True  #: does it draw random numbers
-    layers = named(FIRST_HIT)  #: names of those that can be traced, without internal ones
 
     def __init__(self, source: Source, motion: Sequence[float] | None) -> None:
         integrator = source.integrator
         self.scene, self.sensor, self.motion = source.scene, source.sensor, motion
         self.width, self.height, self.film = source.width, source.height, Film(source.sensor)
-        self.integrator, self.name = integrator, integrator.class_name()
-        self.layered = hasattr(integrator, "kernel_plan")
+        self.integrator, self.name, self._data = integrator, integrator.class_name(), None
+        #: names of those that can be traced, without internal ones
+        self.layers = frozenset(name for name, layer in TABLE.items() if layer.source == FIRST_HIT)
         self._derivatives = isinstance(integrator, mi.CppADIntegrator)  # such as prb
-        if self.layered:
+        if hasattr(integrator, "kernel_plan"):
             try:
-                self._reading = integrator.read(self.scene)
+                self._data = integrator.prepare(self.scene)
             except ParameterError as error:
                 raise SceneError(str(error)) from None
-            self.name, self.facts = integrator.plugin_name, self._reading.facts
-            self.kernel = integrator.kernel_plan(self.facts)
+            self.name, self.facts, self.kernel = integrator.plugin_name, self._data.facts, self._data.plan
             self.random = self.kernel.random
-            self.layers |= integrator.provided_layers()
+            self.layers |= integrator.provided_layers
         elif self._derivatives:
             self.name = type(integrator).__name__
         elif not isinstance(integrator, mi.SamplingIntegrator) or "StokesIntegrator" in repr(integrator):
             # Mitsuba would crash in a sample of stokes, also inside another
             self.layers = frozenset()
         self.aovs = tuple(integrator.aov_names())  #: names of the integrator's own channels
-
-    def prepare(self, kernel: KernelPlan | None) -> None:
-        """Get ready to trace by a plan of the kernels."""
-        if self.layered:
-            self._data = self.integrator.prepare(self.scene, kernel, self._reading)
 
     def shift(self, time: Any) -> Any:
         """Return how far the camera has moved."""
@@ -156,11 +158,9 @@ class Shader:
         if self.motion is not None:
             ray.time = sampler.next_1d() if time is None else time
             ray.o += self.shift(ray.time)
-        if self.layered:
+        if self._data is not None:
             trace = self.integrator.trace(self.scene, sampler, ray, True, self._data)
-            values = RayValues(self, ray, weight, trace.radiance, trace)
-            values.valid = trace.hit.found
-            return values
+            return RayValues(self, ray, weight, trace.radiance, trace.hit.found, trace=trace)
         differential = mi.RayDifferential3f(ray)
         if self._derivatives:
             nothing = {"δL": None, "δaovs": None, "state_in": None}
@@ -171,9 +171,7 @@ class Shader:
         else:
             medium = sensor.get_medium()  # that the camera is in
             radiance, valid, aovs = self.integrator.sample(self.scene, sampler, differential, medium)
-        values = RayValues(self, ray, weight, mi.unpolarized_spectrum(radiance))
-        values.valid, values.aovs = valid, aovs
-        return values
+        return RayValues(self, ray, weight, mi.unpolarized_spectrum(radiance), valid, aovs=aovs)
 
 
 def camera_matrices(sensor: Any) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rays.starts import Places
+from mrt_mitsuba.rays.film import Places
 from mrt_mitsuba.scene.report import report_scene
 
 SMALL = {"width": 96, "height": 72, "focaldist": 0}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba.filters.grid import dilated, window_means
-from mrt_mitsuba.rays.starts import divide, ray_sampler
+from mrt_mitsuba.rays.film import divide
 
 LARGEST = 2**32 - 1
 
@@ -45,7 +45,7 @@ def test_windows_are_those_of_a_loop(shape, reach):
 
 @pytest.mark.usefixtures("variant")
 def test_rays_beyond_32_bits_get_numbers_of_their_own() -> None:
-    sampler, seen = ray_sampler(), []
+    sampler, seen = mi.load_dict({"type": "mrt_rays"}), []
     for first in (0, 2**32, 2**33):
         sampler.start(7, dr.arange(mi.UInt64, 1000) + first)
         seen.append(np.array(sampler.next_1d()))
