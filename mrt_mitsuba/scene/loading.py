@@ -49,9 +49,9 @@ def load_dict(
 
     budget = budget or Budget.of(None)
     with _loading(name):
-        _check_dict(scene, name, budget.inputs)
+        _check_dict(scene, budget.inputs)
         state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene)
-        _check_nodes(state.nodes, name, budget)
+        _check_nodes(state.nodes, budget)
         return _instantiate(state, merge)
 
 
@@ -73,7 +73,7 @@ def load_file(
     with _loading(path, os.path.dirname(path) or "."):
         values = _check_xml(path, given, budget.inputs)
         state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), path, **given)
-        _check_nodes(state.nodes, path, budget)
+        _check_nodes(state.nodes, budget)
         if not as_text:
             return _instantiate(state), values
         for node in state.nodes:
@@ -90,16 +90,15 @@ def declared(path: str) -> dict[str, str]:
 # ---------------------------------------------- Mitsuba's parser ---------------------------------------
 
 
-def _check_nodes(nodes: Iterable[Any], name: str, budget: Budget) -> None:
+def _check_nodes(nodes: Iterable[Any], budget: Budget) -> None:
     """Look at all that Mitsuba would load for what it has parsed."""
     mitsuba_first()  # a <path> of the file puts its folder before
     for node in nodes:
         kind, filename = node.props.plugin_name(), node.props.get("filename", None)
-        _check_plugin(kind, name)
+        _check_plugin(kind)
         samples = node.props.get("sample_count", 1)
         if isinstance(samples, int) and not 1 <= samples <= MOST_SAMPLES:
-            wrong = f"{kind}: sample_count is {samples}; give 1 to {MOST_SAMPLES}"
-            raise SceneError(f"cannot load {name}: {wrong}")
+            raise RuntimeError(f"{kind}: sample_count is {samples}; give 1 to {MOST_SAMPLES}")
         if isinstance(filename, str):
             found = _check_data(filename, budget.inputs)
             if kind in _PICTURES and (size := picture_size(found)):
@@ -118,8 +117,8 @@ def _instantiate(state: Any, merge: bool = True) -> Any:
 
 @contextlib.contextmanager
 def _loading(name: str, folder: str | None = None) -> Iterator[None]:
-    """Take plugins from Mitsuba's own folder within the block, and data from ``folder`` as well; turn what
-    Mitsuba raises into a ``SceneError``."""
+    """Take plugins from Mitsuba's own folder within the block, and data from ``folder`` as well; turn a
+    ``RuntimeError``, of Mitsuba or of the checks below, into a ``SceneError`` that says what was loaded."""
     import mitsuba as mi
 
     before = mi.file_resolver()
@@ -142,14 +141,14 @@ def _resolved(path: str) -> str:
 # ---------------------------------------------- Checks -------------------------------------------------
 
 
-def _check_plugin(plugin: str, name: str) -> None:
+def _check_plugin(plugin: str) -> None:
     """Refuse a native plugin outside Mitsuba's folder. Mitsuba itself reports unknown names."""
     file = os.path.join("plugins", f"{plugin}.so")
     known = "/" not in plugin and os.path.isfile(os.path.join(mitsuba_home(), file))
     if plugin != "scene" and not known and os.path.exists(_resolved(file)):  # "scene" is never looked up
-        raise SceneError(
-            f"cannot load {name}: the plugin {plugin!r} is {_resolved(file)}, native code that is not "
-            f"Mitsuba's; move it away or, if you trust it, into {mitsuba_home()}/plugins"
+        raise RuntimeError(
+            f"the plugin {plugin!r} is {_resolved(file)}, native code that is not Mitsuba's; move it away "
+            f"or, if you trust it, into {mitsuba_home()}/plugins"
         )
 
 
@@ -163,21 +162,19 @@ def _check_data(filename: str, inputs: set[str]) -> str:
     return path
 
 
-def _check_dict(
-    node: Mapping[str, Any], name: str, inputs: set[str], place: str = "", depth: int = 1
-) -> None:
+def _check_dict(node: Mapping[str, Any], inputs: set[str], place: str = "", depth: int = 1) -> None:
     """Look at every entry. None, cycles and depth would end the process."""
     if depth > DEEPEST:
-        raise SceneError(f"cannot load {name}: it is nested more than {DEEPEST} levels deep")
+        raise RuntimeError(f"it is nested more than {DEEPEST} levels deep")
     for key, value in node.items():
         if isinstance(value, dict):
-            _check_dict(value, name, inputs, f"{place}{key}.", depth + 1)
+            _check_dict(value, inputs, f"{place}{key}.", depth + 1)
         elif value is None:
-            raise SceneError(f"cannot load {name}: {place}{key} is None; give it a value, or leave it out")
+            raise RuntimeError(f"{place}{key} is None; give it a value, or leave it out")
         elif key == "type" and not isinstance(value, str):
-            raise SceneError(f"cannot load {name}: {place}type is {value!r}; give the name of a plugin")
+            raise RuntimeError(f"{place}type is {value!r}; give the name of a plugin")
         elif key == "type":
-            _check_plugin(value, name)
+            _check_plugin(value)
         elif key == "filename" and isinstance(value, str):
             _check_data(value, inputs)
 

@@ -165,6 +165,8 @@ class Scene:
 
         Raises ``SceneError`` for a camera, a sky or an object of numbers that make no sense.
         """
+        import mitsuba as mi
+
         _check(self)
         names: dict[Material, str] = {}  # one definition for each material that differs
 
@@ -186,12 +188,26 @@ class Scene:
                 shapes[f"{kind}s"] = {**shape, "bsdf": own or bsdf(grouped[0].material)}
         for i, m in enumerate(self.meshes):
             shapes[f"mesh_{i}"] = {**_mesh(m, self.texturing), "bsdf": bsdf(m.material)}
+        camera = self.camera
+        reach = math.dist(camera.position, camera.target)  # of scenes far smaller or larger than the report's
+        to_world = mi.ScalarTransform4f().look_at(list(camera.position), list(camera.target), list(camera.up))
+        film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb"}
         return {
             "type": "scene",
             # by default, Embree lets rays through between slivers
             **({"embree_use_robust_intersections": True} if self.meshes else {}),
             "integrator": {"type": "mrt_whitted"},
-            "sensor": self._sensor(width, height),
+            "sensor": {
+                "type": "perspective",
+                "fov": camera.hfov,
+                "fov_axis": "x",
+                "near_clip": 0.01 * min(1.0, reach),
+                "far_clip": 1e5 * max(1.0, reach / 10),
+                # the original's picture is mirrored left to right against a right-handed camera
+                "to_world": to_world.scale([-1, 1, 1]),
+                "film": {**film, "component_format": "float32", "rfilter": {"type": "box"}},
+                "sampler": {"type": "independent", "sample_count": 16},
+            },
             "sky": {"type": "constant", "radiance": _rgb(self.sky)},
             **{
                 f"light_{i}": {"type": "mrt_light", "position": list(p.position), "intensity": _rgb(p.color)}
@@ -199,25 +215,6 @@ class Scene:
             },
             **{name: _mrt_bsdf(material, fresnel, self.texturing) for material, name in names.items()},
             **shapes,
-        }
-
-    def _sensor(self, width: int, height: int) -> dict[str, Any]:
-        import mitsuba as mi
-
-        camera = self.camera
-        reach = math.dist(camera.position, camera.target)  # of scenes far smaller or larger than the report's
-        to_world = mi.ScalarTransform4f().look_at(list(camera.position), list(camera.target), list(camera.up))
-        film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb"}
-        return {
-            "type": "perspective",
-            "fov": camera.hfov,
-            "fov_axis": "x",
-            "near_clip": 0.01 * min(1.0, reach),
-            "far_clip": 1e5 * max(1.0, reach / 10),
-            # the original's picture is mirrored left to right against a right-handed camera
-            "to_world": to_world.scale([-1, 1, 1]),
-            "film": {**film, "component_format": "float32", "rfilter": {"type": "box"}},
-            "sampler": {"type": "independent", "sample_count": 16},
         }
 
 

@@ -14,7 +14,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -109,7 +109,7 @@ class _Reader:
         self.libraries: set[str] = set()
         self.missing: list[str] = []
 
-    def fail(self, text: str, line: int) -> None:
+    def fail(self, text: str, line: int) -> NoReturn:
         raise SceneError(f"{self.path}:{line}: {text}")
 
     def read(self, block: re.Match[bytes]) -> None:
@@ -146,8 +146,7 @@ class _Reader:
             again = _BLOCKS.fullmatch(plain.encode() + b"\n")
             if again is None or again.lastgroup == "line":
                 self.fail(f"{_FORMS[keyword]}, but is {plain[:80]!r}", self.line)
-            else:
-                self.read(again)
+            self.read(again)
         elif keyword in ("usemtl", "mtllib") and not name:
             self.fail(f"{keyword} has no name; write {keyword} NAME", self.line)
         elif keyword == "usemtl":

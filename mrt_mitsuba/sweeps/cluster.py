@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 CONNECTING = 10  # seconds to reach a scheduler, and for its first worker to be there
 STARTING = 120  # seconds for worker processes of this machine; a busy one takes its time
+DIED = "every worker that rendered it died, perhaps for want of memory: give each more"
 MOST_DEATHS = 10  # of workers that had been given a job which they did not begin
 
 
@@ -191,11 +192,8 @@ def outcomes(
                 continue
             if not ended:
                 error = future.exception() if future.status == "error" else None
-                facts["error"] = (
-                    "every worker that rendered it died, perhaps for want of memory: give each more"
-                )
-                if error is not None and not isinstance(error, KilledWorker):
-                    facts["error"] = one_line(f"{type(error).__name__}: {error}")
+                died = error is None or isinstance(error, KilledWorker)
+                facts["error"] = DIED if died else one_line(f"{type(error).__name__}: {error}")
             future.release()  # what no one needs is not computed again when its worker goes
             yield job, facts
     finally:

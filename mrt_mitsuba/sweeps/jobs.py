@@ -15,9 +15,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex
 
-from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.runtime import use, versions
+from mrt_mitsuba.scene.files import require_file
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.open import open_scene, set_parameters
 from mrt_mitsuba.scene.report import report_scene
@@ -176,10 +177,10 @@ def identify(sent: Any) -> str:
     """Return the fingerprint of a scene that was sent; of a file by its contents, not by those of the files
     that it names. Raises ``SceneError`` for a file that cannot be read.
     """
-    try:
-        return fingerprint(Path(sent).read_bytes() if isinstance(sent, str) else sent)
-    except OSError as error:
-        raise SceneError(f"cannot read {os.path.relpath(sent)}: {error.strerror}") from error
+    if isinstance(sent, str):
+        require_file(os.path.relpath(sent))
+        return fingerprint(Path(sent).read_bytes())
+    return fingerprint(sent)
 
 
 def fingerprint(*values: Any) -> str:
@@ -215,9 +216,13 @@ class _Pickler(pickle.Pickler):
         if "Transform4" in type(value).__name__:
             return mi.ScalarTransform4f, (np.array(value.matrix, np.float64).reshape(4, 4),)
         if isinstance(value, mi.Bitmap):
-            return mi.Bitmap, (np.array(value),), value.srgb_gamma(), None, None, _set_gamma
+            return _bitmap, (np.array(value), value.srgb_gamma())
         return NotImplemented
 
 
-def _set_gamma(bitmap: Any, srgb: bool) -> None:
+def _bitmap(pixels: Any, srgb: bool) -> Any:
+    import mitsuba as mi
+
+    bitmap = mi.Bitmap(pixels)
     bitmap.set_srgb_gamma(srgb)
+    return bitmap

@@ -89,9 +89,9 @@ def cut(job: Job, tiles: Any) -> list[Job]:
     found = []
     for row, column in itertools.product(range(rows), range(columns)):
         left, top = width * column // columns, height * row // rows
-        region = left, top, width * (column + 1) // columns - left, height * (row + 1) // rows - top
-        memory = max(LEAST_MEMORY, BYTES_PER_PIXEL * region[2] * region[3])
-        arguments = {"memory": memory, **job.arguments, "region": region}
+        wide, high = width * (column + 1) // columns - left, height * (row + 1) // rows - top
+        memory = max(LEAST_MEMORY, BYTES_PER_PIXEL * wide * high)
+        arguments = {"memory": memory, **job.arguments, "region": (left, top, wide, high)}
         found.append(job._replace(name=f"{job.name}.tiles/{row},{column}", arguments=arguments))
     return found
 
@@ -138,11 +138,10 @@ def _write_rows(job: Job, tiles: Sequence[Job], folder: str) -> None:
             picture = stack.enter_context(contextlib.closing(OpenEXR.OutputFile(file.name, header)))
             for first in range(0, len(files), columns):
                 for parts in zip(*map(_strips, files[first : first + columns]), strict=True):
-                    planes, rows = {}, 0
+                    rows, planes = len(parts[0]["R"]) // (4 * regions[first][2]), {}
                     for name in header["channels"]:
-                        blocks = [np.frombuffer(part[name], np.float32) for part in parts]
-                        rows = len(blocks[0]) // regions[first][2]
-                        planes[name] = np.hstack([block.reshape(rows, -1) for block in blocks]).tobytes()
+                        blocks = [np.frombuffer(part[name], np.float32).reshape(rows, -1) for part in parts]
+                        planes[name] = np.hstack(blocks).tobytes()
                     picture.writePixels(planes, rows)
         # The library does not report a full disk: read the last row
         OpenEXR.InputFile(file.name).channel("R", scanLine1=top + high - 1, scanLine2=top + high - 1)

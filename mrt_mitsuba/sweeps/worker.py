@@ -24,12 +24,8 @@ from mrt_mitsuba.sweeps.pictures import MADE_WITH
 
 def describe(folder: str, dask_worker: Any = None) -> dict[str, Any]:
     """Return what a client asks of each worker before it begins: the versions of what decides about pixels,
-    a name for its cores, which workers that share them have in common, and whether it sees a folder.
-
-    Dr.Jit, which is imported here first, keeps the kernels of a worker near it: the homes of clusters are
-    often far away.
-    """
-    if dask_worker is not None:
+    a name for its cores, which workers that share them have in common, and whether it sees a folder."""
+    if dask_worker is not None:  # Dr.Jit, imported here first, keeps kernels near: homes are often far away
         near = os.path.join(os.path.dirname(dask_worker.local_directory), "drjit")
         os.environ.setdefault("DRJIT_CACHE_DIR", near)
     found = {**runtime.versions(), "python": f"{sys.version_info[0]}.{sys.version_info[1]}"}

@@ -133,7 +133,7 @@ def test_pictures_are_those_of_render_alone(address: str, tmp_path: Path) -> Non
     """All combinations of options, seeds and scenes: a number, a dict with Mitsuba's types, a file; of two
     workers each takes half of the machine's cores."""
     mrt.register()
-    scenes = [3, mrt.scene_dict(0, width=64, height=48), str(tmp_path / "mine.xml")]
+    scenes = [3, mrt.scene_dict(8, width=64, height=48), str(tmp_path / "mine.xml")]
     assert cli.main(["export", "1", "--xml", scenes[2]]) == 0
     grid = {"scene": scenes, "aa": [1, 2], "seed": np.arange(2)}
     with Client(address, set_as_default=False) as client:
