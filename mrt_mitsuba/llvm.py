@@ -52,10 +52,8 @@ class Choice(NamedTuple):
 
 
 def version_text(version: Version | None) -> str:
-    """Return a version as text, e.g. "19.1"."""
-    if not version:
-        return "of unknown version"
-    return ".".join(map(str, version)) if version[0] else "older than 16"
+    """Return a version as text, e.g. "19.1"; "none" for None."""
+    return "none" if version is None else ".".join(map(str, version)) if version[0] else "older than 16"
 
 
 def choose(
@@ -117,10 +115,15 @@ def wheel_library(search_path: Iterable[str]) -> tuple[str, str]:
 
 def system_folders(environ: Mapping[str, str] = os.environ) -> list[str]:
     """Return the folders in which a Linux system keeps libLLVM."""
-    folders = [folder for folder in environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
-    folders.append(os.path.join(sys.prefix, "lib"))  # conda
-    folders += ["/usr/local/lib", f"/usr/lib/{os.uname().machine}-linux-gnu", "/usr/lib64", "/usr/lib"]
-    return folders + [f"{folder}/lib" for folder in _matching(["/usr/lib"], "llvm")]
+    return [
+        *filter(None, environ.get("LD_LIBRARY_PATH", "").split(":")),
+        f"{sys.prefix}/lib",  # conda
+        "/usr/local/lib",
+        f"/usr/lib/{os.uname().machine}-linux-gnu",
+        "/usr/lib64",
+        "/usr/lib",
+        *(f"{folder}/lib" for folder in _matching(["/usr/lib"], "llvm")),
+    ]
 
 
 def _matching(folders: Iterable[str], prefix: str) -> Iterator[str]:

@@ -38,8 +38,7 @@ def use(variant: str | None = None) -> str:
     that cannot run here.
     """
     global _used
-    mitsuba = sys.modules.get("mitsuba")
-    if mitsuba is not None and variant in (None, _used) and mitsuba.variant() == _used is not None:
+    if _used and variant in (None, _used) and sys.modules["mitsuba"].variant() == _used:
         return _used
     llvm.prepare()
     check_start()
@@ -49,17 +48,13 @@ def use(variant: str | None = None) -> str:
         if variant is None:
             variant = mi.variant() or default_variant()
         elif variant not in mi.variants():
-            close = difflib.get_close_matches(variant, mi.variants(), n=1)
+            close, known = difflib.get_close_matches(variant, mi.variants(), n=1), ", ".join(mi.variants())
             hint = f" Did you mean {close[0]}?" if close else ""
-            known = ", ".join(mi.variants())
             raise UnknownVariantError(f"unknown variant {variant!r}.{hint} This Mitsuba has {known}.")
         if problem := obstacle(variant):
             raise VariantError(f"the variant {variant} cannot be used: {problem}")
         if mi.variant() != variant:
-            try:
-                mi.set_variant(variant)
-            except ImportError as error:
-                raise VariantError(f"the variant {variant} cannot be used: {error}") from error
+            mi.set_variant(variant)
             import drjit as dr
 
             if dr.thread_count() > usable_cores():  # Dr.Jit does not look at quotas of control groups

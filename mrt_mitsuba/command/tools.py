@@ -69,8 +69,7 @@ def show_version() -> int:
 
 def show_scenes() -> int:
     """Print number and title of every scene."""
-    for number in NUMBERS:
-        print(f"{number}  {report_scene(number).title}")
+    print("\n".join(f"{number}  {report_scene(number).title}" for number in NUMBERS))
     return 0
 
 
@@ -137,13 +136,10 @@ def export(place: str, /, *, xml: str, stock: str = "", **given: str) -> int:
 def sweep(out: str, path: str, *, workers: str | None = None, cluster: str | None = None) -> int:
     """Render the sweep that a TOML file describes; return 1 if a job failed."""
     settings = read_toml(path)
-    if workers is not None:
-        settings["workers"] = int(workers) if workers.isdecimal() else workers
-    if cluster is not None:
-        settings["cluster"] = cluster
-    for name in ("out", "progress"):
-        if name in settings:
-            raise UsageError(f"{path}: {name} cannot be set in a file")
+    if own := settings.keys() & {"out", "progress"}:
+        raise UsageError(f"{path}: {min(own)} cannot be set in a file")
+    count = int(workers) if workers and workers.isdecimal() else workers
+    settings |= {k: v for k, v in (("workers", count), ("cluster", cluster)) if v is not None}
     grid = dict(_axes(settings.pop("grid", {})))
     scene = settings.pop("scene", None if "scene" in grid else 0)
     table = mrt_mitsuba.sweep(scene, out, grid=grid, **settings)
@@ -172,7 +168,6 @@ def read_toml(path: str) -> dict[str, Any]:
         require_file(path)
         with open(path, "rb") as file:
             return tomllib.load(file)
-    except SceneError as error:
-        raise UsageError(str(error)) from error
-    except (OSError, ValueError) as error:
-        raise UsageError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from error
+    except (SceneError, OSError, ValueError) as error:
+        text = str(getattr(error, "strerror", None) or error).removeprefix(f"cannot read {path}: ")
+        raise UsageError(f"cannot read {path}: {text}") from error

@@ -127,8 +127,7 @@ def _pascal(grid: Grid, planes: Sequence[Any], amount: Any) -> list[Any]:
     """
     good = finite(planes)
     gives = good & (amount > 0)
-    sources = [dr.select(gives, plane, 0) for plane in planes]
-    sources.append(dr.select(gives, grid.Float(1), 0))  # the sum of weights is blurred along
+    sources = [dr.select(gives, plane, 0) for plane in (*planes, grid.Float(1))]  # and the sum of weights
     k = dr.select(good, grid.Int(amount), 0)
     blurred, wide = [grid.Float(plane) for plane in planes], k > 0
     dr.eval(sources, k, blurred, wide)
