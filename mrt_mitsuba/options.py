@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import operator
-import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -110,7 +109,6 @@ BYTES = Kind(
 WORDS = {"1": True, "0": False, "yes": True, "no": False, "true": True, "false": False}
 SWITCH = Kind("1|0", "1 or 0", (False, True).__contains__, from_text=lambda text: WORDS.get(text.lower()))
 NAME = Kind("NAME", "a name such as llvm_ad_rgb or scalar_rgb", str.isidentifier)
-PATH = Kind("PATH", "the path of a file", lambda path: path and "\0" not in path, os.fspath)
 ANYTHING = Kind("", "anything", lambda value: True)  # checked where it is used
 FUNCTION = Kind("", "a function", callable)
 RECTANGLE = Kind(

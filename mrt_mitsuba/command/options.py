@@ -11,7 +11,7 @@ from typing import Any
 
 from mrt_mitsuba.command.registry import split
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.options import PATH, SWITCH, check, choice, either, option, table
+from mrt_mitsuba.options import SWITCH, Kind, check, choice, either, option, table
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.model import check_model_options
@@ -32,8 +32,12 @@ class Options(RenderSettings):
     """The arguments of a render and of its output. None: the scene or the machine decides."""
 
     filename: str
-    scene_number: int = 0
-    scene: str | None = option(None, PATH, "XML or OBJ file to render in place of a numbered scene", "none")
+    scene: int | str = option(
+        0,
+        Kind("PATH", "the path of a file", lambda scene: scene in NUMBERS or (scene and "\0" not in scene)),
+        "XML or OBJ file to render in place of a numbered scene",
+        "none",
+    )
     format: str = option("both", choice("png", "exr", "both"), "files to write")
     tonemap: str = option(
         "report", choice("report", "srgb"), "values in the PNG: linear as in the report, or sRGB"
@@ -46,10 +50,13 @@ class Options(RenderSettings):
         """Return the options that say how to render, without those about files and messages."""
         return {name: getattr(self, name) for name in (*settings.TABLE, "params")}
 
-    def outputs(self) -> tuple[str, ...]:
+    def outputs(self) -> list[str]:
         """Return the paths of the pictures to write."""
-        endings = ("png", "exr") if self.format == "both" else (self.format,)
-        return tuple(f"{self.filename}.{ending}" for ending in endings)
+        return [f"{self.filename}.{ending}" for ending in ("png", "exr") if self.format in (ending, "both")]
+
+    def inputs(self) -> list[str]:
+        """Return the paths of the files to render."""
+        return [self.scene] if isinstance(self.scene, str) else []
 
 
 TABLE = table(Options)
@@ -67,7 +74,7 @@ def parse(arguments: Sequence[str]) -> Options:
         if text not in map(str, NUMBERS):
             known = either([*map(str, NUMBERS)])
             raise UsageError(f"SCENE {text}: must be {known} ('mrt scenes' lists them); a file is scene=PATH")
-        values["scene_number"] = int(text)
+        values["scene"] = int(text)
     if "motion" not in given and (idle := given.keys() & {"motionsamples", "motionmode"}):
         raise UsageError(f"{min(idle)} is of use only with motion=dx,dy,dz")
     params = {name: given.pop(name) for name in [*given] if name not in TABLE}
@@ -75,7 +82,7 @@ def parse(arguments: Sequence[str]) -> Options:
     if params:
         from mrt_mitsuba.scene.loading import declared
 
-        scene = values.get("scene", "")
+        scene = str(values.get("scene", ""))
         known = declared(scene) if scene.lower().endswith(".xml") else {}
         if unknown := params.keys() - known.keys():
             strange = min(unknown)

@@ -23,7 +23,7 @@ def run(options: Options) -> int:
 
     check_start()
     for path in options.outputs():
-        check_target(path, [] if options.scene is None else [options.scene])
+        check_target(path, options.inputs())
     # A tenth of the start is a search for garbage among what is loaded to stay, and threads for NumPy's
     # linear algebra wait busily for work
     spared = "mitsuba" not in sys.modules and gc.isenabled()
@@ -47,8 +47,7 @@ def run(options: Options) -> int:
         show_log(options.log)
     progress = Progress() if options.quiet else TerminalProgress(show_plan=options.plan == "show")
     start = time.perf_counter()
-    scene = options.scene_number if options.scene is None else options.scene
-    result = render(scene, progress=progress, **options.render_arguments())
+    result = render(options.scene, progress=progress, **options.render_arguments())
     seconds = time.perf_counter() - start
     result.save(*options.outputs(), tonemap=options.tonemap)
     if not options.quiet:
@@ -76,15 +75,15 @@ def show_log(level: str) -> None:
 def banner(options: Options) -> str:
     """Return the parameters of the render, one per line."""
     distance, reach = options.focus(None, FOCAL_RANGE)
-    if options.scene is None:
+    if isinstance(options.scene, int):
         from mrt_mitsuba.scene.report import report_scene
 
-        scene = report_scene(options.scene_number)
+        scene = report_scene(options.scene)
         distance, reach = options.focus(scene.focal_distance, scene.focal_range)
-    film = "from the file" if options.scene is not None and not is_obj(options.scene) else ""
+    film = "from the file" if options.inputs() and not is_obj(options.scene) else ""
     aamode = options.aamode or (NOISE if options.rmse else None)
     lines = {
-        "Scene": options.scene_number if options.scene is None else printable(options.scene),
+        "Scene": printable(str(options.scene)),
         "Width": options.width or film or SIZE[0],
         "Height": options.height or film or SIZE[1],
         "AA": options.aa or ("as noise needs" if aamode == NOISE else film or AA),

@@ -125,11 +125,10 @@ def export(place: str, /, *, xml: str, stock: str = "", **given: str) -> int:
     from mrt_mitsuba.output.replacing import check_target
     from mrt_mitsuba.scene.export import write_xml
 
-    scene = options.scene_number if options.scene is None else options.scene
-    check_target(xml, [] if options.scene is None else [options.scene])
+    check_target(xml, options.inputs())
     kept = {name: getattr(options, name) for name in ("width", "height", "fresnel", "params")}
-    model = options.model() if is_obj(scene) else {}
-    print(f"Wrote {' and '.join(write_xml(scene, xml, flavor='stock' if stock else 'mrt', **kept, **model))}")
+    kept |= options.model() if is_obj(options.scene) else {}
+    print(f"Wrote {' and '.join(write_xml(options.scene, xml, flavor='stock' if stock else 'mrt', **kept))}")
     return 0
 
 

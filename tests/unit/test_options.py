@@ -20,9 +20,9 @@ from mrt_mitsuba.rendering.settings import RenderSettings
 @pytest.mark.parametrize(
     ("arguments", "values"),
     [
-        ("o 3", {"scene_number": 3}),
-        ("o 9 width=1 height=65536", {"scene_number": 9, "width": 1, "height": 65536}),
-        ("o 1 focaldist=2 focalrange=.5", {"focaldist": 2.0, "focalrange": 0.5}),
+        ("o 3", {"scene": 3}),
+        ("o 9 width=1 height=65536", {"scene": 9, "width": 1, "height": 65536}),
+        ("o 1 focaldist=2 focalrange=.5", {"scene": 1, "focaldist": 2.0, "focalrange": 0.5}),
         ("o fresnel=dielectric variant=scalar_rgb", {"fresnel": "dielectric", "variant": "scalar_rgb"}),
         ("o layers=all aamode=none", {"layers": tuple(LAYERS), "aamode": "none"}),
         ("o motion=0.1,-2,3e-1 motionsamples=4", {"motion": (0.1, -2.0, 0.3), "motionsamples": 4}),
@@ -43,7 +43,7 @@ from mrt_mitsuba.rendering.settings import RenderSettings
 def test_accepted(arguments: str, values: dict[str, object]) -> None:
     parsed = parse(arguments.split())
     assert {name: getattr(parsed, name) for name in values} == values
-    others = {"filename", "scene_number", *values}
+    others = {"filename", *values}
     for field in dataclasses.fields(Options):
         if field.name not in others:
             assert getattr(parsed, field.name) == field.default
