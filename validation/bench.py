@@ -82,8 +82,7 @@ def cases(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     def measure(python: str, turn: int) -> dict[str, float]:
         command = [python, str(renders.__file__), *names]
         ran = subprocess.run(command, check=True, stdout=subprocess.PIPE, timeout=3600)
-        found: dict[str, float] = json.loads(ran.stdout.splitlines()[-1])
-        return found
+        return dict(json.loads(ran.stdout.splitlines()[-1]))
 
     pythons = [sys.executable, *([given.before] if given.before else [])]
     found = in_turns([partial(measure, python) for python in pythons], given.turns)

@@ -12,14 +12,10 @@ import warnings
 from collections.abc import Sequence
 from importlib import import_module, util
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError
-from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
-
-if TYPE_CHECKING:
-    from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.rendering.progress import TerminalProgress
 
 # By name: the module, imported when it is run; what --list says of it; seconds of a quick and of a full run
 # on two idle cores, about
@@ -63,34 +59,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
         warnings.showwarning = lambda message, *more, **_: _say(f"warning: {message}")
         try:
             runtime.check_start()
-            studies = run_studies(names, options.out, quick=options.quick)
+            return int(not run_studies(names, options.out, quick=options.quick))
         except MrtError as error:
             _say(error)
             return error.exit_code
         except KeyboardInterrupt:
             _say("interrupted; no report was written")
             return INTERRUPTED
-    return 0 if all(study.passed for study in studies) else 1
 
 
-def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> list[Study]:
-    """Run studies by name, print their bounds and write the report. Raises ``MrtError``."""
+def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> bool:
+    """Run studies in the default variant, print their bounds and write the report; return whether all passed.
+
+    What a study raises becomes its failure. Raises ``MrtError``.
+    """
     missing = [name.replace("_", "-") for name in EXTRAS if util.find_spec(name) is None]
     if missing:
         packages = " ".join(missing)
         raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
     # Not before: NumPy needs a working folder under some Pythons
+    import drjit as dr
+
     from mrt_mitsuba.validation.tools import report
+    from mrt_mitsuba.validation.tools.study import Study
 
     report.prepare(out)
-    seconds = sum(STUDIES[name][2] if quick else STUDIES[name][3] for name in names)
+    seconds = sum(STUDIES[name][2 if quick else 3] for name in names)
     print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
-    progress = TerminalProgress(unit="step")
-    studies = [run_study(name, quick=quick, progress=progress) for name in names]
+    studies = [Study(name, name, TerminalProgress(unit="step")) for name in names]
+    for study in studies:
+        start = time.perf_counter()
+        try:
+            runtime.use(runtime.default_variant())
+            module = import_module(f"mrt_mitsuba.validation.studies.{STUDIES[study.name][0]}")
+            study.title = module.TITLE
+            print(f"{study.name}: {study.title} ...", file=sys.stderr, flush=True)
+            module.run(study, quick=quick)
+        except Exception:
+            study.failure = traceback.format_exc(limit=-4)
+        study.seconds = time.perf_counter() - start
+        gc.collect()  # scenes that live on, and memory kept for reuse, slow down the next study
+        dr.flush_malloc_cache()
     print(report.terminal_table(studies), flush=True)
     report.save(out, *studies, quick=quick)
     print(f"\nReport: {out / 'index.html'}")
-    return studies
+    return all(study.passed for study in studies)
 
 
 def listing() -> str:
@@ -103,27 +116,6 @@ def listing() -> str:
 
 def _spoken(seconds: int) -> str:
     return f"{seconds} s" if seconds < 100 else f"{round(seconds / 60)} min"
-
-
-def run_study(name: str, *, quick: bool, progress: Progress | None = None) -> Study:
-    """Run one of ``STUDIES`` in the default variant. What it raises becomes its failure."""
-    from mrt_mitsuba.validation.tools.study import Study
-
-    study = Study(name, name, progress or Progress())
-    start = time.perf_counter()
-    try:
-        runtime.use(runtime.default_variant())
-        module = import_module(f"mrt_mitsuba.validation.studies.{STUDIES[name][0]}")
-        study.title = module.TITLE
-        print(f"{name}: {study.title} ...", file=sys.stderr, flush=True)
-        module.run(study, quick=quick)
-    except Exception:
-        study.failure = traceback.format_exc(limit=-4)
-    study.seconds = time.perf_counter() - start
-    gc.collect()  # scenes that live on, and memory that Dr.Jit keeps for reuse, slow down the next study
-    if "drjit" in sys.modules:
-        sys.modules["drjit"].flush_malloc_cache()
-    return study
 
 
 def _say(message: object) -> None:

@@ -14,7 +14,7 @@ from mrt_mitsuba.scene.model import Cone, Material, Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles.reference import nearest, unit
 from mrt_mitsuba.validation.tools.compare import p_values
-from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, rays, with_materials
+from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, with_materials
 from mrt_mitsuba.validation.tools.study import Study
 
 TITLE = "Against Mitsuba's own integrators, lights, materials and meshes"
@@ -117,7 +117,7 @@ def mesh_cones(study: Study, *, quick: bool) -> None:
     numbers = {"apex": list(CONE.apex), "base_center": list(CONE.base_center), "radius": CONE.radius}
     cone = {"type": "mrt_cone", **numbers}  # of 256 sides, the default
     scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "cone": cone})
-    found = np.array(scene.ray_intersect_preliminary(rays(o, d)).t)
+    found = np.array(scene.ray_intersect_preliminary(mi.Ray3f(o.T, d.T)).t)
     both = np.isfinite(found) & np.isfinite(exact)
     relative = np.abs(found[both] / exact[both] - 1)
     same = relative < SAME_PART

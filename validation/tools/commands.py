@@ -11,7 +11,6 @@ from mrt_mitsuba.errors import MrtError, SceneError, UsageError
 from mrt_mitsuba.rendering.progress import TerminalProgress
 from mrt_mitsuba.validation.tools.study import Bound
 
-MISSED = 1  # the exit code where a limit is missed, a law does not hold, or a case failed
 AT_LEAST = ("psnr", "p_value")  # the limits of other measures are at most
 KEYS = ("reference", "cases", "shared", "repeats", "errors")  # of a file of cases
 
@@ -34,8 +33,8 @@ def diff(a: str, b: str, *, layer: str = "", out: str | None = None, **limits: s
         if value is None:
             raise UsageError(f"{name} is not defined for these pictures: {UNDEFINED[name]}")
         bounds.append(Bound(name, value, limit, name not in AT_LEAST))
-    print(*bounds, sep="\n", end="\n" if bounds else "")
-    return 0 if all(bound.holds for bound in bounds) else MISSED
+        print(bounds[-1])
+    return int(not all(bound.holds for bound in bounds))
 
 
 def check(scene: str, *, out: str | None = None, quick: str = "0") -> int:
@@ -44,9 +43,8 @@ def check(scene: str, *, out: str | None = None, quick: str = "0") -> int:
         raise UsageError(f"quick={quick}: must be 0 or 1")
     from mrt_mitsuba.validation.checks.scene import check_scene
 
-    progress = TerminalProgress(unit="plugin")
-    found = _found(lambda: check_scene(_scene(scene), quick=quick == "1", progress=progress), out, scene)
-    return 0 if found.passed else MISSED
+    settings = {"quick": quick == "1", "progress": TerminalProgress(unit="plugin")}
+    return int(not _found(check_scene, scene, settings, out, scene).passed)
 
 
 def error_vs_time(scene: str, *, cases: str, out: str = "error-vs-time") -> int:
@@ -59,18 +57,19 @@ def error_vs_time(scene: str, *, cases: str, out: str = "error-vs-time") -> int:
     if wrong:
         raise UsageError(f"{cases} has {wrong[0]}: it holds {', '.join(KEYS)}")
     settings["progress"] = TerminalProgress(unit="render")
-    found = _found(lambda: work_precision.error_vs_time(_scene(scene), **settings), out, scene, cases)
-    return MISSED if found.failed else 0
+    return int(bool(_found(work_precision.error_vs_time, scene, settings, out, scene, cases).failed))
 
 
-def _found(run: Callable[[], Any], out: str | None, *inputs: str) -> Any:
-    """Run what is to report on a scene, show what it finds, and write the page into ``out``."""
+def _found(
+    look: Callable[..., Any], scene: str, settings: dict[str, Any], out: str | None, *inputs: str
+) -> Any:
+    """Look at a scene, show what is found, and write the page into ``out``."""
     from mrt_mitsuba.validation.tools import report
 
     if out is not None:
         report.prepare(Path(out), inputs=inputs)
     try:
-        found = run()
+        found = look(int(scene) if scene.isdecimal() else scene, **settings)
     except SceneError as error:  # nothing was done
         raise UsageError(str(error)) from error
     print(found)
@@ -78,10 +77,6 @@ def _found(run: Callable[[], Any], out: str | None, *inputs: str) -> Any:
         found.save(out)
         print(f"Report: {Path(out) / 'index.html'}")
     return found
-
-
-def _scene(text: str) -> Any:
-    return int(text) if text.isdecimal() else text
 
 
 def _number(name: str, text: str) -> float:

@@ -1,4 +1,4 @@
-"""Parts of the scenes that studies render: cameras, rays, other materials; and ten whole scenes.
+"""Parts of the scenes that studies render: cameras, other materials; and ten whole scenes.
 
 The whole ones use Mitsuba's own lights, lenses, materials, filters and samplers, as users' scenes do.
 """
@@ -6,7 +6,7 @@ The whole ones use Mitsuba's own lights, lenses, materials, filters and samplers
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import mitsuba as mi
@@ -22,34 +22,31 @@ AT_CENTRES: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}
 SPP = 64  # of the samplers of ``SCENES``
 
 
-def rays(o: np.ndarray, d: np.ndarray) -> Any:
-    """Return rays from points [N, 3] in directions [N, 3]."""
-    return mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T))
-
-
-def traced(scene: Any, ray: Any, **parameters: Any) -> Any:
-    """Return what ``mrt_whitted`` with these parameters finds along rays."""
-    return mi.load_dict({"type": "mrt_whitted", **parameters}).trace(scene, None, ray)
-
-
 def with_materials(scene: Scene, change: Callable[[Material], Material]) -> Scene:
     """Return a scene whose spheres and planes have other materials."""
+    spheres, planes = (
+        tuple(dataclasses.replace(thing, material=change(thing.material)) for thing in things)
+        for things in (scene.spheres, scene.planes)
+    )
+    return dataclasses.replace(scene, spheres=spheres, planes=planes)
 
-    def changed(things: Sequence[Any]) -> tuple[Any, ...]:
-        return tuple(dataclasses.replace(t, material=change(t.material)) for t in things)
 
-    return dataclasses.replace(scene, spheres=changed(scene.spheres), planes=changed(scene.planes))
-
-
-def sensor(origin: list[float], target: list[float], rfilter: str = "gaussian", **more: Any) -> Node:
-    """Return a camera with a film."""
-    film = {"type": "hdrfilm", "rfilter": {"type": rfilter}, "component_format": "float32"}
+def sensor(
+    origin: list[float],
+    target: list[float],
+    rfilter: str = "gaussian",
+    sampler: str = "independent",
+    film: Node | None = None,
+    **more: Any,
+) -> Node:
+    """Return a camera with a film and a sampler."""
     return {
         "type": "perspective",
         "fov": 40,
-        "to_world": mi.ScalarTransform4f().look_at(origin, target, more.pop("up", [0, 1, 0])),
-        "film": film | more.pop("film", {}),
-        "sampler": {"type": more.pop("sampler", "independent"), "sample_count": SPP},
+        "to_world": _to().look_at(origin, target, more.pop("up", [0, 1, 0])),
+        "film": {"type": "hdrfilm", "rfilter": {"type": rfilter}, "component_format": "float32"}
+        | (film or {}),
+        "sampler": {"type": sampler, "sample_count": SPP},
     } | more
 
 
@@ -127,19 +124,14 @@ def _sky(color: Any) -> Node:
     return {"type": "constant", "radiance": rgb(color)}
 
 
-def _sun() -> np.ndarray:
-    """Return an environment with a bright place."""
-    pixels = np.full((16, 32, 3), 0.4, np.float32)
-    pixels[3:5, 10:12] = 30
-    return pixels
-
-
 MEMBER = {"type": "instance", "g": {"type": "ref", "id": "group"}}
+SUN = np.full((16, 32, 3), 0.4, np.float32)
+SUN[3:5, 10:12] = 30
 
 SCENES: dict[str, Callable[[], Node]] = {
     "envmap": lambda: {
         "sensor": sensor([0, 2, 6], [0, 0.5, 0]),
-        "around": {"type": "envmap", "bitmap": mi.Bitmap(_sun())},
+        "around": {"type": "envmap", "bitmap": mi.Bitmap(SUN)},
         "floor": _floor(_diffuse(rgb(0.6))),
         "ball": _ball([0, 1, 0], 1, {"type": "roughconductor", "alpha": 0.2}),
     },

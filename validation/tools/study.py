@@ -17,6 +17,8 @@ import numpy as np
 from mrt_mitsuba.rendering.progress import Progress
 
 Item = TypeVar("Item")
+Rows = Sequence[Sequence[Any]]
+Ends = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class Bound:
     limit: float
     at_most: bool = True  # else: at least
     note: str = ""
-    interval: tuple[float, float] | None = field(default=None, kw_only=True)
+    interval: Ends | None = field(default=None, kw_only=True)
 
     @property
     def holds(self) -> bool:
@@ -95,9 +97,7 @@ class Study:
         """Hold a figure to a lower bound; ``note``: why it is this one."""
         self.bounds.append(Bound(name, float(measured), float(limit), False, note))
 
-    def goal(
-        self, name: str, measured: float, limit: float, note: str, *, interval: tuple[float, float]
-    ) -> None:
+    def goal(self, name: str, measured: float, limit: float, note: str, *, interval: Ends) -> None:
         """Show whether a time or a ratio of times is at most so much; a busy machine must fail no study."""
         self.goals.append(Bound(name, float(measured), float(limit), note=note, interval=interval))
 
@@ -106,7 +106,7 @@ class Study:
         name: str,
         title: str,
         columns: Sequence[str],
-        rows: Sequence[Sequence[Any]],
+        rows: Rows,
         note: str = "",
         *,
         first: bool = False,
@@ -149,8 +149,7 @@ class Study:
             "seconds": round(self.seconds, 2),
         }
         text = json.dumps(found, default=lambda v: v.item() if isinstance(v, np.generic) else str(v))
-        values: dict[str, Any] = json.loads(text, parse_constant=str)
-        return values
+        return dict(json.loads(text, parse_constant=str))
 
 
 def findings(part: Callable[..., None], **options: Any) -> Study:

@@ -16,7 +16,6 @@ from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Material, Mesh, Plane, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles.reference import nearest, unit
-from mrt_mitsuba.validation.tools.scenery import rays, traced
 
 ROUNDING = 2.0**-24
 DECADES = 10.0 ** np.arange(-6, 7, 2)
@@ -114,7 +113,8 @@ def measure(kind: str, size: float, count: int) -> dict[str, float]:
     aside = {"type": "sphere", "center": [1.7 * size] * 3, "radius": 1e-3 * size, "flip_normals": True}
     lamp = {"type": "mrt_light", "position": light.tolist()}
     scene = mi.load_dict({"type": "scene", "solid": {**nodes, "bsdf": mirror}, "aside": aside, "lamp": lamp})
-    trace = traced(scene, rays(o, d), min_contribution=0.0, bounce_budget="plain")
+    whitted = mi.load_dict({"type": "mrt_whitted", "min_contribution": 0.0, "bounce_budget": "plain"})
+    trace = whitted.trace(scene, None, mi.Ray3f(o.T, d.T))
     found, direct, n = np.array(trace.hit.found), np.array(trace.direct[0]), np.array(trace.hit.si.n).T
     t = np.array(trace.hit.si.t, np.float64)
 
