@@ -128,10 +128,6 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     # ------------------------------------------- Plan --------------------------------------------------
 
-    def scene_facts(self, scene: mi.Scene) -> SceneFacts:
-        """Return what the kernels depend on."""
-        return self.prepare(scene).facts
-
     def kernel_plan(self, facts: SceneFacts) -> KernelPlan:
         """Decide what the kernels for such a scene hold."""
         return make_plan(facts, self, None if self.sky is None else largest(self.sky))

@@ -95,7 +95,7 @@ def test_kernel_obeys(name: str) -> None:
         return
     assert getattr(plan, name) != other
     image, kernels = kernel(loaded)
-    turned, facts = replace(plan, **{name: other}), integrator.scene_facts(loaded)
+    turned, facts = replace(plan, **{name: other}), integrator.prepare(loaded).facts
     assert held(turned, facts) != held(plan, facts)  # as ``plan=show`` tells
     integrator.kernel_plan = lambda facts: turned
     changed, other_kernels = kernel(loaded)
@@ -141,7 +141,7 @@ def test_reasons(content: dict[str, Any], name: str, reason: str) -> None:
 def test_no_light_buffers_where_they_would_be_too_long() -> None:
     loaded = scene(**CROWD, light=LIGHT)
     integrator = loaded.integrator()
-    facts = integrator.scene_facts(loaded)
+    facts = integrator.prepare(loaded).facts
     facts.lights = 2**11
     assert integrator.kernel_plan(facts).buffers
     facts.lights += 1
