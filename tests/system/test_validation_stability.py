@@ -73,7 +73,7 @@ def dense(self: Any, context: Any, pair: Any) -> Any:
         ("bsdf", [(fresnel, "fresnel_schlick", rounded)], ["Schlick, F0 = 0.04"]),
         ("bsdf", [(microfacet, "beckmann_d", steep_gradient), (lobes, "beckmann_d", steep_gradient)],
          ["gradient in alpha, p99.9"]),
-        ("geometry", [(scene_data, "CURVED", 0.0)], ["sphere, shadow rays", "cone, shadow rays"]),
+        ("geometry", [(scene_data, "CURVED", 0.0)], ["spheres, shadow rays", "cones, shadow rays"]),
         ("filters", [(filters, "gaussian_dof", spreading)],
          [f"nan or inf in a picture, blur ({variant}_rgb)" for variant in ("llvm_ad", "scalar")]),
         ("finite", [(lobes.Lobes, "density", dense), (lobes, "COS_MIN", 1e-13)],

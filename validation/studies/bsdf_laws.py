@@ -58,40 +58,32 @@ def run(study: Study, *, quick: bool) -> None:
         "follow the stated density and carry value over density, light can be followed either way, no more "
         "comes out than goes in, and derivatives are those of the values."
     )
-    general(study, quick=quick)
-    known(study, quick=quick)
-
-
-def general(study: Study, *, quick: bool) -> None:
-    """Check the laws of any BSDF, over forms and ways to sample; show for each what is nearest its limit."""
     for name in study.each("laws", list(MATERIALS)[: 3 if quick else None]):
         found = check_bsdf({"type": "mrt_bsdf", **MATERIALS[name]}, quick=quick)
-        for law in found.laws.values():
-            if not law.skipped:
-                worst = law.worst
-                limit = min(worst.limit, OWN.get(law.name, worst.limit))
-                least = f"{limit:.3g}" if worst.at_most else "a density 10 % too large, as the tests show"
-                why = f"{worst.name}: {worst.note}; least fault: {least}"
-                study.bounds.append(Bound(f"{name}: {law.name}", worst.measured, limit, worst.at_most, why))
+        for law in (law for law in found.laws.values() if not law.skipped):
+            worst = law.worst
+            limit = min(worst.limit, OWN.get(law.name, worst.limit))
+            least = f"{limit:.3g}" if worst.at_most else "a density 10 % too large, as the tests show"
+            why = f"{worst.name}: {worst.note}; least fault: {least}"
+            study.bounds.append(Bound(f"{name}: {law.name}", worst.measured, limit, worst.at_most, why))
+    known(study, quick=quick)
 
 
 def known(study: Study, *, quick: bool) -> None:
     """Compare albedos with those published with another renderer, and with 1 where nothing is lost."""
-    rows = []
+    furnace = {**WHITE, "alpha": 0.1}
+    gloss, white = (mi.load_dict({"type": "mrt_bsdf", **numbers}) for numbers in (NORI_BSDF, furnace))
+    rows: list[dict[str, Any]] = []
     for angle, published in NORI.items():
-        bsdf = mi.load_dict({"type": "mrt_bsdf", **NORI_BSDF})
-        white = mi.load_dict({"type": "mrt_bsdf", **WHITE, "alpha": 0.1})
         wi = at_angle(angle)
-        rows.append([angle, float(albedo(bsdf, wi) @ LUMINANCE), published, float(albedo(white, wi).max())])
+        found = {"ours": float(albedo(gloss, wi) @ LUMINANCE), "published": published}
+        rows.append({"angle °": angle, **found, "white": float(albedo(white, wi).max())})
     note = "White: F = 1, Ks = 1, Kd = 0, alpha = 0.1; what facets hide at low angles is missing."
-    columns = ["angle °", "ours", "published", "white"]
-    study.table(
-        "published", "Albedos published for this family of BSDFs, and a white furnace", columns, rows, note
-    )
-    off = np.max([abs(ours / published - 1) for _, ours, published, _ in rows])
+    study.records("published", "Albedos published for this family, and a white furnace", rows, note)
+    off = np.max([abs(row["ours"] / row["published"] - 1) for row in rows])
     why = "they were published from a Monte Carlo quadrature with about 1e-3 of noise"
     study.at_most("published albedos, relative", off, 3e-3, why)
-    study.at_most(
-        "white furnace: largest albedo", np.max([row[3] for row in rows]), 1 + G1_FIT, "the fit of G₁"
-    )
-    study.at_least("white furnace: albedo head on", rows[0][3], 1 - G1_FIT, "hardly any facet hides another")
+    top = np.max([row["white"] for row in rows])
+    study.at_most("white furnace: largest albedo", top, 1 + G1_FIT, "the fit of G₁")
+    why = "hardly any facet hides another"
+    study.at_least("white furnace: albedo head on", rows[0]["white"], 1 - G1_FIT, why)

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.tools.study import Study
-from mrt_mitsuba.validation.tools.work_precision import Point, describe, error_vs_time
+from mrt_mitsuba.validation.tools.work_precision import Findings, describe, error_vs_time
 
 TITLE = "Error against run time"
 
-INVISIBLE = 0.5 / 255  # half a step of an 8-bit picture
 MODES = ("none", "luma", "sobel", "geometry")
-CUT_OFFS = (0.0, 1 / 16 / 255, 1 / 255, 4 / 255, 16 / 255)
+PROMISED = 1 / 16 / 255  # a sixteenth of a step of an 8-bit picture
+CUT_OFFS = (0.0, PROMISED, 1 / 255, 4 / 255, 16 / 255)
 DEPTHS = (1, 2, 3, 5, 10)
 
 Options = dict[str, Any]
-Points = Mapping[str, Point]
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -25,20 +24,24 @@ def run(study: Study, *, quick: bool) -> None:
     jobs = [(name, number) for name in TRADES for number in ((0,) if quick else SCENES[name])]
     for name, number in study.each("Error against time", jobs):
         trade, where = TRADES[name](number, quick), f"scene {number}, {name}"
-        scene, cases, title, truth = (trade.pop(key) for key in ("scene", "cases", "title", "truth"))
-        bounds, judged = trade.pop("bounds"), trade.pop("judged", None)
+        scene, cases, *titles, bounds = map(trade.pop, ("scene", "cases", "title", "truth", "bounds"))
         found = error_vs_time(scene, cases, repeats=1 if quick else 5, **trade)
-        describe(study, found, where, f"Scene {number}: {title}", truth)
-        if not found.failed:
-            if judged:
-                what, least = "error of the reference / least error it judges", found.points[judged].rmse
-                why = (
-                    "then it changes no error by more than an eighth, and the judge is better than the judged"
-                )
-                bounds.append((what, lambda _, f=found, e=least: f.reference_error / e, 0.5, why))
-            for what, figure, most, why in bounds:
-                study.at_most(f"{where}: {what}", figure(found.points), most, why)
+        describe(study, found, where, f"Scene {number}: {titles[0]}", titles[1])
+        for what, figure, most, why in () if found.failed else bounds:
+            study.at_most(f"{where}: {what}", figure(found), most, why)
         del scene, found  # what holds them is freed with them
+
+
+def rmse(found: Findings, case: str) -> float:
+    """Return the error of a case."""
+    return found.points[case].rmse
+
+
+def judged(case: str) -> tuple[Any, ...]:
+    """Return the bound of the reference's error, by the case of least error."""
+    why = "then it changes no error by more than an eighth, and the judge is better than the judged"
+    what = "error of the reference / least error it judges"
+    return what, lambda found: found.reference_error / rmse(found, case), 0.5, why
 
 
 def _scene(number: int, quick: bool, **options: Any) -> Options:
@@ -47,8 +50,8 @@ def _scene(number: int, quick: bool, **options: Any) -> Options:
     return mrt.scene_dict(number, width=width, height=height, **options)
 
 
-# Each returns arguments of ``error_vs_time``; titles of the settings and of the reference; "bounds": what, a
-# figure of the points by case, the most, why; and "judged", the case of least error, by a better reference
+# Each returns arguments of ``error_vs_time``; titles of settings and reference; "bounds": what, a figure of
+# the findings, the most, why
 def sampling(number: int, quick: bool) -> Options:
     """Return which pixels get how many samples, and where in the pixel."""
     # the reference: an even multiple of each, since odd ones share samples and with them errors
@@ -70,10 +73,10 @@ def sampling(number: int, quick: bool) -> Options:
         },
         "reference": [{"aa": aa, "aamode": "none", "lattice": "centered"} for aa in (most, most * 3 // 4)],
         "bounds": [
-            (f"RMSE of {case} / {few}", lambda p, c=case: p[c].rmse / p[few].rmse, 2 * least / greatest, why)
-            for case in (many, edges)
+            (f"RMSE of {many} / {few}", lambda f: rmse(f, many) / rmse(f, few), 2 * least / greatest, why),
+            (f"RMSE of {edges} / {few}", lambda f: rmse(f, edges) / rmse(f, few), 2 * least / greatest, why),
+            judged(many),
         ],
-        "judged": many,
     }
 
 
@@ -87,7 +90,7 @@ def whitted(number: int, quick: bool) -> Options:
     default = list(cases)[1]
     cases |= {f"max_depth={depth}": integrator(max_depth=depth) for depth in DEPTHS}
     first, last = (f"max_depth={depth}" for depth in (DEPTHS[0], DEPTHS[-1]))
-    why = "half a step of 8 bits, as promised; a cut-off that is 16 times too large leaves more"
+    what, why = "largest error of the default cut-off", "as promised; one 16 times too large leaves more"
     seen = "seen is 6e-4 (scene 9) and above; a limit that has no effect leaves 0"
     return {
         "scene": _scene(number, quick, fresnel="dielectric"),
@@ -97,8 +100,8 @@ def whitted(number: int, quick: bool) -> Options:
         "reference": integrator(min_contribution=0.0),
         "shared": {"aa": 2, "aamode": "none", "lattice": "report"},
         "bounds": [
-            ("largest error of the default cut-off", lambda p: p[default].difference.largest, INVISIBLE, why),
-            (f"RMSE of {last} - that of {first}", lambda p: p[last].rmse - p[first].rmse, -3e-4, seen),
+            (what, lambda f: f.points[default].difference.largest, PROMISED, why),
+            (f"RMSE of {last} - that of {first}", lambda f: rmse(f, last) - rmse(f, first), -3e-4, seen),
         ],
     }
 
@@ -107,26 +110,24 @@ def path(number: int, quick: bool) -> Options:
     """Return Mitsuba's path and direct at rising spp, and mrt_whitted, against converged path."""
     counts, most = ((1, 16), 256) if quick else ((1, 4, 16, 64), 2048)
     few, many = (f"path spp={spp}" for spp in (counts[0], counts[-1]))
-
-    def off_theory(points: Points) -> float:
-        return abs(points[many].rmse / points[few].rmse * (counts[-1] / counts[0]) ** 0.5 - 1)
-
-    kinds = ("path", "direct")
-    cases: dict[str, Options] = {
-        f"{kind} spp={spp}": {"integrator": kind, "spp": spp} for kind in kinds for spp in counts
-    }
-    cases["mrt_whitted"] = {}
-    cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
+    gain = (counts[-1] / counts[0]) ** 0.5
+    what = f"|RMSE of {many} / {few} / theory - 1|"
     why = "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15"
     return {
         "scene": _scene(number, quick),
         "title": "Whitted, direct and path at rising spp",
         "truth": f"path with spp={most}",
-        "cases": cases,
+        "cases": {
+            **{f"{k} spp={n}": {"integrator": k, "spp": n} for k in ("path", "direct") for n in counts},
+            "mrt_whitted": {},
+            "mrt_whitted, no clamp": {"integrator": {"type": "mrt_whitted", "clamp": False}},
+        },
         "reference": {"integrator": "path", "spp": most},
         "shared": {"aa": 1, "aamode": "none"},
-        "bounds": [(f"|RMSE of {many} / {few} / theory - 1|", off_theory, 0.15, why)],
-        "judged": many,
+        "bounds": [
+            (what, lambda f: abs(rmse(f, many) / rmse(f, few) * gain - 1), 0.15, why),
+            judged(many),
+        ],
     }
 
 

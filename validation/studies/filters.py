@@ -49,37 +49,37 @@ def noise(study: Study, *, quick: bool) -> None:
     """Count refined pixels where the converged picture is flat, and where it has an edge."""
     width, height, counts = (60, 45, (4, 16)) if quick else (200, 150, (2, 4, 8, 16, 32, 64))
     # scene 0 in Mitsuba's own plugins, lit by a small sphere instead of two points
-    nodes = mrt.scene_dict(0, width=width, height=height, flavor="stock")
-    own = ("light", "sky", "integrator")
-    nodes = {name: node for name, node in nodes.items() if not name.startswith(own)}
+    stock = mrt.scene_dict(0, width=width, height=height, flavor="stock")
     lamp = {"type": "area", "radiance": {"type": "rgb", "value": 30.0}}
-    nodes["light"] = {"type": "sphere", "center": [1, 2, 0.5], "radius": 0.3, "emitter": lamp}
-    nodes["sky"] = {"type": "constant", "radiance": 0.2}
-    scene = load(nodes | {"integrator": {"type": "path", "max_depth": 4}})
+    scene = load({name: node for name, node in stock.items() if not name.startswith("light")} | {
+        "light": {"type": "sphere", "center": [1, 2, 0.5], "radius": 0.3, "emitter": lamp},
+        "sky": {"type": "constant", "radiance": 0.2},
+        "integrator": {"type": "path", "max_depth": 4},
+    })  # fmt: skip
     # where the detectors look
     truth = mrt.render(scene, **AT_CENTRES, spp=16 * counts[-1], seed=78).image
     luma = np.sqrt(truth @ np.array(filters.edges.LUMA_WEIGHTS, np.float32))
-    windows = np.lib.stride_tricks.sliding_window_view(luma, (3, 3))
-    contrast = windows.max(axis=(2, 3)) - windows.min(axis=(2, 3))
+    contrast = np.ptp(np.lib.stride_tricks.sliding_window_view(luma, (3, 3)), axis=(2, 3))
     flat, edge = contrast < FLAT, contrast > EDGE
-    rows: list[tuple[Any, ...]] = []
+    rows: list[dict[str, Any]] = []
     for detector, find in (("luma", filters.luma_edges), ("sobel", filters.sobel_edges)):
         for spp in counts:
             refined = mrt.render(scene, aa=2, aamode=detector, lattice="report", spp=spp).layers["samples.Y"]
             seen = refined[1:-1, 1:-1] > 1
             blind = np.asarray(find(mrt.render(scene, **AT_CENTRES, spp=spp).image).mask)[1:-1, 1:-1]
-            rows.append((detector, spp, seen[flat].mean(), seen[edge].mean(), blind[flat].mean()))
-    columns = ("detector", "rays a pixel", "flat", "edges", "flat, without the variance")
-    note = f"Flat: luma contrast below {FLAT} in the converged picture; edges: above {EDGE}."
-    study.table("noise", "Does a detector chase noise? Share of pixels refined", columns, rows, note)
+            shares = {"flat": seen[flat].mean(), "edges": seen[edge].mean(), "blind": blind[flat].mean()}
+            rows.append({"detector": detector, "rays a pixel": spp, **shares})
+    note = f"Flat: luma contrast below {FLAT} in the converged picture; edges: above {EDGE}. Blind: the same "
+    note += "flat pixels for a detector that does not know the variance."
+    study.records("noise", "Does a detector chase noise? Share of pixels refined", rows, note)
     why = "three deviations: 0.3 % for one normal value; estimated from 4 samples, tails are longer"
-    what = "noise: share of flat pixels refined, 4 rays a pixel or more"
-    study.at_most(what, max(r[2] for r in rows if r[1] >= 4), 0.03, why)
+    most = np.max([row["flat"] for row in rows if row["rays a pixel"] >= 4])
+    study.at_most("noise: share of flat pixels refined, 4 rays a pixel or more", most, 0.03, why)
     why = "noise of 0.03, edges from a contrast of 0.2: at three deviations either way, most of them"
-    found = min(r[3] for r in rows if r[1] == 16)
+    found = min(row["edges"] for row in rows if row["rays a pixel"] == 16)
     study.at_least("noise: share of edges found with 16 rays", found, 0.55, why)
-    why = "shows that there is noise to chase"
-    study.at_least("noise: the same flat pixels without the variance", min(r[4] for r in rows), 0.3, why)
+    least, why = min(row["blind"] for row in rows), "shows that there is noise to chase"
+    study.at_least("noise: the same flat pixels without the variance", least, 0.3, why)
 
 
 # ---------------------------------------------- Depth of field ---------------------------------------------
@@ -91,40 +91,38 @@ def depth_of_field(study: Study, *, quick: bool) -> None:
     options: dict[str, Any] = {"aa": aa, "aamode": "none", "lattice": "centered", "focaldist": 0}
     rows: list[dict[str, Any]] = []
     for number in (3, 4):
-        scene, name = report_scene(number), f"scene {number}"
+        scene = report_scene(number)
         sharp = mrt.render(scene, width=width, height=height, layers=["depth"], **options)
         depth = sharp.layers["depth.Z"]
         focus: dict[str, Any] = {"focal_distance": scene.focal_distance, "focal_range": scene.focal_range}
         pictures = {"sharp": sharp.image}
         pictures |= {mode: filters.gaussian_dof(sharp.image, depth, **focus, mode=mode) for mode in BLURS}
-        lens = fit_lens(scene, depth)
-        nodes = scene.to_dict(width=width, height=height)
-        nodes["sensor"] |= lens
+        nodes, lens = scene.to_dict(width=width, height=height), fit_lens(scene, depth)
+        nodes["sensor"] |= {"type": "thinlens", **lens}
         one, other = (mrt.render(nodes, **options, spp=spp, seed=seed).image for seed in (1, 100_001))
         truth = (one + other) / 2
-        errors = {mode: rmse(picture, truth) for mode, picture in pictures.items()}
-        corrected, why = errors["corrected"], "a correction that is worse is none"
-        study.at_most(f"{name}: RMSE of corrected / report", corrected / errors["report"], 1, why)
-        study.at_most(f"{name}: RMSE of corrected / no blur at all", corrected / errors["sharp"], 1, why)
+        errors = {f"RMSE, {mode}": rmse(picture, truth) for mode, picture in pictures.items()}
+        sharp_error, report, corrected = errors.values()
+        why = "a correction that is worse is none"
+        study.at_most(f"scene {number}: RMSE of corrected / report", corrected / report, 1, why)
+        study.at_most(f"scene {number}: RMSE of corrected / no blur at all", corrected / sharp_error, 1, why)
         left, why = rmse(one, other) / 2 / corrected, "else the comparison would be one of noise"
-        study.at_most(f"{name}: noise of the lens / RMSE of corrected", left, 0.5, why)
-        found = {key: value for key, value in lens.items() if key != "type"}
-        rows.append({"scene": number, **{f"RMSE, {mode}": error for mode, error in errors.items()}, **found})
+        study.at_most(f"scene {number}: noise of the lens / RMSE of corrected", left, 0.5, why)
+        rows.append({"scene": number, **errors, **lens})
         sheet = np.concatenate([*pictures.values(), truth], axis=1)
         caption = f"Left to right: {', '.join(pictures)}, thinlens."
         study.picture(f"pictures-{number}", f"Scene {number}", sheet, caption)
     study.records("blur", "RMSE to a lens, and the lens", rows)
 
 
-def fit_lens(scene: Scene, depth: np.ndarray) -> dict[str, Any]:
+def fit_lens(scene: Scene, depth: np.ndarray) -> dict[str, float]:
     """Return the lens whose discs are nearest to the report's blur of these hit distances [H, W]."""
     amount = filters.blur_amount(depth, focal_distance=scene.focal_distance, focal_range=scene.focal_range)
-    radius = disc_radius(np.asarray(amount, np.float64))
-    hit = np.isfinite(depth)
+    radius, hit = disc_radius(np.asarray(amount, np.float64)), np.isfinite(depth)
     signed = np.where(depth < scene.focal_distance, -radius, radius)[hit]
     (a, b), *_ = np.linalg.lstsq(np.stack([np.ones(hit.sum()), -1 / depth[hit]], axis=1), signed, rcond=None)
     pixels = depth.shape[1] / (2 * math.tan(math.radians(scene.camera.hfov) / 2))
-    return {"type": "thinlens", "aperture_radius": float(b / pixels), "focus_distance": float(b / a)}
+    return {"aperture_radius": float(b / pixels), "focus_distance": float(b / a)}
 
 
 def disc_radius(amount: np.ndarray) -> np.ndarray:

@@ -38,24 +38,21 @@ LEVEL = 1e-3  # probability with which a test of pictures rejects equal ones
 
 def run(study: Study, *, quick: bool) -> None:
     """Run all parts; ``compare_roughconductor`` does the pictures of one roughness."""
-    study.text(
-        "With F = 1 and no diffuse part, mrt_bsdf and roughconductor are the same function: their values are "
-        "compared point by point and in pictures, with equal random numbers and with independent ones."
-    )
-    for part in (pointwise, rendered):
-        part(study, quick=quick)
+    study.text("With F = 1 and no diffuse part, mrt_bsdf and roughconductor are the same function.")
+    pointwise(study, quick=quick)
+    rendered(study, quick=quick)
 
 
-def ours(alpha: float, *, visible: bool = True, **more: Any) -> dict[str, Any]:
+def ours(alpha: float, *, visible: bool = True) -> dict[str, Any]:
     """Return ``mrt_bsdf`` with F = 1 and no diffuse part."""
-    form = {"type": "mrt_bsdf", "fresnel": "unity", "diffuse_reflectance": 0.0}
-    return {**form, "alpha": alpha, "sample_visible": visible, **more}
+    lobe = {"fresnel": "unity", "diffuse_reflectance": 0.0}
+    return {"type": "mrt_bsdf", **lobe, "alpha": alpha, "sample_visible": visible}
 
 
 def theirs(alpha: float, *, visible: bool = True) -> dict[str, Any]:
     """Return ``roughconductor`` with F = 1."""
-    form = {"type": "roughconductor", "material": "none", "distribution": "beckmann"}
-    return {**form, "alpha": alpha, "sample_visible": visible}
+    lobe = {"material": "none", "distribution": "beckmann"}
+    return {"type": "roughconductor", **lobe, "alpha": alpha, "sample_visible": visible}
 
 
 # ------------------------------------------ Point by point ------------------------------------------
@@ -75,23 +72,22 @@ def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> dict[str, f
     value = np.max([relative_error(one[0], other[0]) for one, other in (visible, plain)])
     # In the density of visible normals, roughconductor takes the rational fit of G₁(ωi) for the normaliser
     # 1 / (1 + Λ(ωi)), and is off by up to 0.4 %: bring it to integrate to one
-    z, across = wi[:, 2].astype(float), np.hypot(wi[:, 0].astype(float), wi[:, 1])
-    b = z / np.maximum(alpha * across, 1e-30)
+    x, y, z = wi.astype(float).T
+    b = z / np.maximum(alpha * np.hypot(x, y), 1e-30)
     smith = np.exp(-(np.minimum(b, 30) ** 2)) / (2 * np.sqrt(np.pi) * b) - erfc(b) / 2
     fit = np.where(b < 1.6, b * (3.535 + 2.181 * b) / (1 + b * (2.276 + 2.577 * b)), 1)
-    of_visible = relative_error(visible[0][1], visible[1][1] / ((1 + smith) * fit))
+    of_visible = relative_error(visible[0][1], visible[1][1] / ((1 + smith) * fit)).max()
     long = ((wi.astype(float) + wo) ** 2).sum(axis=-1) >= SHORT
-    figures = value, of_visible.max(), relative_error(plain[0][1], plain[1][1])[long].max()
-    return dict(zip(NAMES, map(float, figures), strict=True))
+    of_plain = relative_error(plain[0][1], plain[1][1])[long].max()
+    return {name: float(x) for name, x in zip(NAMES, (value, of_visible, of_plain), strict=True)}
 
 
 def pointwise(study: Study, *, quick: bool) -> None:
     """Compare values and densities, over roughness and in every variant that can run here."""
-    variants = runtime.usable_variants()
+    rows: list[dict[str, Any]] = []
+    before, variants = runtime.use(), runtime.usable_variants()
     if quick:  # every colour mode once, and one scalar variant
         variants = [name for name in variants if not name.startswith("scalar") or name == runtime.SLOW]
-    before = runtime.use()
-    rows: list[dict[str, Any]] = []
     for variant in study.each("points", variants):
         runtime.use(variant)
         pairs = SCALAR_PAIRS if is_scalar() else 5_000 if quick else 200_000
@@ -100,8 +96,9 @@ def pointwise(study: Study, *, quick: bool) -> None:
             rows.append(row | compare_pointwise(alpha, count=pairs))
     runtime.use(before)
     study.records("pointwise", "Largest relative differences from roughconductor", rows)
+    why = "exp of up to 16, of arguments right to roundings"
     for name in NAMES:
-        worst, why = np.max([row[name] for row in rows]), "exp of up to 16, of arguments right to roundings"
+        worst = np.max([row[name] for row in rows])
         study.at_most(f"{name}, relative, {len(variants)} variants", worst, POINTWISE, why)
 
 
@@ -191,11 +188,9 @@ def compare_roughconductor(
 
 def rendered(study: Study, *, quick: bool) -> None:
     """Compare pictures: equal with equal random numbers, alike with others; ``stock`` has the mistakes."""
-    settings: dict[str, Any] = (
-        {"size": 64, "spp": 8, "renders": 64} if quick else {"size": 128, "spp": 8, "renders": 96}
-    )
+    size, renders = (64, 64) if quick else (128, 96)
     for alpha in study.each("pictures", (0.3,) if quick else (0.03, 0.1, 0.3)):
-        found, at = compare_roughconductor(alpha, **settings), f"alpha {alpha:g}"
+        found, at = compare_roughconductor(alpha, size=size, renders=renders), f"alpha {alpha:g}"
         why = "paths that rounding sends past an edge; the ball covers a third of the picture"
         study.at_most(f"share of {SAME}, {at}", found.errors[SAME], 5e-3, why)
         what, why = f"p of the difference with independent numbers, {at}", "pixels, tiles and the picture"

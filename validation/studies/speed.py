@@ -57,36 +57,32 @@ class Pair(NamedTuple):
     name: str
     make: Callable[[], tuple[Run, Run]]
     goal: float  # of the ratio of seconds
-    agree: Callable[[Run, Run], float] | None = None
-    limit: float = 0.0
-    why: str = ""
+    agree: Callable[[Run, Run], float]
+    limit: float
+    why: str
 
 
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study. A quick one holds that pairs agree, and says nothing of goals."""
-    extent = QUICK if quick else FULL
+    extent, rows = QUICK if quick else FULL, []
     runtime.use(runtime.FAST)
-    rows: list[dict[str, Any]] = []
     # scenes are loaded when the turn of their pair comes
     for pair in study.each("Speed", [pair for part in PARTS for pair in part(extent)]):
         time, off = compare(pair, extent.repeats)
-        quartiles = f"{time['low']:.3g} to {time['high']:.3g}"
+        study.at_most(f"{pair.name}: difference", off, pair.limit, pair.why)
+        low, high = time["low"], time["high"]
         if not quick:
-            note = f"quartiles {quartiles} of {extent.repeats} ratios"
-            study.goal(pair.name, time["ratio"], pair.goal, note, interval=(time["low"], time["high"]))
-        if off is not None:
-            study.at_most(f"{pair.name}: difference", off, pair.limit, pair.why)
-        seconds = {"s": time["seconds"], "other, s": time["other_seconds"], "ratio": time["ratio"]}
-        rows.append({"what": pair.name, **seconds, "quartiles": quartiles, "goal": pair.goal})
+            note = f"quartiles {low:.3g} to {high:.3g} of {extent.repeats} ratios"
+            study.goal(pair.name, time["ratio"], pair.goal, note, interval=(low, high))
+        rows.append({"what": pair.name, **time, "goal": pair.goal})
     title = f"Seconds, {extent.width}x{extent.height}, {extent.spp} samples a pixel"
-    study.records("speed", title, rows, "Taken in turn, medians of ratios.", first=True)
+    study.records("speed", title, rows, "Taken in turn: medians, and quartiles of the ratio.", first=True)
 
 
-def compare(pair: Pair, repeats: int) -> tuple[dict[str, float], float | None]:
+def compare(pair: Pair, repeats: int) -> tuple[dict[str, float], float]:
     """Time a pair in turns, and say by how much it disagrees."""
     ours, other = pair.make()
-    off = None if pair.agree is None else pair.agree(ours, other)
-    time = ratio(ours, other, repeats=repeats)
+    off, time = pair.agree(ours, other), ratio(ours, other, repeats=repeats)
     del ours, other
     gc.collect()  # scenes that stay alive slow down the kernels of later ones
     return time, off
@@ -96,7 +92,7 @@ def _render(nodes: Nodes, **options: Any) -> Run:
     return partial(mrt.render, load(nodes), **renders.ONE_RAY | options)
 
 
-def _by_mitsuba(nodes: Nodes, integrator: Nodes | None = None, spp: int = 1) -> Run:
+def _by_mitsuba(nodes: Nodes, integrator: Nodes | None, spp: int) -> Run:
     scene = load(nodes)
     chosen = mi.load_dict(integrator) if integrator else scene.integrator()
     return lambda: np.array(mi.render(scene, integrator=chosen, spp=spp))
@@ -114,8 +110,8 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
         return mrt.scene_dict(number, width=extent.width, height=extent.height, **options)
 
     def other_light(ours: Run, other: Run, factor: float = 1) -> float:
-        means = [float(np.mean(side(), dtype=np.float64)) for side in (ours, other)]
-        return abs(means[1] / means[0] / factor - 1)
+        one, two = (float(np.mean(side(), dtype=np.float64)) for side in (ours, other))
+        return abs(two / one / factor - 1)
 
     def direct(number: int, flavor: str) -> tuple[Run, Run]:
         """Return direct light in the scene of a flavour, with Mitsuba's lights in place of ours."""
@@ -128,14 +124,13 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
 
     def materials(number: int) -> tuple[Run, Run]:
         """Return the scene of Mitsuba's plugins, with either material in place of ``roughplastic``."""
-        stock = nodes(number, flavor="stock")
+        stock, keep = nodes(number, flavor="stock"), "specular_reflectance"
         plastics = {n: m for n, m in stock.items() if isinstance(m, dict) and m["type"] == "roughplastic"}
-        keep = "specular_reflectance"
         ours, theirs = (
             stock | {name: kind(node["alpha"]) | {keep: node[keep]} for name, node in plastics.items()}
             for kind in (roughconductor.ours, roughconductor.theirs)
         )
-        return _by_mitsuba(ours, spp=extent.spp), _by_mitsuba(theirs, spp=extent.spp)
+        return _by_mitsuba(ours, None, extent.spp), _by_mitsuba(theirs, None, extent.spp)
 
     for n in extent.scenes:
         lights = sum(key.startswith("light_") for key in nodes(n))
@@ -177,19 +172,17 @@ def left_out(nodes: Nodes, change: Nodes, more: dict[str, Any]) -> tuple[Run, Ru
 
 def growth(extent: Extent) -> Iterator[Pair]:
     """Yield tasks against smaller ones; the code must not grow with them."""
-    times, side = extent.growth, round(extent.growth**0.5)
-    small = {"width": 40, "height": 30}
-    tasks: list[tuple[str, Callable[[int], Run], int, int]] = [  # the factor of each, and the goal
-        ("pixels", lambda n: _render(mrt.scene_dict(3, width=40 * n, height=30 * n)), side, side * side),
-        ("lights", lambda n: _render(renders.with_lights(16 * n, **small)), times, times),
-        ("triangles", lambda n: _render(renders.with_triangles(100 * n, **small), aa=4), times, 10),
-    ]
+    times, side, small = extent.growth, round(extent.growth**0.5), {"width": 40, "height": 30}
 
     def longer_code(ours: Run, other: Run) -> float:
         return operations(ours) / operations(other) - 1
 
     why = "numbers are data, not code; a loop that is unrolled makes it as many times longer"
-    for name, task, factor, goal in tasks:
+    for name, task, factor, goal in (  # the factor of the task, and the goal
+        ("pixels", lambda n: _render(mrt.scene_dict(3, width=40 * n, height=30 * n)), side, side * side),
+        ("lights", lambda n: _render(renders.with_lights(16 * n, **small)), times, times),
+        ("triangles", lambda n: _render(renders.with_triangles(100 * n, **small), aa=4), times, 10),
+    ):
         make = partial(lambda task, factor: (task(factor), task(1)), task, factor)
         yield Pair(f"{times} times the {name}", make, goal, longer_code, 0.05, why)
 

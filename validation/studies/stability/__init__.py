@@ -1,8 +1,7 @@
 """``mrt-validate stability``: does float32 hold on stiff and extreme cases, and where must it give out?
 
 A case is a row: its name; what is measured; why it is held to its limit, or cannot hold; the figure; the
-limit, if there is one; and the least fault that it shows, if one was made: in words, with the figure that
-came of it, which must be twice the limit. Without one, the least fault is the limit itself.
+limit, if there is one; and whether the figure must be at most that, the default, or at least.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from mrt_mitsuba.validation.studies.stability import finite, geometry, reflectance, transport
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.study import Bound, Study
 
 TITLE = "Numerical stability on stiff and extreme cases"
 COLUMNS = ("case", "what", "why", "measured", "bound", "")
@@ -28,19 +27,14 @@ PARTS: dict[str, tuple[str, Callable[[bool], Iterable[tuple[Any, ...]]], str]] =
 
 def run(study: Study, *, quick: bool) -> None:
     """Make a table of each part, and hold its cases to their limits."""
+    study.text("The least fault that a case shows is as large as its limit; of counts, a single one.")
     for table, (title, cases, note) in study.each(TITLE, PARTS.items()):
         rows: list[tuple[Any, ...]] = []
         for name, what, why, measured, *held in cases(quick):
-            if not held:
-                rows.append((name, what, why, float(measured), "-", "cannot hold"))
-                continue
-            limit, (fault, seen) = held[0], held[1] if len(held) > 1 else ("", 0)
-            least = fault or (f"{limit:.3g}" if limit else "a single one")
-            study.at_most(f"{title}: {name}", measured, limit, f"least fault: {least}")
-            words = [(name, what, why)]
-            if fault:
-                study.at_least(f"{title}: {name}, its fault", seen, 2 * limit or 1.0, "must be seen")
-                words.append((f"{name}, its fault", fault, "must be seen"))
-            for row, bound in zip(words, study.bounds[-len(words) :], strict=True):
-                rows.append((*row, bound.measured, f"{bound.sign} {bound.limit:.3g}", bound.verdict))
+            verdict = "-", "cannot hold"
+            if held:
+                bound = Bound(f"{title}: {name}", float(measured), *held, note=why)
+                study.bounds.append(bound)
+                verdict = f"{bound.sign} {bound.limit:.3g}", bound.verdict
+            rows.append((name, what, why, float(measured), *verdict))
         study.table(table, title, COLUMNS, rows, note)

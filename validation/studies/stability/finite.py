@@ -19,11 +19,10 @@ SHAPES = ((1, 1), (1, 17), (17, 1), (2, 2), (3, 3), (1, 2), (40, 30))
 MODES = ("report", "corrected")
 # A blurred pixel is a weighted mean of at most 16² others: sums of as many float32 products
 MEAN = 64 * 2.0**-24
-UP = np.array([0, 0, 1], np.float32)
 EDGES: dict[str, Callable[[np.ndarray, np.ndarray], Any]] = {
     "luma": lambda image, depth: filters.luma_edges(image),
     "sobel": lambda image, depth: filters.sobel_edges(image),
-    "geometry": lambda image, depth: filters.geometry_edges(image * 0 + UP, depth),
+    "geometry": lambda image, depth: filters.geometry_edges(np.full_like(image, 3**-0.5), depth),
 }
 Case = tuple[Any, ...]
 
@@ -45,9 +44,8 @@ def _blurred(image: np.ndarray, depth: np.ndarray, mode: str, **focus: Any) -> n
 
 
 def _blurs() -> Iterator[Case]:
-    tiny, excess, damage = 0.0, 0.0, 0
+    tiny, excess, damage, rng = 0.0, 0.0, 0, np.random.default_rng(1)
     for shape, mode in product(SHAPES, MODES):
-        rng = np.random.default_rng(1)
         depth = rng.uniform(0.1, 12, shape).astype(np.float32)  # on both sides of the focus
         depth[rng.random(shape) < 0.1] = np.inf
         image = rng.random((*shape, 3)).astype(np.float32)
@@ -59,14 +57,13 @@ def _blurs() -> Iterator[Case]:
             image[20, 15, 1] = value
             bad = ~np.isfinite(_blurred(image, depth, mode)).all(axis=-1)
             damage += int(bad.sum()) + 1 - 2 * int(bad[20, 15])
-    what = "1×1 … 40×30, constant pictures and noise to 1e20: how far means leave the range of values"
+    what = "how far means leave the range of values, 1×1 … 40×30, to 1e20"
     yield "range of a blur", what, "not at all", excess, MEAN
     why = "the smallest weights are 2⁻³⁰: their products are below the least normal float32 and become 0"
     yield "constant pictures of 1e-30, blur", "relative change", why, tiny
     what = "other pixels that are not finite afterwards, and this one where it is hidden"
     yield "nan or inf in a picture, blur", what, "damage stays local, and to be seen", damage, 0
-    image = (10 ** np.random.default_rng(5).uniform(-38, 34, (20, 20, 3))).astype(np.float32)
-    depth = (10 ** np.random.default_rng(6).uniform(-30, 30, (20, 20))).astype(np.float32)
+    image, depth = (np.float32(10 ** rng.uniform(*s)) for s in ((-38, 34, (20, 20, 3)), (-30, 30, (20, 20))))
     settings = product(MODES, (1e-30, 1.0, 1e30), (0.0, 1e-30, 1e30, np.inf))
     found = [_blurred(image, depth, mode, focal_distance=f, focal_range=r) for mode, f, r in settings]
     what = "values that are not finite, pictures 1e-38 … 1e34, depths 1e-30 … 1e30"
@@ -74,27 +71,20 @@ def _blurs() -> Iterator[Case]:
 
 
 def _detectors() -> Iterator[Case]:
-    expected = np.zeros((12, 10), bool)
-    expected[5:8, 4:7] = True
-    rng = np.random.default_rng(7)
-    huge = (10 ** rng.uniform(-38, 34, (20, 20, 3)) * rng.choice([-1, 1], (20, 20, 3))).astype(np.float32)
-    far = (10 ** rng.uniform(-37, 37, (20, 20))).astype(np.float32)
+    rng, (rows, columns) = np.random.default_rng(7), np.mgrid[:12, :10]
+    expected = (abs(rows - 6) < 2) & (abs(columns - 5) < 2)
+    huge = np.float32(10 ** rng.uniform(-38, 34, (20, 20, 3)) * rng.choice([-1, 1], (20, 20, 3)))
+    far = np.float32(10 ** rng.uniform(-37, 37, (20, 20)))
     for name, find in EDGES.items():
-        wrong = 0
+        wrong = np.isnan(np.asarray(find(huge, far).value)).sum()
         for value in (np.nan, np.inf):
             image, depth = np.full((12, 10, 3), 0.5, np.float32), np.full((12, 10), 3, np.float32)
-            if name == "geometry":
-                depth[6, 5] = np.nan  # infinite is a miss
-            else:
-                image[6, 5, 2] = value
+            image[6, 5, 2], depth[6, 5] = value, np.nan  # an infinite depth is a miss
             found = find(image, depth)
-            marked = np.isinf(np.asarray(found.value))
-            wrong += ((marked != expected) | (~np.asarray(found.mask) & expected)).sum()
-        what = "pixels not marked in its 3×3, or marked elsewhere"
-        yield f"nan or inf in a picture, {name}", what, "reported, and local", wrong, 0
-        bad = np.isnan(np.asarray(find(huge, far).value)).sum()
-        what = "NaN among the values, pictures to ±1e34"
-        yield f"huge ranges, {name}", what, "there is none", bad, 0
+            wrong += (np.isinf(np.asarray(found.value)) != expected).sum()
+            wrong += (~np.asarray(found.mask) & expected).sum()
+        what = "pixels not marked in its 3×3, or marked elsewhere; NaN among the values of pictures to ±1e34"
+        yield f"nan or inf in a picture, huge ranges, {name}", what, "reported, and local", wrong, 0
 
 
 # ------------------------------------------------- Material ------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -13,30 +13,20 @@ import numpy as np
 from mrt_mitsuba.plugins import fresnel, microfacet
 from mrt_mitsuba.plugins.quadric_kinds import Columns
 from mrt_mitsuba.validation.oracles import exact
+from mrt_mitsuba.validation.oracles.reference import unit
+from mrt_mitsuba.validation.tools.bsdf_probe import lobe_pairs
 
-ALPHAS = 10.0 ** np.arange(-8, 3)
-COSINES = np.array([1, 0.5, 0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7])
-# Edges of the cells of tan²θh / alpha², minus the logarithm of exp(-…). The lobe is at 1e-7 of its peak at
-# ``IN_BOUND``, and at 1e-20 at the last
-IN_BOUND = -np.log(1e-7)
-STEEPNESS = np.array([0, 0.1, 1, 4, 9, IN_BOUND, 25, 35, -np.log(1e-20)])
+# Of tan²θh / alpha², minus the logarithm of exp(-…): the lobe is at 1e-7 of its peak, and at 1e-20
+IN_BOUND, STEEPEST = -np.log([1e-7, 1e-20])
 IORS = np.array([1.5, 1.33, 3, 1 + 1e-7, 1 - 1e-7, 0.5, 1e-3, 1e6], np.float32)
 FRESNEL_IORS = np.array([*IORS, 1e-2, 0.1, 0.9, 0.99, 1.0001, 1.01, *10.0 ** np.arange(1, 6)], np.float32)
 
-# What is measured, with its limits. The first holds where D is at least 1e-7 of its peak, for alpha 1e-4 … 1:
-# 80 roundings, for the argument of exp is up to 16 there, and its error is multiplied by as much. The second
-# holds on the whole grid, where the argument of exp goes to 46: 46 times the 4 roundings of tan²/alpha², and
-# those of the other factors. G and F hold no exp: 16 and 24 roundings, three times what was measured
-BOUND, EVERYWHERE = 5e-6, 2e-5
-QUANTITIES = {
-    "d": ("D", BOUND, EVERYWHERE),
-    "g": ("G", 1e-6, 1.2e-6),
-    "f": ("F", 1.5e-6, 2e-6),
-    "value": ("BSDF cos", BOUND, EVERYWHERE),
-    "pdf": ("pdf", BOUND, EVERYWHERE),
-    "gradient": ("gradient in alpha", BOUND, EVERYWHERE),
-}
-FAULT = "alpha and index 1 in 30,000 too large: what a quarter of the cases exceed"
+# The first limit holds where D is at least 1e-7 of its peak, for alpha 1e-4 … 1: 80 roundings, for the
+# argument of exp is up to 16 there, and its error is multiplied by as much. The second holds on the whole
+# grid, where the argument of exp goes to 46: 46 times the 4 roundings of tan²/alpha², and those of the other
+# factors. G and F hold no exp: 16 and 32 roundings, three times what was measured
+WITH_EXP = 5e-6, 2e-5
+LIMITS = {"G": (1e-6, 1.2e-6)}
 NOTE = (
     "Relative errors at the same float32 numbers against 50 digits. Directions are what their components "
     "say, and the half vector is their sum; the gradient's error is relative to the sum of the sizes of its "
@@ -48,32 +38,33 @@ Arrays = dict[str, np.ndarray]
 
 
 def cases(quick: bool) -> Iterator[Case]:
-    """Yield errors of D, G, F, the whole, its density and its gradient; then of functions of one cosine."""
-    lobes = lobes_with_truth(2 if quick else 12)
-    ours, wrong = (errors(lobes, 60 if quick else 600, wrong=w) for w in (1, 1 + 1 / 30_000))
-    wi, alpha = lobes["wi"], lobes["alpha"]
-    usual = (alpha > 0.9e-4) & (alpha < 1.1) & (lobes["steepness"] <= IN_BOUND)
-    for name, (title, bound, everywhere) in QUANTITIES.items():
-        part = slice(None) if name == "f" else usual
-        where = "cosines 1e-7 … 1, IOR 1e-3 … 1e6" if name == "f" else "alpha 1e-4 … 1, D ≥ 1e-7 of its peak"
-        figure, fault = np.quantile(ours[name][part], 0.999), (FAULT, np.quantile(wrong[name][part], 0.75))
-        yield f"{title}, p99.9", where, "a few roundings", figure, bound, fault
+    """Yield errors of D, G, the whole, its density and its gradient, of F, and of functions of one cosine."""
+    lobes = lobes_with_truth(2_000 if quick else 12_000)
+    usual = (abs(np.log10(lobes["alpha"]) + 2) < 2) & (lobes["steepness"] <= IN_BOUND)
+    for name, error in errors(lobes).items():
+        limits, where = LIMITS.get(name, WITH_EXP), "alpha 1e-4 … 1, D ≥ 1e-7 of its peak"
+        yield f"{name}, p99.9", where, "a few roundings", np.quantile(error[usual], 0.999), limits[0]
         where, why = "alpha 1e-8 … 100, D ≥ 1e-20 of its peak", "roundings, which exp enlarges by up to 46"
-        yield f"{title}, largest", where, why, ours[name].max(), everywhere, fault
-    moved = slope2(wi, np.nextafter(lobes["wo"], np.float32(2))) / np.float64(alpha) ** 2
-    change = np.abs(np.expm1(lobes["steepness"] - moved))
+        yield f"{name}, largest", where, why, error.max(), limits[1]
     for size in (1e-3, 1e-4, 1e-6):
-        here = np.isclose(alpha, size, atol=0) & (lobes["steepness"] <= IN_BOUND) & np.isclose(wi[:, 2], 0.5)
-        what = "largest relative change of D at 60° when x and y of one direction move by one float32 step"
+        wi, wo = map(np.float32, lobe_pairs(1000, size, least_cos=0.3))
+        moved = slope2(wi, np.nextafter(wo, np.float32(2)))
+        change = np.abs(np.expm1((slope2(wi, wo) - moved) / size**2)).max()
+        what = "largest relative change of D where x and y of one direction move by one float32 step"
         why = "directions are float32: neighbouring ones, equal to a renderer, have values this far apart"
-        yield f"D of a neighbouring direction, alpha {size:g}", what, why, change[here].max()
+        yield f"D of a neighbouring direction, alpha {size:g}", what, why, change
+    count = 60 if quick else 600
+    cosines = np.float32(10 ** np.random.default_rng(4).uniform(-7, 0, count * len(FRESNEL_IORS)))
+    cosines[::count] = 1
+    worst = fresnel_error(cosines, np.repeat(FRESNEL_IORS, count))
+    yield "F, largest", "cosines 1e-7 … 1, IOR 1e-3 … 1e6", "a few roundings", worst, 2e-6
     # where total reflection begins, F ends in a square root: errors are those of g = 0
     iors = np.repeat(np.array([0.5, 0.9, 0.99, 0.9999], np.float32), 81)
     critical = np.float32(np.sqrt((1 - np.float64(iors)) * (1 + np.float64(iors))))
     cosines = (critical.view(np.int32) + np.tile(np.arange(-40, 41, dtype=np.int32), 4)).view(np.float32)
     what = "the 40 float32 cosines on either side of it, IOR 0.5 … 0.9999"
     why = "√ of a rounding: 1 - F is 4 g / (η² cos θ) there, and g² is known to a rounding of cos²"
-    yield "F at the critical angle", what, why, fresnel_errors(cosines, iors).max(), 16 * 2.0**-12
+    yield "F at the critical angle", what, why, fresnel_error(cosines, iors), 16 * 2.0**-12
     stride = 2**12 if quick else 1
     what = f"largest error in steps of float32, over float32 cosines in [0, 1], 1 in {stride}"
     why = "about a dozen roundings, some of them doubled by squares"
@@ -81,25 +72,20 @@ def cases(quick: bool) -> Iterator[Case]:
         yield name, what, why, largest_error(formula, stride), 16
 
 
-def fresnel_errors(cosines: np.ndarray, iors: np.ndarray, wrong: Any = 1) -> np.ndarray:
-    """Return the relative errors of the dielectric term [N]."""
+def fresnel_error(cosines: np.ndarray, iors: np.ndarray) -> float:
+    """Return the largest relative error of the dielectric term."""
     truth = [float(exact.fresnel_dielectric(c, 1, n)) for c, n in zip(cosines, iors, strict=True)]
-    found = np.array(fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(iors * wrong)), np.float64)
-    return np.abs(found / truth - 1)
+    found = np.array(fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(iors)), np.float64)
+    return float(np.abs(found / truth - 1).max())
 
 
-def errors(lobes: Arrays, count: int, *, wrong: float) -> Arrays:
-    """Return the relative errors [N] of the plugin and its functions, by quantity.
-
-    Alpha and indices are ``wrong`` times what they are; ``count``: of cosines for each index of refraction.
-    """
-    factor = np.float32(wrong)
-    alpha, ior = mi.Float(lobes["alpha"] * factor), mi.Float(lobes["ior"] * factor)
-    wi, wo = mi.Vector3f(lobes["wi"].T), mi.Vector3f(lobes["wo"].T)
+def errors(lobes: Arrays) -> Arrays:
+    """Return the relative errors [N] of the plugin and its functions, by quantity."""
+    alpha, wi, wo = mi.Float(lobes["alpha"]), mi.Vector3f(lobes["wi"].T), mi.Vector3f(lobes["wo"].T)
     dr.enable_grad(alpha)
     bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": "dielectric", "diffuse_reflectance": 0.0})
     parameters = mi.traverse(bsdf)
-    for name, values in (("alpha", alpha), ("int_ior", ior)):
+    for name, values in (("alpha", alpha), ("int_ior", mi.Float(lobes["ior"]))):
         parameters[name] = type(parameters[name])(values)
     parameters.update()
     si = dr.zeros(mi.SurfaceInteraction3f)
@@ -109,12 +95,9 @@ def errors(lobes: Arrays, count: int, *, wrong: float) -> Arrays:
     g = microfacet.smith_g1(wi, alpha) * microfacet.smith_g1(wo, alpha)
     dr.forward(alpha)
     slope = np.array(dr.grad(value[0]), float)
-    terms = {"d": d, "g": g, "value": value[0], "pdf": pdf}
+    terms = {"D": d, "G": g, "BSDF cos": value[0], "pdf": pdf}
     of = {name: np.abs(np.array(dr.detach(x), float) / lobes[name] - 1) for name, x in terms.items()}
-    of["gradient"] = np.abs(slope - lobes["gradient"]) / lobes["slope"]
-    cosines = np.float32(10 ** np.random.default_rng(4).uniform(-7, 0, count * len(FRESNEL_IORS)))
-    cosines[::count] = 1
-    of["f"] = fresnel_errors(cosines, np.repeat(FRESNEL_IORS, count), factor)
+    of["gradient in alpha"] = np.abs(slope - lobes["gradient"]) / lobes["slope"]
     return {name: np.where(np.isnan(error), np.inf, error) for name, error in of.items()}
 
 
@@ -165,29 +148,26 @@ def slope2(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     return np.asarray((h[:, 0] ** 2 + h[:, 1] ** 2) / h[:, 2] ** 2)
 
 
-@lru_cache(maxsize=4)
-def lobes_with_truth(per_cell: int) -> Arrays:
-    """Return up to ``per_cell`` pairs of directions in every cell of roughness, cosine and steepness.
+@cache
+def lobes_with_truth(count: int) -> Arrays:
+    """Return about ``count`` pairs of directions above the surface, evenly on logarithmic scales.
 
     Of N pairs ``wi`` and ``wo`` [N, 3], ``alpha``, ``ior``, the ``steepness`` tan²θh / alpha², and what
     ``_exact`` says of them.
     """
-    rng, cells = np.random.default_rng(1), np.arange(len(STEEPNESS) - 1)
-    grid = np.meshgrid(np.float32(ALPHAS), COSINES, cells, np.arange(2 * per_cell))  # half of them point down
-    alpha, cosine, cell, _ = (x.ravel() for x in grid)
-    tan = alpha * np.sqrt(rng.uniform(STEEPNESS[cell], STEEPNESS[cell + 1]))
-    phi, psi = rng.uniform(0, 2 * np.pi, (2, len(alpha)))
-    sine = np.sqrt((1 - cosine) * (1 + cosine))
+    rng, pairs = np.random.default_rng(1), (2, 2 * count)  # half of them point down
+    alpha, cosine = np.float32(10 ** rng.uniform(-8, 2, pairs[1])), 10 ** rng.uniform(-7, 0, pairs[1])
+    tan, sine = alpha * np.sqrt(STEEPEST * rng.random(pairs[1]) ** 2), np.sqrt((1 - cosine) * (1 + cosine))
+    phi, psi = rng.uniform(0, 2 * np.pi, pairs)
     wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine], axis=1)
-    m = np.stack([tan * np.cos(psi), tan * np.sin(psi), np.ones(len(alpha))], axis=1)
-    m /= np.linalg.norm(m, axis=1, keepdims=True)
+    m = unit(np.stack([tan * np.cos(psi), tan * np.sin(psi), np.ones(pairs[1])], axis=1))
     wi, wo = np.float32(wi), np.float32(2 * (wi * m).sum(axis=1, keepdims=True) * m - wi)
     steepness = slope2(wi, wo) / np.float64(alpha) ** 2
-    keep = (wo[:, 2] > 0.5 * COSINES[-1]) & (steepness < STEEPNESS[-1])
-    lobes = {"wi": wi, "wo": wo, "alpha": alpha, "ior": rng.choice(IORS, len(alpha)), "steepness": steepness}
+    keep = (wo[:, 2] > 5e-8) & (steepness < STEEPEST)
+    lobes = {"wi": wi, "wo": wo, "alpha": alpha, "ior": rng.choice(IORS, pairs[1]), "steepness": steepness}
     lobes = {name: values[keep] for name, values in lobes.items()}
     rows = [_exact(*pair) for pair in zip(*list(lobes.values())[:4], strict=True)]
-    names = ("d", "g", "value", "pdf", "gradient", "slope")
+    names = ("D", "G", "BSDF cos", "pdf", "gradient", "slope")
     return lobes | dict(zip(names, np.array(rows).T, strict=True))
 
 
@@ -200,15 +180,10 @@ def _exact(wi: np.ndarray, wo: np.ndarray, alpha: float, ior: float) -> tuple[fl
     # Components are not rounded again: the cosine between the directions is that of them made one unit long
     sides = zip(exact.unit(list(wi)), exact.unit(list(wo)), strict=True)
     f = exact.fresnel_dielectric(exact.mp.sqrt(sum((p + q) ** 2 for p, q in sides)) / 2, 1, ior)
-
-    def terms(a: Any) -> list[Any]:
-        d = exact.beckmann_d(1 / exact.mp.sqrt(1 + tan2), a)
-        return [d, exact.smith_g1(wi, a), exact.smith_g1(wo, a)]
-
-    (d, g_i, g_o), moved = terms(a), terms(a + step)
-    value = d * f * g_i * g_o / (4 * exact.number(wi[2]))
-    of_d, *of_g = ((after / before - 1) / step for after, before in zip(moved, (d, g_i, g_o), strict=True))
-    # d ln D / d alpha is 2 (tan²/alpha² - 1) / alpha
-    size = 2 * (tan2 / a**2 + 1) / a + sum(map(abs, of_g))
-    density = d / (4 * exact.visible_cos(wi, a))
-    return tuple(map(float, (d, g_i * g_o, value, density, value * (of_d + sum(of_g)), value * size)))
+    d, g = exact.beckmann_d(1 / exact.mp.sqrt(1 + tan2), a), [exact.smith_g1(v, a) for v in (wi, wo)]
+    value = d * f * g[0] * g[1] / (4 * exact.number(wi[2]))
+    # Of the logarithms of D, 2 (tan²/alpha² - 1) / alpha, and of both G₁
+    slopes = [(exact.smith_g1(v, a + step) / g1 - 1) / step for v, g1 in zip((wi, wo), g, strict=True)]
+    terms = [2 * tan2 / a**3, -2 / a, *slopes]
+    density, size = d / (4 * exact.visible_cos(wi, a)), sum(map(abs, terms))
+    return tuple(map(float, (d, g[0] * g[1], value, density, value * sum(terms), value * size)))
