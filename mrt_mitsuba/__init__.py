@@ -37,6 +37,7 @@ _HOME = {
     "compare": "mrt_mitsuba.validation.tools.compare",
     "compare_roughconductor": "mrt_mitsuba.validation.studies.roughconductor",
     "error_vs_time": "mrt_mitsuba.validation.tools.work_precision",
+    "filters": "mrt_mitsuba.filters",
     "prepare": "mrt_mitsuba.rendering.prepare",
     "register": "mrt_mitsuba.runtime",
     "render": "mrt_mitsuba.rendering.api",
@@ -44,23 +45,20 @@ _HOME = {
     "sweep": "mrt_mitsuba.sweeps.run",
 }
 __all__ = ["MrtError", "MrtWarning", "OutputError", "SceneError", "UsageError", "VariantError"]
-__all__ += ["__version__", "filters", *_HOME]
+__all__ += ["__version__", *_HOME]
 
 
 def __getattr__(name: str) -> object:
     from importlib import import_module
 
-    if name == "filters":
-        value = import_module("mrt_mitsuba.filters")
-    elif name in _HOME:
-        runtime = import_module("mrt_mitsuba.runtime")
-        runtime.check_start()
-        if ".rendering." in _HOME[name]:
-            runtime.load()
-        value = getattr(import_module(_HOME[name]), name)
-    else:
+    if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value
+    runtime = import_module("mrt_mitsuba.runtime")
+    runtime.check_start()
+    if ".rendering." in _HOME[name]:
+        runtime.load()
+    module = import_module(_HOME[name])
+    globals()[name] = value = getattr(module, name, module)  # ``filters`` is a module
     return value
 
 

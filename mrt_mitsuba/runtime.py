@@ -40,7 +40,6 @@ def use(variant: str | None = None) -> str:
     global _used
     if _used and variant in (None, _used) and sys.modules["mitsuba"].variant() == _used:
         return _used
-    llvm.prepare()
     check_start()
     with one_at_a_time, held(), rewriting_later():
         import mitsuba as mi
@@ -111,7 +110,6 @@ def obstacle(variant: str) -> str | None:
         return llvm.problem(llvm.prepare())
     if not variant.startswith("cuda"):
         return None
-    llvm.prepare()
     import drjit as dr
 
     none = f"it needs an NVIDIA GPU with its driver, and none was found. Use {FAST} or {SLOW}."
@@ -137,7 +135,6 @@ def _warn_once(text: str) -> None:
 
 def usable_variants() -> list[str]:
     """Return the variants of this Mitsuba that can run here."""
-    llvm.prepare()
     import mitsuba as mi
 
     return [variant for variant in mi.variants() if obstacle(variant) is None]
@@ -151,8 +148,12 @@ def versions() -> dict[str, str]:
 
     from mrt_mitsuba import __version__
 
-    found = {"mrt-mitsuba": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__}
-    return found | {"llvm": llvm.version_text(llvm.prepare().version)}
+    return {
+        "mrt-mitsuba": __version__,
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "llvm": llvm.version_text(llvm.prepare().version),
+    }
 
 
 # ------------------------------------- What is changed in Mitsuba --------------------------------------

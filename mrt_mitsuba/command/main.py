@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import errno
 import os
 import signal
@@ -83,11 +84,9 @@ def _dispatch(words: list[str]) -> int:
         return registry.run(name, words[1:])
     if name.isdecimal() and all("=" in word for word in words[1:]):
         raise UsageError(f"FILENAME is missing: write mrt FILENAME {name}, or mrt ./{name} for that name")
-    if meant := registry.near_miss(words):
-        raise UsageError(
-            f"there is no command {name!r}: did you mean mrt {meant}? For a picture of that name, write "
-            f"mrt ./{name}"
-        )
+    close = difflib.get_close_matches(name, registry.COMMANDS, n=1, cutoff=0.75)
+    if close and (len(words) == 1 or words[1].startswith("--")):  # which makes no sense as a render either
+        raise UsageError(f"no command {name!r}: did you mean mrt {close[0]}, or mrt ./{name} for a picture?")
     options = parse(words)
     from mrt_mitsuba.command import render
 

@@ -113,10 +113,3 @@ def run(name: str, words: Sequence[str]) -> int:
 def names_in(form: str) -> list[str]:
     """Return the names that a form has as ``name=value`` or ``--name``; "name" stands for any."""
     return [flag or name for flag, name in re.findall(r"--(\w+)|\b([a-z_]+)(?=[a-z_|]*=)", form)]
-
-
-def near_miss(words: Sequence[str]) -> str | None:
-    """Return the command that was probably meant, where the words make no sense as a render either."""
-    if len(words) > 1 and not words[1].startswith("--"):
-        return None
-    return next(iter(difflib.get_close_matches(words[0], COMMANDS, n=1, cutoff=0.75)), None)

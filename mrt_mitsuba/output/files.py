@@ -107,7 +107,7 @@ def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], heade
     import OpenEXR
 
     planes = {"RGB": np.ascontiguousarray(image, np.float32)}
-    if planes["RGB"].ndim != 3 or planes["RGB"].shape[2] != 3:
+    if planes["RGB"].shape[2:] != (3,):
         raise OutputError(f"the picture has shape {planes['RGB'].shape}; expected [H, W, 3]")
     for name, array in layers.items():
         array = np.atleast_3d(np.asarray(array, np.float32))
@@ -168,18 +168,18 @@ def read_channels(path: Path) -> tuple[dict[str, Image], dict[str, dict[str, Any
         with open(name, "rb") as file:  # reports an unreadable file better than the library
             file.read(1)
         with silenced():
-            parts = OpenEXR.File(name, header_only=True).parts
-            deep = any("deep" in str(part.type()) for part in parts)
-            parts = [] if deep else OpenEXR.File(name, separate_channels=True).parts
+            if any("deep" in str(part.type()) for part in OpenEXR.File(name, header_only=True).parts):
+                raise OutputError(
+                    f"cannot read {name}: a deep EXR has many values in a pixel; flatten it first"
+                )
+            parts = OpenEXR.File(name, separate_channels=True).parts
+        if not parts:
+            raise ValueError("no part of it can be read")
     except OSError as error:
         raise OutputError(f"cannot read {name}: {error.strerror or error}") from error
     except (RuntimeError, ValueError, TypeError) as error:
         raise OutputError(f"cannot read {name}: not a whole EXR ({error})") from error
-    if not parts:
-        problem = "a deep EXR holds many values in a pixel; flatten it first" if deep else "not a whole EXR"
-        raise OutputError(f"cannot read {name}: {problem}")
-    planes: dict[str, Image] = {}
-    headers: dict[str, dict[str, Any]] = {}
+    planes, headers = {}, {}
     for part in parts:
         if len({values.pixels.shape for values in part.channels.values()}) > 1:
             raise OutputError(f"cannot read {name}: its channels differ in size; write them all at full size")
