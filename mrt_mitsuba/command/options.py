@@ -72,8 +72,10 @@ def parse(arguments: Sequence[str]) -> Options:
         if "scene" in given:
             raise UsageError(f"both SCENE {text} and scene={given['scene']}: give one of them")
         if text not in map(str, NUMBERS):
-            known = either([*map(str, NUMBERS)])
-            raise UsageError(f"SCENE {text}: must be {known} ('mrt scenes' lists them); a file is scene=PATH")
+            numbers = either([*map(str, NUMBERS)])
+            raise UsageError(
+                f"SCENE {text}: must be {numbers} ('mrt scenes' lists them); a file is scene=PATH"
+            )
         values["scene"] = int(text)
     if "motion" not in given and (idle := given.keys() & {"motionsamples", "motionmode"}):
         raise UsageError(f"{min(idle)} is of use only with motion=dx,dy,dz")
