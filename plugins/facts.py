@@ -10,8 +10,8 @@ import numpy as np
 
 from .hit_errors import any_touching
 from .kernel_plan import Mirror, SceneFacts
-from .lights import brightness, numbers_of, place
-from .lobes import lobes_in, material_rows
+from .lights import brightness, place
+from .lobes import LOBES, material_rows
 from .parameters import ParameterError
 from .simple_shapes import is_sphere
 from .snapshot import Kept, Snapshot
@@ -45,14 +45,12 @@ class Reading:
         )
         of_shapes = kept("shape facts", shapes, self._read_shapes)
         self.lights, self.numbers, of_lights = kept("light facts", lights, lambda: _lights(snapshot))
-
-        def touching() -> bool:
-            places = [place(light) for light in self.lights[:MOST_LIGHTS]]
-            return any_touching(snapshot.shapes, [point for point in places if point is not None])
-
-        self.facts = SceneFacts(
-            **of_lights, **of_materials, **of_shapes, touching=kept("touching", (shapes, lights), touching)
+        touching = kept(
+            "touching",
+            (shapes, lights),
+            lambda: any_touching(snapshot.shapes, list(filter(None, map(place, self.lights[:MOST_LIGHTS])))),
         )
+        self.facts = SceneFacts(**of_lights, **of_materials, **of_shapes, touching=touching)
 
     def _read_shapes(self) -> dict[str, Any]:
         meshes = [s for s in (*self.native, *self.snapshot.inner) if s.is_mesh()]
@@ -86,7 +84,11 @@ def _lights(snapshot: Snapshot) -> tuple[list[Any], list[Any] | None, dict[str, 
     """Return the lights, their numbers where all have some, and the facts about them."""
     largest = {id(e): brightness(e) for e in snapshot.emitters}
     lights = [e for e in snapshot.emitters if not e.is_environment() and largest[id(e)] != 0]
-    numbers, environment = numbers_of(lights), snapshot.environment
+    numbers: list[Any] | None = None
+    if is_jit() and not mi.is_spectral and all(hasattr(light, "numbers") for light in lights):
+        numbers = [light.numbers() for light in lights]
+        numbers = None if None in numbers else numbers
+    environment = snapshot.environment
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
     surfaces = [largest[id(e)] for e in lights if mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
     return lights, numbers, {
@@ -102,11 +104,16 @@ def _lights(snapshot: Snapshot) -> tuple[list[Any], list[Any] | None, dict[str, 
 
 def _materials(snapshot: Snapshot) -> tuple[list[Any], dict[str, Any]]:
     """Return the materials as rows of a table, none where they have no place in one, and the facts."""
-    bsdfs, found = snapshot.bsdfs, material_rows(snapshot.shapes)
+    found = material_rows(snapshot.shapes)
+    every = (shape.bsdf() for shape in [*snapshot.shapes, *snapshot.inner])
+    bsdfs = {id(bsdf): bsdf for bsdf in every if bsdf is not None}.values()
     rows, unmergeable = ([], found) if isinstance(found, str) else (found, "")
     return rows, {
         # All that mrt_bsdf has, and whether a material has them; those outside the table may have any
-        "lobes": tuple((name, bool(unmergeable) or there) for name, there in lobes_in(rows)),
+        "lobes": tuple(
+            (lobe.name, bool(unmergeable) or any(row[1 + k].any() for row in rows))
+            for k, lobe in enumerate(LOBES)
+        ),
         "mirrors": tuple(
             b.mirror_bound() if hasattr(b, "mirror_bound") else Mirror(1.0, 1.0)
             for b in bsdfs

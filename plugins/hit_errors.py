@@ -24,10 +24,10 @@ import mitsuba as mi
 import numpy as np
 
 from .intersect import Frame
-from .lookup import ByShape
 from .mesh_api import triangles
 from .quadric_kinds import KINDS, QuadricTable
 from .simple_shapes import center_and_radius, is_sphere
+from .variants import ByShape
 
 # What a curved surface's hit, projection and ray test lose, in roundings of the largest coordinate
 CURVED = 32 * 2.0**-24

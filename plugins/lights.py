@@ -12,8 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .lookup import Table
-from .variants import first, is_jit, largest, pointer
+from .variants import Table, first, largest, pointer
 
 
 def towards(position: mi.Point3f, it: mi.Interaction3f) -> mi.DirectionSample3f:
@@ -28,14 +27,6 @@ def towards(position: mi.Point3f, it: mi.Interaction3f) -> mi.DirectionSample3f:
     ds.n, ds.uv, ds.time = mi.Normal3f(-ds.d), mi.Point2f(0), it.time
     ds.pdf, ds.delta = mi.Float(1), mi.Bool(True)
     return ds
-
-
-def numbers_of(lights: list[Any]) -> list[Any] | None:
-    """Return the numbers of lights, in threes; None where not all of them have some."""
-    if not is_jit() or mi.is_spectral or not all(hasattr(light, "numbers") for light in lights):
-        return None
-    found = [light.numbers() for light in lights]
-    return None if None in found else found
 
 
 class Lights:

@@ -17,7 +17,6 @@ import numpy as np
 
 from .fresnel import f0_from_ior, fresnel_dielectric, fresnel_schlick
 from .kernel_plan import SCALAR_VARIANT
-from .lookup import ByShape
 from .microfacet import (
     beckmann_d,
     half_vector_angles,
@@ -27,7 +26,7 @@ from .microfacet import (
     tan2_theta,
     visible_over_cos,
 )
-from .variants import is_jit
+from .variants import ByShape, is_jit
 
 # Roughness below this (zero included) acts as this: the lobe is then narrower than float32 directions can
 # resolve, and D, its inverse square, still fits. Above the other, D is the same everywhere but at the horizon
@@ -246,11 +245,6 @@ def material_rows(shapes: Sequence[mi.Shape]) -> list[np.ndarray] | str:
     rows = {} if reasons else {key: bsdf.row() for key, bsdf in bsdfs.items()}
     reasons += [row for row in rows.values() if isinstance(row, str)]
     return reasons[0] if reasons else [rows[id(s.bsdf())] for s in shapes]
-
-
-def lobes_in(rows: Sequence[np.ndarray]) -> tuple[tuple[str, bool], ...]:
-    """Return the names of all lobes, and whether a material of these has them."""
-    return tuple((lobe.name, any(row[1 + k].any() for row in rows)) for k, lobe in enumerate(LOBES))
 
 
 class MaterialTable:

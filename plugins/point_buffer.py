@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .lookup import aligned
+from .variants import aligned
 
 # With more cells, or more objects in all of them, lists would take more memory and time than they save
 MOST_CELLS, MOST_LISTED = 2**21, 2**22

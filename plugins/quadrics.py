@@ -9,10 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from .intersect import LATERAL, Frame
-from .lookup import aligned, shape_ids
 from .quadric_kinds import KINDS
 from .tree import Tree
-from .variants import is_jit
+from .variants import aligned, is_jit, shape_ids
 
 
 class Quadrics:

@@ -10,9 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from .intersect import intersect_plane
-from .lookup import ByShape, Table
 from .snapshot import parameters_of
-from .variants import first
+from .variants import ByShape, Table, first
 
 
 class Planes:

@@ -12,7 +12,7 @@ last snapshot is the same object as then; one with derivatives never is, as what
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable
 from functools import cache
 from typing import Any, TypeVar
 
@@ -108,30 +108,17 @@ class Snapshot:
         self.material_part: Part = materials.close(before.material_part if before else None)
         self.light_part: Part = lights.close(before.light_part if before else None)
 
-    @property
-    def bsdfs(self) -> list[Any]:
-        """Each material once."""
-        return once(shape.bsdf() for shape in [*self.shapes, *self.inner])
 
-
-class Kept:
+class Kept(dict[str, tuple[Hashable, Any]]):
     """What was made last of something, under a key that names all that it depends on."""
-
-    def __init__(self) -> None:
-        self._values: dict[str, tuple[Hashable, Any]] = {}
 
     def __call__(self, name: str, key: Hashable, make: Callable[[], Value]) -> Value:
         """Return what ``make()`` returns, or returned last if the key is the same."""
-        known = self._values.get(name)
+        known = self.get(name)
         if known is None or known[0] != key:
             # Key and value come together or, where ``make`` is interrupted, not at all
-            known = self._values[name] = key, make()
+            known = self[name] = key, make()
         return known[1]
-
-
-def once(things: Iterable[Any]) -> list[Any]:
-    """Return each object once, in order."""
-    return list({id(thing): thing for thing in things if thing is not None}.values())
 
 
 def parameters_of(thing: Any) -> list[tuple[str, Any, Any]]:

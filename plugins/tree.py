@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from .intersect import off_zero
-from .lookup import aligned
+from .variants import aligned
 
 # Box tests are wider than exact by some float32 roundings, relative to distances and to coordinates
 _SLACK = 8 * 2.0**-24

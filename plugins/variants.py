@@ -1,8 +1,10 @@
-"""Differences between Mitsuba's scalar and vectorised variants, and what its objects do not reveal."""
+"""Differences between Mitsuba's scalar and vectorised variants: numbers and objects by index or by shape, and
+what Mitsuba's objects do not reveal."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -66,3 +68,78 @@ def construct_quietly(integrator: mi.SamplingIntegrator, props: mi.Properties) -
         mi.SamplingIntegrator.__init__(integrator, props)
     finally:
         mi.set_log_level(level)
+
+
+def aligned(values: np.ndarray, kind: Any = np.float32) -> Any:
+    """Return numbers as a flat array, of float32 or uint32, at a multiple of 64 bytes.
+
+    Dr.Jit uses arrays of numpy where they lie, and most lie elsewhere. Only from aligned ones does a kernel
+    read several numbers in a row in one go, which makes one that searches a tree half as fast again; and both
+    kernels would be compiled and kept.
+    """
+    size = np.size(values)
+    room = np.empty(size + 16, kind)
+    first = -room.ctypes.data % 64 // 4
+    room[first : first + size] = np.ravel(values)
+    return (mi.Float if kind is np.float32 else mi.UInt32)(room[first : first + size])
+
+
+def shape_ids(shapes: Any) -> mi.UInt32:
+    """Return Dr.Jit's numbers of shapes.
+
+    Of pointers that a recorded kernel reads, it would look at all objects of all scenes at each launch.
+    """
+    return dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes))
+
+
+class Table:
+    """Rows of numbers, or shapes (``kind`` "Shape"), looked up by index."""
+
+    def __init__(self, kind: Any, rows: Any) -> None:
+        self.kind, self.rows = kind, rows
+        if not is_jit():
+            self.rows = rows if kind == "Shape" else [kind([float(x) for x in row]) for row in rows]
+        else:
+            self.rows = shape_ids(rows) if kind == "Shape" else aligned(np.array(rows))
+        dr.eval(self.rows)
+
+    def __call__(self, index: mi.UInt32, active: mi.Bool) -> Any:
+        if not is_jit():
+            return self.rows[index if active else 0]
+        if self.kind == "Shape":
+            return dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.rows, index, active))
+        return dr.gather(self.kind, self.rows, index, active)
+
+
+class ByShape:
+    """Numbers for each of some shapes, looked up for the one that was hit; ``fallback`` for others.
+
+    In vectorised variants, a row may have several parts of a kind's width.
+    """
+
+    def __init__(self, kind: Any, shapes: Sequence[mi.Shape], rows: Sequence[Any], fallback: Any) -> None:
+        self.kind = kind
+        self.fallback = kind(fallback)
+        if not is_jit():
+            self.shapes = shapes  # alive, or their ids could pass to others
+            self.rows = {id(s): kind(row) for s, row in zip(shapes, rows, strict=True)}
+            return
+        ids = np.array(shape_ids(shapes))
+        size = int(ids.max()) + 1
+        width = 1 if kind is mi.Float else dr.size_v(kind)
+        numbers = np.reshape(rows, (len(shapes), -1, width))
+        self.parts = numbers.shape[1]
+        table = np.empty((size, self.parts, width), np.float32)
+        table[:] = fallback
+        table[ids] = numbers
+        self.table = aligned(table)
+        self.size = dr.opaque(mi.UInt32, size)
+        dr.make_opaque(self.fallback)
+
+    def __call__(self, si: mi.SurfaceInteraction3f, found: mi.Bool, part: int = 0) -> Any:
+        if not is_jit():
+            return self.rows.get(id(si.shape), self.fallback) if found else self.fallback
+        ids = dr.reinterpret_array(mi.UInt32, si.shape)
+        known = found & (ids < self.size)
+        index = ids * self.parts + part
+        return dr.select(known, dr.gather(self.kind, self.table, index, known), self.fallback)

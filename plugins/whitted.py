@@ -182,9 +182,6 @@ class MrtWhitted(mi.SamplingIntegrator):
                 "sampler": s["sampler"],
             }, hit
 
-        def bounce(s: dict) -> tuple[dict]:
-            return (follow(s)[0] | {"bounces": s["bounces"] + 1},)
-
         state: dict[str, Any] = {
             "radiance": mi.UnpolarizedSpectrum(0),  # light found so far
             "throughput": mi.UnpolarizedSpectrum(1),  # product of the mirror reflectances along the path
@@ -199,7 +196,12 @@ class MrtWhitted(mi.SamplingIntegrator):
         state, hit = follow(state)
         direct = state["radiance"]
         if data.plan.mirrors:
-            (state,) = dr.while_loop((state,), lambda s: s["active"], bounce, label="mirror bounces")
+            (state,) = dr.while_loop(
+                (state,),
+                lambda s: s["active"],
+                lambda s: (follow(s)[0] | {"bounces": s["bounces"] + 1},),
+                label="mirror bounces",
+            )
         return Trace(state["radiance"], direct, hit, state["bounces"], state["shadow_rays"])
 
     # ------------------------------------------- Shading -----------------------------------------------
@@ -220,16 +222,16 @@ class MrtWhitted(mi.SamplingIntegrator):
         ``throughput`` is that of the path up to ``hit``.
         """
 
-        def at_surface(hit: Hit, throughput: mi.UnpolarizedSpectrum, sampler: mi.Sampler) -> tuple:
-            return self._shade_surface(data, scene, sampler, hit, throughput), sampler
-
-        def nowhere(hit: Hit, throughput: mi.UnpolarizedSpectrum, sampler: mi.Sampler) -> tuple:
-            black = mi.UnpolarizedSpectrum(0)
-            return (black, mi.UInt32(0), black, mi.UInt32(0)), sampler
-
         # A branch, because packets whose rays all miss are many
         state = hit, throughput, sampler if data.plan.random else None
-        (radiance, *others), _ = dr.if_stmt(state, hit.found, at_surface, nowhere, label="surface")
+        black = mi.UnpolarizedSpectrum(0)
+        (radiance, *others), _ = dr.if_stmt(
+            state,
+            hit.found,
+            lambda hit, path, sampler: (self._shade_surface(data, scene, sampler, hit, path), sampler),
+            lambda hit, path, sampler: ((black, mi.UInt32(0), black, mi.UInt32(0)), sampler),
+            label="surface",
+        )
         if data.plan.sky != "none":
             si, missed = dr.zeros(mi.SurfaceInteraction3f), but_not(active, hit.found)
             si.wi, si.wavelengths = -ray.d, ray.wavelengths

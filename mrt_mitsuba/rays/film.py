@@ -38,9 +38,7 @@ def divide(n: Any, divisor: int) -> tuple[Any, Any]:
     return quotient, n - quotient * _data(variant, "UInt32", divisor)
 
 
-@lru_cache(maxsize=64)
-def _data(variant: str, kind: str, number: float) -> Any:
-    return dr.opaque(getattr(mi, kind), number)
+_data = lru_cache(maxsize=64)(lambda variant, kind, number: dr.opaque(getattr(mi, kind), number))
 
 
 class Region(NamedTuple):

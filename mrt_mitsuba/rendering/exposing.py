@@ -128,7 +128,7 @@ class Exposer:
         workspace, channels, size = self.job.workspace, len(self.names), places.size
         width, height = self.shader.width, self.shader.height
         random = self.shader.random or mi.is_spectral or self.shader.sensor.needs_aperture_sample()
-        sampler = _sampler("mrt_rays") if random else None
+        sampler = mi.load_dict({"type": "mrt_rays"}) if random else None
 
         def start(pixel: Any, number: Any) -> tuple[Any, Any, Any, Any]:
             if sampler is not None:
@@ -178,24 +178,10 @@ class Exposer:
         canvas = Canvas(film, rays, len(self.names), moments=moments)
         most = max(1, self.job.workspace.rays_at_once(2 * len(self.names)) // size)
         log.debug("tracing %d rays, at most %d at once", len(groups.pixels) * size, most * size)
-        for part, some in groups.parts(most, film.width):
-            place, values = self._trace(some, self._on_film(some, seed, part.start, progressive))
-            planes = [plane for channels in values.values() for plane in channels]
-            canvas.put(place, planes, np.repeat(some.pixels, size))
-            advance(len(some.pixels) * size)
-        return canvas
-
-    def _on_film(self, groups: Groups, seed: int, before: int, progressive: bool) -> Start:
-        """Return where rays of groups start; ``before``: how many were traced already."""
-        film, size, scalar = self.film, groups.size, mi.variant().startswith("scalar")
+        scalar = mi.variant().startswith("scalar")
         sequence = progressive and not scalar
         independent = scalar or film.sampler == "IndependentSampler"
-        sampler = _sampler("mrt_sequence" if sequence else "mrt_rays")
-        if not (sequence or independent):
-            sampler = film.sensor.sampler().clone()
-            sampler.set_sample_count(size)
-            sampler.set_samples_per_wavefront(size)
-            sampler.seed((seed + before) % 2**32, len(groups.pixels) * size)
+        sampler: Any = mi.load_dict({"type": "mrt_sequence" if sequence else "mrt_rays"})
 
         def start(pixel: Any, number: Any) -> tuple[Any, Any, Any, Any]:
             if sequence:
@@ -207,7 +193,18 @@ class Exposer:
                 _, pixel = divide(pixel, film.pixels)
             return *film.place(pixel, sampler), None, sampler
 
-        return start
+        for part, some in groups.parts(most, film.width):
+            count = len(some.pixels) * size
+            if not (sequence or independent):
+                sampler = film.sensor.sampler().clone()
+                sampler.set_sample_count(size)
+                sampler.set_samples_per_wavefront(size)
+                sampler.seed((seed + part.start) % 2**32, count)
+            place, values = self._trace(some, start)
+            planes = [plane for channels in values.values() for plane in channels]
+            canvas.put(place, planes, np.repeat(some.pixels, size))
+            advance(count)
+        return canvas
 
     def _trace(self, groups: Groups, start: Start) -> tuple[Any, dict[str, list[Any]]]:
         """Trace a wavefront; return places on the film and values, by layer and channel, of all rays."""
@@ -258,8 +255,3 @@ class Exposer:
         found |= {name: TABLE[name].value(values) for name in self.layers}
         parts = {name: list(value) if dr.size_v(value) > 1 else [value] for name, value in found.items()}
         return place, {name: [mi.Float(c) for c in channels] for name, channels in parts.items()}
-
-
-def _sampler(plugin: str) -> Any:
-    """Return a sampler of ``rays.samplers``; call ``start`` for the rays that it is to serve."""
-    return mi.PluginManager.instance().create_object(mi.Properties(plugin))

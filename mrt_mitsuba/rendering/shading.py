@@ -13,8 +13,8 @@ import numpy as np
 from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
-from mrt_mitsuba.plugins.lookup import ByShape
 from mrt_mitsuba.plugins.parameters import ParameterError
+from mrt_mitsuba.plugins.variants import ByShape
 from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.scene.open import Source
 
