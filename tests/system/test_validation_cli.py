@@ -50,7 +50,7 @@ def good(study: Study, *, quick: bool) -> None:
 
     figure = Figure()
     figure.subplots().plot([1, 2])
-    study.text("What it does, in a <b>sentence</b>.")
+    study.texts.append("What it does, in a <b>sentence</b>.")
     study.at_most("largest error", 1e-6, 1e-5, "a reason")
     study.at_least("power", 0.9, 0.5, "a reason")
     study.goal("ratio of seconds", 1.4, 1.3, "taken in turn", interval=(1.35, 1.5))

@@ -53,7 +53,7 @@ G1_FIT = 3.5e-3
 def run(study: Study, *, quick: bool) -> None:
     """Hold the laws and the numbers, in ``llvm_ad_rgb``."""
     runtime.use(runtime.FAST)
-    study.text(
+    study.texts.append(
         "Each law is a property that the formula has and that no other renderer is needed to check: samples "
         "follow the stated density and carry value over density, light can be followed either way, no more "
         "comes out than goes in, and derivatives are those of the values."

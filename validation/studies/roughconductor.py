@@ -38,7 +38,7 @@ LEVEL = 1e-3  # probability with which a test of pictures rejects equal ones
 
 def run(study: Study, *, quick: bool) -> None:
     """Run all parts; ``compare_roughconductor`` does the pictures of one roughness."""
-    study.text("With F = 1 and no diffuse part, mrt_bsdf and roughconductor are the same function.")
+    study.texts.append("With F = 1 and no diffuse part, mrt_bsdf and roughconductor are the same function.")
     pointwise(study, quick=quick)
     rendered(study, quick=quick)
 

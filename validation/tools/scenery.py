@@ -16,6 +16,7 @@ from mrt_mitsuba.scene.model import Material, Scene
 from mrt_mitsuba.validation.tools.bsdf_probe import rgb
 
 Node = dict[str, Any]
+Point = list[float]
 
 # One ray at a time through the pixel's centre, as the report's lattice has it
 AT_CENTRES: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}
@@ -32,20 +33,15 @@ def with_materials(scene: Scene, change: Callable[[Material], Material]) -> Scen
 
 
 def sensor(
-    origin: list[float],
-    target: list[float],
-    rfilter: str = "gaussian",
-    sampler: str = "independent",
-    film: Node | None = None,
-    **more: Any,
+    origin: Point, target: Point, rfilter: str = "gaussian", sampler: str = "independent", **more: Any
 ) -> Node:
     """Return a camera with a film and a sampler."""
+    film = {"type": "hdrfilm", "rfilter": {"type": rfilter}, "component_format": "float32"}
     return {
         "type": "perspective",
         "fov": 40,
         "to_world": _to().look_at(origin, target, more.pop("up", [0, 1, 0])),
-        "film": {"type": "hdrfilm", "rfilter": {"type": rfilter}, "component_format": "float32"}
-        | (film or {}),
+        "film": film | more.pop("film", {}),
         "sampler": {"type": sampler, "sample_count": SPP},
     } | more
 
@@ -107,7 +103,7 @@ def _floor(bsdf: Node) -> Node:
     return _rectangle(_to().rotate([1, 0, 0], -90).scale(10), bsdf=bsdf)
 
 
-def _ball(center: list[float], radius: float, bsdf: Node) -> Node:
+def _ball(center: Point, radius: float, bsdf: Node) -> Node:
     return {"type": "sphere", "center": center, "radius": radius, "bsdf": bsdf}
 
 
@@ -115,7 +111,7 @@ def _box() -> Node:
     return {"type": "cube", "to_world": _to().translate([0, 0.5, 0]).rotate([0, 1, 0], 30).scale(0.5)}
 
 
-def _lamp(center: list[float], radius: float, radiance: float) -> Node:
+def _lamp(center: Point, radius: float, radiance: float) -> Node:
     emitter = {"type": "area", "radiance": rgb(radiance)}
     return {"type": "sphere", "center": center, "radius": radius, "emitter": emitter}
 

@@ -65,7 +65,7 @@ class Study:
     name: str
     title: str
     progress: Progress = field(default_factory=Progress)
-    texts: list[str] = field(default_factory=list)
+    texts: list[str] = field(default_factory=list)  # paragraphs
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)  # title, columns, rows, note, first
     images: dict[str, dict[str, Any]] = field(default_factory=dict)  # title, content, caption
     bounds: list[Bound] = field(default_factory=list)
@@ -123,10 +123,6 @@ class Study:
     def picture(self, name: str, title: str, content: Any, caption: str = "") -> None:
         """Add a linear picture [H, W, 3] or a matplotlib figure, with a caption that says what it shows."""
         self.images[name] = {"title": title, "content": content, "caption": caption}
-
-    def text(self, paragraph: str) -> None:
-        """Add a paragraph."""
-        self.texts.append(paragraph)
 
     def each(self, title: str, items: Collection[Item]) -> Iterator[Item]:
         """Yield items and show progress; frees scenes, which would slow down the kernels of later ones."""
