@@ -27,7 +27,7 @@ PARTS: dict[str, tuple[str, Callable[[bool], Iterable[tuple[Any, ...]]], str]] =
 
 def run(study: Study, *, quick: bool) -> None:
     """Make a table of each part, and hold its cases to their limits."""
-    study.text("The least fault that a case shows is as large as its limit; of counts, a single one.")
+    study.texts.append("The least fault that a case shows is as large as its limit; of counts, a single one.")
     for table, (title, cases, note) in study.each(TITLE, PARTS.items()):
         rows: list[tuple[Any, ...]] = []
         for name, what, why, measured, *held in cases(quick):
