@@ -92,7 +92,7 @@ def _measured(scene: Any, seeds: int, truth_rays: int) -> tuple[float, ...]:
     truth = np.mean(pictures, axis=0, dtype=np.float64)
     own = np.std([p.mean() for p in pictures], ddof=1) / len(pictures) ** 0.5  # of its mean
     noise = np.var(pictures, axis=0, ddof=1).mean(-1) / len(pictures)  # squared error of the truth
-    rounding = (1e-5 * truth.mean()) ** 2  # where nothing is noisy
+    rounding = (1e-4 * truth.mean()) ** 2  # of many rays of one value, in single precision
     target = float(np.sqrt(noise.mean() * truth_rays / SPP))
     held, doubted, means, stated, true, p = 0, 0, [], [], [], []
     last = None
