@@ -82,9 +82,6 @@ def noise(study: Study, *, quick: bool) -> None:
     study.at_least("noise: the same flat pixels without the variance", least, 0.3, why)
 
 
-# ---------------------------------------------- Depth of field ---------------------------------------------
-
-
 def depth_of_field(study: Study, *, quick: bool) -> None:
     """Blur sharp renders with each filter, and hold both to renders through the fitted lens."""
     width, height, aa, spp = (96, 72, 2, 12) if quick else (400, 300, 4, 32)
@@ -103,11 +100,13 @@ def depth_of_field(study: Study, *, quick: bool) -> None:
         truth = (one + other) / 2
         errors = {f"RMSE, {mode}": rmse(picture, truth) for mode, picture in pictures.items()}
         sharp_error, report, corrected = errors.values()
-        why = "a correction that is worse is none"
-        study.at_most(f"scene {number}: RMSE of corrected / report", corrected / report, 1, why)
-        study.at_most(f"scene {number}: RMSE of corrected / no blur at all", corrected / sharp_error, 1, why)
-        left, why = rmse(one, other) / 2 / corrected, "else the comparison would be one of noise"
-        study.at_most(f"scene {number}: noise of the lens / RMSE of corrected", left, 0.5, why)
+        left, worse = rmse(one, other) / 2, "a correction that is worse is none"
+        for what, figure, limit, why in (
+            ("RMSE of corrected / report", corrected / report, 1, worse),
+            ("RMSE of corrected / no blur at all", corrected / sharp_error, 1, worse),
+            ("noise of the lens / RMSE of corrected", left / corrected, 0.5, "else noise would be compared"),
+        ):
+            study.at_most(f"scene {number}: {what}", figure, limit, why)
         rows.append({"scene": number, **errors, **lens})
         sheet = np.concatenate([*pictures.values(), truth], axis=1)
         caption = f"Left to right: {', '.join(pictures)}, thinlens."

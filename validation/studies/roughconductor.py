@@ -55,9 +55,6 @@ def theirs(alpha: float, *, visible: bool = True) -> dict[str, Any]:
     return {"type": "roughconductor", **lobe, "alpha": alpha, "sample_visible": visible}
 
 
-# ------------------------------------------ Point by point ------------------------------------------
-
-
 def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> dict[str, float]:
     """Return the largest relative differences over ``count`` random pairs of directions, by ``NAMES``.
 
@@ -100,9 +97,6 @@ def pointwise(study: Study, *, quick: bool) -> None:
     for name in NAMES:
         worst = np.max([row[name] for row in rows])
         study.at_most(f"{name}, relative, {len(variants)} variants", worst, POINTWISE, why)
-
-
-# --------------------------------------------- Pictures ---------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -34,17 +34,19 @@ SHINY = Material(1.5, 0.1, (0.9, 0.8, 0.7), (0.1, 0.1, 0.1))
 def _crowded(lights: int) -> Scene:
     """Return a few hundred objects of all kinds, looked up in trees and in light buffers."""
     rng = np.random.default_rng(5)
-    things: list[Any] = []
-    for i in range(330):
-        place, radius = rng.uniform(-2, 2, 3), float(rng.uniform(0.08, 0.2))
-        first, end = (tuple(p.tolist()) for p in (place, place + 0.5 * rng.normal(size=3)))
-        kind, ends = [(Sphere, [first]), (Cone, [first, end]), (Cylinder, [first, end])][i % 3]
-        things.append(kind(*ends, radius, (GREY, SHINY)[i % 5 == 0]))
-    places = 6 * rng.normal(size=(lights, 3)) + [0, 6, 6]
-    lamps = tuple(Light(tuple(p.tolist()), (1.2 / lights, 1.2 / lights, 1.44 / lights)) for p in places)
-    camera, sky = Camera((0, 1, 6), (0, 0, 0)), (0.2, 0.3, 0.4)
-    spheres, cones, cylinders = (tuple(things[kind::3]) for kind in range(3))
-    return Scene(camera, sky, lamps, spheres, cones=cones, cylinders=cylinders)
+    start = rng.uniform(-2, 2, (330, 3))
+    ends, radii = start + 0.5 * rng.normal(size=(330, 3)), rng.uniform(0.08, 0.2, 330).tolist()
+    points = (map(tuple, place.tolist()) for place in (start, ends))
+    things = list(zip(*points, radii, 66 * [SHINY, GREY, GREY, GREY, GREY], strict=True))
+    lamps = (6 * rng.normal(size=(lights, 3)) + [0, 6, 6]).tolist()
+    return Scene(
+        Camera((0, 1, 6), (0, 0, 0)),
+        (0.2, 0.3, 0.4),
+        tuple(Light(tuple(p), (1.2 / lights, 1.2 / lights, 1.44 / lights)) for p in lamps),
+        spheres=tuple(Sphere(p, *more) for p, _, *more in things[::3]),
+        cones=tuple(Cone(*thing) for thing in things[1::3]),
+        cylinders=tuple(Cylinder(*thing) for thing in things[2::3]),
+    )
 
 
 LARGE, SMALL = ((320, 240), (120, 90)), ((160, 120), (64, 48))  # in full, and quick

@@ -61,12 +61,13 @@ def direct(study: Study, *, quick: bool) -> None:
     note = f"Stock point light, no sky. Differences relative to 1 + value, up to {NEAR:g} from the camera."
     title = "mrt_whitted without bounces and clamp against direct: the worst of the lights"
     study.records("direct", title, rows, note)
-    median, off, seen = ([row[figure] for row in rows] for figure in figures)
-    why = "least fault: 1 in a million of the light"
-    study.at_most(f"direct light: {figures[0]}", np.max(median), 3e-7, why)
-    why = "edges and what hides lights; measured 7 in 76,800, and 36 among the 600 spheres of scene 4"
-    study.at_most(f"direct light: {figures[1]}", np.max(off), 1e-3, why)
-    study.at_least(f"direct light: {figures[2]}", min(seen), 0.05, "else there is nothing to compare")
+    edges = "edges and what hides lights; measured 7 in 76,800, and 36 among the 600 spheres of scene 4"
+    for figure, hold, worst, limit, why in (
+        (figures[0], study.at_most, np.max, 3e-7, "least fault: 1 in a million of the light"),
+        (figures[1], study.at_most, np.max, 1e-3, edges),
+        (figures[2], study.at_least, np.min, 0.05, "else there is nothing to compare"),
+    ):
+        hold(f"direct light: {figure}", worst([row[figure] for row in rows]), limit, why)
 
 
 def gloss(study: Study, *, quick: bool) -> None:
@@ -121,9 +122,6 @@ def mesh_cones(study: Study, *, quick: bool) -> None:
     study.at_most(what, np.count_nonzero(~same) / count, 1e-3, why)
 
 
-# --------------------------------- Whole scenes, right and with mistakes ---------------------------------
-
-
 def physical(m: Material) -> Material:
     """Return a material that Mitsuba's plugins take: colours up to 1, positive roughness, no diffuse part.
 
@@ -172,14 +170,12 @@ def whole_scenes(study: Study, *, quick: bool) -> None:
         pictures = {f"scene {number}": ours}
         if number == 0:
             pictures |= {f"scene 0, {mistake}": change(ours) for mistake, change in MISTAKES.items()}
+        why = "least fault: 2 % of the light and 5 % of alpha, as the mistakes show: they must be seen"
         for what, nodes in pictures.items():
             found = renders(nodes, 0)
             p = p_values(found, theirs)
-            if nodes is ours:
-                why = "least fault: 2 % of the light and 5 % of alpha, as the mistakes show"
-                study.at_least(f"p of equality, {what}", min(p.values()), LEVEL, why)
-            else:
-                study.at_most(f"p of equality, {what}", min(p.values()), LEVEL, "it must be seen")
+            hold = study.at_least if nodes is ours else study.at_most
+            hold(f"p of equality, {what}", min(p.values()), LEVEL, why)
             seen = ", ".join(name for name in p if p[name] < LEVEL)
             error = mrt.compare(found.mean(axis=0), theirs.mean(axis=0)).rel_mse ** 0.5
             rows.append({"what": what, "found by": seen or "-", **p, "relRMSE": error})

@@ -26,14 +26,19 @@ OUTLINE = 64
 # Directions to a light flatter than this may meet their own surface
 FLATTEST = 1e-3
 
-SCALES = (1e-6, 1e-4, 1e-2, 1e2, 1e4, 1e6)
-MOVES = (1.0, 1e1, 1e2, 1e3, 1e4)  # scene sizes
-HOLDS_TO = 100.0
 # A pixel is another one if a channel differs by more than two steps of an 8-bit picture. After scaling by
 # powers of ten, so many may be: those whose centre ray passes an outline or the edge of a shadow within the
 # roundings of the scaled numbers, seen directly or through ten mirrors. After moving by n scene sizes, they
 # move by n roundings, enlarged by every curved mirror
 VISIBLE, SHARE_SCALED, SHARE_MOVED = 2 / 255, 0.001, 1e-4
+# Of each place its name, a factor, a number of scene sizes, why, and the most that it holds to, if it can
+STEPS = "coordinates have steps of {:.0e} scene sizes there: normals and outlines move"
+PLACES: tuple[tuple[Any, ...], ...] = (
+    *((f"times {s:g}", s, 0, "the same picture", SHARE_SCALED) for s in (1e-6, 1e-3, 1e3, 1e6)),
+    *((f"moved by {n:g} sizes", 1, n, STEPS.format(n * 2**-23), max(SHARE_MOVED * n, SHARE_SCALED))
+      for n in (1.0, 10.0, 100.0)),
+    *((f"moved by {n:g} sizes", 1, n, STEPS.format(n * 2**-23)) for n in (1e3, 1e4)),
+)  # fmt: skip
 
 WHERE = f"sizes 1e-6 … 1e6, from 1e-6 to {FARTHEST:g} sizes away and from inside"
 # What ``measure`` returns of an object, in this order: what it is, why it must be so, and the most
@@ -70,22 +75,13 @@ def cases(quick: bool) -> Iterator[tuple[Any, ...]]:
         worst = np.max([measure(kind, size, 300 if quick else 3000) for size in sizes], axis=0)
         for (figure, what, why, most), found in zip(FIGURES, worst, strict=True):
             yield f"{kind}, {figure}", what, why, found, most
-    places: list[tuple[Any, ...]] = [
-        (f"times {factor:g}", factor, 0, "the same picture", SHARE_SCALED)
-        for factor in (SCALES[::5] if quick else SCALES)
-    ]
-    for n in MOVES:
-        why = f"coordinates have steps of {n * 2**-23:.0e} scene sizes there: normals and outlines move"
-        held = [max(SHARE_MOVED * n, SHARE_SCALED)] if n <= HOLDS_TO else []
-        places.append((f"moved by {n:g} sizes", 1, n, why, *held))
     # Scene 2 shows the horizon, which a far plane can cut off
     for number in (0, 2, 3) if quick else range(5):
         scene = replace(report_scene(number), focal_distance=None)
-        base, *others = (picture(placed(scene, *place[1:3])) for place in (("", 1, 0), *places))
-        for (name, _, _, *held), image in zip(places, others, strict=True):
-            share = np.mean(~(np.abs(image - base).max(axis=-1) <= VISIBLE))
-            what = "share of pixels that differ by more than 2/255"
-            yield f"scene {number} {name}", what, held[0], share, *held[1:]
+        base = picture(scene)
+        for name, factor, sizes, why, *held in PLACES:
+            share = np.mean(~(np.abs(picture(placed(scene, factor, sizes)) - base).max(axis=-1) <= VISIBLE))
+            yield f"scene {number} {name}", "share of pixels off by more than 2/255", why, share, *held
 
 
 def picture(scene: Scene) -> np.ndarray:
