@@ -39,7 +39,7 @@ def run_command(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str
         given = os.environ | {"DRJIT_LIBLLVM_PATH": None} | variables
         environ = {key: value for key, value in given.items() if value is not None}
         done = subprocess.run(
-            words, cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=120, check=False
+            words, cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=300, check=False
         )
         assert code in (None, done.returncode), done.stdout + done.stderr
         return done

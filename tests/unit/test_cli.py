@@ -138,7 +138,7 @@ KERNEL = """
     ("work", "number", "code"),
     [
         (KERNEL + "dr.sync_thread()", signal.SIGTERM, 143),
-        (KERNEL + "time.sleep(60)", signal.SIGINT, 130),
+        (KERNEL + "time.sleep(300)", signal.SIGINT, 130),
     ],
     ids=["kernel", "kernel next to python"],
 )
@@ -151,7 +151,7 @@ def test_signal_leaves_the_old_file_and_does_not_wait_for_the_kernel(
             assert process.poll() is None, process.stderr.read()
         time.sleep(0.3)  # into the kernel
         process.send_signal(number)
-        process.wait(timeout=20)  # a third of the kernel's time
+        process.wait(timeout=100)  # a third of the kernel's time
         errors = process.stderr.read()
     assert process.returncode == code, errors
     assert errors.startswith("mrt: ") and errors.count("\n") == 1
