@@ -182,17 +182,12 @@ def energy(law: Law, case: Case) -> None:
     In the mode of importance, in which transmitted energy is not rescaled.
     """
     # that surely reached near the horizon, where lobes peak, by samples alone
-    count, albedos, apart = case.count(2**12, 2**14), [], []
+    count, mode = case.count(2**12, 2**14), context(importance=True)
     wi = probe.direction(np.cos(np.radians(GRAZING)), case.rng.uniform(0, 2 * np.pi, len(GRAZING)))
-    uv = case.uniform(len(GRAZING), 2)
-    for i, t in zip(wi, uv, strict=True):
-        mean, error = _mean(case.sample(i, case.uniform(count, 3), t, context(importance=True)).weight)
-        albedos.append((mean - SIGMAS * error).max())
-    for view, cells in zip(case.views, case.densities, strict=True):
-        albedo, off = _albedo(case, view, cells)
-        albedos.append(albedo)
-        apart.append(off)
-    at = {"wi": wi, "uv": uv}
+    at = {"wi": wi, "uv": case.uniform(len(GRAZING), 2)}
+    drawn = [case.sample(i, case.uniform(count, 3), t, mode) for i, t in zip(*at.values(), strict=True)]
+    found = [_albedo(case, *known) for known in zip(case.views, case.densities, strict=True)]
+    albedos, apart = [*(_surely(s.weight) for s in drawn), *(a for a, _ in found)], [off for _, off in found]
     law.hold("largest", albedos, **{n: np.concatenate([at[n], x]) for n, x in case.incidence.items()})
     if not np.isnan(apart).all():
         law.hold("apart", np.nan_to_num(apart), **case.incidence)
@@ -202,6 +197,12 @@ def _mean(weight: Array) -> tuple[Array, Array]:
     """Return the mean of finite weights [N, channels], and its standard error."""
     weight = np.nan_to_num(weight, posinf=0, neginf=0).astype(np.float64)
     return weight.mean(axis=0), weight.std(axis=0) / np.sqrt(len(weight))
+
+
+def _surely(weight: Array) -> float:
+    """Return the albedo that the brightest channel surely reaches."""
+    mean, error = _mean(weight)
+    return float((mean - SIGMAS * error).max())
 
 
 def _albedo(case: Case, view: SimpleNamespace, cells: Cells | None) -> tuple[float, float]:

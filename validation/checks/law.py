@@ -33,7 +33,6 @@ TITLE = "Laws of plugins"
 LEVEL = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction
 RARE = "one false alarm in a million checks"
 SIGMAS = 6  # the same for a normal distribution: 2e-9
-Called = TypeVar("Called", bound=Callable[..., None])
 Found = TypeVar("Found")
 SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
 TIMEOUT = 120.0  # seconds for each law: sound plugins take a few, those of scalar variants a dozen
@@ -55,15 +54,15 @@ class Part(Bound):
     snippet: str = ""
 
 
-def figures(**rows: tuple[Any, ...]) -> Callable[[Called], Called]:
+def figures(**rows: tuple[Any, ...]) -> Callable[[Any], Any]:
     """Give a law its figures, by name: how, what is held to which limit, why that, and a snippet's body.
 
     How: a number "at most" or "at least"; or of N errors the "most", "none" or a "share" of those that are
     bad, or a quantile, NaN left out.
     """
 
-    def mark(law: Called) -> Called:
-        vars(law)["figures"] = rows
+    def mark(law: Any) -> Any:
+        law.figures = rows
         return law
 
     return mark

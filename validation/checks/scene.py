@@ -28,7 +28,7 @@ from mrt_mitsuba.validation.tools.study import Study
 
 ALIKE = 6  # of one kind of plugin, so many are checked, spread over all
 DEPTH = 12  # bounces that the hunt follows
-MOST_SAMPLES = 2**14  # of one pixel, to see a fault again
+COUNTS = (16, 128, 1024, 8192)  # samples of one pixel, to see a fault again
 
 
 @dataclass(frozen=True)
@@ -133,24 +133,19 @@ def _check_emitter(scene: Any, plugin: Any, *, quick: bool, seed: int) -> Check:
 
 
 def _hunt(source: Any, quick: bool, seed: int) -> Fault | None:
-    """Render, and narrow the film down to a crop that still shows a pixel that is not finite."""
-    spp = 4 if quick else 32
+    """Render, and look for a pixel that is not finite: alone if it then still is, else in the whole film."""
+    spp, film = 4 if quick else 32, source.sensor.film()
     bad = _bad(source, spp, seed)
     if not bad.any():
         return None
-    (left, top), (y, x) = map(int, np.array(source.sensor.film().crop_offset())), np.argwhere(bad)[0]
-    size, count = 1, 0
-    while not count:
-        height, width = (min(size, extent) for extent in bad.shape)
-        crop = int(left + x // width * width), int(top + y // height * height), width, height
-        counts = [n for n in (16, 128, 1024, 8192) if n * width * height <= MOST_SAMPLES] or [16]
-        if (height, width) == bad.shape:
-            crop, count = (left, top, width, height), spp
-        with _cropped(source.sensor, crop):
-            count = count or next((n for n in counts if _bad(source, n, seed).any()), 0)
-            culprit = _culprit(source, count, seed) if count else ""
-        size *= 2
-    return Fault(int(bad.sum()), crop, count, culprit)
+    (left, top), (y, x) = film.crop_offset(), np.argwhere(bad)[0]
+    alone = int(left + x), int(top + y), 1, 1
+    with _cropped(source.sensor, alone):
+        for count in COUNTS:
+            if _bad(source, count, seed).any():
+                return Fault(int(bad.sum()), alone, count, _culprit(source, count, seed))
+    whole = int(left), int(top), *bad.shape[::-1]
+    return Fault(int(bad.sum()), whole, spp, _culprit(source, spp, seed))
 
 
 def _bad(source: Any, spp: int, seed: int) -> np.ndarray:
@@ -163,19 +158,12 @@ def _bad(source: Any, spp: int, seed: int) -> np.ndarray:
 def _cropped(sensor: Any, crop: tuple[int, int, int, int]) -> Iterator[None]:
     """Crop the film for a while."""
     params, keys = mi.traverse(sensor), ("film.crop_size", "film.crop_offset")
-    before = [type(params[key])(params[key]) for key in keys]
-
-    def change(*values: Any) -> None:
-        for key, value in zip(keys, values, strict=True):
-            params[key] = value
-        params.update()
-        sensor.parameters_changed()
-
-    change(list(crop[2:]), list(crop[:2]))
+    before = {key: type(params[key])(params[key]) for key in keys}
+    params.update(dict(zip(keys, (crop[2:], crop[:2]), strict=True)))
     try:
         yield
     finally:
-        change(*before)
+        params.update(before)
 
 
 def _culprit(source: Any, spp: int, seed: int) -> str:
@@ -184,8 +172,7 @@ def _culprit(source: Any, spp: int, seed: int) -> str:
         return "something that scalar variants do not reveal: check it in a vectorised one"
     pixels = int(np.prod(np.array(source.sensor.film().crop_size())))
     for attempt in range(8):
-        counts = _follow(source, min(max(spp, 2**12) * pixels, 2**20), seed + attempt)
-        if counts:
+        if counts := _follow(source, min(max(spp, 2**12) * pixels, 2**20), seed + attempt):
             return counts.most_common(1)[0][0]
     return "no object's own numbers: by the integrator, or a sum that overflows"
 

@@ -109,6 +109,21 @@ class Case(Subject):
         return trace(self.target, leave(hits.p, hits.n, d), -d)
 
     @cached_property
+    def positions(self) -> tuple[list[Array], Array, float]:
+        """Sampled positions: points, normals, densities stated and asked for; their ``u``; and the area."""
+        u = self.uniform(self.count(2**14, 2**19), 2)
+
+        def sample(second: Any) -> list[Any]:
+            ps = self.plugin.sample_position(0, second)
+            return [ps.p, ps.n, ps.pdf, self.plugin.pdf_position(ps)]
+
+        try:
+            area = float(np.ravel(np.array(self.plugin.surface_area()))[0])
+            return lanes(sample, ("Point2f", u)), u, area
+        except (AttributeError, RuntimeError) as problem:
+            raise Skip("positions cannot be sampled") from problem
+
+    @cached_property
     def crossings(self) -> list[tuple[Array, Lanes]]:
         """Whole lines: hit by hit, which line, and what it meets."""
         return list(walk(self.target, *self.seen))

@@ -50,23 +50,15 @@ def gaussian_dof(image: np.ndarray, amount: np.ndarray) -> np.ndarray:
     """Blur with Pascal windows; ``amount`` as from ``blur_amount``, both with the top row first."""
     buffer = np.asarray(image, dtype=np.float64)[::-1]  # row 0 at the bottom
     amount = amount[::-1]
-    height, width = amount.shape
     result = buffer.copy()
-    for y in range(height):
-        for x in range(width):
-            k = int(amount[y, x])
-            pascal = [math.comb(2 * k - 1, j) for j in range(2 * k)]
-            first_row, first_column = max(y - k, 0), max(x - k, 0)
-            total, weights = np.zeros(3), 0
-            for row in range(first_row, min(y + k, height)):
-                for column in range(first_column, min(x + k, width)):
-                    if amount[row, column] == 0:
-                        continue
-                    weight = pascal[row - first_row] * pascal[column - first_column]
-                    total += weight * buffer[row, column]
-                    weights += weight
-            if weights > 0:
-                result[y, x] = total / weights
+    for place in np.ndindex(amount.shape):
+        k = int(amount[place])
+        pascal = np.array([math.comb(2 * k - 1, j) for j in range(2 * k)], float)
+        window = tuple(slice(max(at - k, 0), at + k) for at in place)
+        rows, columns = amount[window].shape  # cut off at the border; the weights begin with the first
+        weight = np.outer(pascal[:rows], pascal[:columns]) * (amount[window] != 0)
+        if weight.any():
+            result[place] = np.einsum("yx,yxc->c", weight, buffer[window]) / weight.sum()
     return result[::-1]
 
 
