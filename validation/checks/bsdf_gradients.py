@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -92,8 +91,7 @@ def gradients(law: Law, case: Case) -> None:
 def _attached(law: Law, case: Case, key: str) -> bool:
     """Hold the derivative by one parameter to differences; return False where it is detached, and wrong."""
     few = case.lit
-    with _shifted(case, key) as shift:
-        (found,), attached = _forward(shift, len(few.wi), _values(case))
+    (found,), attached = _derivatives(case, key, len(few.wi), lambda: [_values(case)])
     broken, found = ~np.isfinite(found), np.nan_to_num(found, posinf=0, neginf=0)
     slope, error = _differences(case, key)
     if not attached and not slope.any():
@@ -114,21 +112,16 @@ def _attached(law: Law, case: Case, key: str) -> bool:
     return attached or measured <= GRADIENT
 
 
-@contextmanager
-def _shifted(case: Case, key: str) -> Iterator[Any]:
-    """Add a number with derivatives to a parameter for a while."""
+def _derivatives(case: Case, key: str, count: int, values: Callable[[], list[Any]]) -> tuple[Array, bool]:
+    """Return derivatives [K, N] by a parameter of K arrays that ``values`` makes, and if there are any."""
     shift = mi.Float(0)
     dr.enable_grad(shift)
     with changed(case, key, lambda old: _moved(old, shift)):
-        yield shift
-
-
-def _forward(shift: Any, count: int, *values: Any) -> tuple[Array, bool]:
-    """Return the derivatives [K, N] of K arrays by one number, and whether any of them has one."""
-    attached = any(map(dr.grad_enabled, values))
-    if attached:
-        dr.forward(shift)
-    return np.array([np.broadcast_to(np.array(dr.grad(v), np.float64), count) for v in values]), attached
+        found = values()
+        attached = any(map(dr.grad_enabled, found))
+        if attached:
+            dr.forward(shift)
+        return np.array([np.broadcast_to(np.array(dr.grad(v), np.float64), count) for v in found]), attached
 
 
 def _sampled(law: Law, case: Case, key: str) -> None:
@@ -139,15 +132,17 @@ def _sampled(law: Law, case: Case, key: str) -> None:
     """
     count = case.count(2**14, 2**16)
     wi, u, uv = case.units(count), case.uniform(count, 3), case.uniform(count, 2)
-    with _shifted(case, key) as shift:
+
+    def weights() -> list[Any]:
         si = probe.interaction(as_mitsuba("Vector3f", wi), as_mitsuba("Point2f", uv))
         first, second = as_mitsuba("Float", u[:, 0]), as_mitsuba("Point2f", u[:, 1:])
         bs, weight = case.plugin.sample(context(), si, first, second)
         value, pdf = case.plugin.eval_pdf(context(), si, dr.detach(bs.wo))
-        moves, light = dr.grad_enabled(bs.wo), 1 + 0.5 * bs.wo.x + 0.25 * dr.square(bs.wo.z)
-        one = _total(weight) * (light if moves else dr.detach(light))
-        other = _total(value) / dr.detach(dr.select(pdf > 0, pdf, 1)) * dr.detach(light)
-        (found, expected), attached = _forward(shift, count, one, other)
+        light = 1 + 0.5 * bs.wo.x + 0.25 * dr.square(bs.wo.z)
+        fixed = dr.detach(dr.select(pdf > 0, pdf, 1))
+        return [_total(weight) * light, _total(value) / fixed * dr.detach(light), dr.sum(bs.wo)]
+
+    (found, expected, moves), attached = _derivatives(case, key, count, weights)
     s = case.sample(wi, u, uv)
     counts = live(wi, s, *case.both(wi, np.nan_to_num(s.wo), uv)) & ~narrow(wi, s)
     counts &= np.isfinite(found) & np.isfinite(expected) & (np.abs(wi[:, 2]) > 0.05)
@@ -157,13 +152,13 @@ def _sampled(law: Law, case: Case, key: str) -> None:
     apart = np.where(counts, found - expected, 0)
     i, known = int(np.abs(apart).argmax()), apart[counts]
     size = max(np.abs(expected[counts]).mean(), 1e-3 * np.abs(s.weight[counts]).mean(), 1e-30)
-    if moves:
+    if np.any(moves):
         known = np.clip(known, *np.quantile(known, (1e-3, 1 - 1e-3)))
         off = max(abs(known.mean()) - SIGMAS * known.std() / np.sqrt(len(known)), 0)
     else:
         known = np.abs(known)
         off = known[known <= np.quantile(known, 0.98)].mean()
-    law.hold("mean" if moves else "weights", off / size, wi=wi[i], uv=uv[i], u=u[i], key=key)
+    law.hold("mean" if np.any(moves) else "weights", off / size, wi=wi[i], uv=uv[i], u=u[i], key=key)
 
 
 def _total(spectrum: Any) -> Any:

@@ -99,11 +99,11 @@ class Probe:
             bs, weight = self.plugin.sample(c, si, u.x, mi.Point2f(u.y, u.z))
             return [bs.wo, bs.pdf, bs.eta, bs.sampled_type, bs.sampled_component, weight]
 
-        wo, pdf, eta, kind, component, weight = self.ask(call, wi, u, uv, ctx)
-        kind, component = kind.astype(np.int64), component.astype(np.int64)
-        delta, lit = (kind & int(mi.BSDFFlags.Delta)) != 0, (weight != 0).any(axis=1)
-        columns = {"wo": wo, "pdf": pdf, "eta": eta, "type": kind, "component": component, "weight": weight}
-        return Lanes(**columns, delta=delta, lit=lit)
+        names = ("wo", "pdf", "eta", "type", "component", "weight")
+        s = Lanes(**dict(zip(names, self.ask(call, wi, u, uv, ctx), strict=True)))
+        s.type, s.component = s.type.astype(np.int64), s.component.astype(np.int64)
+        s.delta, s.lit = (s.type & int(mi.BSDFFlags.Delta)) != 0, (s.weight != 0).any(axis=1)
+        return s
 
 
 def not_finite(*values: Any, least: float = -np.inf) -> Any:

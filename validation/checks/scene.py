@@ -33,7 +33,7 @@ COUNTS = (16, 128, 1024, 8192)  # samples of one pixel, to see a fault again
 
 @dataclass(frozen=True)
 class Fault:
-    """A pixel that is not finite: the smallest crop of the film that shows it, and what makes it."""
+    """A pixel that is not finite: the smallest crop found that shows it, and what makes it."""
 
     pixels: int  # how many there are in the whole picture
     crop: tuple[int, int, int, int]  # x, y, width, height
@@ -74,9 +74,8 @@ class SceneCheck:
 
     def save(self, folder: str | Path) -> None:
         """Write the page (``index.html``), ``summary.json`` and CSV files. Raises ``OutputError``."""
-        bad, why = self.fault.pixels if self.fault else 0, "a picture is of numbers"
-        picture = Study("picture", "picture")
-        picture.at_most("pixels that are not finite", bad, 0, f"{why}. {self.fault}" if self.fault else why)
+        picture, bad = Study("picture", "picture"), self.fault.pixels if self.fault else 0
+        picture.at_most("pixels that are not finite", bad, 0, str(self.fault or "a picture is of numbers"))
         studies = [*(check.study() for check in self.checks.values()), picture]
         report.save(folder, *studies, title=f"{TITLE}: {self.name}")
 
@@ -102,10 +101,10 @@ def check_scene(
     chosen = {kind: range(0, len(alike), max(len(alike) // ALIKE, 1)) for kind, alike in kinds.items()}
     with (progress or Progress()).stage("Laws", sum(map(len, chosen.values()))) as advance:
         for kind, number in ((kind, number) for kind, numbers in chosen.items() for number in numbers):
-            plugin = kinds[kind][number]
-            name = f"{kind} {plugin.id() or number}"
+            name = f"{kind} {kinds[kind][number].id() or number}"
             name = name if name not in found else f"{name} ({number})"
-            found[name] = replace(laws[kind.split()[0]](plugin, quick=quick, seed=seed), subject=name)
+            check = laws[kind.split()[0]](kinds[kind][number], quick=quick, seed=seed)
+            found[name] = replace(check, subject=name)
             advance(1)
     more = {kind: len(alike) - len(chosen[kind]) for kind, alike in kinds.items()}
     left_out = [f"{n} more of {kind} are like those that were checked" for kind, n in more.items() if n]
