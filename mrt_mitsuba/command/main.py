@@ -38,7 +38,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         warnings.showwarning = lambda message, *place, **more: print(
             f"mrt: warning: {one_line(str(message))}", file=sys.stderr
         )
-        code = _guarded(words)
+        code, problem = _guarded(words)
+        if problem:
+            print(f"mrt: {one_line(problem)}", file=sys.stderr)
     picture = bool(words) and words[0] not in registry.ALL
     if arguments is None and (picture or code in (INTERRUPTED, TERMINATED)):
         # the interpreter would wait for kernels that run, and take apart all that it has loaded
@@ -46,31 +48,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code
 
 
-def _guarded(words: list[str]) -> int:
-    """Run the command; whatever goes wrong becomes one line and an exit code."""
+def _guarded(words: list[str]) -> tuple[int, str]:
+    """Run the command; return its exit code, and what went wrong."""
     try:
         with ending_soon(_end_by_force):
             code = _dispatch(words)
             sys.stdout.flush()
-        return code
+        return code, ""
     except MrtError as error:
-        return _say(str(error), error.exit_code)
+        return error.exit_code, str(error)
     except Terminated:
-        return _say("terminated", TERMINATED)
+        return TERMINATED, "terminated"
     except KeyboardInterrupt:
-        return _say("interrupted", INTERRUPTED)
+        return INTERRUPTED, "interrupted"
     except MemoryError:
-        return _say("out of memory: choose a smaller width, height or aa", 1)
+        return 1, "out of memory: choose a smaller width, height or aa"
     except Exception as error:
         if isinstance(error, OSError) and error.errno in UNPRINTED and error.filename is None:
             # or Python complains once more at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            if isinstance(error, BrokenPipeError):
-                return 1
-            return _say(f"cannot print: {error.strerror}; send the output elsewhere", 1)
+            gone = isinstance(error, BrokenPipeError)  # who would have read it
+            return 1, "" if gone else f"cannot print: {error.strerror}; send the output elsewhere"
         if os.environ.get(TRACEBACK):
             raise
-        return _say(f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)", 1)
+        return 1, f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)"
 
 
 def _dispatch(words: list[str]) -> int:
@@ -91,11 +92,6 @@ def _dispatch(words: list[str]) -> int:
     from mrt_mitsuba.command import render
 
     return render.run(options)
-
-
-def _say(message: str, code: int) -> int:
-    print(f"mrt: {one_line(message)}", file=sys.stderr)
-    return code
 
 
 def _end_by_force() -> None:
