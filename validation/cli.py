@@ -84,7 +84,7 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> bool:
     from mrt_mitsuba.validation.tools.study import Study
 
     report.prepare(out)
-    seconds = sum(STUDIES[name][2 if quick else 3] for name in names)
+    seconds = sum(STUDIES[name][2] if quick else STUDIES[name][3] for name in names)
     print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
     studies = [Study(name, name, TerminalProgress(unit="step")) for name in names]
     for study in studies:

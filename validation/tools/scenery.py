@@ -25,11 +25,11 @@ SPP = 64  # of the samplers of ``SCENES``
 
 def with_materials(scene: Scene, change: Callable[[Material], Material]) -> Scene:
     """Return a scene whose spheres and planes have other materials."""
-    spheres, planes = (
-        tuple(dataclasses.replace(thing, material=change(thing.material)) for thing in things)
-        for things in (scene.spheres, scene.planes)
-    )
-    return dataclasses.replace(scene, spheres=spheres, planes=planes)
+    parts: dict[str, Any] = {
+        kind: tuple(dataclasses.replace(t, material=change(t.material)) for t in getattr(scene, kind))
+        for kind in ("spheres", "planes")
+    }
+    return dataclasses.replace(scene, **parts)
 
 
 def sensor(

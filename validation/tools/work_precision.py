@@ -126,7 +126,7 @@ class Findings:
 
         def crossings(points: Sequence[Point]) -> tuple[float, ...]:
             curves = [[(p.seconds, *p.seconds_interval), (p.rmse, *p.rmse_interval)] for p in points]
-            return tuple(_crossing(*curve, error) for curve in np.transpose(curves, (2, 1, 0)))
+            return tuple(_crossing(at, down_to, error) for at, down_to in np.transpose(curves, (2, 1, 0)))
 
         return {name: crossings(points) for name, points in self.families.items()}
 
@@ -430,9 +430,9 @@ def _diagram(found: Findings) -> Any:
         ends = np.array([[p.seconds_interval, p.rmse_interval] for p in curve]).transpose(1, 2, 0)
         x, y = np.nan_to_num(np.maximum(np.stack([places - ends[:, 0], ends[:, 1] - places], axis=1), 0))
         style: dict[str, Any] = {"marker": marker, "markersize": 5, "linewidth": 1, "capsize": 2}
-        axes.errorbar(*places, xerr=x, yerr=y, label=name, **style)
+        axes.errorbar(places[0], places[1], xerr=x, yerr=y, label=name, **style)
         for place in places.T:
-            axes.annotate(next(numbers), place, textcoords="offset points", xytext=(4, 4), fontsize=8)
+            axes.annotate(str(next(numbers)), place, textcoords="offset points", xytext=(4, 4), fontsize=8)
     if floor:
         axes.axhspan(bottom / 10, floor, color="0.9", zorder=0, label="within the reference's error")
     if any(p.rmse == 0 for p in found.points.values()):
