@@ -18,7 +18,7 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.checks import bsdf_case, noise, probe
 from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, live, narrow, parameters
 from mrt_mitsuba.validation.checks.bsdf_gradients import gradients
-from mrt_mitsuba.validation.checks.law import LEVEL, RARE, SIGMAS, TIMEOUT, Check, Law, Skip, examine, figures
+from mrt_mitsuba.validation.checks.law import SIGMAS, TIMEOUT, Check, Law, Skip, examine, figures, rare
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Probe, context, excess, is_scalar
 from mrt_mitsuba.validation.checks.sphere import DEPTH, Cells, chi_square, encode, integrate
 from mrt_mitsuba.validation.tools.compare import sidak
@@ -81,12 +81,10 @@ print("there, pdf():", pdf, "eval() / pdf():", bsdf.eval(ctx, si, bs.wo) / pdf)
 
 
 @figures(
-    cells=("at least", "chance of such counts if samples follow pdf(), the least of {angles} angles, for "
-           "their number", LEVEL, RARE, CELL),
+    cells=rare("least chance of counts at {angles} angles if samples follow pdf(), for their number", CELL),
     integral=("most", f"integral of pdf() less the share of samples it stands for, beyond {SIGMAS} "
               "standard errors", FIT, "rational fits of Smith's G1 in use are off by 0.35 %", WHOLE),
-    small=("at least", "chance of such counts of all angles in cells of a degree, for their number",
-           LEVEL, RARE, CELL),
+    small=rare("chance of such counts of all angles in cells of a degree, for their number", CELL),
 )  # fmt: skip
 def sampling(law: Law, case: Case) -> None:
     """Samples against the density: ∫ pdf dω over a cell is the share of samples in it (Pearson's χ²).

@@ -31,7 +31,6 @@ from mrt_mitsuba.validation.tools.study import Bound, Study
 
 TITLE = "Laws of plugins"
 LEVEL = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction
-RARE = "one false alarm in a million checks"
 SIGMAS = 6  # the same for a normal distribution: 2e-9
 Found = TypeVar("Found")
 SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
@@ -66,6 +65,11 @@ def figures(**rows: tuple[Any, ...]) -> Callable[[Any], Any]:
         return law
 
     return mark
+
+
+def rare(what: str, *body: str) -> tuple[Any, ...]:
+    """Return the row of a figure that is the chance of what was seen, if a plugin is sound."""
+    return "at least", what, LEVEL, "one false alarm in a million checks", *body
 
 
 @dataclass

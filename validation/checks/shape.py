@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from mrt_mitsuba.validation.checks import noise
-from mrt_mitsuba.validation.checks.law import LEVEL, RARE, SIGMAS, TIMEOUT, Check, Law, Skip, examine, figures
+from mrt_mitsuba.validation.checks.law import LEVEL, SIGMAS, TIMEOUT, Check, Law, Skip, examine, figures, rare
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import Array, lanes, unit
 from mrt_mitsuba.validation.checks.shape_case import FLAT, Case, dot, leave, near, offset, trace, walk
@@ -411,8 +411,7 @@ SAME = "the same number"
     crossings=("at most", "surface_area() against that by crossings of lines, relative, beyond "
                f"{SIGMAS} standard errors", 3e-3, "lines that graze may cross twice within the offset of a "
                "spawned ray", POSITIONS),
-    spread=("at least", "chance of such positions if they follow the area, along the worst of some axes",
-            LEVEL, RARE, POSITIONS),
+    spread=rare("chance of such positions if they follow the area, along the worst of some axes", POSITIONS),
     direction=(0.99, "density of a direction against pdf_direction(), relative, 99 in 100", 1e-2,
                "the same number; near outlines the cosine, and the density with it, hangs on roundings", RAY),
     misses=("share", "share of sampled directions that miss the shape, or reach it behind the sampled point",
