@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import os
 import re
 import resource
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -57,7 +59,7 @@ class Budget:
     @classmethod
     def of(cls, wanted: int | None) -> Budget:
         """Return what was asked for, by default half of what is free; never more than the machine has."""
-        free, most = memory()
+        free, most = _look(memory, int(time.monotonic()))
         return cls(min(free // 2 if wanted is None else wanted, most))
 
     def take_texture(self, path: str, width: int, height: int, *, around: bool = False) -> None:
@@ -73,6 +75,12 @@ class Budget:
                 f"memory, and {_text(self.size)} may be used: choose a smaller picture or a larger memory="
             )
         self.taken += stays
+
+
+@functools.lru_cache(maxsize=1)
+def _look(function: Callable[[], tuple[int, int]], second: int) -> tuple[int, int]:
+    """Return what a function returns, looked up once a second: that takes a tenth of a small render."""
+    return function()
 
 
 @dataclass(frozen=True)
