@@ -226,10 +226,10 @@ def obj_scene(
     """Return a scene of an OBJ file; camera and lights that are not given are placed by the model's size.
 
     The camera stands in front, towards +z, a little above and to the right, and sees all of it; a light is up
-    on each side, the right one brighter. ``texturing`` follows ``convention`` unless given; ``light`` is the
-    place of a white light in place of ``lights``; ``view``: ``camera``, ``target`` and ``up``, vectors, and
-    ``fov``, horizontal, in degrees. Raises ``UsageError`` for a camera that sees nothing, and what
-    ``read_obj`` raises.
+    on each side, the right one brighter. ``texturing`` follows ``convention`` unless given. ``light``: where
+    a single white light is, instead of ``lights``; ``view``: ``camera``, ``target`` and ``up`` (vectors) and
+    ``fov`` (horizontal, in degrees), as ``render`` takes them. Raises ``UsageError`` for a camera that sees
+    nothing, and what ``read_obj`` raises.
     """
     meshes, files = read_obj(path, convention=convention)
     low = np.min([m.vertices.min(axis=0) for m in meshes], axis=0).astype(float)

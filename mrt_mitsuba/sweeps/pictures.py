@@ -78,12 +78,12 @@ def cut(job: Job, tiles: Any) -> list[Job]:
         raise UsageError(f"tiles={tiles!r}: give rows and columns, such as (4, 4)")
     if job.arguments.get("target") or job.arguments.get("aamode") == "noise":
         raise UsageError("tiles: target and aamode=noise share the rays out over the whole picture")
-    width, height = size = job.arguments.get("width"), job.arguments.get("height")
+    size: Any = job.arguments.get("width"), job.arguments.get("height")
     if None in size:  # only the scene knows
         use()
         source = open_scene(receive(job.scene), size=size)
-        width, height = source.width, source.height
-    rows, columns = tiles
+        size = source.width, source.height
+    (width, height), (rows, columns) = size, tiles
     if rows > height or columns > width:
         raise UsageError(f"tiles={tiles}: a picture of {width}x{height} pixels has fewer rows or columns")
     found = []
@@ -127,8 +127,7 @@ def _write_rows(job: Job, tiles: Sequence[Job], folder: str) -> None:
     header: dict[str, Any] = OpenEXR.Header(left + wide, top + high)
     header |= {name: value for name, value in own.items() if name not in header and name != "type"}
     options = {name: value for name, value in json.loads(own["mrt:options"]).items() if name != "region"}
-    header["channels"] = own["channels"]
-    header["mrt:options"] = json.dumps(options).encode()
+    header |= {"channels": own["channels"], "mrt:options": json.dumps(options).encode()}
     header[MADE_WITH] = job.made_with.encode()
     columns = [region[1] for region in regions].count(0)  # those in the first row
     with replacing(os.path.join(folder, job.file)) as (file,):
