@@ -175,12 +175,10 @@ def test_any_text_is_read_or_refused(model, obj: bytes, start: str, mtl: str) ->
 
 
 def test_view_as_asked_for(tmp_path) -> None:
-    path = tmp_path / "a.obj"
-    path.write_text(SQUARE + "f 1 2 3\n")
-    placed = obj_scene(path)
-    radius, (right, _) = math.sqrt(0.5), placed.lights
-    assert placed.camera.position == pytest.approx((0.5 + radius, 0.5 + 0.8 * radius, 2.4 * radius))
-    assert right.position == pytest.approx((0.5 + 4 * radius, 0.5 + 5 * radius, 4 * radius))
+    (path := tmp_path / "a.obj").write_text(SQUARE + "f 1 2 3\n")
+    placed, r = obj_scene(path), math.sqrt(0.5)
+    found = placed.camera.position, placed.lights[0].position
+    np.testing.assert_allclose(found, [(0.5 + r, 0.5 + 0.8 * r, 2.4 * r), (0.5 + 4 * r, 0.5 + 5 * r, 4 * r)])
     view = obj_scene(path, camera=(0, 0, 5), fov=30, light=(1, 2, 3), texturing="standard")
     assert view.camera == Camera((0, 0, 5), placed.camera.target, hfov=30)
     assert [light.position for light in view.lights] == [(1, 2, 3)] and view.texturing == "standard"
