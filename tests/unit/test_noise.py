@@ -127,6 +127,18 @@ def test_stated_errors_of_pixels_are_right_in_every_tenth() -> None:
         assert 1 / 3 < ratio < 3
 
 
+def test_pixels_state_what_neighbours_met_and_what_halves_differ_by() -> None:
+    """A row that met no noise is not sure to have none; rays that cancel in pairs leave less than others."""
+
+    def draw(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
+        pairs = np.where(np.arange(len(pixel)) % 2, 2, -2)
+        return 5 + np.where(pixel % 2, pairs, rng.normal(size=len(pixel)) / 2) * (pixel // SIDE != 8)
+
+    stated = _render(Draws(draw), rays=256).map
+    even = stated[:8, ::2].mean()
+    assert stated[8].mean() > 0.05 * even and stated[:8, 1::2].mean() < even
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_radiance_that_is_no_number_is_named_and_left_out(value: float) -> None:
     def draw(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
