@@ -16,8 +16,11 @@ import functools
 import os
 import re
 import sys
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
+
+from mrt_mitsuba.errors import MrtWarning
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 OLDEST = 17
@@ -127,7 +130,7 @@ def system_folders(environ: Mapping[str, str] = os.environ) -> list[str]:
 
 
 def _matching(folders: Iterable[str], prefix: str) -> Iterator[str]:
-    """Yield the path of everything in folders, if they can be read, whose name begins with a prefix."""
+    """Yield the paths in folders whose names begin with a prefix; folders that cannot be read have none."""
     for folder in folders:
         with contextlib.suppress(OSError):
             names = sorted(os.listdir(folder or "."))
@@ -188,10 +191,6 @@ def prepare() -> Choice:
     elif choice.rejected and VARIABLE in choice.rejected[0]:
         text = f"{choice.rejected[0]}; Dr.Jit needs LLVM {OLDEST} or newer. Instead: {choice.describe()}"
     if text:
-        import warnings
-
-        from mrt_mitsuba.errors import MrtWarning
-
         warnings.warn(text, MrtWarning, stacklevel=2)
     return choice
 

@@ -196,8 +196,8 @@ def usable_cores(root: Path = Path("/")) -> int:
 
 
 def control_groups(controller: str, names: Sequence[str], root: Path) -> Iterator[list[str]]:
-    """Yield the texts of some files of each control group that this process is in, and of those above it,
-    where they are all there."""
+    """Yield the texts of files of each control group that this process is in, and of those above it; groups
+    that lack one are passed over."""
     try:
         lines = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:  # a container may hide it

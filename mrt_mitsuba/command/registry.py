@@ -58,8 +58,7 @@ ALL = {
 
 def split(words: Iterable[str]) -> tuple[list[str], dict[str, str]]:
     """Return plain words, and those of the form ``name=value`` by name; each name may be given once."""
-    plain: list[str] = []
-    given: dict[str, str] = {}
+    plain, given = list[str](), dict[str, str]()
     for word in words:
         name, equals, value = word.partition("=")
         if name in given:

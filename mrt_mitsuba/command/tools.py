@@ -94,9 +94,8 @@ def doctor() -> int:
 
         print(f"variants: {', '.join(runtime.usable_variants())}")
         reasons = {runtime.obstacle(variant): variant.split("_")[0] for variant in mi.variants()}
-        for reason, family in reasons.items():
-            if reason:
-                print(f"  not {family}_*: {reason}")
+        reasons.pop(None, None)  # of those that work
+        print("".join(f"  not {family}_*: {reason}\n" for reason, family in reasons.items()), end="")
         variant = runtime.use()
         image = np.asarray(render(0, width=16, height=12, aa=1, aamode="none").image)
         # the sky, exact to float32, above spheres and a plane, which differ in every channel

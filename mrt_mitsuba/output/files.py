@@ -127,7 +127,7 @@ def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], heade
 
 @contextlib.contextmanager
 def compressing(pixels: int) -> Iterator[Any]:
-    """Let the EXR library compress in threads, to the same file, and give how, as it names it.
+    """Let the EXR library compress in threads, to the same file; yield the kind of compression to use.
 
     The threads are gone afterwards: a process that is forked while it has some waits for them for ever.
     """
