@@ -10,6 +10,7 @@ from nodes import rgb, sensor
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
+from mrt_mitsuba.output.files import write_exr
 from mrt_mitsuba.validation.tools.work_precision import Findings, Point
 
 for needed in ("matplotlib", "jinja2", "scipy", "flip_evaluator"):
@@ -99,6 +100,9 @@ def test_references_of_other_kinds(variant, tmp_path):
         two = found.points["aa=2"]
         assert (two.rmse, *two.rmse_interval) == pytest.approx((error,) * 3, rel=1e-4)  # nothing is random
         assert np.isnan(two.efficiency)
+    write_exr(tmp_path / "noisy.exr", best.image, {"error": np.full((24, 32), 0.01)})
+    found = mrt.error_vs_time(scene, {"a": {}}, reference=tmp_path / "noisy.exr", repeats=1, shared=lattice)
+    assert found.reference_error == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize(
