@@ -81,9 +81,8 @@ def known(study: Study, *, quick: bool) -> None:
     note = "White: F = 1, Ks = 1, Kd = 0, alpha = 0.1; what facets hide at low angles is missing."
     study.records("published", "Albedos published for this family, and a white furnace", rows, note)
     off = np.max([abs(row["ours"] / row["published"] - 1) for row in rows])
+    top, head_on = np.max([row["white"] for row in rows]), rows[0]["white"]
     why = "they were published from a Monte Carlo quadrature with about 1e-3 of noise"
     study.at_most("published albedos, relative", off, 3e-3, why)
-    top = np.max([row["white"] for row in rows])
     study.at_most("white furnace: largest albedo", top, 1 + G1_FIT, "the fit of G₁")
-    why = "hardly any facet hides another"
-    study.at_least("white furnace: albedo head on", rows[0]["white"], 1 - G1_FIT, why)
+    study.at_least("white furnace: albedo head on", head_on, 1 - G1_FIT, "hardly any facet hides another")

@@ -72,14 +72,17 @@ def noise(study: Study, *, quick: bool) -> None:
     note = f"Flat: luma contrast below {FLAT} in the converged picture; edges: above {EDGE}. Blind: the same "
     note += "flat pixels for a detector that does not know the variance."
     study.records("noise", "Does a detector chase noise? Share of pixels refined", rows, note)
-    why = "three deviations: 0.3 % for one normal value; estimated from 4 samples, tails are longer"
-    most = np.max([row["flat"] for row in rows if row["rays a pixel"] >= 4])
-    study.at_most("noise: share of flat pixels refined, 4 rays a pixel or more", most, 0.03, why)
-    why = "noise of 0.03, edges from a contrast of 0.2: at three deviations either way, most of them"
-    found = min(row["edges"] for row in rows if row["rays a pixel"] == 16)
-    study.at_least("noise: share of edges found with 16 rays", found, 0.55, why)
-    least, why = min(row["blind"] for row in rows), "shows that there is noise to chase"
-    study.at_least("noise: the same flat pixels without the variance", least, 0.3, why)
+    for hold, what, figure, limit, why in (
+        (study.at_most, "share of flat pixels refined, 4 rays a pixel or more",
+         np.max([row["flat"] for row in rows if row["rays a pixel"] >= 4]), 0.03,
+         "three deviations: 0.3 % for one normal value; estimated from 4 samples, tails are longer"),
+        (study.at_least, "share of edges found with 16 rays",
+         min(row["edges"] for row in rows if row["rays a pixel"] == 16), 0.55,
+         "noise of 0.03, edges from a contrast of 0.2: at three deviations either way, most of them"),
+        (study.at_least, "the same flat pixels without the variance", min(row["blind"] for row in rows), 0.3,
+         "shows that there is noise to chase"),
+    ):  # fmt: skip
+        hold(f"noise: {what}", figure, limit, why)
 
 
 def depth_of_field(study: Study, *, quick: bool) -> None:

@@ -88,9 +88,8 @@ def pointwise(study: Study, *, quick: bool) -> None:
     for variant in study.each("points", variants):
         runtime.use(variant)
         pairs = SCALAR_PAIRS if is_scalar() else 5_000 if quick else 200_000
-        for alpha in ALPHAS:
-            row = {"variant": variant, "alpha": alpha, "pairs": pairs}
-            rows.append(row | compare_pointwise(alpha, count=pairs))
+        of = {"variant": variant, "pairs": pairs}
+        rows += [{**of, "alpha": alpha, **compare_pointwise(alpha, count=pairs)} for alpha in ALPHAS]
     runtime.use(before)
     study.records("pointwise", "Largest relative differences from roughconductor", rows)
     why = "exp of up to 16, of arguments right to roundings"

@@ -104,9 +104,9 @@ def hold(study: Study, name: str, error: np.ndarray, reason: np.ndarray) -> dict
         "share of pixels off by > 1/255": (np.mean(error > STEP), SHARE, edges),
         "pixels off without a reason": (left, 0, "reasons are found by rays that are moved"),
     }
-    for what, (figure, limit, why) in found.items():
-        study.at_most(f"scene {name}: {what}", figure, limit, why)
-    return {what: figure for what, (figure, *_) in found.items()}
+    for what, bound in found.items():
+        study.at_most(f"scene {name}: {what}", *bound)
+    return {what: bound[0] for what, bound in found.items()}
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -118,10 +118,7 @@ def run(study: Study, *, quick: bool) -> None:
         counts = {word: int(np.sum(reason == i)) for i, word in enumerate(REASONS)}
         size = "{}x{}".format(*sizes[quick])
         rows.append({"scene": name, "size": size, **found, "largest": error.max(), **counts})
-    note = (
-        "One sample per pixel. Fresnel is exact, and Schlick's in the crowds. Pixels off by more than 1/255 "
-    )
-    note += "are counted by reason."
+    note = "One sample per pixel. Fresnel is exact, and Schlick's in the crowds. By reason: pixels off."
     study.records("scenes", "Our pictures against the float64 tracer", rows, note)
     lattices(study)
 

@@ -33,7 +33,8 @@ def run(study: Study, *, quick: bool) -> None:
         for name, what, why, measured, *held in cases(quick):
             verdict = "-", "cannot hold"
             if held:
-                bound = Bound(f"{title}: {name}", float(measured), *held, note=why)
+                limit, at_most = (*held, True)[:2]
+                bound = Bound(f"{title}: {name}", float(measured), limit, at_most, why)
                 study.bounds.append(bound)
                 verdict = f"{bound.sign} {bound.limit:.3g}", bound.verdict
             rows.append((name, what, why, float(measured), *verdict))

@@ -57,7 +57,7 @@ CORNERS = np.array([(-0.8, -0.5, 0.1), (0.9, -0.3, -0.2), (0.1, 0.9, 0.3)])
 SOLIDS: dict[str, Callable[[float], Any]] = {
     "spheres": lambda size: Sphere((0, 0, 0), size, MIRROR),
     "planes": lambda size: Plane((0.6, 0.64, 0.48), 0.3 * size, MIRROR),
-    "meshes": lambda size: Mesh(np.float32(CORNERS * size), np.uint32([[0, 1, 2]]), MIRROR),
+    "meshes": lambda size: Mesh(np.float32(CORNERS * size), np.array([[0, 1, 2]], np.uint32), MIRROR),
     "cones": lambda size: Cone(*ends(size), 0.5 * size, MIRROR),
     "cylinders": lambda size: Cylinder(*ends(size), 0.5 * size, MIRROR),
 }

@@ -127,8 +127,8 @@ def cases(quick: bool) -> Iterator[tuple[Any, ...]]:
             for drawn, options in ((other, settings), (changed, settings | setting))
         )
         yield name, what, "roundings", difference(image, truth), limit
-        almost = "a scene or setting almost the same"
-        yield f"{name}, its fault", almost, "must be seen", difference(wrong, truth), 2 * limit, False
+        what = "a scene or setting almost the same"
+        yield f"{name}, its fault", what, "must be seen", difference(wrong, truth), 2 * limit, False
 
 
 def difference(image: np.ndarray, truth: np.ndarray) -> float:
