@@ -37,14 +37,8 @@ OWN |= dict.fromkeys(("reciprocity", "eval_pdf", "components", "switch"), 1e-6)
 
 # Albedos by angle that the tests of Nori give for a BSDF of this family, and its parameters
 NORI = {0: 0.207067, 45: 0.215733, 60: 0.247884, 80: 0.430936, 85: 0.519016}
-NORI_BSDF = {
-    "alpha": 0.1,
-    "int_ior": 1.5,
-    "ext_ior": 1.000277,
-    "fresnel": "dielectric",
-    "diffuse_reflectance": rgb((0.1, 0.2, 0.15)),
-    "specular_reflectance": 0.8,
-}
+NORI_BSDF = {**EXACT, "alpha": 0.1, "int_ior": 1.5, "ext_ior": 1.000277, "specular_reflectance": 0.8}
+NORI_BSDF |= {"diffuse_reflectance": rgb((0.1, 0.2, 0.15))}
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 # The rational fit of G₁ strays by this much from Smith's function, and so may the energy
 G1_FIT = 3.5e-3
