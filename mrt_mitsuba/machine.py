@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.errors import MrtError, UsageError
 
 # For every pixel: what is kept, by channel, and what Pillow needs to write a PNG
 BYTES_PER_CHANNEL = 4
@@ -159,8 +159,14 @@ def memory(root: Path = Path("/")) -> tuple[int, int]:
     return max(0, min(limits + free)), min(limits)
 
 
-def check_addresses() -> None:
-    """Raise ``UsageError`` where the limit of addresses is too low to start: libraries would crash."""
+def check_start() -> None:
+    """Raise ``MrtError`` where Mitsuba could not even be imported: its libraries would crash."""
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:
+        raise MrtError(
+            "the working folder has been deleted, and Mitsuba needs one: change to another"
+        ) from error
     free = _free_addresses()
     if free is not None and free < ADDRESSES_TO_START:
         raise UsageError(

@@ -14,9 +14,9 @@ from functools import cache, wraps
 from typing import Any
 
 from mrt_mitsuba import llvm
-from mrt_mitsuba.errors import MrtError, MrtWarning, UnknownVariantError, VariantError
+from mrt_mitsuba.errors import MrtWarning, UnknownVariantError, VariantError
 from mrt_mitsuba.interrupts import held
-from mrt_mitsuba.machine import check_addresses, usable_cores
+from mrt_mitsuba.machine import check_start, usable_cores
 
 FAST = "llvm_ad_rgb"
 SLOW = "scalar_rgb"
@@ -73,17 +73,6 @@ def load() -> None:
     """Import Mitsuba, with less to do than by itself."""
     with held(), rewriting_later():
         import mitsuba  # noqa: F401
-
-
-def check_start() -> None:
-    """Raise ``MrtError`` where Mitsuba could not even be imported."""
-    try:
-        os.getcwd()
-    except FileNotFoundError as error:
-        raise MrtError(
-            "the working folder has been deleted, and Mitsuba needs one: change to another"
-        ) from error
-    check_addresses()
 
 
 def register() -> None:
@@ -148,11 +137,12 @@ def versions() -> dict[str, str]:
 
     from mrt_mitsuba import __version__
 
+    version = llvm.prepare().version
     return {
         "mrt-mitsuba": __version__,
         "mitsuba": mi.__version__,
         "drjit": dr.__version__,
-        "llvm": llvm.version_text(llvm.prepare().version),
+        "llvm": ".".join(map(str, version)) if version else "of unknown version",
     }
 
 

@@ -100,14 +100,10 @@ class MrtBSDF(mi.BSDF):
         components = []
         for lobe in LOBES:
             flags = getattr(mi.BSDFFlags, lobe.flag) | mi.BSDFFlags.FrontSide
-            if any(self._varies(name) for name in (lobe.reflectance, *lobe.numbers)):
+            if any(varies(self.parameters.get(name)) for name in (lobe.reflectance, *lobe.numbers)):
                 flags |= mi.BSDFFlags.SpatiallyVarying
             components.append(flags)
         self.m_components, self.m_flags = components, reduce(or_, components)
-
-    def _varies(self, name: str) -> bool:
-        parameter = self.parameters.get(name)
-        return isinstance(parameter, mi.Texture) and varies(parameter)
 
     def traverse(self, callback: Any) -> None:
         for name, parameter in self.parameters.items():
@@ -132,7 +128,7 @@ class MrtBSDF(mi.BSDF):
         """Return the parameters as plain numbers [1 + lobes, 4], or why they are none: numbers, and a
         reflectance for each lobe.
         """
-        if "f0" in self.parameters or any(self._varies(name) for name in self.parameters):
+        if "f0" in self.parameters or any(map(varies, self.parameters.values())):
             return VARYING
         given = self.lobes(dr.zeros(mi.SurfaceInteraction3f), True).given
         if dr.grad_enabled(given):

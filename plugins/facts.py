@@ -135,7 +135,7 @@ def is_textured(bsdf: Any) -> bool:
     """Return whether a BSDF varies over its surface; the flags of Mitsuba's own do not say so."""
     if hasattr(bsdf, "mirror_bound"):
         return mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
-    return any(isinstance(node, mi.Texture) and varies(node) for node in mi.traverse(bsdf).hierarchy)
+    return any(map(varies, mi.traverse(bsdf).hierarchy))
 
 
 def is_oriented(bsdf: Any) -> bool:

@@ -133,6 +133,7 @@ LOBES: tuple[Any, ...] = (Diffuse(), Specular())
 TABLED = ("alpha", "int_ior", "ext_ior")
 
 
+@dataclass(eq=False)
 class Lobes:
     """Value, density and samples of the lobes, seen from the local direction ``wi``.
 
@@ -140,8 +141,10 @@ class Lobes:
     derivatives (detached sampling): only the value, divided by the density, follows the parameters.
     """
 
-    def __init__(self, form: str, given: dict[str, Any], wi: mi.Vector3f, *, visible: bool = True) -> None:
-        self.form, self.given, self.wi, self.visible = form, given, wi, visible
+    form: str  # of Fresnel's reflectance
+    given: dict[str, Any]
+    wi: mi.Vector3f
+    visible: bool = True  # are visible normals sampled
 
     @cached_property
     def constant(self) -> Lobes:

@@ -52,11 +52,13 @@ def _checked(props: Any, name: str, default: Any, right: Callable[[Any], Any], a
 def integer(props: Any, name: str, default: int, *, least: int, most: float = math.inf) -> int:
     """Return an integer parameter from ``least`` to ``most``."""
     limits = f">= {least}" if most == math.inf else f"from {least} to {most}"
-
-    def right(value: Any) -> bool:
-        return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
-
-    return _checked(props, name, default, right, f"an integer {limits}")
+    return _checked(
+        props,
+        name,
+        default,
+        lambda v: isinstance(v, int) and not isinstance(v, bool) and least <= v <= most,
+        f"an integer {limits}",
+    )
 
 
 def segments(props: Any, default: int) -> int:

@@ -13,6 +13,7 @@ last snapshot is the same object as then; one with derivatives never is, as what
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, TypeVar
 
@@ -26,14 +27,14 @@ Value = TypeVar("Value")
 PLAIN = (bool, int, float, str, bytes, type(None))
 
 
+@dataclass(eq=False)
 class Part:
     """Some objects with their textures and the like, as they are; equal to itself only."""
 
-    def __init__(self) -> None:
-        self.state: list[Any] = []  # what is compared
-        self.steady = True  # no derivatives are wanted
-        self._held: dict[int, Any] = {}  # objects, by id
-        self._arrays: list[Any] = []
+    state: list[Any] = field(default_factory=list)  # what is compared
+    steady: bool = True  # no derivatives are wanted
+    _held: dict[int, Any] = field(default_factory=dict)  # objects, by id
+    _arrays: list[Any] = field(default_factory=list)
 
     def add(self, thing: Any, elsewhere: tuple[type, ...], *facts: Any) -> None:
         """Add an object and what it holds, but for objects of the classes that belong ``elsewhere``."""
@@ -124,19 +125,16 @@ class Kept(dict[str, tuple[Hashable, Any]]):
 def parameters_of(thing: Any) -> list[tuple[str, Any, Any]]:
     """Return the parameters of one object: name, value, and how ``mi.get_property`` reads it, or None."""
     found = _collector(mi.variant())()
+    found.entries = []
     thing.traverse(found)
     return found.entries
 
 
 @cache
-def _collector(variant: str) -> type:
+def _collector(variant: str) -> Any:
     """Return the class of what collects parameters, for a variant: there is none before one is chosen."""
 
     class Collector(mi.TraversalCallback):
-        def __init__(self) -> None:
-            super().__init__()
-            self.entries: list[tuple[str, Any, Any]] = []
-
         def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
             self.entries.append((name, value, cpptype))
 

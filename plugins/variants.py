@@ -37,9 +37,11 @@ def but_not(mask: mi.Bool, excluded: mi.Bool) -> mi.Bool:
     return mask & ~excluded if is_jit() else mask and not excluded
 
 
-def varies(texture: mi.Texture) -> bool:
-    """Return whether a texture varies over a surface; Mitsuba's ``mesh_attribute`` denies that it does."""
-    return texture.is_spatially_varying() or texture.class_name() == "MeshAttribute"
+def varies(value: Any) -> bool:
+    """Return whether a value is a texture that varies over a surface; ``mesh_attribute`` denies it."""
+    if not isinstance(value, mi.Texture):
+        return False
+    return bool(value.is_spatially_varying() or value.class_name() == "MeshAttribute")
 
 
 def largest(texture: mi.Texture) -> float:

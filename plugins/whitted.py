@@ -117,9 +117,6 @@ class MrtWhitted(mi.SamplingIntegrator):
         trace = self.trace(scene, sampler, mi.Ray3f(ray), active, self._rendering)
         return mi.depolarizer(trace.radiance), trace.hit.found, []
 
-    def aov_names(self) -> list[str]:
-        return []
-
     def to_string(self) -> str:
         return (
             f"MrtWhitted[max_depth={self.max_depth}, clamp={self.clamp}, "

@@ -14,7 +14,7 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import SWITCH, Kind, check, choice, either, option, table
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
-from mrt_mitsuba.scene.model import check_model_options
+from mrt_mitsuba.scene.open import is_obj
 from mrt_mitsuba.scene.report import NUMBERS
 
 # What ``log`` shows, from the fewest records to the most, as Python, Mitsuba and Dr.Jit call them
@@ -92,7 +92,7 @@ def parse(arguments: Sequence[str]) -> Options:
             hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
             raise UsageError(f"unknown option {strange!r}.{hint}")
     options = Options(**values, params=params or None)
-    check_model_options(options.scene, options.model())
+    is_obj(options.scene, options.model())
     return options
 
 

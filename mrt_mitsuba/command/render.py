@@ -13,7 +13,8 @@ from mrt_mitsuba.command.options import LEVELS, Options
 from mrt_mitsuba.errors import MrtWarning, printable
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.rendering.settings import AA, AAMODE, NOISE
-from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, is_obj
+from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE
+from mrt_mitsuba.scene.open import is_obj
 
 
 def run(options: Options) -> int:
@@ -80,7 +81,7 @@ def banner(options: Options) -> str:
 
         scene = report_scene(options.scene)
         distance, reach = options.focus(scene.focal_distance, scene.focal_range)
-    film = "from the file" if options.inputs() and not is_obj(options.scene) else ""
+    film = "from the file" if options.inputs() and not is_obj(options.scene, {}) else ""
     aamode = options.aamode or (NOISE if options.rmse else None)
     lines = {
         "Scene": printable(str(options.scene)),

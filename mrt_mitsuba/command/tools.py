@@ -15,7 +15,8 @@ from mrt_mitsuba import llvm
 from mrt_mitsuba.command.options import TABLE, parse
 from mrt_mitsuba.command.registry import COMMANDS
 from mrt_mitsuba.errors import MrtError, SceneError, UsageError
-from mrt_mitsuba.scene.model import MODEL_OPTIONS, is_obj
+from mrt_mitsuba.scene.model import MODEL_OPTIONS
+from mrt_mitsuba.scene.open import is_obj
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
 if sys.version_info >= (3, 11):
@@ -126,7 +127,7 @@ def export(place: str, /, *, xml: str, stock: str = "", **given: str) -> int:
 
     check_target(xml, options.inputs())
     kept = {name: getattr(options, name) for name in ("width", "height", "fresnel", "params")}
-    kept |= options.model() if is_obj(options.scene) else {}
+    kept |= options.model() if is_obj(options.scene, {}) else {}
     print(f"Wrote {' and '.join(write_xml(options.scene, xml, flavor='stock' if stock else 'mrt', **kept))}")
     return 0
 

@@ -112,7 +112,8 @@ class Exposer:
     """
 
     def __init__(self, job: Job, shader: Shader, film: Film | None, layers: Set[str]) -> None:
-        self.job, self.shader, self.film = job, shader, film
+        self.job, self.shader = job, shader
+        self.film: Any = film  #: None for a lattice
         own = ("image", "square") if film else ()  # which a film knows by itself
         self.layers = [name for name in TABLE if name in layers and name not in own]
         self.names = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]

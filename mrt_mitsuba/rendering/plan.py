@@ -127,10 +127,14 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
     frames = moments if motion == "frames" and (detector or blur) else 1
     traced = _traced(asked & shader.layers, blur, detector, shader, settings)
     passes = _passes(traced, detector, shader, settings, frames)
-    passes += [Pass(BLUR, mode=blur)] if blur else []
+    passes += [Pass(BLUR, mode=str(blur))] * bool(blur)
     made = {step.name for step in passes}
     returned = asked | {name for name in possible if made & set(TABLE[name].free_with)}
-    region = _region(source, settings)
+    region = Region(*(settings.region or (0, 0, source.width, source.height)))
+    channels = sum(len(TABLE[name].letters) for name in traced | returned)
+    # sums by pixel, in double precision, while a film is exposed
+    sums = ROUND_CHANNELS if ROUNDS in made else FILM_CHANNELS
+    channels += on_film * (sums + OWN_CHANNELS * len(film.bands + shader.aovs))
     reach = edges.REACH * bool(detector) + dof.REACH * bool(blur)
     plan = Plan(
         scene=source.name,
@@ -146,7 +150,7 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
         region=region,
         seen=region.grown(reach, source.width, source.height),
         samples=int(settings.aa or 1) ** 2,
-        channels=_channels(traced | returned, ROUNDS in made, shader if on_film else None),
+        channels=channels,
         blur=blur,
         motion=motion,
         moments=moments,
@@ -156,23 +160,6 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
         left_out=_left_out(traced, made, source.own, shader, settings),
     )
     return plan, settings.but(layers=tuple(name for name in settings.layers if name in returned))
-
-
-def _region(source: Source, settings: RenderSettings) -> Region:
-    region = Region(*(settings.region or (0, 0, source.width, source.height)))
-    if region.x + region.width > source.width or region.y + region.height > source.height:
-        size = f"{source.width}x{source.height} pixels"
-        raise UsageError(f"region={settings.region}: it exceeds the picture, {size}")
-    return region
-
-
-def _channels(kept: frozenset[str], rounds: bool, on_film: Shader | None) -> int:
-    """Return how many float32 values are kept for every pixel."""
-    channels = sum(len(TABLE[name].letters) for name in kept)
-    if on_film:  # sums by pixel, in double precision, while it is exposed
-        channels += ROUND_CHANNELS if rounds else FILM_CHANNELS
-        channels += OWN_CHANNELS * len(on_film.film.bands + on_film.aovs)
-    return channels
 
 
 def _traced(
@@ -195,6 +182,10 @@ def _decided(settings: RenderSettings, source: Source, shader: Shader) -> Render
     own, whole, aamode = source.own, not shader.layers, settings.aamode
     distance, reach = settings.focus(source.focal_distance, source.focal_range)
     _check(settings, shader, distance)
+    x, y, width, height = settings.region or (0, 0, 1, 1)
+    if x + width > source.width or y + height > source.height:
+        size = f"{source.width}x{source.height} pixels"
+        raise UsageError(f"region={settings.region}: it exceeds the picture, {size}")
     # Mitsuba's integrators draw random numbers for every ray, and their noise would pass for edges
     plain = (own or whole) and shader.random and settings.aa is None
     if aamode is None:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
-from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.options import choice, integer
 
 if TYPE_CHECKING:
@@ -32,18 +32,6 @@ LARGEST = 3.4e38  # number that Mitsuba's float32 can hold
 FOCAL_RANGE = 2.0  # half-width of the sharp zone
 # What is of use only with an OBJ file
 MODEL_OPTIONS = ("convention", "texturing", "camera", "target", "up", "fov", "light")
-
-
-def is_obj(scene: object) -> bool:
-    """Return whether a scene is given as the path of an OBJ file."""
-    return isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".obj")
-
-
-def check_model_options(scene: object, given: Mapping[str, Any]) -> None:
-    """Raise ``UsageError`` for options of an OBJ file where the scene is none."""
-    useless = [name for name, value in given.items() if (name, value) != ("convention", "report")]
-    if useless and not is_obj(scene):
-        raise UsageError(f"{useless[0]} is of use only with an OBJ file: scene=PATH.obj")
 
 
 @dataclass(frozen=True)

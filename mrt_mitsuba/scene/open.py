@@ -13,7 +13,7 @@ from typing import Any
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.scene.loading import load_dict, load_file
-from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene, check_model_options, is_obj
+from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene
 from mrt_mitsuba.scene.report import report_scene
 
 WIDEST_FILTER = 1024  # pixels: the largest radius of a film's filter
@@ -91,13 +91,24 @@ def open_scene(
     )
 
 
+def is_obj(scene: object, model: Mapping[str, Any]) -> bool:
+    """Return whether a scene is given as the path of an OBJ file.
+
+    Raises ``UsageError`` where it is not, for options of ``model_scene``.
+    """
+    obj = isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".obj")
+    useless = [name for name, value in model.items() if (name, value) != ("convention", "report")]
+    if useless and not obj:
+        raise UsageError(f"{useless[0]} is of use only with an OBJ file: scene=PATH.obj")
+    return obj
+
+
 def in_terms(scene: Any, model: Mapping[str, Any]) -> Scene | None:
     """Return a number, a ``Scene`` or the path of an OBJ file in the report's terms; None for anything else.
 
     ``model``: options of ``obj_scene``. Raises ``UsageError`` where they are of no use.
     """
-    check_model_options(scene, model)
-    if is_obj(scene):
+    if is_obj(scene, model):
         from mrt_mitsuba.scene.obj import obj_scene  # with numpy
 
         return obj_scene(scene, **model)
