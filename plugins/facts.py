@@ -50,7 +50,9 @@ class Reading:
             (shapes, lights),
             lambda: any_touching(snapshot.shapes, list(filter(None, map(place, self.lights[:MOST_LIGHTS])))),
         )
-        self.facts = SceneFacts(**of_lights, **of_materials, **of_shapes, touching=touching)
+        self.facts = SceneFacts(
+            **of_lights, **of_materials, **of_shapes, touching=touching, pinhole=snapshot.eye is not None
+        )
 
     def _read_shapes(self) -> dict[str, Any]:
         meshes = [s for s in (*self.native, *self.snapshot.inner) if s.is_mesh()]

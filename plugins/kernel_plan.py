@@ -22,6 +22,9 @@ UNROLLED_LIGHTS = 8
 # pairs of an object and a light, the lists are too long for a processor's caches
 LEAST_BUFFERED, MOST_PAIRS = 64, 2**17
 
+# Beyond, lists of what the eye sees take longer to make than they save
+MOST_SEEN = 2**14
+
 BUDGETS = ("report", "plain")
 
 # Why materials have no place in one table
@@ -54,6 +57,7 @@ class KernelPlan:
     quadrics: tuple[str, ...]  #: kinds of exact quadrics; others are traced as meshes
     planes: bool  #: analytic planes, else they are traced as meshes
     buffers: bool  #: lists of what may be in the way of a light, in place of a search
+    eye: bool  #: lists of the quadrics that the camera may see, in place of a search
     touching: bool  #: shadow rays that end short of lights on surfaces
     random: bool  #: random numbers
     emission: bool  #: surfaces that emit
@@ -79,6 +83,7 @@ def _case(facts: SceneFacts, tracer: Any, own_sky: float | None, made: Mapping[s
     sky = facts.sky if own_sky is None else own_sky
     lights = facts.lights if tracer.clamp or facts.lights == 0 else math.inf
     arriving = lights + max(1, sky) + facts.emission
+    quadrics = sum(count for _, count in facts.quadrics)
     affordable = [m for m in facts.mirrors if bounce_cost(tracer, m.int_ior) < tracer.max_depth]
     return SimpleNamespace(
         facts=facts,
@@ -89,7 +94,8 @@ def _case(facts: SceneFacts, tracer: Any, own_sky: float | None, made: Mapping[s
         visible=any(m.reflectance * arriving > tracer.min_contribution for m in affordable),
         sky="parameter" if own_sky is not None else "environment" if facts.environment else "none",
         lobes=tuple(name for name, there in facts.lobes if there),
-        objects=facts.native_shapes + sum(count for _, count in facts.quadrics),
+        quadrics=quadrics,
+        objects=facts.native_shapes + quadrics,
     )
 
 
@@ -205,6 +211,16 @@ RULES = (
             _OTHERS: case.facts.native_shapes > 0 and case.made["spheres"] != "table",
             "few objects": case.objects < LEAST_BUFFERED,
             "too many lights and objects": case.objects * case.facts.lights > MOST_PAIRS,
+        },
+    ),
+    Rule(
+        "eye", "lists around the eye",
+        lambda facts, plan: "lists around the eye: what its rays may meet",
+        lambda case: {
+            SCALAR_VARIANT: not case.facts.vectorised,
+            "few cones and cylinders": case.quadrics < LEAST_BUFFERED,
+            "too many cones and cylinders": case.quadrics > MOST_SEEN,
+            "the camera is no pinhole": not case.facts.pinhole,
         },
     ),
     Rule(

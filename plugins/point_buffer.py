@@ -1,6 +1,6 @@
-"""Which objects are seen from a light: lists of them for the cells of a cube around it.
+"""Which objects are seen from a point, a light or the eye: lists of them for the cells of a cube around it.
 
-A ray to the light looks up the cell that it comes through and tests the objects listed there, one or
+A ray to or from the point looks up the cell that it comes through and tests the objects listed there, one or
 two of hundreds, in place of a walk down a tree. Each list begins with the object nearest to the point, and a
 ray leaves it where all others are beyond its end, or behind its hit. The lists are conservative: objects are
 taken for wider by what float32 loses; what a ray meets is for the test of each to say.
@@ -79,18 +79,43 @@ class PointBuffer:
         self.lists, self.faces = aligned(lists), aligned(np.concatenate([start, scale], axis=1))
         self.starts = aligned(np.where(counts > 0, ends - counts - 1, ends[-1]), np.uint32)
         self.size = dr.opaque(mi.UInt32, size)  # data: one kernel serves all places and sizes
+        self.place = dr.opaque(mi.Point3f, places[0].tolist())
+        self.off = dr.opaque(mi.Float, _OFF_PLACE * extent)
         dr.eval(self.starts, self.lists, self.faces)
 
     def any(self, light: Any, to_light: Any, active: Any, test: Callable[[Any], Any]) -> Any:
         """Return whether ``test(object)`` holds of an object listed where a ray comes to ``light`` from."""
-        d, far = -to_light, dr.abs(to_light)
+
+        def visit(thing: Any, state: tuple) -> tuple:
+            return (dr.select(test(thing), -1, state[0]),)
+
+        state = (mi.Float(1 + _SHORT),)
+        return self._walk(light, mi.Vector3f(0), -to_light, active, visit, state)[0] < 0
+
+    def nearest(self, ray: Any, active: Any, visit: Callable, state: tuple) -> tuple[tuple, Any]:
+        """Call ``visit(object, state)`` as a tree does for rays that come from the first point, wherever they
+        start; return the last state, and which rays these are.
+        """
+        o = ray.o - self.place
+        off = dr.norm(dr.cross(o, ray.d)) > self.off * dr.norm(ray.d)
+        active = active & ~off & (dr.dot(o, ray.d) >= 0)
+        return self._walk(mi.UInt32(0), o, ray.d, active, visit, state), active
+
+    def _walk(self, point: Any, o: Any, d: Any, active: Any, visit: Callable, state: tuple) -> tuple:
+        """Visit the objects listed where a ray goes from a point, until all others are beyond its reach: the
+        first of ``state``, in lengths of ``d`` from ``o``, which is relative to the point.
+        """
+        far = dr.abs(d)
         on_x = (far.x >= far.y) & (far.x >= far.z)
         on_y = ~on_x & (far.y >= far.z)
-        along = dr.select(on_x, d.x, dr.select(on_y, d.y, d.z))
-        backwards, depth = along < 0, dr.abs(along)
+
+        def along(v: Any) -> Any:
+            return dr.select(on_x, v.x, dr.select(on_y, v.y, v.z))
+
+        depth, start = along(far), dr.abs(along(o))
         inverse = 1 / depth
         face = dr.select(on_x, mi.UInt32(0), dr.select(on_y, mi.UInt32(2), 4))
-        face += dr.select(backwards, mi.UInt32(1), 0) + 6 * light
+        face += dr.select(along(d) < 0, mi.UInt32(1), 0) + 6 * point
         low_u, low_v, scale_u, scale_v = dr.gather(mi.Vector4f, self.faces, face)
 
         def cell(across: Any, low: Any, scale: Any) -> Any:
@@ -104,11 +129,10 @@ class PointBuffer:
         row = cell(dr.select(on_x | on_y, d.z, d.y), low_v, scale_v)
         column = cell(dr.select(on_x, d.y, d.x), low_u, scale_u)
         first = dr.gather(mi.UInt32, self.starts, (face * self.size + row) * self.size + column)
-        end = depth * (1 + _SHORT)
         return dr.while_loop(
-            (first, *entry(first), mi.Bool(False)),
-            lambda k, near, thing, blocked: active & (near < end) & ~blocked,
-            lambda k, near, thing, blocked: (k + 1, *entry(k + 1), test(thing)),
+            (first, *entry(first), state),
+            lambda k, near, thing, state: active & (near < dr.fma(state[0], depth, start)),
+            lambda k, near, thing, state: (k + 1, *entry(k + 1), visit(thing, state)),
             label="point buffer",
         )[3]
 

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from .intersect import LATERAL, Frame
+from .point_buffer import PointBuffer
 from .quadric_kinds import KINDS
 from .tree import Tree
 from .variants import aligned, is_jit, shape_ids
@@ -50,13 +51,32 @@ class Quadrics:
         frames = [s.moving_frame() for s in shapes]
         self.moving = [(k, f) for k, f in zip(leaves, frames, strict=True) if f is not None]
 
-    def intersect(self, ray: Any, active: Any) -> tuple[Any, Any, Any]:
-        """Return distance, place in the rows and part of the nearest quadric; ``ray.maxt`` for none."""
-        return self._walk(ray, active, any_hit=False)
+    def intersect(
+        self, ray: Any, active: Any, eye: PointBuffer | None = None, *, any_hit: bool = False
+    ) -> tuple[Any, Any, Any]:
+        """Return distance, place in the rows and part of the nearest quadric; ``ray.maxt`` for none.
+
+        ``eye``: lists for a point that rays may come from. ``any_hit``: another than the nearest will do.
+        """
+
+        def visit(leaf: Any, state: tuple) -> tuple:
+            t, part = self._meet(leaf, ray)
+            closer = t < state[0]
+            return tuple(dr.select(closer, *pair) for pair in zip((t, leaf, part), state, strict=True))
+
+        state = mi.Float(ray.maxt), mi.UInt32(0), mi.Int32(LATERAL)
+        if eye is not None:
+            state, seen = eye.nearest(ray, active, visit, state)
+            active = active & ~seen
+        if is_jit():
+            return self.tree.walk(ray, active, visit, state, any_hit=any_hit)
+        for k in range(self.count) if active else ():
+            state = visit(k, state)
+        return state
 
     def occluded(self, ray: Any, active: Any) -> Any:
         """Return whether there is a quadric before ``ray.maxt``."""
-        return active & (self._walk(ray, active, any_hit=True)[0] < ray.maxt)
+        return active & (self.intersect(ray, active, any_hit=True)[0] < ray.maxt)
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the boxes [n, 2, 3] of the quadrics, and their places in the rows."""
@@ -109,19 +129,6 @@ class Quadrics:
         shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.shapes, leaf, where))
         si.shape = dr.select(where, shape, si.shape)
         si.prim_index = dr.select(where, dr.gather(mi.UInt32, self.faces, leaf, where), si.prim_index)
-
-    def _walk(self, ray: Any, active: Any, *, any_hit: bool) -> tuple[Any, Any, Any]:
-        def visit(leaf: Any, state: tuple) -> tuple:
-            t, part = self._meet(leaf, ray)
-            closer = t < state[0]
-            return tuple(dr.select(closer, *pair) for pair in zip((t, leaf, part), state, strict=True))
-
-        state = mi.Float(ray.maxt), mi.UInt32(0), mi.Int32(LATERAL)
-        if is_jit():
-            return self.tree.walk(ray, active, visit, state, any_hit=any_hit)
-        for k in range(self.count) if active else ():
-            state = visit(k, state)
-        return state
 
     def _row(self, leaf: Any, active: Any = True) -> tuple[Frame, Any, Any]:
         """Return frame, kind and side of the normal."""

@@ -63,6 +63,12 @@ class SceneData:
             (now.light_part, plan.buffers, *form),
             lambda: [(PointBuffer(places, *thing.boxes()), thing) for thing in things],
         )
+        seen = self.quadrics if plan.eye else None
+        self.eye: PointBuffer | None = kept(
+            "eye",
+            (now.eye, plan.eye, *form),
+            lambda: PointBuffer(np.array([now.eye]), *seen.boxes()) if seen is not None else None,
+        )
         self.merged = kept(
             "merged",
             (now.shape_part, now.material_part, plan.merged),
@@ -83,12 +89,14 @@ class SceneData:
         if not tabled or (sky is not None and sky.class_name() != "ConstantBackgroundEmitter"):
             return None
         rays = self._kept("rays", self._form, lambda: _ray_arrays(self.bvh or scene)) if plan.bvh else []
-        own = [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.buffers, self.merged]
-        return [*_arrays_in(own), *rays, self.path_limit, sky]
+        own = [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged]
+        return [*_arrays_in([*own, self.buffers, self.eye]), *rays, self.path_limit, sky]
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 
-    def intersect(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> Hit:
+    def intersect(
+        self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, eye: PointBuffer | None = None
+    ) -> Hit:
         """Return the nearest hit among Mitsuba's shapes, the quadrics and the analytic planes."""
         plan = self.plan
         t, plane, on_plane = self.planes.intersect(ray, active)
@@ -111,7 +119,7 @@ class SceneData:
         if self.quadrics is not None:
             reach = dr.select(found, si.t, ray.maxt)
             nearer = mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths)
-            quadric = self.quadrics.intersect(nearer, active)
+            quadric = self.quadrics.intersect(nearer, active, eye)
             closer = active & (quadric[0] < reach)
             self.quadrics.put_into(si, ray, quadric, closer, tangents=plan.tangents)
             scale = dr.select(closer, self.quadrics.scale(quadric[1], closer), scale)

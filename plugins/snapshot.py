@@ -88,6 +88,12 @@ class Snapshot:
         """Look at a scene; parts that have not changed since ``before`` are taken from there."""
         # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed
         self.shapes, self.emitters, self.environment = scene.shapes(), scene.emitters(), scene.environment()
+        sensor = next(iter(scene.sensors()), None)
+        place = np.zeros(0)
+        if sensor is not None and sensor.class_name() == "PerspectiveCamera":
+            place = np.array(sensor.world_transform().translation(), float).ravel()
+        #: where the rays of the first camera come from; None where that is no point
+        self.eye = tuple(place) if len(place) == 3 and np.isfinite(place).all() else None
         # Groups are traced through their instances, which don't say what group they belong to
         inside = [value for _, value, _ in parameters_of(scene) if isinstance(value, mi.Shape)]
         self.groups = [shape for shape in inside if shape.class_name().startswith("ShapeGroup")]

@@ -12,6 +12,7 @@ import mitsuba as mi
 from .facts import Reading
 from .kernel_plan import BUDGETS, KernelPlan, SceneFacts, make_plan
 from .parameters import LARGEST, choice, flag, integer, number, spectrum
+from .point_buffer import PointBuffer
 from .scene_data import Hit, SceneData
 from .snapshot import Kept, Snapshot
 from .variants import but_not, construct_quietly, largest
@@ -155,9 +156,9 @@ class MrtWhitted(mi.SamplingIntegrator):
         """
         data = self.prepare(scene) if data is None else data
 
-        def follow(s: dict) -> tuple[dict, Hit]:
+        def follow(s: dict, eye: PointBuffer | None = None) -> tuple[dict, Hit]:
             """Trace the next ray of each path."""
-            hit = data.intersect(scene, s["ray"], s["active"])
+            hit = data.intersect(scene, s["ray"], s["active"], eye)
             radiance, shadow_rays, reflectance, cost = self._shade(
                 data, scene, s["sampler"], s["ray"], hit, s["throughput"], s["active"]
             )
@@ -190,7 +191,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             "sampler": sampler if data.plan.random else None,  # for lights that are no points
         }
         # The camera ray, which the layers look at, comes before the loop
-        state, hit = follow(state)
+        state, hit = follow(state, data.eye)
         direct = state["radiance"]
         if data.plan.mirrors:
             (state,) = dr.while_loop(
