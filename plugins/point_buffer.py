@@ -35,11 +35,13 @@ _SHORT = 2.0**-9
 class PointBuffer:
     """Lists of objects for each of some points, in ``size`` x ``size`` cells of each face of its cube.
 
-    The points lie at ``places`` [m, 3]; the objects, by their ``numbers`` [n], in ``boxes`` [n, 2, 3]. The
-    cells of a face divide what the objects take up of it.
+    The points lie at ``places`` [m, 3]; the objects, by their ``numbers`` [n], in ``boxes`` [n, 2, 3] or,
+    with ``balls``, in the balls inside these. The cells of a face divide what the objects take up of it.
     """
 
-    def __init__(self, places: np.ndarray, boxes: np.ndarray, numbers: np.ndarray) -> None:
+    def __init__(
+        self, places: np.ndarray, boxes: np.ndarray, numbers: np.ndarray, balls: bool = False
+    ) -> None:
         faces, size = 6 * len(places), 2 ** int(np.ceil(np.log2(2 * np.sqrt(len(boxes)))))
         extent = float(max(np.abs(places).max(), np.abs(boxes).max()))
         # The test of spheres in float32 also finds what passes by, the farther a ray starts, and is to be
@@ -49,7 +51,7 @@ class PointBuffer:
         slack = np.sqrt(np.minimum(radius**2 + 2.0**-20 * farthest**2, 3 * radius**2)) - radius
         slack = (slack + 2 * _OFF_PLACE * extent)[..., None]
         low, high = boxes[:, 0] - places[:, None] - slack, boxes[:, 1] - places[:, None] + slack
-        columns = zip(*(_seen(low, high, side) for side in range(6)), strict=True)
+        columns = zip(*(_seen(low, high, side, balls) for side in range(6)), strict=True)
         face, thing, near, first, last = (np.concatenate(column) for column in columns)
         start, end = np.full((faces, 2), np.inf), np.full((faces, 2), -np.inf)
         np.minimum.at(start, face, first)
@@ -137,9 +139,9 @@ class PointBuffer:
         )[3]
 
 
-def _seen(low: np.ndarray, high: np.ndarray, side: int) -> tuple[np.ndarray, ...]:
-    """Return pairs of a point and a box that it sees through a face of its cube: the numbers of face and box,
-    the depth where the box begins, and the tangents between which it is seen.
+def _seen(low: np.ndarray, high: np.ndarray, side: int, balls: bool) -> tuple[np.ndarray, ...]:
+    """Return pairs of a point and a box or ball that it sees through a face of its cube: the numbers of face
+    and box, the depth where the box begins, and the tangents between which it is seen.
 
     Sides: those towards x, y and z, each forwards, then backwards. The corners of the boxes are ``low`` and
     ``high`` [points, n, 3] relative to each point.
@@ -147,11 +149,16 @@ def _seen(low: np.ndarray, high: np.ndarray, side: int) -> tuple[np.ndarray, ...
     axis, backwards = divmod(side, 2)
     across = [a for a in range(3) if a != axis]
     near, far = (-high, -low) if backwards else (low, high)
-    near, far = np.maximum(near[..., axis, None], 0), far[..., axis, None]
-    low, high = low[..., across], high[..., across]
+    near, far, low, high = near[..., axis, None], far[..., axis, None], low[..., across], high[..., across]
+    z, radius, along, near = (near + far) / 2, (far - near) / 2, (low + high) / 2, np.maximum(near, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        first = low / np.where(low < 0, near, far) - _OFF_TANGENT
-        last = high / np.where(high > 0, near, far) + _OFF_TANGENT
+        first, last = low / np.where(low < 0, near, far), high / np.where(high > 0, near, far)
+        if balls:  # between the lines that touch them
+            square = np.where(z > 1.001 * radius, z**2 - radius**2, np.nan)
+            root = radius * np.sqrt(square + along**2)
+            first = np.fmax(first, (along * z - root) / square)
+            last = np.fmin(last, (along * z + root) / square)
+    first, last = first - _OFF_TANGENT, last + _OFF_TANGENT
     seen = (far[..., 0] > 0) & ((first < 1) & (last > -1)).all(axis=2)
     point, thing = np.nonzero(seen)
     depth = near[seen][:, 0] * (1 - 2.0**-18)

@@ -130,15 +130,16 @@ class Spheres:
         row = self.by_shape(si, found)
         return mi.Point3f(row.x, row.y, row.z), row.w
 
-    def boxes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the boxes [n, 2, 3] of the spheres, and their numbers; they are then ready for ``block``."""
+    def boxes(self) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Return the boxes [n, 2, 3] of the spheres, their numbers, and that they are balls; they are then
+        ready for ``block``."""
         found = [(s, next(e for e in parameters_of(s) if e[0] == "to_world")) for s in self.shapes]
         frames = [mi.get_property(value, kind, s).matrix for s, (_, value, kind) in found]
         numbers = np.array([[first(m[row][column]) for row in range(3) for column in (0, 3)] for m in frames])
         # To the last bit, which Mitsuba's boxes do not have
         centers, radii = numbers[:, 1::2], np.linalg.norm(numbers[:, ::2], axis=1)[:, None]
         self.balls = Table(mi.Vector4f, np.column_stack([centers, radii]).tolist())
-        return np.stack([centers - radii, centers + radii], axis=1), np.arange(len(radii))
+        return np.stack([centers - radii, centers + radii], axis=1), np.arange(len(radii)), True
 
     def block(self, index: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
         """Return whether a sphere is in the way of a ray: to the bit what Mitsuba says."""
