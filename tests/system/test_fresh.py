@@ -5,14 +5,16 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import edits
 import mitsuba as mi
 import numpy as np
 import pytest
-from nodes import rgb, sensor
+from nodes import group, rgb, sensor
 
 import mrt_mitsuba as mrt
 
@@ -90,3 +92,35 @@ def test_a_prepared_scene_gives_what_render_gives(loaded: bool) -> None:
         parameters.update()
         expected = mrt.render(other, seed=seed, **options).image
         np.testing.assert_array_equal(again(seed=seed).image, expected)
+
+
+def test_lists_around_the_eye_follow_the_camera() -> None:
+    """Whichever camera looks and however it moves, the picture is that of a search; trees are made once."""
+    ends = np.random.default_rng(2).uniform(-1, 1, (80, 6))
+    nodes = {name: node for name, node in content("schlick").items() if name in ("light", "sky", "floor")}
+    nodes["crowd"] = group(np.column_stack([ends, np.full(80, 0.2)]), kind="cone", bsdf=GREEN)
+    size = {"width": 12, "height": 9, "aa": 1, "aamode": "none"}
+    views = sensor([0, 1, 4], [0, 0, 0], (12, 9)), sensor([3, 2, 3], [0, 0, 0], (12, 9))
+    scene = mi.load_dict({"type": "scene", "first": views[0], "other": views[1], **nodes})
+    lists, search = (mi.load_dict({"type": "mrt_whitted", "max_depth": 1}) for _ in range(2))
+    search.kernel_plan = lambda facts: replace(lists.kernel_plan(facts), eye=False)
+    trees, again, parameters = lists.prepare(scene).quadrics, mrt.prepare(scene, **size), mi.traverse(scene)
+    color, slopes = "crowd.bsdf.diffuse_reflectance.value", []
+    for x in (0, 0.1, 3):
+        parameters["first.to_world"] = mi.Transform4f().look_at([x, 1, 4], [0, 0, 0], [0, 1, 0])
+        parameters.update()
+        for view in (0, 1, 0):
+            pictures = [mi.render(scene, integrator=way, sensor=view, spp=4) for way in (lists, search)]
+            np.testing.assert_array_equal(*map(np.array, pictures))
+        data = lists.prepare(scene)
+        assert data.quadrics is trees
+        np.testing.assert_allclose(np.ravel(data.eye.place), (x, 1, 4))
+        np.testing.assert_array_equal(again().image, mrt.render(scene, **size).image)
+    for way in (lists, search):
+        dr.enable_grad(parameters[color])
+        dr.backward(dr.sum(mi.render(scene, parameters, integrator=way, spp=4)))
+        slopes.append(np.array(dr.grad(parameters[color])))
+        parameters[color] = dr.detach(parameters[color])
+        parameters.update()
+    np.testing.assert_allclose(*slopes, rtol=1e-5)
+    assert slopes[0].all()

@@ -60,3 +60,24 @@ def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: f
         expected = np.array(search(ray))
         assert 0.02 < expected.mean() <= (0.98 if number < len(PLACES) else 1)
         np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("size", [1, 1e6])
+@pytest.mark.parametrize("kind", ["cone", "cylinder"])
+def test_lists_around_the_eye_find_what_a_search_finds(kind: str, size: float) -> None:
+    """For rays from there, wherever they start; those from elsewhere are searched for."""
+    starts, ends, radii, aims = crowd(size, 0)
+    things = Quadrics([mi.load_dict(group(np.column_stack([starts, ends, radii]), kind=kind))])
+    for place in size * np.array(PLACES[1:4]):
+        eye, lists = dr.opaque(mi.Point3f, place.tolist()), PointBuffer(place[None], *things.boxes())
+        d = dr.normalize(mi.Point3f(aims.T) - eye)
+        for way, at_eye in ((d, 1), (-d, 0), (dr.cross(d, mi.Vector3f(1, 0, 0)), 0)):
+            start = eye + dr.opaque(mi.Float, 0.3 * size) * way
+            ray = mi.Ray3f(start, d, dr.opaque(mi.Float, 2.0**127), 0, [])
+            dr.eval(ray)
+            found, expected = (things.intersect(ray, mi.Bool(True), where) for where in (lists, None))
+            assert np.mean(np.array(expected[0]) < 1e38) > 0.02
+            np.testing.assert_array_equal(found, expected)
+            listed, seen = lists.nearest(ray, mi.Bool(True), lambda *_: (mi.Float(0),), (ray.maxt,))
+            assert np.mean(seen) == at_eye
+            assert np.mean(np.array(listed[0]) == 0) >= 0.02 * at_eye  # where something is listed

@@ -63,6 +63,7 @@ CHOICES = {
     "planes": ({"a": {"type": "mrt_plane", "normal": [0, 1, 0]}, "b": SPHERE, "light": LIGHT}, False, False),
     "lights": ({"a": SPHERE, "light": LIGHT}, "loop", True),
     "buffers": ({**CROWD, "light": LIGHT}, False, True),
+    "eye": ({"a": GROUP, "light": LIGHT}, False, True),
     "touching": ({"a": SPHERE, "light": {"type": "mrt_light", "position": [0, 0.7, 0]}}, False, False),
     "random": ({"a": SPHERE, "lamp": LAMP}, False, False),
     "emission": ({"a": SPHERE, "lamp": LAMP}, False, False),
@@ -116,6 +117,8 @@ REASONS = [
     ({**CROWD, "light": {"type": "point"}}, "buffers",
      "a light other than mrt_light, or one with derivatives"),
     ({**CROWD, "light": LIGHT, "b": MESH}, "buffers", "other shapes, or spheres that emit or face inwards"),
+    ({"a": CONE}, "eye", "few cones and cylinders"),
+    ({"a": GROUP, "sensor": {"type": "orthographic"}}, "eye", "the camera is no pinhole"),
     ({"a": {**SPHERE, "bsdf": MATTE}}, "mirrors", "no material reflects visibly"),
     ({"a": SPHERE, "integrator": {"type": "mrt_whitted", "max_depth": 1}}, "mirrors",
      "max_depth admits no mirror ray"),
@@ -138,7 +141,7 @@ def test_reasons(content: dict[str, Any], name: str, reason: str) -> None:
     assert loaded.integrator().prepare(loaded).plan.reason(name) == reason
 
 
-def test_no_light_buffers_where_they_would_be_too_long() -> None:
+def test_no_lists_where_they_would_be_too_long() -> None:
     loaded = scene(**CROWD, light=LIGHT)
     integrator = loaded.integrator()
     facts = integrator.prepare(loaded).facts
@@ -146,6 +149,10 @@ def test_no_light_buffers_where_they_would_be_too_long() -> None:
     assert integrator.kernel_plan(facts).buffers
     facts.lights += 1
     assert integrator.kernel_plan(facts).reason("buffers") == "too many lights and objects"
+    facts.quadrics = (("cone", 2**14),)
+    assert integrator.kernel_plan(facts).eye
+    facts.quadrics = (("cone", 2**14 + 1),)
+    assert integrator.kernel_plan(facts).reason("eye") == "too many cones and cylinders"
 
 
 def test_merged_materials_are_recorded_once(monkeypatch: pytest.MonkeyPatch) -> None:
