@@ -35,7 +35,6 @@ CURVED = 32 * 2.0**-24
 # The same for flat ones, in roundings of the numbers across the surface: 11 are proven, in first order
 FLAT = 16 * 2.0**-24
 
-
 # A level triangle at height zero has no error at all, but a ray that starts on it exactly may meet it
 LEAST = 2.0**-12
 

@@ -19,11 +19,9 @@ import numpy as np
 UNROLLED_LIGHTS = 8
 
 # With fewer objects, looking up what is in the way of a light takes as long as searching for it; with more
-# pairs of an object and a light, the lists are too long for a processor's caches
-LEAST_BUFFERED, MOST_PAIRS = 64, 2**17
-
-# Beyond, lists of what the eye sees take longer to make than they save
-MOST_SEEN = 2**14
+# pairs of an object and a light, the lists are too long for a processor's caches; with more objects than
+# ``MOST_SEEN``, those around the eye take longer to make than they save
+LEAST_BUFFERED, MOST_PAIRS, MOST_SEEN = 64, 2**17, 2**14
 
 BUDGETS = ("report", "plain")
 
@@ -48,10 +46,9 @@ class KernelPlan:
     lights: str  #: "none", "unrolled", "loop" that calls each, or "table": a loop over their numbers
     mirrors: bool  #: mirror reflections
     lobes: tuple[str, ...]  #: of the materials: "diffuse", "specular"
-    cut_off: tuple[
-        float, float
-    ]  #: what multiplies a path's throughput (inf: it never ends for being too dim),
-    #: and a light's share at a hit, before they are compared with ``min_contribution``
+    #: what multiplies a path's throughput (inf: it never ends for being too dim), and a light's share at a
+    #: hit, before they are compared with ``min_contribution``
+    cut_off: tuple[float, float]
     bvh: bool  #: Mitsuba's ray queries
     coherent: bool  #: Embree's treatment of packets of like rays
     quadrics: tuple[str, ...]  #: kinds of exact quadrics; others are traced as meshes

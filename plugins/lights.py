@@ -56,9 +56,8 @@ class Lights:
         """Return the direction from ``it`` to a light, by its number, and what arrives from it."""
         kind: Any = None
         if self.called is not None:
-            one = (
-                self.called[light] if self.unrolled else dr.gather(mi.EmitterPtr, self.called, light, active)
-            )
+            called = self.called
+            one = called[light] if self.unrolled else dr.gather(mi.EmitterPtr, called, light, active)
             return one.sample_direction(it, sample, active)
         if self.unrolled:
             kinds, row = [self.kinds[self.kind_of[light]]], self.rows[light]

@@ -39,16 +39,13 @@ class MrtMesh(mi.Mesh):
         extras = {name: _array(props, name, *_EXTRAS[name])[:, : _EXTRAS[name][0]] for name in given}
         if (faces % 1).any():
             raise ParameterError('mrt_mesh: "faces" holds a number that is not whole')
-        wrong = faces[(faces < 0) | (faces >= len(positions))]
+        sizes = count, _ = len(positions), len(faces)
+        wrong = faces[(faces < 0) | (faces >= count)]
         if len(wrong):
-            raise ParameterError(
-                f'mrt_mesh: "faces" holds {wrong[0]}, but there are {len(positions)} positions'
-            )
+            raise ParameterError(f'mrt_mesh: "faces" holds {wrong[0]}, but there are {count} positions')
         for name, array in extras.items():
-            if len(array) != len(positions):
-                raise ParameterError(
-                    f'mrt_mesh: "{name}" has {len(array)} entries for {len(positions)} positions'
-                )
+            if len(array) != count:
+                raise ParameterError(f'mrt_mesh: "{name}" has {len(array)} entries for {count} positions')
         if "to_world" in props:
             placement = Placement(props)
             positions = placement.points(positions.astype(np.float64))
@@ -58,7 +55,6 @@ class MrtMesh(mi.Mesh):
         if "normals" in extras:
             lengths = np.linalg.norm(extras["normals"], axis=1, keepdims=True)
             extras["normals"] = extras["normals"] / np.where(lengths == 0, 1, lengths)
-        sizes = len(positions), len(faces)
         buffers = {f"has_vertex_{name}": name in extras for name in _EXTRAS}
         mi.Mesh.__init__(self, "mrt_mesh", *sizes, props, **buffers)
         arrays = {"positions": positions, **extras}

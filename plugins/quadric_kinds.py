@@ -24,7 +24,6 @@ POINT, DISC, BALL = (0, 0, 0), (1, 1, 0), (1, 1, 1)
 Hit = tuple[Any, Any]  # t in units of |d|, inf for a miss, and the part of the surface
 SurfacePoint = tuple[Any, Any, Any, Any]  # on the surface; the outward unit normal; texture coordinates u, v
 
-
 # Vertices [n, 8] in the unit frame: place, gradient that becomes the normal, and texture coordinates; faces
 # [m, 3], counter-clockwise seen from outside in a right-handed frame
 UnitMesh = tuple[np.ndarray, np.ndarray]
@@ -40,9 +39,8 @@ class Sphere:
         """Return the unit frame of a sphere."""
         inverse = 1 / radius
         zero, make = 0 * inverse, type(center)
-        return Frame(
-            center, make([inverse, zero, zero]), make([zero, inverse, zero]), make([zero, zero, inverse])
-        )
+        rows = [inverse, zero, zero], [zero, inverse, zero], [zero, zero, inverse]
+        return Frame(center, *map(make, rows))
 
     def intersect(self, o: Any, d: Any, frame: Frame) -> Hit:
         """Return the first hit at t > 0."""

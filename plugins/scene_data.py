@@ -64,10 +64,9 @@ class SceneData:
             lambda: [(PointBuffer(places, *thing.boxes()), thing) for thing in things],
         )
         seen = self.quadrics if plan.eye else None
+        around = (now.eye, plan.eye, *form)
         self.eye: PointBuffer | None = kept(
-            "eye",
-            (now.eye, plan.eye, *form),
-            lambda: PointBuffer(np.array([now.eye]), *seen.boxes()) if seen is not None else None,
+            "eye", around, lambda: None if seen is None else PointBuffer(np.array([now.eye]), *seen.boxes())
         )
         self.merged = kept(
             "merged",

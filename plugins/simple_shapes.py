@@ -28,9 +28,6 @@ class Planes:
         self.tangents = [Table(mi.Vector3f, [s.tangents[k] for s in shapes]) for k in range(2)]
         self.shapes = Table("Shape", shapes)
 
-    def __len__(self) -> int:
-        return len(self.equations)
-
     def intersect(self, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32, mi.Bool]:
         """Return the distance of the nearest plane, or ``ray.maxt``, its number, and if there is one."""
         t, index, found = mi.Float(ray.maxt), mi.UInt32(0), mi.Bool(False)
@@ -76,9 +73,8 @@ class Planes:
         si.sh_frame.n = dr.select(where, mi.Normal3f(n), si.sh_frame.n)
         along = [tangent(index, where) for tangent in self.tangents]
         if tangents:
-            si.dp_du, si.dp_dv = (
-                dr.select(where, *both) for both in zip(along, (si.dp_du, si.dp_dv), strict=True)
-            )
+            pairs = zip(along, (si.dp_du, si.dp_dv), strict=True)
+            si.dp_du, si.dp_dv = (dr.select(where, *pair) for pair in pairs)
         uv = mi.Point2f(*(dr.dot(tangent, p) for tangent in along))
         si.uv = dr.select(where, uv, si.uv)
         si.shape = dr.select(where, self.shapes(index, where), si.shape)

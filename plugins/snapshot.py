@@ -105,9 +105,11 @@ class Snapshot:
                 shape, (mi.Shape, mi.BSDF, mi.Emitter, mi.Sensor, mi.Medium),
                 shape.has_flipped_normals(), shape.is_emitter(),
             )  # fmt: skip
-        for shape in [*self.shapes, *self.inner]:
-            bsdf = shape.bsdf()
-            materials.add(bsdf, (mi.Shape, mi.Emitter, mi.Medium), None if bsdf is None else bsdf.flags())
+        bsdfs = [shape.bsdf() for shape in [*self.shapes, *self.inner]]
+        materials.state += map(id, bsdfs)
+        self.bsdfs = once(bsdfs)  #: each material once
+        for bsdf in self.bsdfs:
+            materials.add(bsdf, (mi.Shape, mi.Emitter, mi.Medium), bsdf.flags())
         for emitter in self.emitters:
             lights.add(emitter, (mi.Shape, mi.Medium), emitter.flags())
         lights.add(self.environment, (mi.Shape, mi.Medium))

@@ -135,8 +135,6 @@ def _heap(boxes: np.ndarray, leaf_of: np.ndarray, leaves: int) -> np.ndarray:
         low[size : 2 * size] = low[2 * size : 4 * size].reshape(size, 2, 3).min(axis=1)
         high[size : 2 * size] = high[2 * size : 4 * size].reshape(size, 2, 3).max(axis=1)
     largest = np.finfo(np.float32).max / 4
-    ends = np.clip(np.stack([low, high]), -largest, largest).reshape(
-        2, leaves, 2, 3
-    )  # end, node, child, axis
+    ends = np.stack([low, high]).clip(-largest, largest).reshape(2, leaves, 2, 3)  # end, node, child, axis
     forwards = ends.transpose(1, 3, 0, 2)  # node, axis, end, child
     return np.stack([forwards, forwards[:, :, ::-1]], axis=2).reshape(leaves, 3, 2, 4).astype(np.float32)
