@@ -88,12 +88,7 @@ class Snapshot:
         """Look at a scene; parts that have not changed since ``before`` are taken from there."""
         # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed
         self.shapes, self.emitters, self.environment = scene.shapes(), scene.emitters(), scene.environment()
-        sensor = next(iter(scene.sensors()), None)
-        place = np.zeros(0)
-        if sensor is not None and sensor.class_name() == "PerspectiveCamera":
-            place = np.array(sensor.world_transform().translation(), float).ravel()
-        #: where the rays of the first camera come from; None where that is no point
-        self.eye = tuple(place) if len(place) == 3 and np.isfinite(place).all() else None
+        self.eye = _eye(scene)
         # Groups are traced through their instances, which don't say what group they belong to
         inside = [value for _, value, _ in parameters_of(scene) if isinstance(value, mi.Shape)]
         self.groups = [shape for shape in inside if shape.class_name().startswith("ShapeGroup")]
@@ -107,7 +102,7 @@ class Snapshot:
             )  # fmt: skip
         bsdfs = [shape.bsdf() for shape in [*self.shapes, *self.inner]]
         materials.state += map(id, bsdfs)
-        self.bsdfs = once(bsdfs)  #: each material once
+        self.bsdfs = list({id(b): b for b in bsdfs if b is not None}.values())  #: each material once
         for bsdf in self.bsdfs:
             materials.add(bsdf, (mi.Shape, mi.Emitter, mi.Medium), bsdf.flags())
         for emitter in self.emitters:
@@ -128,6 +123,15 @@ class Kept(dict[str, tuple[Hashable, Any]]):
             # Key and value come together or, where ``make`` is interrupted, not at all
             known = self[name] = key, make()
         return known[1]
+
+
+def _eye(scene: mi.Scene) -> tuple[float, ...] | None:
+    """Return where the rays of the first camera come from; None where that is no point."""
+    sensor = next(iter(scene.sensors()), None)
+    if sensor is None or sensor.class_name() != "PerspectiveCamera":
+        return None
+    place = np.array(sensor.world_transform().translation(), float).ravel()
+    return tuple(place) if len(place) == 3 and np.isfinite(place).all() else None
 
 
 def parameters_of(thing: Any) -> list[tuple[str, Any, Any]]:
