@@ -38,8 +38,7 @@ def colored(**parameters: Any) -> mi.BSDF:
 
 def interaction(wi: np.ndarray, uv: Any = (0, 0)) -> Any:
     """A surface point seen from directions [N, 3] or [3], at texture coordinates [N, 2] or [2]."""
-    columns = (np.array(np.transpose(x), np.float32, order="C") for x in (wi, uv))
-    return probe.interaction(*(kind(x) for kind, x in zip((mi.Vector3f, mi.Point2f), columns, strict=True)))
+    return probe.interaction(mi.Vector3f(np.transpose(wi)), mi.Point2f(np.transpose(uv)))
 
 
 def draw(bsdf: mi.BSDF, wi: np.ndarray, count: int) -> probe.Lanes:
