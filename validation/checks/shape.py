@@ -522,5 +522,5 @@ def _moments(case: Case, o: Array, d: Array, p: Array, weight: Array) -> tuple[A
     return found.mean(axis=0), found.var(axis=0) / len(found)
 
 
-_LAWS = (hits, surface, normals, watertight, scale, far, finite, sampling, bbox, variants)
-LAWS = {law.__name__: law for law in _LAWS}
+LAWS = {law.__name__: law for law in (hits, surface, normals, watertight, scale, far, finite, sampling, bbox,
+                                      variants)}  # fmt: skip
