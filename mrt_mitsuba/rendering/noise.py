@@ -107,18 +107,22 @@ class Halves(Stack):
 
     # ------------------------------------------- Errors ---------------------------------------------
 
+    def squares(self) -> np.ndarray:
+        """Return the squared errors of pixels, by the halves alone, [H, W], without the border."""
+        halves = self.film.picture(self.pictures()[..., :3])
+        if self._blurred is not None:
+            halves = np.stack([self._blurred(half) for half in halves])
+        return np.where(self._inside(self._unknown), 0, quarter_squares(*halves).mean(-1))
+
     def error(self) -> ErrorEstimate:
         """Return the estimated RMSE with its interval, and the tail of what single rays contribute.
 
-        By the halves alone, without the border: the mean of squares of which each is as uncertain as it is
-        large, correlated as the filter has it; the true error is a mean of as many squares, and as uncertain.
-        The interval is that of a log-normal law, wider upwards the fewer squares make up the mean.
+        The mean of squares of which each is as uncertain as it is large, correlated as the filter has it; the
+        true error is a mean of as many squares, and as uncertain. The interval is that of a log-normal law,
+        wider upwards the fewer squares make up the mean.
         """
-        halves, correlation = self.film.picture(self.pictures()[..., :3]), self.film.correlation
-        if self._blurred is not None:
-            halves = np.stack([self._blurred(half) for half in halves])
-        squares = np.where(self._inside(self._unknown), 0, quarter_squares(*halves).mean(-1))
-        rmse, tail = math.sqrt(float(squares.mean())), self._tail(HALVES)
+        squares, correlation, tail = self.squares(), self.film.correlation, self._tail(HALVES)
+        rmse = math.sqrt(float(squares.mean()))
         if self._blurred is not None:  # pixels are as good as one in a window of the blur's reach
             correlation = 1.0
             for axis in (0, 1):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 import warnings
 from collections.abc import Callable
@@ -56,14 +57,14 @@ def run_rounds(
         spent += cost
         with stage("rounds", cost, _message(done, target, cost / pixels)) as advance:
             picture.trace(chosen, advance)
-        error = picture.error()
-        now = Round(time.perf_counter() - start, spent / pixels, error.rmse)
+        rmse = math.sqrt(float(picture.squares().mean()))
+        now = Round(time.perf_counter() - start, spent / pixels, rmse)
         done.append(now)
         log.info("round %d: %.1f rays a pixel, error %.3g", len(done), now.spp, now.rmse)
         if on_round is not None:
             maps = (np.array(values, np.float32) for values in picture.maps())  # its own, to write into
             if on_round(RoundPicture(now.seconds, now.spp, now.rmse, *maps)) is False:
-                return done, error
+                return done, picture.error()
         most = min(rays, GROWTH * now.spp)
         if seconds is not None:
             most = min(most, now.spp * seconds / now.seconds)
@@ -78,6 +79,7 @@ def run_rounds(
             chosen, doubled = picture.next(min(most, 2 * now.spp), rays, None), doubled + 1
         else:
             break
+    error = picture.error()
     found = [picture.unfit(), _doubt(error), _missed(target, rays, seconds, now, error)]
     if any(found):
         warnings.warn("; ".join(filter(None, found)), MrtWarning, stacklevel=7)  # the caller of render
