@@ -56,7 +56,8 @@ def __getattr__(name: str) -> object:
     runtime = import_module("mrt_mitsuba.runtime")
     runtime.check_start()
     if ".rendering." in _HOME[name]:
-        runtime.load()
+        with runtime.held(), runtime.rewriting_later():  # so that Mitsuba has less to do
+            import_module("mitsuba")
     module = import_module(_HOME[name])
     globals()[name] = value = getattr(module, name, module)  # ``filters`` is a module
     return value

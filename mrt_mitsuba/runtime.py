@@ -69,12 +69,6 @@ def use(variant: str | None = None) -> str:
     return variant
 
 
-def load() -> None:
-    """Import Mitsuba, with less to do than by itself."""
-    with held(), rewriting_later():
-        import mitsuba  # noqa: F401
-
-
 def register() -> None:
     """Register the plugins with Mitsuba, so that ``mi.load_dict`` and ``mi.load_file`` know them.
 

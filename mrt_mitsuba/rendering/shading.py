@@ -42,16 +42,18 @@ class RayValues:
         self.weight, self.valid, self.aovs = mi.unpolarized_spectrum(weight), valid, aovs
         self.spectrum = radiance * self.weight  #: radiance with the sensor's weight
         self.image = to_rgb(self.spectrum, ray)
+        if trace is not None:
+            self.si, self.found = trace.hit.si, trace.hit.found
 
     @cached_property
     def si(self) -> Any:
         """Interaction at the first hit."""
-        return self.trace.hit.si if self.trace else self.scene.ray_intersect(mi.Ray3f(self.ray))
+        return self.scene.ray_intersect(mi.Ray3f(self.ray))
 
-    @property
+    @cached_property
     def found(self) -> Any:
         """Is there a first hit."""
-        return self.trace.hit.found if self.trace else self.si.is_valid()
+        return self.si.is_valid()
 
     def at_hit(self, kind: str, value: Any, miss: float = 0) -> Any:
         """Return a value, of a type of Mitsuba's, where something is hit, and another elsewhere."""
