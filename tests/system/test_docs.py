@@ -84,7 +84,7 @@ def test_commands_of_the_pages_are_understood(path: Path, command: str) -> None:
     if arguments[0] in registry.ALL:
         return  # tried by tests of its own
     parsed = options.parse(arguments)
-    assert name == "mrt" and (parsed.scene is None or (DOCS / parsed.scene).is_file())
+    assert name == "mrt" and all((DOCS / path).is_file() for path in parsed.inputs())
 
 
 def test_the_memory_that_a_picture_would_need_is_as_shown(capsys) -> None:
