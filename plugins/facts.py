@@ -106,9 +106,7 @@ def _lights(snapshot: Snapshot) -> tuple[list[Any], list[Any] | None, dict[str, 
 
 def _materials(snapshot: Snapshot) -> tuple[list[Any], dict[str, Any]]:
     """Return the materials as rows of a table, none where they have no place in one, and the facts."""
-    found = material_rows(snapshot.shapes)
-    every = (shape.bsdf() for shape in [*snapshot.shapes, *snapshot.inner])
-    bsdfs = {id(bsdf): bsdf for bsdf in every if bsdf is not None}.values()
+    bsdfs, found = snapshot.bsdfs, material_rows(snapshot.shapes)
     rows, unmergeable = ([], found) if isinstance(found, str) else (found, "")
     return rows, {
         # All that mrt_bsdf has, and whether a material has them; those outside the table may have any

@@ -91,8 +91,7 @@ class PointBuffer:
         def visit(thing: Any, state: tuple) -> tuple:
             return (dr.select(test(thing), -1, state[0]),)
 
-        state = (mi.Float(1 + _SHORT),)
-        return self._walk(light, mi.Vector3f(0), -to_light, active, visit, state)[0] < 0
+        return self._walk(light, mi.Vector3f(0), -to_light, active, visit, (mi.Float(1 + _SHORT),))[0] < 0
 
     def nearest(self, ray: Any, active: Any, visit: Callable, state: tuple) -> tuple[tuple, Any]:
         """Call ``visit(object, state)`` as a tree does for rays that come from the first point, wherever they

@@ -52,7 +52,7 @@ class Quadrics:
         self.moving = [(k, f) for k, f in zip(leaves, frames, strict=True) if f is not None]
 
     def intersect(
-        self, ray: Any, active: Any, eye: PointBuffer | None = None, *, any_hit: bool = False
+        self, ray: Any, active: Any, eye: PointBuffer | None = None, any_hit: bool = False
     ) -> tuple[Any, Any, Any]:
         """Return distance, place in the rows and part of the nearest quadric; ``ray.maxt`` for none.
 
