@@ -81,9 +81,8 @@ def _table(props: mi.Properties, name: str, width: int | None = None) -> np.ndar
     table = np.array(props[name])
     table = table.reshape(len(table), -1).astype(np.float32)
     if width is not None and table.shape[1] != width:
-        raise ParameterError(
-            f'mrt_group: "{name}" has {table.shape[1]} numbers for an object, but must have {width}'
-        )
+        given = table.shape[1]
+        raise ParameterError(f'mrt_group: "{name}" has {given} numbers for an object, but must have {width}')
     return table
 
 

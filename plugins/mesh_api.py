@@ -62,7 +62,6 @@ class Placement:
             return type(v)([sum(v[i] * self.inverse[i][j] for i in range(3)) for j in range(3)])
 
         o = frame.origin
-        origin = [
-            sum(m * c for m, c in zip(self.linear[i], o, strict=True)) + self.offset[i] for i in range(3)
-        ]
+        rows = zip(self.linear, self.offset, strict=True)
+        origin = [sum(m * c for m, c in zip(line, o, strict=True)) + shift for line, shift in rows]
         return Frame(type(o)(origin), row(frame.x), row(frame.y), row(frame.z))
