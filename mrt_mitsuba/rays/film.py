@@ -55,13 +55,6 @@ class Region(NamedTuple):
         right, bottom = min(self.x + self.width + reach, width), min(self.y + self.height + reach, height)
         return Region(left, top, right - left, bottom - top)
 
-    def pixels(self, width: int) -> Any:
-        """Return the numbers of its pixels in a picture so wide, as a range where that is possible."""
-        if self.width == width:
-            return range(self.y * width, (self.y + self.height) * width)
-        rows, columns = np.arange(self.height)[:, None] + self.y, np.arange(self.width) + self.x
-        return (rows * width + columns).ravel().astype(np.uint32)
-
     def inside(self, other: Region) -> tuple[slice, slice]:
         """Return its rows and columns in an array of another region's pixels."""
         top, left = self.y - other.y, self.x - other.x

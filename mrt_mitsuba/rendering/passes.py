@@ -42,7 +42,12 @@ class Passes:
         self._job, self._shader, self._plan, self._settings = job, shader, plan, settings
         self._phase: dict[str, Any] = {"phase": frame / plan.moments} if plan.frames > 1 else {}
         self._seed = settings.seed + 2 * frame  # two passes in a frame, each with random numbers of its own
-        self._pixels = plan.seen.pixels(plan.width)
+        # numbers of what is seen in the whole picture, as a range where that is possible
+        (x, y, width, height), whole = plan.seen, plan.width
+        rows, columns = np.arange(height)[:, None] + y, np.arange(x, x + width)
+        self._pixels: Any = range(y * whole, (y + height) * whole)
+        if width < whole:
+            self._pixels = (rows * whole + columns).ravel().astype(np.uint32)
         self._seen = plan.seen.inside(Region(0, 0, plan.width, plan.height))
         self.layers: dict[str, np.ndarray] = {}
 
