@@ -39,7 +39,7 @@ Arrays = dict[str, np.ndarray]
 
 def cases(quick: bool) -> Iterator[Case]:
     """Yield errors of D, G, the whole, its density and its gradient, of F, and of functions of one cosine."""
-    lobes = lobes_with_truth(2_000 if quick else 12_000)
+    lobes = lobes_with_truth(2_000 if quick else 8_000)
     usual = (abs(np.log10(lobes["alpha"]) + 2) < 2) & (lobes["steepness"] <= IN_BOUND)
     for name, error in errors(lobes).items():
         limits, where = LIMITS.get(name, WITH_EXP), "alpha 1e-4 … 1, D ≥ 1e-7 of its peak"
@@ -143,12 +143,12 @@ def slope2(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
 
 @cache
 def lobes_with_truth(count: int) -> Arrays:
-    """Return about ``count`` pairs of directions above the surface, evenly on logarithmic scales.
+    """Return ``count`` pairs of directions, or a third more, above the surface, evenly on logarithmic scales.
 
     Of N pairs ``wi`` and ``wo`` [N, 3], ``alpha``, ``ior``, the ``steepness`` tan²θh / alpha², and what
     ``_exact`` says of them.
     """
-    rng, pairs = np.random.default_rng(1), (2, 2 * count)  # half of them point down
+    rng, pairs = np.random.default_rng(2), (2, 2 * count)  # a third of them points down
     alpha, cosine = np.float32(10 ** rng.uniform(-8, 2, pairs[1])), 10 ** rng.uniform(-7, 0, pairs[1])
     tan, sine = alpha * np.sqrt(STEEPEST * rng.random(pairs[1]) ** 2), np.sqrt((1 - cosine) * (1 + cosine))
     phi, psi = rng.uniform(0, 2 * np.pi, pairs)
