@@ -24,8 +24,7 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.validation.tools import renders
-from mrt_mitsuba.validation.tools.report import machine, prepare
-from mrt_mitsuba.validation.tools.timing import in_turns, ratio_of, timed
+from mrt_mitsuba.validation.tools.study import in_turns, machine, prepare_folder, ratio_of, timed
 
 START_GOAL = 1.7
 DEVICE_SIZES = (800, 600), (4096, 4096)
@@ -117,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     try:
         before = read(given.compare) if given.compare else {}
-        prepare(given.out.parent, given.out.name)
+        prepare_folder(given.out.parent, given.out.name)
         print(62 * " " + "".join(f"{column:>14}" for column in COLUMNS))
         found: dict[str, Row] = {}
         for name, row in rows(given):

@@ -80,10 +80,9 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> bool:
     # Not before: NumPy needs a working folder under some Pythons
     import drjit as dr
 
-    from mrt_mitsuba.validation.tools import report
-    from mrt_mitsuba.validation.tools.study import Study
+    from mrt_mitsuba.validation.tools.study import Study, prepare_folder, save_report, terminal_table
 
-    report.prepare(out)
+    prepare_folder(out)
     seconds = sum(STUDIES[name][2] if quick else STUDIES[name][3] for name in names)
     print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
     studies = [Study(name, name, TerminalProgress(unit="step")) for name in names]
@@ -100,8 +99,8 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> bool:
         study.seconds = time.perf_counter() - start
         gc.collect()  # scenes that live on, and memory kept for reuse, slow down the next study
         dr.flush_malloc_cache()
-    print(report.terminal_table(studies), flush=True)
-    report.save(out, *studies, quick=quick)
+    print(terminal_table(studies), flush=True)
+    save_report(out, *studies, quick=quick)
     print(f"\nReport: {out / 'index.html'}")
     return all(study.passed for study in studies)
 

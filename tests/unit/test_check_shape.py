@@ -12,8 +12,7 @@ import pytest
 from unit.specimens import exceeded
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.checks.shape import LAWS
-from mrt_mitsuba.validation.checks.shape_case import Case
+from mrt_mitsuba.validation.checks.shape import LAWS, Case
 from mrt_mitsuba.validation.studies import power
 from mrt_mitsuba.validation.studies.power import ChangedShape, put
 

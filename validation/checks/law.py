@@ -26,8 +26,7 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.scene.loading import load_dict
 from mrt_mitsuba.validation.checks.probe import Array, is_scalar, unit
-from mrt_mitsuba.validation.tools import report
-from mrt_mitsuba.validation.tools.study import Bound, Study
+from mrt_mitsuba.validation.tools.study import Bound, Study, notebook, save_report
 
 TITLE = "Laws of plugins"
 LEVEL = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction
@@ -178,10 +177,10 @@ class Check:
 
     def save(self, folder: str | Path) -> None:
         """Write the page (``index.html``), ``summary.json`` and CSV files. Raises ``OutputError``."""
-        report.save(folder, self.study(), title=TITLE, quick=self.quick)
+        save_report(folder, self.study(), title=TITLE, quick=self.quick)
 
     def _repr_html_(self) -> str:
-        return report.notebook(self.study(), title=TITLE)
+        return notebook(self.study(), title=TITLE)
 
 
 @dataclass(frozen=True, repr=False)

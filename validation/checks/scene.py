@@ -25,9 +25,8 @@ from mrt_mitsuba.validation.checks.law import Check, Law, Skip, Subject, class_n
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, excess, lanes, not_finite
 from mrt_mitsuba.validation.checks.shape import check_shape
 from mrt_mitsuba.validation.checks.sphere import Cells, chi_square, encode, integrate
-from mrt_mitsuba.validation.tools import report
 from mrt_mitsuba.validation.tools.compare import sidak
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.study import Study, save_report
 
 ALIKE = 6  # of one kind of plugin, so many are checked, spread over all
 DEPTH = 12  # bounces that the hunt follows
@@ -80,7 +79,7 @@ class SceneCheck:
         picture, bad = Study("picture", "picture"), self.fault.pixels if self.fault else 0
         picture.at_most("pixels that are not finite", bad, 0, str(self.fault or "a picture is of numbers"))
         studies = [*(check.study() for check in self.checks.values()), picture]
-        report.save(folder, *studies, title=f"Laws of plugins: {self.name}")
+        save_report(folder, *studies, title=f"Laws of plugins: {self.name}")
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(str(self))}</pre>"

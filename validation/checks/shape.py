@@ -5,8 +5,9 @@ A new law is a function of ``Law`` and ``Case`` and a row of ``LAWS``; see ``bsd
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -14,13 +15,27 @@ import mitsuba as mi
 import numpy as np
 from scipy import stats
 
+from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.checks import noise
-from mrt_mitsuba.validation.checks.law import LEVEL, SIGMAS, TIMEOUT, Check, Law, Skip, examine, figures, rare
+from mrt_mitsuba.validation.checks.law import (
+    LEVEL,
+    SIGMAS,
+    TIMEOUT,
+    Check,
+    Law,
+    Skip,
+    Subject,
+    examine,
+    figures,
+    rare,
+)
 from mrt_mitsuba.validation.checks.noise import ROUNDING
-from mrt_mitsuba.validation.checks.probe import Array, lanes, unit
-from mrt_mitsuba.validation.checks.shape_case import FLAT, Case, dot, leave, near, offset, trace, walk
+from mrt_mitsuba.validation.checks.probe import Array, Lanes, lanes, unit
 from mrt_mitsuba.validation.tools.compare import sidak
 
+OFFSET = 1500 * ROUNDING  # of the origin of a spawned ray from its surface, over 1 + max |p|
+FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
+MOST_HITS = 16  # along a line
 HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
 TYPICAL = 16  # roundings: twice the most that was measured of sound shapes
 TILTED = 2e-3
@@ -52,6 +67,162 @@ def check_shape(
     """
     return examine(Case, shape, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
 
+
+# --------------------------------------- Rays and what they meet ---------------------------------------
+
+
+def trace(target: Any, o: Array, d: Array) -> Lanes:
+    """Trace rays from float32 points [N, 3] in directions [N, 3].
+
+    Return whether each ``found`` anything, the distance ``t``, the points and vectors ``p``, ``n``,
+    ``shading``, ``du``, ``dv`` [N, 3], ``uv`` [N, 2], the index of the triangle or the like (``part``), and
+    whether the surface is ``steep``: met, and not in passing.
+    """
+
+    def call(origin: Any, direction: Any) -> list[Any]:
+        si = target.ray_intersect(mi.Ray3f(origin, direction))
+        return [si.is_valid(), si.t, si.p, si.n, si.sh_frame.n, si.dp_du, si.dp_dv, si.uv, si.prim_index]
+
+    names = ("found", "t", "p", "n", "shading", "du", "dv", "uv", "part")
+    hits = Lanes(**dict(zip(names, lanes(call, ("Point3f", o), ("Vector3f", d)), strict=True)))
+    hits.cos = dot(hits.n, d)
+    hits.steep = hits.found & (np.abs(hits.cos) > FLAT)
+    return hits
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Return the dot products of vectors [N, 3]."""
+    return (a * b).sum(axis=-1)
+
+
+def walk(target: Any, o: Array, d: Array, first: Lanes | None = None) -> Iterator[tuple[Array, Lanes]]:
+    """Follow N lines through all that they meet; yield hit by hit which lines do, and what they meet."""
+    line, hits = np.arange(len(o)), first or trace(target, o, d)
+    for _ in range(MOST_HITS):
+        line, d, hits = line[hits.found], d[hits.found], hits.only(hits.found)
+        if not len(line):
+            return
+        yield line, hits
+        hits = trace(target, leave(hits.p, hits.n, d), d)
+
+
+class Case(Subject):
+    """A shape under examination, rays towards it and what they meet."""
+
+    word = "shape"
+
+    def __init__(self, given: Any, quick: bool, seed: int) -> None:
+        super().__init__(given, quick, seed)
+        if not all(hasattr(self.plugin, name) for name in ("ray_intersect", "ray_test", "bbox")):
+            kind = type(self.plugin).__name__
+            raise UsageError(f"{kind} is not a shape of {mi.variant()}: give a dict or a loaded shape")
+        self.target = self.plugin
+        if isinstance(self.plugin, mi.Shape) and self.plugin.class_name() == "Instance":
+            if self.description is None:
+                raise UsageError("a loaded instance does not give its group away: give a dict of both")
+            self.target = self.scene()
+        elif isinstance(self.plugin, mi.Shape):
+            name = self.plugin.id()
+            self.target = mi.load_dict({"type": "scene", "shape": self.plugin})
+            self.plugin.set_id(name)  # which the scene has changed
+        box = self.plugin.bbox()
+        self.box = np.array([np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max)])
+        if not np.isfinite(self.box).all() or (self.box[1] < self.box[0]).any():
+            raise UsageError(f"the bounding box of the shape is {self.box}: it must be finite")
+        self.corners = corners(self.plugin)
+        points = np.concatenate([self.box, self.corners])
+        self.low, self.high = points.min(axis=0), points.max(axis=0)  # the box itself may be wrong
+        self.middle, self.size = (self.low + self.high) / 2, float(np.linalg.norm(self.high - self.low))
+
+    def around(self, count: int) -> Array:
+        """Return points that look at the shape, from 1.5 sizes away."""
+        return (self.middle + 1.5 * self.size * self.units(count)).astype(np.float32)
+
+    @cached_property
+    def seen(self) -> tuple[Array, Array, Lanes]:
+        """Rays from all around to points in the box, and what they meet."""
+        o = self.around(self.count(2**14, 2**17))
+        extent = np.maximum(self.high - self.low, 0.01 * self.size)
+        d = unit(self.middle + extent * self.rng.uniform(-0.55, 0.55, o.shape) - o)
+        return o, d, trace(self.target, o, d)
+
+    @cached_property
+    def met(self) -> tuple[Array, Array, Lanes]:
+        """The rays that meet the surface and do not graze it, and their hits."""
+        o, d, hits = self.seen
+        if hits.steep.sum() < 20:
+            raise Skip("hardly any ray towards its bounding box meets the shape")
+        return o[hits.steep], d[hits.steep], hits.only(hits.steep)
+
+    @cached_property
+    def behind(self) -> Lanes:
+        """The hits of rays that come back from just behind ``met``."""
+        _, d, hits = self.met
+        return trace(self.target, leave(hits.p, hits.n, d), -d)
+
+    @cached_property
+    def positions(self) -> tuple[list[Array], Array, float]:
+        """Sampled positions: points, normals, densities stated and asked for; their ``u``; and the area."""
+        u = self.uniform(self.count(2**14, 2**19), 2)
+
+        def sample(second: Any) -> list[Any]:
+            ps = self.plugin.sample_position(0, second)
+            return [ps.p, ps.n, ps.pdf, self.plugin.pdf_position(ps)]
+
+        try:
+            area = float(np.ravel(np.array(self.plugin.surface_area()))[0])
+            return lanes(sample, ("Point2f", u)), u, area
+        except (AttributeError, RuntimeError) as problem:
+            raise Skip("positions cannot be sampled") from problem
+
+    @cached_property
+    def crossings(self) -> list[tuple[Array, Lanes]]:
+        """Whole lines: hit by hit, which line, and what it meets."""
+        return list(walk(self.target, *self.seen))
+
+    @cached_property
+    def closed(self) -> bool:
+        """Whether most lines cross the surface an even number of times: it is closed, with holes perhaps."""
+        judged, even = self.lines
+        return bool(judged.sum() > 20 and even[judged].mean() > 0.75)
+
+    @cached_property
+    def lines(self) -> tuple[Array, Array]:
+        """Which lines can be judged, and which cross the surface an even number of times; both [N]."""
+        met, even = self.seen[2].found, np.ones(len(self.seen[0]), bool)
+        clear, last = met.copy(), np.full((len(met), 3), np.inf)
+        for line, hits in self.crossings:
+            clear[line] &= (np.abs(hits.cos) > 4 * FLAT) & ~near(hits.p, last[line])
+            even[line] ^= True
+            last[line] = hits.p
+        return clear, even
+
+
+def offset(p: Array) -> Array:
+    """Return how far off the surface ``spawn_ray`` starts from points [N, 3]."""
+    return OFFSET * (1 + np.abs(p).max(axis=1))
+
+
+def near(p: Array, q: Array) -> Array:
+    """Return whether points [N, 3] are one, for all that a spawned ray can tell."""
+    return np.linalg.norm(p - q, axis=1) < 4 * offset(p)
+
+
+def leave(p: Array, n: Array, d: Array) -> Array:
+    """Return origins off the surface on the side of ``d``, as ``spawn_ray`` has them."""
+    return (p + np.sign(dot(n, d))[:, None] * n * offset(p)[:, None]).astype(np.float32)
+
+
+def corners(shape: Any) -> Array:
+    """Return the vertices of a mesh and the middles of its edges [N, 3]; none for other shapes."""
+    names = ("vertex_positions", "faces")
+    if not isinstance(shape, mi.Mesh) or not set(names) <= set(mi.traverse(shape).keys()):
+        return np.zeros((0, 3))  # a rectangle hides that it is a mesh
+    vertex, face = (np.array(mi.traverse(shape)[name]).reshape(-1, 3) for name in names)
+    return np.concatenate([vertex, *((vertex[face[:, k]] + vertex[face[:, k - 1]]) / 2 for k in range(3))])
+
+
+# ------------------------------------------------- Laws ------------------------------------------------
 
 MAXT = """ray = mi.Ray3f(o, d)
 print("meets the surface at", scene.ray_intersect(ray).t)

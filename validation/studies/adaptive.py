@@ -15,8 +15,7 @@ import numpy as np
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.studies.filters import rmse
 from mrt_mitsuba.validation.tools.scenery import LOCAL, SCENES, SPP, load
-from mrt_mitsuba.validation.tools.study import Study
-from mrt_mitsuba.validation.tools.timing import in_turns, timed
+from mrt_mitsuba.validation.tools.study import Study, in_turns, timed
 
 TITLE = "Scenes of one's own, and the cost of an error"
 QUICK = ("gloss", "stratified", "texture_and_sky")

@@ -21,8 +21,7 @@ from mrt_mitsuba.validation.checks.probe import is_scalar
 from mrt_mitsuba.validation.tools.bsdf_probe import evaluate, lobe_pairs, relative_error
 from mrt_mitsuba.validation.tools.compare import compare, p_values
 from mrt_mitsuba.validation.tools.scenery import ball_scene
-from mrt_mitsuba.validation.tools.study import Study
-from mrt_mitsuba.validation.tools.timing import in_turns, timed
+from mrt_mitsuba.validation.tools.study import Study, in_turns, timed
 
 TITLE = "The BSDF against Mitsuba's roughconductor"
 

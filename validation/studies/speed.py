@@ -27,8 +27,7 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.studies import roughconductor
 from mrt_mitsuba.validation.tools import renders
 from mrt_mitsuba.validation.tools.renders import load
-from mrt_mitsuba.validation.tools.study import Study
-from mrt_mitsuba.validation.tools.timing import operations, ratio
+from mrt_mitsuba.validation.tools.study import Study, operations, ratio
 
 TITLE = "Speed: against Mitsuba's own plugins, other ways and smaller tasks"
 

@@ -9,7 +9,7 @@ from typing import Any
 from mrt_mitsuba.command.tools import read_toml
 from mrt_mitsuba.errors import MrtError, SceneError, UsageError
 from mrt_mitsuba.rendering.progress import TerminalProgress
-from mrt_mitsuba.validation.tools.study import Bound
+from mrt_mitsuba.validation.tools.study import Bound, prepare_folder
 
 AT_LEAST = ("psnr", "p_value")  # the limits of other measures are at most
 KEYS = ("reference", "cases", "shared", "repeats", "errors")  # of a file of cases
@@ -64,10 +64,8 @@ def _found(
     look: Callable[..., Any], scene: str, settings: dict[str, Any], out: str | None, *inputs: str
 ) -> Any:
     """Look at a scene, show what is found, and write the page into ``out``."""
-    from mrt_mitsuba.validation.tools import report
-
     if out is not None:
-        report.prepare(Path(out), inputs=inputs)
+        prepare_folder(Path(out), inputs=inputs)
     try:
         found = look(int(scene) if scene.isdecimal() else scene, **settings)
     except SceneError as error:  # nothing was done

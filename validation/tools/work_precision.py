@@ -23,9 +23,8 @@ from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.rendering.api import Result, render
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.open import open_scene
-from mrt_mitsuba.validation.tools import report
 from mrt_mitsuba.validation.tools.compare import Difference, compare, read_layer
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.study import Study, notebook, save_report
 
 TITLE = "Error against time"
 REFERENCE_SEEDS = (2**20 + 1, 2**20 + 2)  # far from those of the repeats
@@ -172,10 +171,10 @@ class Findings:
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""
-        report.save(folder, self.study(), title=TITLE)
+        save_report(folder, self.study(), title=TITLE)
 
     def _repr_html_(self) -> str:
-        return report.notebook(self.study(), title=TITLE)
+        return notebook(self.study(), title=TITLE)
 
 
 def _reach(values: np.ndarray) -> float:
