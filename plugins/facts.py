@@ -8,9 +8,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from .hit_errors import any_touching
 from .kernel_plan import Mirror, SceneFacts
-from .lights import brightness, place
+from .lights import brightness
 from .lobes import LOBES, material_rows
 from .parameters import ParameterError
 from .simple_shapes import is_sphere
@@ -19,9 +18,6 @@ from .variants import is_jit, varies
 
 # Beyond these sizes, Embree's products of three lengths leave float32
 SMALLEST_MESH, LARGEST_MESH = 1e-8, 1e10
-
-# Lights beyond this number are not looked at one by one where one could be on a surface
-MOST_LIGHTS = 64
 
 
 class Reading:
@@ -45,14 +41,7 @@ class Reading:
         )
         of_shapes = kept("shape facts", shapes, self._read_shapes)
         self.lights, self.numbers, of_lights = kept("light facts", lights, lambda: _lights(snapshot))
-        touching = kept(
-            "touching",
-            (shapes, lights),
-            lambda: any_touching(snapshot.shapes, list(filter(None, map(place, self.lights[:MOST_LIGHTS])))),
-        )
-        self.facts = SceneFacts(
-            **of_lights, **of_materials, **of_shapes, touching=touching, pinhole=snapshot.eye is not None
-        )
+        self.facts = SceneFacts(**of_lights, **of_materials, **of_shapes, pinhole=snapshot.eye is not None)
 
     def _read_shapes(self) -> dict[str, Any]:
         meshes = [s for s in (*self.native, *self.snapshot.inner) if s.is_mesh()]

@@ -55,7 +55,6 @@ class KernelPlan:
     planes: bool  #: analytic planes, else they are traced as meshes
     buffers: bool  #: lists of what may be in the way of a light, in place of a search
     eye: bool  #: lists of the quadrics that the camera may see, in place of a search
-    touching: bool  #: shadow rays that end short of lights on surfaces
     random: bool  #: random numbers
     emission: bool  #: surfaces that emit
     sky: str  #: "none", "parameter" or "environment"
@@ -219,11 +218,6 @@ RULES = (
             "too many cones and cylinders": case.quadrics > MOST_SEEN,
             "the camera is no pinhole": not case.facts.pinhole,
         },
-    ),
-    Rule(
-        "touching", "lights on surfaces",
-        lambda facts, plan: "shadow rays that end short of lights on surfaces",
-        lambda case: {"no point light is on a surface": not case.facts.touching},
     ),
     Rule(
         "random", "random numbers",

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .variants import Table, first, largest, pointer
+from .variants import Table, largest, pointer
 
 
 def towards(position: mi.Point3f, it: mi.Interaction3f) -> mi.DirectionSample3f:
@@ -84,11 +84,3 @@ def brightness(emitter: Any) -> float:
         return float(np.max(np.array(data)[..., :3]) * np.max(np.array(scale))) if known else np.inf
     values = [largest(node) for node in parameters.hierarchy if isinstance(node, mi.Texture)]
     return max(values, default=np.inf)
-
-
-def place(emitter: Any) -> tuple[float, ...] | None:
-    """Return where an emitter is a point; None for one that is none."""
-    if not mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
-        return None
-    parameters = mi.traverse(emitter)
-    return tuple(first(x) for x in parameters["position"]) if "position" in parameters else None

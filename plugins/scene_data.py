@@ -22,9 +22,8 @@ from .simple_shapes import Planes, Spheres
 from .snapshot import Kept
 from .variants import but_not, is_jit
 
-# Where a light lies on a surface, shadow rays end by this share of their way short of it: it shines to both
-# sides
-TOUCHING = 2.0**-10
+# Shadow rays end this share of their way short of a light: one that lies on a surface shines to both sides
+TOUCHING = 2.0**-14
 
 # Reach of a mirror ray: any number that float32 holds
 FARTHEST = 2.0**127
@@ -140,12 +139,12 @@ class SceneData:
     ) -> mi.Bool:
         """Return whether anything blocks the segment from ``hit`` to the sample ``ds`` of a light."""
         o = self._off_surface(hit, ds.d)
-        to_light = (ds.p - o) * (1 - TOUCHING) if self.plan.touching else ds.p - o
-        blocked = self.planes.separate(o, o + to_light if self.plan.touching else ds.p)
+        to_light = ds.p - o
+        blocked = self.planes.separate(o, o + to_light * (1 - TOUCHING))
         if not self.plan.bvh and self.quadrics is None:
             return blocked
-        # Stop short of a light that has a surface of its own
-        reach = 1 - mi.math.ShadowEpsilon if self.plan.emission else 1
+        # Lights that have a surface of their own are Mitsuba's
+        reach = 1 - (mi.math.ShadowEpsilon if self.plan.emission else TOUCHING)
         ray = mi.Ray3f(o, to_light, reach, hit.si.time, hit.si.wavelengths)
         for buffer, things in self.buffers:
             test = partial(things.block, ray=ray)
