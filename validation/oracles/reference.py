@@ -66,7 +66,7 @@ def reference_render(
     d = unit(forward + u[:, None] * right + v[:, None] * np.cross(forward, right))
     o = np.broadcast_to(np.array(camera.position, float), d.shape)
     with np.errstate(all="ignore"):
-        layers = _radiance(scene, o, d, np.zeros(len(d), int), **settings)
+        layers = _radiance(scene, o, d, **settings)
     return ReferenceResult(*(layer.reshape(height, width, *layer.shape[1:])[::-1] for layer in layers))
 
 
@@ -79,60 +79,54 @@ def _radiance(
     scene: Scene,
     o: Array,
     d: Array,
-    spent: Array,
     *,
     fresnel: str = "dielectric",
     clamp: bool = True,
     max_depth: int = 10,
     bounce_budget: str = "report",
 ) -> tuple[Array, Array, Array]:
-    """Return the light [N, 3] that comes back along rays, and their hashes; ``spent``: of the bounces."""
+    """Return the light [N, 3] that comes back along rays, and the hashes of their paths and lights [N]."""
     things = objects(scene)
-    t, thing, n, diffuse = nearest(things, o, d)
-    hit = np.flatnonzero(thing >= 0)
-    light, path, lights = np.full(d.shape, scene.sky, float), _mix(thing), np.zeros(len(d), np.uint64)
-    if not len(hit):
-        return light, path, lights
     numbers = np.array([(m.material.ior, m.material.alpha, *m.material.specular) for m in things])
-    ior, alpha, specular = np.split(numbers[thing[hit]], (1, 2), axis=1)
-    ior, alpha, n, diffuse, d_in = ior[:, 0], alpha[:, 0], n[hit], diffuse[hit], d[hit]
-    p = o[hit] + t[hit, None] * d_in
-    start = p + (OFFSET * (np.abs(o[hit]).max(axis=1) + t[hit]))[:, None] * n
-    cos = -dot(n, d_in)
+    light, (path, lights) = np.zeros(d.shape), np.zeros((2, len(d)), np.uint64)
+    ray, weight, spent = np.arange(len(d)), np.ones(d.shape), np.zeros(len(d), int)
+    while len(ray):
+        t, thing, n, diffuse = nearest(things, o, d)
+        path[ray], hit = _mix(path[ray], thing), thing >= 0
+        light[ray[~hit]] += weight[~hit] * scene.sky
+        ray, weight, spent, o, d, t, n, diffuse = (x[hit] for x in (ray, weight, spent, o, d, t, n, diffuse))
+        ior, alpha, *specular = numbers.reshape(-1, 5)[thing[hit]].T
+        p, cos, specular = o + t[:, None] * d, -dot(n, d), np.transpose(specular)
+        start = p + (OFFSET * (np.abs(o).max(axis=1) + t))[:, None] * n
 
-    light[hit], seen = 0, np.zeros(len(hit), int)
-    for lamp in scene.lights:
-        to_light, way = unit(lamp.position - p), lamp.position - start
-        facing = np.flatnonzero((dot(n, to_light) > 0) & (cos > 0))
-        shadow, reach = unit(way[facing]), np.linalg.norm(way[facing], axis=1)
-        lit = facing[nearest(things, start[facing], shadow, reach)[1] < 0]
-        seen *= 3
-        seen[facing] += 1
-        seen[lit] += 1
-        lobe = specular_lobe(n[lit], to_light[lit], -d_in[lit], alpha[lit])
-        lobe *= reflectance(fresnel, dot(unit(to_light - d_in), to_light)[lit], ior[lit])
-        # The G₁ of a negative roughness can be negative; light cannot
-        value = np.maximum(diffuse[lit] / math.pi + specular[lit] * lobe[:, None], 0)
-        value = value * dot(n, to_light)[lit, None] * lamp.color
-        light[hit[lit]] += np.clip(value, 0, 1) if clamp else value
-    lights[hit] = _mix(seen)
+        seen = np.zeros(len(ray), int)
+        for lamp in scene.lights:
+            to_light, way = unit(lamp.position - p), lamp.position - start
+            facing = np.flatnonzero((dot(n, to_light) > 0) & (cos > 0))
+            shadow, reach = unit(way[facing]), np.linalg.norm(way[facing], axis=1)
+            lit = facing[nearest(things, start[facing], shadow, reach)[1] < 0]
+            seen *= 3
+            seen[facing] += 1
+            seen[lit] += 1
+            lobe = specular_lobe(n[lit], to_light[lit], -d[lit], alpha[lit])
+            lobe *= reflectance(fresnel, dot(unit(to_light - d), to_light)[lit], ior[lit])
+            # The G₁ of a negative roughness can be negative; light cannot
+            value = np.maximum(diffuse[lit] / math.pi + specular[lit] * lobe[:, None], 0)
+            value = value * dot(n, to_light)[lit, None] * lamp.color
+            light[ray[lit]] += weight[lit] * (np.clip(value, 0, 1) if clamp else value)
+        lights[ray] = _mix(lights[ray], seen)
 
-    mirrored = specular * reflectance(fresnel, cos, ior)[:, None]
-    spent = spent[hit] + (1 if bounce_budget == "plain" else np.maximum(1, 10 - (10 * ior).astype(int)))
-    on = np.flatnonzero((cos > 0) & (spent < max_depth) & (mirrored != 0).any(axis=1))
-    if len(on):
-        away = unit(d_in + 2 * cos[:, None] * n)[on]
-        settings: dict[str, Any] = {"fresnel": fresnel, "clamp": clamp, "max_depth": max_depth}
-        settings["bounce_budget"] = bounce_budget
-        found, their_path, their_lights = _radiance(scene, start[on], away, spent[on], **settings)
-        light[hit[on]] += mirrored[on] * found
-        path[hit[on]], lights[hit[on]] = _mix(path[hit[on]], their_path), _mix(lights[hit[on]], their_lights)
+        weight = weight * specular * reflectance(fresnel, cos, ior)[:, None]
+        spent += 1 if bounce_budget == "plain" else np.maximum(1, 10 - (10 * ior).astype(int))
+        on = (cos > 0) & (spent < max_depth) & (weight != 0).any(axis=1)
+        d = unit(d + 2 * cos[:, None] * n)
+        ray, weight, spent, o, d = (x[on] for x in (ray, weight, spent, start, d))
     return light, path, lights
 
 
-def _mix(value: Array, hashed: Any = 1) -> Array:
-    """Continue a hash by one more number."""
-    return (np.uint64(hashed) * HASH ^ (value + np.array(2, value.dtype)).astype(np.uint64)) * HASH
+def _mix(hashed: Array, value: Array) -> Array:
+    """Continue hashes by one more number each."""
+    return (hashed * HASH ^ (value + 2).astype(np.uint64)) * HASH
 
 
 def unit(v: Any) -> Array:
