@@ -90,11 +90,6 @@ def cases(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
         yield name, ratio_of(*times) if given.before else {"seconds": statistics.median(times[0])}
 
 
-def line(name: str, row: Row) -> str:
-    """Return a row as text, in ``COLUMNS``."""
-    return f"{name:<62}" + "".join(f"{row[c]:>14.4g}" if c in row else 14 * " " for c in COLUMNS).rstrip()
-
-
 def read(path: Path) -> dict[str, Row]:
     """Return the rows of an earlier run. Raises ``UsageError`` for a file that is none."""
     try:
@@ -123,7 +118,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             key = "ratio" if "ratio" in row else "seconds"
             then = before.get(name, {}).get(key)
             found[name] = row | ({"to then": row[key] / then} if then else {})
-            print(line(name, found[name]), flush=True)
+            cells = (f"{found[name][c]:>14.4g}" if c in found[name] else 14 * " " for c in COLUMNS)
+            print(f"{name:<62}{''.join(cells)}".rstrip(), flush=True)
     except UsageError as error:
         parser.error(str(error))
     except MrtError as error:

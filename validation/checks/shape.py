@@ -129,9 +129,8 @@ class Case(Subject):
         self.box = np.array([np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max)])
         if not np.isfinite(self.box).all() or (self.box[1] < self.box[0]).any():
             raise UsageError(f"the bounding box of the shape is {self.box}: it must be finite")
-        self.corners = corners(self.plugin)
-        points = np.concatenate([self.box, self.corners])
-        self.low, self.high = points.min(axis=0), points.max(axis=0)  # the box itself may be wrong
+        self.points = np.concatenate([self.box, corners(self.plugin)])
+        self.low, self.high = self.points.min(axis=0), self.points.max(axis=0)  # the box itself may be wrong
         self.middle, self.size = (self.low + self.high) / 2, float(np.linalg.norm(self.high - self.low))
 
     def around(self, count: int) -> Array:
@@ -294,17 +293,13 @@ def surface(law: Law, case: Case) -> None:
     missed = ~again.found | (np.linalg.norm(again.p - met.p, axis=1) >= 1e-3 * case.size)
     law.hold("missed", missed, o=before, d=d)
     first, scale = slice(0, case.count(300, 1000)), np.abs(o).max(axis=1) + met.t
-    for what, pick, size in (
-        ("distance", lambda h: h.t, scale),
-        ("hit point", lambda h: h.p.sum(axis=1), scale),
-        ("normal", lambda h: h.n @ np.array([0.6, 0.48, 0.64]), np.ones_like(scale)),
+    inputs, options = np.concatenate([o, d], axis=1)[first], {"strides": (64,), "seed": case.seed}
+    for what, size, pick in (
+        ("distance", scale, lambda x: trace(case.target, x[:, :3], x[:, 3:]).t),
+        ("hit point", scale, lambda x: trace(case.target, x[:, :3], x[:, 3:]).p.sum(axis=1)),
+        ("normal", 1 + 0 * scale, lambda x: trace(case.target, x[:, :3], x[:, 3:]).n @ [0.6, 0.48, 0.64]),
     ):
-
-        def function(x: Array, pick: Any = pick) -> Array:
-            return np.asarray(pick(trace(case.target, x[:, :3], x[:, 3:])))
-
-        inputs = np.concatenate([o[first], d[first]], axis=1)
-        found = noise.measure(function, inputs, size=size[first], strides=(64,), seed=case.seed)
+        found = noise.measure(pick, inputs, size=size[first], **options)
         law.hold("noise", found.lost, o=o, d=d, what=what)
 
 
@@ -373,10 +368,9 @@ def normals(law: Law, case: Case) -> None:
     same = back.found & near(met.p, back.p) & (back.part == met.part)
     if same.sum() > 20:
         law.hold("turned", same & (dot(back.n, met.n) < -0.5), o=o, d=d)
-    usable = (np.linalg.norm(met.du, axis=1) > 0) & (np.linalg.norm(met.dv, axis=1) > 0)
-    if usable.any():
-        slant = np.maximum(*(np.abs(dot(unit(v), met.n)) for v in (met.du, met.dv)))
-        law.hold("slant", np.where(usable & np.isfinite(slant), slant, 0), o=o, d=d)
+    slant = np.maximum(*(np.abs(dot(unit(v), met.n)) for v in (met.du, met.dv)))  # NaN of derivatives of 0
+    if np.isfinite(slant).any():
+        law.hold("slant", np.where(np.isfinite(slant), slant, 0), o=o, d=d)
     _differences(law, case)
 
 
@@ -509,14 +503,13 @@ def finite(law: Law, case: Case) -> None:
     """Rays along axes, from the surface, the middle, corners and very far: all results are finite."""
     _, _, met = case.met
     count, pick = case.count(2**12, 2**15), case.rng.integers
-    kinds = [
+    kinds = (
         np.where(case.rng.random((count, 3)) < 0.5, case.low, case.high),
         np.broadcast_to(case.middle, (count, 3)),
         met.p[pick(len(met.p), size=count)],
         case.middle + case.size * 10.0 ** case.rng.uniform(0, 5, (count, 1)) * case.units(count),
-    ]
-    if len(case.corners):
-        kinds.append(case.corners[pick(len(case.corners), size=count)])
+        case.points[pick(len(case.points), size=count)],
+    )
     o = np.choose(pick(len(kinds), size=count)[:, None], kinds).astype(np.float32)
     d = case.units(count)
     d[case.rng.random(d.shape) < 0.4] = 0
@@ -534,14 +527,13 @@ def finite(law: Law, case: Case) -> None:
 def bbox(law: Law, case: Case) -> None:
     """Whatever is hit or sampled lies in the bounding box."""
     o, d, met = case.met
-    points = [met.p, case.corners]
-    if not len(case.corners):
-        with suppress(Skip):
-            points.append(case.positions[0][0])
+    points = [met.p, case.points]
+    with suppress(Skip):
+        points.append(case.positions[0][0])
     p = np.concatenate(points)
     out = np.maximum(case.box[0] - p, p - case.box[1]).max(axis=1) / case.size
     i = min(int(out.argmax()), len(o) - 1)
-    law.hold("outside", max(out.max(), 0), o=o[i], d=d[i])
+    law.hold("outside", out.max(), o=o[i], d=d[i])
 
 
 @figures(

@@ -17,6 +17,9 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 
+# isort: split
+import mitsuba as mi  # after ours, which finds LLVM for it
+
 SMALL: dict[str, Any] = {"width": 64, "height": 48}
 ONE_RAY: dict[str, Any] = {"aamode": "none", "aa": 1, "lattice": "report", "focaldist": 0}
 SUPERSAMPLED: dict[str, Any] = ONE_RAY | {"aa": 4}
@@ -30,8 +33,6 @@ Render = Callable[..., Any]
 
 def load(nodes: Nodes) -> Any:
     """Return a Mitsuba scene of a dict with our plugins."""
-    import mitsuba as mi
-
     mrt.register()
     return mi.load_dict(nodes)
 
@@ -48,8 +49,6 @@ def with_lights(number: int, **size: Any) -> Nodes:
 
 def with_triangles(number: int, **size: Any) -> Nodes:
     """Return hills under the camera and the lights of scene 0."""
-    import mitsuba as mi
-
     cells = max(1, round((number / 2) ** 0.5))
     z, x = np.mgrid[-3 : 3 : (cells + 1) * 1j, -3 : 3 : (cells + 1) * 1j]
     positions = np.stack([x, 0.2 * np.sin(5 * x) * np.cos(7 * z), z], axis=-1).reshape(1, -1, 3)
@@ -72,8 +71,6 @@ def crowd(number: int, kind: str, **size: Any) -> Nodes:
 
     With the kind "group", the spheres are a single shape.
     """
-    import mitsuba as mi
-
     nodes = {name: node for name, node in mrt.scene_dict(4, **size).items() if not name.startswith("sphere")}
     bsdf = {"type": "ref", "id": "material_0"}
     rng = np.random.default_rng(5)
@@ -100,8 +97,6 @@ def of_scene(nodes: Callable[..., Nodes], size: tuple[int, int], options: dict[s
 
 def _with_update() -> Render:
     """Return a render of a loaded scene that changes a colour first."""
-    import mitsuba as mi
-
     scene = load(mrt.scene_dict(3, **SMALL))
     parameters = mi.traverse(scene)
     key = next(name for name in list(parameters.keys()) if name.endswith("diffuse_reflectance.value"))
@@ -124,15 +119,11 @@ def _prepared() -> Render:
 
 def _by_mitsuba() -> Render:
     """Return Mitsuba's own way to a picture by the scene's integrator, ``mrt_whitted``."""
-    import mitsuba as mi
-
     scene = load(mrt.scene_dict(3, **SMALL))
     return lambda: np.array(mi.render(scene, spp=1))
 
 
 def _box(width: int, height: int) -> Nodes:
-    import mitsuba as mi
-
     box: Nodes = mi.cornell_box()
     box["sensor"]["film"] |= {"width": width, "height": height, "rfilter": {"type": "box"}}
     return box

@@ -75,8 +75,8 @@ def load(name: str, width: int, height: int, *, film: Node | None = None, **more
     size: Node = {"width": width, "height": height}
     if name == "crop":
         window = {"crop_offset_x": width // 4, "crop_offset_y": height // 4}
-        size = {"width": 3 * width // 2, "height": 3 * height // 2, "crop_width": width} | window
-        size["crop_height"] = height
+        window |= {f"crop_{side}": pixels for side, pixels in size.items()}
+        size = {side: 3 * pixels // 2 for side, pixels in size.items()} | window
     nodes["sensor"] |= {"film": size | nodes["sensor"]["film"] | (film or {})}
     path = {"type": "path", "max_depth": 4}
     return mi.load_dict({"type": "scene", "integrator": path, **nodes} | more)
