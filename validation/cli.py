@@ -22,7 +22,7 @@ from mrt_mitsuba.rendering.progress import TerminalProgress
 STUDIES: dict[str, tuple[str, str, int, int]] = {
     "laws": ("bsdf_laws", "does the material obey its own laws", 6, 60),
     "roughconductor": ("roughconductor", "is the material the function that Mitsuba's is", 10, 90),
-    "stock": ("stock", "are light, gloss, mirrors and stand-ins what Mitsuba computes", 15, 60),
+    "stock": ("stock", "are light, gloss and mirrors what Mitsuba computes", 15, 60),
     "scenes": ("scenes", "are the report's scenes right, with a reason for each pixel off", 10, 60),
     "filters": ("filters", "do detectors chase noise, is the blur like a lens", 9, 120),
     "adaptive": ("adaptive", "are own scenes Mitsuba's, and errors cheap", 6, 60),

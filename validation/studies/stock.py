@@ -1,4 +1,4 @@
-"""Mitsuba against ours: direct light, gloss and mirrors, meshes, whole scenes; and mistakes on purpose."""
+"""Mitsuba against ours: direct light, gloss and mirrors, whole scenes; and mistakes on purpose."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.scene.model import Cone, Material
+from mrt_mitsuba.scene.model import Material
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.oracles.reference import nearest, unit
 from mrt_mitsuba.validation.tools.compare import p_values
 from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, with_materials
 from mrt_mitsuba.validation.tools.study import Study
 
-TITLE = "Against Mitsuba's own integrators, lights, materials and meshes"
+TITLE = "Against Mitsuba's own integrators, lights and materials"
 
 NEAR = 40.0  # the mesh that stands in for a plane ends at 50
 RENDERS = 8  # enough for a mean and its variance
@@ -29,7 +28,7 @@ Nodes = dict[str, Any]
 
 def run(study: Study, *, quick: bool) -> None:
     """Make all comparisons with what Mitsuba brings."""
-    for part in (direct, gloss, mesh_cones, whole_scenes):
+    for part in (direct, gloss, whole_scenes):
         part(study, quick=quick)
 
 
@@ -95,31 +94,6 @@ def gloss(study: Study, *, quick: bool) -> None:
 
     hold(study.at_least, 0.3, 0.05, "else there is nothing to compare")
     hold(study.at_most, 0.003 if quick else 0.001, 2e-3, "what is left is noise, as wide as the lobe")
-
-
-CONE = Cone((0.2, 1.5, -0.1), (0.5, 0.4, 0.3), 0.65, Material(1.5, 0.1, (0, 0, 0), (0, 0, 0)))
-
-
-def mesh_cones(study: Study, *, quick: bool) -> None:
-    """Hold the meshes that other integrators see to the exact cone."""
-    rng, count = np.random.default_rng(3), 100_000 if quick else 1_000_000
-    middle = np.mean([CONE.apex, CONE.base_center], axis=0)
-    o = (4 * unit(rng.normal(size=(count, 3))) + middle).astype(np.float32)
-    d = unit(middle + rng.uniform(-0.4, 0.4, size=(count, 3)) - o).astype(np.float32)
-    exact = nearest([CONE], o.astype(float), d.astype(float))[0]
-    numbers = {"apex": list(CONE.apex), "base_center": list(CONE.base_center), "radius": CONE.radius}
-    cone = {"type": "mrt_cone", **numbers}  # of 256 sides, the default
-    scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "cone": cone})
-    found = np.array(scene.ray_intersect_preliminary(mi.Ray3f(o.T, d.T)).t)
-    met = np.isfinite(found) | np.isfinite(exact)
-    error = np.abs(found[met] / exact[met] - 1)
-    same = error < 1e-2  # beyond, near the rim, one ray met the side and the other the base, or nothing
-    # The height of a chord of 2π/n over an arc of radius r is r (π/n)²/2; rays are 3 to 5 long
-    chord, why = CONE.radius * (np.pi / 256) ** 2 / 2 / 3, "its height over the distance; 128 sides: 4 times"
-    study.at_most("mean error of a mesh cone", error[same].mean(), chord, why)
-    why = "a share: silhouette, rim and apex within a chord's height, a few times 7.5e-5; a leak adds to it"
-    what = "rays that meet another part of a mesh cone, or nothing"
-    study.at_most(what, np.count_nonzero(~same) / count, 1e-3, why)
 
 
 def physical(m: Material) -> Material:

@@ -24,15 +24,15 @@ def at_angle(degrees: float) -> Array:
     return np.array([np.sin(theta) * 0.8, np.sin(theta) * 0.6, np.cos(theta)])
 
 
-def lobe_pairs(count: int, alpha: float, *, least_cos: float = 0.02, seed: int = 1) -> tuple[Array, Array]:
+def lobe_pairs(count: int, alpha: float, *, seed: int = 1) -> tuple[Array, Array]:
     """Return pairs of random directions above the surface whose half vector lies within a slope of 4 alpha.
 
-    Both cosines are at least ``least_cos``. Beyond that slope the lobe is below e^-16 of its peak.
+    Both cosines are at least 0.02. Beyond that slope the lobe is below e^-16 of its peak.
     """
     rng = np.random.default_rng(seed)
     wi, wo = np.empty((0, 3)), np.empty((0, 3))
     while len(wi) < count:
-        c, phi = rng.uniform(least_cos, 1, 4 * count), rng.uniform(0, 2 * np.pi, 4 * count)
+        c, phi = rng.uniform(0.02, 1, 4 * count), rng.uniform(0, 2 * np.pi, 4 * count)
         s = np.sqrt(1 - c**2)
         i = np.stack([s * np.cos(phi), s * np.sin(phi), c], axis=-1)
         slope = alpha * 4 * np.sqrt(rng.random(4 * count))
@@ -40,7 +40,7 @@ def lobe_pairs(count: int, alpha: float, *, least_cos: float = 0.02, seed: int =
         m = np.stack([slope * np.cos(psi), slope * np.sin(psi), np.ones(4 * count)], axis=-1)
         m /= np.linalg.norm(m, axis=-1, keepdims=True)
         o = 2 * (i * m).sum(axis=-1, keepdims=True) * m - i
-        up = o[:, 2] > least_cos
+        up = o[:, 2] > 0.02
         wi, wo = np.concatenate([wi, i[up]]), np.concatenate([wo, o[up]])
     return unit(wi[:count]), unit(wo[:count])
 
