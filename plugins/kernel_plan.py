@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
-from collections.abc import Mapping
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -70,31 +69,6 @@ class KernelPlan:
         return dict(self.reasons).get(name)
 
 
-def _case(facts: SceneFacts, tracer: Any, own_sky: float | None, made: Mapping[str, Any]) -> SimpleNamespace:
-    """Return what the rules go by: the facts, the decisions ``made`` so far, and what follows from them.
-
-    ``arriving`` bounds the radiance from anywhere, but for what mirrors add: a light counts for one where its
-    share is clamped to that, and the sky for one at least. inf where there is no bound.
-    """
-    sky = facts.sky if own_sky is None else own_sky
-    lights = facts.lights if tracer.clamp or facts.lights == 0 else math.inf
-    arriving = lights + max(1, sky) + facts.emission
-    quadrics = sum(count for _, count in facts.quadrics)
-    affordable = [m for m in facts.mirrors if bounce_cost(tracer, m.int_ior) < tracer.max_depth]
-    return SimpleNamespace(
-        facts=facts,
-        tracer=tracer,
-        made=made,
-        arriving=arriving,
-        affordable=affordable,  # mirrors that the bounce budget admits
-        visible=any(m.reflectance * arriving > tracer.min_contribution for m in affordable),
-        sky="parameter" if own_sky is not None else "environment" if facts.environment else "none",
-        lobes=tuple(name for name, there in facts.lobes if there),
-        quadrics=quadrics,
-        objects=facts.native_shapes + quadrics,
-    )
-
-
 def bounce_cost(tracer: Any, int_ior: float) -> int:
     """Return what a bounce off a material of this index takes from the bounce budget."""
     if tracer.bounce_budget == "plain":
@@ -117,9 +91,9 @@ def _cut_off(case: SimpleNamespace) -> tuple[float, float]:
     return case.arriving * hits if case.made["mirrors"] else 0.0, case.facts.lights * hits
 
 
-#: A decision: the field of the plan; what is decided, in words; what kernels hold by facts and plan ("" if
-#: there is nothing to tell); reasons against it, the first that holds being given; and the value, by the
-#: case and whether there is no reason
+#: A decision: the field of the plan; what is decided, in words; what kernels hold, perhaps by facts and plan
+#: ("" if there is nothing to tell); reasons against it, the first that holds being given; and the value, by
+#: the case (see ``make_plan``) and whether there is no reason
 Rule = namedtuple("Rule", "name what held against value", defaults=[lambda case, free: free])
 
 _SPHERES = {"table": "spheres from a table of centres and radii", "corrected": "hits moved onto spheres"}
@@ -151,8 +125,7 @@ RULES = (
         else "table" if case.facts.tabled else "loop",
     ),
     Rule(
-        "mirrors", "bounce loop",
-        lambda facts, plan: "mirror bounces",
+        "mirrors", "bounce loop", "mirror bounces",
         lambda case: {
             "max_depth admits no mirror ray": bool(case.facts.mirrors) and not case.affordable,
             "no material reflects visibly": not case.visible,
@@ -181,8 +154,7 @@ RULES = (
         lambda case: {"no shapes but analytic ones": case.facts.native_shapes == 0},
     ),
     Rule(  # it pays where there are thousands of triangles to meet
-        "coherent", "coherent packets",
-        lambda facts, plan: "coherent packets of rays",
+        "coherent", "coherent packets", "coherent packets of rays",
         lambda case: {"no mesh in the scene": case.facts.meshes == 0},
     ),
     Rule(
@@ -198,8 +170,7 @@ RULES = (
         lambda case: {"none in the scene": case.facts.planes == 0},
     ),
     Rule(
-        "buffers", "light buffers",
-        lambda facts, plan: "light buffers: what may be in the way of each light",
+        "buffers", "light buffers", "light buffers: what may be in the way of each light",
         lambda case: {
             "no light": case.made["lights"] == "none",
             SCALAR_VARIANT: not case.facts.vectorised,
@@ -210,8 +181,7 @@ RULES = (
         },
     ),
     Rule(
-        "eye", "lists around the eye",
-        lambda facts, plan: "lists around the eye: what its rays may meet",
+        "eye", "lists around the eye", "lists around the eye: what its rays may meet",
         lambda case: {
             SCALAR_VARIANT: not case.facts.vectorised,
             "few cones and cylinders": case.quadrics < LEAST_BUFFERED,
@@ -220,13 +190,11 @@ RULES = (
         },
     ),
     Rule(
-        "random", "random numbers",
-        lambda facts, plan: "random numbers",
+        "random", "random numbers", "random numbers",
         lambda case: {"every light is a point or a direction": case.facts.random_lights == 0},
     ),
     Rule(
-        "emission", "emission",
-        lambda facts, plan: "emission of surfaces",
+        "emission", "emission", "emission of surfaces",
         lambda case: {"no surface emits": case.facts.surface_emitters == 0},
     ),
     Rule(
@@ -236,30 +204,25 @@ RULES = (
         lambda case, free: case.sky,
     ),
     Rule(
-        "textures", "textures",
-        lambda facts, plan: "textures and their coordinates",
+        "textures", "textures", "textures and their coordinates",
         lambda case: {"every material is uniform": not case.facts.textured},
     ),
     Rule(
-        "shading_frames", "shading normals",
-        lambda facts, plan: "shading normals of meshes",
+        "shading_frames", "shading normals", "shading normals of meshes",
         lambda case: {"no mesh in the scene": case.facts.meshes == 0},
     ),
     Rule(
-        "tangents", "tangents",
-        lambda facts, plan: "tangents along texture coordinates",
+        "tangents", "tangents", "tangents along texture coordinates",
         lambda case: {
             "no material depends on the direction of texture coordinates": not case.facts.oriented
         },
     ),
     Rule(
-        "merged", "merged materials",
-        lambda facts, plan: "all materials as one, from a table",
+        "merged", "merged materials", "all materials as one, from a table",
         lambda case: {case.facts.unmergeable: bool(case.facts.unmergeable)},
     ),
     Rule(
-        "two_sided", "light from behind",
-        lambda facts, plan: "light from behind surfaces",
+        "two_sided", "light from behind", "light from behind surfaces",
         lambda case: {"no material is lit from behind": not case.facts.two_sided},
     ),
 )  # fmt: skip
@@ -274,8 +237,25 @@ def make_plan(facts: SceneFacts, tracer: Any, own_sky: float | None) -> KernelPl
     ``tracer`` has the integrator's parameters; ``own_sky`` is the largest radiance of its ``sky``: inf where
     that is not known, None without one.
     """
+    sky = facts.sky if own_sky is None else own_sky
+    # A light counts for one, where its share is clamped to that, and the sky for one at least
+    lights = facts.lights if tracer.clamp or facts.lights == 0 else math.inf
+    arriving = lights + max(1, sky) + facts.emission
+    quadrics = sum(count for _, count in facts.quadrics)
+    affordable = [m for m in facts.mirrors if bounce_cost(tracer, m.int_ior) < tracer.max_depth]
     made, reasons = dict[str, Any](), list[tuple[str, str]]()
-    case = _case(facts, tracer, own_sky, made)
+    case = SimpleNamespace(  # what the rules go by
+        facts=facts,
+        tracer=tracer,
+        made=made,  # the decisions so far
+        arriving=arriving,  # bounds the radiance from anywhere, but for what mirrors add; inf without bound
+        affordable=affordable,  # mirrors that the bounce budget admits
+        visible=any(m.reflectance * arriving > tracer.min_contribution for m in affordable),
+        sky="parameter" if own_sky is not None else "environment" if facts.environment else "none",
+        lobes=tuple(name for name, there in facts.lobes if there),
+        quadrics=quadrics,
+        objects=facts.native_shapes + quadrics,
+    )
     for rule in RULES:
         found = [why for why, holds in rule.against(case).items() if holds]
         reasons += [(rule.name, why) for why in found[:1]]
@@ -285,5 +265,6 @@ def make_plan(facts: SceneFacts, tracer: Any, own_sky: float | None) -> KernelPl
 
 def held(plan: KernelPlan, facts: SceneFacts) -> list[str]:
     """Return a line for each thing that the kernels hold."""
-    there = [rule for rule in RULES if getattr(plan, rule.name) not in (False, "none", ())]
-    return [line for line in (rule.held(facts, plan) for rule in there) if line]
+    there = [rule.held for rule in RULES if getattr(plan, rule.name) not in (False, "none", ())]
+    lines = [text if isinstance(text, str) else text(facts, plan) for text in there]
+    return [line for line in lines if line]

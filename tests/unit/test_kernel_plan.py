@@ -13,7 +13,6 @@ import pytest
 from nodes import group, mesh, rgb, sensor
 
 from mrt_mitsuba.plugins.kernel_plan import RULES, KernelPlan, held
-from mrt_mitsuba.plugins.lobes import Lobes
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -151,15 +150,3 @@ def test_no_lists_where_they_would_be_too_long() -> None:
     assert integrator.kernel_plan(facts).eye
     facts.quadrics = (("cone", 2**14 + 1),)
     assert integrator.kernel_plan(facts).reason("eye") == "too many cones and cylinders"
-
-
-def test_merged_materials_are_recorded_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    value, calls = Lobes.value, []
-    monkeypatch.setattr(Lobes, "value", lambda *arguments: calls.append(1) or value(*arguments))
-    counts = []
-    for count in (2, 30):
-        materials = [{**GLOSSY, "alpha": 0.1 + k / 99} for k in range(count)]
-        calls.clear()
-        kernel(scene(light=LIGHT, **{f"ball{k}": {**SPHERE, "bsdf": m} for k, m in enumerate(materials)}))
-        counts.append(len(calls))
-    assert counts[0] == counts[1] > 0

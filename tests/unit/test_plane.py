@@ -39,16 +39,3 @@ def test_corners_are_a_square_on_the_plane(variant: str) -> None:
         assert mesh.distance == distance
         for axis in np.flatnonzero(np.abs(unit(normal)) == 1):  # planes across an axis stay so
             assert (points[:, axis] == np.float32(-distance * unit(normal)[axis])).all()
-
-
-def test_texture_coordinates_are_lengths_from_the_foot() -> None:
-    mesh = plane((0.3, -0.2, 1), 4.0)
-    scene = mi.load_dict({"type": "scene", "plane": mesh})
-    n = unit((0.3, -0.2, 1))
-    s, t = mesh.tangents
-    np.testing.assert_allclose([n @ s, n @ t, s @ t], 0, atol=1e-15)
-    np.testing.assert_allclose(np.cross(s, t), n, atol=1e-15)
-    for u, v in ((0, 0), (1.5, -2.5), (-30, 20)):
-        start = -3 * n + u * s + v * t
-        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(start), mi.Vector3f(-n)))
-        np.testing.assert_allclose(np.array(si.uv).ravel(), (u, v), atol=2e-5)
