@@ -97,6 +97,7 @@ def _pareto(excess: np.ndarray, usual: float = 0.5) -> tuple[float, float]:
     grid = 30 + math.isqrt(size)
     quarter = max(excess[int(size / 4 + 0.5) - 1], 1e-9 * most)
     slope = (1 - np.sqrt(grid / (np.arange(grid) + 0.5))) / (3 * quarter) + 1 / most
+    slope = slope[np.abs(slope) * most > 1e-9]  # 0 is the exponential law, and 0/0 below
     shape = np.log1p(-slope[:, None] * excess).mean(1)
     likelihood = size * (np.log(-slope / shape) - shape - 1)
     best = float(np.average(slope, weights=np.exp(likelihood - likelihood.max())))

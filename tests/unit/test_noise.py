@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.output.error import DOUBTFUL
+from mrt_mitsuba.output.error import DOUBTFUL, tail_shape
 from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.rendering.noise import Halves
 from mrt_mitsuba.rendering.rounds import run_rounds
@@ -100,6 +100,11 @@ def test_rare_bright_values_keep_their_share() -> None:
         warnings.simplefilter("ignore", mrt.MrtWarning)
         means = np.array([_render(exposer, seed).image.mean() for seed in range(150)])
     assert abs(means.mean() - expected) < 4 * means.std(ddof=1) / len(means) ** 0.5
+
+
+def test_a_tail_of_values_that_are_alike_has_a_shape() -> None:
+    values = np.repeat([0.0, 2.0], [39204, 99])  # one of the shapes tried is that of an exponential law
+    assert np.isfinite(tail_shape(values, np.ones_like(values)))
 
 
 @pytest.mark.parametrize(("draw", "doubtful"), [(_calm, False), (_rare(0.3), False), (_rare(0.003, 8), True)])
