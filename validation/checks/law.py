@@ -107,9 +107,7 @@ class Law:
         """Return the figure that uses most of its limit."""
 
         def used(part: Part) -> float:
-            over, under = part.measured, part.limit
-            if not part.at_most:
-                over, under = under, over
+            over, under = (part.measured, part.limit)[:: 1 if part.at_most else -1]
             return math.inf if not part.holds else over / under if under > 0 else 0.0
 
         return max(self.parts, key=used, default=Part("", math.nan, math.nan))
@@ -165,8 +163,8 @@ class Check:
 
     def study(self) -> Study:
         """Return the findings in the form that pages are made of."""
-        study, laws = Study(self.subject, f"{self.subject}, {self.variant}"), self.laws.values()
-        study.seconds = self.seconds
+        laws = self.laws.values()
+        study = Study(self.subject, f"{self.subject}, {self.variant}", seconds=self.seconds)
         study.bounds += [replace(p, name=f"{law.name}: {p.name}") for law in laws for p in law.parts]
         rows = [
             [law.name, law.verdict, law.skipped or law.note, "" if law.holds else law.snippet] for law in laws
@@ -244,25 +242,23 @@ class Subject:
 
     def program(self, body: str, **names: Any) -> str:
         """Return a program that loads the plugin and runs ``body``, filled with ``names``."""
-        word, variant, given = self.word, mi.variant(), repr(self.description)
+        word, given = self.word, repr(self.description)
         text = "".join(setup for name, setup in _SETUP.items() if names.get(name) is not None) + "\n" + body
         if "variants" in names:
-            each = f"    mi.set_variant(variant)\n    print(variant)\n    {word} = load()\n"
-            text = "for variant in {variants}:\n" + each + indent(text, "    ")
-        if "PCG32(n)" in text:
-            variant = variant.replace("scalar_", "llvm_ad_")
-        ours, load = "'mrt_" in given, f"# {word}: the object that was checked\nload = lambda: {word}\n"
+            text = f"mi.set_variant(variant)\nprint(variant)\n{word} = load()\n{text}"
+            text = "for variant in {variants}:\n" + indent(text, "    ")
+        variant = mi.variant().replace("scalar_", "llvm_ad_" if "PCG32(n)" in text else "scalar_")
+        load = f"# {word}: the object that was checked\nload = lambda: {word}\n"
+        ours, stock = "'mrt_" in given, type(self.plugin).__module__.startswith("mitsuba")
         with suppress(Exception):  # of what some dicts hold there is no source
             if eval(given, {"mi": mi, "np": np}):
-                known = ours or type(self.plugin).__module__.startswith("mitsuba")
-                load = "" if known else f"# register {self.name!r} here\n"
+                load = "" if ours or stock else f"# register {self.name!r} here\n"
                 load += f"\ndef load(**more):\n    return mi.load_dict({{**{given}, **more}})\n"
                 load += f"\n{word} = load()\n"
         start = "import mrt_mitsuba as mrt  # before mitsuba\n" if ours else ""
         start += "import drjit as dr\nimport mitsuba as mi\nimport numpy as np\n\n"
         start += f"mi.set_variant({variant!r})\n" + ("mrt.register()\n" if ours else "")
-        numbers = {name: _written(value) for name, value in names.items()}
-        return start + load + text.format(**numbers)
+        return start + load + text.format(**{name: _written(value) for name, value in names.items()})
 
     def elsewhere(self, other: str, call: Callable[[], Found]) -> Found:
         """Return what a function gives in another variant. Raises ``Skip`` where there is none."""
@@ -275,8 +271,8 @@ class Subject:
         except RuntimeError as problem:
             if "not found" not in str(problem):
                 raise
-            register = "register it there (mi.detail.add_variant_callback)"
-            raise Skip(f"{other} does not know the plugin: {register}") from None
+            fix = "register it there (mi.detail.add_variant_callback)"
+            raise Skip(f"{other} does not know the plugin: {fix}") from None
         finally:
             mi.set_variant(here)
 
@@ -350,6 +346,7 @@ def examine(
                 if late:
                     raise Skip(f"a law before it {late}")
                 laws[name](law, case)
+            law.skipped = "" if law.parts else "; ".join(law.notes)
         except Skip as why:
             law.skipped = f"{why}: {_reason(why.__cause__)}" if why.__cause__ else str(why)
         except TimedOut:
@@ -383,9 +380,8 @@ def settings_restored() -> Iterator[None]:
 @contextmanager
 def _limited(seconds: float) -> Iterator[None]:
     """Raise ``TimedOut`` in this thread's Python code after so many seconds. A kernel is not interrupted."""
-    thread, start = ctypes.c_ulong(threading.get_ident()), time.perf_counter()
-    interrupt = ctypes.pythonapi.PyThreadState_SetAsyncExc
-    timer = threading.Timer(seconds, interrupt, (thread, ctypes.py_object(TimedOut)))
+    start, raised = time.perf_counter(), (ctypes.c_ulong(threading.get_ident()), ctypes.py_object(TimedOut))
+    timer = threading.Timer(seconds, ctypes.pythonapi.PyThreadState_SetAsyncExc, raised)
     timer.daemon = True
     timer.start()
     try:

@@ -38,10 +38,8 @@ def is_scalar() -> bool:
 
 def context(component: int | None = None, *, importance: bool = False) -> Any:
     """Return a ``BSDFContext`` for one component or all."""
-    made = mi.BSDFContext(mi.TransportMode.Importance if importance else mi.TransportMode.Radiance)
-    if component is not None:
-        made.component = component
-    return made
+    mode = mi.TransportMode.Importance if importance else mi.TransportMode.Radiance
+    return mi.BSDFContext(mode, mi.BSDFContext().type_mask, component)
 
 
 def interaction(wi: Any, uv: Any) -> Any:
@@ -167,12 +165,9 @@ def spread(
 ) -> Array:
     """Return the largest change of a quantity of directions [N, 3] as they move ``by`` so much."""
     base = quantity(*directions)
-    largest = np.zeros_like(base)
-    for _ in range(6):
-        moved = [v + by * rng.normal(size=v.shape).astype(np.float32) for v in directions]
-        change = np.abs(quantity(*moved) - base)
-        largest = np.maximum(largest, np.where(np.isnan(change), np.inf, change))
-    return largest
+    moved = ([v + by * rng.normal(size=v.shape).astype(np.float32) for v in directions] for _ in range(6))
+    changes = np.abs([quantity(*at) - base for at in moved])
+    return np.where(np.isnan(changes), np.inf, changes).max(axis=0)
 
 
 def excess(one: Array, other: Array, allowed: Array | float = 0.0) -> Array:
