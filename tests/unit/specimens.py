@@ -101,6 +101,7 @@ CHANGES = {
     "cancelling half vector": (GLOSS, *_value(_cancelling), {"roundoff.lost"}),
     "NaN at the least roughness": (
         GLOSS, *_value(lambda value, wi, wo: dr.select(value > 1e5, dr.nan, value)), {"finite.values"}),
+    "updates ignored": (GLOSS, "stale", None, {"gradients.reached"}),
     "detached gradient": (GLOSS, *_value(lambda value, wi, wo: dr.detach(value)), {"gradients.values"}),
     # of directions that move with the roughness
     "derivative of the density in weights": (

@@ -180,12 +180,14 @@ def energy(law: Law, case: Case) -> None:
     count, mode = case.count(2**12, 2**14), context(importance=True)
     wi = probe.direction(np.cos(np.radians(GRAZING)), case.rng.uniform(0, 2 * np.pi, len(GRAZING)))
     at = {"wi": wi, "uv": case.uniform(len(GRAZING), 2)}
-    drawn = [case.sample(i, case.uniform(count, 3), t, mode) for i, t in zip(*at.values(), strict=True)]
-    apart = []
+    drawn = (case.sample(i, case.uniform(count, 3), t, mode) for i, t in zip(*at.values(), strict=True))
+    means, apart = [_mean(s.weight) for s in drawn], []
     for view, cells in zip(case.views, case.densities, strict=True):
-        drawn.append(case.sample(view.wi, view.u, view.uv, mode))
-        apart.append(_apart(case, view, cells, drawn[-1]) if cells else 0)
-    surely = [(mean - SIGMAS * error).max() for mean, error in (_mean(s.weight) for s in drawn)]
+        s = case.sample(view.wi, view.u, view.uv, mode)
+        means.append(_mean(s.weight))
+        # where values are NaN, the law ``finite`` says so
+        apart.append(_apart(case, view, cells, s) if cells and view.holes < 0.01 else 0)
+    surely = [(mean - SIGMAS * error).max() for mean, error in means]
     law.hold("largest", surely, **{n: np.concatenate([at[n], x]) for n, x in case.incidence.items()})
     if any(case.densities):
         law.hold("apart", apart, **case.incidence)
@@ -237,13 +239,11 @@ def eval_pdf(law: Law, case: Case) -> None:
     law.hold("value", excess(value, p.value, p.value_off), **vars(p))
     law.hold("density", excess(pdf, p.pdf, p.pdf_off), **vars(p))
     if not is_scalar():  # where Mitsuba takes ``active`` out of its plugins
-
-        def inactive(c: Any, si: Any, o: Any) -> list[Any]:
-            off = o.z > 2  # no lane
-            return [bsdf.eval(c, si, o, off), bsdf.eval_pdf(c, si, o, off)[0]]
-
-        values = np.concatenate(case.ask(inactive, p.wi, p.wo, p.uv), axis=1)
-        law.hold("inactive", (values != 0).any(axis=1), **vars(p))
+        values = case.ask(
+            lambda c, si, o: [bsdf.eval(c, si, o, o.z > 2), bsdf.eval_pdf(c, si, o, o.z > 2)[0]],  # no lane
+            *(p.wi, p.wo, p.uv),
+        )
+        law.hold("inactive", np.any(values, axis=(0, 2)), **vars(p))
 
 
 RECIPROCITY = """eta = {eta}  # index of refraction at wo over that at wi
@@ -285,15 +285,13 @@ def reciprocity(law: Law, case: Case) -> None:
     def forth(i: Array, o: Array, t: Array, eta: Array) -> Array:
         return case.eval(i, o, t) / np.abs(o[:, 2:]) * eta[:, None] ** 2
 
-    def back(i: Array, o: Array, t: Array, eta: Array) -> Array:
-        return case.eval(o, i, t) / np.abs(i[:, 2:])
-
-    def importance(i: Array, o: Array, t: Array, eta: Array) -> Array:
-        return case.eval(i, o, t, context(importance=True)) / np.abs(o[:, 2:])
-
+    others = {
+        "swapped": lambda i, o, t, _: case.eval(o, i, t) / np.abs(i[:, 2:]),
+        "modes": lambda i, o, t, _: case.eval(i, o, t, context(importance=True)) / np.abs(o[:, 2:]),
+    }
     at = few.wi, few.wo, few.uv, few.eta
     one, allowed = forth(*at), case.spread(forth, *at)
-    for name, other in (("swapped", back), ("modes", importance)):
+    for name, other in others.items():
         law.hold(name, excess(one, other(*at), allowed + case.spread(other, *at)), **vars(few))
     _delta_either_way(law, case)
     # light that is reflected stays in its medium: integrators multiply by ``eta`` as they go
@@ -390,8 +388,8 @@ def _finite(law: Law, case: Case, extremes: tuple, setting: tuple | None = None)
     words = ", ".join(f"{kind} {faults.sum()}" for kind, faults in kinds.items() if faults.any())
     if words or not setting:
         where = f" with {setting[0]} = {setting[1]:g}" if setting else ""
-        named = {"setting": setting, "where": where, "faults": words or "none"}
-        law.hold(name, np.any([*kinds.values()], axis=0), wi=wi, uv=uv, wo=wo, u=u, **named)
+        at = {"wi": wi, "uv": uv, "wo": wo, "u": u, "setting": setting, "where": where}
+        law.hold(name, np.any([*kinds.values()], axis=0), faults=words or "none", **at)
     return not words
 
 

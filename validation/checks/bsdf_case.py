@@ -43,7 +43,7 @@ class Case(Subject, Probe):
 
         ``density``: pdf() at the samples that count, of lobes with a width and not refused; 0 elsewhere. The
         first quarter (``pilot``, directions) makes the cells in which the other ``count`` are judged, by the
-        ``codes`` of those that count and their ``share``.
+        ``codes`` of those that count and their ``share``. ``holes``: the share at which eval() is not finite.
         """
         found = []
         for angle in QUICK_ANGLES if self.quick else ANGLES:
@@ -54,7 +54,8 @@ class Case(Subject, Probe):
             density, first = np.where(live(wi, samples, value, pdf), pdf, 0), len(u) // 4
             pilot, rest = (samples.wo[part][density[part] > 0] for part in np.s_[:first, first:])
             known = {"wi": wi, "uv": uv, "u": u, "samples": samples, "density": density, "pilot": pilot}
-            judged = {"codes": encode(rest), "count": len(u) - first, "share": len(rest) / (len(u) - first)}
+            holes, count = ((density > 0) & ~np.isfinite(value).all(axis=1)).mean(), len(u) - first
+            judged = {"codes": encode(rest), "count": count, "share": len(rest) / count, "holes": holes}
             found.append(SimpleNamespace(**known, **judged))
         return found
 

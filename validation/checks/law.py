@@ -98,9 +98,8 @@ class Law:
                 measured = {"most": errors[i], "none": errors.sum(), "share": errors.mean()}[how]
             names = {key: x[i] if isinstance(x, np.ndarray) else x for key, x in names.items()}
         snippet = self.program(*body, **names) if self.program and body else ""
-        limit = float(usual if limit is None else limit)
-        what = what.format(**names)
-        self.parts.append(Part(what, float(measured), limit, how != "at least", why, name, snippet))
+        figures = float(measured), float(usual if limit is None else limit)
+        self.parts.append(Part(what.format(**names), *figures, how != "at least", why, name, snippet))
 
     @property
     def worst(self) -> Part:
@@ -253,8 +252,8 @@ class Subject:
         with suppress(Exception):  # of what some dicts hold there is no source
             if eval(given, {"mi": mi, "np": np}):
                 load = "" if ours or stock else f"# register {self.name!r} here\n"
-                load += f"\ndef load(**more):\n    return mi.load_dict({{**{given}, **more}})\n"
-                load += f"\n{word} = load()\n"
+                whole = f"mi.load_dict({{**{given}, **more}})"
+                load += f"\ndef load(**more):\n    return {whole}\n\n{word} = load()\n"
         start = "import mrt_mitsuba as mrt  # before mitsuba\n" if ours else ""
         start += "import drjit as dr\nimport mitsuba as mi\nimport numpy as np\n\n"
         start += f"mi.set_variant({variant!r})\n" + ("mrt.register()\n" if ours else "")
@@ -333,8 +332,7 @@ def examine(
     """
     runtime.use()
     chosen = list(laws if only is None else only)
-    unknown = [name for name in chosen if name not in laws]
-    if unknown:
+    if unknown := [name for name in chosen if name not in laws]:
         raise UsageError(f"unknown law {unknown[0]!r}: choose from {', '.join(laws)}")
     start, variant, found, late = time.perf_counter(), mi.variant(), {}, ""
     with settings_restored():

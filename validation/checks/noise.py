@@ -70,17 +70,14 @@ def measure(
 ) -> Lanes:
     """Estimate the noise of ``function([M, K]) -> [M]`` at float32 inputs [N, K].
 
-    Return the ``noise`` found by differences in roundings (2⁻²⁴) of the value; the noise over what inputs,
-    rounded twice, and ``ALLOWANCE`` other roundings explain (``lost``); and the most float32 steps between
-    points of a line (``stride``).
+    Return the ``noise`` in roundings (2⁻²⁴) of the value, or of ``size`` [N]; the noise over what inputs,
+    rounded twice, and ``ALLOWANCE`` other roundings explain (``lost``); and the ``stride`` of each line.
 
-    ``size`` [N]: what roundings are of, the value itself if left out. ``strides``: the most float32 steps
-    between points of a line, in ascending order; the first counts along which the value changes at half of
-    them, since digits that are lost leave stairs, flat where a line is short. A slope is a central
-    difference; of several widths, the one that agrees best with its neighbour counts. ``project``: what makes
-    inputs valid again that are far from the first; with it, ``COARSE`` lines are looked at, too. Stairs are
-    as high at any step that is large against them, unlike kinks and what is left of a smooth function: noise
-    counts that is ``ALIKE`` at two steps.
+    ``strides``: the most float32 steps between points of a line, ascending; the first counts along which the
+    value changes at half of them, since lost digits leave stairs, flat where a line is short. ``project``
+    makes inputs far from the first valid again; with it, ``COARSE`` lines are examined, too. Stairs are as
+    high at any step that is large compared with them, unlike kinks and what is left of a smooth function:
+    only noise that is ``ALIKE`` at two steps counts.
     """
     inputs, rng = inputs.astype(np.float32), np.random.default_rng(seed)
 
@@ -102,6 +99,7 @@ def measure(
     steps = np.array([1, -1])[:, None, None, None] * reaches * np.eye(inputs.shape[1], dtype=int)[:, None]
     forth, back = np.moveaxis(values(np.broadcast_to(steps, (*steps.shape[:3], *inputs.shape))), 1, 0)
     slope = (forth - back) / (2 * reaches[..., 0, 0])
+    # of several widths, the one that agrees best with its neighbour
     best = np.abs(np.diff(slope, axis=0)).argmin(axis=0)[None]
     slope = np.take_along_axis(slope[1:], best, axis=0)[0]  # change per step
     explained = np.sqrt((slope**2).sum(axis=0) / 12)  # a rounded input is within half a step: variance 1/12

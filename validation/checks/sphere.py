@@ -124,8 +124,8 @@ def integrate(
     for attempt in range(8):
         first, last = below[np.searchsorted(codes, [cells.start, cells.end])]
         wo, omega = cells.points(rng)
-        values = function(wo.reshape(-1, 3)).reshape(*omega.shape, -1)
-        values = np.where(np.isfinite(values), values, 0) * omega[..., None] * POINTS
+        values = np.nan_to_num(function(wo.reshape(-1, 3)), posinf=0, neginf=0)
+        values = values.reshape(*omega.shape, -1) * omega[..., None] * POINTS
         mean, variance = values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
         total = np.abs(mean).sum(axis=0) + 1e-12
         # half of what chance does to the count of the samples, or one sample, is known well enough
