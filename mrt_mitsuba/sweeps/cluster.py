@@ -1,8 +1,10 @@
-"""Workers: processes of this machine, or of a cluster that somebody else has started; and jobs on them."""
+"""Workers: processes of this machine, or of a cluster that somebody else has started; and jobs on them.
+
+Needs Dask, which only a sweep does.
+"""
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import os
 import subprocess
@@ -10,16 +12,17 @@ from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from mrt_mitsuba.errors import MrtError, OutputError, UsageError, one_line
+from distributed import Client, Future, KilledWorker, Scheduler, SpecCluster, as_completed
+from distributed.client import ClosedClientError
+from distributed.deploy.subprocess import SubprocessWorker
+from distributed.system import MEMORY_LIMIT
+
+from mrt_mitsuba.errors import MrtError, OutputError, one_line
 from mrt_mitsuba.machine import usable_cores
-from mrt_mitsuba.options import check, integer
 from mrt_mitsuba.sweeps import worker
 from mrt_mitsuba.sweeps.jobs import Job
-
-if TYPE_CHECKING:
-    from distributed import Client, Future
 
 CONNECTING = 10  # seconds to reach a scheduler, and for its first worker to be there
 STARTING = 120  # seconds for worker processes of this machine; a busy one takes its time
@@ -31,16 +34,6 @@ class ClusterError(MrtError):
     """Workers cannot be reached, cannot be used, or are gone."""
 
 
-def check_engine(cluster: Any, **numbers: Any) -> None:
-    """Raise ``UsageError`` where the engine is not installed or is asked for what it cannot be."""
-    if importlib.util.find_spec("distributed") is None:
-        raise UsageError("a sweep needs Dask: pip install 'mrt-mitsuba[cluster]'")
-    for name in (name for name, number in numbers.items() if number is not None):
-        check(name, integer(int(name == "workers"), 65535), numbers[name])
-    if numbers["workers"] is not None and cluster is not None:
-        raise UsageError("workers are for this machine, and a cluster brings its own: give one of them")
-
-
 @contextmanager
 def connected(
     cluster: Any, jobs: int, workers: int | None, dashboard: int | None, variant: str
@@ -50,9 +43,6 @@ def connected(
     Workers of this machine, as many as there are jobs at most, end with the block. Raises ``ClusterError``
     where no scheduler answers or has a worker, and where it goes away in the block.
     """
-    from distributed import Client
-    from distributed.client import ClosedClientError
-
     with ExitStack() as stack:
         # Whoever asked for connections that break says so once
         for name in ("distributed", "distributed.client", "tornado.application"):
@@ -97,10 +87,6 @@ def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
     They are started anew, not forked, nor do they import the caller's script: it needs no
     ``if __name__ == "__main__"``.
     """
-    from distributed import Scheduler, SpecCluster
-    from distributed.deploy.subprocess import SubprocessWorker
-    from distributed.system import MEMORY_LIMIT
-
     options = {
         "nthreads": 1,
         "memory_limit": MEMORY_LIMIT // count,
@@ -162,8 +148,6 @@ def outcomes(
 
     One that lost its worker, or failed by accident, is handed over again. ``setting``: of ``render_job``.
     """
-    from distributed import KilledWorker, as_completed
-
     calls: dict[Future, Job] = {}
     handed: Counter[str] = Counter()
     coming = as_completed(loop=client.loop)

@@ -61,7 +61,7 @@ def points(grid: Any, zipped: bool) -> dict[str, dict[str, Any]]:
     """
     if not isinstance(grid, Mapping):
         raise UsageError(f'grid={grid!r}: give a dict of lists, such as {{"aa": [1, 2]}}')
-    axes = {key: _axis(key, values) for key, values in grid.items()}
+    axes = {str(key): _axis(key, values) for key, values in grid.items()}
     lengths = list(map(len, axes.values()))
     if zipped and len(set(lengths)) > 1:
         raise UsageError(f"zipped axes must be of one length, and those of {', '.join(axes)} are {lengths}")
@@ -74,19 +74,16 @@ def points(grid: Any, zipped: bool) -> dict[str, dict[str, Any]]:
     names = [
         ",".join(f"{word(key)}={word(value)}" for key, value in point.items()) or "picture" for point in found
     ]
-    counts = Counter(map(str.casefold, names))  # some file systems ignore case
-    for name in names:
-        if (count := counts[name.casefold()]) > 1:
-            raise UsageError(
-                f"{count} jobs would write the same file {name}: take values out, or use zipped=True, which "
-                "numbers the files"
-            )
+    ((name, count),) = Counter(map(str.casefold, names)).most_common(1)  # some file systems ignore case
+    if count > 1:
+        raise UsageError(
+            f"{count} jobs would write the same file {name}: take values out, or use zipped=True, which "
+            "numbers the files"
+        )
     return dict(zip(names, found, strict=True))
 
 
 def _axis(key: Any, values: Any) -> list[Any]:
-    if not (isinstance(key, str) and key.isprintable()):
-        raise UsageError(f"grid: the key {key!r} is no name of an option or a parameter")
     values = values.tolist() if hasattr(values, "tolist") else values  # NumPy's
     if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
         raise UsageError(f"grid: {key} is {values!r}; give a list of values, such as [{values!r}]")

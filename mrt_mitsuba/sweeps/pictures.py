@@ -6,13 +6,16 @@ picture is written some rows at a time, so that no process ever holds it.
 
 from __future__ import annotations
 
-import collections
 import contextlib
 import itertools
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
+import OpenEXR
+from PIL import Image
 
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
 from mrt_mitsuba.output.files import compressing, silenced
@@ -28,27 +31,25 @@ BYTES_PER_PIXEL = 128
 LEAST_MEMORY = 2**27
 
 
-def mark(path: str, whole: bool = False) -> str | None:
-    """Return the fingerprint in a picture that a sweep made, "" in any other; None for what is no picture,
-    or, if that is asked for, no ``whole`` one."""
-    import OpenEXR
-    from PIL import Image
-
-    if not os.path.isfile(path):  # a pipe has no end to wait for
-        return None
+def mark(path: str) -> tuple[str | None, bool]:
+    """Return the fingerprint in a picture that a sweep made, "" in any other and None in what is no picture,
+    and whether the picture is whole."""
+    found = None
     try:
+        if not os.path.isfile(path):  # a pipe has no end to wait for
+            return None, False
         if path.endswith(".png"):
             with Image.open(path) as picture:
-                if whole:
-                    picture.verify()  # every chunk to the last, which ``load`` can do without
-                return str(picture.info.get(MADE_WITH, ""))
-        with silenced():
-            found = str(OpenEXR.File(path, header_only=True).header().get(MADE_WITH, ""))
-            if whole and found:
-                collections.deque(_strips(OpenEXR.InputFile(path)), maxlen=0)
-            return found
+                found = str(picture.info.get(MADE_WITH, ""))
+                picture.verify()  # every chunk to the last, which ``load`` can do without
+        else:
+            with silenced():
+                found = str(OpenEXR.File(path, header_only=True).header().get(MADE_WITH, ""))
+                if found:
+                    _read_last_row(path)
+        return found, True
     except (OSError, RuntimeError, ValueError, TypeError, SyntaxError):  # what libraries raise for files
-        return None
+        return found, False
 
 
 def is_fresh(job: Job, folder: str, png: bool = False, listed: bool = False) -> bool:
@@ -59,13 +60,13 @@ def is_fresh(job: Job, folder: str, png: bool = False, listed: bool = False) -> 
     """
     wanted, fresh = job.made_with, True
     for path in (os.path.join(folder, file) for file in job.files(png)):
-        found = mark(path)
+        found, whole = mark(path)
         if os.path.lexists(path) and not (found or (found is None and listed and os.path.isfile(path))):
             raise OutputError(
                 f"{path} was not made by a sweep, which would replace it: move it away, or choose "
                 "another folder"
             )
-        fresh = fresh and found == wanted == mark(path, whole=True)
+        fresh = fresh and whole and found == wanted
     return fresh
 
 
@@ -103,14 +104,12 @@ def join(job: Job, parts: Sequence[Job], found: Sequence[Mapping[str, Any]], fol
     attempts = max(facts.get("attempts", 1) for facts in found)
     if error := next((facts["error"] for facts in found if "error" in facts), ""):
         return {"error": error, "attempts": attempts}
-    own = os.path.join(folder, f"{job.name}.tiles")
     try:
         _write_rows(job, parts, folder)
-        for tile in (os.path.join(own, name) for name in os.listdir(own)):
-            if mark(tile):  # also those of another number of tiles
-                os.unlink(tile)
-        with contextlib.suppress(OSError):  # something of the user's own is in there
-            os.rmdir(own)
+        for part in parts:
+            os.unlink(os.path.join(folder, part.file))
+        with contextlib.suppress(OSError):  # something else is in there
+            os.rmdir(os.path.join(folder, f"{job.name}.tiles"))
     except (MrtError, OSError, RuntimeError) as error:
         return {"error": f"cannot put {job.name} together: {error}", "attempts": attempts}
     sums = {name: sum(facts[name] for facts in found) if all(found) else None for name in ("seconds", "rays")}
@@ -118,12 +117,10 @@ def join(job: Job, parts: Sequence[Job], found: Sequence[Mapping[str, Any]], fol
 
 
 def _write_rows(job: Job, tiles: Sequence[Job], folder: str) -> None:
-    import numpy as np
-    import OpenEXR
-
     files = [OpenEXR.InputFile(os.path.join(folder, tile.file)) for tile in tiles]
     regions = [tile.arguments["region"] for tile in tiles]
     own, (left, top, wide, high) = files[0].header(), regions[-1]
+    names = list(own["channels"])
     header: dict[str, Any] = OpenEXR.Header(left + wide, top + high)
     header |= {name: value for name, value in own.items() if name not in header and name != "type"}
     options = {name: value for name, value in json.loads(own["mrt:options"]).items() if name != "region"}
@@ -136,19 +133,22 @@ def _write_rows(job: Job, tiles: Sequence[Job], folder: str) -> None:
             header["compression"] = type(header["compression"])(int(kind))  # an older type of the library
             picture = stack.enter_context(contextlib.closing(OpenEXR.OutputFile(file.name, header)))
             for first in range(0, len(files), columns):
-                for parts in zip(*map(_strips, files[first : first + columns]), strict=True):
-                    rows, planes = len(parts[0]["R"]) // (4 * regions[first][2]), {}
-                    for name in header["channels"]:
-                        blocks = [np.frombuffer(part[name], np.float32).reshape(rows, -1) for part in parts]
-                        planes[name] = np.hstack(blocks).tobytes()
-                    picture.writePixels(planes, rows)
-        # The library does not report a full disk: read the last row
-        OpenEXR.InputFile(file.name).channel("R", scanLine1=top + high - 1, scanLine2=top + high - 1)
+                for row in range(0, regions[first][3], ROWS):
+                    rows = min(ROWS, regions[first][3] - row)
+                    strips = [
+                        b"".join(tile.channels(names, scanLine1=row, scanLine2=row + rows - 1))
+                        for tile in files[first : first + columns]
+                    ]
+                    blocks = [
+                        np.frombuffer(strip, np.float32).reshape(len(names), rows, -1) for strip in strips
+                    ]
+                    planes = map(bytes, np.concatenate(blocks, axis=2))
+                    picture.writePixels(dict(zip(names, planes, strict=True)), rows)
+        _read_last_row(file.name)  # the library does not report a full disk
 
 
-def _strips(file: Any) -> Iterator[dict[str, bytes]]:
-    """Yield the channels of an EXR, ``ROWS`` rows at a time."""
-    channels, height = list(file.header()["channels"]), file.header()["dataWindow"].max.y + 1
-    for top in range(0, height, ROWS):
-        bottom = min(top + ROWS, height) - 1
-        yield dict(zip(channels, file.channels(channels, scanLine1=top, scanLine2=bottom), strict=True))
+def _read_last_row(path: str) -> None:
+    """Raise what the EXR library does where a file ends too soon."""
+    file = OpenEXR.InputFile(path)
+    last = file.header()["dataWindow"].max.y
+    file.channel("R", scanLine1=last, scanLine2=last)

@@ -11,9 +11,9 @@ from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import OutputError, UsageError
+from mrt_mitsuba.options import check, integer
 from mrt_mitsuba.output.replacing import temporary_folder
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
-from mrt_mitsuba.sweeps.cluster import check_engine, connected, inspect, outcomes
 from mrt_mitsuba.sweeps.jobs import Job, check_parameters, jobs, points
 from mrt_mitsuba.sweeps.pictures import cut, is_fresh, join
 from mrt_mitsuba.sweeps.table import Table
@@ -64,7 +64,19 @@ def sweep(
         ClusterError: where workers cannot be reached or the scheduler is gone; a second run goes on from
             there.
     """
-    check_engine(cluster, workers=workers, retries=retries, dashboard=dashboard)
+    try:
+        from mrt_mitsuba.sweeps.cluster import connected, inspect, outcomes
+    except ModuleNotFoundError:
+        raise UsageError("a sweep needs Dask: pip install 'mrt-mitsuba[cluster]'") from None
+    for name, number, least in (
+        ("workers", workers, 1),
+        ("retries", retries, 0),
+        ("dashboard", dashboard, 0),
+    ):
+        if number is not None:
+            check(name, integer(least, 65535), number)
+    if workers is not None and cluster is not None:
+        raise UsageError("workers are for this machine, and a cluster brings its own: give one of them")
     if tiles is not None and png:
         raise UsageError("tiles: pictures in tiles are written as EXR only; leave out png")
     current = getattr(sys.modules.get("mitsuba"), "variant", str)()

@@ -84,14 +84,11 @@ def _read(path: str) -> dict[str, dict[str, Any]]:
     """Return the facts of an earlier table by the name of the file."""
     if not os.path.exists(path):
         return {}
-    rows: list[list[str]] = []
     with suppress(OSError, ValueError, csv.Error), open(path, encoding="utf-8", newline="") as file:
-        rows = [row[-len(FACTS) :] for row in csv.reader(file)]
-    if rows[:1] != [[*FACTS]]:
-        raise OutputError(f"{path} is not the table of a sweep: move it away, or choose another folder")
-    found: dict[str, dict[str, Any]] = {}
-    for row in filter(None, rows[1:]):
-        found[row[0]] = {}
-        with suppress(ValueError):  # it was edited
-            found[row[0]] = {name: FACTS[name](text) for name, text in zip(FACTS, row, strict=True) if text}
-    return found
+        head, *rows = (row[-len(FACTS) :] for row in csv.reader(file) if row)
+        if head == [*FACTS]:
+            return {
+                row[0]: {name: FACTS[name](text) for name, text in zip(FACTS, row, strict=True) if text}
+                for row in rows
+            }
+    raise OutputError(f"{path} is not the table of a sweep: move it away, or choose another folder")
