@@ -86,8 +86,8 @@ def write_xml(
         raise UsageError(f"params: only an XML file declares names, such as {next(iter(params))}")
     else:
         terms = terms or report_scene(scene)  # type: ignore[arg-type]  # which refuses anything else
-        wide, high = width or SIZE[0], height or SIZE[1]
-        nodes = scene_dict(terms, fresnel=fresnel or "schlick", width=wide, height=high)
+        size = {"width": width or SIZE[0], "height": height or SIZE[1]}
+        nodes = scene_dict(terms, fresnel=fresnel or "schlick", **size)
         files = _put_into_files(nodes, os.path.splitext(os.fspath(path))[0], flavor)
         nodes = _stock(nodes, terms) if flavor == "stock" else nodes
         import mitsuba as mi
@@ -153,8 +153,10 @@ def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
                 place = _facing(center, list(map(operator.sub, center, opposite)), node["radius"])
                 result[f"{name}_disc{number}"] = {"type": "disk", "to_world": place, "bsdf": node["bsdf"]}
         elif kind.startswith("mrt_"):
-            reason = "is made of arrays, or a mesh to them; write_xml, or mrt export, writes meshes and cones"
-            raise SceneError(f"{name} has no counterpart among Mitsuba's plugins: {kind} {reason} into files")
+            raise SceneError(
+                f"{name} has no counterpart among Mitsuba's plugins: {kind} is made of arrays, or a mesh to "
+                "them; write_xml, or mrt export, writes meshes and cones into files"
+            )
     return result
 
 

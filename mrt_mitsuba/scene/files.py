@@ -47,12 +47,9 @@ def read_text(path: Path) -> bytes:
     if b"\0" in data:
         raise SceneError(f"{path}: is not a text file (it holds a zero byte); export it as OBJ or MTL text")
     data = re.sub(rb"\r\n?", b"\n", data).removeprefix(b"\xef\xbb\xbf") + b"\n"
-
-    def joined(lines: re.Match[bytes]) -> bytes:
-        return lines[0].replace(b"\\\n", b" ") + b"\n" * lines[0].count(b"\\\n")
-
-    if b"\\\n" in data:
-        data = re.sub(rb"(?m)^(?:.*\\\n)+.*\n", joined, data)
+    if (end := b"\\\n") in data:
+        continued = re.compile(rb"(?m)^(?:.*\\\n)+.*\n")
+        data = continued.sub(lambda m: m[0].replace(end, b" ") + b"\n" * m[0].count(end), data)
     longest = max(io.BytesIO(data), key=len).removesuffix(b"\n")
     if len(longest) > LONGEST_LINE:
         number = data.count(b"\n", 0, data.find(longest)) + 1

@@ -223,19 +223,16 @@ def _all_finite(values: Sequence[float], count: int) -> bool:
 
 
 def _check(scene: Scene) -> None:
-    """Refuse what Mitsuba would draw as nothing, or as noise, without a word. Materials, lights, planes and
-    meshes are checked by their plugins."""
+    """Refuse what Mitsuba would draw as nothing, or as noise, without a word. Our plugins check the rest."""
     if problem := scene.camera.problem():
         raise SceneError(problem)
     if not _all_finite(scene.sky, 3):
         raise SceneError(f"sky is {scene.sky!r}, but must be three finite numbers: red, green and blue")
     if scene.texturing not in ("report", "standard"):
         raise SceneError(f"texturing is {scene.texturing!r}, but must be report or standard")
-    for kind in MOST_SINGLE:
-        for i, thing in enumerate(getattr(scene, f"{kind}s")):
-            *points, radius, _ = vars(thing).values()
-            if not (all(_all_finite(p, 3) for p in points) and _all_finite([radius], 1) and radius > 0):
-                raise SceneError(f"{kind}s[{i}] is {thing!r}, but must have finite places and a radius > 0")
+    for i, ball in enumerate(scene.spheres):
+        if not (_all_finite(ball.center, 3) and _all_finite([ball.radius], 1) and ball.radius > 0):
+            raise SceneError(f"spheres[{i}] is {ball!r}, but must have a finite center and a radius > 0")
 
 
 def _rgb(color: Color) -> dict[str, Any]:
@@ -250,18 +247,17 @@ def _group(kind: str, objects: list, fresnel: str) -> tuple[dict[str, Any], dict
     own = [each.material for each in objects]
     places = [vars(each).values() for each in objects]
     tables: dict[str, list] = {"numbers": [[*chain(*points), radius] for *points, radius, _ in places]}
-    bsdf: dict[str, Any] | None = None
-    if len(set(own)) > 1:
-        values = {
-            "alpha": [(m.alpha,) for m in own],
-            "int_ior": [(max(m.ior, _SMALLEST_IOR),) for m in own],
-            "diffuse_reflectance": [m.diffuse for m in own],
-            "specular_reflectance": [m.specular for m in own],
-        }
-        tables |= {f"face_{name}": rows for name, rows in values.items()}
-        by_object = {name: {"type": "mesh_attribute", "name": f"face_{name}"} for name in values}
-        bsdf = {"type": "mrt_bsdf", "fresnel": fresnel, **by_object}
+    values = {
+        "alpha": [(m.alpha,) for m in own],
+        "int_ior": [(max(m.ior, _SMALLEST_IOR),) for m in own],
+        "diffuse_reflectance": [m.diffuse for m in own],
+        "specular_reflectance": [m.specular for m in own],
+    }
+    by_object = {name: {"type": "mesh_attribute", "name": f"face_{name}"} for name in values}
+    differ = len(set(own)) > 1
+    tables |= {f"face_{name}": rows for name, rows in values.items() if differ}
     bitmaps = {name: mi.Bitmap(np.array(rows, np.float32)) for name, rows in tables.items()}
+    bsdf = {"type": "mrt_bsdf", "fresnel": fresnel, **by_object} if differ else None
     return {"type": "mrt_group", "kind": kind, **bitmaps}, bsdf
 
 

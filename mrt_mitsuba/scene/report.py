@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from itertools import count, product
 from pathlib import Path
@@ -51,57 +52,62 @@ SCENE_4_MATERIALS = (
 )
 
 
-def scene_0() -> Scene:
-    centers = (0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)
-    colors = (0.5, 0.5, 0.5), (0.5, 0, 0), (0, 0.5, 0.5), (0, 0, 0.5)
-    glossy = 1.3, 0.1, 0.5, 0.5, 0.5
-    return Scene(
-        title="four spheres on a plane",
-        camera=Camera((3, 1, 0), (0, 0.3, 0)),
-        sky=(0.1, 0.3, 0.5),
-        lights=_lights((10, 10, 10, 1, 1, 1), (4, 10, -2, 1, 1, 1)),
-        spheres=_spheres(*((*p, 0.25, *glossy, *kd) for p, kd in zip(centers, colors, strict=True))),
-        planes=_planes((0, 1, 0, 0, *glossy, 0.6, 0.6, 0.6)),
-    )
-
-
 def _row(i: int) -> float:
     """Return the place of the i-th of ten spheres in [-1.5, 1.5], to nine digits as in the original."""
     return round(-1.5 + i / 3, 9)
 
 
-def scene_1() -> Scene:
-    red, blue = (1, 0.992, 0.98, 0.301, 0.034, 0.039), (1, 0.965, 1.07, 0.012, 0.036, 0.106)
-    lower = _spheres(*((0, 0, _row(i), 0.15, 1.1382, (10 - i) / 90, *red) for i in range(10)))
-    upper = _spheres(*((0, 1, _row(i), 0.15, 1.1153, (i + 1) / 10, *blue) for i in range(10)))
-    return Scene(
+# What a material has in common with others: index and roughness, specular and diffuse colour, or both
+_GLOSSY = (1.3, 0.1, 0.5, 0.5, 0.5)
+_RED, _BLUE = (1, 0.992, 0.98, 0.301, 0.034, 0.039), (1, 0.965, 1.07, 0.012, 0.036, 0.106)
+_PINK = (1, 0.748, 0.718, 0.005, 0.013, 0.032)
+_WOOD = _material(1.0771, 0.0589, 0.26, 0.036, 0.014, 1, 0.852, 1.172)
+# Surfaces of index 0, as in the report's files, have no mirror reflection
+_GRASS = (0.0, 0.6, 0.0, 0.0, 0.0, 0.22, 0.36, 0.12)
+_BARK = _material(0.0, 0.6, 0.0, 0.0, 0.0, 0.3, 0.18, 0.1)
+_FLAME = _material(0.0, 0.5, 0.0, 0.0, 0.0, 1.6, 0.7, 0.15)
+_DIM = (0.3764705882352941, 0.11176470588235295, 0.08431372549019608)  # colour of a light
+
+_SCENES = (
+    Scene(  # 0
+        title="four spheres on a plane",
+        camera=Camera((3, 1, 0), (0, 0.3, 0)),
+        sky=(0.1, 0.3, 0.5),
+        lights=_lights((10, 10, 10, 1, 1, 1), (4, 10, -2, 1, 1, 1)),
+        spheres=_spheres(
+            (0, 0, 0, 0.25, *_GLOSSY, 0.5, 0.5, 0.5),
+            (1, 0, 0, 0.25, *_GLOSSY, 0.5, 0, 0),
+            (0, 1, 0, 0.25, *_GLOSSY, 0, 0.5, 0.5),
+            (0, 0, 1, 0.25, *_GLOSSY, 0, 0, 0.5),
+        ),
+        planes=_planes((0, 1, 0, 0, *_GLOSSY, 0.6, 0.6, 0.6)),
+    ),
+    Scene(  # 1
         title="roughness along two rows of spheres, before a large mirror",
         camera=Camera((3, 0, 0), (0, 0.3, 0)),
         sky=BLUE_SKY,
         lights=_lights((10, 10, 10, 10, 10, 10), (4, 10, -2, 5, 3, 10)),
-        spheres=(*lower, *upper, Sphere((-3, 1, 0), 2, SCENE_4_MATERIALS[0])),
+        spheres=(
+            *_spheres(*((0, 0, _row(i), 0.15, 1.1382, (10 - i) / 90, *_RED) for i in range(10))),
+            *_spheres(*((0, 1, _row(i), 0.15, 1.1153, (i + 1) / 10, *_BLUE) for i in range(10))),
+            Sphere((-3, 1, 0), 2, SCENE_4_MATERIALS[0]),
+        ),
         planes=_planes((0, 1, 0, 1, 1.1481, 0.0625, 1, 1.056, 1.146, 0.016, 0.073, 0.04)),
-    )
-
-
-def scene_2() -> Scene:
-    """The two leftmost columns have a negative roughness, as in the original."""
-    spheres = (
-        (_row(i), 0, 0.4 * (j + 1), 0.15, 1.0051 + 0.4 * j / 3, -0.0432 + 0.1 * i / 3)
-        for j, i in product(range(4), range(10))
-    )
-    return Scene(
+    ),
+    Scene(  # 2
         title="roughness against index of refraction",
         camera=Camera((0.5, 3, 1), (0, 0, 0.6), (0, 0, 1)),
         sky=BLUE_SKY,
         lights=_lights((-20, 5, 10, 30, 30, 30), (10, 10, 10, 30, 30, 30), (50, -100, 10, 1, 0.7, 2)),
-        spheres=_spheres(*((*sphere, 1, 0.748, 0.718, 0.005, 0.013, 0.032) for sphere in spheres)),
+        spheres=_spheres(  # the two leftmost columns have a negative roughness, as in the original
+            *(
+                (_row(i), 0, 0.4 * (j + 1), 0.15, 1.0051 + 0.4 * j / 3, -0.0432 + 0.1 * i / 3, *_PINK)
+                for j, i in product(range(4), range(10))
+            )
+        ),
         planes=_planes((0, 0, 1, 0, 1.1022, 0.0579, 0.95, 0.95, 0.95, 0.05, 0.05, 0.05)),
-    )
-
-
-def scene_3() -> Scene:
-    return Scene(
+    ),
+    Scene(  # 3
         title="six spheres in the corner of three planes",
         camera=Camera((4.5, 0.8, 4.5), (0, 0.3, 0)),
         sky=BLUE_SKY,
@@ -120,22 +126,12 @@ def scene_3() -> Scene:
             (0.3, -0.2, 1, 4, 1.9382, 0.0886, 0.5, 0.5, 0.5, 0.1, 0.3, 0.05),
         ),
         focal_distance=2.0,
-    )
-
-
-def scene_4() -> Scene:
-    numbers, spheres = c_rand(), []
-    for _ in range(600):
-        material = SCENE_4_MATERIALS[next(numbers) % 10]
-        radius = 0.05 + next(numbers) % 200 / 1000
-        z, y, x = 1 + next(numbers) % 650 / 100, next(numbers) % 650 / 100, 1 + next(numbers) % 650 / 100
-        spheres.append(Sphere((x, y, z), radius, material))
-    return Scene(
+    ),
+    Scene(  # 4, to which ``report_scene`` adds the spheres
         title="600 spheres in the corner of three planes",
         camera=Camera((6, 4, 6), (0, 1, 0), hfov=90),
         sky=BLUE_SKY,
         lights=_lights((10, 10.7, 1, 1.5, 1.5, 1.5), (8, 20, 3, 2, 2, 2), (4, 30, -1, 2.5, 2.5, 2.5)),
-        spheres=tuple(spheres),
         planes=_planes(
             (0, 1, 0, 0.2, 2.382, 0.005886, 0.2, 0.2, 0.2, 0.2, 0.4, 0.3),
             (1, 0, 0, 2, 2.8382, 0.00886, 0.2, 0.2, 0.1, 0.5, 0.09, 0.07),
@@ -143,25 +139,9 @@ def scene_4() -> Scene:
         ),
         focal_distance=0.1,
         focal_range=3.0,
-    )
-
-
-def _with_model(name: str, **parts: Any) -> Scene:
-    """Return a scene with the meshes of an OBJ file, in the report's reading."""
-    from mrt_mitsuba.scene.obj import read_obj  # with numpy, which the other scenes do without
-
-    return Scene(meshes=read_obj(Path(__file__).parent / "assets" / name)[0], **parts)
-
-
-# Surfaces of index 0, as in the report's files, have no mirror reflection
-_GRASS = (0.0, 0.6, 0.0, 0.0, 0.0, 0.22, 0.36, 0.12)
-_BARK = _material(0.0, 0.6, 0.0, 0.0, 0.0, 0.3, 0.18, 0.1)
-_FLAME = _material(0.0, 0.5, 0.0, 0.0, 0.0, 1.6, 0.7, 0.15)
-
-
-def scene_5() -> Scene:
-    return _with_model(
-        "ring.obj",
+    ),
+    # 5 to 8, to which it adds the meshes
+    Scene(  # 5
         title="a ring, stones and two glossy spheres",
         camera=Camera((2.8, 1.5, 3.2), (0.1, 0.45, 0)),
         sky=(0.25, 0.35, 0.6),
@@ -171,20 +151,8 @@ def scene_5() -> Scene:
             (1.25, 0.3, 0.75, 0.3, 2.0, 0.03, 0.9, 0.85, 0.6, 0.5, 0.06, 0.05),
         ),
         planes=_planes((0, 1, 0, 0, 1.3, 0.1, 0.25, 0.25, 0.25, 0.55, 0.52, 0.5)),
-    )
-
-
-def scene_6() -> Scene:
-    turns = [(math.cos(a), math.sin(a)) for a in (2 * math.pi * k / 9 for k in range(0, 9, 2))]
-    logs = [  # that lean against each other
-        Cylinder((0.28 * x, 0.05, 0.28 * z), (0.03 * x, 0.3, 0.03 * z), 0.045, _BARK) for x, z in turns
-    ]
-    seats = (
-        Cylinder((-1.0, 0.1, 0.5), (-0.55, 0.1, 1.15), 0.1, _BARK),
-        Cylinder((1.15, 0.1, 0.1), (0.9, 0.1, 0.85), 0.1, _BARK),
-    )
-    return _with_model(
-        "camp.obj",
+    ),
+    Scene(  # 6
         title="a camp: tents, firs and a fire",
         camera=Camera((1.6, 1.5, 4.2), (-0.1, 0.5, -0.3)),
         sky=(0.75, 0.45, 0.3),
@@ -194,43 +162,68 @@ def scene_6() -> Scene:
             Cone((0, 0.62, 0), (0, 0.12, 0), 0.13, _FLAME),
             Cone((0.07, 0.45, 0.06), (0.07, 0.12, 0.06), 0.09, _FLAME),
         ),
-        cylinders=(*logs, *seats),
-    )
-
-
-def scene_7() -> Scene:
-    return _with_model(
-        "lake.obj",
+        cylinders=(
+            *(  # logs that lean against each other
+                Cylinder((0.28 * x, 0.05, 0.28 * z), (0.03 * x, 0.3, 0.03 * z), 0.045, _BARK)
+                for x, z in (
+                    (math.cos(a), math.sin(a)) for a in (2 * math.pi * k / 9 for k in range(0, 9, 2))
+                )
+            ),
+            Cylinder((-1.0, 0.1, 0.5), (-0.55, 0.1, 1.15), 0.1, _BARK),
+            Cylinder((1.15, 0.1, 0.1), (0.9, 0.1, 0.85), 0.1, _BARK),
+        ),
+    ),
+    Scene(  # 7
         title="a lake between hills",
         camera=Camera((0.4, 0.9, 5.6), (0, 0.35, 0)),
         sky=(0.45, 0.65, 0.9),
         lights=_lights((8, 9, 6, 2.6, 2.5, 2.2), (-6, 7, 3, 0.7, 0.75, 0.9)),
         planes=_planes((0, 1, 0, 0, 1.33, 0.03, 0.7, 0.75, 0.8, 0.02, 0.08, 0.12)),
-    )
-
-
-def scene_8() -> Scene:
-    return _with_model(
-        "block.obj",
+    ),
+    Scene(  # 8
         title="a textured block on a glossy plane",
         camera=Camera((1.6, 1.25, 2.2), (0, 0.42, 0)),
         sky=(0.2, 0.25, 0.35),
         lights=_lights((3, 4, 2, 3.2, 3.2, 3.0), (-2, 3, 4, 2.4, 2.4, 2.6)),
         planes=_planes((0, 1, 0, 0, 2.2, 0.05, 0.6, 0.6, 0.62, 0.12, 0.12, 0.13)),
-    )
-
-
-def scene_9() -> Scene:
-    wood = _material(1.0771, 0.0589, 0.26, 0.036, 0.014, 1, 0.852, 1.172)
-    dim = (0.3764705882352941, 0.11176470588235295, 0.08431372549019608)
-    return Scene(
+    ),
+    Scene(  # 9
         title="a cone above a plane",
         camera=Camera((3, 3, 0), (0, 0, 0)),
         sky=BLUE_SKY,
-        lights=_lights((2.8, -28.34, 4.33, *dim), (3, 3, 3, 2.5, 2.5, 2.5)),
-        planes=(Plane((0, 1, 0), 0, wood),),
-        cones=(Cone((0, 1.5, 0), (0, 0.5, 0), 0.648361, wood),),
-    )
+        lights=_lights((2.8, -28.34, 4.33, *_DIM), (3, 3, 3, 2.5, 2.5, 2.5)),
+        planes=(Plane((0, 1, 0), 0, _WOOD),),
+        cones=(Cone((0, 1.5, 0), (0, 0.5, 0), 0.648361, _WOOD),),
+    ),
+)
+_MODELS = {5: "ring.obj", 6: "camp.obj", 7: "lake.obj", 8: "block.obj"}  # in ``assets``
+NUMBERS = tuple(range(len(_SCENES)))
+
+
+def report_scene(number: int) -> Scene:
+    """Return a scene by its number. Raises ``UsageError`` for one that there is not."""
+    if number not in NUMBERS:
+        raise UsageError(f"there is no scene {number!r}: choose one of {', '.join(map(str, NUMBERS))}")
+    return _complete(number)
+
+
+@cache
+def _complete(number: int) -> Scene:
+    """Return a scene with what takes time to read or to draw."""
+    scene, model = _SCENES[number], _MODELS.get(number)
+    if model:
+        from mrt_mitsuba.scene.obj import read_obj  # with numpy, which the other scenes do without
+
+        return replace(scene, meshes=read_obj(Path(__file__).parent / "assets" / model)[0])
+    if number != 4:
+        return scene
+    numbers, spheres = c_rand(), []
+    for _ in range(600):
+        material = SCENE_4_MATERIALS[next(numbers) % 10]
+        radius = 0.05 + next(numbers) % 200 / 1000
+        z, y, x = 1 + next(numbers) % 650 / 100, next(numbers) % 650 / 100, 1 + next(numbers) % 650 / 100
+        spheres.append(Sphere((x, y, z), radius, material))
+    return replace(scene, spheres=tuple(spheres))
 
 
 def c_rand(seed: int = 1) -> Iterator[int]:
@@ -247,16 +240,3 @@ def c_rand(seed: int = 1) -> Iterator[int]:
         words.append((words[i - 31] + words[i - 3]) & 0xFFFFFFFF)
         if i >= 344:
             yield words[-1] >> 1
-
-
-_SCENES = [
-    *map(cache, (scene_0, scene_1, scene_2, scene_3, scene_4, scene_5, scene_6, scene_7, scene_8, scene_9))
-]
-NUMBERS = tuple(range(len(_SCENES)))
-
-
-def report_scene(number: int) -> Scene:
-    """Return a scene by its number. Raises ``UsageError`` for one that there is not."""
-    if number not in NUMBERS:
-        raise UsageError(f"there is no scene {number!r}: choose one of {', '.join(map(str, NUMBERS))}")
-    return _SCENES[number]()

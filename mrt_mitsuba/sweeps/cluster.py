@@ -75,18 +75,15 @@ def connected(
 
 
 def _close(client: Client) -> None:
-    """Close a client, also one that could not connect: left to the garbage collector, which may come while
-    Dask holds a lock, it waits for ever."""
+    """Close a client, also one that could not connect: if the garbage collector does while Dask holds a lock,
+    it waits for ever."""
     with suppress(Exception):
         client.close()
 
 
 def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
     """Return a scheduler in this process, and workers in processes of their own with one thread for jobs.
-
-    They are started anew, not forked, nor do they import the caller's script: it needs no
-    ``if __name__ == "__main__"``.
-    """
+    They do not import the caller's script, so it needs no ``if __name__ == "__main__"``."""
     options = {
         "nthreads": 1,
         "memory_limit": MEMORY_LIMIT // count,
@@ -95,10 +92,10 @@ def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
         "config": {"distributed.worker.profile.enabled": False},  # it stops a job 100 times a second
     }
     kernels = {"DRJIT_CACHE_DIR": os.environ.get("DRJIT_CACHE_DIR", os.path.expanduser("~/.drjit"))}
+    environs = [kernels | {"CUDA_VISIBLE_DEVICES": device} for device in devices] or [kernels]
     workers = {}
     for number in range(count):
-        pinned = {"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]} if devices else {}
-        own = options | {"env": kernels | pinned}
+        own = options | {"env": environs[number % len(environs)]}
         workers[number] = {"cls": SubprocessWorker, "options": {"worker_kwargs": own}}
     scheduler = {
         "allowed_failures": 0,  # ``outcomes`` hands over again a job that lost its worker
@@ -120,10 +117,8 @@ def gpus() -> list[str]:
 
 
 def inspect(client: Client, scratch: str, here: str) -> dict[str, int]:
-    """Check all workers, whose versions must be those ``here``; return how many share cores (``render_job``).
-
-    Raises ``ClusterError`` or ``OutputError`` if they cannot be used.
-    """
+    """Return how many workers share cores (``render_job``); raise ``ClusterError`` or ``OutputError`` where
+    one has other versions than those ``here`` or cannot be used."""
     try:
         found = client.run(worker.describe, scratch)
     except Exception as error:  # whatever another Python or another version makes of it

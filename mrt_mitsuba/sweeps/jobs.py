@@ -100,8 +100,7 @@ def word(value: Any) -> str:
     if isinstance(value, Mapping):
         return word(value.get("type") or [f"{key}-{word(own)}" for key, own in value.items()])
     if isinstance(value, str | os.PathLike):
-        text = os.fspath(value)
-        value = os.path.splitext(os.path.basename(text))[0] if os.sep in text else text
+        value = Path(value).stem if os.sep in os.fspath(value) else value
     elif isinstance(value, Scene):
         value = value.title or "scene"
     return re.sub(r"[^\w.+-]+", "-", str(value))
@@ -146,7 +145,6 @@ def check_parameters(jobs: Sequence[Job]) -> None:
         declared = {name: value for name, value in params.items() if "." not in name}
         which = fingerprint(job.scene, declared)
         if params and which not in loaded:
-            use()
             loaded[which] = open_scene(receive(job.scene), params=declared).scene
         set_parameters(loaded.get(which), {key: params[key] for key in params.keys() - declared.keys()})
 
@@ -165,15 +163,15 @@ def _send(scene: Any, path: str) -> Any:
 
 
 def receive(scene: Any) -> Any:
-    """Return the scene that was sent; needs a variant, as it may hold Mitsuba's types."""
+    """Return the scene that was sent."""
+    use()  # it may hold Mitsuba's types
     sent = isinstance(scene, str) and scene.endswith(SENT)
     return pickle.loads(Path(scene).read_bytes()) if sent else scene
 
 
 def identify(sent: Any) -> str:
-    """Return the fingerprint of a scene that was sent; of a file by its contents, not by those of the files
-    that it names. Raises ``SceneError`` for a file that cannot be read.
-    """
+    """Return the fingerprint of a scene that was sent: of a file, that of its contents, not of the files that
+    it names. Raises ``SceneError`` for a file that cannot be read."""
     if isinstance(sent, str):
         require_file(os.path.relpath(sent))
         return fingerprint(Path(sent).read_bytes())
@@ -186,10 +184,8 @@ def fingerprint(*values: Any) -> str:
 
 
 def _encode(value: Any) -> bytes:
-    """Return what is made of Python's and NumPy's types as bytes, the same for equal values.
-
-    Raises ``UsageError`` for what lives in this process only, such as a loaded Mitsuba scene.
-    """
+    """Return what is made of Python's and NumPy's types as bytes, the same for equal values; raise
+    ``UsageError`` for what lives in this process only, such as a loaded Mitsuba scene."""
     stream = io.BytesIO()
     pickler = _Pickler(stream, protocol=5)
     pickler.fast = True  # no references to what came before: they would distinguish equal from identical

@@ -20,7 +20,6 @@ from PIL import Image
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
 from mrt_mitsuba.output.files import compressing, silenced
 from mrt_mitsuba.output.replacing import replacing
-from mrt_mitsuba.runtime import use
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.sweeps.jobs import Job, receive
 
@@ -62,10 +61,8 @@ def is_fresh(job: Job, folder: str, png: bool = False, listed: bool = False) -> 
     for path in (os.path.join(folder, file) for file in job.files(png)):
         found, whole = mark(path)
         if os.path.lexists(path) and not (found or (found is None and listed and os.path.isfile(path))):
-            raise OutputError(
-                f"{path} was not made by a sweep, which would replace it: move it away, or choose "
-                "another folder"
-            )
+            text = "was not made by a sweep, which would replace it: move it away, or choose another folder"
+            raise OutputError(f"{path} {text}")
         fresh = fresh and whole and found == wanted
     return fresh
 
@@ -81,7 +78,6 @@ def cut(job: Job, tiles: Any) -> list[Job]:
         raise UsageError("tiles: target and aamode=noise share the rays out over the whole picture")
     size: Any = job.arguments.get("width"), job.arguments.get("height")
     if None in size:  # only the scene knows
-        use()
         source = open_scene(receive(job.scene), size=size)
         size = source.width, source.height
     (width, height), (rows, columns) = size, tiles
@@ -112,8 +108,8 @@ def join(job: Job, parts: Sequence[Job], found: Sequence[Mapping[str, Any]], fol
             os.rmdir(os.path.join(folder, f"{job.name}.tiles"))
     except (MrtError, OSError, RuntimeError) as error:
         return {"error": f"cannot put {job.name} together: {error}", "attempts": attempts}
-    sums = {name: sum(facts[name] for facts in found) if all(found) else None for name in ("seconds", "rays")}
-    return {"file": job.file, "attempts": attempts, **sums}
+    known = ("seconds", "rays") if all(found) else ()
+    return {"file": job.file, "attempts": attempts, **{name: sum(f[name] for f in found) for name in known}}
 
 
 def _write_rows(job: Job, tiles: Sequence[Job], folder: str) -> None:

@@ -112,8 +112,8 @@ def sweep(
             if missing:
                 variant = options.get("variant") or ""
                 client = stack.enter_context(connected(cluster, len(every), workers, dashboard, variant))
-                setting = {"folder": folder, "png": png, "versions": versions}
-                setting["sharing"] = inspect(client, scratch, versions)
+                sharing = inspect(client, scratch, versions)
+                setting = {"folder": folder, "png": png, "versions": versions, "sharing": sharing}
                 rest = [part for part in every if part.name not in kept]
                 ending = stack.enter_context(closing(outcomes(client, rest, retries, scratch, **setting)))
             stack.callback(table.write)

@@ -11,6 +11,9 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError, one_line
 from mrt_mitsuba.machine import memory, usable_cores
@@ -38,9 +41,7 @@ def describe(folder: str, dask_worker: Any = None) -> dict[str, Any]:
 
 def outcome(job: Job, scratch: str) -> dict[str, Any]:
     """Return what workers have noted of a job: "attempts", and what the last left where that has ended.
-
-    Notes outlive workers: one may die of its next job before Dask has reported on this.
-    """
+    Notes outlive workers: one may die of its next job before Dask has reported on this."""
     with contextlib.suppress(FileNotFoundError), open(f"{scratch}/{job.name}.json", "rb") as file:
         return json.load(file)
     return {"attempts": 0}
@@ -88,13 +89,9 @@ def _note(own: str, facts: Mapping[str, Any]) -> None:
     os.replace(f"{own}.note", f"{own}.json")
 
 
-def _render(
-    job: Job, folder: str, scratch: str, png: bool, threads: int, limit: int | None
-) -> dict[str, Any]:
+def _render(job: Job, folder: str, scratch: str, png: bool, threads: int, limit: Any) -> dict[str, Any]:
     start = time.perf_counter()
     import drjit as dr
-    from PIL import Image
-    from PIL.PngImagePlugin import PngInfo
 
     from mrt_mitsuba.rendering.api import render
 
@@ -118,6 +115,5 @@ def _render(
         os.makedirs(os.path.dirname(target), exist_ok=True)
         check_target(target, result.inputs)  # a scene may read pictures of earlier sweeps
         os.replace(os.path.join(scratch, file), target)
-    error = result.error and float(result.error.rmse)
-    rays = int(sum(result.rays.values()))
+    rays, error = int(sum(result.rays.values())), result.error and float(result.error.rmse)
     return {"file": job.file, "seconds": time.perf_counter() - start, "rays": rays, "rmse": error}
