@@ -223,16 +223,18 @@ def _all_finite(values: Sequence[float], count: int) -> bool:
 
 
 def _check(scene: Scene) -> None:
-    """Refuse what Mitsuba would draw as nothing, or as noise, without a word. Our plugins check the rest."""
+    """Refuse what Mitsuba would draw as nothing, or as noise, without a word. Plugins check the rest."""
     if problem := scene.camera.problem():
         raise SceneError(problem)
     if not _all_finite(scene.sky, 3):
         raise SceneError(f"sky is {scene.sky!r}, but must be three finite numbers: red, green and blue")
     if scene.texturing not in ("report", "standard"):
         raise SceneError(f"texturing is {scene.texturing!r}, but must be report or standard")
-    for i, ball in enumerate(scene.spheres):
-        if not (_all_finite(ball.center, 3) and _all_finite([ball.radius], 1) and ball.radius > 0):
-            raise SceneError(f"spheres[{i}] is {ball!r}, but must have a finite center and a radius > 0")
+    for kind in MOST_SINGLE:
+        for i, thing in enumerate(getattr(scene, f"{kind}s")):
+            *points, radius, _ = vars(thing).values()
+            if not (all(_all_finite(p, 3) for p in points) and _all_finite([radius], 1) and radius > 0):
+                raise SceneError(f"{kind}s[{i}] is {thing!r}, but must have finite places and a radius > 0")
 
 
 def _rgb(color: Color) -> dict[str, Any]:

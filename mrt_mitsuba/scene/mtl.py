@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,11 @@ from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn
 from mrt_mitsuba.scene.model import LARGEST, Color, Material
 
-CONVENTIONS = ("report", "standard")
+# What the statements mean, by convention: fields of ``Material``
+CONVENTIONS = {
+    "report": {"Ka": "ior", "Ni": "alpha", "Ks": "specular", "Kd": "diffuse", "map_Kd": "texture"},
+    "standard": {"Ni": "ior", "Ns": "alpha", "Ks": "specular", "Kd": "diffuse", "map_Kd": "texture"},
+}
 
 # The report's material of everything before the first usemtl
 DEFAULT_MATERIAL = Material(
@@ -44,7 +49,7 @@ def read_mtl(
 
     Raises ``SceneError`` with file and line for what cannot be read.
     """
-    path = Path(path)
+    path, fields = Path(path), CONVENTIONS[convention]
     findings: dict[str, list[str]] = {}
     blocks: dict[str, dict[str, Any]] = {}
     block: dict[str, Any] | None = None
@@ -58,7 +63,8 @@ def read_mtl(
         elif statement in ("Kd", "Ks", "Ka", "Ni", "Ns", "map_Kd"):
             if block is None:
                 raise SceneError(f"{where}: {statement} comes before any newmtl; write newmtl NAME before it")
-            block[statement] = _value(statement, text, where, folder or path.parent, path.parent, findings)
+            value = _value(statement, text, where, folder or path.parent, path.parent, findings)
+            block |= {fields[statement]: value} if statement in fields else {}
         # the report's reading defines itself; from the standard's, statements may be missing
         elif (
             statement
@@ -67,25 +73,15 @@ def read_mtl(
         ):
             findings.setdefault("statements", []).append(f"{where}: {statement} {text[:40]} is not used")
     warn(findings)
-    materials = {}
-    for name, block in blocks.items():
-        if convention == "standard":
-            base, ior, alpha = _STANDARD, block.get("Ni", 1.0), math.sqrt(2 / (block.get("Ns", 0.0) + 2))
-        else:
-            base = DEFAULT_MATERIAL
-            ior, alpha = block.get("Ka", (base.ior,))[0], block.get("Ni", base.alpha)
-        colors = block.get("Ks", base.specular), block.get("Kd", base.diffuse)
-        materials[name] = Material(ior, alpha, *colors, block.get("map_Kd"))
-    return materials
+    default = DEFAULT_MATERIAL if convention == "report" else _STANDARD
+    return {name: replace(default, **block) for name, block in blocks.items()}
 
 
 def _value(
     statement: str, text: str, where: str, folder: Path, library: Path, findings: dict[str, list[str]]
 ) -> Color | float | str | None:
-    """Return a colour, a number, or the path of a picture; None, with a warning, for one that is missing.
-
-    Raises ``SceneError`` for anything else.
-    """
+    """Return a colour, an index, a roughness, or the path of a picture; None, with a warning, for one that is
+    missing. Raises ``SceneError`` for anything else."""
     words = text.split()
     if statement == "map_Kd":
         if not text:
@@ -101,8 +97,10 @@ def _value(
         values = list(map(float, words))
     except ValueError:
         values = []
-    colored = statement.startswith("K")
-    if len(values) not in ((1, 3) if colored else (1,)) or not all(0 <= v <= LARGEST for v in values):
-        form = f"{'one or three numbers' if colored else 'one number'}, finite and not negative"
-        raise SceneError(f"{where}: {statement} must be {form}, but is {text[:80]!r}")
-    return (values[0], values[len(values) // 2], values[-1]) if colored else values[0]
+    counts, form = ((1, 3), "one or three numbers") if statement[0] == "K" else ((1,), "one number")
+    if len(values) not in counts or not all(0 <= v <= LARGEST for v in values):
+        must = f"must be {form}, finite and not negative, but is"
+        raise SceneError(f"{where}: {statement} {must} {text[:80]!r}")
+    if statement == "Ns":
+        return math.sqrt(2 / (values[0] + 2))
+    return (values[0], values[len(values) // 2], values[-1]) if statement in ("Kd", "Ks") else values[0]

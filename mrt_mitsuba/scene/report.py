@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import count, product
 from pathlib import Path
 from typing import Any
@@ -27,15 +27,12 @@ def _lights(*rows: Any) -> tuple[Light, ...]:
     return tuple(Light(row[:3], row[3:]) for row in rows)
 
 
-def _spheres(*rows: Any) -> tuple[Sphere, ...]:
-    """Return a sphere for each row of a centre, a radius and a material."""
-    return tuple(Sphere(row[:3], row[3], _material(*row[4:])) for row in rows)
+def _objects(kind: Any, *rows: Any) -> tuple[Any, ...]:
+    """Return an object for each row: centre and radius, or normal and distance; then its material."""
+    return tuple(kind(row[:3], row[3], _material(*row[4:])) for row in rows)
 
 
-def _planes(*rows: Any) -> tuple[Plane, ...]:
-    """Return a plane for each row of a normal, a distance and a material."""
-    return tuple(Plane(row[:3], row[3], _material(*row[4:])) for row in rows)
-
+_spheres, _planes = partial(_objects, Sphere), partial(_objects, Plane)
 
 # The ten materials that scene 4 draws from, in the order of its random numbers
 SCENE_4_MATERIALS = (
@@ -52,12 +49,8 @@ SCENE_4_MATERIALS = (
 )
 
 
-def _row(i: int) -> float:
-    """Return the place of the i-th of ten spheres in [-1.5, 1.5], to nine digits as in the original."""
-    return round(-1.5 + i / 3, 9)
-
-
-# What a material has in common with others: index and roughness, specular and diffuse colour, or both
+_ROW = [round(-1.5 + i / 3, 9) for i in range(10)]  # places of spheres, to nine digits as in the original
+# Parts of materials: index and roughness, specular and diffuse colour, or some of these
 _GLOSSY = (1.3, 0.1, 0.5, 0.5, 0.5)
 _RED, _BLUE = (1, 0.992, 0.98, 0.301, 0.034, 0.039), (1, 0.965, 1.07, 0.012, 0.036, 0.106)
 _PINK = (1, 0.748, 0.718, 0.005, 0.013, 0.032)
@@ -88,8 +81,8 @@ _SCENES = (
         sky=BLUE_SKY,
         lights=_lights((10, 10, 10, 10, 10, 10), (4, 10, -2, 5, 3, 10)),
         spheres=(
-            *_spheres(*((0, 0, _row(i), 0.15, 1.1382, (10 - i) / 90, *_RED) for i in range(10))),
-            *_spheres(*((0, 1, _row(i), 0.15, 1.1153, (i + 1) / 10, *_BLUE) for i in range(10))),
+            *_spheres(*((0, 0, _ROW[i], 0.15, 1.1382, (10 - i) / 90, *_RED) for i in range(10))),
+            *_spheres(*((0, 1, _ROW[i], 0.15, 1.1153, (i + 1) / 10, *_BLUE) for i in range(10))),
             Sphere((-3, 1, 0), 2, SCENE_4_MATERIALS[0]),
         ),
         planes=_planes((0, 1, 0, 1, 1.1481, 0.0625, 1, 1.056, 1.146, 0.016, 0.073, 0.04)),
@@ -101,7 +94,7 @@ _SCENES = (
         lights=_lights((-20, 5, 10, 30, 30, 30), (10, 10, 10, 30, 30, 30), (50, -100, 10, 1, 0.7, 2)),
         spheres=_spheres(  # the two leftmost columns have a negative roughness, as in the original
             *(
-                (_row(i), 0, 0.4 * (j + 1), 0.15, 1.0051 + 0.4 * j / 3, -0.0432 + 0.1 * i / 3, *_PINK)
+                (_ROW[i], 0, 0.4 * (j + 1), 0.15, 1.0051 + 0.4 * j / 3, -0.0432 + 0.1 * i / 3, *_PINK)
                 for j, i in product(range(4), range(10))
             )
         ),

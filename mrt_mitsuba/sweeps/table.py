@@ -59,8 +59,7 @@ class Table:
 
     def add(self, name: str, facts: Mapping[str, Any]) -> None:
         """Add the row of a job that ended; the file follows once in a while."""
-        unknown = dict.fromkeys(FACTS) | {"file": "", "error": ""}
-        self._ended[name] = {**self._points[name], **unknown, **facts}
+        self._ended[name] = {**self._points[name], **dict.fromkeys(FACTS), "file": "", "error": "", **facts}
         if time.monotonic() > self._written + PAUSE:
             self.write()
 
