@@ -73,10 +73,8 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> bool:
 
     What a study raises becomes its failure. Raises ``MrtError``.
     """
-    missing = [name.replace("_", "-") for name in EXTRAS if util.find_spec(name) is None]
-    if missing:
-        packages = " ".join(missing)
-        raise MrtError(f"{packages} missing: {sys.executable} -m pip install {packages}")
+    if missing := " ".join(name.replace("_", "-") for name in EXTRAS if util.find_spec(name) is None):
+        raise MrtError(f"{missing} missing: {sys.executable} -m pip install {missing}")
     # Not before: NumPy needs a working folder under some Pythons
     import drjit as dr
 

@@ -96,35 +96,34 @@ def check_scene(
     """
     runtime.use()
     source = open_scene(scene, **options)
-    kinds, instances = _plugins(source.scene)
-    check_emitter = partial(examine, partial(EmitterCase, source.scene), laws=EMITTER_LAWS)
-    laws: dict[str, Callable[..., Check]]
-    laws = {"BSDF": check_bsdf, "shape": check_shape, "emitter": check_emitter}
+    kinds = _plugins(source.scene)
+    emitter = partial(examine, partial(EmitterCase, source.scene), laws=EMITTER_LAWS)
+    laws: dict[str, Callable[..., Check]] = {"BSDF": check_bsdf, "shape": check_shape, "emitter": emitter}
     found: dict[str, Check] = {}
-    chosen = {kind: range(0, len(alike), max(len(alike) // ALIKE, 1)) for kind, alike in kinds.items()}
-    with (progress or Progress()).stage("Laws", sum(map(len, chosen.values()))) as advance:
-        for kind, number in ((kind, number) for kind, numbers in chosen.items() for number in numbers):
+    chosen = [(k, i) for k, alike in kinds.items() for i in range(0, len(alike), max(len(alike) // ALIKE, 1))]
+    with (progress or Progress()).stage("Laws", len(chosen)) as advance:
+        for kind, number in chosen:
             name = f"{kind} {kinds[kind][number].id() or number}"
             name = name if name not in found else f"{name} ({number})"
             check = laws[kind.split()[0]](kinds[kind][number], quick=quick, seed=seed)
             found[name] = replace(check, subject=name)
             advance(1)
-    more = {kind: len(alike) - len(chosen[kind]) for kind, alike in kinds.items()}
-    left_out = [f"{n} more of {kind} are like those that were checked" for kind, n in more.items() if n]
-    if instances:
+    more = Counter({kind: len(alike) for kind, alike in kinds.items()}) - Counter(kind for kind, _ in chosen)
+    left_out = [f"{n} more of {kind} are like those that were checked" for kind, n in more.items()]
+    if instances := sum(shape.class_name() == "Instance" for shape in source.scene.shapes()):
         left_out.append(f"{instances} instances are not checked: give a dict of one with its group")
     return SceneCheck(source.name, found, _hunt(source, quick, seed), tuple(left_out))
 
 
-def _plugins(scene: Any) -> tuple[dict[str, list[Any]], int]:
-    """Return the BSDFs, shapes and emitters of a scene, each once, by kind, and how many instances it has."""
+def _plugins(scene: Any) -> dict[str, list[Any]]:
+    """Return the BSDFs, shapes and emitters of a scene, each once, by kind, but for instances."""
     shapes = [shape for shape in scene.shapes() if shape.class_name() != "Instance"]
     bsdfs = {str(id(b)): b for b in (shape.bsdf() for shape in shapes) if b is not None}.values()
     kinds: dict[str, list[Any]] = {}
     for word, plugins in (("BSDF", bsdfs), ("shape", shapes), ("emitter", scene.emitters())):
         for plugin in plugins:
             kinds.setdefault(f"{word} {class_name(plugin)}", []).append(plugin)
-    return kinds, len(scene.shapes()) - len(shapes)
+    return kinds
 
 
 # ------------------------------------------------ Emitters -----------------------------------------------
@@ -137,6 +136,8 @@ LENGTH = 1e-4  # relative: a square root, and the difference of two points
 class EmitterCase(Subject):
     """An emitter of a scene, and points in and about its box from which it is looked at [N, 3]."""
 
+    samples = cached_property(lambda self: self.sample(self.points))
+
     def __init__(self, scene: Any, emitter: Any, quick: bool, seed: int) -> None:
         super().__init__(emitter, quick, seed)
         box = scene.bbox()
@@ -146,10 +147,6 @@ class EmitterCase(Subject):
         flags = int(emitter.flags())
         # whether light comes from all around, and not from single directions, a surface or a point
         self.around = bool(flags & int(mi.EmitterFlags.Infinite)) and not flags & int(mi.EmitterFlags.Delta)
-
-    @cached_property
-    def samples(self) -> Lanes:
-        return self.sample(self.points)
 
     def sample(self, points: Array) -> Lanes:
         """Return a sample for each point; ``again``: pdf_direction(), ``value``: eval_direction()."""
@@ -167,7 +164,7 @@ class EmitterCase(Subject):
         names = ("p", "d", "dist", "pdf", "again", "delta", "weight", "value")
         return Lanes(**dict(zip(names, found, strict=True)), lit=(found[6] != 0).any(axis=1))
 
-    def seen(self, d: Array) -> tuple[Array, Array]:
+    def seen(self, d: Array) -> list[Array]:
         """Return the density of directions [N] and the light that is seen there [N, channels]."""
 
         def call(d: Any) -> list[Any]:
@@ -176,8 +173,7 @@ class EmitterCase(Subject):
             ds.d, it.wi = d, -d
             return [self.plugin.pdf_direction(it, ds), self.plugin.eval(it)]
 
-        pdf, light = lanes(call, ("Vector3f", d))
-        return pdf, light
+        return lanes(call, ("Vector3f", d))
 
     @cached_property
     def spread(self) -> tuple[Array, Array]:
@@ -312,39 +308,34 @@ def _follow(source: Any, count: int, seed: int) -> Counter[str]:
     # the unit square covers the crop of a cropped film
     ray, _ = source.sensor.sample_ray(draw(), draw(), mi.Point2f(draw(), draw()), mi.Point2f(draw(), draw()))
 
-    def sound(name: Callable[[Any], str], pointers: Any, *values: Any) -> Any:
+    def sound(what: str, pointers: Any, *values: Any) -> Any:
         """Return where values are finite, and count those that are not for the objects of ``pointers``."""
-        bad, plugins = active & not_finite(*values), scene.emitters() if name is _emitter else scene.shapes()
-        for plugin in plugins if dr.any(bad) else ():
-            counts[name(plugin)] += int(dr.count(bad & (pointers == type(pointers)(plugin)))[0])
+        bad, plugins = active & not_finite(*values), scene.emitters() if what == "emitter" else scene.shapes()
+        for one in plugins if dr.any(bad) else ():
+            name = f"{_name(one.bsdf())}, on {_name(one)}" if what == "BSDF" else _name(one)
+            counts[f"the {what} {name}"] += int(dr.count(bad & (pointers == type(pointers)(one)))[0])
         return ~bad
 
     for _ in range(DEPTH):
         si = scene.ray_intersect(ray, active)
         met = si.emitter(scene, active)
-        active &= sound(_emitter, met, met.eval(si, active))
+        active &= sound("emitter", met, met.eval(si, active))
         active &= si.is_valid()
-        active &= sound(lambda shape: f"the shape {_name(shape)}", si.shape, si.p, si.n, si.sh_frame.n, si.uv)
+        active &= sound("shape", si.shape, si.p, si.n, si.sh_frame.n, si.uv)
         ds, light = scene.sample_emitter_direction(si, mi.Point2f(draw(), draw()), True, active)
-        active &= sound(_emitter, ds.emitter, light)
+        active &= sound("emitter", ds.emitter, light)
         bsdf = si.bsdf(ray)
         value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active & (ds.pdf > 0))
         bs, weight = bsdf.sample(ctx, si, draw(), mi.Point2f(draw(), draw()), active)
         value, weight = mi.unpolarized_spectrum(value), mi.unpolarized_spectrum(weight)
         lit = dr.any(weight != 0)
         drawn = dr.select(lit, bs.wo, 0), dr.select(lit, bs.pdf, 0)
-        active &= lit & sound(
-            lambda s: f"the BSDF {_name(s.bsdf())}, on {_name(s)}", si.shape, value, pdf, weight, *drawn
-        )
+        active &= lit & sound("BSDF", si.shape, value, pdf, weight, *drawn)
         ray = si.spawn_ray(si.to_world(bs.wo))
         dr.eval(ray, active, rng)
         if not dr.any(active):
             break
     return +counts
-
-
-def _emitter(emitter: Any) -> str:
-    return f"the emitter {_name(emitter)}"
 
 
 def _name(plugin: Any) -> str:

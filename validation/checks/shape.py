@@ -16,19 +16,9 @@ import numpy as np
 from scipy import stats
 
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.validation.checks import law as laws
 from mrt_mitsuba.validation.checks import noise
-from mrt_mitsuba.validation.checks.law import (
-    LEVEL,
-    SIGMAS,
-    TIMEOUT,
-    Check,
-    Law,
-    Skip,
-    Subject,
-    examine,
-    figures,
-    rare,
-)
+from mrt_mitsuba.validation.checks.law import LEVEL, SIGMAS, TIMEOUT, Check, Law, Skip, Subject, figures, rare
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import Array, Lanes, lanes, unit
 from mrt_mitsuba.validation.tools.compare import sidak
@@ -38,11 +28,8 @@ FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
 MOST_HITS = 16  # along a line
 HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
 TYPICAL = 16  # roundings: twice the most that was measured of sound shapes
-TILTED = 2e-3
-NORMAL = 1e-5  # a few roundings of a square root and a quotient
 FAR = 1e4  # sizes away
 SMOOTHED = ("SDFGrid", "BSplineCurve", "LinearCurve", "Instance")
-DIGITS = f"over that of {noise.ALLOWANCE:g} roundings with a rounded ray, 9 in 10"
 
 RAY = """si = scene.ray_intersect(mi.Ray3f(o, d))
 print(si)
@@ -65,7 +52,7 @@ def check_shape(
     ``quick``: fewer rays. ``only``: names of ``LAWS``. ``timeout``: seconds after which a law fails that is
     not done. Raises ``UsageError`` for anything else, and ``SceneError`` for a dict that Mitsuba cannot load.
     """
-    return examine(Case, shape, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
+    return laws.examine(Case, shape, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
 
 
 # --------------------------------------- Rays and what they meet ---------------------------------------
@@ -117,7 +104,7 @@ class Case(Subject):
             kind = type(self.plugin).__name__
             raise UsageError(f"{kind} is not a shape of {mi.variant()}: give a dict or a loaded shape")
         self.target = self.plugin
-        if isinstance(self.plugin, mi.Shape) and self.plugin.class_name() == "Instance":
+        if laws.class_name(self.plugin) == "Instance":
             if self.description is None:
                 raise UsageError("a loaded instance does not give its group away: give a dict of both")
             self.target = self.scene()
@@ -129,7 +116,12 @@ class Case(Subject):
         self.box = np.array([np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max)])
         if not np.isfinite(self.box).all() or (self.box[1] < self.box[0]).any():
             raise UsageError(f"the bounding box of the shape is {self.box}: it must be finite")
-        self.points = np.concatenate([self.box, corners(self.plugin)])
+        self.points = self.box  # and of a mesh the vertices and the middles of edges
+        params = mi.traverse(self.plugin) if isinstance(self.plugin, mi.Mesh) else {}
+        if "faces" in params:  # a rectangle hides that it is a mesh
+            vertex, face = (np.array(params[name]).reshape(-1, 3) for name in ("vertex_positions", "faces"))
+            middles = [(vertex[face[:, k]] + vertex[face[:, k - 1]]) / 2 for k in range(3)]
+            self.points = np.concatenate([self.box, vertex, *middles])
         self.low, self.high = self.points.min(axis=0), self.points.max(axis=0)  # the box itself may be wrong
         self.middle, self.size = (self.low + self.high) / 2, float(np.linalg.norm(self.high - self.low))
 
@@ -212,15 +204,6 @@ def leave(p: Array, n: Array, d: Array) -> Array:
     return (p + np.sign(dot(n, d))[:, None] * n * offset(p)[:, None]).astype(np.float32)
 
 
-def corners(shape: Any) -> Array:
-    """Return the vertices of a mesh and the middles of its edges [N, 3]; none for other shapes."""
-    names = ("vertex_positions", "faces")
-    if not isinstance(shape, mi.Mesh) or not set(names) <= set(mi.traverse(shape).keys()):
-        return np.zeros((0, 3))  # a rectangle hides that it is a mesh
-    vertex, face = (np.array(mi.traverse(shape)[name]).reshape(-1, 3) for name in names)
-    return np.concatenate([vertex, *((vertex[face[:, k]] + vertex[face[:, k - 1]]) / 2 for k in range(3))])
-
-
 # ------------------------------------------------- Laws ------------------------------------------------
 
 MAXT = """ray = mi.Ray3f(o, d)
@@ -270,8 +253,8 @@ def hits(law: Law, case: Case) -> None:
            "self-intersections are dark spots; grazing rays are left out", RAY),
     missed=("share", "share of rays from a thousandth of the size before the surface that do not meet "
             "it there", 2e-3, "no absolute limits; outlines hang on roundings", RAY),
-    noise=(0.9, "noise of the {what} " + DIGITS, noise.LOST,
-           "digits are lost inside that could be kept", RAY),
+    noise=(0.9, f"noise of the {{what}} over that of {noise.ALLOWANCE:g} roundings with a rounded ray, "
+           "9 in 10", noise.LOST, "digits are lost inside that could be kept", RAY),
 )  # fmt: skip
 def surface(law: Law, case: Case) -> None:
     """p = o + t d is on the surface; spawned rays do not meet it where they start; digits are kept."""
@@ -334,10 +317,10 @@ PARTED = "extrapolated to no step; edges may part neighbours"
 @figures(
     outwards=("share", "share of rays from outside whose normal points the wrong way", 1e-3,
               "a closed shape has an outside; what edges hide is left room for", RAY),
-    length=("most", "length of a normal less 1", NORMAL, "a square root and a quotient", RAY),
+    length=("most", "length of a normal less 1", 1e-5, "a square root and a quotient", RAY),
     side=("none", "shading normals on the other side than the geometric one", 0, "one surface", RAY),
     shading=(0.9, "shading normal against the geometric one, except on smoothed meshes, 9 in 10",
-             TILTED, "the same, within some roundings", RAY),
+             2e-3, "the same, within some roundings", RAY),
     turned=("share", "share of normals that turn where the same point is met from behind", 1e-3,
             "a surface has one normal; thin parts are left room for", RAY),
     slant=("most", "cosine between the normal and a partial derivative of the point", 1e-3,
@@ -359,9 +342,8 @@ def normals(law: Law, case: Case) -> None:
     length = np.linalg.norm(np.stack([met.n, met.shading]).astype(np.float64), axis=-1)
     law.hold("length", np.abs(length - 1).max(axis=0), o=o, d=d)
     law.hold("side", dot(met.n, met.shading) <= 0, o=o, d=d)
-    shape = case.plugin if isinstance(case.plugin, mi.Shape) else None
-    smoothed = isinstance(shape, mi.Mesh) and shape.has_vertex_normals()
-    if not smoothed and (shape is None or shape.class_name() not in SMOOTHED):
+    smoothed = isinstance(case.plugin, mi.Mesh) and case.plugin.has_vertex_normals()
+    if not smoothed and laws.class_name(case.plugin) not in SMOOTHED:
         law.hold("shading", np.linalg.norm(met.shading - met.n, axis=1), o=o, d=d)
     # the normal is the surface's, not the ray's: the same for a ray that comes back from behind
     back = case.behind
@@ -672,8 +654,8 @@ def _directions(law: Law, case: Case, u: Array) -> None:
     law.hold("angle", max(off.max(), 0) / expected[0])
 
 
-SINE = 1 / 3  # of the angle between the middle and the rim of the sphere around, from 1.5 sizes away
-CONE = 2 * np.pi * (1 - np.sqrt(1 - SINE**2))  # solid angle
+# solid angle of the sphere around, from 1.5 sizes away: the sine of its half angle is a third
+CONE = 2 * np.pi * (1 - np.sqrt(1 - 1 / 9))
 
 
 def _moments(case: Case, o: Array, d: Array, p: Array, weight: Array) -> tuple[Array, Array]:

@@ -51,10 +51,9 @@ def reference_render(
     a texture on anything but triangles, and for one that is not looked up as in the report.
     """
     camera = scene.camera
-    for thing in objects(scene):
-        drawn = isinstance(thing, Mesh) and thing.uvs is not None and scene.texturing == "report"
-        if thing.material.texture and not drawn:
-            raise SceneError("float64 draws textures on triangles only, looked up as in the report")
+    textured = [thing for thing in objects(scene) if thing.material.texture]
+    if any(getattr(thing, "uvs", None) is None or scene.texturing != "report" for thing in textured):
+        raise SceneError("float64 draws textures on triangles only, looked up as in the report")
     # The first row is the lowest; the column grows along up × forward: mirrored against a right-handed
     # camera, as in the original
     pixel = np.arange(width * height)
@@ -65,8 +64,7 @@ def reference_render(
     u, v = (2 * x - width) / width * half_width, (2 * y - height) / width * half_width
     d = unit(forward + u[:, None] * right + v[:, None] * np.cross(forward, right))
     o = np.broadcast_to(np.array(camera.position, float), d.shape)
-    with np.errstate(all="ignore"):
-        layers = _radiance(scene, o, d, **settings)
+    layers = _radiance(scene, o, d, **settings)
     return ReferenceResult(*(layer.reshape(height, width, *layer.shape[1:])[::-1] for layer in layers))
 
 
@@ -75,6 +73,7 @@ def objects(scene: Scene) -> list[Any]:
     return [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
 
 
+@np.errstate(all="ignore")
 def _radiance(
     scene: Scene,
     o: Array,
@@ -174,6 +173,7 @@ def specular_lobe(n: Array, to_light: Array, to_eye: Array, alpha: Array) -> Arr
 Met = tuple[Array, Callable[[Array], tuple[Array, Any]]]
 
 
+@np.errstate(all="ignore")
 def nearest(things: Sequence[Any], o: Array, d: Array, reach: Any = np.inf) -> tuple[Array, ...]:
     """Return what rays (origins [N, 3], unit directions [N, 3]) meet first within ``reach``.
 
@@ -182,14 +182,13 @@ def nearest(things: Sequence[Any], o: Array, d: Array, reach: Any = np.inf) -> t
     """
     t, thing = np.full(len(o), np.inf), np.full(len(o), -1)
     n, diffuse = np.zeros((2, len(o), 3))
-    with np.errstate(all="ignore"):
-        for number, one in enumerate(things):
-            met, surface = MEET[type(one)](one, o, d)
-            k = np.flatnonzero((met < t) & (met < reach))
-            if len(k):
-                normal, color = surface(k)
-                t[k], thing[k], n[k] = met[k], number, normal
-                diffuse[k] = one.material.diffuse if color is None else color
+    for number, one in enumerate(things):
+        met, surface = MEET[type(one)](one, o, d)
+        k = np.flatnonzero((met < t) & (met < reach))
+        if len(k):
+            normal, color = surface(k)
+            t[k], thing[k], n[k] = met[k], number, normal
+            diffuse[k] = one.material.diffuse if color is None else color
     return t, thing, n, diffuse
 
 

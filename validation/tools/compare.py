@@ -178,14 +178,10 @@ def _layer_of(channels: Mapping[str, np.ndarray], headers: Mapping[str, Any], la
     keys = picture if not layer else [layer] if layer in channels else groups.get(layer)
     if not keys:
         raise UsageError(f"{name} has no layer {layer or 'R, G, B'!r}; it has {', '.join(sorted(groups))}")
-    corners = headers[keys[0]]["dataWindow"] if headers else ()
-    window = tuple(int(n) for corner in corners for n in corner)
-
-    def stacked(names: Sequence[str]) -> np.ndarray:
-        return np.stack([channels[each] for each in names], axis=-1, dtype=np.float64)
-
-    known = not layer and "error" in groups
-    return stacked(keys), stacked(groups["error"]) ** 2 if known else None, window
+    window = tuple(int(n) for corner in (headers[keys[0]]["dataWindow"] if headers else ()) for n in corner)
+    wanted = [keys] if layer or "error" not in groups else [keys, groups["error"]]
+    found, *error = (np.stack([channels[c] for c in names], -1, dtype=np.float64) for names in wanted)
+    return found, error[0] ** 2 if error else None, window
 
 
 def _p_value(sides: Sequence[Layer]) -> float | None:

@@ -32,12 +32,8 @@ from mrt_mitsuba.output.files import to_8bit
 from mrt_mitsuba.output.replacing import check_target, replacing
 from mrt_mitsuba.rendering.progress import Progress
 
-# Pictures this many times wider than high, and plots of so many inches, have a row of the page to themselves
-BROAD, COLUMN = 2, 6.5
 VALIDATION = "Validation of mrt-mitsuba"
 Item = TypeVar("Item")
-Rows = Sequence[Sequence[Any]]
-Ends = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -49,7 +45,7 @@ class Bound:
     limit: float
     at_most: bool = True  # else: at least
     note: str = ""
-    interval: Ends | None = field(default=None, kw_only=True)
+    interval: Sequence[float] | None = field(default=None, kw_only=True)
 
     @property
     def holds(self) -> bool:
@@ -116,7 +112,7 @@ class Study:
         """Hold a figure to a lower bound; ``note``: why it is this one."""
         self.bounds.append(Bound(name, float(measured), float(limit), False, note))
 
-    def goal(self, name: str, measured: float, limit: float, note: str, *, interval: Ends) -> None:
+    def goal(self, name: str, measured: float, limit: float, note: str, *, interval: Sequence[float]) -> None:
         """Show whether a time or a ratio of times is at most so much; a busy machine must fail no study."""
         self.goals.append(Bound(name, float(measured), float(limit), note=note, interval=interval))
 
@@ -125,7 +121,7 @@ class Study:
         name: str,
         title: str,
         columns: Sequence[str],
-        rows: Rows,
+        rows: Sequence[Sequence[Any]],
         note: str = "",
         *,
         first: bool = False,
@@ -307,25 +303,22 @@ def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[st
         "passed": all(study.passed for study in studies),
         "studies": {study.name: study.summary() for study in studies},
     }
-    loader = jinja2.FileSystemLoader(Path(__file__).parent / "templates")
-    pages = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
-    )
+    options: Any = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True}
+    pages = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"), **options)
     pages.filters |= {"cell": cell, "base64": lambda data: base64.b64encode(data).decode()}
     shown = {**result, "studies": studies, "images": images, "title": title, "explain": title == VALIDATION}
-    page = pages.get_template("report.html").render(shown)
-    summary = json.dumps(result, indent=2, allow_nan=False) + "\n"
-    return files | {"summary.json": summary.encode(), "index.html": page.encode()}
+    files["index.html"] = pages.get_template("report.html").render(shown).encode()
+    return files | {"summary.json": json.dumps(result, indent=2, allow_nan=False).encode() + b"\n"}
 
 
 def _drawn(content: Any) -> dict[str, Any]:
     """Return the bytes of a PNG, the class of the picture, and whether it has a row of the page to itself."""
     buffer = io.BytesIO()
     if isinstance(content, np.ndarray):
-        kind, broad = "picture", content.shape[1] > BROAD * len(content)
+        kind, broad = "picture", content.shape[1] > 2 * len(content)
         PIL.Image.fromarray(to_8bit(content.astype(np.float32), "srgb")).save(buffer, format="PNG")
     else:
-        kind, broad = "plot", content.get_figwidth() > COLUMN
+        kind, broad = "plot", content.get_figwidth() > 6.5  # inches
         content.savefig(buffer, format="png", dpi=110, bbox_inches="tight", facecolor="white")
     return {"data": buffer.getvalue(), "kind": kind, "broad": broad}
 

@@ -276,8 +276,8 @@ def _runner(scene: Any, shared: Options) -> Run:
     def run(options: Options, seed: int) -> Result:
         given = {"scene": scene, "variant": variant, **shared, **options, "seed": seed}
         one = given.pop("scene")
-        can_be_loaded = isinstance(one, dict) or str(one).lower().endswith(".xml")
-        if can_be_loaded and given["variant"] == variant and "params" not in given:
+        loadable = isinstance(one, dict) or str(one).lower().endswith(".xml")
+        if loadable and given["variant"] == variant and "params" not in given:
             if id(one) not in loaded:
                 loaded[id(one)] = open_scene(one).scene
             one = loaded[id(one)]
@@ -367,12 +367,13 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
         study.records(f"{prefix}failed", f"{title}: cases that failed", reasons)
     if not found.points:
         return
-    own = f"about {found.reference_error:.2g}; no claim is made below twice that."
-    own = own if found.reference_error else "not known: every RMSE includes it."
-    caption = ["Down and to the left is better. Bars are 95 % intervals, numbers those of the table."]
-    caption += [f"Reference: {truth}."] if truth else []
-    caption += [f"The RMSE of the reference itself is {own}", *found.verdicts]
-    study.picture(f"{prefix}diagram", f"{title}: work and precision", _diagram(found), " ".join(caption))
+    own = f"about {found.reference_error:.2g}; no claim is made below twice that"
+    caption = (
+        "Down and to the left is better. Bars are 95 % intervals, numbers those of the table. Reference: "
+        f"{truth or 'as given'}. Its own RMSE is {own if found.reference_error else 'not known'}. "
+    )
+    caption += " ".join(found.verdicts)
+    study.picture(f"{prefix}diagram", f"{title}: work and precision", _diagram(found), caption)
     if found.errors:
         reached = {f"RMSE {error:g}": found.time_to(error) for error in found.errors}
         times = [
@@ -436,9 +437,8 @@ def _diagram(found: Findings) -> Any:
         axes.axhspan(bottom / 10, floor, color="0.9", zorder=0, label="within the reference's error")
     if any(p.rmse == 0 for p in found.points.values()):
         axes.axhline(bottom, color="0.9", linewidth=8, zorder=0, label="no error")
-    axes.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="RMSE")
-    axes.set_ylim(bottom=0.8 * bottom)
     axes.margins(x=0.08, y=0.08)
+    axes.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="RMSE", ylim=(0.8 * bottom, None))
     axes.grid(alpha=0.3)
     figure.legend(fontsize=8, ncols=4, loc="outside lower center")
     return figure
