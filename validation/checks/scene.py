@@ -142,8 +142,7 @@ class EmitterCase(Subject):
         super().__init__(emitter, quick, seed)
         box = scene.bbox()
         low, high = (np.nan_to_num(np.ravel(np.array(c)), posinf=1, neginf=-1) for c in (box.min, box.max))
-        points = self.rng.uniform(1.1 * low - 0.1 * high, 1.1 * high - 0.1 * low, (2**12, 3))
-        self.points = points.astype(np.float32)
+        self.points = np.float32(self.rng.uniform(1.1 * low - 0.1 * high, 1.1 * high - 0.1 * low, (2**12, 3)))
         flags = int(emitter.flags())
         # whether light comes from all around, and not from single directions, a surface or a point
         self.around = bool(flags & int(mi.EmitterFlags.Infinite)) and not flags & int(mi.EmitterFlags.Delta)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.validation.checks.probe import Array, Probe, unit
+from mrt_mitsuba.validation.checks.probe import Array, Probe, direction, unit
 
 
 def rgb(value: float | Sequence[float]) -> dict[str, Any]:
@@ -32,9 +32,7 @@ def lobe_pairs(count: int, alpha: float, *, seed: int = 1) -> tuple[Array, Array
     rng = np.random.default_rng(seed)
     wi, wo = np.empty((0, 3)), np.empty((0, 3))
     while len(wi) < count:
-        c, phi = rng.uniform(0.02, 1, 4 * count), rng.uniform(0, 2 * np.pi, 4 * count)
-        s = np.sqrt(1 - c**2)
-        i = np.stack([s * np.cos(phi), s * np.sin(phi), c], axis=-1)
+        i = direction(rng.uniform(0.02, 1, 4 * count), rng.uniform(0, 2 * np.pi, 4 * count))
         slope = alpha * 4 * np.sqrt(rng.random(4 * count))
         psi = rng.uniform(0, 2 * np.pi, 4 * count)
         m = np.stack([slope * np.cos(psi), slope * np.sin(psi), np.ones(4 * count)], axis=-1)
@@ -56,12 +54,9 @@ def albedo(bsdf: Any, wi: Array, *, resolution: int = 700) -> Array:
     With 700² points the error is below 1e-4 for alpha >= 0.1.
     """
     middles = (np.arange(resolution) + 0.5) / resolution
-    cos = middles[:, None] * np.ones(resolution)
     s = 2 * middles - 1
     phi = np.arctan2(-wi[1], -wi[0]) + np.pi * s * np.abs(s)
-    sin = np.sqrt(1 - cos**2)
-    wo = np.stack([sin * np.cos(phi), sin * np.sin(phi), cos], axis=-1).reshape(-1, 3).astype(np.float32)
-    value, _ = evaluate(bsdf, wi, wo)
+    value, _ = evaluate(bsdf, wi, direction(middles[:, None], phi).reshape(-1, 3))
     # dω = d cos dφ, dφ = 2π |s| ds, ds = 2 dv
     weight = np.broadcast_to(4 * np.pi * np.abs(s), (resolution, resolution)).ravel() / resolution**2
     return (value.astype(np.float64) * weight[:, None]).sum(axis=0)

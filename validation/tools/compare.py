@@ -124,14 +124,13 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
         size, square = np.abs(difference), difference**2
         relative = np.where(np.isinf(square), np.inf, square / (second**2 + EPSILON))
         psnr = 20 * np.log10(peak) - 10 * np.log10(square.mean())
-    row, column, _ = np.unravel_index(size.argmax(), size.shape)
     return Difference(
         mae=float(size.mean()),
         rmse=float(square.mean() ** 0.5),
         rel_mse=float(relative.mean()),
         psnr=float(psnr),
         largest=float(size.max()),
-        place=(int(row), int(column)),
+        place=divmod(int(size.max(axis=2).argmax()), size.shape[1]),
         p_value=_p_value(sides),
         difference=difference.astype(np.float32),
         pictures=(first, second),
