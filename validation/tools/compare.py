@@ -115,10 +115,7 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
         sizes = " and ".join("{1}x{0} with {2} channels".format(*side[0].shape) for side in sides)
         raise UsageError(f"cannot compare pictures of {sizes}: their sizes must be the same")
     if window and other and window != other:
-        raise UsageError(
-            f"cannot compare the data windows {window} and {other}, of first column and row to last "
-            "column and row: the pictures show other places"
-        )
+        raise UsageError(f"cannot compare the data windows {window} and {other}: they show other places")
     with np.errstate(all="ignore"):
         difference = np.where(first == second, 0, first - second)  # inf where both are
         size, square = np.abs(difference), difference**2
@@ -173,7 +170,7 @@ def _layer_of(channels: Mapping[str, np.ndarray], headers: Mapping[str, Any], la
     groups: dict[str, list[str]] = {}  # channels by layer, in order
     for key in sorted(channels, key=lambda key: ((ORDER + key[-1]).index(key[-1]), key)):
         groups.setdefault(key.rpartition(".")[0] or key, []).append(key)
-    picture = [c for c in "RGB" if c in channels] or [c for c in "Y" if c in channels]
+    picture = [c for c in "RGB" if c in channels] or [*channels.keys() & {"Y"}]
     keys = picture if not layer else [layer] if layer in channels else groups.get(layer)
     if not keys:
         raise UsageError(f"{name} has no layer {layer or 'R, G, B'!r}; it has {', '.join(sorted(groups))}")

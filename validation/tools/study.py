@@ -117,14 +117,7 @@ class Study:
         self.goals.append(Bound(name, float(measured), float(limit), note=note, interval=interval))
 
     def table(
-        self,
-        name: str,
-        title: str,
-        columns: Sequence[str],
-        rows: Sequence[Sequence[Any]],
-        note: str = "",
-        *,
-        first: bool = False,
+        self, name: str, title: str, columns: Sequence[str], rows: Any, note: str = "", *, first: bool = False
     ) -> None:
         """Add a table, which is also written as CSV; ``first``: an answer, shown before the pictures."""
         self.tables[name] = {"title": title, "columns": columns, "rows": rows, "note": note, "first": first}
