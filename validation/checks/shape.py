@@ -276,13 +276,13 @@ def surface(law: Law, case: Case) -> None:
     missed = ~again.found | (np.linalg.norm(again.p - met.p, axis=1) >= 1e-3 * case.size)
     law.hold("missed", missed, o=before, d=d)
     first, scale = slice(0, case.count(300, 1000)), np.abs(o).max(axis=1) + met.t
-    inputs, options = np.concatenate([o, d], axis=1)[first], {"strides": (64,), "seed": case.seed}
+    inputs = np.concatenate([o, d], axis=1)[first]
     for what, size, pick in (
         ("distance", scale, lambda x: trace(case.target, x[:, :3], x[:, 3:]).t),
         ("hit point", scale, lambda x: trace(case.target, x[:, :3], x[:, 3:]).p.sum(axis=1)),
         ("normal", 1 + 0 * scale, lambda x: trace(case.target, x[:, :3], x[:, 3:]).n @ [0.6, 0.48, 0.64]),
     ):
-        found = noise.measure(pick, inputs, size=size[first], **options)
+        found = noise.measure(pick, inputs, size=size[first], strides=(64,), seed=case.seed)
         law.hold("noise", found.lost, o=o, d=d, what=what)
 
 

@@ -88,8 +88,9 @@ def _radiance(
     things = objects(scene)
     numbers = np.array([(m.material.ior, m.material.alpha, *m.material.specular) for m in things])
     light, (path, lights) = np.zeros(d.shape), np.zeros((2, len(d)), np.uint64)
-    ray, weight, spent = np.arange(len(d)), np.ones(d.shape), np.zeros(len(d), int)
-    while len(ray):
+    rays: list[Array] = [np.arange(len(d)), np.ones(d.shape), np.zeros(len(d), int), o, d]
+    while len(rays[0]):
+        ray, weight, spent, o, d = rays
         t, thing, n, diffuse = nearest(things, o, d)
         path[ray], hit = _mix(path[ray], thing), thing >= 0
         light[ray[~hit]] += weight[~hit] * scene.sky
@@ -119,7 +120,7 @@ def _radiance(
         spent += 1 if bounce_budget == "plain" else np.maximum(1, 10 - (10 * ior).astype(int))
         on = (cos > 0) & (spent < max_depth) & (weight != 0).any(axis=1)
         d = unit(d + 2 * cos[:, None] * n)
-        ray, weight, spent, o, d = (x[on] for x in (ray, weight, spent, start, d))
+        rays = [x[on] for x in (ray, weight, spent, start, d)]
     return light, path, lights
 
 
