@@ -32,9 +32,8 @@ def scene_dict(
 
     ``flavor``: "mrt" for this project's plugins; "stock" for the nearest equivalents among Mitsuba's, which
     any Mitsuba program opens: ``roughplastic`` for the material, ``point`` lights as bright at the camera's
-    target, finite squares for planes, ``cylinder`` and two ``disk`` for a cylinder, ``bitmap``
-    for a texture, and ``path`` with few bounces for the integrator. Cones and meshes
-    have none but in a file of their own, which ``write_xml`` writes.
+    target, finite squares for planes, ``cylinder`` and two ``disk`` for a cylinder, ``bitmap`` for a
+    texture, and ``path`` with few bounces. Cones and meshes have none but in files: see ``write_xml``.
 
     Raises ``UsageError`` for a scene, flavor, size or formula that there is not, ``SceneError`` for a stock
     flavor that cannot be had.
@@ -86,7 +85,7 @@ def write_xml(
         raise UsageError(f"params: only an XML file declares names, such as {next(iter(params))}")
     else:
         terms = terms or report_scene(scene)  # type: ignore[arg-type]  # which refuses anything else
-        size = {"width": width or SIZE[0], "height": height or SIZE[1]}
+        size: Any = {"width": width or SIZE[0], "height": height or SIZE[1]}
         nodes = scene_dict(terms, fresnel=fresnel or "schlick", **size)
         files = _put_into_files(nodes, os.path.splitext(os.fspath(path))[0], flavor)
         nodes = _stock(nodes, terms) if flavor == "stock" else nodes

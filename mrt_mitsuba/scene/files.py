@@ -17,8 +17,7 @@ MISSING = "is missing or may not be read in"  # what messages say about a file t
 
 
 def require_file(path: str | os.PathLike[str]) -> None:
-    """Raise ``SceneError`` unless ``path`` is a file that may be read. Pipes and devices may never
-    end."""
+    """Raise ``SceneError`` unless ``path`` is a file that may be read: pipes and devices may never end."""
     name = os.fspath(path)
     try:
         mode = os.stat(path).st_mode
@@ -37,10 +36,9 @@ def require_file(path: str | os.PathLike[str]) -> None:
 
 
 def read_text(path: Path) -> bytes:
-    """Return a text file with Unix line ends, one at the end too, and continued lines joined.
+    """Return a text file with Unix line ends, one at the end too; raise ``SceneError`` if it is no text.
 
     Lines that end in a backslash are joined with the next; empty ones after them keep line numbers right.
-    Raises ``SceneError`` if the file cannot be read as text.
     """
     require_file(path)
     data = path.read_bytes()
@@ -66,10 +64,7 @@ def decode(data: bytes) -> str:
 
 
 def find(name: str, folders: list[Path]) -> Path | None:
-    """Return the file ``name`` in the first folder where it exists and may be read, or None.
-
-    Backslashes may separate folders.
-    """
+    """Return the file ``name``, also with backslashes, in the first folder where it may be read, or None."""
     places = (folder / form for form in (name, name.replace("\\", "/")) for folder in folders)
     return next((place for place in places if os.path.isfile(place) and os.access(place, os.R_OK)), None)
 

@@ -208,9 +208,8 @@ class Scene:
 
 # The plugins of objects; all fields except the material, which comes last, are their parameters
 PLUGINS = {"sphere": "sphere", "cone": "mrt_cone", "cylinder": "mrt_cylinder", "plane": "mrt_plane"}
-# More objects than this of a kind make one shape: Mitsuba takes a tenth of a millisecond for a native shape
-# and more than a millisecond for one in Python, which it loads one inside the other, to Python's limit of
-# recursion
+# More objects of a kind than this make one shape: Mitsuba takes 0.1 ms to load a native shape and over 1 ms
+# for one in Python, each inside the one before, up to Python's limit of recursion
 MOST_SINGLE = {"sphere": 1000, "cone": 100, "cylinder": 100}
 
 

@@ -48,7 +48,6 @@ SCENE_4_MATERIALS = (
     _material(1.1153, 0.0680, 0.012, 0.036, 0.106, 1.0, 0.965, 1.07),
 )
 
-
 _ROW = [round(-1.5 + i / 3, 9) for i in range(10)]  # places of spheres, to nine digits as in the original
 # Parts of materials: index and roughness, specular and diffuse colour, or some of these
 _GLOSSY = (1.3, 0.1, 0.5, 0.5, 0.5)

@@ -1,5 +1,4 @@
-"""The jobs of a sweep: every combination of a grid's values, checked, with the name of its file, and the
-scenes on their way to the workers."""
+"""The jobs of a sweep: each combination of a grid's values, checked; and scenes on their way to workers."""
 
 from __future__ import annotations
 
