@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
-from scipy import stats
+from scipy import ndimage, stats
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
@@ -73,13 +73,15 @@ def test_more_than_noise(tmp_path: Path) -> None:
     assert mrt.compare(noisy("a.exr", 1, 0.25), noisy("b.exr", 1)).p_value < 1e-3
 
 
-@pytest.mark.parametrize("share", [0, 0.01])
-def test_p_value_is_uniform_for_equal_pictures(share: float, tmp_path: Path) -> None:
-    """Also where 1 % of the rays is bright, and most pixels state far too small an error."""
+@pytest.mark.parametrize(("share", "deviation"), [(0, 0), (0.01, 0), (0, 0.6)])
+def test_p_value_is_uniform_for_equal_pictures(share: float, deviation: float, tmp_path: Path) -> None:
+    """Also where 1 % of the rays is bright, and most pixels state far too small an error, and under filters
+    of a Gaussian of some pixels."""
     rng, size = np.random.default_rng(2), (16, 24, 32, 1)
 
     def noisy(name: str) -> Path:
-        return mean_of(0.5 + 0.05 * rng.normal(size=size) + 50 * (rng.random(size) < share), tmp_path / name)
+        rays = 0.5 + 0.05 * rng.normal(size=size) + 50 * (rng.random(size) < share)
+        return mean_of(ndimage.gaussian_filter(rays, (0, deviation, deviation, 0)), tmp_path / name)
 
     p = [mrt.compare(noisy("a.exr"), noisy("b.exr")).p_value for _ in range(120)]
     assert stats.kstest(p, "uniform").pvalue > 0.01

@@ -104,7 +104,7 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
         peak: brightest value, for the PSNR.
 
     The p-value needs a layer "error", the standard error of each pixel, next to the picture, as
-    ``render(target=...)`` and ``aamode="noise"`` write it, and pixels that are independent: a box filter.
+    ``render(target=...)`` and ``aamode="noise"`` write it, whatever the film's filter.
 
     An EXR of several parts has each as a layer, by its name. Raises ``UsageError`` for what cannot be
     compared: another size or data window, no such layer, NaN.
@@ -205,11 +205,17 @@ def _p_of_means(difference: np.ndarray) -> float:
 
     Their noise is as often positive as negative, whatever its law. So the least p value of Student's test is
     compared with those after random changes of sign of blocks of pixels; where it is among the least of
-    these, with the exponential law that their logarithms continue.
+    these, with the exponential law that their logarithms continue. Under a film's filter, neighbours share
+    rays; their correlation, taken for a Gaussian's, says how much wider that makes sums.
     """
     from scipy import stats
 
     side = -(-max(difference.shape) // BLOCKS)
+    near = [difference[1:] * difference[:-1], difference[:, 1:] * difference[:, :-1]]
+    total, chance = sum(each.sum() for each in near), sum((each**2).sum() for each in near) ** 0.5
+    alike = total / 2 / (difference**2).sum() if total > 3 * chance else 0
+    apart = np.arange(1, 4)  # pixels, and how many of a block's are so far from its end
+    wide, inside = (1 + 2 * (alike**apart**2 * s).sum() for s in (1, np.maximum(1 - apart / side, 0)))
     count, square, blocks = (
         cell_sums(v[None, ..., None], side) for v in (np.ones_like(difference), difference**2, difference)
     )
@@ -219,6 +225,7 @@ def _p_of_means(difference: np.ndarray) -> float:
         pixels, squares, totals = (cell_sums(v, size) for v in (count, square, blocks))
         share = np.minimum(totals**2 / np.maximum(squares * pixels, 1e-300), 1 - 1e-15)
         t = np.sqrt((pixels - 1) * share / (1 - share)).max((1, 2, 3))
+        t[0] *= inside / wide
         p = 2 * stats.t.sf(t, max(pixels.max() - 1, 1))
         least = np.minimum(least, p * max(np.count_nonzero(squares), 1))
     surprise = -np.log(least + 1e-300)
