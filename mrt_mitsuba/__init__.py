@@ -53,12 +53,12 @@ def __getattr__(name: str) -> object:
 
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    runtime = import_module("mrt_mitsuba.runtime")
-    runtime.check_start()
-    if ".rendering." in _HOME[name]:
-        with runtime.held(), runtime.rewriting_later():  # so that Mitsuba has less to do
-            import_module("mitsuba")
-    module = import_module(_HOME[name])
+    from mrt_mitsuba.interrupts import held
+    from mrt_mitsuba.machine import check_start
+
+    check_start()
+    with held():
+        module = import_module(_HOME[name])
     globals()[name] = value = getattr(module, name, module)  # ``filters`` is a module
     return value
 

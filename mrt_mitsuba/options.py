@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import operator
-from collections.abc import Callable, Iterable, Sequence
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from mrt_mitsuba.errors import UsageError
@@ -159,3 +160,15 @@ def check(name: str, kind: Kind, value: Any, *, text: bool = False) -> Any:
     except (TypeError, ValueError, OverflowError):
         pass
     raise UsageError(f"{name}={value if text else repr(value)}: must be {kind.allowed}")
+
+
+def is_obj(scene: object, model: Mapping[str, Any]) -> bool:
+    """Return whether a scene is given as the path of an OBJ file.
+
+    Raises ``UsageError`` where it is not, for options of ``model_scene``.
+    """
+    obj = isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".obj")
+    useless = [name for name, value in model.items() if (name, value) != ("convention", "report")]
+    if useless and not obj:
+        raise UsageError(f"{useless[0]} is of use only with an OBJ file: scene=PATH.obj")
+    return obj

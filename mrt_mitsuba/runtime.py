@@ -6,17 +6,19 @@ from __future__ import annotations
 import contextlib
 import difflib
 import os
-import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
 from functools import cache, wraps
 from typing import Any
 
-from mrt_mitsuba import llvm
+import drjit as dr
+import mitsuba as mi
+
+from mrt_mitsuba import llvm, plugins
 from mrt_mitsuba.errors import MrtWarning, UnknownVariantError, VariantError
 from mrt_mitsuba.interrupts import held
-from mrt_mitsuba.machine import check_start, usable_cores
+from mrt_mitsuba.machine import usable_cores
 
 FAST = "llvm_ad_rgb"
 SLOW = "scalar_rgb"
@@ -38,12 +40,9 @@ def use(variant: str | None = None) -> str:
     that cannot run here.
     """
     global _used
-    if _used and variant in (None, _used) and sys.modules["mitsuba"].variant() == _used:
+    if _used and variant in (None, _used) and mi.variant() == _used:
         return _used
-    check_start()
     with one_at_a_time, held(), rewriting_later():
-        import mitsuba as mi
-
         if variant is None:
             variant = mi.variant() or default_variant()
         elif variant not in mi.variants():
@@ -54,12 +53,8 @@ def use(variant: str | None = None) -> str:
             raise VariantError(f"the variant {variant} cannot be used: {problem}")
         if mi.variant() != variant:
             mi.set_variant(variant)
-            import drjit as dr
-
             if dr.thread_count() > usable_cores():  # Dr.Jit does not look at quotas of control groups
                 dr.set_thread_count(usable_cores())
-        from mrt_mitsuba import plugins
-
         mitsuba_first()
         one_by_one()
         plugins.register()
@@ -93,16 +88,12 @@ def obstacle(variant: str) -> str | None:
         return llvm.problem(llvm.prepare())
     if not variant.startswith("cuda"):
         return None
-    import drjit as dr
-
     none = f"it needs an NVIDIA GPU with its driver, and none was found. Use {FAST} or {SLOW}."
     return None if dr.has_backend(dr.JitBackend.CUDA) else none
 
 
 def warn_if_slow() -> None:
     """Say once in a process that the current variant is slow, if it is."""
-    import mitsuba as mi
-
     if mi.variant().startswith("scalar"):
         _warn_once(
             f"{mi.variant()} traces one ray at a time in Python: use it for small pictures, else {FAST}"
@@ -118,17 +109,12 @@ def _warn_once(text: str) -> None:
 
 def usable_variants() -> list[str]:
     """Return the variants of this Mitsuba that can run here."""
-    import mitsuba as mi
-
     return [variant for variant in mi.variants() if obstacle(variant) is None]
 
 
 @cache
 def versions() -> dict[str, str]:
     """Return the versions of what decides about pixels."""
-    import drjit as dr
-    import mitsuba as mi
-
     from mrt_mitsuba import __version__
 
     version = llvm.prepare().version
@@ -149,8 +135,6 @@ def rewriting_later() -> Iterator[None]:
 
     Mitsuba has ten of them, in integrators for derivatives; to rewrite them takes 60 ms of each start.
     """
-    import drjit as dr
-
     rewrite = dr.syntax
 
     def later(function: Any = None, **options: Any) -> Any:
@@ -168,8 +152,6 @@ def rewriting_later() -> Iterator[None]:
 
 def mitsuba_first(folder: str | None = None) -> None:
     """Let Mitsuba find its own plugins before files of their names in ``folder`` and others."""
-    import mitsuba as mi
-
     current = mi.file_resolver()
     others = [str(current[i]) for i in range(len(current))]
     resolver = mi.FileResolver()
@@ -182,8 +164,6 @@ def mitsuba_first(folder: str | None = None) -> None:
 @cache
 def mitsuba_home() -> str:
     """Return the folder in which Mitsuba is installed."""
-    import mitsuba as mi
-
     return os.path.dirname(os.path.abspath(mi.__file__))
 
 
@@ -193,7 +173,6 @@ def one_by_one() -> None:
 
     Scenes without our plugins, and calls that say ``parallel``, load as before. Idempotent.
     """
-    import mitsuba as mi
 
     def in_turn(loader: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(loader)

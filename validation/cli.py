@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from importlib import import_module, util
 from pathlib import Path
 
-from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError
+from mrt_mitsuba.machine import check_start
 from mrt_mitsuba.rendering.progress import TerminalProgress
 
 # By name: the module, imported when it is run; what --list says of it; seconds of a quick and of a full run
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *more, **_: _say(f"warning: {message}")
         try:
-            runtime.check_start()
+            check_start()
             return int(not run_studies(names, options.out, quick=options.quick))
         except MrtError as error:
             _say(error)
@@ -78,6 +78,7 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> bool:
     # Not before: NumPy needs a working folder under some Pythons
     import drjit as dr
 
+    from mrt_mitsuba import runtime
     from mrt_mitsuba.validation.tools.study import Study, prepare_folder, save_report, terminal_table
 
     prepare_folder(out)

@@ -15,6 +15,7 @@ from mrt_mitsuba.command import registry
 from mrt_mitsuba.command.options import parse
 from mrt_mitsuba.errors import MrtError, UsageError, one_line
 from mrt_mitsuba.interrupts import Terminated, ending_soon, leave_now
+from mrt_mitsuba.output.replacing import discard_unfinished
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
@@ -95,8 +96,6 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _end_by_force() -> None:
-    from mrt_mitsuba.output.replacing import discard_unfinished
-
     if psutil := sys.modules.get("psutil"):  # Dask has loaded it: workers of a sweep would stay
         for worker in psutil.Process().children(recursive=True):
             with contextlib.suppress(psutil.Error):

@@ -11,10 +11,9 @@ from typing import Any
 
 from mrt_mitsuba.command.registry import split
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.options import SWITCH, Kind, check, choice, either, option, table
+from mrt_mitsuba.options import SWITCH, Kind, check, choice, either, is_obj, option, table
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
-from mrt_mitsuba.scene.open import is_obj
 from mrt_mitsuba.scene.report import NUMBERS
 
 # What ``log`` shows, from the fewest records to the most, as Python, Mitsuba and Dr.Jit call them
@@ -82,7 +81,7 @@ def parse(arguments: Sequence[str]) -> Options:
     params = {name: given.pop(name) for name in [*given] if name not in TABLE}
     values |= {n: check(n, TABLE[n].metadata["kind"], text, text=True) for n, text in given.items()}
     if params:
-        from mrt_mitsuba.scene.loading import declared
+        from mrt_mitsuba.scene.files import declared
 
         scene = str(values.get("scene", ""))
         known = declared(scene) if scene.lower().endswith(".xml") else {}

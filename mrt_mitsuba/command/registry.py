@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from importlib import import_module
 
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.machine import check_start
 
 TOOLS, CHECKS = "mrt_mitsuba.command.tools", "mrt_mitsuba.validation.tools.commands"
 
@@ -102,8 +103,6 @@ def run(name: str, words: Sequence[str]) -> int:
     if missing:
         raise UsageError(f"{missing[0]} is missing. {usage}")
     if form or name == "doctor":  # the others do without Mitsuba
-        from mrt_mitsuba.runtime import check_start
-
         check_start()
     code: int = getattr(import_module(module), function)(*plain, **given)
     return code

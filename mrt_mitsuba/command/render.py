@@ -12,16 +12,15 @@ import warnings
 from mrt_mitsuba.command.options import LEVELS, Options
 from mrt_mitsuba.errors import MrtWarning, printable
 from mrt_mitsuba.interrupts import held
+from mrt_mitsuba.machine import check_start
+from mrt_mitsuba.options import is_obj
+from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.settings import AA, AAMODE, NOISE
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE
-from mrt_mitsuba.scene.open import is_obj
 
 
 def run(options: Options) -> int:
     """Render and write what the options say; return the exit code."""
-    from mrt_mitsuba.output.replacing import check_target
-    from mrt_mitsuba.runtime import check_start
-
     check_start()
     for path in options.outputs():
         check_target(path, options.inputs())
@@ -31,15 +30,16 @@ def run(options: Options) -> int:
     if spared:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         gc.disable()
-    from mrt_mitsuba import runtime
     from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
 
     if options.quiet:
         warnings.simplefilter("ignore", MrtWarning)
     else:
         print(banner(options), flush=True)
-    runtime.use(options.variant)
     with held():
+        from mrt_mitsuba import runtime
+
+        runtime.use(options.variant)
         from mrt_mitsuba.rendering.api import render
     if spared:
         gc.freeze()

@@ -15,8 +15,9 @@ from mrt_mitsuba import llvm
 from mrt_mitsuba.command.options import TABLE, parse
 from mrt_mitsuba.command.registry import COMMANDS
 from mrt_mitsuba.errors import MrtError, SceneError, UsageError
+from mrt_mitsuba.output.replacing import check_target
+from mrt_mitsuba.scene.files import require_file
 from mrt_mitsuba.scene.model import MODEL_OPTIONS
-from mrt_mitsuba.scene.open import is_obj
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
 if sys.version_info >= (3, 11):
@@ -122,12 +123,11 @@ def export(place: str, /, *, xml: str, stock: str = "", **given: str) -> int:
         raise UsageError(
             f"{min(strange)} is of no use to mrt export. Usage: mrt export {COMMANDS['export'][0]}"
         )
-    from mrt_mitsuba.output.replacing import check_target
     from mrt_mitsuba.scene.export import write_xml
 
     check_target(xml, options.inputs())
     kept = {name: getattr(options, name) for name in ("width", "height", "fresnel", "params")}
-    kept |= options.model() if is_obj(options.scene, {}) else {}
+    kept |= options.model()
     print(f"Wrote {' and '.join(write_xml(options.scene, xml, flavor='stock' if stock else 'mrt', **kept))}")
     return 0
 
@@ -161,8 +161,6 @@ def _axes(grid: Any, before: str = "") -> Iterator[tuple[str, Any]]:
 
 def read_toml(path: str) -> dict[str, Any]:
     """Return the tables of a TOML file; raise ``UsageError`` where it cannot be read."""
-    from mrt_mitsuba.scene.files import require_file
-
     try:
         require_file(path)
         with open(path, "rb") as file:

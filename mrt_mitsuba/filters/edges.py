@@ -194,28 +194,19 @@ def geometry_edges(
     return _edge_map(grid, value > 1, value)
 
 
-def edges_image(edges: EdgeMap) -> np.ndarray:
-    """Return the contours as a picture: [H, W] float32, 1 at an edge, else 0."""
-    return np.array(edges.mask).astype(np.float32)
-
-
 def contours(*edges: EdgeMap) -> np.ndarray:
-    """Return the contours of one or several detectors as one picture, [H, W', 3] float32, from left to right.
+    """Return the contours of one or several detectors as one picture, [H, W', 3] float32, from left to right:
+    1 at an edge, else 0.
 
     Raises:
         UsageError: for no detector, or pictures of different heights.
     """
-    if not edges:
-        raise UsageError("contours needs at least one EdgeMap, such as sobel_edges(image)")
-    pictures = [edges_image(found) for found in edges]
-    heights = {picture.shape[0] for picture in pictures}
-    if len(heights) > 1:
-        raise UsageError(
-            f"contours of pictures with different heights {sorted(heights)}: give those of one render"
-        )
+    heights = {len(found.mask) for found in edges}
+    if len(heights) != 1:
+        raise UsageError(f"contours needs EdgeMaps of one height, at least one; given: {sorted(heights)}")
     gap = np.full((heights.pop(), GAP), GREY, np.float32)
-    parts = [part for picture in pictures for part in (gap, picture)][1:]
-    return np.repeat(np.concatenate(parts, axis=1)[..., None], 3, axis=-1)
+    parts = [part for found in edges for part in (gap, np.array(found.mask))][1:]
+    return np.repeat(np.concatenate(parts, axis=1, dtype=np.float32)[..., None], 3, axis=-1)
 
 
 def save_contours(path: str | os.PathLike[str], *edges: EdgeMap) -> None:

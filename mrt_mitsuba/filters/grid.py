@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mrt_mitsuba import runtime
+from mrt_mitsuba import llvm
 from mrt_mitsuba.errors import UsageError
 
 
@@ -38,7 +38,7 @@ class Grid:
         elif variant := (mitsuba := sys.modules.get("mitsuba")) and mitsuba.variant():
             name = variant.partition("_")[0]
         else:
-            name = "scalar" if runtime.obstacle(runtime.FAST) else "llvm"
+            name = "scalar" if llvm.problem(llvm.prepare()) else "llvm"
         self._tensor = importlib.import_module(f"drjit.{name}").TensorXf
         self._kind = type(image) if dr.is_tensor_v(image) else np.ndarray
         self.Float: Any = dr.array_t(self._tensor)

@@ -1,4 +1,4 @@
-"""Reading the text files of a model: bytes, lines, and where the files they name are."""
+"""Reading the files of a scene: bytes, lines, elements, and where the files they name are."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 
 from mrt_mitsuba.errors import MrtWarning, SceneError
 
+DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from about 3000 on
 LONGEST_LINE = 2**18  # bytes, about 40,000 corners of a face
 MISSING = "is missing or may not be read in"  # what messages say about a file that was not found
 
@@ -95,3 +96,36 @@ def warn(findings: Mapping[str, list[str]]) -> None:
         more = f" (and so do {len(texts) - 1} more {kind})" if texts[1:] else ""
         if texts:
             warnings.warn(f"{texts[0]}{more}", MrtWarning, stacklevel=4)
+
+
+def declared(path: str) -> dict[str, str]:
+    """Return the parameters that an XML file declares, with their defaults. Raises ``SceneError``."""
+    return {a.get("name", ""): a.get("value", "") for tag, a in elements(path) if tag == "default"}
+
+
+def elements(file: str) -> list[tuple[str, dict[str, str]]]:
+    """Return tag and attributes of each element of an XML file, in order."""
+    from xml.parsers import expat
+
+    require_file(file)
+    found: list[tuple[str, dict[str, str]]] = []
+    inside: list[str] = []  # the tags around
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        inside.append(tag)
+        found.append((tag, attributes))
+        if len(inside) > DEEPEST:
+            raise SceneError(f"cannot load {file}: it is nested more than {DEEPEST} levels deep")
+
+    def entity(name: str, *declaration: object) -> None:  # which Mitsuba's parser reads in another way
+        raise SceneError(f"cannot load {file}: it declares the entity {name}; write the text in its place")
+
+    parser = expat.ParserCreate("utf-8")
+    parser.StartElementHandler, parser.EntityDeclHandler = start, entity
+    parser.EndElementHandler = lambda tag: inside.pop()
+    try:
+        with open(file, "rb") as stream:
+            parser.ParseFile(stream)
+    except expat.ExpatError as error:
+        raise SceneError(f"cannot load {file}: it must be XML in UTF-8, but has {error}") from None
+    return found

@@ -19,13 +19,14 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+import mitsuba as mi
+
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.runtime import mitsuba_first, mitsuba_home
-from mrt_mitsuba.scene.files import picture_size, require_file
+from mrt_mitsuba.scene.files import DEEPEST, elements, picture_size, require_file
 
-DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from about 3000 on
 MOST_SAMPLES = 2**24  # of a pixel; some samplers divide by none, or never end at 2^31
 _PICTURES = ("mrt_texture", "bitmap", "envmap")  # plugins that read one
 
@@ -45,8 +46,6 @@ def load_dict(
     ``merge``: make one of meshes of the same material, as Mitsuba does, which leaves them in any order.
     Raises ``SceneError`` that calls it ``name``, and ``UsageError`` for a texture too large for the budget.
     """
-    import mitsuba as mi
-
     budget = budget or Budget.of(None)
     with _loading(name):
         _check_dict(scene, budget.inputs)
@@ -63,8 +62,6 @@ def load_file(
     ``as_text``: return it as XML, with includes and parameters filled in, and files by their whole path.
     Raises ``SceneError``, and ``UsageError`` for another kind of file or a texture too large for the budget.
     """
-    import mitsuba as mi
-
     require_file(path)
     if not path.lower().endswith(".xml"):
         raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
@@ -80,11 +77,6 @@ def load_file(
             if isinstance(node.props.get("filename", None), str):
                 node.props["filename"] = os.path.abspath(_resolved(node.props["filename"]))
         return mi.parser.write_string(state), values
-
-
-def declared(path: str) -> dict[str, str]:
-    """Return the parameters that an XML file declares, with their defaults. Raises ``SceneError``."""
-    return {a.get("name", ""): a.get("value", "") for tag, a in _elements(path) if tag == "default"}
 
 
 # ---------------------------------------------- Mitsuba's parser ---------------------------------------
@@ -106,8 +98,6 @@ def _check_nodes(nodes: Iterable[Any], budget: Budget) -> None:
 
 
 def _instantiate(state: Any, merge: bool = True) -> Any:
-    import mitsuba as mi
-
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel, config.merge_meshes = False, merge
     mi.parser.transform_all(config, state)
@@ -119,8 +109,6 @@ def _instantiate(state: Any, merge: bool = True) -> Any:
 def _loading(name: str, folder: str | None = None) -> Iterator[None]:
     """Take plugins from Mitsuba's own folder within the block, and data from ``folder`` as well; turn a
     ``RuntimeError``, of Mitsuba or of the checks below, into a ``SceneError`` that says what was loaded."""
-    import mitsuba as mi
-
     before = mi.file_resolver()
     mitsuba_first(folder)
     try:
@@ -133,8 +121,6 @@ def _loading(name: str, folder: str | None = None) -> Iterator[None]:
 
 
 def _resolved(path: str) -> str:
-    import mitsuba as mi
-
     return str(mi.file_resolver().resolve(path))
 
 
@@ -184,7 +170,7 @@ def _check_xml(path: str, parameters: Mapping[str, str], inputs: set[str]) -> Ma
     values, files = dict(parameters), [path]
     inputs.add(path)
     for file in files:  # which grows
-        for tag, attributes in _elements(file):
+        for tag, attributes in elements(file):
             if tag == "default":
                 values.setdefault(attributes.get("name", ""), attributes.get("value", ""))
                 continue
@@ -198,31 +184,3 @@ def _check_xml(path: str, parameters: Mapping[str, str], inputs: set[str]) -> Ma
                 if tag == "include" and os.path.isfile(found) and found not in files:
                     files.append(found)
     return values
-
-
-def _elements(file: str) -> list[tuple[str, dict[str, str]]]:
-    """Return tag and attributes of each element of an XML file, in order."""
-    from xml.parsers import expat
-
-    require_file(file)
-    found: list[tuple[str, dict[str, str]]] = []
-    inside: list[str] = []  # the tags around
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        inside.append(tag)
-        found.append((tag, attributes))
-        if len(inside) > DEEPEST:
-            raise SceneError(f"cannot load {file}: it is nested more than {DEEPEST} levels deep")
-
-    def entity(name: str, *declaration: object) -> None:  # which Mitsuba's parser reads in another way
-        raise SceneError(f"cannot load {file}: it declares the entity {name}; write the text in its place")
-
-    parser = expat.ParserCreate("utf-8")
-    parser.StartElementHandler, parser.EntityDeclHandler = start, entity
-    parser.EndElementHandler = lambda tag: inside.pop()
-    try:
-        with open(file, "rb") as stream:
-            parser.ParseFile(stream)
-    except expat.ExpatError as error:
-        raise SceneError(f"cannot load {file}: it must be XML in UTF-8, but has {error}") from None
-    return found

@@ -10,8 +10,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+import mitsuba as mi
+
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.machine import Budget
+from mrt_mitsuba.options import is_obj
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene
 from mrt_mitsuba.scene.report import report_scene
@@ -91,18 +94,6 @@ def open_scene(
     )
 
 
-def is_obj(scene: object, model: Mapping[str, Any]) -> bool:
-    """Return whether a scene is given as the path of an OBJ file.
-
-    Raises ``UsageError`` where it is not, for options of ``model_scene``.
-    """
-    obj = isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".obj")
-    useless = [name for name, value in model.items() if (name, value) != ("convention", "report")]
-    if useless and not obj:
-        raise UsageError(f"{useless[0]} is of use only with an OBJ file: scene=PATH.obj")
-    return obj
-
-
 def in_terms(scene: Any, model: Mapping[str, Any]) -> Scene | None:
     """Return a number, a ``Scene`` or the path of an OBJ file in the report's terms; None for anything else.
 
@@ -119,8 +110,6 @@ def in_terms(scene: Any, model: Mapping[str, Any]) -> Scene | None:
 
 def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
     """Set values by their ``mi.traverse`` key; raise ``UsageError`` for unknown ones and wrong types."""
-    import mitsuba as mi
-
     if not values:
         return
     parameters = mi.traverse(scene)
@@ -140,8 +129,6 @@ def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
 @contextmanager
 def sized(source: Source) -> Iterator[None]:
     """Give the film the source's size within the block; a film of another size loses its crop window."""
-    import mitsuba as mi
-
     size, before = [source.width, source.height], {}
     if list(source.sensor.film().crop_size()) != size:
         parameters = mi.traverse(source.sensor)
@@ -159,8 +146,6 @@ def _loaded(
     scene: Any, budget: Budget | None, declared: Mapping[str, Any]
 ) -> tuple[str, Any, Mapping[str, str]]:
     """Return the name of someone's own scene, the Mitsuba scene, and the parameters of its file."""
-    import mitsuba as mi
-
     if isinstance(scene, dict):
         return "a dict", load_dict(scene, budget=budget), {}
     if isinstance(scene, str | os.PathLike):
@@ -174,8 +159,6 @@ def _loaded(
 
 def _check_variant(name: str, thing: Any) -> None:
     """Raise ``UsageError`` for an object of Mitsuba that was loaded in another variant."""
-    import mitsuba as mi
-
     variant = thing.variant_name() if hasattr(thing, "variant_name") else mi.variant()
     if variant != mi.variant():
         raise UsageError(
@@ -193,8 +176,6 @@ def _number(values: Mapping[str, str], name: str, default: Any) -> Any:
 
 
 def _sensor(name: str, scene: Any, number: int) -> Any:
-    import mitsuba as mi
-
     if not isinstance(scene, mi.Scene):
         raise SceneError(f"{name} is a {type(scene).__name__}, not a scene: put it into one, with a sensor")
     sensors = scene.sensors()
@@ -207,8 +188,6 @@ def _sensor(name: str, scene: Any, number: int) -> Any:
 
 def opened(name: str, scene: Any, sensor: Any, integrator: Any) -> Source:
     """Return the source of someone's own loaded scene; raise ``SceneError`` if its sensor sees nothing."""
-    import mitsuba as mi
-
     for part in [sensor] if sensor.class_name() != "BatchSensor" else mi.traverse(sensor).hierarchy:
         if part.class_name() == "IrradianceMeter" and part.get_shape() is None:  # Mitsuba would crash
             raise SceneError(f"{name} has an irradiancemeter outside of a shape: put it into one")
@@ -222,8 +201,6 @@ def opened(name: str, scene: Any, sensor: Any, integrator: Any) -> Source:
 
 
 def _integrator(integrator: Any, scene: Any) -> Any:
-    import mitsuba as mi
-
     if integrator is None:
         integrator = scene.integrator() or "mrt_whitted"
     if isinstance(integrator, str):

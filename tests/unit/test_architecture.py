@@ -131,7 +131,7 @@ def test_imports_make_no_cycle() -> None:
         ("plugins", {"plugins"}),
         ("rays", {"rays"}),
         ("output", {"output", "machine", "errors", "interrupts"}),
-        ("filters", {"filters", "errors", "runtime", "output"}),
+        ("filters", {"filters", "errors", "llvm", "output"}),
         ("scene", {"scene", "plugins", "output", *FOUNDATION}),
         ("rendering", {"rendering", "plugins", "rays", "filters", "scene", "output", *FOUNDATION}),
     ],
