@@ -4,11 +4,12 @@ from mrt_mitsuba.filters.dof import blur_amount, gaussian_dof
 from mrt_mitsuba.filters.edges import (
     EdgeMap,
     contours,
+    edges_image,
     geometry_edges,
     luma_edges,
     save_contours,
     sobel_edges,
 )
 
-__all__ = ["EdgeMap", "blur_amount", "contours", "gaussian_dof"]
-__all__ += ["geometry_edges", "luma_edges", "save_contours", "sobel_edges"]
+__all__ = ["EdgeMap", "blur_amount", "contours", "edges_image"]
+__all__ += ["gaussian_dof", "geometry_edges", "luma_edges", "save_contours", "sobel_edges"]

@@ -194,6 +194,11 @@ def geometry_edges(
     return _edge_map(grid, value > 1, value)
 
 
+def edges_image(edges: EdgeMap) -> np.ndarray:
+    """Return the contours as a picture: [H, W] float32, 1 at an edge, else 0."""
+    return np.array(edges.mask).astype(np.float32)
+
+
 def contours(*edges: EdgeMap) -> np.ndarray:
     """Return the contours of one or several detectors as one picture, [H, W', 3] float32, from left to right:
     1 at an edge, else 0.
@@ -205,8 +210,8 @@ def contours(*edges: EdgeMap) -> np.ndarray:
     if len(heights) != 1:
         raise UsageError(f"contours needs EdgeMaps of one height, at least one; given: {sorted(heights)}")
     gap = np.full((heights.pop(), GAP), GREY, np.float32)
-    parts = [part for found in edges for part in (gap, np.array(found.mask))][1:]
-    return np.repeat(np.concatenate(parts, axis=1, dtype=np.float32)[..., None], 3, axis=-1)
+    parts = [part for found in edges for part in (gap, edges_image(found))][1:]
+    return np.repeat(np.concatenate(parts, axis=1)[..., None], 3, axis=-1)
 
 
 def save_contours(path: str | os.PathLike[str], *edges: EdgeMap) -> None:

@@ -17,6 +17,7 @@ from PIL import Image
 from mrt_mitsuba import UsageError, filters, runtime
 from mrt_mitsuba.filters import (
     blur_amount,
+    edges_image,
     gaussian_dof,
     geometry_edges,
     luma_edges,
@@ -281,7 +282,7 @@ def test_contours_stand_side_by_side_in_white_on_black(tmp_path: Path) -> None:
     assert (sheet[:, 12:16] == 0.5).all()
     for edges, part in ((luma, sheet[:, :12]), (sobel, sheet[:, 16:])):
         assert edges.mask[3, 5] and edges.mask[3, 6] and not edges.mask[3, 3]
-        for channel in np.moveaxis(part, -1, 0):
+        for channel in (edges_image(edges), *np.moveaxis(part, -1, 0)):
             np.testing.assert_array_equal(channel, edges.mask)
     for ending in ("png", "exr"):
         filters.save_contours(tmp_path / f"contours.{ending}", luma, sobel)
