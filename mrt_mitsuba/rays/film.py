@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 STEPS = 32  # of a pixel, where integrals over a filter are summed
 
@@ -199,12 +200,9 @@ class Film:
         for axis in (-2, -1) if self.reach else ():
             padding = [(0, 0)] * variance.ndim
             padding[axis] = (self.reach, self.reach)
-            wide = np.moveaxis(np.pad(variance, padding, mode="edge"), axis, 0)
-            count = variance.shape[axis]
-            total = share[self.reach] * wide[self.reach : self.reach + count]
-            for step in range(self.reach):  # filters are symmetric
-                total += (wide[step : step + count] + wide[2 * self.reach - step :][:count]) * share[step]
-            variance = np.moveaxis(total, 0, axis)
+            wide = sliding_window_view(np.pad(variance, padding, mode="edge"), len(share), axis)
+            pairs = ((wide[..., k] + wide[..., -1 - k]) * share[k] for k in range(self.reach))  # symmetric
+            variance = sum(pairs, share[self.reach] * wide[..., self.reach])
         return variance
 
 

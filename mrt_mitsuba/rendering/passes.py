@@ -109,12 +109,11 @@ class Passes:
                 counts, pictures = zip(*whole_pictures(exposer, seed, rays, advance), strict=True)
             self._develop(exposer, np.average(pictures, axis=0, weights=counts))
             return
-        marked = np.zeros((plan.height, plan.width), bool)
+        marked, whole = np.zeros((plan.height, plan.width), bool), Region(0, 0, plan.width, plan.height)
         if step.name == RENDERING:
             self._stack, chosen = Stack(film, 1, len(exposer.names)), np.ones((1, film.pixels), bool)
             # pixels whose rays reach what is seen
-            reached = plan.seen.grown(film.reach, plan.width, plan.height)
-            marked[reached.inside(Region(0, 0, plan.width, plan.height))] = True
+            marked[plan.seen.grown(film.reach, plan.width, plan.height).inside(whole)] = True
             pixels = np.flatnonzero(np.pad(marked, film.border, constant_values=True))
         else:
             seed, marked[self._seen] = seed + 1, self.layers["samples"][..., 0] > 1

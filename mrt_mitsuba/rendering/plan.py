@@ -135,7 +135,6 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
     # sums by pixel, in double precision, while a film is exposed
     sums = ROUND_CHANNELS if ROUNDS in made else FILM_CHANNELS
     channels += on_film * (sums + OWN_CHANNELS * len(film.bands + shader.aovs))
-    reach = edges.REACH * bool(detector) + dof.REACH * bool(blur)
     plan = Plan(
         scene=source.name,
         variant=str(mi.variant()),
@@ -148,7 +147,7 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> tuple
         kernel=shader.kernel,
         parts=shader.facts,
         region=region,
-        seen=region.grown(reach, source.width, source.height),
+        seen=region.grown(edges.REACH * bool(detector) + dof.REACH * bool(blur), source.width, source.height),
         samples=int(settings.aa or 1) ** 2,
         channels=channels,
         blur=blur,
@@ -166,10 +165,9 @@ def _traced(
     asked: frozenset[str], blur: str | None, detector: str | None, shader: Shader, settings: RenderSettings
 ) -> frozenset[str]:
     """Return the layers that must be traced: for the picture, the passes over it, and those asked for."""
-    traced = {"image", *asked, *(DETECTORS[detector] if detector else ())}
-    if blur:
-        traced.add("depth")
-    if detector and (settings.spp or 1) > 1 and "image" in DETECTORS[detector]:
+    read = DETECTORS[detector] if detector else ()
+    traced = {"image", *asked, *read, *(["depth"] if blur else [])}
+    if (settings.spp or 1) > 1 and "image" in read:
         traced.add("square")
     if settings.count_rays:
         traced |= {name for name, layer in TABLE.items() if layer.counts} & shader.layers
@@ -320,29 +318,25 @@ def _left_out(
         "none": "aamode=none gives every pixel all its samples",
         NOISE: "rounds go where the variance is",
     }
-    one, film = "aa=1 has no further samples to add", shader.film
-    skipped = [name for name in LAYERS if name in shader.layers - traced - {"depth"}]
-    kernel = shader.kernel.reasons if shader.kernel else ()
-    rows = [(True, kernel_plan.WHAT.get(name, name), why) for name, why in kernel]
-    rows += [
-        (EDGES not in made, "edge pass", aamodes.get(str(settings.aamode), one)),
+    edgeless = aamodes.get(str(settings.aamode), "aa=1 has no further samples to add")
+    film, on_film = shader.film, settings.lattice == FILM
+    scalar, rounds = mi.variant().startswith("scalar"), settings.aamode == NOISE
+    reasons = shader.kernel.reasons if shader.kernel else ()
+    rows = [
+        *((True, kernel_plan.WHAT.get(name, name), why) for name, why in reasons),
+        (EDGES not in made, "edge pass", edgeless),
         (BLUR not in made, BLUR, "no focal distance"),
         ("depth" not in traced, "depth", "nothing needs it"),
-        *((True, name, "not asked for") for name in skipped),
-    ]
-    if own and settings.lattice != FILM:
-        lattice = "the lattice that was asked for places and averages samples"
-        rows.append((True, f"{film.rfilter} and {film.sampler}", lattice))
-    elif settings.lattice == FILM:
-        scalar = shader.scene.variant_name().startswith("scalar")
-        linear = "pictures are linear sRGB, whose luminance or XYZ follow"
-        spectrum = "the picture is the colour of the spectrum that the film sees, and rounds go by it"
-        alone = "a scalar variant draws independent numbers, ray by ray"
-        rounds = "rounds continue one sequence of numbers in each pixel"
-        rows += [
-            (film.pixel_format.startswith("xyz"), f"pixel format {film.pixel_format}", linear),
-            (bool(film.bands), f"{', '.join(film.bands)} in the picture, only as layers", spectrum),
-            (scalar and film.sampler != "IndependentSampler", film.sampler, alone),
-            (not scalar and settings.aamode == NOISE, film.sampler, rounds),
-        ]
+        *((name in shader.layers - traced - {"depth"}, name, "not asked for") for name in LAYERS),
+        (own and not on_film, f"{film.rfilter} and {film.sampler}",
+         "the lattice that was asked for places and averages samples"),
+        (on_film and film.pixel_format.startswith("xyz"), f"pixel format {film.pixel_format}",
+         "pictures are linear sRGB, whose luminance or XYZ follow"),
+        (on_film and film.bands, f"{', '.join(film.bands)} in the picture, only as layers",
+         "the picture is the colour of the spectrum that the film sees, and rounds go by it"),
+        (on_film and scalar and film.sampler != "IndependentSampler", film.sampler,
+         "a scalar variant draws independent numbers, ray by ray"),
+        (on_film and not scalar and rounds, film.sampler,
+         "rounds continue one sequence of numbers in each pixel"),
+    ]  # fmt: skip
     return tuple((what, why) for holds, what, why in rows if holds)

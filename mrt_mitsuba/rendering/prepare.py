@@ -13,7 +13,6 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.plugins.snapshot import Part
-from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.rendering.api import Result, render_with
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import camera_matrices
@@ -35,8 +34,8 @@ class Prepared:
     def __init__(self, scene: Any, options: dict[str, Any]) -> None:
         self._scene, self._settings = scene, RenderSettings.of(**options)
         with runtime.one_at_a_time, held():
-            self._made = self._render(self._settings.seed)  # result from which others differ by the picture
-            self._integrator, self.params = self._source.integrator, mi.traverse(self._source.scene)
+            self._render(self._settings.seed)
+            self.params = mi.traverse(self._source.scene)
             self._record()
 
     def __call__(self, seed: int = 0) -> Result:
@@ -46,49 +45,47 @@ class Prepared:
             self.params.update()
             if self._launch is None:
                 return self._render(seed)
-            data = self._integrator.prepare(self._source.scene)
-            if data.plan != self._data.plan or self._look() is not self._state:
-                self._made = self._render(seed)
+            plan, self._data = self._data.plan, self._source.integrator.prepare(self._source.scene)
+            if self._data.plan != plan or self._look() is not self._state:
+                self._render(seed)
                 self._record()
                 return self._made
-            self._data = data
-            plan, options = replace(self._made.plan, parts=data.facts), {**self._made.options, "seed": seed}
+            plan = replace(self._made.plan, parts=self._data.facts)
+            options = {**self._made.options, "seed": seed}
             return replace(self._made, image=self._picture(seed), plan=plan, options=options)
 
     def _render(self, seed: int) -> Result:
+        """Render from scratch; later results differ from this one by the picture."""
+
         def opened(scene: Any, **how: Any) -> Any:
             self._source = self._source or open_scene(scene, **how)
             return self._source
 
-        return render_with(self._scene, replace(self._settings, seed=seed), opener=opened)
+        self._made = render_with(self._scene, replace(self._settings, seed=seed), opener=opened)
+        return self._made
 
     def _look(self) -> Part:
         """Return the state of the camera and the integrator, the same object if it is the same."""
-        now, settings = Part(), vars(self._integrator)
+        now, settings = Part(), vars(self._source.integrator)
         now.add(self._source.sensor, ())
         now.state += [settings[name] for name in sorted(settings) if not name.startswith("_")]
         return now.close(self._state)
 
     def _record(self) -> None:
         """Record the kernels, if they read only what is known and give the picture that they should."""
-        self._launch, plan, made = None, self._made.plan, self._made
-        sensor, film, size = self._source.sensor, self._source.sensor.film(), [plan.width, plan.height]
-        rules, places = Film(sensor), plan.passes[0].places
-        plain = (rules.sampler, rules.rfilter, rules.pixel_format) == (
-            "IndependentSampler",
-            "BoxFilter",
-            "rgb",
-        )
+        self._launch, made, plan, sensor = None, self._made, self._made.plan, self._source.sensor
+        film, size = sensor.film(), [plan.width, plan.height]
+        kinds = sensor.class_name(), sensor.sampler().class_name(), film.rfilter().class_name()
         if not (
-            plain and hasattr(self._integrator, "kernel_plan") and plan.variant == "llvm_ad_rgb"
+            kinds == ("PerspectiveCamera", "IndependentSampler", "BoxFilter")
+            and hasattr(self._source.integrator, "kernel_plan") and plan.variant == "llvm_ad_rgb"
             and [step.layers for step in plan.passes] == [{"image"}] and not plan.layers and not plan.motion
-            and (plan.film or places.size == 1)
-            and (plan.region.width, plan.region.height) == (plan.width, plan.height)
-            and sensor.class_name() == "PerspectiveCamera" and sensor.shutter_open_time() == 0
+            and plan.film in ("", "BoxFilter, rgb") and plan.passes[0].places.size == 1
+            and plan.region == plan.seen == (0, 0, *size) and sensor.shutter_open_time() == 0
             and (list(film.crop_size()) != size or list(film.size()) == size)
         ):  # fmt: skip
             return
-        self._data, self._state = self._integrator.prepare(self._source.scene), None
+        self._data, self._state = self._source.integrator.prepare(self._source.scene), None
         if self._data.arrays(self._source.scene) is None:
             return
         self._state = self._look()
@@ -99,40 +96,37 @@ class Prepared:
         own, theirs = mi.traverse(self._sensor), mi.traverse(sensor)
         names = "x_fov", "principal_point_offset_x", "principal_point_offset_y", "to_world"
         own.update({name: theirs[name] for name in names})
-        self._size, self._rays = dr.opaque(mi.Vector2f, size), places.size
+        self._size = dr.opaque(mi.Vector2f, size)
+        self._made = replace(made, camera=camera_matrices(self._sensor))
         # By a weak reference: in a ring, garbage collection would free recordings in the midst of another one
         me: Any = weakref.ref(self)
         self._launch = dr.freeze(lambda seed, inputs: me()._trace(seed))
         try:
-            if not all(np.array_equal(self._picture(made.options["seed"]), made.image) for _ in range(2)):
-                self._launch = None
+            same = all(np.array_equal(self._picture(made.options["seed"]), made.image) for _ in range(2))
         except RuntimeError:  # something else is read
-            self._launch = None
-        self._made = replace(made, camera=camera_matrices(self._sensor))
+            same = False
+        self._launch = self._launch if same else None
 
     def _picture(self, seed: int) -> np.ndarray:
-        inputs = [self._data.arrays(self._source.scene), self._integrator.sky, self._sensor, self._size]
+        """Return the picture that the recorded kernels give."""
+        source = self._source
+        inputs = [self._data.arrays(source.scene), source.integrator.sky, self._sensor, self._size]
         channels = self._launch(mi.UInt32(seed), inputs)
-        means = np.stack([np.asarray(c).astype(np.float64) / self._rays for c in channels], axis=-1)
-        return means.astype(np.float32).reshape(self._made.image.shape)
+        return np.stack([np.asarray(c) for c in channels], axis=-1).reshape(self._made.image.shape)
 
     def _trace(self, seed: Any) -> list[Any]:
-        """Return the sums of the channels over the rays of each pixel, drawn as the film's rules say."""
-        plan, rays = self._made.plan, self._rays
-        lane = dr.arange(mi.UInt32, plan.width * plan.height * rays)
-        pixel = lane // rays
-        corner = mi.Point2f(mi.Float(pixel % plan.width), mi.Float(pixel // plan.width))
-        offset = mi.Point2f(0.5)
+        """Return the channels along one ray of each pixel, at its centre or where the film's rules say."""
+        plan, offset = self._made.plan, mi.Point2f(0.5)
+        pixel = dr.arange(mi.UInt32, plan.width * plan.height)
         if plan.film:
-            state, sequence = mi.sample_tea_32(seed, lane)
-            random = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
-            offset = mi.Point2f(random.next_float32(), random.next_float32())
-        place, time = (corner + offset) / self._size, mi.Float(self._sensor.shutter_open())
-        ray, weight = self._sensor.sample_ray(time, mi.Float(0), place, mi.Point2f(0.5))
-        traced = self._integrator.trace(self._source.scene, None, mi.Ray3f(ray), True, self._data)
-        channels = list(mi.Color3f(traced.radiance * mi.unpolarized_spectrum(weight)))
-        dr.eval(channels)
-        return [dr.block_reduce(dr.ReduceOp.Add, c, rays) for c in channels] if rays > 1 else channels
+            sampler = mi.load_dict({"type": "mrt_rays"})
+            sampler.start(seed, mi.UInt64(pixel))
+            offset = sampler.next_2d()
+        place = mi.Point2f(mi.Float(pixel % plan.width), mi.Float(pixel // plan.width)) + offset
+        time = mi.Float(self._sensor.shutter_open())
+        ray, weight = self._sensor.sample_ray(time, mi.Float(0), place / self._size, mi.Point2f(0.5))
+        traced = self._source.integrator.trace(self._source.scene, None, mi.Ray3f(ray), True, self._data)
+        return list(mi.Color3f(traced.radiance * mi.unpolarized_spectrum(weight)))
 
 
 def prepare(scene: Any = 0, **options: Any) -> Prepared:
@@ -144,6 +138,7 @@ def prepare(scene: Any = 0, **options: Any) -> Prepared:
         again.params["ball.bsdf.alpha"] = 0.2
         result = again(seed=1)
 
-    Kernels that call plugins, or that filters follow, are not recorded but run as ``render`` does.
+    Kernels that trace more than one ray a pixel, that call plugins, or that filters follow, are not recorded
+    but run as ``render`` does.
     """
     return Prepared(scene, options)

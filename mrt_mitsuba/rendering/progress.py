@@ -104,10 +104,8 @@ class Job:
     @contextlib.contextmanager
     def stage(self, name: str, total: int, message: str = "") -> Iterator[Advance]:
         """Open a stage of the progress, and measure its time."""
-        # does the progress want to know which kernels ran in a stage?
-        asked, start = type(self.progress).kernels is not Progress.kernels, time.perf_counter()
-        if asked:
-            self.collect()
+        start = time.perf_counter()
+        self.collect()
         with self.progress.stage(name.capitalize(), total, message or SAID.get(name, "")) as advance:
 
             def advance_and_collect(steps: int) -> None:
@@ -117,8 +115,7 @@ class Job:
                     self.collect()
 
             yield advance_and_collect
-            if asked:
-                self.collect()
+            self.collect()
         seconds = time.perf_counter() - start
         self.passes[name] = self.passes.get(name, 0.0) + seconds
         log.info("%s: %d pixels in %.3f s", name, total, seconds)

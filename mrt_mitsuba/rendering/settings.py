@@ -67,10 +67,7 @@ class RenderSettings:
         AAMODE,
     )
     target: float | Sequence[float] | None = option(
-        None,
-        TARGET,
-        "error to render to (RMSE, linear); OBJ file: what the camera looks at",
-        "none",
+        None, TARGET, "error to render to (RMSE, linear); OBJ file: what the camera looks at", "none"
     )
     maxspp: int | None = option(
         None, integer(MIN_SPP, 2**24), "rays of a pixel at most, with a target, on average", str(MAX_SPP)
@@ -150,11 +147,7 @@ class RenderSettings:
     )
     progress: Progress | None = option(
         None,
-        Kind(
-            "",
-            "a rendering.progress.Progress",
-            lambda value: isinstance(value, Progress),
-        ),
+        Kind("", "a rendering.progress.Progress", lambda value: isinstance(value, Progress)),
         "receives the plan, the stages and their progress",
     )
 
