@@ -25,12 +25,9 @@ from mrt_mitsuba.sweeps.jobs import Job, identify, receive
 from mrt_mitsuba.sweeps.pictures import MADE_WITH
 
 
-def describe(folder: str, dask_worker: Any = None) -> dict[str, Any]:
+def describe(folder: str) -> dict[str, Any]:
     """Return what a client asks of each worker before it begins: the versions of what decides about pixels,
     a name for its cores, which workers that share them have in common, and whether it sees a folder."""
-    if dask_worker is not None:  # Dr.Jit, imported here first, keeps kernels near: homes are often far away
-        near = os.path.join(os.path.dirname(dask_worker.local_directory), "drjit")
-        os.environ.setdefault("DRJIT_CACHE_DIR", near)
     found = {**runtime.versions(), "python": f"{sys.version_info[0]}.{sys.version_info[1]}"}
     return {
         "versions": ", ".join(f"{name} {version}" for name, version in found.items()),
@@ -69,7 +66,7 @@ def render_job(
     _note(own, facts)
     try:
         with runtime.one_at_a_time:
-            here = describe(folder, worker)
+            here = describe(folder)
             if here["versions"] != versions:
                 raise MrtError(f"the worker has {here['versions']}; the sweep began with {versions}")
             threads = max(1, usable_cores() // sharing.get(here["cores"], 1))
