@@ -15,9 +15,9 @@ from pathlib import Path
 
 from mrt_mitsuba.errors import MrtError, UsageError
 
-# For every pixel: what is kept, by channel, and what writing a PNG needs: its bytes and Pillow's copy
+# For every pixel: what is kept, by channel, and what Pillow needs to write a PNG
 BYTES_PER_CHANNEL = 4
-BYTES_TO_WRITE = 7
+BYTES_TO_WRITE = 4
 
 # A wavefront's arrays, per ray and channel: what the kernel writes, what is formed of it, and the part before
 BYTES_PER_CHANNEL_OF_RAY = 12

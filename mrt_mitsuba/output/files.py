@@ -93,7 +93,11 @@ def write_exr(
 def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
     from PIL import Image as PilImage
 
-    PilImage.fromarray(to_8bit(image, tonemap)).save(file, format="PNG", compress_type=PNG_RUNS)
+    height, width = image.shape[:2]
+    picture = PilImage.new("RGB", (width, height))
+    for row, block in _blocks(image, tonemap):
+        picture.paste(PilImage.fromarray(block), (0, row))
+    picture.save(file, format="PNG", compress_type=PNG_RUNS)
 
 
 def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Mapping[str, Any]) -> None:
@@ -207,10 +211,19 @@ def to_8bit(image: Image, tonemap: str = "report") -> NDArray[np.uint8]:
     """
     import numpy as np
 
+    pixels = np.empty(image.shape, np.uint8)
+    for row, block in _blocks(image, tonemap):
+        pixels[row : row + len(block)] = block
+    return pixels
+
+
+def _blocks(image: Image, tonemap: str) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Yield the picture in 8 bit as ``to_8bit`` has it, some rows at a time with the number of the first."""
+    import numpy as np
+
     if tonemap not in TONEMAPS:
         raise UsageError(f"tonemap={tonemap!r}: must be {' or '.join(TONEMAPS)}")
-    pixels, lost = np.empty(image.shape, np.uint8), 0
-    rows = max(1, _PIXELS // image.shape[1])
+    rows, lost = max(1, _PIXELS // image.shape[1]), 0
     for row in range(0, len(image), rows):
         block = np.asarray(image[row : row + rows], np.float32)
         lost += int(np.isnan(block).any(axis=-1).sum())
@@ -220,7 +233,6 @@ def to_8bit(image: Image, tonemap: str = "report") -> NDArray[np.uint8]:
         else:
             encoded = np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
             values = encoded * 255 + 0.5
-        pixels[row : row + rows] = values.astype(np.uint8)
+        yield row, values.astype(np.uint8)
     if lost:
-        warnings.warn(f"{lost} pixels are NaN; the PNG holds 0 there", MrtWarning, stacklevel=3)
-    return pixels
+        warnings.warn(f"{lost} pixels are NaN; the PNG holds 0 there", MrtWarning, stacklevel=4)

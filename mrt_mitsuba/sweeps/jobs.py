@@ -14,6 +14,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex
 
+import mitsuba as mi
+
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.runtime import use, versions
@@ -202,19 +204,20 @@ class _Pickler(pickle.Pickler):
     """Pickles Mitsuba's transforms and bitmaps by their numbers, too."""
 
     def reducer_override(self, value: Any) -> Any:
-        import mitsuba as mi
         import numpy as np
 
         if "Transform4" in type(value).__name__:
-            return mi.ScalarTransform4f, (np.array(value.matrix, np.float64).reshape(4, 4),)
+            return _transform, (np.array(value.matrix, np.float64).reshape(4, 4),)
         if isinstance(value, mi.Bitmap):
             return _bitmap, (np.array(value), value.srgb_gamma())
         return NotImplemented
 
 
-def _bitmap(pixels: Any, srgb: bool) -> Any:
-    import mitsuba as mi
+def _transform(matrix: Any) -> Any:  # its class has another name where a scalar variant was set first
+    return mi.ScalarTransform4f(matrix)
 
+
+def _bitmap(pixels: Any, srgb: bool) -> Any:
     bitmap = mi.Bitmap(pixels)
     bitmap.set_srgb_gamma(srgb)
     return bitmap
