@@ -23,12 +23,12 @@ def test_plenty_of_memory_gives_the_largest_parts():
 @pytest.mark.parametrize(
     ("more", "needed"),
     [
-        # 2^28 pixels of three floats, seven bytes to write them, 24 rows under a filter, kernels: 4.9 GiB
-        ({}, "4.9 GiB"),
+        # 2^28 pixels of three floats, four bytes to write them, 24 rows under a filter, kernels: 4.1 GiB
+        ({}, "4.1 GiB"),
         # twice the floats
-        ({"pictures": 2}, "7.9 GiB"),
+        ({"pictures": 2}, "7.1 GiB"),
         # 2^26 rays of three floats each, three times
-        ({"rays_per_pixel": 2**26}, "7.0 GiB"),
+        ({"rays_per_pixel": 2**26}, "6.3 GiB"),
     ],
 )
 def test_a_picture_that_does_not_fit_is_refused_with_both_sizes(more, needed):
