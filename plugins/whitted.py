@@ -76,7 +76,7 @@ class MrtWhitted(mi.SamplingIntegrator):
     """
 
     plugin_name = "mrt_whitted"
-    #: names of the layers of which ``trace`` returns what they need, next to those of the first hit
+    #: names of the layers for which ``trace`` returns what they need, next to those of the first hit
     provided_layers = frozenset({"direct", "reflection", "bounces", "shadow_rays"})
 
     def __init__(self, props: mi.Properties) -> None:

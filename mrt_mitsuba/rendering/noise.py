@@ -117,8 +117,8 @@ class Halves(Stack):
     def error(self) -> ErrorEstimate:
         """Return the estimated RMSE with its interval, and the tail of what single rays contribute.
 
-        The mean of squares of which each is as uncertain as it is large, correlated as the filter has it; the
-        true error is a mean of as many squares, and as uncertain. The interval is that of a log-normal law,
+        It is a mean of squares, each as uncertain as it is large, correlated as the filter has it; the true
+        error is a mean of as many squares, and as uncertain. The interval is that of a log-normal law,
         wider upwards the fewer squares make up the mean.
         """
         squares, correlation, tail = self.squares(), self.film.correlation, self._tail(HALVES)

@@ -47,7 +47,7 @@ def whole_pictures(
 
 
 class Wholes(Halves):
-    """Two half pictures and two scouts of which all pixels get the same rays.
+    """Two half pictures and two scouts, in which all pixels get the same rays.
 
     A picture has no single rays, so halves and scouts are compared as they are; what rules rays by their tail
     rules sums of them, too.

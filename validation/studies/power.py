@@ -136,7 +136,7 @@ FAULTY: dict[str, tuple[dict[str, Any], str, Any]] = {}  # by name, the changes 
 
 
 def register(*variants: str) -> None:
-    """Register the BSDF "faulty" in variants, of which the last one becomes current."""
+    """Register the BSDF "faulty" in variants; the last one becomes current."""
     for variant in variants:
         runtime.use(variant)
         mi.register_bsdf("faulty", changed_bsdf(FAULTY))
