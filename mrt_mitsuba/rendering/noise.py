@@ -28,7 +28,8 @@ SUSPECT = 0.5  # shape of a tail where rare rays may rule
 TILE = 16  # pixels that round alike, under a filter: it has rays traced around all that need some
 WINDOWS = (1, 2, 4, 8)  # half the widths of windows that pixels borrow from
 JUDGES = 2**11  # pixels, about, that choose the mixture
-LEAST_SHARE = 3e-4  # of each part of it: what no pixel has shown yet may be there
+MISSED = 0.25  # of a pixel like those that make up the noise: it may be among the others, unseen
+STATED = 8  # squared errors that a stated variance counts as much as
 
 
 class Halves(Stack):
@@ -159,7 +160,9 @@ class Halves(Stack):
             _variance, (one, another, [a + b for a, b in zip(one, another, strict=True)])
         )
         parts, more = self._around(np.stack([seen, both]))
-        mixed = np.tensordot(_mixture(parts, measured), more, 1)
+        shares = _mixture(parts, measured)
+        shares[0] = max(shares[0], MISSED / max(_number(both), 1))
+        mixed = np.tensordot(shares, more, 1)
         quiet, also = window_means(np.stack([seen, measured]), 1) == 0
         if not (measured[quiet].any() or seen[also].any()):  # where one met no noise, the other met none
             mixed[quiet & also] = 0
@@ -199,12 +202,13 @@ class Halves(Stack):
 
     # ------------------------------------------- Sharing --------------------------------------------
 
-    def next(self, most: float, rays: float, target: float | None) -> np.ndarray:
+    def next(self, most: float, rays: float, target: float | None, even: float = 0) -> np.ndarray:
         """Return numbers of further groups, to be called after ``forecast``.
 
         The scouts decide until ``most`` rays a pixel are enough for an RMSE of ``target``, or are all of the
         ``rays`` to spend. The next round is the last then, and what a half gets in it is decided by the other
         half, too: that knows more, and what it makes of this half's share cannot come back to it any more.
+        In the others, no pixel is taken for less noisy than ``even`` times the mean.
         """
         room, self.last = most * self.film.pixels - self._traced.sum(), most >= rays
         if target is not None:
@@ -213,7 +217,7 @@ class Halves(Stack):
             self.last = self.last or wanted.sum() <= room / 2
         if not self.last:
             scouting = self.scouting[self._shape >= SUSPECT]
-            half = self._share(0, self._scouted, room / 2 / (1 + scouting), None)
+            half = self._share(0, self._scouted, room / 2 / (1 + scouting), None, even)
             scouts = self._due(
                 scouting * (self.rays[0] + self.group * half), self._traced[2], self._rounding()
             )
@@ -223,10 +227,14 @@ class Halves(Stack):
         halves = [self._share(half, views[half], room / 2, target) for half in HALVES]
         return np.stack([*halves, *np.zeros_like(halves)])
 
-    def _share(self, half: int, variance: np.ndarray, room: float, target: float | None) -> np.ndarray:
+    def _share(
+        self, half: int, variance: np.ndarray, room: float, target: float | None, even: float = 0
+    ) -> np.ndarray:
         """Return groups for a half: what a target takes, if the other half is like this one, or nearly, but
         no more than, what there is room for. Rays are a multiple of the deviation, or what there is."""
-        have, deviation = self.rays[half], np.sqrt(variance.ravel() + 1e-30)
+        have, own = self.rays[half], np.sqrt(variance + 1e-30)
+        deviation = (own + window_means(own, 1)).ravel() / 2  # single pixels are known badly
+        deviation = np.maximum(deviation, even * deviation.mean())
         low, high, best = 0.0, (room + have.sum()) / deviation.sum(), np.zeros(len(have), np.int64)
         if target is not None:
             high = min(high, deviation.mean() / (2 * target**2))
@@ -290,14 +298,26 @@ def _mixture(parts: np.ndarray, measured: np.ndarray) -> np.ndarray:
         expected = shares @ known
         weights = 1 / np.sqrt(expected)
         shares *= known @ (weights * values / expected) / (known @ weights)
-    return np.maximum(shares, LEAST_SHARE)
+    return shares
 
 
 def _calibrated(variance: np.ndarray, squares: np.ndarray) -> np.ndarray:
-    """Return variances [H, W], each tenth of them, as they sort, drawn to the mean of its squared errors."""
-    order, found, least = np.argsort(variance, axis=None), variance.copy(), 0.001 * variance.mean()
+    """Return variances [H, W], each tenth of them, as they sort, drawn to the mean of its squared errors.
+
+    The more squares make up that mean, the more: a tenth in which both halves missed the same rare rays has
+    none, and keeps what was stated.
+    """
+    order, found = np.argsort(variance, axis=None), variance.copy()
     for tenth in np.array_split(order[np.count_nonzero(variance == 0) :], 10):
         if len(tenth):
-            stated, measured = variance.flat[tenth].mean(), squares.flat[tenth].mean()
-            found.flat[tenth] *= (measured + 0.2 * stated + least) / (1.2 * stated + least)
+            number, ratio = (
+                _number(squares.flat[tenth]),
+                squares.flat[tenth].mean() / variance.flat[tenth].mean(),
+            )
+            found.flat[tenth] *= ratio ** (number / (number + STATED))
     return found
+
+
+def _number(values: np.ndarray) -> float:
+    """Return how many values make up their sum: all if they are equal, one if it rules."""
+    return float(values.sum() ** 2 / max(np.square(values).sum(), 1e-300))

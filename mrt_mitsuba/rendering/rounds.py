@@ -25,6 +25,7 @@ GROWTH = 4.25  # times the rays there are may be there after another round: the 
 MARGIN = 0.95  # of the target to aim at: a forecast is as often too low as too high
 LEAST = 2**18  # rays that a target takes at least: fewer do not show what is rare
 MORE = 2  # times the rays are doubled where the tail of their values is in doubt
+EVEN = 0.25  # of the mean deviation is the least that a pixel is given rays for, until there are as many
 LEAST_GROWTH = 1.05  # fewer rays, and a round costs more than it brings
 
 OnRound = Callable[[RoundPicture], object]
@@ -72,7 +73,7 @@ def run_rounds(
             break
         forecast, tail = picture.forecast()
         if now.spp < least / LEAST_GROWTH:
-            chosen = picture.next(min(most, least), rays, None)
+            chosen = picture.next(min(most, least), rays, None, EVEN)
         elif target is None or forecast > target:
             chosen = picture.next(most, rays, target and MARGIN * target)
         elif tail > DOUBTFUL and doubled < MORE:

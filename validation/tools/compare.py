@@ -206,14 +206,17 @@ def _p_of_means(difference: np.ndarray) -> float:
     Their noise is as often positive as negative, whatever its law. So the least p value of Student's test is
     compared with those after random changes of sign of blocks of pixels; where it is among the least of
     these, with the exponential law that their logarithms continue. Under a film's filter, neighbours share
-    rays; their correlation, taken for a Gaussian's, says how much wider that makes sums.
+    rays, which their signs show; their correlation, taken for a Gaussian's, says how much wider sums are.
     """
     from scipy import stats
 
     side = -(-max(difference.shape) // BLOCKS)
-    near = [difference[1:] * difference[:-1], difference[:, 1:] * difference[:, :-1]]
-    total, chance = sum(each.sum() for each in near), sum((each**2).sum() for each in near) ** 0.5
-    alike = total / 2 / (difference**2).sum() if total > 3 * chance else 0
+    near, both = (
+        np.concatenate([(v[1:] * v[:-1]).ravel(), (v[:, 1:] * v[:, :-1]).ravel()])
+        for v in (difference, np.sign(difference))
+    )
+    shared = both.sum() > 3 * np.count_nonzero(both) ** 0.5
+    alike = max(near.sum(), 0) / 2 / (difference**2).sum() if shared else 0
     apart = np.arange(1, 4)  # pixels, and how many of a block's are so far from its end
     wide, inside = (1 + 2 * (alike**apart**2 * s).sum() for s in (1, np.maximum(1 - apart / side, 0)))
     count, square, blocks = (
