@@ -29,7 +29,8 @@ TILE = 16  # pixels that round alike, under a filter: it has rays traced around 
 WINDOWS = (1, 2, 4, 8)  # half the widths of windows that pixels borrow from
 JUDGES = 2**11  # pixels, about, that choose the mixture
 MISSED = 0.25  # of a pixel like those that make up the noise: it may be among the others, unseen
-STATED = 8  # squared errors that a stated variance counts as much as
+STATED = 4  # squared errors that a stated variance counts as much as
+LEAST_RATIO = 0.05  # of squared errors to stated variances, to be believed: rare ones may be missing
 
 
 class Halves(Stack):
@@ -310,10 +311,8 @@ def _calibrated(variance: np.ndarray, squares: np.ndarray) -> np.ndarray:
     order, found = np.argsort(variance, axis=None), variance.copy()
     for tenth in np.array_split(order[np.count_nonzero(variance == 0) :], 10):
         if len(tenth):
-            number, ratio = (
-                _number(squares.flat[tenth]),
-                squares.flat[tenth].mean() / variance.flat[tenth].mean(),
-            )
+            number, measured = _number(squares.flat[tenth]), squares.flat[tenth].mean()
+            ratio = max(measured / variance.flat[tenth].mean(), LEAST_RATIO)
             found.flat[tenth] *= ratio ** (number / (number + STATED))
     return found
 
