@@ -72,7 +72,7 @@ def run_rounds(
         if picture.last or most < LEAST_GROWTH * now.spp:
             break
         forecast, tail = picture.forecast()
-        if now.spp < least / LEAST_GROWTH:
+        if now.spp < 0.9 * least:  # shares are rounded
             chosen = picture.next(min(most, least), rays, None, EVEN)
         elif target is None or forecast > target:
             chosen = picture.next(most, rays, target and MARGIN * target)
