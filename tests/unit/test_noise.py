@@ -165,6 +165,20 @@ def test_what_is_done_to_a_round_does_not_change_the_picture() -> None:
     np.testing.assert_array_equal(spoiled.samples, plain.samples)
 
 
+def test_quiet_pixels_get_rays_enough_to_meet_a_lamp_in_a_mirror() -> None:
+    """Lit by a tenth of the rays, a pixel among quiet ones is found, also where others take most rays."""
+
+    def draw(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
+        lit = (pixel == 130) & (rng.random(len(pixel)) < 0.1)
+        return np.where(pixel < 16, rng.exponential(size=len(pixel)), 1) + 20 * lit
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", mrt.MrtWarning)
+        results = [_render(Draws(draw), seed, target=0.02, rays=512) for seed in range(20)]
+    assert np.mean([r.image[8, 2, 0] > 1 for r in results]) > 0.9
+    assert all(r.samples.min() > 8 for r in results)
+
+
 def test_a_picture_without_noise_ends() -> None:
     result = _render(Draws(lambda rng, pixel: np.ones(len(pixel))), target=0.1)
     assert result.error.rmse == 0 and (result.image == 1).all()
