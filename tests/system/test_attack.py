@@ -327,23 +327,30 @@ print(len(keys) > 5, np.array_equal(render(), first))
 INTERRUPTED = """
 import os, signal, sys, threading, time
 import mrt_mitsuba as mrt
+mrt.register()
+import mitsuba as mi
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background
+mi.set_log_level(mi.LogLevel.Error)
 options = {"width": 160, "height": 120, "aa": 2, "integrator": "path", "spp": 4}
-mrt.render(3, **options)
+scene = mi.load_dict(mrt.scene_dict(3, width=320, height=240))
+doors = {"mrt": lambda: mrt.render(3, **options), "mi": lambda: mi.render(scene, spp=4).numpy()}
+render = doors[sys.argv[1]]
+interrupts = {"mrt": KeyboardInterrupt, "mi": (KeyboardInterrupt, RuntimeError)}  # as Dr.Jit has them
+render()
 start = time.perf_counter()
-mrt.render(3, **options)
+render()
 length = time.perf_counter() - start
 found = []
 for part in range(24):
     killer = threading.Timer(length * part / 20, os.kill, (os.getpid(), signal.SIGINT))
     try:
         killer.start()
-        mrt.render(3, **options)
+        render()
         found.append("done")
         killer.join()
         time.sleep(0.01)
-    except KeyboardInterrupt:
-        found[part:] = ["KeyboardInterrupt"]
+    except interrupts[sys.argv[1]]:
+        found[part:] = ["interrupted"]
     except Exception as error:
         found.append(repr(error))
     killer.join()
@@ -355,7 +362,8 @@ PROGRAMS = {
     "first renders of several threads": (THREADS, "", "True 4\n"),
     "a scene that another thread edits": (EDITED, "mrt", "True True\n"),
     "the same by mi.render": (EDITED, "mi", "True True\n"),
-    "Ctrl-C in a render is always an interrupt": (INTERRUPTED, "", "{'KeyboardInterrupt'}\n"),
+    "Ctrl-C in mi.render": (INTERRUPTED, "mi", "{'interrupted'}\n"),
+    "Ctrl-C in a render is always an interrupt": (INTERRUPTED, "mrt", "{'interrupted'}\n"),
 }
 
 

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
 import threading
 from collections.abc import Iterator
 
+import mitsuba as mi
 import pytest
 
-from mrt_mitsuba import interrupts
+from mrt_mitsuba import interrupts, scene_dict
 from mrt_mitsuba.interrupts import Terminated, ending_soon
 
 
 @pytest.fixture(autouse=True)
 def heeded() -> Iterator[None]:
-    """A shell that runs the tests in the background has Ctrl-C ignored, and ``mi.render`` leaves a handler of
-    its own behind, of which Python knows nothing."""
+    """A shell that runs the tests in the background has Ctrl-C ignored."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -82,3 +83,12 @@ def test_a_held_interrupt_is_heeded_at_safe_places_and_a_second_one_anywhere(mon
         done.append("never")
     assert done[1:] == ["waits"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
     interrupts.heed()  # nothing is left
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
+def test_mi_render_leaves_no_handler(variant: str) -> None:
+    """Mitsuba's, left behind, called itself for ever at the next Ctrl-C, or an integrator that was gone."""
+    handler = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.c_int)(("PyOS_getsig", ctypes.pythonapi))
+    before = handler(signal.SIGINT)
+    mi.render(mi.load_dict(scene_dict(0, width=8, height=6)), spp=1)
+    assert handler(signal.SIGINT) == before
