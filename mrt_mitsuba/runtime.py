@@ -53,8 +53,9 @@ def use(variant: str | None = None) -> str:
             raise VariantError(f"the variant {variant} cannot be used: {problem}")
         if mi.variant() != variant:
             mi.set_variant(variant)
-            if dr.thread_count() > usable_cores():  # Dr.Jit does not look at quotas of control groups
-                dr.set_thread_count(usable_cores())
+            # Dr.Jit does not look at quotas of control groups; for two, see below
+            if dr.thread_count() > (threads := max(usable_cores(), 2)):
+                dr.set_thread_count(threads)
         mitsuba_first()
         one_by_one()
         plugins.register()
@@ -161,6 +162,17 @@ def mitsuba_first(folder: str | None = None) -> None:
     mi.set_file_resolver(resolver)
 
 
+@contextlib.contextmanager
+def two_threads() -> Iterator[None]:
+    """Let Dr.Jit have two threads at least: with one, Mitsuba waits for the EXR files it reads for ever."""
+    before = dr.thread_count()
+    dr.set_thread_count(max(before, 2))
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)
+
+
 @cache
 def mitsuba_home() -> str:
     """Return the folder in which Mitsuba is installed."""
@@ -171,7 +183,7 @@ def one_by_one() -> None:
     """Let Mitsuba's loaders make this project's objects one by one, and ``mi.render`` and changes by
     ``mi.traverse`` wait for each other: done at once, either ends the process.
 
-    Scenes without our plugins, and calls that say ``parallel``, load as before. Idempotent.
+    Scenes without our plugins, and calls that say ``parallel``, load at once as before. Idempotent.
     """
 
     def in_turn(loader: Callable[..., Any]) -> Callable[..., Any]:
@@ -179,7 +191,8 @@ def one_by_one() -> None:
         def load(source: Any, *flags: bool, **given: Any) -> Any:
             if not flags:
                 given.setdefault("parallel", not _mentions_ours(source))
-            return loader(source, *flags, **given)
+            with two_threads():
+                return loader(source, *flags, **given)
 
         return load
 

@@ -24,7 +24,7 @@ import mitsuba as mi
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.machine import Budget
-from mrt_mitsuba.runtime import mitsuba_first, mitsuba_home
+from mrt_mitsuba.runtime import mitsuba_first, mitsuba_home, two_threads
 from mrt_mitsuba.scene.files import DEEPEST, elements, picture_size, require_file
 
 MOST_SAMPLES = 2**24  # of a pixel; some samplers divide by none, or never end at 2^31
@@ -101,7 +101,7 @@ def _instantiate(state: Any, merge: bool = True) -> Any:
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel, config.merge_meshes = False, merge
     mi.parser.transform_all(config, state)
-    with held():  # an interrupt would leave plugins half made, and later renders would crash
+    with two_threads(), held():  # an interrupt would leave plugins half made, and later renders would crash
         return mi.parser.instantiate(config, state)
 
 
