@@ -42,6 +42,7 @@ class Halves(Stack):
     group = 2  #: rays that are traced together
     begin = (1, 1, 1, 1)  #: groups in each pixel of the first round
     scouting = (1 / 15, 1 / 4)  #: rays of scouts over those of halves; where rare rays may rule
+    fields = 2  #: of a chessboard of pixels whose rays are independent
     least = 256  #: mean rays of a pixel that a target takes at least, in a small picture
     last = False  #: was the last round decided?
 
@@ -52,6 +53,7 @@ class Halves(Stack):
         super().__init__(film, 2, len(exposer.names))
         self._exposer, self._seed, self._blurred = exposer, seed, blurred
         self._tile = TILE if film.reach else 1
+        self._board = np.indices(film.shape).sum(0) % (1 if film.reach else self.fields)
         self._traced = np.zeros((4, film.pixels))
         self._total = np.zeros((3, 4, *film.shape), np.float32)
         self._square = np.zeros((4, *film.shape))  # mean of colours, as the next
@@ -150,16 +152,18 @@ class Halves(Stack):
         rounding = np.nan_to_num(np.square(2.0**-24 * self.mean()[..., :3], dtype=np.float64), posinf=0)
         return self.film.picture(variance) + rounding
 
-    def _decisive(self, first: list[int], second: list[int]) -> np.ndarray:
+    def _decisive(
+        self, first: list[int], second: list[int], differences: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return the variance of a pixel times its rays, [H, W], as two sets of pictures have it.
 
         Pixels that met no rare bright ray look quiet, so each borrows from windows around it, and from the
-        picture: in the mixture of the first set that explains best what the second measures.
+        picture: in the mixture of the first set that explains best what the second measures. Rays of a
+        sequence err less than independent ones: by that much, the sets differ less than their rays do.
+        ``differences``: of other sets that show it better, [..., 2, H, W], for as many results.
         """
         one, another = self._gathered(first), self._gathered(second)
-        seen, measured, both = map(
-            _variance, (one, another, [a + b for a, b in zip(one, another, strict=True)])
-        )
+        (both, own), seen, measured = _compared(one, another), _variance(one), _variance(another)
         parts, more = self._around(np.stack([seen, both]))
         shares = _mixture(parts, measured)
         shares[0] = max(shares[0], MISSED / max(_number(both), 1))
@@ -167,10 +171,10 @@ class Halves(Stack):
         quiet, also = window_means(np.stack([seen, measured]), 1) == 0
         if not (measured[quiet].any() or seen[also].any()):  # where one met no noise, the other met none
             mixed[quiet & also] = 0
-        # Rays of a sequence err less than independent ones; without noise, a window takes the picture's ratio
-        found = quarter_squares(*(total / rays for rays, total, _ in (one, another))).mean(0)
-        near = window_means(np.stack([found, both * (1 / one[0] + 1 / another[0]) / 4]), WINDOWS[-1])
-        found, expected = near + 0.1 * near.mean((-2, -1), keepdims=True)
+        near, width = (own, WINDOWS[3]) if differences is None else (differences, WINDOWS[2])
+        near = window_means(near, width) + 0.2 * near.mean((-2, -1), keepdims=True)
+        near = near + 1e-3 * own.mean((-2, -1), keepdims=True)  # the picture's, where there is no noise
+        found, expected = np.moveaxis(near, -3, 0)
         return np.asarray(mixed * found / np.maximum(expected, 1e-30) * self.film.averaging)
 
     def _around(self, values: np.ndarray) -> np.ndarray:
@@ -209,7 +213,9 @@ class Halves(Stack):
         The scouts decide until ``most`` rays a pixel are enough for an RMSE of ``target``, or are all of the
         ``rays`` to spend. The next round is the last then, and what a half gets in it is decided by the other
         half, too: that knows more, and what it makes of this half's share cannot come back to it any more.
-        In the others, no pixel is taken for less noisy than ``even`` times the mean.
+        How much less a sequence errs, the halves show best: in pixels of the other colour of a chessboard,
+        so that no value moves its own weight. Before the last round, no pixel is taken for less noisy than
+        ``even`` times the mean.
         """
         room, self.last = most * self.film.pixels - self._traced.sum(), most >= rays
         if target is not None:
@@ -218,40 +224,57 @@ class Halves(Stack):
             self.last = self.last or wanted.sum() <= room / 2
         if not self.last:
             scouting = self.scouting[self._shape >= SUSPECT]
-            half = self._share(0, self._scouted, room / 2 / (1 + scouting), None, even)
+            half = self._share(
+                0, self._scouted, room / 2 / (1 + scouting), None, np.ones(self.film.shape, bool), even
+            )
             scouts = self._due(
                 scouting * (self.rays[0] + self.group * half), self._traced[2], self._rounding()
             )
             return np.stack([half, half, scouts, scouts])
         room += (rays - most) * self.film.pixels
-        views = [self._decisive([1 - half], SCOUTS) for half in HALVES]
-        halves = [self._share(half, views[half], room / 2, target) for half in HALVES]
-        return np.stack([*halves, *np.zeros_like(halves)])
+        fields = np.stack([self._board == field for field in range(self._board.max() + 1)])
+        _, halves = _compared(self._gathered([0]), self._gathered([1]))
+        apart = halves * ~fields[:, None] if len(fields) > 1 else None
+        chosen = np.zeros((4, self.film.pixels), np.int64)
+        for half in HALVES:
+            views = self._decisive([1 - half], SCOUTS, apart).reshape(fields.shape)
+            for field, variance in zip(fields, views, strict=True):
+                chosen[half] += self._share(half, variance, room / 2 * field.mean(), target, field)
+        return chosen
 
     def _share(
-        self, half: int, variance: np.ndarray, room: float, target: float | None, even: float = 0
+        self,
+        half: int,
+        variance: np.ndarray,
+        room: float,
+        target: float | None,
+        among: np.ndarray,
+        even: float = 0,
     ) -> np.ndarray:
         """Return groups for a half: what a target takes, if the other half is like this one, or nearly, but
         no more than, what there is room for. Rays are a multiple of the deviation, or what there is."""
-        have, own = self.rays[half], np.sqrt(variance + 1e-30)
-        deviation = (own + window_means(own, 1)).ravel() / 2  # single pixels are known badly
+        own = np.sqrt(variance + 1e-30)
+        deviation = ((own + window_means(own, 1)) / 2)[among]  # single pixels are known badly
         deviation = np.maximum(deviation, even * deviation.mean())
+        have, rounding, variance = (
+            v.reshape(among.shape)[among] for v in (self.rays[half], self._rounding(), variance)
+        )
         low, high, best = 0.0, (room + have.sum()) / deviation.sum(), np.zeros(len(have), np.int64)
         if target is not None:
             high = min(high, deviation.mean() / (2 * target**2))
-        rounding, factor = self._rounding(), high
+        factor = high
         for _ in range(12):
             groups = self._due(factor * deviation, have, rounding)
             fits = self.group * self.widened(groups[None]).sum() <= room
             best = groups if fits else best
-            if fits and (
-                target is None or np.mean(variance.ravel() / (have + self.group * groups)) > 2 * target**2
-            ):
+            if fits and (target is None or np.mean(variance / (have + self.group * groups)) > 2 * target**2):
                 low = factor
             else:
                 high = factor
             factor = (low + high) / 2
-        return best
+        shares = np.zeros(among.shape, np.int64)
+        shares[among] = best
+        return shares.ravel()
 
     def _rounding(self) -> np.ndarray:
         """Return random numbers to add before rounding down, alike in a tile."""
@@ -277,6 +300,14 @@ def quarter_squares(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return a quarter of the squared difference of pictures; what is no number is left out later."""
     with np.errstate(invalid="ignore", over="ignore"):
         return np.asarray(np.square(first - second, dtype=np.float64) / 4)
+
+
+def _compared(one: Sequence[np.ndarray], another: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the variance of the rays of two sets, given sums as of ``_gathered``; and a quarter of their
+    squared difference, and what it is for independent rays, [2, H, W]."""
+    variance = _variance([a + b for a, b in zip(one, another, strict=True)])
+    found = quarter_squares(*(total / rays for rays, total, _ in (one, another))).mean(0)
+    return variance, np.stack([found, variance * (1 / one[0] + 1 / another[0]) / 4])
 
 
 def _variance(sums: Sequence[np.ndarray]) -> np.ndarray:

@@ -54,6 +54,7 @@ class Wholes(Halves):
     """
 
     group = 1
+    fields = 1
     begin = (2, 2, 1, 1)
     scouting = (1 / 8, 1 / 8)
     least = 64
