@@ -231,19 +231,20 @@ class Canvas:
         self.sums, self.weights = sums[..., :-1], sums[..., -1]
         self.total, self.square, self.peak = np.split(found, [3, 6], axis=-1)
 
-    def put(self, place: Any, values: Sequence[Any], pixels: np.ndarray) -> None:
+    def put(self, place: Any, values: Sequence[Any], pixels: np.ndarray, size: int) -> None:
         """Add the values of rays, [channels] each, colours first, at their places on the film.
 
-        ``pixels``: where each starts, ascending; those of the second picture follow on those of the first.
+        ``pixels``: where ``size`` rays each start, ascending; those of the second picture follow on those of
+        the first.
         """
         if isinstance(place, np.ndarray):
-            self._put_one_by_one(place, np.asarray(values), pixels)
+            self._put_one_by_one(place, np.asarray(values), np.repeat(pixels, size))
             return
-        counts = np.bincount(pixels + 1, minlength=len(self._share) + 1)
+        counts = size * np.bincount(pixels + 1, minlength=len(self._share) + 1)
         first = mi.UInt32(np.cumsum(counts, dtype=np.uint32))  # of each pixel, the number of its first ray
         reach, width = self._film.reach, self._film.width
-        low = max(pixels[0] // width - reach, 0) * width
-        high = min((pixels[-1] // width + reach + 1) * width, len(self._share))
+        low = max(int(pixels[0]) // width - reach, 0) * width
+        high = min((int(pixels[-1]) // width + reach + 1) * width, len(self._share))
         pixel = dr.arange(mi.UInt32, high - low) + dr.opaque(mi.UInt32, low)
         if len(self._moments):
             more = _moments(
@@ -253,13 +254,15 @@ class Canvas:
             for index, found in enumerate(more):
                 known = self._moments[index, low:high]
                 (np.add if index < 6 else np.maximum)(known, np.asarray(found), out=known)
-        sums = self._near(place, values, mi.Float(self._share[pixels]), first, pixel)
+        sums = self._near(place, values, (mi.Float(self._share[pixels]), size), first, pixel)
         dr.eval(sums)
         for total, found in zip(self._sums, sums, strict=True):
             total[low:high] += np.asarray(found)
 
-    def _near(self, place: Any, values: Sequence[Any], share: Any, first: Any, pixel: Any) -> list[Any]:
-        """Return what rays with a share in their pixel give to these pixels."""
+    def _near(
+        self, place: Any, values: Sequence[Any], share: tuple[Any, int], first: Any, pixel: Any
+    ) -> list[Any]:
+        """Return what rays give to these pixels; ``share``: of each so many in theirs."""
         film, rfilter, reach = self._film, self._film.sensor.film().rfilter(), opaque(self._film.reach)
         line, column = divide(pixel, film.width)
         row = divide(line, film.height)[1]
@@ -268,7 +271,7 @@ class Canvas:
         centre = mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5
 
         def add_ray(ray: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            weight = dr.gather(mi.Float, share, ray)
+            weight = dr.gather(mi.Float, share[0], divide(ray, share[1])[0])
             if film.reach:
                 weight *= rfilter.eval(centre.x - dr.gather(mi.Float, place.x, ray))
                 weight *= rfilter.eval(centre.y - dr.gather(mi.Float, place.y, ray))

@@ -41,9 +41,10 @@ class Groups(NamedTuple):
     def spread(cls, size: int, counts: np.ndarray, before: np.ndarray) -> Groups:
         """Return ``counts`` groups in each picture and pixel, [pictures, pixels], after ``before`` rays."""
         counts = counts.ravel()
-        pixels = np.repeat(np.arange(len(counts)), counts)
-        within = np.arange(len(pixels)) - (np.cumsum(counts) - counts)[pixels]
-        return cls(size, pixels, before.ravel()[pixels].astype(np.int64) + size * within)
+        pixels = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
+        first = before.ravel() - size * (np.cumsum(counts) - counts)  # of the first group, and on from there
+        numbers = np.repeat(first.astype(np.int64).astype(np.uint32), counts)
+        return cls(size, pixels, numbers + np.arange(0, size * len(pixels), size, np.uint32))
 
     def parts(self, most: int, width: int) -> Iterator[tuple[slice, Groups]]:
         """Yield parts of no more than ``most`` groups, cut between rows where that can be, and which groups
@@ -203,7 +204,7 @@ class Exposer:
                 sampler.seed((seed + part.start) % 2**32, count)
             place, values = self._trace(some, start)
             planes = [plane for channels in values.values() for plane in channels]
-            canvas.put(place, planes, np.repeat(some.pixels, size))
+            canvas.put(place, planes, some.pixels, size)
             advance(count)
         return canvas
 
@@ -230,7 +231,7 @@ class Exposer:
             else:
                 pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), group)
             if groups.first is not None:
-                number += dr.gather(mi.UInt32, mi.UInt32(groups.first % 2**32), group)
+                number += dr.gather(mi.UInt32, mi.UInt32(groups.first), group)
             place, values = self._ray(pixel, number, start)
             dr.eval(place, values)
         self.job.rays["primary"] += count

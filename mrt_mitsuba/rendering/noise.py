@@ -77,16 +77,17 @@ class Halves(Stack):
         exposed = self._exposer.expose(
             groups, self._seed, pictures=4, progressive=True, moments=True, advance=advance
         )
-        bad = ~np.isfinite(exposed.square).all(-1)
+        square = exposed.square.mean(-1)
+        bad = ~np.isfinite(square)
         if bad.any():
             self._bad |= bad.any(0)
             worst = exposed.total[bad].max()
             self._unfit = float(exposed.peak[bad].max() if np.isfinite(worst) else worst)
-            for values in (exposed.total, exposed.square, exposed.peak):
+            for values in (exposed.total, square, exposed.peak):
                 values[bad] = 0
         self._traced += exposed.rays
         self._total += np.moveaxis(exposed.total, -1, 0)
-        self._square += exposed.square.mean(-1)
+        self._square += square
         np.maximum(self._peak, exposed.peak[..., 0], out=self._peak)
         with np.errstate(invalid="ignore"):
             self.add(exposed, chosen[:2] > 0)
