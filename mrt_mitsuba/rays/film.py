@@ -238,7 +238,7 @@ class Canvas:
         the first.
         """
         if isinstance(place, np.ndarray):
-            self._put_one_by_one(place, np.asarray(values), np.repeat(pixels, size))
+            self._put_one_by_one(place, np.asarray(values), np.repeat(pixels.astype(np.int64), size))
             return
         counts = size * np.bincount(pixels + 1, minlength=len(self._share) + 1)
         first = mi.UInt32(np.cumsum(counts, dtype=np.uint32))  # of each pixel, the number of its first ray
