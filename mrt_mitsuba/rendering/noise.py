@@ -209,7 +209,7 @@ class Halves(Stack):
     # ------------------------------------------- Sharing --------------------------------------------
 
     def next(self, most: float, rays: float, target: float | None, even: float = 0) -> np.ndarray:
-        """Return numbers of further groups, to be called after ``forecast``.
+        """Return numbers of further groups; to be called after ``forecast``, but for the last of all rays.
 
         The scouts decide until ``most`` rays a pixel are enough for an RMSE of ``target``, or are all of the
         ``rays`` to spend. The next round is the last then, and what a half gets in it is decided by the other
