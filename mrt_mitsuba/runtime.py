@@ -183,6 +183,9 @@ def one_by_one() -> None:
     """Let Mitsuba's loaders make this project's objects one by one, and ``mi.render`` and changes by
     ``mi.traverse`` wait for each other: done at once, either ends the process.
 
+    Light tracing refuses ``mrt_light``, which cannot do so itself: Dr.Jit calls its methods for scenes that
+    have none, too.
+
     Scenes without our plugins, and calls that say ``parallel``, load at once as before. Idempotent.
     """
 
@@ -204,8 +207,18 @@ def one_by_one() -> None:
 
         return call
 
+    def refusing(render: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(render)
+        def call(integrator: Any, scene: Any, *args: Any, **given: Any) -> Any:
+            if any(hasattr(emitter, "arriving") for emitter in scene.emitters()):
+                raise NotImplementedError("mrt_light has no finite power to trace light from; take a 'point'")
+            return render(integrator, scene, *args, **given)
+
+        return call
+
     for wrapped, owner, names in (
         (guarded, mi, ("render",)),
+        (refusing, mi.AdjointIntegrator, ("render",)),
         (guarded, mi.SceneParameters, ("update", "__setitem__")),
         (in_turn, mi, ("load_dict", "load_file", "load_string")),
     ):

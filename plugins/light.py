@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -95,17 +95,16 @@ class MrtLight(mi.Emitter):
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
         return mi.Spectrum(0)
 
-    def sample_ray(
-        self,
-        time: mi.Float,
-        sample1: mi.Float,
-        sample2: mi.Point2f,
-        sample3: mi.Point2f,
-        active: mi.Bool = True,
-    ) -> NoReturn:
-        raise NotImplementedError(
-            "mrt_light: light tracing needs a finite emitted power; use a stock 'point' light"
-        )
+    # Dr.Jit calls these for scenes without such a light, too, if there is one elsewhere: they cannot refuse
+
+    def sample_ray(self, *_: Any) -> tuple[mi.Ray3f, mi.Spectrum]:
+        return dr.zeros(mi.Ray3f), mi.Spectrum(0)
+
+    def sample_position(self, *_: Any) -> tuple[mi.PositionSample3f, mi.Float]:
+        return dr.zeros(mi.PositionSample3f), mi.Float(0)
+
+    def sample_wavelengths(self, si: mi.SurfaceInteraction3f, *_: Any) -> tuple[mi.Wavelength, mi.Spectrum]:
+        return si.wavelengths, mi.Spectrum(0)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
         p = mi.ScalarPoint3f(list(map(first, self.position)))

@@ -49,6 +49,7 @@ def run_command(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str
 
 # Where tests in a vectorised variant run: "llvm", or "cuda" with make test-gpu
 DEVICE = os.environ.get("MRT_DEVICE", "llvm")
+FAST = runtime.FAST.replace("llvm", DEVICE)
 
 
 def pytest_sessionstart() -> None:
@@ -110,20 +111,22 @@ def original_data() -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def fast_first() -> None:
+    """Every test begins in the fast variant, whatever the one before has left; or in none."""
+    if (mi := sys.modules.get("mitsuba")) and mi.variant() not in (None, FAST):
+        runtime.use(FAST)
+
+
 @pytest.fixture
 def variant(request: pytest.FixtureRequest) -> Iterator[str]:
     """A Mitsuba variant with the plugins: ``llvm_ad_rgb``, or what a test asks for by an indirect parameter;
     of ``MRT_DEVICE`` in place of LLVM.
 
-    Skips where it cannot run here. Afterwards the variant before is back; the fast one if there was none, so
-    that tests without this fixture meet it, whichever test came first.
+    Skips where it cannot run here. Afterwards the fast one is current.
     """
-    import mitsuba as mi
-
     name = getattr(request, "param", runtime.FAST).replace("llvm", DEVICE)
-    problem = runtime.obstacle(name)
-    if problem:
+    if problem := runtime.obstacle(name):
         pytest.skip(problem)
-    before = mi.variant() or runtime.FAST.replace("llvm", DEVICE)
     yield runtime.use(name)
-    runtime.use(name if runtime.obstacle(before) else before)
+    runtime.use(name if runtime.obstacle(FAST) else FAST)

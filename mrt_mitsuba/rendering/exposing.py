@@ -42,9 +42,8 @@ class Groups(NamedTuple):
         """Return ``counts`` groups in each picture and pixel, [pictures, pixels], after ``before`` rays."""
         counts = counts.ravel()
         pixels = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
-        first = before.ravel() - size * (np.cumsum(counts) - counts)  # of the first group, and on from there
-        numbers = np.repeat(first.astype(np.int64).astype(np.uint32), counts)
-        return cls(size, pixels, numbers + np.arange(0, size * len(pixels), size, np.uint32))
+        first = (before.ravel() - size * (np.cumsum(counts) - counts)).astype(np.int64).astype(np.uint32)
+        return cls(size, pixels, np.repeat(first, counts) + np.arange(0, size * len(pixels), size, np.uint32))
 
     def parts(self, most: int, width: int) -> Iterator[tuple[slice, Groups]]:
         """Yield parts of no more than ``most`` groups, cut between rows where that can be, and which groups

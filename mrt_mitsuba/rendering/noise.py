@@ -173,9 +173,8 @@ class Halves(Stack):
         if not (measured[quiet].any() or seen[also].any()):  # where one met no noise, the other met none
             mixed[quiet & also] = 0
         near, width = (own, WINDOWS[3]) if differences is None else (differences, WINDOWS[2])
-        near = window_means(near, width) + 0.2 * near.mean((-2, -1), keepdims=True)
-        near = near + 1e-3 * own.mean((-2, -1), keepdims=True)  # the picture's, where there is no noise
-        found, expected = np.moveaxis(near, -3, 0)
+        mean, rest = (v.mean((-2, -1), keepdims=True) for v in (near, own))  # where there is no noise near
+        found, expected = np.moveaxis(window_means(near, width) + 0.2 * mean + 1e-3 * rest, -3, 0)
         return np.asarray(mixed * found / np.maximum(expected, 1e-30) * self.film.averaging)
 
     def _around(self, values: np.ndarray) -> np.ndarray:
@@ -225,12 +224,10 @@ class Halves(Stack):
             self.last = self.last or wanted.sum() <= room / 2
         if not self.last:
             scouting = self.scouting[self._shape >= SUSPECT]
-            half = self._share(
-                0, self._scouted, room / 2 / (1 + scouting), None, np.ones(self.film.shape, bool), even
-            )
-            scouts = self._due(
-                scouting * (self.rays[0] + self.group * half), self._traced[2], self._rounding()
-            )
+            room, everywhere = room / 2 / (1 + scouting), np.ones(self.film.shape, bool)
+            half = self._share(0, self._scouted, room, None, everywhere, even)
+            wanted = scouting * (self.rays[0] + self.group * half)
+            scouts = self._due(wanted, self._traced[2], self._rounding())
             return np.stack([half, half, scouts, scouts])
         room += (rays - most) * self.film.pixels
         fields = np.stack([self._board == field for field in range(self._board.max() + 1)])
@@ -240,7 +237,7 @@ class Halves(Stack):
         for half in HALVES:
             views = self._decisive([1 - half], SCOUTS, apart).reshape(fields.shape)
             for field, variance in zip(fields, views, strict=True):
-                chosen[half] += self._share(half, variance, room / 2 * field.mean(), target, field)
+                chosen[half] += self._share(half, variance, room / 2 * field.mean(), target, field, 0)
         return chosen
 
     def _share(
@@ -250,7 +247,7 @@ class Halves(Stack):
         room: float,
         target: float | None,
         among: np.ndarray,
-        even: float = 0,
+        even: float,
     ) -> np.ndarray:
         """Return groups for a half: what a target takes, if the other half is like this one, or nearly, but
         no more than, what there is room for. Rays are a multiple of the deviation, or what there is."""

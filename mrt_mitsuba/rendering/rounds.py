@@ -71,8 +71,7 @@ def run_rounds(
             most = min(most, now.spp * seconds / now.seconds)
         if picture.last or most < LEAST_GROWTH * now.spp:
             break
-        all_at_once = target is None and most >= rays  # whatever a forecast says
-        forecast, tail = (math.inf, 0.0) if all_at_once else picture.forecast()
+        forecast, tail = picture.forecast() if target or most < rays else (math.inf, 0.0)  # that decide
         if now.spp < 0.9 * least:  # shares are rounded
             chosen = picture.next(min(most, least), rays, None, EVEN)
         elif target is None or forecast > target:

@@ -69,9 +69,13 @@ def test_colour_does_not_depend_on_the_distance(variant: str) -> None:
     assert np.linalg.norm(np.ravel(ds.d)) == pytest.approx(1)  # there is none, and any will do
 
 
-def test_light_tracing_is_refused() -> None:
-    with pytest.raises(NotImplementedError, match="light tracing needs a finite emitted power"):
-        light().sample_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
+def test_light_tracing_is_refused_where_there_is_one() -> None:
+    """Dr.Jit asks all lights of the process: other scenes could not be rendered while one was there."""
+    box, tracer, other = mi.cornell_box(), mi.load_dict({"type": "ptracer"}), light()
+    box["sensor"]["film"] |= {"width": 4, "height": 4}
+    assert mi.render(mi.load_dict(box), integrator=tracer, spp=4).numpy().mean() > 0
+    with pytest.raises(NotImplementedError, match="no finite power"):
+        tracer.render(mi.load_dict(box | {"other": other}), spp=4)
 
 
 def test_other_kinds_of_lights_join_the_table() -> None:

@@ -81,11 +81,3 @@ def visible_cos(v: Any, alpha: Any) -> Any:
         return z
     a = z / across
     return z + (mp.exp(-a * a) * across / mp.sqrt(mp.pi) - z * mp.erfc(a)) / 2
-
-
-def specular_bsdf(wi: Sequence[Any], wo: Sequence[Any], alpha: Any, *, form: str, int_ior: Any = 1) -> Any:
-    """Return D F G / (4 cos θi cos θo) for directions above the surface; outside index 1."""
-    i, o = unit(wi), unit(wo)
-    h = unit([a + b for a, b in zip(i, o, strict=True)])
-    f = fresnel(form, sum(a * b for a, b in zip(i, h, strict=True)), 1, int_ior)
-    return beckmann_d(h[2], alpha) * f * smith_g1(i, alpha) * smith_g1(o, alpha) / (4 * i[2] * o[2])
