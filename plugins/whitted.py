@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
+import contextlib
 import math
 import signal
 from dataclasses import dataclass
@@ -22,12 +22,6 @@ from .variants import but_not, construct_quietly, largest
 # A sixteenth of a step of an 8-bit picture: what many cut paths add up to stays below half a step, and on
 # average over the report's scenes below 1e-5
 MIN_CONTRIBUTION = 1 / 16 / 255
-
-# The handlers of signals below Python's own, of which the module ``signal`` knows nothing
-_get_handler = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.c_int)(("PyOS_getsig", ctypes.pythonapi))
-_set_handler = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)(
-    ("PyOS_setsig", ctypes.pythonapi)
-)
 
 
 @dataclass
@@ -97,7 +91,6 @@ class MrtWhitted(mi.SamplingIntegrator):
         self._snapshot: Snapshot | None = None  # of the scene that was looked at last
         self._made = Kept()
         self._rendering: SceneData | None = None  # what ``sample`` traces while ``render`` runs
-        self._on_interrupt: int | None = None  # the handler of Ctrl-C that ``render`` met
 
     # ------------------------------------- Mitsuba's interface ----------------------------------------
 
@@ -111,10 +104,10 @@ class MrtWhitted(mi.SamplingIntegrator):
         evaluate: bool = True,
     ) -> mi.TensorXf:
         before, self._rendering = self._rendering, self.prepare(scene)
-        if before is None:
-            self._on_interrupt = _get_handler(signal.SIGINT)
-        else:  # Mitsuba calls this again, under a handler that would take itself for the one before it
-            _set_handler(signal.SIGINT, self._on_interrupt)
+        # Mitsuba calls this under a handler of Ctrl-C that would take itself for the one before it. Only the
+        # main thread may set one, and only one of Python's
+        with contextlib.suppress(ValueError, TypeError):
+            signal.signal(signal.SIGINT, signal.getsignal(signal.SIGINT))
         try:
             return mi.SamplingIntegrator.render(self, scene, sensor, seed, spp, develop, evaluate)
         finally:

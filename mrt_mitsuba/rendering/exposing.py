@@ -43,7 +43,7 @@ class Groups(NamedTuple):
         counts = counts.ravel()
         pixels = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
         first = (before.ravel() - size * (np.cumsum(counts) - counts)).astype(np.int64).astype(np.uint32)
-        return cls(size, pixels, np.repeat(first, counts) + np.arange(0, size * len(pixels), size, np.uint32))
+        return cls(size, pixels, np.repeat(first, counts) + size * np.arange(len(pixels), dtype=np.uint32))
 
     def parts(self, most: int, width: int) -> Iterator[tuple[slice, Groups]]:
         """Yield parts of no more than ``most`` groups, cut between rows where that can be, and which groups

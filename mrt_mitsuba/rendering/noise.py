@@ -234,10 +234,10 @@ class Halves(Stack):
         _, halves = _compared(self._gathered([0]), self._gathered([1]))
         apart = halves * ~fields[:, None] if len(fields) > 1 else None
         chosen = np.zeros((4, self.film.pixels), np.int64)
-        for half in HALVES:
-            views = self._decisive([1 - half], SCOUTS, apart).reshape(fields.shape)
+        for index in HALVES:
+            views = self._decisive([1 - index], SCOUTS, apart).reshape(fields.shape)
             for field, variance in zip(fields, views, strict=True):
-                chosen[half] += self._share(half, variance, room / 2 * field.mean(), target, field, 0)
+                chosen[index] += self._share(index, variance, room / 2 * field.mean(), target, field, 0)
         return chosen
 
     def _share(

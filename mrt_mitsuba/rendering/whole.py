@@ -80,7 +80,7 @@ class Wholes(Halves):
         squares = window_means(np.moveaxis(self._squares(HALVES), -1, 0), 4)
         return np.moveaxis(squares, 0, -1)
 
-    def _decisive(self, *_: list[int]) -> np.ndarray:
+    def _decisive(self, *_: object) -> np.ndarray:
         """Return the variance of a pixel times its rays as the scouts have it, alike in all pixels."""
         return np.full(self.film.shape, self._squares(SCOUTS).mean() * self._traced[SCOUTS].sum(0)[0])
 

@@ -7,7 +7,9 @@ import signal
 import threading
 from collections.abc import Iterator
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from mrt_mitsuba import interrupts, scene_dict
@@ -89,6 +91,12 @@ def test_a_held_interrupt_is_heeded_at_safe_places_and_a_second_one_anywhere(mon
 def test_mi_render_leaves_no_handler(variant: str) -> None:
     """Mitsuba's, left behind, called itself for ever at the next Ctrl-C, or an integrator that was gone."""
     handler = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.c_int)(("PyOS_getsig", ctypes.pythonapi))
-    before = handler(signal.SIGINT)
-    mi.render(mi.load_dict(scene_dict(0, width=8, height=6)), spp=1)
-    assert handler(signal.SIGINT) == before
+    before, nodes = handler(signal.SIGINT), scene_dict(0, width=8, height=6)
+    nodes["integrator"] = {"type": "mrt_whitted", "max_depth": 1}
+    params = mi.traverse(scene := mi.load_dict(nodes))
+    assert np.array(mi.render(scene, params, spp=1)).any() and handler(signal.SIGINT) == before
+    if variant != "scalar_rgb":
+        key = next(key for key, _ in params if "reflectance" in key)
+        dr.enable_grad(params[key])
+        dr.backward(dr.mean(mi.render(scene, params, spp=1)))
+        assert np.isfinite(dr.grad(params[key])).all() and handler(signal.SIGINT) == before
