@@ -53,7 +53,7 @@ def use(variant: str | None = None) -> str:
             raise VariantError(f"the variant {variant} cannot be used: {problem}")
         if mi.variant() != variant:
             mi.set_variant(variant)
-            # Dr.Jit does not look at quotas of control groups; for two, see below
+            # Dr.Jit does not look at quotas of control groups; two at least, see ``two_threads``
             if dr.thread_count() > (threads := max(usable_cores(), 2)):
                 dr.set_thread_count(threads)
         mitsuba_first()

@@ -29,7 +29,7 @@ TILE = 16  # pixels that round alike, under a filter: it has rays traced around 
 WINDOWS = (1, 2, 4, 8)  # half the widths of windows that pixels borrow from
 JUDGES = 2**11  # pixels, about, that choose the mixture
 MISSED = 0.25  # of a pixel like those that make up the noise: it may be among the others, unseen
-STATED = 4  # squared errors that a stated variance counts as much as
+STATED = 2  # squared errors that a stated variance counts as much as
 LEAST_RATIO = 0.05  # of squared errors to stated variances, to be believed: rare ones may be missing
 
 
@@ -145,7 +145,7 @@ class Halves(Stack):
 
     def variance(self) -> np.ndarray:
         """Return the estimated variance of each channel in the picture, [H, W, 3], without the border."""
-        each = self._decisive([0, 2], [1, 3]) * (1 / self.rows(self.rays)).sum(0) / 4
+        each = self._decisive([0, 2], [1, 3], missed=2 * MISSED) * (1 / self.rows(self.rays)).sum(0) / 4
         colors = np.where(self._unknown[..., None], 0, quarter_squares(*self.pictures()[..., :3]))
         total = _calibrated(self.film.spread_out(each), colors.mean(-1))
         colors = window_means(np.moveaxis(colors, -1, 0), 4) + 1e-30
@@ -154,27 +154,33 @@ class Halves(Stack):
         return self.film.picture(variance) + rounding
 
     def _decisive(
-        self, first: list[int], second: list[int], differences: np.ndarray | None = None
+        self,
+        first: list[int],
+        second: list[int],
+        differences: np.ndarray | None = None,
+        missed: float = MISSED,
     ) -> np.ndarray:
         """Return the variance of a pixel times its rays, [H, W], as two sets of pictures have it.
 
         Pixels that met no rare bright ray look quiet, so each borrows from windows around it, and from the
         picture: in the mixture of the first set that explains best what the second measures. Rays of a
         sequence err less than independent ones: by that much, the sets differ less than their rays do.
-        ``differences``: of other sets that show it better, [..., 2, H, W], for as many results.
+        ``differences``: of other sets that show it better, [..., 2, H, W], for as many results. ``missed``:
+        see ``MISSED``; what is stated counts it twice.
         """
         one, another = self._gathered(first), self._gathered(second)
         (both, own), seen, measured = _compared(one, another), _variance(one), _variance(another)
         parts, more = self._around(np.stack([seen, both]))
         shares = _mixture(parts, measured)
-        shares[0] = max(shares[0], MISSED / max(_number(both), 1))
+        shares[0] = max(shares[0], missed / max(_number(both), 1))
         mixed = np.tensordot(shares, more, 1)
         quiet, also = window_means(np.stack([seen, measured]), 1) == 0
         if not (measured[quiet].any() or seen[also].any()):  # where one met no noise, the other met none
             mixed[quiet & also] = 0
-        near, width = (own, WINDOWS[3]) if differences is None else (differences, WINDOWS[2])
+        near, widths = (own, WINDOWS[3:]) if differences is None else (differences, WINDOWS[2:])
         mean, rest = (v.mean((-2, -1), keepdims=True) for v in (near, own))  # where there is no noise near
-        found, expected = np.moveaxis(window_means(near, width) + 0.2 * mean + 1e-3 * rest, -3, 0)
+        around = np.mean([window_means(near, width) for width in widths], 0)
+        found, expected = np.moveaxis(around + 0.2 * mean + 1e-3 * rest, -3, 0)
         return np.asarray(mixed * found / np.maximum(expected, 1e-30) * self.film.averaging)
 
     def _around(self, values: np.ndarray) -> np.ndarray:
@@ -251,8 +257,7 @@ class Halves(Stack):
     ) -> np.ndarray:
         """Return groups for a half: what a target takes, if the other half is like this one, or nearly, but
         no more than, what there is room for. Rays are a multiple of the deviation, or what there is."""
-        own = np.sqrt(variance + 1e-30)
-        deviation = ((own + window_means(own, 1)) / 2)[among]  # single pixels are known badly
+        deviation = window_means(np.sqrt(variance + 1e-30), 1)[among]  # single pixels are known badly
         deviation = np.maximum(deviation, even * deviation.mean())
         have, rounding, variance = (
             v.reshape(among.shape)[among] for v in (self.rays[half], self._rounding(), variance)
@@ -283,10 +288,10 @@ class Halves(Stack):
     def _due(self, rays: np.ndarray, have: np.ndarray, rounding: np.ndarray) -> np.ndarray:
         """Return the groups that make of the rays there are so many.
 
-        Or a multiple of a power of two near it, a quarter to half of it: rays of a sequence err least then.
+        Or a multiple of a power of two near it, an eighth to a quarter of it: a sequence errs less then.
         """
         rays = np.minimum(rays, 2.0**40)
-        step = np.ldexp(0.25, np.maximum(np.frexp(rays)[1], 3))
+        step = np.ldexp(0.125, np.maximum(np.frexp(rays)[1], 4))
         due = np.floor(rays / step + rounding) * step - have
         return np.asarray(np.maximum(due, 0) / self.group, np.int64)
 
