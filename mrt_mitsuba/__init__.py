@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os as _os
 
+import mrt_mitsuba.errors as _errors
 from mrt_mitsuba.errors import MrtError, MrtWarning, OutputError, SceneError, UsageError, VariantError
 
 __version__ = "0.1.0"
@@ -57,8 +58,11 @@ def __getattr__(name: str) -> object:
     from mrt_mitsuba.machine import check_start
 
     check_start()
-    with held():
-        module = import_module(_HOME[name])
+    try:
+        with held():
+            module = import_module(_HOME[name])
+    except ModuleNotFoundError as error:
+        raise MrtError(_errors.NOT_INSTALLED.format(error.name)) from error
     globals()[name] = value = getattr(module, name, module)  # ``filters`` is a module
     return value
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 LONGEST = 800  # characters of a message
+NOT_INSTALLED = "{} is not installed: pip install 'mrt-mitsuba[validation]'"
 
 
 def printable(text: str) -> str:

@@ -12,7 +12,9 @@ import sys
 import time
 import types
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -105,6 +107,16 @@ def test_failures_and_warnings_are_one_line(
         monkeypatch.setenv(cli.TRACEBACK, "1")
         with pytest.raises(RuntimeError):
             cli.main(words)
+
+
+def test_what_is_not_installed_is_named_with_the_way_to_install_it(run_python: Callable[..., Any]) -> None:
+    """By the command and from Python, where the tools of validation are missing."""
+    text = "scipy is not installed: pip install 'mrt-mitsuba[validation]'"
+    begin = "import sys; sys.modules['scipy'] = None\n"
+    command = "from mrt_mitsuba.command import main as cli; sys.exit(cli.main(['check', 'roughconductor']))"
+    assert run_python(begin + command, code=1).stderr == f"mrt: {text}\n"
+    found = run_python(begin + "import mrt_mitsuba as mrt; mrt.check_bsdf", code=1).stderr
+    assert found.endswith(f"mrt_mitsuba.errors.MrtError: {text}\n")
 
 
 # What the signal meets: a Dr.Jit kernel that runs for minutes (a million steps per entry).
