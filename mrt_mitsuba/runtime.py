@@ -211,7 +211,9 @@ def one_by_one() -> None:
         @wraps(render)
         def call(integrator: Any, scene: Any, *args: Any, **given: Any) -> Any:
             if any(hasattr(emitter, "arriving") for emitter in scene.emitters()):
-                raise NotImplementedError("mrt_light has no finite power to trace light from; take a 'point'")
+                raise NotImplementedError(
+                    "mrt_light: light tracing needs a finite emitted power; use a stock 'point' light"
+                )
             return render(integrator, scene, *args, **given)
 
         return call

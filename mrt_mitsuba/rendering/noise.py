@@ -157,7 +157,7 @@ class Halves(Stack):
         self,
         first: list[int],
         second: list[int],
-        differences: np.ndarray | None = None,
+        near: np.ndarray | None = None,
         missed: float = MISSED,
     ) -> np.ndarray:
         """Return the variance of a pixel times its rays, [H, W], as two sets of pictures have it.
@@ -165,8 +165,8 @@ class Halves(Stack):
         Pixels that met no rare bright ray look quiet, so each borrows from windows around it, and from the
         picture: in the mixture of the first set that explains best what the second measures. Rays of a
         sequence err less than independent ones: by that much, the sets differ less than their rays do.
-        ``differences``: of other sets that show it better, [..., 2, H, W], for as many results. ``missed``:
-        see ``MISSED``; what is stated counts it twice.
+        ``near``: these differences of other sets, which show it better, [..., 2, H, W], for as many results.
+        ``missed``: see ``MISSED``; what is stated counts it twice.
         """
         one, another = self._gathered(first), self._gathered(second)
         (both, own), seen, measured = _compared(one, another), _variance(one), _variance(another)
@@ -177,10 +177,9 @@ class Halves(Stack):
         quiet, also = window_means(np.stack([seen, measured]), 1) == 0
         if not (measured[quiet].any() or seen[also].any()):  # where one met no noise, the other met none
             mixed[quiet & also] = 0
-        near, widths = (own, WINDOWS[3:]) if differences is None else (differences, WINDOWS[2:])
-        mean, rest = (v.mean((-2, -1), keepdims=True) for v in (near, own))  # where there is no noise near
-        around = np.mean([window_means(near, width) for width in widths], 0)
-        found, expected = np.moveaxis(around + 0.2 * mean + 1e-3 * rest, -3, 0)
+        near = _near(own, WINDOWS[3:]) if near is None else near
+        # where there is no noise near, all of the picture
+        found, expected = np.moveaxis(near + 1e-3 * own.mean((-2, -1), keepdims=True), -3, 0)
         return np.asarray(mixed * found / np.maximum(expected, 1e-30) * self.film.averaging)
 
     def _around(self, values: np.ndarray) -> np.ndarray:
@@ -238,10 +237,10 @@ class Halves(Stack):
         room += (rays - most) * self.film.pixels
         fields = np.stack([self._board == field for field in range(self._board.max() + 1)])
         _, halves = _compared(self._gathered([0]), self._gathered([1]))
-        apart = halves * ~fields[:, None] if len(fields) > 1 else None
+        near = _near(halves * ~fields[:, None], WINDOWS[2:]) if len(fields) > 1 else None
         chosen = np.zeros((4, self.film.pixels), np.int64)
         for index in HALVES:
-            views = self._decisive([1 - index], SCOUTS, apart).reshape(fields.shape)
+            views = self._decisive([1 - index], SCOUTS, near).reshape(fields.shape)
             for field, variance in zip(fields, views, strict=True):
                 chosen[index] += self._share(index, variance, room / 2 * field.mean(), target, field, 0)
         return chosen
@@ -311,6 +310,14 @@ def _compared(one: Sequence[np.ndarray], another: Sequence[np.ndarray]) -> tuple
     variance = _variance([a + b for a, b in zip(one, another, strict=True)])
     found = quarter_squares(*(total / rays for rays, total, _ in (one, another))).mean(0)
     return variance, np.stack([found, variance * (1 / one[0] + 1 / another[0]) / 4])
+
+
+def _near(values: np.ndarray, widths: Sequence[int]) -> np.ndarray:
+    """Return what values [..., H, W] are around each pixel, a little of the mean of all among it."""
+    return np.asarray(
+        np.mean([window_means(values, width) for width in widths], 0)
+        + 0.2 * values.mean((-2, -1), keepdims=True)
+    )
 
 
 def _variance(sums: Sequence[np.ndarray]) -> np.ndarray:

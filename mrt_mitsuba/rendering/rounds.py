@@ -71,7 +71,8 @@ def run_rounds(
             most = min(most, now.spp * seconds / now.seconds)
         if picture.last or most < LEAST_GROWTH * now.spp:
             break
-        forecast, tail = picture.forecast() if target or most < rays else (math.inf, 0.0)  # that decide
+        # not asked for where all rays that are left are spent at once, whatever it says
+        forecast, tail = picture.forecast() if target or most < rays else (math.inf, 0.0)
         if now.spp < 0.9 * least:  # shares are rounded
             chosen = picture.next(min(most, least), rays, None, EVEN)
         elif target is None or forecast > target:

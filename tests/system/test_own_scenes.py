@@ -289,11 +289,14 @@ def test_every_pixel_has_its_place_shape_and_material():
 
 
 def test_rays_go_on_until_the_target_is_reached() -> None:
-    """By more rays than any target takes: 850 to 1,620, with 24 seeds."""
-    box = mi.cornell_box()
+    """By more rays than any target takes: 850 to 1,620, with 24 seeds; the median is 1,070."""
+    box, rays = mi.cornell_box(), []
     box["sensor"]["film"] |= {"width": 24, "height": 24}
     scene = mi.load_dict(box)
-    target = mrt.render(scene, integrator="path", aamode="noise", spp=256).error.rmse / 1.5
-    result = mrt.render(scene, integrator="path", target=target)
-    assert result.error.low <= target and result.error.rmse < 1.2 * target
-    assert 300 < result.rounds[-1].spp < 2400
+    for seed in range(5):
+        known = mrt.render(scene, integrator="path", aamode="noise", spp=256, seed=seed)
+        target = known.error.rmse / 1.5
+        result = mrt.render(scene, integrator="path", target=target, seed=seed)
+        assert result.error.low <= target and result.error.rmse < 1.2 * target
+        rays.append(result.rounds[-1].spp)
+    assert min(rays) > 300 and np.median(rays) < 1200
