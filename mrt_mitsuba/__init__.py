@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from mrt_mitsuba.scene.export import scene_dict as scene_dict
     from mrt_mitsuba.sweeps import sweep as sweep
     from mrt_mitsuba.validation.checks.bsdf import check_bsdf as check_bsdf
+    from mrt_mitsuba.validation.checks.emitter import check_emitter as check_emitter
     from mrt_mitsuba.validation.checks.scene import check_scene as check_scene
     from mrt_mitsuba.validation.checks.shape import check_shape as check_shape
     from mrt_mitsuba.validation.studies.roughconductor import compare_roughconductor as compare_roughconductor
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Result": "mrt_mitsuba.rendering.api",
     "check_bsdf": "mrt_mitsuba.validation.checks.bsdf",
+    "check_emitter": "mrt_mitsuba.validation.checks.emitter",
     "check_scene": "mrt_mitsuba.validation.checks.scene",
     "check_shape": "mrt_mitsuba.validation.checks.shape",
     "compare": "mrt_mitsuba.validation.tools.compare",
@@ -58,11 +60,8 @@ def __getattr__(name: str) -> object:
     from mrt_mitsuba.machine import check_start
 
     check_start()
-    try:
-        with held():
-            module = import_module(_HOME[name])
-    except ModuleNotFoundError as error:
-        raise MrtError(_errors.NOT_INSTALLED.format(error.name)) from error
+    with _errors.needs_extra(), held():
+        module = import_module(_HOME[name])
     globals()[name] = value = getattr(module, name, module)  # ``filters`` is a module
     return value
 

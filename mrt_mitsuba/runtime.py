@@ -1,33 +1,27 @@
-"""Start-up of Mitsuba: which variant, which LLVM, the plugins registered in it, and what is changed in how it
-loads and renders."""
+"""Start-up of Mitsuba: which variant, which LLVM, and the plugins registered in it."""
 
 from __future__ import annotations
 
 import contextlib
 import difflib
-import os
-import threading
 import warnings
-from collections.abc import Callable, Iterator
-from functools import cache, wraps
-from typing import Any
+from functools import cache
 
 import drjit as dr
 import mitsuba as mi
 
-from mrt_mitsuba import llvm, plugins
+from mrt_mitsuba import llvm, mitsuba_changes, plugins
 from mrt_mitsuba.errors import MrtWarning, UnknownVariantError, VariantError
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.machine import usable_cores
+from mrt_mitsuba.mitsuba_changes import one_at_a_time
 
 FAST = "llvm_ad_rgb"
 SLOW = "scalar_rgb"
 
-# Held while Mitsuba is set up and while it renders: neither it nor Dr.Jit is safe with several Python threads
-one_at_a_time = threading.RLock()
-
 _warned = False  # that variants are slow
 _used: str | None = None  # the variant that was made current last
+_guard = True  # is Mitsuba to be changed
 
 
 def use(variant: str | None = None) -> str:
@@ -42,7 +36,8 @@ def use(variant: str | None = None) -> str:
     global _used
     if _used and variant in (None, _used) and mi.variant() == _used:
         return _used
-    with one_at_a_time, held(), rewriting_later():
+    quickly = mitsuba_changes.rewriting_later() if _guard else contextlib.nullcontext()
+    with one_at_a_time, held(), quickly:
         if variant is None:
             variant = mi.variant() or default_variant()
         elif variant not in mi.variants():
@@ -53,11 +48,12 @@ def use(variant: str | None = None) -> str:
             raise VariantError(f"the variant {variant} cannot be used: {problem}")
         if mi.variant() != variant:
             mi.set_variant(variant)
-            # Dr.Jit does not look at quotas of control groups; two at least, see ``two_threads``
+            # Dr.Jit does not look at quotas of control groups; two at least, see ``TwoThreads``
             if dr.thread_count() > (threads := max(usable_cores(), 2)):
                 dr.set_thread_count(threads)
-        mitsuba_first()
-        one_by_one()
+        if _guard:
+            mitsuba_changes.mitsuba_first()
+            mitsuba_changes.make()
         plugins.register()
         plugins.register_modules("mrt_mitsuba.rays", ["samplers"])
         plugins.register_modules("mrt_mitsuba.rendering", ["adaptive"])
@@ -65,13 +61,21 @@ def use(variant: str | None = None) -> str:
     return variant
 
 
-def register() -> None:
+def register(guard: bool = True) -> None:
     """Register the plugins with Mitsuba, so that ``mi.load_dict`` and ``mi.load_file`` know them.
 
     They follow every later switch of the variant. Where no variant is set yet, the default one is.
+
+    ``guard``: change what ``mrt_mitsuba.mitsuba_changes.CHANGES`` lists in how Mitsuba loads, renders and
+    updates, for scenes with these plugins. With False, nothing of Mitsuba is changed, and earlier changes are
+    taken back, until the next ``register()``: then such scenes must be loaded with ``parallel=False`` and
+    used by one thread, and numbers that are written where they lie are not noticed.
     """
-    global _used
+    global _used, _guard
     _used = None  # also where a caller has taken them out since
+    _guard = guard
+    if not guard:
+        mitsuba_changes.undo()
     use()
 
 
@@ -125,124 +129,3 @@ def versions() -> dict[str, str]:
         "drjit": dr.__version__,
         "llvm": ".".join(map(str, version)) if version else "of unknown version",
     }
-
-
-# ------------------------------------- What is changed in Mitsuba --------------------------------------
-
-
-@contextlib.contextmanager
-def rewriting_later() -> Iterator[None]:
-    """Let functions under ``@dr.syntax`` be rewritten when they are first called.
-
-    Mitsuba has ten of them, in integrators for derivatives; to rewrite them takes 60 ms of each start.
-    """
-    rewrite = dr.syntax
-
-    def later(function: Any = None, **options: Any) -> Any:
-        if function is None or options:
-            return rewrite(function, **options)
-        rewritten = cache(lambda: rewrite(function))
-        return wraps(function)(lambda *args, **given: rewritten()(*args, **given))
-
-    dr.syntax = later
-    try:
-        yield
-    finally:
-        dr.syntax = rewrite
-
-
-def mitsuba_first(folder: str | None = None) -> None:
-    """Let Mitsuba find its own plugins before files of their names in ``folder`` and others."""
-    current = mi.file_resolver()
-    others = [str(current[i]) for i in range(len(current))]
-    resolver = mi.FileResolver()
-    resolver.clear()
-    for each in dict.fromkeys([mitsuba_home(), *([folder] if folder else []), *others]):
-        resolver.append(each)
-    mi.set_file_resolver(resolver)
-
-
-@contextlib.contextmanager
-def two_threads() -> Iterator[None]:
-    """Let Dr.Jit have two threads at least: with one, Mitsuba waits for the EXR files it reads for ever."""
-    before = dr.thread_count()
-    dr.set_thread_count(max(before, 2))
-    try:
-        yield
-    finally:
-        dr.set_thread_count(before)
-
-
-@cache
-def mitsuba_home() -> str:
-    """Return the folder in which Mitsuba is installed."""
-    return os.path.dirname(os.path.abspath(mi.__file__))
-
-
-def one_by_one() -> None:
-    """Let Mitsuba's loaders make this project's objects one by one, and ``mi.render`` and changes by
-    ``mi.traverse`` wait for each other: done at once, either ends the process.
-
-    Light tracing refuses ``mrt_light``, which cannot do so itself: Dr.Jit calls its methods for scenes that
-    have none, too.
-
-    Scenes without our plugins, and calls that say ``parallel``, load at once as before. Idempotent.
-    """
-
-    def in_turn(loader: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(loader)
-        def load(source: Any, *flags: bool, **given: Any) -> Any:
-            if not flags:
-                given.setdefault("parallel", not _mentions_ours(source))
-            with two_threads():
-                return loader(source, *flags, **given)
-
-        return load
-
-    def guarded(function: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(function)
-        def call(*args: Any, **given: Any) -> Any:
-            with one_at_a_time:
-                return function(*args, **given)
-
-        return call
-
-    def refusing(render: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(render)
-        def call(integrator: Any, scene: Any, *args: Any, **given: Any) -> Any:
-            if any(hasattr(emitter, "arriving") for emitter in scene.emitters()):
-                raise NotImplementedError(
-                    "mrt_light: light tracing needs a finite emitted power; use a stock 'point' light"
-                )
-            return render(integrator, scene, *args, **given)
-
-        return call
-
-    for wrapped, owner, names in (
-        (guarded, mi, ("render",)),
-        (refusing, mi.AdjointIntegrator, ("render",)),
-        (guarded, mi.SceneParameters, ("update", "__setitem__")),
-        (in_turn, mi, ("load_dict", "load_file", "load_string")),
-    ):
-        for name in names:
-            if not hasattr(function := getattr(owner, name), "__wrapped__"):
-                setattr(owner, name, wrapped(function))
-
-
-def _mentions_ours(source: Any) -> bool:
-    """Return whether a dict, or a file of XML or its text, may have a plugin of this project; Mitsuba itself
-    refuses anything else, and reports files that cannot be read."""
-    if isinstance(source, dict):  # as text, it would have Dr.Jit evaluate what lies in it
-        waiting, seen = [source], set[int]()  # a dict may lie in itself
-        while waiting:
-            node = waiting.pop()
-            if isinstance(node, dict) and id(node) not in seen:
-                seen.add(id(node))
-                if str(node.get("type", "")).startswith("mrt_"):
-                    return True
-                waiting += node.values()
-        return False
-    text = str(source)
-    with contextlib.suppress(OSError, ValueError), open(text, encoding="utf-8", errors="ignore") as file:
-        text = file.read()
-    return "mrt_" in text or "<include" in text

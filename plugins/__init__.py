@@ -1,21 +1,26 @@
 """Mitsuba plugins in Dr.Jit, and the maths they share.
 
-``register()`` makes ``mrt_bsdf``, ``mrt_cone``, ``mrt_cylinder``, ``mrt_group``, ``mrt_light``,
-``mrt_mesh``, ``mrt_plane``, ``mrt_texture`` and ``mrt_whitted`` known to Mitsuba;
-``register_modules()`` does the same for plugins of other packages.
+``register()`` makes the plugins of ``table.PLUGINS`` known to Mitsuba; ``register_modules()`` does the same
+for plugins of other packages.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
-MODULES = ("axial", "bsdf", "group", "light", "mesh", "plane", "texture", "whitted")
+from .table import PLUGINS, Plugin
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 _packages: dict[str, tuple[str, ...]] = {}  # the plugin modules of each package
 _loaded: dict[tuple[str, str, str], ModuleType] = {}  # by variant, package and name
+_registered: set[str] = set()  # the variants in which Mitsuba knows ``PLUGINS``
+_constructed = False  # has this process ever made one of ``PLUGINS``
 
 
 def register() -> None:
@@ -23,7 +28,7 @@ def register() -> None:
 
     Idempotent. Raises ``RuntimeError`` where no variant is set.
     """
-    register_modules(__name__, MODULES)
+    register_modules(__name__, [])
 
 
 def register_modules(package: str, names: Sequence[str]) -> None:
@@ -57,9 +62,9 @@ def plugin(name: str, package: str = __name__) -> ModuleType:
 
     key = mi.variant(), package, name
     if key not in _loaded:
-        found = importlib.util.find_spec(f"{package}.{name}")
-        source = found.origin if found else None
-        spec = importlib.util.spec_from_file_location(f"{package}.{name}_{key[0]}", source)
+        source = importlib.util.find_spec(f"{package}.{name}")
+        origin = source.origin if source else None
+        spec = importlib.util.spec_from_file_location(f"{package}.{name}_{key[0]}", origin)
         if spec is None or spec.loader is None:
             raise ImportError(f"the plugin module {name} is missing in {package}: install the package anew")
         module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
@@ -68,7 +73,46 @@ def plugin(name: str, package: str = __name__) -> ModuleType:
     return _loaded[key]
 
 
+def class_of(row: Plugin) -> type:
+    """Return the class of a plugin for the current variant."""
+    return getattr(plugin(row.module), row.class_name)
+
+
+def is_known(thing: object) -> bool:
+    """Return whether Mitsuba or this folder has the class of an object, so that all its state is in sight.
+
+    What somebody else wrote in Python may depend on anything, and is asked each time.
+    """
+    module = type(thing).__module__
+    return module.split(".", 1)[0] == "mitsuba" or is_ours(thing)
+
+
+def is_ours(thing: object) -> bool:
+    """Return whether this folder has the class of an object."""
+    return type(thing).__module__.startswith(f"{__name__}.")
+
+
+def any_constructed() -> bool:
+    """Return whether this process has ever made one of ``PLUGINS``."""
+    return _constructed
+
+
+def _constructor(cls: type) -> Callable[[mi.Properties], Any]:
+    def construct(props: mi.Properties) -> Any:
+        global _constructed
+        _constructed = True
+        return cls(props)
+
+    return construct
+
+
 def _load_all() -> None:
+    import mitsuba as mi
+
+    if mi.variant() not in _registered:
+        for row in PLUGINS:
+            getattr(mi, f"register_{row.kind}")(row.name, _constructor(class_of(row)))
+        _registered.add(mi.variant())
     for package, names in _packages.items():
         for name in names:
             plugin(name, package)

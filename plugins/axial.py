@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import plugin
 from .intersect import Frame
 from .mesh_api import Placement, keep_apart, write_buffers
 from .parameters import ParameterError, flag, number, segments, vector
@@ -17,7 +18,7 @@ from .quadric_kinds import KINDS, QuadricTable
 from .variants import first, is_jit, updatable
 
 
-class AxialMesh(mi.Mesh):
+class AxialMesh(plugin("exact_mesh").ExactMesh):  # type: ignore[misc]
     """The base class of ``mrt_cone`` and ``mrt_cylinder`` (Mitsuba's classes take no mix-in).
 
     Parameters: the two points ``ends``, ``radius``, ``segments``, ``capped`` and ``to_world``.
@@ -28,37 +29,37 @@ class AxialMesh(mi.Mesh):
     parameters: Mapping[str, Any] = MappingProxyType({})  # none while the mesh is being filled
 
     def __init__(self, props: mi.Properties) -> None:
-        plugin = props.plugin_name()
+        name = props.plugin_name()
         ends = [vector(props, name) for name in self.ends]
         radius = number(props, "radius", 1.0, above=0)
         if np.array_equal(*np.asarray(ends, np.float32)):
             both = " and ".join(f'"{name}"' for name in self.ends)
-            raise ParameterError(f"{plugin}: {both} are both {ends[0]}, but must be two points")
+            raise ParameterError(f"{name}: {both} are both {ends[0]}, but must be two points")
         self.capped = flag(props, "capped", True)
         self.kind = self.kind if self.capped else f"open {self.kind}"
+        if props.get("face_normals", False):
+            raise ParameterError(f'{name}: "face_normals" is not accepted; its side is round')
         self.placement = Placement(props)
         self.unit = vertices, faces = KINDS[self.kind].mesh(segments(props, 256))
         #: the unit frame in world space, in double precision (see ``intersect``)
         self.exact_frame = self._frame_of(vector64(ends[0]), vector64(ends[1]), radius)
         buffers = {"has_vertex_normals": True, "has_vertex_texcoords": True}
-        mi.Mesh.__init__(self, plugin, len(vertices), len(faces), props, **buffers)
+        mi.Mesh.__init__(self, name, len(vertices), len(faces), props, **buffers)
         uvs = vertices[:, 6:].astype(np.float32).ravel()
         write_buffers(self, vertex_texcoords=uvs, **self.quadrics().stand_in(self.unit))
         self.parameters = {
             **dict(zip(self.ends, map(mi.Point3f, ends), strict=True)),
             "radius": updatable(radius),
         }
-        keep_apart(self, plugin, len(faces))
+        keep_apart(self, name, len(faces))
 
     def _frame_of(self, p0: Any, p1: Any, radius: Any) -> Frame:
         return self.placement(KINDS[self.kind].frame(p0, p1, radius))
 
     def quadrics(self) -> QuadricTable:
-        """Return what ``mrt_whitted`` intersects in place of the mesh."""
         return QuadricTable.of_one(self.kind, self.exact_frame, flipped=self.has_flipped_normals())
 
     def moving_frame(self) -> Frame | None:
-        """Return the unit frame with its derivatives, None where none are wanted."""
         values = list(self.parameters.values())
         return self._frame_of(*values) if dr.grad_enabled(values) else None
 
@@ -67,13 +68,13 @@ class AxialMesh(mi.Mesh):
         arrays = [*self.parameters.values(), self.vertex_positions_buffer(), self.faces_buffer()]
         return [self.kind], [self.exact_frame, self.placement], arrays
 
-    def traverse(self, callback: Any) -> None:
+    def traverse(self, callback: mi.TraversalCallback) -> None:
         mi.Mesh.traverse(self, callback)
         flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
         for name, value in self.parameters.items():
             callback.put(name, value, flags)
 
-    def parameters_changed(self, keys: Any = ()) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         if not set(self.parameters).isdisjoint(keys):
             p0, p1, radius = self.parameters.values()
             self.exact_frame = self._frame_of(vector64(p0), vector64(p1), first(radius))
@@ -180,7 +181,3 @@ class MrtCylinder(AxialMesh):
 def vector64(v: Any) -> Any:
     """Return three numbers, or a point or vector of one entry, in double precision."""
     return dr.scalar.Array3f64([first(c) for c in v])
-
-
-mi.register_shape("mrt_cone", MrtCone)
-mi.register_shape("mrt_cylinder", MrtCylinder)

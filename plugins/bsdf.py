@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import reduce
 from operator import or_
 from typing import Any
@@ -19,10 +20,12 @@ from .variants import first, is_jit, largest, updatable, varies
 
 FRESNEL_FORMS = ("schlick", "dielectric", "unity")
 
-# Numbers, or textures of one channel, with their defaults and limits
-NUMBERS: dict[str, tuple[float, dict[str, float]]] = {
-    "alpha": (0.1, {}), "int_ior": (1.5, {"above": 0}), "ext_ior": (1.0, {"above": 0}),
-}  # fmt: skip
+# Parameters that are numbers, or textures of one channel, with their defaults and limits
+SCALARS: dict[str, tuple[float, dict[str, float]]] = {
+    "alpha": (0.1, {}),
+    "int_ior": (1.5, {"above": 0}),
+    "ext_ior": (1.0, {"above": 0}),
+}
 
 
 class MrtBSDF(mi.BSDF):
@@ -79,7 +82,7 @@ class MrtBSDF(mi.BSDF):
         self.fresnel = choice(props, "fresnel", FRESNEL_FORMS)
         self.sample_visible = flag(props, "sample_visible", True)
         self.parameters: dict[str, Any] = {}
-        for name, (default, limits) in NUMBERS.items():
+        for name, (default, limits) in SCALARS.items():
             textured = name in props and props.type(name) == mi.Properties.Type.Object
             self.parameters[name] = (
                 spectrum(props, name) if textured else updatable(number(props, name, default, **limits))
@@ -100,23 +103,23 @@ class MrtBSDF(mi.BSDF):
         components = []
         for lobe in LOBES:
             flags = getattr(mi.BSDFFlags, lobe.flag) | mi.BSDFFlags.FrontSide
-            if any(varies(self.parameters.get(name)) for name in (lobe.reflectance, *lobe.numbers)):
+            if any(varies(self.parameters.get(name)) for name in (lobe.reflectance, *lobe.depends_on)):
                 flags |= mi.BSDFFlags.SpatiallyVarying
             components.append(flags)
         self.m_components, self.m_flags = components, reduce(or_, components)
 
-    def traverse(self, callback: Any) -> None:
+    def traverse(self, callback: mi.TraversalCallback) -> None:
         for name, parameter in self.parameters.items():
             callback.put(name, parameter, mi.ParamFlags.Differentiable)
 
-    def parameters_changed(self, keys: Any = ()) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         self._update()
 
     def _read(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Any:
         """Return a parameter at a surface point."""
         parameter = self.parameters[name]
         if isinstance(parameter, mi.Texture):
-            return parameter.eval_1(si, active) if name in NUMBERS else parameter.eval(si, active)
+            return parameter.eval_1(si, active) if name in SCALARS else parameter.eval(si, active)
         return parameter if is_jit() else first(parameter)
 
     def lobes(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Lobes:
@@ -124,7 +127,7 @@ class MrtBSDF(mi.BSDF):
         given = {name: self._read(name, si, active) for name in self.parameters}
         return Lobes(self.fresnel, given, si.wi, visible=self.sample_visible)
 
-    def row(self) -> np.ndarray | str:
+    def fixed_row(self) -> np.ndarray | str:
         """Return the parameters as plain numbers [1 + lobes, 4], or why they are none: numbers, and a
         reflectance for each lobe.
         """
@@ -208,6 +211,3 @@ class MrtBSDF(mi.BSDF):
         parameters = self.parameters | {"f0": self.parameters.get("f0")}
         text = ", ".join(f"{name}={parameter}" for name, parameter in parameters.items())
         return f"MrtBSDF[fresnel={self.fresnel}, {text}]"
-
-
-mi.register_bsdf("mrt_bsdf", MrtBSDF)

@@ -8,6 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from . import is_known, plugin
 from .kernel_plan import Mirror, SceneFacts
 from .lights import brightness
 from .lobes import LOBES, material_rows
@@ -23,115 +24,140 @@ SMALLEST_MESH, LARGEST_MESH = 1e-8, 1e10
 class Reading:
     """A snapshot of a scene and what is read of it, by part; ``kept`` spares reading a part again.
 
-    Plugins declare by methods what ``mrt_whitted`` may do in place of calling them: a plane by
-    ``unit_normal``, ``distance`` and ``tangents``; a mesh that stands for exact quadrics by ``quadrics()``
-    (a ``QuadricTable``) and ``moving_frame()``; a light of a table by ``numbers()``; a BSDF with the
-    attributes ``mirror_reflectance`` and ``int_ior`` by ``mirror_bound()``, one of a table by ``row()``, too.
+    What ``mrt_whitted`` may do in place of calling a plugin is known by its class: an ``MrtPlane`` has an
+    equation, an ``ExactMesh`` stands for quadrics, a light that derives from ``MrtLight`` is a row of a
+    table, and so is an ``MrtBSDF``. Somebody else's class derived from the latter three may do anything, and
+    is called.
     """
 
     def __init__(self, snapshot: Snapshot, kept: Kept) -> None:
         self.snapshot = snapshot
         shapes, materials, lights = snapshot.shape_part, snapshot.material_part, snapshot.light_part
-        self.planes = [s for s in snapshot.shapes if hasattr(s, "unit_normal")]
-        self.quadrics = [s for s in snapshot.shapes if hasattr(s, "quadrics")]
-        own = {id(s) for s in (*self.planes, *self.quadrics)}
-        self.native = [s for s in snapshot.shapes if id(s) not in own]
+        plane, exact_mesh = plugin("plane").MrtPlane, plugin("exact_mesh").ExactMesh
+        known = [s for s in snapshot.shapes if is_known(s)]
+        self.planes = [s for s in known if isinstance(s, plane)]
+        self.quadrics = [s for s in known if isinstance(s, exact_mesh)]
+        analytic = {id(s) for s in (*self.planes, *self.quadrics)}
+        self.native = [s for s in snapshot.shapes if id(s) not in analytic]
+        #: the rows of the materials by shape, none where they have no place in one table
         self.materials, of_materials = kept(
-            "material facts", (shapes, materials), lambda: _materials(snapshot)
+            "material facts", (shapes, materials), lambda: _read_materials(snapshot)
         )
         of_shapes = kept("shape facts", shapes, self._read_shapes)
-        self.lights, self.numbers, of_lights = kept("light facts", lights, lambda: _lights(snapshot))
+        #: the lights, and their rows where all have one
+        self.lights, self.light_rows, of_lights = kept("light facts", lights, lambda: _read_lights(snapshot))
         self.facts = SceneFacts(**of_lights, **of_materials, **of_shapes, pinhole=snapshot.eye is not None)
 
     def _read_shapes(self) -> dict[str, Any]:
+        """Return the facts about the shapes."""
         meshes = [s for s in (*self.native, *self.snapshot.inner) if s.is_mesh()]
         for mesh in meshes:
-            low, high = (np.array(corner, float).ravel() for corner in (mesh.bbox().min, mesh.bbox().max))
-            extent, farthest = (high - low).max(), np.abs([low, high]).max()
-            fits = extent >= SMALLEST_MESH and farthest <= LARGEST_MESH
-            if np.isfinite(farthest) and extent > 0 and not fits:
-                raise ParameterError(
-                    f'mrt_whitted: the mesh "{mesh.id()}" is {extent:.3g} across and reaches to '
-                    f"{farthest:.3g}; rays meet meshes from {SMALLEST_MESH:g} to {LARGEST_MESH:g}: scale the "
-                    "scene"
-                )
+            _check_size(mesh)
         spheres = [s for s in self.native if is_sphere(s)]
         quadrics = Counter[str]()
         for table in (s.quadrics() for s in self.quadrics):
             quadrics[table.kind] += len(table.rows)
         return {
-            "vectorised": is_jit(),  # is the variant one that compiles kernels
-            "native_shapes": len(self.native),  # that only Mitsuba can trace
-            "meshes": len(meshes),  # of the native ones, and of those in groups
+            "vectorised": is_jit(),
+            "native_shapes": len(self.native),
+            "meshes": len(meshes),
             "spheres": len(spheres),
-            # Those that face outwards and do not emit
             "plain_spheres": sum(not (s.has_flipped_normals() or s.is_emitter()) for s in spheres),
-            "planes": len(self.planes),  # infinite ones
-            "quadrics": tuple(sorted(quadrics.items())),  # kinds of exact ones, and how many of each
+            "planes": len(self.planes),
+            "quadrics": tuple(sorted(quadrics.items())),
         }
 
 
-def _lights(snapshot: Snapshot) -> tuple[list[Any], list[Any] | None, dict[str, Any]]:
-    """Return the lights, their numbers where all have some, and the facts about them."""
+def _check_size(mesh: mi.Mesh) -> None:
+    low, high = (np.array(corner, float).ravel() for corner in (mesh.bbox().min, mesh.bbox().max))
+    extent = (high - low).max()
+    farthest = np.abs([low, high]).max()
+    fits = extent >= SMALLEST_MESH and farthest <= LARGEST_MESH
+    if np.isfinite(farthest) and extent > 0 and not fits:
+        raise ParameterError(
+            f'mrt_whitted: the mesh "{mesh.id()}" is {extent:.3g} across and reaches to {farthest:.3g}; rays '
+            f"meet meshes from {SMALLEST_MESH:g} to {LARGEST_MESH:g}: scale the scene"
+        )
+
+
+def _read_lights(
+    snapshot: Snapshot,
+) -> tuple[list[mi.Emitter], list[list[list[float]]] | None, dict[str, Any]]:
+    """Return the lights, their rows where all have some, and the facts about them."""
     largest = {id(e): brightness(e) for e in snapshot.emitters}
     lights = [e for e in snapshot.emitters if not e.is_environment() and largest[id(e)] != 0]
-    numbers: list[Any] | None = None
-    if is_jit() and not mi.is_spectral and all(hasattr(light, "numbers") for light in lights):
-        numbers = [light.numbers() for light in lights]
-        numbers = None if None in numbers else numbers
+    rows = _light_rows(lights)
     environment = snapshot.environment
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
     surfaces = [largest[id(e)] for e in lights if mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
-    return lights, numbers, {
-        "lights": len(lights),  # emitters but for the environment and what is black
+    facts = {
+        "lights": len(lights),
         "random_lights": sum(not mi.has_flag(e.flags(), delta) for e in lights),
         "surface_emitters": len(surfaces),
         "environment": environment is not None,
-        "sky": 0.0 if environment is None else largest[id(environment)],  # its radiance; inf if not known
-        "emission": max(surfaces, default=0.0),  # the same of the surfaces
-        "tabled": numbers is not None,  # can the lights be
-    }  # fmt: skip
+        "sky": 0.0 if environment is None else largest[id(environment)],
+        "emission": max(surfaces, default=0.0),
+        "tabled": rows is not None,
+    }
+    return lights, rows, facts
 
 
-def _materials(snapshot: Snapshot) -> tuple[list[Any], dict[str, Any]]:
+def _light_rows(lights: list[mi.Emitter]) -> list[list[list[float]]] | None:
+    """Return the rows of the lights for a table, None where one has no place in it."""
+    kind = plugin("light").MrtLight
+    if not is_jit() or mi.is_spectral or not all(isinstance(light, kind) for light in lights):
+        return None
+    rows = [light.fixed_row() for light in lights]
+    return None if None in rows else rows
+
+
+def _read_materials(snapshot: Snapshot) -> tuple[list[np.ndarray], dict[str, Any]]:
     """Return the materials as rows of a table, none where they have no place in one, and the facts."""
-    bsdfs, found = snapshot.bsdfs, material_rows(snapshot.shapes)
-    rows, unmergeable = ([], found) if isinstance(found, str) else (found, "")
-    return rows, {
-        # All that mrt_bsdf has, and whether a material has them; those outside the table may have any
-        "lobes": tuple(
-            (lobe.name, bool(unmergeable) or any(row[1 + k].any() for row in rows))
-            for k, lobe in enumerate(LOBES)
-        ),
-        "mirrors": tuple(
-            b.mirror_bound() if hasattr(b, "mirror_bound") else Mirror(1.0, 1.0)
-            for b in bsdfs
-            if has_mirror(b)
-        ),
-        "oriented": any(map(is_oriented, bsdfs)),  # does one depend on tangents
-        "textured": bool(unmergeable) and any(map(is_textured, bsdfs)),  # does one vary over its surface
-        "two_sided": any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in bsdfs),  # lit from behind
-        "unmergeable": unmergeable,  # why they have no place in one table; "" where they do
-    }  # fmt: skip
+    bsdfs, outcome = snapshot.bsdfs, material_rows(snapshot.shapes)
+    unmergeable = outcome if isinstance(outcome, str) else ""
+    rows = [] if isinstance(outcome, str) else outcome
+    # Those outside the table may have any lobe
+    lobes = [
+        (lobe.name, bool(unmergeable) or any(row[1 + k].any() for row in rows))
+        for k, lobe in enumerate(LOBES)
+    ]
+    facts = {
+        "lobes": tuple(lobes),
+        "mirrors": tuple(_mirror_bound(b) for b in bsdfs if has_mirror(b)),
+        "oriented": any(map(is_oriented, bsdfs)),
+        "textured": bool(unmergeable) and any(map(is_textured, bsdfs)),
+        "two_sided": any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in bsdfs),
+        "unmergeable": unmergeable,
+    }
+    return rows, facts
 
 
-def has_mirror(bsdf: Any) -> bool:
+def is_mrt_bsdf(bsdf: mi.BSDF) -> bool:
+    """Return whether a material is an ``mrt_bsdf`` itself: a class derived from it may be anything."""
+    return type(bsdf) is plugin("bsdf").MrtBSDF
+
+
+def has_mirror(bsdf: mi.BSDF) -> bool:
     """Return whether a BSDF reflects like a mirror."""
     return bsdf.has_attribute("mirror_reflectance") or mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
 
 
-def is_textured(bsdf: Any) -> bool:
+def _mirror_bound(bsdf: mi.BSDF) -> Mirror:
+    return bsdf.mirror_bound() if is_mrt_bsdf(bsdf) else Mirror(1.0, 1.0)
+
+
+def is_textured(bsdf: mi.BSDF) -> bool:
     """Return whether a BSDF varies over its surface; the flags of Mitsuba's own do not say so."""
-    if hasattr(bsdf, "mirror_bound"):
+    if is_mrt_bsdf(bsdf):
         return mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
-    return any(map(varies, mi.traverse(bsdf).hierarchy))
+    return any(varies(node) or not is_known(node) for node in mi.traverse(bsdf).hierarchy)
 
 
-def is_oriented(bsdf: Any) -> bool:
+def is_oriented(bsdf: mi.BSDF) -> bool:
     """Return whether a BSDF depends on how the surface is turned about its normal."""
-    if hasattr(bsdf, "mirror_bound"):
+    if is_mrt_bsdf(bsdf):
         return False
     names = {node.class_name() for node in mi.traverse(bsdf).hierarchy}
     if names & {"BumpMap", "NormalMap"} or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Anisotropic):
         return True
-    return not type(bsdf).__module__.startswith("mitsuba")  # somebody else's, which may ask for anything
+    return not is_known(bsdf)

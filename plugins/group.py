@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from . import plugin
 from .mesh_api import Placement, keep_apart, write_buffers
 from .parameters import ParameterError, choice, segments
 from .quadric_kinds import KINDS, QuadricTable
@@ -13,7 +14,7 @@ from .quadric_kinds import KINDS, QuadricTable
 CLOSED = tuple(name for name, kind in KINDS.items() if kind.closed)
 
 
-class MrtGroup(mi.Mesh):
+class MrtGroup(plugin("exact_mesh").ExactMesh):  # type: ignore[misc]
     r"""Many spheres, cones or cylinders as one shape, with per-object values for textures.
 
     Mitsuba takes about 0.1 ms for a native shape, 1 ms for one in Python, and traces the methods of each BSDF
@@ -64,11 +65,7 @@ class MrtGroup(mi.Mesh):
         keep_apart(self, "mrt_group", sizes[1])
 
     def quadrics(self) -> QuadricTable:
-        """Return what ``mrt_whitted`` intersects in place of the mesh."""
         return self.table
-
-    def moving_frame(self) -> None:
-        """Return None: its objects have no derivatives."""
 
     def to_string(self) -> str:
         return f"MrtGroup[{self.content}]"
@@ -97,6 +94,3 @@ def _check(numbers: np.ndarray) -> None:
         if wrong.any():
             row = int(np.argmax(wrong))
             raise ParameterError(f'mrt_group: row {row} of "numbers" is {fault}: {numbers[row].tolist()}')
-
-
-mi.register_shape("mrt_group", MrtGroup)

@@ -7,12 +7,13 @@ decide, and the integrator obeys. A plan may be edited (``dataclasses.replace``)
 from __future__ import annotations
 
 import math
-from collections import namedtuple
-from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+
+from .table import names_in
 
 # Up to this many lights the kernel holds the code of each; beyond, it loops over them
 UNROLLED_LIGHTS = 8
@@ -30,11 +31,39 @@ VARYING = "a material varies over its surface"
 GRADIENTS = "derivatives are wanted"
 
 
-#: Bounds of a material's mirror rays: reflectance, index, reflectance at normal incidence; inf if unknown
-Mirror = namedtuple("Mirror", "reflectance int_ior at_normal", defaults=[1.0])
+class Mirror(NamedTuple):
+    """Bounds of a material's mirror rays; inf where they are not known."""
 
-#: The content of a scene, as far as a kernel depends on it: see ``facts``
-SceneFacts = SimpleNamespace
+    reflectance: float
+    int_ior: float
+    at_normal: float = 1.0  # reflectance at normal incidence
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """The content of a scene, as far as a kernel depends on it."""
+
+    vectorised: bool  #: is the variant one that compiles kernels
+    pinhole: bool  #: do the rays of the first camera start at one point
+    native_shapes: int  #: shapes that only Mitsuba can trace
+    meshes: int  #: meshes among these, and in groups
+    spheres: int  #: spheres among them
+    plain_spheres: int  #: those that face outwards and do not emit
+    planes: int  #: infinite planes
+    quadrics: tuple[tuple[str, int], ...]  #: kinds of exact quadrics, and how many of each
+    lights: int  #: emitters but for the environment and those that are black
+    random_lights: int  #: lights that are no point and no direction
+    surface_emitters: int  #: lights that are a surface
+    tabled: bool  #: do all lights have a place in a table
+    environment: bool  #: is there an environment emitter
+    sky: float  #: its largest radiance; 0 without one, inf where it is not known
+    emission: float  #: the same of the surfaces
+    lobes: tuple[tuple[str, bool], ...]  #: those of ``mrt_bsdf``, and whether a material may have them
+    mirrors: tuple[Mirror, ...]  #: of the materials that reflect like a mirror
+    oriented: bool  #: does a material depend on tangents
+    textured: bool  #: does a material vary over its surface
+    two_sided: bool  #: is a material lit from behind
+    unmergeable: str  #: why the materials have no place in one table; "" where they do
 
 
 @dataclass(frozen=True)
@@ -69,202 +98,318 @@ class KernelPlan:
         return dict(self.reasons).get(name)
 
 
-def bounce_cost(tracer: Any, int_ior: float) -> int:
+class Tracer(Protocol):
+    """The parameters of the integrator that a plan depends on."""
+
+    max_depth: int
+    clamp: bool
+    min_contribution: float
+    bounce_budget: str
+
+
+def bounce_cost(tracer: Tracer, int_ior: float) -> int:
     """Return what a bounce off a material of this index takes from the bounce budget."""
     if tracer.bounce_budget == "plain":
         return 1
     return max(10 - int(np.float32(10) * np.float32(min(int_ior, 1))), 1)
 
 
-def _cut_off(case: SimpleNamespace) -> tuple[float, float]:
+@dataclass
+class Case:
+    """What the rules go by: a scene, the integrator, and the decisions so far."""
+
+    facts: SceneFacts
+    tracer: Tracer
+    own_sky: float | None  # largest radiance of the integrator's ``sky``; None without one
+    made: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        facts = self.facts
+        sky = facts.sky if self.own_sky is None else self.own_sky
+        # A light counts for one, where its share is clamped to that, and the sky for one at least
+        lights = facts.lights if self.tracer.clamp or facts.lights == 0 else math.inf
+        #: bounds the radiance from anywhere, but for what mirrors add; inf without bound
+        self.arriving = lights + max(1, sky) + facts.emission
+        #: mirrors that the bounce budget admits
+        self.affordable = [m for m in facts.mirrors if self.cost(m) < self.tracer.max_depth]
+        self.lobes = tuple(name for name, present in facts.lobes if present)
+        self.quadrics = sum(count for _, count in facts.quadrics)
+        self.objects = facts.native_shapes + self.quadrics
+
+    def cost(self, mirror: Mirror) -> int:
+        """Return what a bounce off a mirror takes from the bounce budget."""
+        return bounce_cost(self.tracer, mirror.int_ior)
+
+
+Reasons = dict[str, bool]  # against something, by whether they hold; the first that holds is given
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A decision."""
+
+    name: str  #: the field of the plan
+    what: str  #: what is decided, in words
+    #: what kernels hold, in words: a format of ``facts`` and ``plan``, or a function of them; "" for nothing
+    content: str | Callable[[SceneFacts, KernelPlan], str]
+    against: Callable[[Case], Reasons]
+    value: Callable[[Case, bool], Any]  # of the field, by whether there is no reason against it
+
+
+RULES: list[Rule] = []  #: in the order in which they are taken: later ones may ask for earlier decisions
+
+
+def _free(case: Case, free: bool) -> bool:
+    return free
+
+
+def rule(
+    name: str,
+    what: str,
+    content: str | Callable[[SceneFacts, KernelPlan], str],
+    value: Callable[[Case, bool], Any] = _free,
+) -> Callable[[Callable[[Case], Reasons]], Callable[[Case], Reasons]]:
+    """Put a decision into ``RULES``, by the function that gives the reasons against it."""
+
+    def add(against: Callable[[Case], Reasons]) -> Callable[[Case], Reasons]:
+        RULES.append(Rule(name, what, content, against, value))
+        return against
+
+    return add
+
+
+# ----------------------------------------------- The rules ---------------------------------------------
+
+_OTHERS = "other shapes, or spheres that emit or face inwards"
+
+
+_SPHERES = {"table": "spheres from a table of centres and radii", "corrected": "hits moved onto spheres"}
+
+
+def _sphere_content(facts: SceneFacts, plan: KernelPlan) -> str:
+    return _SPHERES[plan.spheres]
+
+
+def _sphere_form(case: Case, free: bool) -> str:
+    if free:
+        return "table"
+    return "corrected" if case.facts.spheres else "none"
+
+
+@rule("spheres", "table of spheres", _sphere_content, _sphere_form)
+def _spheres(case: Case) -> Reasons:
+    facts = case.facts
+    return {
+        "no sphere in the scene": facts.spheres == 0,
+        SCALAR_VARIANT: not facts.vectorised,
+        VARYING: facts.textured,
+        "a material needs the frame along texture coordinates": facts.oriented,
+        _OTHERS: facts.plain_spheres < facts.native_shapes,
+    }
+
+
+_LIGHTS = {"unrolled": "unrolled", "loop": "in a loop of calls", "table": "in a loop over a table"}
+
+
+def _light_content(facts: SceneFacts, plan: KernelPlan) -> str:
+    return f"{facts.lights} lights, {_LIGHTS[plan.lights]}"
+
+
+def _light_form(case: Case, free: bool) -> str:
+    facts = case.facts
+    if not free:
+        return "none"
+    if facts.lights <= UNROLLED_LIGHTS or not facts.vectorised:
+        return "unrolled"
+    return "table" if facts.tabled else "loop"
+
+
+@rule("lights", "shadow rays", _light_content, _light_form)
+def _lights(case: Case) -> Reasons:
+    return {"no light": case.facts.lights == 0, "every material is black": not case.lobes}
+
+
+@rule("mirrors", "bounce loop", "mirror bounces")
+def _mirrors(case: Case) -> Reasons:
+    brightest = max((m.reflectance for m in case.affordable), default=0.0) * case.arriving
+    return {
+        "max_depth admits no mirror ray": bool(case.facts.mirrors) and not case.affordable,
+        "no material reflects visibly": not brightest > case.tracer.min_contribution,
+    }
+
+
+def _lobe_content(facts: SceneFacts, plan: KernelPlan) -> str:
+    return f"lobes: {', '.join(plan.lobes)}"
+
+
+def _lobe_names(case: Case, free: bool) -> tuple[str, ...]:
+    return case.lobes
+
+
+@rule("lobes", "one of the lobes", _lobe_content, _lobe_names)
+def _lobes(case: Case) -> Reasons:
+    missing = {f"no material has the {name} one": not present for name, present in reversed(case.facts.lobes)}
+    return {"every material is black": not case.lobes, **missing}
+
+
+def _cut_off_content(facts: SceneFacts, plan: KernelPlan) -> str:
+    return "an end of paths too dim to be seen" if 0 < plan.cut_off[0] < math.inf else ""
+
+
+def _cut_off_bounds(case: Case, free: bool) -> tuple[float, float]:
     """Return the bound of what may still arrive along a path, and that of what lights bring.
 
     Both count the hits of a path, weighted by its throughput at normal incidence. It is one where materials
     reflect less than a half there: what is left out at further hits adds less than as much again. Where
     mirrors face each other, it adds up.
     """
-    mirrors, tracer = case.affordable if case.made["mirrors"] else [], case.tracer
-    reflectance, hits = max((m.at_normal for m in mirrors if m.at_normal < math.inf), default=0.0), 1.0
+    mirrors = case.affordable if case.made["mirrors"] else []
+    hits = 1.0
+    reflectance = max((m.at_normal for m in mirrors if m.at_normal < math.inf), default=0.0)
     if reflectance > 0.5:
-        bounces = (tracer.max_depth - 2) // min(bounce_cost(tracer, m.int_ior) for m in mirrors) + 1
+        bounces = (case.tracer.max_depth - 2) // min(map(case.cost, mirrors)) + 1
         hits = sum(min(reflectance, 1.0) ** k for k in range(max(bounces, 0) + 1))
     return case.arriving * hits if case.made["mirrors"] else 0.0, case.facts.lights * hits
 
 
-#: A decision: the field of the plan; what is decided, in words; what kernels hold, perhaps by facts and plan
-#: ("" if there is nothing to tell); reasons against it, the first that holds being given; and the value, by
-#: the case (see ``make_plan``) and whether there is no reason
-Rule = namedtuple("Rule", "name what held against value", defaults=[lambda case, free: free])
+@rule("cut_off", "cut-off", _cut_off_content, _cut_off_bounds)
+def _cut_off(case: Case) -> Reasons:
+    unbounded = case.made["mirrors"] and case.arriving == math.inf
+    return {"what may still arrive has no known bound": unbounded}
 
-_SPHERES = {"table": "spheres from a table of centres and radii", "corrected": "hits moved onto spheres"}
-_LIGHTS = {"unrolled": "unrolled", "loop": "in a loop of calls", "table": "in a loop over a table"}
+
+@rule("bvh", "BVH", "{facts.native_shapes} shapes in Mitsuba's BVH")
+def _bvh(case: Case) -> Reasons:
+    return {"no shapes but analytic ones": case.facts.native_shapes == 0}
+
+
+@rule("coherent", "coherent packets", "coherent packets of rays")
+def _coherent(case: Case) -> Reasons:  # it pays where there are thousands of triangles to meet
+    return {"no mesh in the scene": case.facts.meshes == 0}
+
+
+def _quadric_content(facts: SceneFacts, plan: KernelPlan) -> str:
+    count = sum(number for kind, number in facts.quadrics if kind in plan.quadrics)
+    return f"{count} exact objects in a tree: {', '.join(plan.quadrics)}"
+
+
+def _quadric_kinds(case: Case, free: bool) -> tuple[str, ...]:
+    return tuple(kind for kind, _ in case.facts.quadrics)
+
+
+@rule("quadrics", "cones and cylinders", _quadric_content, _quadric_kinds)
+def _quadrics(case: Case) -> Reasons:
+    return {"none in the scene": not case.facts.quadrics}
+
+
+@rule("planes", "planes", "{facts.planes} analytic planes")
+def _planes(case: Case) -> Reasons:
+    return {"none in the scene": case.facts.planes == 0}
+
+
+@rule("buffers", "light buffers", "light buffers: what may be in the way of each light")
+def _buffers(case: Case) -> Reasons:
+    facts = case.facts
+    return {
+        "no light": case.made["lights"] == "none",
+        SCALAR_VARIANT: not facts.vectorised,
+        f"a light other than {names_in('lights')}, or one with derivatives": not facts.tabled,
+        _OTHERS: facts.native_shapes > 0 and case.made["spheres"] != "table",
+        "few objects": case.objects < LEAST_BUFFERED,
+        "too many lights and objects": case.objects * facts.lights > MOST_PAIRS,
+    }
+
+
+@rule("eye", "lists around the eye", "lists around the eye: what its rays may meet")
+def _eye(case: Case) -> Reasons:
+    return {
+        SCALAR_VARIANT: not case.facts.vectorised,
+        "few cones and cylinders": case.quadrics < LEAST_BUFFERED,
+        "too many cones and cylinders": case.quadrics > MOST_SEEN,
+        "the camera is no pinhole": not case.facts.pinhole,
+    }
+
+
+@rule("random", "random numbers", "random numbers")
+def _random(case: Case) -> Reasons:
+    return {"every light is a point or a direction": case.facts.random_lights == 0}
+
+
+@rule("emission", "emission", "emission of surfaces")
+def _emission(case: Case) -> Reasons:
+    return {"no surface emits": case.facts.surface_emitters == 0}
+
+
 _SKY = {"parameter": "the integrator's sky", "environment": "the scene's sky"}
-_OTHERS = "other shapes, or spheres that emit or face inwards"
 
 
-# In the order in which they are taken: later ones may ask for earlier decisions
-RULES = (
-    Rule(
-        "spheres", "table of spheres",
-        lambda facts, plan: _SPHERES[plan.spheres],
-        lambda case: {
-            "no sphere in the scene": case.facts.spheres == 0,
-            SCALAR_VARIANT: not case.facts.vectorised,
-            VARYING: case.facts.textured,
-            "a material needs the frame along texture coordinates": case.facts.oriented,
-            _OTHERS: case.facts.plain_spheres < case.facts.native_shapes,
-        },
-        lambda case, free: "table" if free else "corrected" if case.facts.spheres else "none",
-    ),
-    Rule(
-        "lights", "shadow rays",
-        lambda facts, plan: f"{facts.lights} lights, {_LIGHTS[plan.lights]}",
-        lambda case: {"no light": case.facts.lights == 0, "every material is black": not case.lobes},
-        lambda case, free: "none" if not free
-        else "unrolled" if case.facts.lights <= UNROLLED_LIGHTS or not case.facts.vectorised
-        else "table" if case.facts.tabled else "loop",
-    ),
-    Rule(
-        "mirrors", "bounce loop", "mirror bounces",
-        lambda case: {
-            "max_depth admits no mirror ray": bool(case.facts.mirrors) and not case.affordable,
-            "no material reflects visibly": not case.visible,
-        },
-    ),
-    Rule(
-        "lobes", "one of the lobes",
-        lambda facts, plan: f"lobes: {', '.join(plan.lobes)}",
-        lambda case: {
-            "every material is black": not case.lobes,
-            **{f"no material has the {name} one": not there for name, there in reversed(case.facts.lobes)},
-        },
-        lambda case, free: case.lobes,
-    ),
-    Rule(
-        "cut_off", "cut-off",
-        lambda facts, plan: "an end of paths too dim to be seen" if 0 < plan.cut_off[0] < math.inf else "",
-        lambda case: {
-            "what may still arrive has no known bound": case.made["mirrors"] and case.arriving == math.inf
-        },
-        lambda case, free: _cut_off(case),
-    ),
-    Rule(
-        "bvh", "BVH",
-        lambda facts, plan: f"{facts.native_shapes} shapes in Mitsuba's BVH",
-        lambda case: {"no shapes but analytic ones": case.facts.native_shapes == 0},
-    ),
-    Rule(  # it pays where there are thousands of triangles to meet
-        "coherent", "coherent packets", "coherent packets of rays",
-        lambda case: {"no mesh in the scene": case.facts.meshes == 0},
-    ),
-    Rule(
-        "quadrics", "cones and cylinders",
-        lambda facts, plan: f"{sum(n for kind, n in facts.quadrics if kind in plan.quadrics)} exact objects "
-        f"in a tree: {', '.join(plan.quadrics)}",
-        lambda case: {"none in the scene": not case.facts.quadrics},
-        lambda case, free: tuple(kind for kind, _ in case.facts.quadrics),
-    ),
-    Rule(
-        "planes", "planes",
-        lambda facts, plan: f"{facts.planes} analytic planes",
-        lambda case: {"none in the scene": case.facts.planes == 0},
-    ),
-    Rule(
-        "buffers", "light buffers", "light buffers: what may be in the way of each light",
-        lambda case: {
-            "no light": case.made["lights"] == "none",
-            SCALAR_VARIANT: not case.facts.vectorised,
-            "a light other than mrt_light, or one with derivatives": not case.facts.tabled,
-            _OTHERS: case.facts.native_shapes > 0 and case.made["spheres"] != "table",
-            "few objects": case.objects < LEAST_BUFFERED,
-            "too many lights and objects": case.objects * case.facts.lights > MOST_PAIRS,
-        },
-    ),
-    Rule(
-        "eye", "lists around the eye", "lists around the eye: what its rays may meet",
-        lambda case: {
-            SCALAR_VARIANT: not case.facts.vectorised,
-            "few cones and cylinders": case.quadrics < LEAST_BUFFERED,
-            "too many cones and cylinders": case.quadrics > MOST_SEEN,
-            "the camera is no pinhole": not case.facts.pinhole,
-        },
-    ),
-    Rule(
-        "random", "random numbers", "random numbers",
-        lambda case: {"every light is a point or a direction": case.facts.random_lights == 0},
-    ),
-    Rule(
-        "emission", "emission", "emission of surfaces",
-        lambda case: {"no surface emits": case.facts.surface_emitters == 0},
-    ),
-    Rule(
-        "sky", "sky",
-        lambda facts, plan: _SKY[plan.sky],
-        lambda case: {"no sky in the scene": case.sky == "none"},
-        lambda case, free: case.sky,
-    ),
-    Rule(
-        "textures", "textures", "textures and their coordinates",
-        lambda case: {"every material is uniform": not case.facts.textured},
-    ),
-    Rule(
-        "shading_frames", "shading normals", "shading normals of meshes",
-        lambda case: {"no mesh in the scene": case.facts.meshes == 0},
-    ),
-    Rule(
-        "tangents", "tangents", "tangents along texture coordinates",
-        lambda case: {
-            "no material depends on the direction of texture coordinates": not case.facts.oriented
-        },
-    ),
-    Rule(
-        "merged", "merged materials", "all materials as one, from a table",
-        lambda case: {case.facts.unmergeable: bool(case.facts.unmergeable)},
-    ),
-    Rule(
-        "two_sided", "light from behind", "light from behind surfaces",
-        lambda case: {"no material is lit from behind": not case.facts.two_sided},
-    ),
-)  # fmt: skip
+def _sky_content(facts: SceneFacts, plan: KernelPlan) -> str:
+    return _SKY[plan.sky]
+
+
+def _sky_source(case: Case, free: bool = True) -> str:
+    if case.own_sky is not None:
+        return "parameter"
+    return "environment" if case.facts.environment else "none"
+
+
+@rule("sky", "sky", _sky_content, _sky_source)
+def _sky(case: Case) -> Reasons:
+    return {"no sky in the scene": _sky_source(case) == "none"}
+
+
+@rule("textures", "textures", "textures and their coordinates")
+def _textures(case: Case) -> Reasons:
+    return {"every material is uniform": not case.facts.textured}
+
+
+@rule("shading_frames", "shading normals", "shading normals of meshes")
+def _shading_frames(case: Case) -> Reasons:
+    return {"no mesh in the scene": case.facts.meshes == 0}
+
+
+@rule("tangents", "tangents", "tangents along texture coordinates")
+def _tangents(case: Case) -> Reasons:
+    return {"no material depends on the direction of texture coordinates": not case.facts.oriented}
+
+
+@rule("merged", "merged materials", "all materials as one, from a table")
+def _merged(case: Case) -> Reasons:
+    return {case.facts.unmergeable: bool(case.facts.unmergeable)}
+
+
+@rule("two_sided", "light from behind", "light from behind surfaces")
+def _two_sided(case: Case) -> Reasons:
+    return {"no material is lit from behind": not case.facts.two_sided}
+
 
 #: What a decision is about, by its name
-WHAT = {rule.name: rule.what for rule in RULES}
+WHAT = {each.name: each.what for each in RULES}
 
 
-def make_plan(facts: SceneFacts, tracer: Any, own_sky: float | None) -> KernelPlan:
+def make_plan(facts: SceneFacts, tracer: Tracer, own_sky: float | None) -> KernelPlan:
     """Decide what the kernels for a scene hold.
 
     ``tracer`` has the integrator's parameters; ``own_sky`` is the largest radiance of its ``sky``: inf where
     that is not known, None without one.
     """
-    sky = facts.sky if own_sky is None else own_sky
-    # A light counts for one, where its share is clamped to that, and the sky for one at least
-    lights = facts.lights if tracer.clamp or facts.lights == 0 else math.inf
-    arriving = lights + max(1, sky) + facts.emission
-    quadrics = sum(count for _, count in facts.quadrics)
-    affordable = [m for m in facts.mirrors if bounce_cost(tracer, m.int_ior) < tracer.max_depth]
-    made, reasons = dict[str, Any](), list[tuple[str, str]]()
-    case = SimpleNamespace(  # what the rules go by
-        facts=facts,
-        tracer=tracer,
-        made=made,  # the decisions so far
-        arriving=arriving,  # bounds the radiance from anywhere, but for what mirrors add; inf without bound
-        affordable=affordable,  # mirrors that the bounce budget admits
-        visible=any(m.reflectance * arriving > tracer.min_contribution for m in affordable),
-        sky="parameter" if own_sky is not None else "environment" if facts.environment else "none",
-        lobes=tuple(name for name, there in facts.lobes if there),
-        quadrics=quadrics,
-        objects=facts.native_shapes + quadrics,
-    )
-    for rule in RULES:
-        found = [why for why, holds in rule.against(case).items() if holds]
-        reasons += [(rule.name, why) for why in found[:1]]
-        made[rule.name] = rule.value(case, not found)
-    return KernelPlan(**made, reasons=tuple(reasons))
+    case = Case(facts, tracer, own_sky)
+    reasons = list[tuple[str, str]]()
+    for each in RULES:
+        valid = [why for why, holds in each.against(case).items() if holds]
+        reasons += [(each.name, why) for why in valid[:1]]
+        case.made[each.name] = each.value(case, not valid)
+    return KernelPlan(**case.made, reasons=tuple(reasons))
 
 
-def held(plan: KernelPlan, facts: SceneFacts) -> list[str]:
+def contents(plan: KernelPlan, facts: SceneFacts) -> list[str]:
     """Return a line for each thing that the kernels hold."""
-    there = [rule.held for rule in RULES if getattr(plan, rule.name) not in (False, "none", ())]
-    lines = [text if isinstance(text, str) else text(facts, plan) for text in there]
+    lines = []
+    for each in RULES:
+        if getattr(plan, each.name) in (False, "none", ()):
+            continue
+        if isinstance(each.content, str):
+            lines.append(each.content.format(facts=facts, plan=plan))
+        else:
+            lines.append(each.content(facts, plan))
     return [line for line in lines if line]

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .lights import towards
-from .parameters import spectrum, vector
+from .parameters import ParameterError, spectrum, vector
 from .variants import first, is_jit, pointer, varies
 
 
@@ -37,12 +37,17 @@ class MrtLight(mi.Emitter):
             <rgb name="intensity" value="2"/>
         </emitter>
 
-    Nearest stock plugin: ``point``, which falls off with the squared distance. Light tracing (``ptracer``) is
-    refused: a light without falloff emits no finite power.
+    Nearest stock plugin: ``point``, which falls off with the squared distance. ``position`` places the light,
+    so ``to_world`` is refused. So is light tracing (``ptracer``): a light without falloff emits no finite
+    power.
     """
 
     def __init__(self, props: mi.Properties) -> None:
         mi.Emitter.__init__(self, props)
+        if "to_world" in props:
+            raise ParameterError(
+                f'{props.plugin_name()}: "to_world" is not accepted; give "position" in world space'
+            )
         self.position = mi.Point3f(vector(props, "position", (0, 0, 0)))
         self.intensity = spectrum(props, "intensity", 1.0, emissive=True)
         self.m_flags = +mi.EmitterFlags.DeltaPosition
@@ -67,8 +72,8 @@ class MrtLight(mi.Emitter):
         """Return what arrives at a point from which the light is seen along the unit vector ``d``."""
         return intensity
 
-    def numbers(self) -> list[list[float]] | None:
-        """Return the numbers of the row; None where they vary, or where derivatives are wanted."""
+    def fixed_row(self) -> list[list[float]] | None:
+        """Return the row as plain numbers; None where they vary, or where derivatives are wanted."""
         row = None if varies(self.intensity) else self.row(dr.zeros(mi.Interaction3f))
         if row is None or dr.grad_enabled(row):
             return None
@@ -113,6 +118,3 @@ class MrtLight(mi.Emitter):
 
     def to_string(self) -> str:
         return f"MrtLight[position={self.position}, intensity={self.intensity}]"
-
-
-mi.register_emitter("mrt_light", MrtLight)

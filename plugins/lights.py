@@ -1,7 +1,7 @@
-"""The lights of a scene, as numbers in place of calls to plugins where they are known.
+"""The lights of a scene, as rows of a table in place of calls to plugins where they are known.
 
-A light that is tabled is an emitter with ``numbers()``, such as ``mrt_light``. Another kind derives from
-that, adds to its ``row`` and overrides ``arriving``.
+A light of the table is an ``mrt_light``, or derives from ``plugin("light").MrtLight``, adds to its ``row``
+and overrides ``arriving``.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import is_known
 from .variants import Table, largest, pointer
 
 
@@ -32,23 +33,26 @@ def towards(position: mi.Point3f, it: mi.Interaction3f) -> mi.DirectionSample3f:
 class Lights:
     """The lights of a scene as its kernels have them; ``form`` is that of the plan."""
 
-    def __init__(self, lights: list[Any], numbers: list[Any] | None, form: str) -> None:
+    def __init__(
+        self, lights: list[mi.Emitter], light_rows: list[list[list[float]]] | None, form: str
+    ) -> None:
         self.unrolled = len(lights) if form == "unrolled" else 0  #: those with code of their own
         self.count = dr.opaque(mi.UInt32, len(lights)) if form in ("loop", "table") else None
-        self.called: Any = lights if numbers is None else None
+        self.called: Any = lights if light_rows is None else None
         if form == "loop":
             self.called = pointer("Emitter", lights)
-        elif form != "none" and numbers is not None:
+        elif form != "none" and light_rows is not None:
             kinds = [type(light) for light in lights]
             self.kinds = list(dict.fromkeys(kinds))  # the kernel holds these only
             self.kind_of = [self.kinds.index(kind) for kind in kinds]
-            rows = np.zeros((1 + max(map(len, numbers)), len(lights), 3))
-            for k, row in enumerate(numbers):
-                rows[0, k], rows[1 : 1 + len(row), k] = self.kind_of[k], row
             if form == "table":
-                self.columns = [Table(mi.Vector3f, part) for part in rows]
+                parts = np.zeros((1 + max(map(len, light_rows)), len(lights), 3))
+                for k, row in enumerate(light_rows):
+                    parts[0, k] = self.kind_of[k]
+                    parts[1 : 1 + len(row), k] = row
+                self.parts = [Table(mi.Vector3f, part) for part in parts]
             else:
-                self.rows = [[dr.opaque(mi.Vector3f, part) for part in row] for row in numbers]
+                self.rows = [[dr.opaque(mi.Vector3f, part) for part in row] for row in light_rows]
 
     def sample(
         self, light: Any, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
@@ -62,8 +66,8 @@ class Lights:
         if self.unrolled:
             kinds, row = [self.kinds[self.kind_of[light]]], self.rows[light]
         else:
-            kinds, row = self.kinds, [column(light, active) for column in self.columns[1:]]
-            kind = self.columns[0](light, active).x if len(kinds) > 1 else None
+            kinds, row = self.kinds, [part(light, active) for part in self.parts[1:]]
+            kind = self.parts[0](light, active).x if len(kinds) > 1 else None
         ds, channels = towards(mi.Point3f(row[0]), it), dr.size_v(mi.UnpolarizedSpectrum)
         row = [mi.UnpolarizedSpectrum(list(row[1])[:channels]), *row[2:]]
         arriving = kinds[0].arriving(ds.d, *row)
@@ -72,11 +76,14 @@ class Lights:
         return ds, arriving
 
 
-def brightness(emitter: Any) -> float:
+def brightness(emitter: mi.Emitter) -> float:
     """Return the largest radiance, irradiance or intensity of an emitter; inf where it is not known.
 
-    It is not known of what varies, of spectra in scalar variants, and where derivatives are wanted.
+    It is not known of what varies, of spectra in scalar variants, of what somebody else wrote in Python, and
+    where derivatives are wanted.
     """
+    if not is_known(emitter):
+        return np.inf
     parameters = mi.traverse(emitter)
     if emitter.class_name() == "EnvironmentMapEmitter":
         data, scale = parameters["data"], parameters["scale"]

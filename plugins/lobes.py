@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import plugin
 from .fresnel import f0_from_ior, fresnel_dielectric, fresnel_schlick
 from .kernel_plan import SCALAR_VARIANT
 from .microfacet import (
@@ -26,6 +27,7 @@ from .microfacet import (
     tan2_theta,
     visible_over_cos,
 )
+from .table import names_in
 from .variants import ByShape, is_jit
 
 # Roughness below this (zero included) acts as this: the lobe is then narrower than float32 directions can
@@ -75,7 +77,7 @@ class Diffuse:
 
     name, reflectance, default = "diffuse", "diffuse_reflectance", 0.5
     flag = "DiffuseReflection"
-    numbers: tuple[str, ...] = ()
+    depends_on: tuple[str, ...] = ()
 
     def value(self, at: Lobes, pair: Pair) -> mi.UnpolarizedSpectrum:
         return at.given[self.reflectance] * (dr.inv_pi * pair.wo.z)
@@ -96,7 +98,7 @@ class Specular:
 
     name, reflectance, default = "specular", "specular_reflectance", 1.0
     flag = "GlossyReflection"
-    numbers: tuple[str, ...] = ("alpha", "int_ior", "ext_ior", "f0")
+    depends_on: tuple[str, ...] = ("alpha", "int_ior", "ext_ior", "f0")
 
     def value(self, at: Lobes, pair: Pair) -> mi.UnpolarizedSpectrum:
         fresnel = at.fresnel(*half_vector_angles(pair.wi, pair.wo))
@@ -233,19 +235,20 @@ def _within(x: Any, least: float, most: float) -> Any:
 
 
 def material_rows(shapes: Sequence[mi.Shape]) -> list[np.ndarray] | str:
-    """Return the ``row`` of the material of each shape, or why they have no place in one table."""
+    """Return the ``fixed_row`` of the material of each shape, or why they have no place in one table."""
     bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
-    mergeable = bool(bsdfs) and all(hasattr(b, "row") for b in bsdfs.values())
+    # Of the class itself: one derived from it may have other lobes
+    mergeable = bool(bsdfs) and {type(b) for b in bsdfs.values()} == {plugin("bsdf").MrtBSDF}
     obstacles = {
         SCALAR_VARIANT: not is_jit(),
         "a spectral variant": mi.is_spectral,
         # Inside an instance, shapes are not the scene's own
         "instances in the scene": any(s.class_name() == "Instance" for s in shapes),
-        "a material other than mrt_bsdf": not mergeable,
+        f"a material other than {names_in('materials')}": not mergeable,
         "materials of different Fresnel formulas": mergeable and len({b.fresnel for b in bsdfs.values()}) > 1,
     }
     reasons = [why for why, holds in obstacles.items() if holds]
-    rows = {} if reasons else {key: bsdf.row() for key, bsdf in bsdfs.items()}
+    rows = {} if reasons else {key: bsdf.fixed_row() for key, bsdf in bsdfs.items()}
     reasons += [row for row in rows.values() if isinstance(row, str)]
     return reasons[0] if reasons else [rows[id(s.bsdf())] for s in shapes]
 

@@ -35,7 +35,7 @@ class MrtMesh(mi.Mesh):
 
     def __init__(self, props: mi.Properties) -> None:
         positions, faces = _array(props, "positions", 3), _array(props, "faces", 3)
-        given = [name for name in _EXTRAS if name in props]
+        given = _given_extras(props)
         extras = {name: _array(props, name, *_EXTRAS[name])[:, : _EXTRAS[name][0]] for name in given}
         if (faces % 1).any():
             raise ParameterError('mrt_mesh: "faces" holds a number that is not whole')
@@ -66,6 +66,13 @@ class MrtMesh(mi.Mesh):
         return f"MrtMesh[{self.content}]"
 
 
+def _given_extras(props: mi.Properties) -> list[str]:
+    given = [name for name in _EXTRAS if name in props]
+    if "normals" in given and props.get("face_normals", False):
+        raise ParameterError('mrt_mesh: give "normals" or "face_normals", not both')
+    return given
+
+
 def _array(props: mi.Properties, name: str, *widths: int) -> np.ndarray:
     if name not in props or not isinstance(props[name], mi.Bitmap):
         raise ParameterError(
@@ -78,6 +85,3 @@ def _array(props: mi.Properties, name: str, *widths: int) -> np.ndarray:
     if not np.isfinite(array).all():
         raise ParameterError(f'mrt_mesh: "{name}" holds a number that is not finite')
     return array[0]
-
-
-mi.register_shape("mrt_mesh", MrtMesh)

@@ -69,6 +69,3 @@ class MrtPlane(mi.Mesh):
 
     def to_string(self) -> str:
         return f"MrtPlane[normal={self.unit_normal.tolist()}, distance={self.distance:g}]"
-
-
-mi.register_shape("mrt_plane", MrtPlane)

@@ -20,7 +20,7 @@ class Quadrics:
 
     Scalar variants have no tree: they go through the list.
 
-    A shape takes part if it has ``quadrics()``, a ``QuadricTable``.
+    The shapes are ``ExactMesh``es.
     """
 
     def __init__(self, shapes: list) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
+from operator import or_
 from typing import Any
 
 import drjit as dr
@@ -47,16 +49,19 @@ class SceneData:
     def __init__(self, reading: Reading, plan: KernelPlan, kept: Kept) -> None:
         self.plan, self.facts, self.environment = plan, reading.facts, reading.snapshot.environment
         now, self._kept = reading.snapshot, kept
+        parts = now.shape_part, now.material_part, now.light_part
+        self.known = now.material_part.known and now.light_part.known
+        self.differentiated = any(part.differentiated for part in parts)  #: are derivatives wanted
         self._form = form = now.shape_part, plan.bvh, plan.planes, plan.quadrics, plan.spheres
         # The shapes by who traces them; ``bvh``: a scene of those that only Mitsuba can, or None for all
         self.bvh, self.planes, self.quadrics, self.errors, self.spheres = kept(
             "traced", form, lambda: _trace(reading, plan)
         )
         lit = now.light_part, plan.lights
-        self.lights: Lights = kept("lights", lit, lambda: Lights(reading.lights, reading.numbers, lit[1]))
+        self.lights: Lights = kept("lights", lit, lambda: Lights(reading.lights, reading.light_rows, lit[1]))
         # Lists of what may be in the way of the lights, with what tests it
         things = [thing for thing in (self.quadrics, self.spheres) if thing is not None and plan.buffers]
-        places = np.array([row[0] for row in reading.numbers or ()])
+        places = np.array([row[0] for row in reading.light_rows or ()])
         self.buffers: list[tuple[PointBuffer, Any]] = kept(
             "buffers",
             (now.light_part, plan.buffers, *form),
@@ -82,6 +87,8 @@ class SceneData:
     def arrays(self, scene: mi.Scene) -> list[Any] | None:
         """Return all that the kernels read; None where they call plugins, which may read anything."""
         plan, sky = self.plan, self.environment
+        if not self.known:
+            return None
         tabled = plan.merged and (plan.lights == "none" or self.facts.tabled)
         tabled = tabled and (plan.spheres == "table" or not plan.bvh)
         if not tabled or (sky is not None and sky.class_name() != "ConstantBackgroundEmitter"):
@@ -175,10 +182,7 @@ class SceneData:
         """Return the values f cos θo at ``hit`` towards ``wos``, the mirror reflectance and its index of
         refraction: all of it in one call.
         """
-        context, lobes = mi.BSDFContext(), self.plan.lobes
-        if 0 < len(lobes) < len(LOBES):
-            flags = [+getattr(mi.BSDFFlags, lobe.flag) for lobe in LOBES if lobe.name in lobes]
-            context.type_mask = sum(flags)
+        context = context_of(self.plan.lobes)
         arguments = (hit.si, wos, facing, hit.found)
         # Not among the arguments, where dispatch would take a bool for its mask
         evaluate = partial(_eval_bsdf, mirror, context)
@@ -190,6 +194,15 @@ class SceneData:
         return dr.if_stmt(
             arguments, hit.found, partial(evaluate, self.merged), partial(evaluate, None), label="bsdf"
         )
+
+
+def context_of(lobes: Sequence[str]) -> mi.BSDFContext:
+    """Return the context in which BSDFs have some lobes, by name; all of them for none."""
+    context = mi.BSDFContext()
+    if 0 < len(lobes) < len(LOBES):
+        flags = [+getattr(mi.BSDFFlags, lobe.flag) for lobe in LOBES if lobe.name in lobes]
+        context.type_mask = reduce(or_, flags)  # several lobes may have the same one
+    return context
 
 
 def _trace(reading: Reading, plan: KernelPlan) -> tuple:

@@ -6,8 +6,12 @@ each of their arrays. It holds the arrays, so that Dr.Jit cannot give their indi
 objects, so that Python cannot give away their ids: parts with equal lists are the same, and no array is read
 to tell.
 
+Numbers may also be written where they lie, through an array of NumPy's: no index shows that, but an update by
+``mi.traverse`` does (``updates``). What somebody else wrote in Python may depend on anything.
+
 What is made of a part is kept with that part as its key (``Kept``). A part that has not changed since the
-last snapshot is the same object as then; one with derivatives never is, as what was made of it has none.
+last snapshot is the same object as then; one with derivatives never is, as what was made of it has none, nor
+one of materials or lights with a class that is somebody else's.
 """
 
 from __future__ import annotations
@@ -21,10 +25,35 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import is_known, plugin
 from .variants import is_jit
 
 Value = TypeVar("Value")
+MOST_NOTED = 2**16  # objects of which it is known when they were updated
 PLAIN = (bool, int, float, str, bytes, type(None))
+
+
+class Updates:
+    """Counts updates by ``mi.traverse`` of objects, by id: those of an object that is alive are its own."""
+
+    def __init__(self) -> None:
+        self._count = self._forgotten = 0
+        self._last: dict[int, int] = {}
+
+    def note(self, thing: Any) -> None:
+        """Take note that an object was updated."""
+        if len(self._last) >= MOST_NOTED:  # from now on all look as if they had been updated
+            self._forgotten = self._count = self._count + 1
+            self._last.clear()
+        self._count += 1
+        self._last[id(thing)] = self._count
+
+    def of(self, thing: Any) -> int:
+        """Return a number that differs from earlier ones if the object was updated since."""
+        return self._last.get(id(thing), self._forgotten)
+
+
+updates = Updates()
 
 
 @dataclass(eq=False)
@@ -32,17 +61,21 @@ class Part:
     """Some objects with their textures and the like, as they are; equal to itself only."""
 
     state: list[Any] = field(default_factory=list)  # what is compared
-    steady: bool = True  # no derivatives are wanted
+    steady: bool = True  # can a look tell that nothing has changed
+    known: bool = True  # Mitsuba or this project has the classes of all objects
+    differentiated: bool = False  # are derivatives wanted
     _held: dict[int, Any] = field(default_factory=dict)  # objects, by id
     _arrays: list[Any] = field(default_factory=list)
 
     def add(self, thing: Any, elsewhere: tuple[type, ...], *facts: Any) -> None:
         """Add an object and what it holds, but for objects of the classes that belong ``elsewhere``."""
-        self.state += [id(thing), *facts]
+        self.state += [id(thing), updates.of(thing), *facts]
         if thing is None or id(thing) in self._held:
             return
         self._held[id(thing)] = thing
-        if is_jit() and hasattr(thing, "looked_at"):  # many objects are looked at in less time
+        if not (is_known(thing) or isinstance(thing, mi.Shape)):  # all that is read of shapes is in arrays
+            self.known = self.steady = False
+        if is_jit() and isinstance(thing, plugin("axial").AxialMesh):  # many are looked at in less time
             plain, things, arrays = thing.looked_at()
             self.state += *plain, *map(id, things)
             self._held |= {id(x): x for x in things}
@@ -56,23 +89,32 @@ class Part:
                 self.state.append(name)
                 self.add(value, elsewhere)
                 continue
-            value = value if kind is None else mi.get_property(value, kind, thing)
-            if isinstance(value, PLAIN):
-                self.state += name, value
-            elif dr.is_jit_v(value) or (is_jit() and hasattr(value, "matrix")):
-                self.state.append(name)
+            self.state.append(name)
+            if kind is None:
+                self._add_value(value)
+            else:  # made for this look at it
+                self._add_value(mi.get_property(value, kind, thing), in_words=True)
+
+    def _add_value(self, value: Any, in_words: bool = False) -> None:
+        """Add a value; one of an unknown type by its text where ``in_words``, else by its identity."""
+        numbers = value if dr.is_array_v(value) else getattr(value, "matrix", None)  # of transforms
+        if isinstance(value, PLAIN):
+            self.state.append(value)
+        elif numbers is not None:
+            if dr.is_jit_v(numbers):
                 self._arrays.append(value)
-            elif dr.is_array_v(value) or hasattr(value, "matrix"):
-                self.state += name, np.array(getattr(value, "matrix", value)).tobytes()
-            elif kind is not None:  # made for this look at it
-                self.state += name, str(value)
             else:
-                self.state += name, id(value)
-                self._held[id(value)] = value
+                self.state.append(np.array(numbers).tobytes())
+        elif in_words:
+            self.state.append(str(value))
+        else:
+            self.state.append(id(value))
+            self._held[id(value)] = value
 
     def close(self, before: Part | None) -> Part:
         """Return the part from ``before`` if nothing has changed since, else this one."""
-        self.steady = not dr.grad_enabled(self._arrays)
+        self.differentiated = dr.grad_enabled(self._arrays)
+        self.steady = self.steady and not self.differentiated
         self.state += dr.detail.collect_indices(self._arrays)
         if before is not None and self.steady and before.steady and self.state == before.state:
             return before

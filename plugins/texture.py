@@ -91,6 +91,3 @@ def _read(props: mi.Properties) -> mi.Bitmap:
             ) from None
     bitmap.set_srgb_gamma(False)
     return bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-
-
-mi.register_texture("mrt_texture", MrtTexture)

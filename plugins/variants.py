@@ -11,6 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import is_known
+
 
 def is_jit() -> bool:
     """Return whether the current variant is a vectorised one (LLVM or CUDA)."""
@@ -38,10 +40,14 @@ def but_not(mask: mi.Bool, excluded: mi.Bool) -> mi.Bool:
 
 
 def varies(value: Any) -> bool:
-    """Return whether a value is a texture that varies over a surface; ``mesh_attribute`` denies it."""
+    """Return whether a value is a texture that may vary over a surface.
+
+    ``mesh_attribute`` denies it, and what somebody else wrote in Python need not say so.
+    """
     if not isinstance(value, mi.Texture):
         return False
-    return bool(value.is_spatially_varying() or value.class_name() == "MeshAttribute")
+    denies = value.class_name() == "MeshAttribute" or not is_known(value)
+    return bool(denies or value.is_spatially_varying())
 
 
 def largest(texture: mi.Texture) -> float:

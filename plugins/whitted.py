@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from .facts import Reading
 from .kernel_plan import BUDGETS, KernelPlan, SceneFacts, make_plan
-from .parameters import LARGEST, choice, flag, integer, number, spectrum
+from .parameters import LARGEST, ParameterError, choice, flag, integer, number, spectrum
 from .point_buffer import PointBuffer
 from .scene_data import Hit, SceneData
 from .snapshot import Kept, Snapshot
@@ -22,6 +22,11 @@ from .variants import but_not, construct_quietly, largest
 # A sixteenth of a step of an 8-bit picture: what many cut paths add up to stays below half a step, and on
 # average over the report's scenes below 1e-5
 MIN_CONTRIBUTION = 1 / 16 / 255
+
+OUTLINES = (
+    "mrt_whitted: derivatives by shapes leave out how outlines and the edges of shadows move. Of scenes that "
+    "Mitsuba can trace as meshes, prb_projective and direct_projective have all of them."
+)
 
 
 @dataclass
@@ -45,8 +50,8 @@ class MrtWhitted(mi.SamplingIntegrator):
     with r the mirror direction, and the sky where a ray meets nothing. Shading goes through ``si.bsdf()``:
     k_s F is the attribute ``mirror_reflectance`` of an ``mrt_bsdf``, and the delta reflection of any other
     BSDF. Lights are all emitters of the scene; those without a delta position take one random sample each.
-    ``mrt_plane``, ``mrt_cone``, ``mrt_cylinder`` and ``mrt_group`` shapes are intersected
-    analytically.
+    ``mrt_plane``, ``mrt_cone``, ``mrt_cylinder`` and ``mrt_group`` shapes are intersected analytically.
+    ``hide_emitters`` is refused: surfaces that emit are seen.
 
     ==================== ======== ============ ===========================================================
     name                 type     default      unit or range
@@ -71,10 +76,14 @@ class MrtWhitted(mi.SamplingIntegrator):
             <integer name="max_depth" value="10"/>
         </integrator>
 
-    Nearest stock plugin: ``direct``, which it equals at ``max_depth`` 1 without clamp. Differentiable at
-    ``max_depth`` 1 only (the bounces are a loop of unknown length). The equation of an ``mrt_plane`` is fixed
-    when it is made; moving its vertices changes only its stand-in for other integrators. Polarisation is
+    Nearest stock plugin: ``direct``, which it equals at ``max_depth`` 1 without clamp. Polarisation is
     ignored.
+
+    Derivatives follow materials, lights and surfaces through the mirror rays; backwards, that takes memory in
+    proportion to ``max_depth``. They leave out how outlines and the edges of shadows move with a shape or a
+    light: of a shape, that may be most of its derivative, even its sign, and a warning says so once.
+    The equation of an ``mrt_plane`` is fixed when it is made; moving its vertices changes only its stand-in
+    for other integrators.
     """
 
     plugin_name = "mrt_whitted"
@@ -83,6 +92,8 @@ class MrtWhitted(mi.SamplingIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         construct_quietly(self, props)
+        if props.get("hide_emitters", False):
+            raise ParameterError('mrt_whitted: "hide_emitters" is not accepted; take away the lamp\'s shape')
         self.max_depth = integer(props, "max_depth", 10, least=1, most=2**32 - 1)
         self.sky: Any = spectrum(props, "sky", emissive=True) if "sky" in props else None
         self.clamp = flag(props, "clamp", True)
@@ -90,6 +101,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         self.bounce_budget = choice(props, "bounce_budget", BUDGETS)
         self._snapshot: Snapshot | None = None  # of the scene that was looked at last
         self._made = Kept()
+        self._warned = False  # of outlines
         self._rendering: SceneData | None = None  # what ``sample`` traces while ``render`` runs
 
     # ------------------------------------- Mitsuba's interface ----------------------------------------
@@ -143,6 +155,9 @@ class MrtWhitted(mi.SamplingIntegrator):
         ``kernel_plan``.
         """
         self._snapshot = Snapshot(scene, self._snapshot)
+        if self._snapshot.shape_part.differentiated and not self._warned:
+            self._warned = True
+            mi.Log(mi.LogLevel.Warn, OUTLINES)
         reading = Reading(self._snapshot, self._made)
         return SceneData(reading, plan or self.kernel_plan(reading.facts), self._made)
 
@@ -205,6 +220,8 @@ class MrtWhitted(mi.SamplingIntegrator):
                 lambda s: s["active"],
                 lambda s: (follow(s)[0] | {"bounces": s["bounces"] + 1},),
                 label="mirror bounces",
+                # Derivatives are propagated backwards through as many, whose state is stored
+                max_iterations=self.max_depth if data.differentiated else None,
             )
         return Trace(state["radiance"], direct, hit, state["bounces"], state["shadow_rays"])
 
@@ -299,6 +316,3 @@ class MrtWhitted(mi.SamplingIntegrator):
         if self.bounce_budget == "report":
             cost = mi.UInt32(dr.maximum(10 - mi.Int32(dr.minimum(10 * int_ior, 10)), 1))
         return radiance, shadow_rays, reflectance, cost
-
-
-mi.register_integrator(MrtWhitted.plugin_name, MrtWhitted)
