@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 LONGEST = 800  # characters of a message
-NOT_INSTALLED = "{} is not installed: pip install 'mrt-mitsuba[validation]'"
+NOT_INSTALLED = "{} is not installed: pip install 'mrt-mitsuba[{}]'"
 
 
 def printable(text: str) -> str:
-    """Return a text for people: what a file put into it can neither steer a terminal nor flood it.
+    """A text for people: no file's content in it can steer a terminal or flood it.
 
     Characters that do not print are escaped, line ends too; of a long text, start and end stay.
     """
@@ -20,7 +23,7 @@ def printable(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Return a text of others for people, its lines joined."""
+    """A text of others for people, its lines joined."""
     return printable(" ".join(text.split()))
 
 
@@ -60,3 +63,16 @@ class MrtWarning(UserWarning):
 
     def __init__(self, text: str = "") -> None:
         super().__init__(printable(text))
+
+
+@contextlib.contextmanager
+def needs_extra(extra: str = "validation") -> Iterator[None]:
+    """Turn a module that is missing in the block into an ``MrtError`` that says how to install it.
+
+    Also for functions, as ``@needs_extra()``. ``extra``: of this package, with what it needs there.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        name = str(error.name).partition(".")[0]
+        raise MrtError(NOT_INSTALLED.format(name, extra)) from error

@@ -71,6 +71,14 @@ def heed(handlers: dict[int, Callable[..., Any]] = _handlers) -> None:
             handlers[number](number, None)
 
 
+def interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
+    """Return the interrupt that an error was made of by Mitsuba or Dr.Jit, None where there was none."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    return cause
+
+
 def _note(number: int, frame: FrameType | None) -> None:
     now = time.monotonic()
     if _waiting and number in _handlers and now - _waiting[0][1] > PATIENCE:

@@ -58,7 +58,7 @@ class Budget:
 
     @classmethod
     def of(cls, wanted: int | None) -> Budget:
-        """Return what was asked for, by default half of what is free; never more than the machine has."""
+        """The bytes asked for, by default half of those that are free; never more than the machine has."""
         free, most = _look(memory, int(time.monotonic()))
         return cls(min(free // 2 if wanted is None else wanted, most))
 
@@ -79,7 +79,7 @@ class Budget:
 
 @functools.lru_cache(maxsize=1)
 def _look(function: Callable[[], tuple[int, int]], second: int) -> tuple[int, int]:
-    """Return what a function returns, looked up once a second: that takes a tenth of a small render."""
+    """The result of a function, which is called once a second: it takes a tenth of a small render."""
     return function()
 
 
@@ -100,9 +100,10 @@ class Workspace:
         pictures: int = 1,
         rays_per_pixel: int = 1,
     ) -> Workspace:
-        """Return what a budget leaves next to a picture of so many float32 channels, held ``pictures`` times.
+        """The memory that a budget leaves next to a picture of so many float32 channels, kept ``pictures``
+        times.
 
-        ``rays_per_pixel``: which are traced at once. Raises ``UsageError`` where that does not suffice.
+        ``rays_per_pixel``: traced at once. Raises ``UsageError`` where the budget does not suffice.
         """
         pixels = width * height
         finished = pixels * (pictures * channels * BYTES_PER_CHANNEL + BYTES_TO_WRITE) + BYTES_OF_KERNELS
@@ -120,11 +121,11 @@ class Workspace:
         return cls(budget.size - finished)
 
     def rays_at_once(self, channels: int) -> int:
-        """Return the rays of one wavefront, which returns so many channels."""
+        """The rays of one wavefront, which returns so many channels."""
         return max(1, min(self.size // (channels * BYTES_PER_CHANNEL_OF_RAY), MOST_RAYS))
 
     def rows_at_once(self, width: int) -> int:
-        """Return the rows of a picture that a filter works on at once."""
+        """The rows of a picture that a filter works on at once."""
         return max(1, min(self.size // BYTES_PER_PIXEL_OF_FILTER, MOST_PIXELS) // width)
 
     def give_back(self, used: int) -> None:
@@ -139,12 +140,13 @@ class Workspace:
 
 
 def memory(root: Path = Path("/")) -> tuple[int, int]:
-    """Return the bytes that are free without swapping, and all that there are, within the limits of control
-    groups and of addresses.
+    """The bytes that are free without swapping, and those of the machine, within the limits of control groups
+    and of addresses.
 
     ``root``: where the system's folders ``proc`` and ``sys`` are.
     """
-    limits, free = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")], []
+    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    free = []
     for names in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
         for limit, used, statistics in control_groups("memory", (*names, "memory.stat"), root):
             with contextlib.suppress(ValueError):  # "max"
@@ -176,7 +178,7 @@ def check_start() -> None:
 
 
 def _free_addresses() -> int | None:
-    """Return the bytes of addresses that are left, or None without a limit."""
+    """The bytes of addresses that are left, or None without a limit."""
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit == resource.RLIM_INFINITY:
         return None
@@ -188,7 +190,7 @@ def _text(count: float) -> str:
 
 
 def usable_cores(root: Path = Path("/")) -> int:
-    """Return the cores of this process's affinity, or what its control groups grant if that is less.
+    """The cores of this process's affinity, or as many as its control groups grant if that is less.
 
     A quota of one and a half cores counts as two. ``root``: where the system's ``proc`` and ``sys`` are.
     """
@@ -197,12 +199,13 @@ def usable_cores(root: Path = Path("/")) -> int:
         for texts in control_groups("cpu", names, root):
             with contextlib.suppress(ValueError):  # "max"
                 quota, period = map(float, " ".join(texts).split())
-                counts += [math.ceil(quota / period)] if quota > 0 and period > 0 else []
+                if quota > 0 and period > 0:
+                    counts.append(math.ceil(quota / period))
     return min(counts)
 
 
 def control_groups(controller: str, names: Sequence[str], root: Path) -> Iterator[list[str]]:
-    """Yield the texts of files of each control group that this process is in, and of those above it; groups
+    """The texts of files of each control group that this process is in, and of those above it; groups
     that lack one are passed over."""
     try:
         lines = (root / "proc/self/cgroup").read_text().splitlines()

@@ -7,9 +7,12 @@ import math
 import operator
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.target import Target
+
+Value = TypeVar("Value")
 
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 SMALLEST_MEMORY = 64 * 2**20  # bytes; about what one tile with all layers takes
@@ -18,44 +21,54 @@ SMALLEST_MEMORY = 64 * 2**20  # bytes; about what one tile with all layers takes
 class Kind(NamedTuple):
     """A kind of value. ``form`` is the help's "name=form", ``allowed`` completes "must be ...".
 
-    ``from_text`` turns the command's text into a value, ``convert`` any value into the one that is held, and
-    ``fits`` says whether it is allowed; all may raise ValueError, TypeError or OverflowError. A kind without
-    a form is for Python only.
+    ``from_text`` turns the command's text into a value, and ``convert`` any value into the one that an option
+    holds; both raise ValueError, TypeError or OverflowError for what is not allowed. A kind without a form is
+    for Python only.
     """
 
     form: str
     allowed: str
-    fits: Callable[[Any], Any]
-    convert: Callable[[Any], Any] = lambda value: value
+    convert: Callable[[Any], Any]
     from_text: Callable[[str], Any] = str
 
 
 def integer(low: int, high: int) -> Kind:
-    """Return the kind of whole numbers in [low, high]."""
-    allowed = f"a whole number from {low} to {high}"
-    return Kind("N", allowed, lambda value: low <= value <= high, _whole, lambda text: int(plain(text)))
+    """The kind of whole numbers in [low, high]."""
+
+    def convert(value: Any) -> int:
+        number = _whole(value)
+        return _only(number, low <= number <= high)
+
+    return Kind("N", f"a whole number from {low} to {high}", convert, lambda text: int(plain(text)))
 
 
 def choice(*names: str) -> Kind:
-    """Return the kind of a choice among names."""
-    return Kind("|".join(names), either(names), names.__contains__, str)
+    """The kind of a choice among names."""
+
+    def convert(value: Any) -> str:
+        return _only(str(value), value in names)
+
+    return Kind("|".join(names), either(names), convert)
 
 
 def subset(known: Iterable[str]) -> Kind:
-    """Return the kind of comma lists of known names, each once, or ``all``."""
+    """The kind of comma lists of known names, each once, or ``all``."""
     known = tuple(known)
 
     def convert(value: Any) -> tuple[str, ...]:
-        if isinstance(value, str):
-            return known if value == "all" else tuple(value.split(","))
-        return tuple(value)
+        if value == "all":
+            return known
+        names = tuple(value.split(",") if isinstance(value, str) else value)
+        return _only(names, len(set(names)) == len(names) and set(names) <= set(known))
 
-    return Kind(
-        "A,B,..",
-        f"a comma list out of {', '.join(known)}, each once, or all",
-        lambda names: len(set(names)) == len(names) and set(names) <= set(known),
-        convert,
-    )
+    return Kind("A,B,..", f"a comma list out of {', '.join(known)}, each once, or all", convert)
+
+
+def _only(value: Value, allowed: bool) -> Value:
+    """The value, where it is allowed; else a ``ValueError``."""
+    if not allowed:
+        raise ValueError
+    return value
 
 
 def _whole(value: Any) -> int:
@@ -70,17 +83,39 @@ def _real(value: Any) -> float:
     return float(value)
 
 
-def _numbers(value: Any) -> Any:
-    return tuple(map(_real, value)) if isinstance(value, Iterable) else _real(value)
+def _real_in(text: str) -> float:
+    return float(plain(text))
 
 
-def _numbers_in(text: str) -> Any:
-    parts = [float(plain(part)) for part in text.split(",")]
-    return parts if len(parts) > 1 else parts[0]
+def _reals_in(text: str) -> tuple[float, ...]:
+    return tuple(_real_in(part) for part in text.split(","))
 
 
-def _point(value: Any) -> bool:
-    return len(value) == 3 and all(map(math.isfinite, value))
+def _not_negative(value: Any) -> float:
+    number = _real(value)
+    return _only(number, 0 <= number < math.inf)
+
+
+def _angle(value: Any) -> float:
+    degrees = _real(value)
+    return _only(degrees, 0 < degrees < 180)
+
+
+def _point(value: Any) -> tuple[float, ...]:
+    point = tuple(_real(part) for part in value)
+    return _only(point, len(point) == 3 and all(math.isfinite(part) for part in point))
+
+
+def _target(value: Any) -> Target | tuple[float, ...]:
+    """A target, or the point of an OBJ file that the camera looks at."""
+    if isinstance(value, Iterable) and not isinstance(value, str):
+        return _point(value)
+    target = Target.of(value)
+    return _only(target, target.positive)
+
+
+def _target_in(text: str) -> Any:
+    return _reals_in(text) if "," in text else plain(text)
 
 
 def _bytes(value: Any) -> int:
@@ -88,53 +123,64 @@ def _bytes(value: Any) -> int:
         upper = plain(value).upper().removesuffix("B").removesuffix("I")
         unit = upper[-1:] if upper[-1:] in UNITS else ""
         value = int(float(upper.removesuffix(unit)) * UNITS[unit])
-    return operator.index(value)
+    count = operator.index(value)
+    return _only(count, count >= SMALLEST_MEMORY)
 
 
-NUMBER = Kind("X", "a finite number, 0 or more", lambda x: 0 <= x < math.inf, _real, _numbers_in)
-ANGLE = Kind("DEGREES", "degrees, more than 0 and less than 180", lambda x: 0 < x < 180, _real, _numbers_in)
-VECTOR = Kind("X,Y,Z", "three finite numbers separated by commas", _point, _numbers, _numbers_in)
-TARGET = Kind(
-    "X|X,Y,Z",
-    "a positive number, or three separated by commas",
-    lambda value: 0 < value < math.inf if isinstance(value, float) else _point(value),
-    _numbers,
-    _numbers_in,
-)
-BYTES = Kind(
-    "BYTES",
-    "bytes with an optional unit K, M, G or T, at least 64M, such as 4G",
-    lambda count: count >= SMALLEST_MEMORY,
-    _bytes,
-)
+def _switch(value: Any) -> bool:
+    return _only(value, value in (False, True))
+
+
+def _name(value: Any) -> str:
+    return _only(value, str.isidentifier(value))
+
+
+def _rectangle(value: Any) -> tuple[int, ...]:
+    numbers = tuple(_whole(part) for part in value)
+    return _only(numbers, len(numbers) == 4 and min(numbers) >= 0 and min(numbers[2:]) >= 1)
+
+
+def _parameters(value: Any) -> dict[str, Any]:
+    return _only(dict(value), all(isinstance(key, str) and key for key in value))
+
+
+def instance(kind: type, allowed: str) -> Kind:
+    """The kind of objects of a class, for Python only."""
+    return Kind("", allowed, lambda value: _only(value, isinstance(value, kind)))
+
+
 WORDS = {"1": True, "0": False, "yes": True, "no": False, "true": True, "false": False}
-SWITCH = Kind("1|0", "1 or 0", (False, True).__contains__, from_text=lambda text: WORDS.get(text.lower()))
-NAME = Kind("NAME", "a name such as llvm_ad_rgb or scalar_rgb", str.isidentifier)
-ANYTHING = Kind("", "anything", lambda value: True)  # checked where it is used
-FUNCTION = Kind("", "a function", callable)
-RECTANGLE = Kind(
-    "",
-    "four whole numbers: column, row, width and height in pixels",
-    lambda value: len(value) == 4 and min(value) >= 0 and min(value[2:]) >= 1,
-    lambda value: tuple(map(_whole, value)),
+NUMBER = Kind("X", "a finite number, 0 or more", _not_negative, _real_in)
+ANGLE = Kind("DEGREES", "degrees, more than 0 and less than 180", _angle, _real_in)
+VECTOR = Kind("X,Y,Z", "three finite numbers separated by commas", _point, _reals_in)
+TARGET = Kind(
+    "X|P%|X,Y,Z",
+    "a positive number, or three separated by commas, or a percentage above 0 such as 2%",
+    _target,
+    _target_in,
 )
+BYTES = Kind("BYTES", "bytes with an optional unit K, M, G or T, at least 64M, such as 4G", _bytes)
+SWITCH = Kind("1|0", "1 or 0", _switch, lambda text: WORDS[text.lower()])
+NAME = Kind("NAME", "a name such as llvm_ad_rgb or scalar_rgb", _name)
+ANYTHING = instance(object, "anything")  # checked where it is used
+FUNCTION = Kind("", "a function", lambda value: _only(value, callable(value)))
+RECTANGLE = Kind("", "four whole numbers: column, row, width and height in pixels", _rectangle)
 PARAMETERS = Kind(
     "",
     "a dict of values by names of an XML file or keys of mi.traverse, such as material_0.alpha",
-    lambda value: all(isinstance(key, str) and key for key in value),
-    dict,
+    _parameters,
 )
 
 
 def plain(text: str) -> str:
-    """Return text that may be a number; raise ``ValueError`` for spaces and underscores, which int takes."""
+    """Check text that may be a number: spaces and underscores, which ``int`` takes, raise ``ValueError``."""
     if not text.isascii() or "_" in text or text != text.strip():
         raise ValueError
     return text
 
 
 def either(names: Sequence[str]) -> str:
-    """Return "a, b or c"."""
+    """The text "a, b or c"."""
     return " or ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
 
 
@@ -144,28 +190,26 @@ def option(default: Any, kind: Kind, text: str = "", shown: str | None = None) -
 
 
 def table(kind: Any) -> dict[str, dataclasses.Field[Any]]:
-    """Return the fields that are options of the command, by name."""
+    """The fields that are options of the command, by name."""
     return {f.name: f for f in dataclasses.fields(kind) if f.metadata and f.metadata["kind"].form}
 
 
 def check(name: str, kind: Kind, value: Any, *, text: bool = False) -> Any:
-    """Return a value from Python, or from the command's text, as its kind holds it.
+    """Turn a value from Python, or the command's text, into the one that an option of this kind holds.
 
     Raises ``UsageError`` if it is not allowed.
     """
     try:
-        held = kind.convert(kind.from_text(value) if text else value)
-        if kind.fits(held):
-            return held
-    except (TypeError, ValueError, OverflowError):
-        pass
-    raise UsageError(f"{name}={value if text else repr(value)}: must be {kind.allowed}")
+        return kind.convert(kind.from_text(value) if text else value)
+    except (TypeError, ValueError, OverflowError, LookupError):
+        shown = value if text else repr(value)
+        raise UsageError(f"{name}={shown}: must be {kind.allowed}") from None
 
 
 def is_obj(scene: object, model: Mapping[str, Any]) -> bool:
-    """Return whether a scene is given as the path of an OBJ file.
+    """Whether a scene is given as the path of an OBJ file.
 
-    Raises ``UsageError`` where it is not, for options of ``model_scene``.
+    Raises ``UsageError`` for options of a model where it is not.
     """
     obj = isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".obj")
     useless = [name for name, value in model.items() if (name, value) != ("convention", "report")]

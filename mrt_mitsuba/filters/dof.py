@@ -40,7 +40,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -48,13 +48,18 @@ import numpy as np
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.filters.grid import Grid, check_numbers, dilated, finite
 
+if TYPE_CHECKING:
+    from mitsuba import Float, Int
+
+    from mrt_mitsuba.filters.grid import Array
+
 MAX_AMOUNT = 8
 REACH = MAX_AMOUNT  # rows and columns of neighbours that a pixel may depend on, either way
 MODES = ("report", "corrected")
 
 
-def blur_amount(depth: Any, *, focal_distance: float | None, focal_range: float = 2.0) -> Any:
-    """Return the amount of blur a, [H, W] float32: ``clamp(|focal_distance − depth| − focal_range, 0, 8)``.
+def blur_amount(depth: Array, *, focal_distance: float | None, focal_range: float = 2.0) -> Array:
+    """The amount of blur a, [H, W] float32: ``clamp(|focal_distance − depth| − focal_range, 0, 8)``.
 
     A miss gives 8, NaN gives 0, and without a focal distance (None, zero or negative) all is 0.
 
@@ -72,9 +77,14 @@ def blur_amount(depth: Any, *, focal_distance: float | None, focal_range: float 
 
 
 def gaussian_dof(
-    image: Any, depth: Any, *, focal_distance: float | None, focal_range: float = 2.0, mode: str = "report"
-) -> Any:
-    """Return the picture as a lens focused at a distance would show it, [H, W, 3] float32.
+    image: Array,
+    depth: Array,
+    *,
+    focal_distance: float | None,
+    focal_range: float = 2.0,
+    mode: str = "report",
+) -> Array:
+    """The picture as a lens focused at a distance would show it, [H, W, 3] float32.
 
     Without a focal distance (None, zero or negative) the picture comes back as it is, the same object.
     Otherwise the result is an array of the same kind: NumPy for NumPy, a Dr.Jit tensor for a tensor.
@@ -101,24 +111,28 @@ def gaussian_dof(
         return grid.output(_pascal(grid, planes, amount), (3,))
     radius = _radius(amount)
     near = (distance > 0) & (distance < dr.opaque(grid.Float, focal_distance))
-    return grid.output(_discs(grid, planes, dr.select(near, -radius, radius)), (3,))
+    signed = dr.select(near, -radius, radius)
+    return grid.output(_discs(grid, planes, signed), (3,))
 
 
-def _amount(grid: Grid, distance: Any, focal_distance: float, focal_range: float) -> Any:
+def _amount(grid: Grid, distance: Float, focal_distance: float, focal_range: float) -> Float:
     check_numbers(focal_distance=focal_distance, focal_range=focal_range)
     if focal_distance <= 0:
         return dr.zeros(grid.Float, grid.count)
-    amount = dr.abs(dr.opaque(grid.Float, focal_distance) - distance) - dr.opaque(grid.Float, focal_range)
+    defocus = dr.abs(dr.opaque(grid.Float, focal_distance) - distance)
+    amount = defocus - dr.opaque(grid.Float, focal_range)
     amount = dr.select(amount > 0, dr.minimum(amount, MAX_AMOUNT), 0)  # NaN > 0 is false
-    return dr.select((distance <= 0) | (distance == math.inf), MAX_AMOUNT, amount)
+    miss = (distance <= 0) | (distance == math.inf)
+    return dr.select(miss, MAX_AMOUNT, amount)
 
 
-def _radius(amount: Any) -> Any:
+def _radius(amount: Float) -> Float:
     small = dr.square(amount) / (8 - 4 * dr.square(dr.minimum(amount, 1)))
-    return dr.select(amount < 1, small, dr.sqrt(dr.maximum(2 * amount - 23 / 16, 0)) - 0.5)
+    large = dr.sqrt(dr.maximum(2 * amount - 23 / 16, 0)) - 0.5
+    return dr.select(amount < 1, small, large)
 
 
-def _pascal(grid: Grid, planes: Sequence[Any], amount: Any) -> list[Any]:
+def _pascal(grid: Grid, planes: Sequence[Float], amount: Float) -> list[Float]:
     """Blur with Pascal windows, in one pass along rows and one along columns.
 
     The weights of a window are the product of a row's and a column's, at the borders too, so two passes of 2k
@@ -127,65 +141,79 @@ def _pascal(grid: Grid, planes: Sequence[Any], amount: Any) -> list[Any]:
     """
     good = finite(planes)
     gives = good & (amount > 0)
-    sources = [dr.select(gives, plane, 0) for plane in (*planes, grid.Float(1))]  # and the sum of weights
+    sources = [dr.select(gives, plane, 0) for plane in planes]
+    sources.append(dr.select(gives, grid.Float(1), 0))  # for the sum of the weights
     k = dr.select(good, grid.Int(amount), 0)
-    blurred, wide = [grid.Float(plane) for plane in planes], k > 0
+    blurred = [grid.Float(plane) for plane in planes]
+    wide = k > 0
     dr.eval(sources, k, blurred, wide)
     pixels = grid.Int(dr.compress(wide))
     if dr.width(pixels) == 0:
         return blurred
 
+    # what the columns of the pixels read
     k = dr.gather(grid.Int, k, pixels)
     column, row = grid.coordinates(pixels)
-    start, count = _cut(grid.height - 1 - row, k, grid.height)
+    height = grid.height - 1 - row  # over the bottom row
+    start, count = _cut(height, k, grid.height)
     first = (k - 1) * grid.size + (grid.height - 1 - start) * grid.width + column
     read = dr.zeros(grid.Bool, MAX_AMOUNT * grid.count)
 
-    def mark(j: Any, none: Sequence[Any]) -> Sequence[Any]:
+    def mark(j: Int, none: Sequence[Float]) -> Sequence[Float]:
         dr.scatter(read, grid.Bool(True), first - j * grid.width, active=j < count)
         return none
 
     grid.accumulate(count, [], mark)
+
+    # along rows
     needed = grid.Int(dr.compress(read))
     level = needed // grid.size
     column, row = grid.coordinates(needed - level * grid.size)
     left, number = _cut(column, level + 1, grid.width)
-    along_rows = _weighted(grid, sources, (row * grid.width + left, 1, number, level + 1))
+    row_lines = (row * grid.width + left, 1, number, level + 1)
+    along_rows = _weighted(grid, sources, row_lines)
     place = dr.empty(grid.Int, MAX_AMOUNT * grid.count)  # read below only where written here
     dr.scatter(place, dr.arange(grid.Int, dr.width(needed)), needed)
     dr.eval(along_rows, place)
 
-    sums = _weighted(grid, along_rows, (first, -grid.width, count, k), place)
-    for target, total in zip(blurred, sums[:3], strict=True):
-        dr.scatter(target, total / sums[3], pixels)  # not zero: the pixel itself gives
+    # along columns
+    column_lines = (first, -grid.width, count, k)
+    *sums, weights = _weighted(grid, along_rows, column_lines, place)
+    for target, total in zip(blurred, sums, strict=True):
+        dr.scatter(target, total / weights, pixels)  # not zero: the pixel itself gives
     dr.eval(blurred)
     return blurred
 
 
-def _cut(centre: Any, k: Any, size: Any) -> tuple[Any, Any]:
-    """Return start and length of [centre − k, centre + k) cut to [0, size)."""
+def _cut(centre: Int, k: Int, size: Int) -> tuple[Int, Int]:
+    """Start and length of [centre − k, centre + k) cut to [0, size)."""
     start = dr.maximum(centre - k, 0)
-    return start, dr.minimum(centre + k, size) - start
+    end = dr.minimum(centre + k, size)
+    return start, end - start
 
 
 def _weighted(
-    grid: Grid, planes: Sequence[Any], line: tuple[Any, Any, Any, Any], place: Any = None
-) -> Sequence[Any]:
-    """Return the weighted sums of each plane's values in lines: from a first value on, so far apart, so many,
-    with the weights of k. ``place``: where in the planes they are."""
-    (first, stride, count, k), weights = line, grid.Float(_PASCAL)
+    grid: Grid, planes: Sequence[Float], line: tuple[Int, Int, Int, Int], place: Int | None = None
+) -> Sequence[Float]:
+    """The weighted sums of each plane's values along lines.
 
-    def add(j: Any, totals: Sequence[Any]) -> list[Any]:
-        weight = dr.gather(grid.Float, weights, (k - 1) * _MOST + j)
-        index, active = first + j * stride, j < count
+    ``line``: the index of its first value, the stride to the next, their number, and the k of the weights.
+    ``place``: where in the planes the values are that have these indices.
+    """
+    first, stride, count, k = line
+    pascal = grid.Float(_PASCAL)
+
+    def add(j: Int, totals: Sequence[Float]) -> list[Float]:
+        weight = dr.gather(grid.Float, pascal, (k - 1) * _MOST + j)
+        active = j < count
+        index = first + j * stride
         if place is not None:
             index = dr.gather(grid.Int, place, index, active=active)
-        return [
-            total + weight * dr.gather(grid.Float, plane, index, active=active)
-            for total, plane in zip(totals, planes, strict=True)
-        ]
+        values = [dr.gather(grid.Float, plane, index, active=active) for plane in planes]
+        return [total + weight * value for total, value in zip(totals, values, strict=True)]
 
-    return grid.accumulate(count, [dr.zeros(grid.Float, dr.width(first))] * len(planes), add)
+    zero = dr.zeros(grid.Float, dr.width(first))
+    return grid.accumulate(count, [zero] * len(planes), add)
 
 
 _MOST = 2 * MAX_AMOUNT
@@ -193,8 +221,8 @@ _MOST = 2 * MAX_AMOUNT
 _PASCAL = [math.comb(2 * k - 1, j) / 2 ** (2 * k - 1) for k in range(1, MAX_AMOUNT + 1) for j in range(_MOST)]
 
 
-def _discs(grid: Grid, planes: Sequence[Any], radius: Any) -> list[Any]:
-    """Return the blurred colours, three planes; pixels that no disc of another reaches are not computed.
+def _discs(grid: Grid, planes: Sequence[Float], radius: Float) -> list[Float]:
+    """The blurred colours, three planes; pixels that no disc of another reaches are not computed.
 
     ``radius``: a plane of signed radii in pixels.
     """
@@ -204,8 +232,8 @@ def _discs(grid: Grid, planes: Sequence[Any], radius: Any) -> list[Any]:
     # the neighbours that a disc of the largest radius covers at least in part
     offsets = [(dx, dy, math.hypot(dx, dy)) for dy in steps for dx in steps]
     offsets = [offset for offset in offsets if offset[2] < max_radius + 1]
-    distances = sorted(Counter(distance for _, _, distance in offsets).items())
-    spread = sum(number * _coverage(radius, distance) for distance, number in distances)
+    distances = Counter(distance for _, _, distance in offsets)
+    spread = sum(number * _coverage(radius, distance) for distance, number in sorted(distances.items()))
     good = finite(planes)
     share = dr.select(good, 1 / spread, 0)  # what a covered pixel gets of a disc's light
     colours = [dr.select(good, plane, 0) for plane in planes]
@@ -222,41 +250,45 @@ def _discs(grid: Grid, planes: Sequence[Any], radius: Any) -> list[Any]:
     own_share = dr.gather(grid.Float, share, pixels)
     tables = [grid.Float(list(values)) for values in zip(*offsets, strict=True)]
 
-    def add(j: Any, totals: Sequence[Any]) -> list[Any]:
+    def add(j: Int, totals: Sequence[Float]) -> list[Float]:
         """Add the weighted red, green, blue and 1 of a neighbour: in front, in the same layer, behind."""
         dx, dy, distance = (dr.gather(grid.Float, table, j) for table in tables)
         # the border pixels are repeated outside
-        index = dr.clip(row + grid.Int(dy), 0, grid.height - 1) * grid.width
-        index += dr.clip(column + grid.Int(dx), 0, grid.width - 1)
+        their_row = dr.clip(row + grid.Int(dy), 0, grid.height - 1)
+        their_column = dr.clip(column + grid.Int(dx), 0, grid.width - 1)
+        index = their_row * grid.width + their_column
         their_radius = dr.gather(grid.Float, radius, index)
         light = dr.gather(grid.Float, share, index)
         order = their_radius - own_radius
         seen = dr.select(light > 0, _coverage(own_radius, distance) * own_share, 0)
         reaching = _coverage(their_radius, distance) * light
         narrower = (order > 0) & (dr.abs(own_radius) < dr.abs(their_radius))
-        weights = (
-            reaching * dr.clip(-order, 0, 1),
-            dr.select(narrower, seen, reaching) * dr.maximum(1 - dr.abs(order), 0),
-            seen * dr.clip(order, 0, 1),
-        )
+        alike = dr.maximum(1 - dr.abs(order), 0)
+        in_front = reaching * dr.clip(-order, 0, 1)
+        in_layer = dr.select(narrower, seen, reaching) * alike
+        behind = seen * dr.clip(order, 0, 1)
         values = [dr.gather(grid.Float, colour, index) for colour in colours] + [1]
-        terms = [weight * value for weight in weights for value in values]
+        terms = [weight * value for weight in (in_front, in_layer, behind) for value in values]
         return [total + term for total, term in zip(totals, terms, strict=True)]
 
-    totals = grid.accumulate(len(offsets), [dr.zeros(grid.Float, dr.width(pixels))] * 12, add)
-    front, same, behind = totals[:4], totals[4:8], totals[8:]
+    zero = dr.zeros(grid.Float, dr.width(pixels))
+    totals = grid.accumulate(len(offsets), [zero] * 12, add)
+    front = totals[:4]
+    same = totals[4:8]
+    back = totals[8:]
     # the layers laid over each other; the same layer holds the pixel itself, so its weight is not zero
-    covered, solid = dr.minimum(front[3], 1), dr.minimum(same[3], 1)
-    gap = dr.minimum(1 - solid, behind[3])
+    covered = dr.minimum(front[3], 1)
+    solid = dr.minimum(same[3], 1)
+    gap = dr.minimum(1 - solid, back[3])
     per_front = dr.select(front[3] > 0, covered / front[3], 0)
     per_same = solid / same[3] / (solid + gap)
-    per_behind = dr.select(behind[3] > 0, gap / behind[3], 0) / (solid + gap)
+    per_back = dr.select(back[3] > 0, gap / back[3], 0) / (solid + gap)
     for c, target in enumerate(blurred):
-        under = per_same * same[c] + per_behind * behind[c]
+        under = per_same * same[c] + per_back * back[c]
         dr.scatter(target, per_front * front[c] + (1 - covered) * under, pixels)
     dr.eval(blurred)
     return blurred
 
 
-def _coverage(radius: Any, distance: Any) -> Any:
+def _coverage(radius: Float, distance: Float) -> Float:
     return dr.clip(dr.abs(radius) + (1 - distance), 0, 1)

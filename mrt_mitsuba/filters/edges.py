@@ -27,13 +27,18 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.filters.grid import Grid, check_numbers, finite
+
+if TYPE_CHECKING:
+    from mitsuba import Float, Mask
+
+    from mrt_mitsuba.filters.grid import Array
 
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 GREY_WEIGHTS = (0.07, 0.72, 0.21)
@@ -43,23 +48,23 @@ REACH = 1  # rows and columns of neighbours that a pixel depends on, either way
 
 @dataclass(frozen=True)
 class EdgeMap:
-    """The findings of a detector.
+    """The result of a detector.
 
     ``mask``: [H, W] truth values, the pixels to refine. ``value``: [H, W] float32, the detector's own
     measure, in the unit that its function names; infinity next to a pixel that is not finite.
     """
 
-    mask: Any
-    value: Any
+    mask: Array
+    value: Array
 
 
 def luma_edges(
-    image: Any,
+    image: Array,
     *,
     contrast_offset: float = 0.05,
     absolute_threshold: float = 0.0312,
     relative_threshold: float = 0.125,
-    variance: Any = None,
+    variance: Array | None = None,
     noise_sigmas: float = 3.0,
 ) -> EdgeMap:
     """Find edges by the contrast of luma.
@@ -84,29 +89,31 @@ def luma_edges(
     thresholds = {"absolute_threshold": absolute_threshold, "relative_threshold": relative_threshold}
     check_numbers(contrast_offset=contrast_offset, **thresholds)
     grid = Grid(image)
-    sum_ = _sum(grid.planes(image, "image"), LUMA_WEIGHTS)
-    luma = dr.select(dr.isfinite(sum_), dr.sqrt(dr.maximum(sum_, 0)), math.inf)
+    brightness = _sum(grid.planes(image, "image"), LUMA_WEIGHTS)
+    luma = dr.select(dr.isfinite(brightness), dr.sqrt(dr.maximum(brightness, 0)), math.inf)
     window = _window(grid, luma)
-    high, low = functools.reduce(dr.maximum, window), functools.reduce(dr.minimum, window)
+    high = functools.reduce(dr.maximum, window)
+    low = functools.reduce(dr.minimum, window)
     offset = dr.opaque(grid.Float, contrast_offset)
     value = high - low + offset
     if variance is not None:
         deviation = _deviation(grid, variance, LUMA_WEIGHTS, noise_sigmas)
         # the last term keeps 0/0 out where the pixel is black and free of noise
-        luma_variance = dr.square(deviation) / dr.maximum(dr.maximum(4 * sum_, deviation), 1e-30)
+        slope = dr.maximum(dr.maximum(4 * brightness, deviation), 1e-30)
+        luma_variance = dr.square(deviation) / slope
         noise = dr.sqrt(_sum(_window(grid, luma_variance), [1 / 9] * 9))
         # not above zero where the variance is NaN
         excess = high - low - 2 * dr.opaque(grid.Float, noise_sigmas) * noise
         value = dr.select(excess > 0, excess + offset, 0)
     value = dr.select(dr.isfinite(high), value, math.inf)
-    threshold = dr.maximum(
-        dr.opaque(grid.Float, absolute_threshold), dr.opaque(grid.Float, relative_threshold) * high
-    )
-    return _edge_map(grid, ~(value < threshold), value)
+    absolute = dr.opaque(grid.Float, absolute_threshold)
+    relative = dr.opaque(grid.Float, relative_threshold) * high
+    below = value < dr.maximum(absolute, relative)
+    return _edge_map(grid, ~below, value)
 
 
 def sobel_edges(
-    image: Any, *, threshold: float = 0.0, variance: Any = None, noise_sigmas: float = 3.0
+    image: Array, *, threshold: float = 0.0, variance: Array | None = None, noise_sigmas: float = 3.0
 ) -> EdgeMap:
     """Find edges by the Sobel gradient of an integer grey.
 
@@ -130,13 +137,16 @@ def sobel_edges(
     grey = 255 * _sum(grid.planes(image, "image"), GREY_WEIGHTS)
     # both sides of a difference are summed alike, so equal sides give 0
     w = _window(grid, grey if variance is not None else dr.trunc(grey))
-    gx = (w[2] + 2 * w[5] + w[8]) - (w[0] + 2 * w[3] + w[6])
-    gy = (w[6] + 2 * w[7] + w[8]) - (w[0] + 2 * w[1] + w[2])
-    value = dr.abs(gx) + dr.abs(gy)
+    left = w[0] + 2 * w[3] + w[6]
+    right = w[2] + 2 * w[5] + w[8]
+    top = w[0] + 2 * w[1] + w[2]
+    bottom = w[6] + 2 * w[7] + w[8]
+    value = dr.abs(right - left) + dr.abs(bottom - top)
     if variance is not None:
-        grey_variance = dr.square(255 * _deviation(grid, variance, GREY_WEIGHTS, noise_sigmas))
+        deviation = 255 * _deviation(grid, variance, GREY_WEIGHTS, noise_sigmas)
+        variances = _window(grid, dr.square(deviation))
         squares = [2, 4, 2, 4, 0, 4, 2, 4, 2]  # of Gx's and Gy's weights, summed
-        noise = dr.sqrt(_sum(_window(grid, grey_variance), squares))
+        noise = dr.sqrt(_sum(variances, squares))
         excess = value - dr.opaque(grid.Float, noise_sigmas) * noise
         value = dr.select(excess > 0, dr.trunc(excess), 0)
     value = dr.select(finite(w), value, math.inf)
@@ -144,7 +154,7 @@ def sobel_edges(
 
 
 def geometry_edges(
-    normal: Any, depth: Any, *, crease_angle: float = 20.0, depth_step: float = 0.02
+    normal: Array, depth: Array, *, crease_angle: float = 20.0, depth_step: float = 0.02
 ) -> EdgeMap:
     """Find outlines and creases from the first hits.
 
@@ -175,15 +185,20 @@ def geometry_edges(
     distance = grid.flat(depth, (), "depth")
     hit = (distance > 0) & (distance < math.inf)
     bad = dr.isnan(distance) | (hit & ~finite(normals))
-    inverse = dr.select(bad, math.inf, dr.select(hit, 1 / distance, 0))
+    inverse = dr.select(hit, 1 / distance, 0)
+    inverse = dr.select(bad, math.inf, inverse)
     dr.eval(inverse, normals)  # in one kernel
-    near, windows = _window(grid, inverse), [_window(grid, plane) for plane in normals]
-    step, crease, centre = 0, 0, near[4]
+    near = _window(grid, inverse)
+    windows = [_window(grid, plane) for plane in normals]
+    centre = near[4]
+    step = 0
     for k in range(4):  # pairs of opposite neighbours
-        one, other = near[k], near[8 - k]
+        one = near[k]
+        other = near[8 - k]
         largest = dr.maximum(dr.maximum(one, other), centre)
         difference = dr.abs((one - centre) + (other - centre))
         step = dr.maximum(step, dr.select(largest > 0, difference / largest, 0))
+    crease = 0
     for k in (0, 1, 2, 3, 5, 6, 7, 8):
         dot = sum(window[4] * window[k] for window in windows)
         both = (centre > 0) & (near[k] > 0)
@@ -195,23 +210,25 @@ def geometry_edges(
 
 
 def edges_image(edges: EdgeMap) -> np.ndarray:
-    """Return the contours as a picture: [H, W] float32, 1 at an edge, else 0."""
+    """The contours as a picture: [H, W] float32, 1 at an edge, else 0."""
     return np.array(edges.mask).astype(np.float32)
 
 
 def contours(*edges: EdgeMap) -> np.ndarray:
-    """Return the contours of one or several detectors as one picture, [H, W', 3] float32, from left to right:
-    1 at an edge, else 0.
+    """The contours of one or several detectors next to each other, [H, W', 3] float32: 1 at an edge, else 0.
 
     Raises:
         UsageError: for no detector, or pictures of different heights.
     """
-    heights = {len(found.mask) for found in edges}
+    heights = {len(each.mask) for each in edges}
     if len(heights) != 1:
         raise UsageError(f"contours needs EdgeMaps of one height, at least one; given: {sorted(heights)}")
     gap = np.full((heights.pop(), GAP), GREY, np.float32)
-    parts = [part for found in edges for part in (gap, edges_image(found))][1:]
-    return np.repeat(np.concatenate(parts, axis=1)[..., None], 3, axis=-1)
+    parts = [edges_image(edges[0])]
+    for each in edges[1:]:
+        parts += [gap, edges_image(each)]
+    grey = np.concatenate(parts, axis=1)  # [H, W']
+    return np.repeat(grey[..., None], 3, axis=-1)
 
 
 def save_contours(path: str | os.PathLike[str], *edges: EdgeMap) -> None:
@@ -221,32 +238,36 @@ def save_contours(path: str | os.PathLike[str], *edges: EdgeMap) -> None:
     save(path, contours(*edges))
 
 
-def _inner(grid: Grid) -> Any:
-    """Return where a pixel is not on the picture's border."""
+def _inner(grid: Grid) -> Mask:
+    """Where a pixel is not on the picture's border."""
     column, row = grid.coordinates(grid.index)
-    return (column > 0) & (row > 0) & (column < grid.width - 1) & (row < grid.height - 1)
+    inner_column = (column > 0) & (column < grid.width - 1)
+    inner_row = (row > 0) & (row < grid.height - 1)
+    return inner_column & inner_row
 
 
-def _window(grid: Grid, plane: Any) -> list[Any]:
-    """Return the 3×3 values around every pixel, row by row; zeros on the picture's border."""
+def _window(grid: Grid, plane: Float) -> list[Float]:
+    """The 3×3 values around every pixel, row by row; zeros on the picture's border."""
     dr.eval(plane)  # computed once for each pixel, not once for each of the nine that read it
     indices = [grid.index + dx + dy * grid.width for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     return [dr.gather(grid.Float, plane, index, active=_inner(grid)) for index in indices]
 
 
-def _edge_map(grid: Grid, mask: Any, value: Any) -> EdgeMap:
-    """Return the result, with the border left out."""
-    mask, value = mask & _inner(grid), dr.select(_inner(grid), value, 0)
+def _edge_map(grid: Grid, mask: Mask, value: Float) -> EdgeMap:
+    """The result of a detector, with the border left out."""
+    mask = mask & _inner(grid)
+    value = dr.select(_inner(grid), value, 0)
     dr.eval(mask, value)  # both in one kernel
     return EdgeMap(mask=grid.output([mask]), value=grid.output([value]))
 
 
-def _sum(values: Sequence[Any], weights: Sequence[float]) -> Any:
+def _sum(values: Sequence[Float], weights: Sequence[float]) -> Float:
     return sum(weight * value for weight, value in zip(weights, values, strict=True) if weight)
 
 
-def _deviation(grid: Grid, variance: Any, weights: Sequence[float], noise_sigmas: float) -> Any:
-    """Return the standard deviation of a weighted sum of fully correlated channels."""
+def _deviation(grid: Grid, variance: Array, weights: Sequence[float], noise_sigmas: float) -> Float:
+    """The standard deviation of a weighted sum of fully correlated channels."""
     if not 0 <= noise_sigmas < math.inf:
         raise UsageError(f"noise_sigmas={noise_sigmas} is out of range; give a number from 0 on")
-    return _sum([dr.sqrt(plane) for plane in grid.planes(variance, "variance")], weights)
+    deviations = [dr.sqrt(plane) for plane in grid.planes(variance, "variance")]
+    return _sum(deviations, weights)

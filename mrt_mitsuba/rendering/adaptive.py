@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.options import TARGET, check
 from mrt_mitsuba.plugins.parameters import ParameterError, integer, number
 from mrt_mitsuba.plugins.variants import construct_quietly
+from mrt_mitsuba.rendering.settings import MAX_SPP
+from mrt_mitsuba.target import Goal, StatesGoal, Target
 
-NUMBERS = ("target", "max_spp", "max_seconds", "spp")
+PARAMETERS = ("target", "max_spp", "max_seconds", "spp")
 FEWEST = 8  # rays of a pixel in the first round
 
 
+@StatesGoal.register
 class MrtAdaptive(mi.SamplingIntegrator):
     r"""Renders to an error with another integrator: rays go in rounds to the pixels that need them.
 
@@ -27,7 +33,8 @@ class MrtAdaptive(mi.SamplingIntegrator):
     ================ =========== ======== ================================================================
     name             type        default  unit or range
     ================ =========== ======== ================================================================
-    ``target``       float       0.01     > 0, RMSE to the converged picture, in linear values
+    ``target``       float or    0.01     > 0, RMSE to the converged picture, in linear values; "2%": of the
+                     string               mean luminance of the picture
     ``max_spp``      integer     4096     >= 8, rays of a pixel at most, on average
     ``max_seconds``  float       0        >= 0, time to spend at most; 0 for no limit
     ``spp``          integer     (none)   >= 8, in place of ``target``: a mean of so many rays a pixel
@@ -53,34 +60,23 @@ class MrtAdaptive(mi.SamplingIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         construct_quietly(self, props)
-        given = {name: props[name] for name in props if name not in NUMBERS}
+        given = {name: props[name] for name in props if name not in PARAMETERS}
         inner = [thing for thing in given.values() if isinstance(thing, mi.Integrator)]
         others = [name for name, thing in given.items() if not isinstance(thing, mi.Integrator)]
         if others:
-            raise ParameterError(
-                f'mrt_adaptive: "{others[0]}" is none of its parameters: {", ".join(NUMBERS)}'
-            )
+            known = ", ".join(PARAMETERS)
+            raise ParameterError(f'mrt_adaptive: "{others[0]}" is none of its parameters: {known}')
         if len(inner) != 1 or isinstance(inner[0], MrtAdaptive):
             raise ParameterError("mrt_adaptive: give one integrator inside, such as path")
-        if "spp" in props and "target" in props:
-            raise ParameterError('mrt_adaptive: give "target" or "spp", not both')
         self.nested = inner[0]
-        self.target = None if "spp" in props else number(props, "target", 0.01, above=0)
-        self.most = integer(props, "max_spp", 4096, least=FEWEST, most=2**24)
-        self.seconds = number(props, "max_seconds", 0.0, least=0) or None
-        if "spp" in props:
-            self.most = integer(props, "spp", self.most, least=FEWEST, most=65536)
+        self.goal = _goal(props)
 
-    def options(self, spp: int = 0) -> dict[str, Any]:
-        """Return what ``mrt.render`` is to be given, with a bound of ``spp`` rays, if any."""
-        most = min(self.most, spp or self.most) if self.target else spp or self.most
-        return {
-            "target": self.target,
-            "aamode": None if self.target else "noise",
-            "spp": None if self.target else max(most, 16),
-            "maxspp": max(most, FEWEST),
-            "maxseconds": self.seconds,
-        }
+    def bounded(self, spp: int) -> Goal:
+        """The goal with a bound of ``spp`` rays a pixel on average, as ``mi.render`` gives it; 0: none."""
+        if not spp:
+            return self.goal
+        most = spp if self.goal.target is None else min(self.goal.most, spp)
+        return replace(self.goal, most=max(most, FEWEST))
 
     def render(
         self,
@@ -91,21 +87,20 @@ class MrtAdaptive(mi.SamplingIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> mi.TensorXf:
-        from mrt_mitsuba.interrupts import held
-        from mrt_mitsuba.rendering.api import render_with
+        from mrt_mitsuba.rendering.api import render_source, session
         from mrt_mitsuba.rendering.progress import Progress
         from mrt_mitsuba.rendering.settings import RenderSettings
-        from mrt_mitsuba.runtime import one_at_a_time
         from mrt_mitsuba.scene.open import opened
 
         if 0 < spp < FEWEST:
             warnings.warn(f"mrt_adaptive takes {FEWEST} rays a pixel at least, not spp={spp}", stacklevel=2)
-        number, view = sensor if isinstance(sensor, int) else 0, _sensor(scene, sensor)
+        number = sensor if isinstance(sensor, int) else 0
+        view = _sensor(scene, sensor)
         seed = int(np.ravel(seed)[0]) % 2**32
-        settings = RenderSettings(seed=seed, sensor=number, progress=Progress()).but(**self.options(spp))
-        with one_at_a_time, held(), dr.suspend_grad():
-            source = opened("a Mitsuba scene", scene, view, self.nested)
-            result = render_with(scene, settings, opener=lambda *_, **__: source)
+        settings = RenderSettings(seed=seed, sensor=number, progress=Progress())
+        with dr.suspend_grad(), session(settings) as job:
+            source = replace(opened("a Mitsuba scene", scene, view, self.nested), goal=self.bounded(spp))
+            result = render_source(source, settings, job)
             film, layers = view.film(), result.layers
             names = self.aov_names() if _further(film) else []
             colors = [layers[name] for name in result.plan.bands] or list(np.moveaxis(result.image, -1, 0))
@@ -115,6 +110,11 @@ class MrtAdaptive(mi.SamplingIntegrator):
             values = mi.TensorXf(np.ascontiguousarray(np.stack(planes, -1), np.float32))
             film.put_block(mi.ImageBlock(values, film.crop_offset(), film.rfilter(), border=False))
             return self._seen(film.develop()) if develop else mi.TensorXf()
+
+    def sample(self, *_: Any) -> Any:
+        raise ParameterError(
+            "mrt_adaptive: it is no part of another integrator; put aov or moment into it instead"
+        )
 
     def aov_names(self) -> list[str]:
         return [*self.nested.aov_names(), "error.Y", "samples.Y"]
@@ -150,8 +150,33 @@ class MrtAdaptive(mi.SamplingIntegrator):
         callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
 
     def to_string(self) -> str:
-        goal = f"target={self.target:g}, max_spp={self.most}" if self.target else f"spp={self.most}"
-        return f"MrtAdaptive[{goal}, max_seconds={self.seconds or 0:g}, nested={self.nested}]"
+        target, most = self.goal.target, self.goal.most
+        goal = f"spp={most}" if target is None else f"target={target}, max_spp={most}"
+        return f"MrtAdaptive[{goal}, max_seconds={self.goal.seconds or 0:g}, nested={self.nested}]"
+
+
+def _goal(props: mi.Properties) -> Goal:
+    """The goal that the parameters state; raise ``ParameterError`` for values that are not allowed."""
+    if "spp" in props and "target" in props:
+        raise ParameterError('mrt_adaptive: give "target" or "spp", not both')
+    seconds = number(props, "max_seconds", 0.0, least=0) or None
+    most = integer(props, "max_spp", MAX_SPP, least=FEWEST, most=2**24)
+    if "spp" in props:
+        return Goal(None, integer(props, "spp", most, least=FEWEST, most=65536), seconds)
+    return Goal(_target(props), most, seconds)
+
+
+def _target(props: mi.Properties) -> Target:
+    value = props.get("target", 0.01)
+    try:
+        target = check("target", TARGET, value)
+    except UsageError:
+        target = None
+    if not isinstance(target, Target):
+        raise ParameterError(
+            f'mrt_adaptive: "target" is {value!r}, but must be a number > 0, or a percentage such as "2%"'
+        )
+    return target
 
 
 def _sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:

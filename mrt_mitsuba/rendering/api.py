@@ -6,13 +6,11 @@ scene → plan → rays → integrator → filters → result: each step is a mo
 from __future__ import annotations
 
 import dataclasses
-import io
 import logging
 import os
-import sys
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from inspect import Parameter, Signature
 from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, cast
 
@@ -21,15 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrt_mitsuba import runtime
+from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.machine import Budget, Workspace
 from mrt_mitsuba.output import files
 from mrt_mitsuba.output.layers import AVERAGED
 from mrt_mitsuba.output.layers import TABLE as LAYER_TABLE
+from mrt_mitsuba.rendering.exposing import OWN
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import Plan, make_plan
-from mrt_mitsuba.rendering.progress import Job, Progress, TerminalProgress
-from mrt_mitsuba.rendering.settings import TABLE, RenderSettings
+from mrt_mitsuba.rendering.progress import Job, Timings, default_progress
+from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import Source, open_scene, sized
 
@@ -39,20 +39,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 Image = NDArray[np.float32]
 Options = ParamSpec("Options")
-
-# The options that a result names: those that shape a picture
-_IN_FORCE = (*(name for name in TABLE if name != "memory"), "params", "region", "integrator")
-
-
-@dataclass(frozen=True)
-class Timings:
-    """Seconds of one render; ``load`` and ``passes`` add up to about ``total``."""
-
-    total: float  #: all of the render
-    load: float  #: scene and plan
-    compile: float  #: kernels that were not in the cache
-    kernels: float  #: kernels running
-    passes: Mapping[str, float]  #: by the name of the pass
 
 
 @dataclass(frozen=True)
@@ -82,14 +68,10 @@ class Result:
         files.save(paths, self.image, layers=self.layers, header=header, tonemap=tonemap, inputs=self.inputs)
 
     def header(self) -> dict[str, Any]:
-        """Return the header attributes of an EXR: how the picture was made, and nothing such as seconds that
-        changes when it is made again.
+        """The header attributes of an EXR: how the picture was made, and nothing such as seconds that changes
+        when it is made again.
         """
         version = self.versions["mrt-mitsuba"]
-        error = self.error and {name: getattr(self.error, name) for name in ("rmse", "low", "high", "tail")}
-        if error and error["high"] == np.inf:
-            error["high"] = None  # JSON has no infinity
-        rounds = [{"spp": each.spp, "rmse": each.rmse} for each in self.rounds]
         return {
             "software": f"mrt-mitsuba {version}",
             "mrt:version": version,
@@ -97,17 +79,22 @@ class Result:
             "mrt:options": dict(self.options),
             "mrt:variant": self.plan.variant,
             **{f"mrt:{name}": self.versions[name] for name in ("mitsuba", "drjit", "llvm")},
-            **({"mrt:error": error, "mrt:rounds": rounds} if error else {}),
+            **self._error_header(),
             **{f"mrt:{name}": matrix.tolist() for name, matrix in self.camera.items()},
         }
 
+    def _error_header(self) -> dict[str, Any]:
+        if self.error is None:
+            return {}
+        error = dataclasses.asdict(self.error)
+        if error["high"] == np.inf:
+            error["high"] = None  # JSON has no infinity
+        rounds = [{"spp": each.spp, "rmse": each.rmse} for each in self.rounds]
+        return {"mrt:error": error, "mrt:rounds": rounds}
+
     def _repr_png_(self) -> bytes:
         """Show the picture in a notebook, in sRGB as screens expect it."""
-        from PIL import Image as PilImage
-
-        buffer = io.BytesIO()
-        PilImage.fromarray(files.to_8bit(self.image, "srgb")).save(buffer, format="PNG")
-        return buffer.getvalue()
+        return files.png(self.image)
 
 
 class Render(Protocol[Options]):
@@ -156,88 +143,115 @@ def render(scene: Any = 0, **options: Any) -> Result:
         SceneError: for a scene that cannot be read.
         VariantError: for a variant that cannot run here.
     """
-    with runtime.one_at_a_time, held():
-        return render_with(scene, RenderSettings.of(**options))
+    settings = RenderSettings.of(**options)
+    with session(settings) as job:
+        return render_source(open_with(scene, settings, job), settings, job)
 
 
-def render_with(
-    scene: Any, settings: RenderSettings, *, opener: Callable[..., Source] = open_scene
-) -> Result:
-    """Render a scene as ``render`` does; ``opener`` takes the place of ``open_scene``."""
-    start = time.perf_counter()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+@contextmanager
+def session(settings: RenderSettings) -> Iterator[Job]:
+    """Let one render run alone, in the variant that the settings name, and measure what it costs.
+
+    Raises ``UsageError`` inside a function that ``dr.freeze`` records.
+    """
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise UsageError(
+            "a render cannot be recorded by dr.freeze: it decides by what it has traced. Call it outside of "
+            "the frozen function, or use mrt.prepare(scene), which records the kernels of a render"
+        )
+    with runtime.one_at_a_time, held(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
+        budget = Budget.of(cast("int | None", settings.memory))
+        job = Job(settings.progress or default_progress(), budget, settings.on_round)
         runtime.use(settings.variant)
         runtime.warn_if_slow()
-        budget = Budget.of(cast("int | None", settings.memory))
-        source = opener(
-            scene,
-            size=(settings.width, settings.height),
-            fresnel=settings.fresnel,
-            integrator=settings.integrator,
-            budget=budget,
-            sensor=settings.sensor,
-            params=settings.params,
-            model=settings.model(),
-        )
-        if getattr(source.integrator, "plugin_name", "") == "mrt_adaptive":  # it says where to stop
-            if settings.rmse is None and settings.aamode is None and settings.spp is None:
-                given = {k: v for k, v in source.integrator.options().items() if getattr(settings, k) is None}
-                settings = settings.but(**given)
-            source = replace(source, integrator=source.integrator.nested)
-        with sized(source):
-            return _render(source, settings, budget, start)
+        yield job
 
 
-def _render(source: Source, settings: RenderSettings, budget: Budget, start: float) -> Result:
-    """Render an open scene."""
-    shader = Shader(source, settings.motion)
-    plan, settings = make_plan(source, shader, settings)
-    workspace = Workspace.next_to(
-        plan.seen.width,
-        plan.seen.height,
-        plan.channels,
-        pictures=min(plan.frames, 2),  # the frames' sum, and one of them
-        rays_per_pixel=max(step.places.size for step in plan.passes),
-        budget=budget,
+def open_with(scene: Any, settings: RenderSettings, job: Job) -> Source:
+    """Load a scene as the options of a render say; see ``render`` for what it may be."""
+    return open_scene(
+        scene,
+        size=(settings.width, settings.height),
+        fresnel=settings.fresnel,
+        integrator=settings.integrator,
+        budget=job.budget,
+        sensor=settings.sensor,
+        params=settings.params,
+        model=settings.model(),
     )
-    in_notebook = settings.progress is None and "ipykernel" in sys.modules
-    job = Job(TerminalProgress() if in_notebook else settings.progress or Progress(), workspace)
-    job.progress.plan(plan)
-    load = time.perf_counter() - start
-    log.info("scene %s loaded in %.3f s for %s", source.name, load, plan.variant)
+
+
+def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
+    """Plan and render an open scene: what ``render``, ``prepare`` and ``mrt_adaptive`` have in common."""
+    with sized(source):  # before the shader, whose film has this size
+        shader = Shader(source, settings.motion)
+        plan = make_plan(source, shader, settings)
+        workspace = Workspace.next_to(
+            plan.seen.width,
+            plan.seen.height,
+            plan.channels,
+            pictures=min(plan.frames, 2),  # the frames' sum, and one of them
+            rays_per_pixel=max(step.places.size for step in plan.passes),
+            budget=job.budget,
+        )
+        job.start(plan, workspace)
+        log.info("scene %s loaded in %.3f s for %s", source.name, job.timings().load, plan.variant)
+        layers, error, rounds = _frames(shader, plan, job)
+        job.collect()
+        log.info("%d kernels: compiled in %.3f s, ran for %.3f s", job.launches, job.compiling, job.running)
+        return Result(
+            image=layers["image"],
+            layers=_channels(layers, plan),
+            plan=plan,
+            timings=job.timings(),
+            rays=job.rays,
+            kernel_launches=job.launches,
+            options=plan.options,
+            versions=runtime.versions(),
+            camera=camera_matrices(source.sensor),
+            inputs=frozenset(os.path.abspath(path) for path in job.budget.inputs),
+            error=error,
+            rounds=tuple(rounds),
+        )
+
+
+def _frames(
+    shader: Shader, plan: Plan, job: Job
+) -> tuple[dict[str, np.ndarray], ErrorEstimate | None, Sequence[Round]]:
+    """Trace the plan's frames: the mean of their layers in the region, [H, W, channels] each; and the
+    error and the rounds of the last frame.
+    """
     total = dict[str, np.ndarray]()
     for frame in range(plan.frames):
-        passes = Passes(job, shader, plan, settings, frame)
-        found = passes.run()
-        total = total or found
-        for name in found if plan.frames > 1 else ():
-            if name in LAYER_TABLE and LAYER_TABLE[name].source != AVERAGED:
-                continue  # those of the first frame stay
-            if frame:
-                total[name] += found[name]
-            if frame == plan.frames - 1:
-                total[name] /= np.float32(plan.frames)
+        passes = Passes(job, shader, plan, frame)
+        layers = passes.run()
+        if frame == 0:
+            total = layers
+            continue
+        for name in _averaged(layers):
+            total[name] += layers[name]
+    for name in _averaged(total) if plan.frames > 1 else ():
+        total[name] /= np.float32(plan.frames)
     inside = plan.region.inside(plan.seen)
-    # views of the region [H, W] by EXR channel, first those of the film and the integrator
-    channels = {name: values[inside][..., 0] for name, values in total.items() if name not in LAYER_TABLE}
-    for name in sorted(total.keys() & plan.layers):
-        for index, letter in enumerate(LAYER_TABLE[name].letters):
-            channels[f"{name}.{letter}"] = total[name][inside][..., index]
-    job.collect()
-    log.info("%d kernels: compiled in %.3f s, ran for %.3f s", job.launches, job.compiling, job.running)
-    seconds = time.perf_counter() - start
-    return Result(
-        total["image"][inside],
-        channels,
-        plan,
-        Timings(seconds, load, job.compiling, job.running, job.passes),
-        job.rays,
-        job.launches,
-        {name: value for name in _IN_FORCE if (value := getattr(settings, name)) is not None},
-        runtime.versions(),
-        camera_matrices(source.sensor),
-        frozenset(map(os.path.abspath, budget.inputs)),
-        passes.error,
-        tuple(passes.rounds),
-    )
+    return {name: values[inside] for name, values in total.items()}, passes.error, passes.rounds
+
+
+def _averaged(layers: Iterable[str]) -> list[str]:
+    """The layers that are averaged over frames; of the others, those of the first frame stay."""
+    return [name for name in layers if name not in LAYER_TABLE or LAYER_TABLE[name].source == AVERAGED]
+
+
+def _channels(layers: Mapping[str, np.ndarray], plan: Plan) -> dict[str, Image]:
+    """Views [H, W] by EXR channel: first those of the film and the integrator, then our layers.
+
+    A layer of ours is left out where the integrator has a channel of the same name.
+    """
+    own = {name.removeprefix(OWN): layer[..., 0] for name, layer in layers.items() if name.startswith(OWN)}
+    channels = dict(own)
+    for name in sorted(layers.keys() & plan.layers):
+        letters = LAYER_TABLE[name].letters
+        names = [f"{name}.{letter}" for letter in letters]
+        if own.keys().isdisjoint(names):
+            channels |= {channel: layers[name][..., index] for index, channel in enumerate(names)}
+    return channels

@@ -1,15 +1,18 @@
-"""Exposing pixels: tracing groups of rays in chosen ones, and what their values add up to.
+"""Exposing pixels: tracing groups of rays in chosen ones, and adding up their values.
 
-Rays start where a lattice places them, or where a film's sampler does. In vectorised variants they are traced
-in wavefronts, split where they would not fit into memory; in scalar variants by a loop in Python.
+Where rays start is up to an object with ``start``: a lattice, the sampler of a scene, or any other sampling
+of a film. What their values add up to is up to a canvas: means over the rays of each pixel, or sums under the
+filter of a film. In vectorised variants rays are traced in wavefronts, split where they would not fit into
+memory; in scalar variants by a loop in Python.
 """
 
 from __future__ import annotations
 
 import logging
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Set
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Set
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -19,15 +22,16 @@ from mrt_mitsuba.filters.grid import dilated
 from mrt_mitsuba.interrupts import heed
 from mrt_mitsuba.machine import BYTES_PER_CHANNEL_OF_RAY
 from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
-from mrt_mitsuba.rays.film import Canvas, Film, Places, divide, opaque
-from mrt_mitsuba.rendering.progress import Job
-from mrt_mitsuba.rendering.shading import Shader
+from mrt_mitsuba.rays.canvas import Canvas
+from mrt_mitsuba.rays.film import Film, Places, divide, opaque
+from mrt_mitsuba.rendering.progress import Advance, Job
+from mrt_mitsuba.rendering.shading import RayValues, Shader
 
 log = logging.getLogger(__name__)
 
-# From the number of a pixel and that of a ray among all of the pixel: the place on the film, in pixels, that
-# in the picture, [0, 1]², the time, and the sampler of what else is random
-Start = Callable[[Any, Any], tuple[Any, Any, Any, Any]]
+# Of rays, by layer and channel: mi.Float, in scalar variants np.ndarray
+Values = dict[str, list[Any]]
+OWN = "own:"  # begins what is no layer's name: the channels of the film and the integrator
 
 
 class Groups(NamedTuple):
@@ -36,6 +40,7 @@ class Groups(NamedTuple):
     size: int
     pixels: Any  #: of each: numbers row by row, those of a second picture after those of the first; ascending
     first: np.ndarray | None = None  #: of each, the number of its first ray among all of its pixel; None: 0
+    before: int = 0  #: number of groups in earlier wavefronts
 
     @classmethod
     def spread(cls, size: int, counts: np.ndarray, before: np.ndarray) -> Groups:
@@ -48,14 +53,189 @@ class Groups(NamedTuple):
     def parts(self, most: int, width: int) -> Iterator[tuple[slice, Groups]]:
         """Yield parts of no more than ``most`` groups, cut between rows where that can be, and which groups
         are in each."""
-        start, count = 0, len(self.pixels)
+        start = 0
+        count = len(self.pixels)
         while start < count:
             stop = min(start + most, count)
             if stop < count:
                 row = bisect_left(self.pixels, self.pixels[stop] // width * width)
                 stop = row if row > start else stop
-            part, start = slice(start, stop), stop
-            yield part, Groups(self.size, self.pixels[part], None if self.first is None else self.first[part])
+            part = slice(start, stop)
+            first = None if self.first is None else self.first[part]
+            yield part, Groups(self.size, self.pixels[part], first, start)
+            start = stop
+
+    @property
+    def rays(self) -> int:
+        """Number of rays."""
+        return len(self.pixels) * self.size
+
+    def lanes(self) -> tuple[mi.UInt32, mi.UInt32]:
+        """Return of each ray the number of its pixel, and its own among all of the pixel."""
+        group, number = divide(dr.arange(mi.UInt32, self.rays), self.size)
+        if isinstance(self.pixels, range):
+            pixel = group + opaque(self.pixels.start)
+        else:
+            pixel = dr.gather(mi.UInt32, mi.UInt32(self.pixels), group)
+        if self.first is not None:
+            number += dr.gather(mi.UInt32, mi.UInt32(self.first), group)
+        return pixel, number
+
+
+# ------------------------------------------ Where rays start ------------------------------------------
+
+
+class Start(NamedTuple):
+    """Where and when rays start, one or one in each lane."""
+
+    film: mi.Point2f | None  #: place on the film, in pixels; None on a lattice
+    picture: mi.Point2f  #: place in the picture, [0, 1]²
+    time: mi.Float | None  #: from 0, when the shutter opens, to 1; None: the sampler draws it
+    sampler: mi.Sampler | None  #: of all else that is random; None where nothing is
+
+
+class Starts(Protocol):
+    """Where rays start."""
+
+    def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
+        """Return where rays start, given their pixels and their numbers among all of the pixel; ``before``:
+        groups in earlier wavefronts."""
+        ...
+
+
+class Sampling(Protocol):
+    """Random numbers of rays."""
+
+    seed: Any
+
+    def start(self, pixel: mi.UInt32, number: mi.UInt32) -> mi.Sampler:
+        """Return a sampler of rays, given their pixels and their numbers among all of the pixel."""
+        ...
+
+
+class Independent:
+    """Independent random numbers, as Mitsuba numbers the rays of a whole picture, ``rays`` in each pixel.
+
+    ``seed``: a number, or an array of one.
+    """
+
+    def __init__(self, seed: Any, rays: Any) -> None:
+        self.seed = seed
+        self._rays = rays
+        self._sampler = mi.load_dict({"type": "mrt_rays"})
+
+    def start(self, pixel: mi.UInt32, number: mi.UInt32) -> mi.Sampler:
+        self._sampler.start(self.seed, mi.UInt64(pixel) * mi.UInt64(self._rays) + mi.UInt64(number))
+        return self._sampler
+
+
+class Sequences:
+    """One sequence for each pixel, to be continued by later exposures."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        self._sampler = mi.load_dict({"type": "mrt_sequence"})
+
+    def start(self, pixel: mi.UInt32, number: mi.UInt32) -> mi.Sampler:
+        key = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, self.seed))[0]
+        self._sampler.start(number, key)
+        return self._sampler
+
+
+@dataclass(frozen=True)
+class LatticeStarts:
+    """Rays start at the samples of a lattice, in a picture of this size."""
+
+    places: Places
+    width: int
+    height: int
+    sampling: Sampling | None  #: of what else is random; None where nothing is
+
+    def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
+        sampler = None if self.sampling is None else self.sampling.start(pixel, number)
+        return Start(None, *self.places.at(pixel, number, self.width, self.height), sampler)
+
+
+@dataclass(frozen=True)
+class FilmStarts:
+    """Rays start in the pixels of a film where random numbers place them."""
+
+    film: Film
+    sampling: Sampling
+
+    def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
+        sampler = self.sampling.start(pixel, number)
+        return Start(*self.film.place(divide(pixel, self.film.pixels)[1], sampler), None, sampler)
+
+
+class SceneStarts:
+    """Rays start in the pixels of a film where the sampler of its scene places ``rays`` of each pixel."""
+
+    def __init__(self, film: Film, seed: Any, rays: int) -> None:
+        self._film = film
+        self._seed = seed
+        self._rays = rays
+        one_by_one = mi.variant().startswith("scalar")
+        independent = one_by_one or film.sampler == "IndependentSampler"
+        self._independent = Independent(seed, opaque(rays)) if independent else None
+
+    def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
+        if self._independent:
+            sampler = self._independent.start(pixel, number)
+        else:
+            sampler = self._film.sensor.sampler().clone()
+            sampler.set_sample_count(self._rays)
+            sampler.set_samples_per_wavefront(self._rays)
+            sampler.seed((self._seed + before) % 2**32, dr.width(pixel))
+        return Start(*self._film.place(pixel, sampler), None, sampler)
+
+
+# ---------------------------------------- What values add up to ----------------------------------------
+
+
+class Means:
+    """Means over the rays of each pixel, or of layers of the first hit what the first ray hit.
+
+    They are written into layers, [pixels, channels] each; or averaged with rows ``chosen`` of them, ``share``
+    being the weights of what is there and of what is new.
+    """
+
+    def __init__(
+        self,
+        layers: Mapping[str, np.ndarray],
+        size: int,
+        chosen: np.ndarray | None = None,
+        share: tuple[int, int] = (0, 1),
+    ) -> None:
+        self._layers = layers
+        self._size = size
+        self._chosen = chosen
+        self._share = share
+
+    def put(self, part: slice, values: Values) -> None:
+        """Take up the values of rays, ``size`` in each pixel of a part."""
+        rows = part if self._chosen is None else self._chosen[part]
+        for name, planes in values.items():
+            first = TABLE[name].source == FIRST_HIT
+            sums = np.broadcast_arrays(*(self._over_rays(plane, first) for plane in planes))
+            means = np.stack(sums, -1).astype(np.float32, copy=False)
+            means *= np.float32(1 if first else 1 / self._size)
+            layer = self._layers[name]
+            if self._chosen is not None:
+                known, new = self._share
+                means = (known * layer[rows] + new * means) / np.float32(known + new)
+            layer[rows] = means
+
+    def _over_rays(self, plane: Any, first: bool) -> np.ndarray:
+        """Return by pixel the sum over its rays, or the value of the first."""
+        size = self._size
+        if first or size == 1:
+            return np.asarray(plane)[::size]
+        if isinstance(plane, np.ndarray):
+            return np.asarray(plane.reshape(-1, size).sum(1))
+        if dr.width(plane) == 1:  # a value of one entry is that of all rays
+            return np.asarray(plane * size)
+        return np.asarray(dr.block_reduce(dr.ReduceOp.Add, plane, size))
 
 
 class Stack:
@@ -63,14 +243,17 @@ class Stack:
 
     An exposure may leave pixels out. It counts in proportion to the independent rays that it brings to a
     pixel, and only where none is missing under the filter; the rays of a pixel have the same weight in all.
+
+    ``sums`` [channels, pictures, H, W]: filtered values times their weights; ``weights`` and ``amount``
+    [pictures, H, W]: sums of these weights, and of those of the exposures; ``rays`` [pictures, pixels].
     """
 
     def __init__(self, film: Film, pictures: int, channels: int) -> None:
         self.film = film
         self.rays = np.zeros((pictures, film.pixels))
-        # rows of channels in memory, which NumPy adds up much faster
-        self._sums = np.moveaxis(np.zeros((channels, pictures, *film.shape), np.float32), 0, -1)
-        self._weights, self._amount = np.zeros((2, pictures, *film.shape), np.float32)
+        self.sums = np.zeros((channels, pictures, *film.shape), np.float32)
+        self.weights = np.zeros((pictures, *film.shape), np.float32)
+        self.amount = np.zeros((pictures, *film.shape), np.float32)
 
     def widened(self, groups: np.ndarray) -> np.ndarray:
         """Return numbers of groups [pictures, pixels], one at least wherever the filter reaches from."""
@@ -83,21 +266,25 @@ class Stack:
     def add(self, exposed: Canvas, chosen: np.ndarray) -> None:
         """Add as many pictures of an exposure as there are ``chosen`` pixels for, [pictures, pixels]."""
         rays = exposed.rays[: len(chosen)]
-        amount = self.rows(chosen) / self.film.spread_out(self.rows(np.float32(1 / np.maximum(rays, 1))))
-        self._sums += amount[..., None] * exposed.sums[: len(chosen)]
-        self._weights += amount * exposed.weights[: len(chosen)]
-        self._amount += amount
+        each = np.float32(1 / np.maximum(rays, 1))  # variance of a pixel's mean, up to a factor
+        amount = self.rows(chosen) / self.film.spread_out(self.rows(each))
+        self.sums += amount * exposed.sums[:, : len(chosen)]
+        self.weights += amount * exposed.weights[: len(chosen)]
+        self.amount += amount
         self.rays += rays
 
     def pictures(self) -> np.ndarray:
         """Return the pictures one by one, [pictures, H, W, channels], with the film's border."""
-        return self._sums / np.where(self._weights == 0, 1, self._weights)[..., None]
+        weights = np.where(self.weights == 0, 1, self.weights)
+        return np.moveaxis(self.sums / weights, 0, -1)
 
-    def mean(self) -> np.ndarray:
-        """Return the mean of the pictures, each counting alike, [H, W, channels], without the border."""
-        amount = np.maximum(self._amount, 1e-30)
-        sums, weights = (self._sums / amount[..., None]).sum(0), (self._weights / amount).sum(0)
-        return self.film.picture(sums / np.where(weights == 0, 1, weights)[..., None])
+    def mean(self, pictures: int | None = None) -> np.ndarray:
+        """Return the mean of the first pictures, each counting alike, [H, W, channels], without the border;
+        None: of all."""
+        amount = np.maximum(self.amount[:pictures], 1e-30)
+        sums = (self.sums[:, :pictures] / amount).sum(1)
+        weights = (self.weights[:pictures] / amount).sum(0)
+        return self.film.picture(np.moveaxis(sums / np.where(weights == 0, 1, weights), 0, -1))
 
     def rows(self, values: np.ndarray) -> np.ndarray:
         """Return a view [pictures, H, W, ...] of values [pictures, pixels, ...]."""
@@ -105,154 +292,129 @@ class Stack:
 
 
 class Exposer:
-    """A shader that exposes pixels of a film or, without one, of a lattice.
+    """A shader that exposes pixels of a lattice, or of a film.
 
-    ``layers``: by name, those to expose; of a film next to the picture. ``names``: of all channels, of a film
-    first R, G, B, its own, and the integrator's.
+    ``layers``: by name, those to expose; of a film next to the picture. ``own``: names of the channels of a
+    film, R, G and B first, and of its integrator. ``names``: of all channels, the own ones first.
     """
 
     def __init__(self, job: Job, shader: Shader, film: Film | None, layers: Set[str]) -> None:
-        self.job, self.shader = job, shader
+        self.job = job
+        self.shader = shader
         self.film: Any = film  #: None for a lattice
-        own = ("image", "square") if film else ()  # which a film knows by itself
-        self.layers = [name for name in TABLE if name in layers and name not in own]
-        self.names = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
-        if film:
-            self.names = [*"RGB", *"A" * film.alpha, *film.bands, *shader.aovs, *self.names]
+        known = ("image", "square") if film else ()  # to a film by itself
+        self.layers = [name for name in TABLE if name in layers and name not in known]
+        self.own = [*"RGB", *"A" * film.alpha, *film.bands, *shader.aovs] if film else []
+        ours = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
+        self.names = self.own + ours
 
-    def means(self, pixels: Any, places: Places, seed: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
-        """Trace samples of a lattice in pixels, in parts that fit into memory or of one pixel.
+    def lattice(self, places: Places, seed: Any) -> LatticeStarts:
+        """Return where the rays of a lattice start."""
+        shader = self.shader
+        random = shader.random or mi.is_spectral or shader.sensor.needs_aperture_sample()
+        sampling = Independent(seed, opaque(places.size)) if random else None
+        return LatticeStarts(places, shader.width, shader.height, sampling)
 
-        Yields which of the pixels are in a part, and by layer the values there, [pixels, channels]: means
-        over the rays of each pixel, or what the first ray hit. They do not depend on the parts.
-        """
-        workspace, channels, size = self.job.workspace, len(self.names), places.size
-        width, height = self.shader.width, self.shader.height
-        random = self.shader.random or mi.is_spectral or self.shader.sensor.needs_aperture_sample()
-        sampler = mi.load_dict({"type": "mrt_rays"}) if random else None
-
-        def start(pixel: Any, number: Any) -> tuple[Any, Any, Any, Any]:
-            if sampler is not None:
-                sampler.start(seed, mi.UInt64(pixel) * mi.UInt64(opaque(size)) + mi.UInt64(number))
-            return None, *places.at(pixel, number, width, height), sampler
-
-        def over_rays(plane: Any, first: bool) -> np.ndarray:
-            if first or size == 1:
-                return np.asarray(plane)[::size]
-            if isinstance(plane, np.ndarray):
-                return np.asarray(plane.reshape(-1, size).sum(1))
-            if dr.width(plane) == 1:  # a value of one entry is that of all rays
-                return np.asarray(plane * size)
-            return np.asarray(dr.block_reduce(dr.ReduceOp.Add, plane, size))
-
-        most = workspace.rays_at_once(channels)
-        log.debug("tracing %d rays, at most %d at once", len(pixels) * size, most)
-        for part, groups in Groups(size, pixels).parts(max(1, most // size), width):
-            means = dict[str, np.ndarray]()
-            for name, planes in self._trace(groups, start)[1].items():
-                first = TABLE[name].source == FIRST_HIT
-                sums = np.broadcast_arrays(*(over_rays(plane, first) for plane in planes))
-                means[name] = np.stack(sums, -1).astype(np.float32, copy=False)
-                means[name] *= np.float32(1 if first else 1 / size)
-            yield part, means
-        workspace.give_back(min(most, len(pixels) * size) * channels * BYTES_PER_CHANNEL_OF_RAY)
+    def average(self, pixels: Any, starts: LatticeStarts, means: Means, advance: Advance) -> None:
+        """Trace the rays of a lattice in pixels, and take up their means. They do not depend on how memory
+        cuts the rays into wavefronts."""
+        groups = Groups(starts.places.size, pixels)
+        channels = len(self.names)
+        for part, _, _, values in self._wavefronts(groups, starts, channels):
+            means.put(part, values)
+            advance(part.stop - part.start)
+        workspace = self.job.workspace
+        most = max(workspace.rays_at_once(channels), groups.size)
+        workspace.give_back(min(most, groups.rays) * channels * BYTES_PER_CHANNEL_OF_RAY)
 
     def expose(
         self,
         groups: Groups,
-        seed: int,
+        starts: Starts,
         *,
         pictures: int = 1,
-        progressive: bool = False,
         moments: bool = False,
-        advance: Callable[[int], object] = lambda rays: None,
+        advance: Advance = lambda rays: None,
     ) -> Canvas:
-        """Trace groups of rays in as many wavefronts as fit into memory, and add their values up.
-
-        Args:
-            progressive: draw from one sequence for each pixel, to be continued by later exposures; else as
-                the scene's sampler does.
-            moments: add up colours and their squares by pixel as well.
-        """
-        film, size = self.film, groups.size
-        rays = np.bincount(groups.pixels, minlength=pictures * film.pixels).reshape(pictures, -1) * size
-        canvas = Canvas(film, rays, len(self.names), moments=moments)
-        most = max(1, self.job.workspace.rays_at_once(2 * len(self.names)) // size)
-        log.debug("tracing %d rays, at most %d at once", len(groups.pixels) * size, most * size)
-        scalar = mi.variant().startswith("scalar")
-        sequence = progressive and not scalar
-        independent = scalar or film.sampler == "IndependentSampler"
-        sampler: Any = mi.load_dict({"type": "mrt_sequence" if sequence else "mrt_rays"})
-
-        def start(pixel: Any, number: Any) -> tuple[Any, Any, Any, Any]:
-            if sequence:
-                sampler.start(number, mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, seed))[0])
-            elif independent:  # numbered as Mitsuba numbers the rays of a whole picture
-                rays = 2**24 if progressive else opaque(size)
-                sampler.start(seed, mi.UInt64(pixel) * mi.UInt64(rays) + mi.UInt64(number))
-            if progressive:
-                _, pixel = divide(pixel, film.pixels)
-            return *film.place(pixel, sampler), None, sampler
-
-        for part, some in groups.parts(most, film.width):
-            count = len(some.pixels) * size
-            if not (sequence or independent):
-                sampler = film.sensor.sampler().clone()
-                sampler.set_sample_count(size)
-                sampler.set_samples_per_wavefront(size)
-                sampler.seed((seed + part.start) % 2**32, count)
-            place, values = self._trace(some, start)
+        """Trace groups of rays on a film, and add their values up; with ``moments``, the squares of their
+        colours as well."""
+        film = self.film
+        rays = np.bincount(groups.pixels, minlength=pictures * film.pixels).reshape(pictures, -1)
+        canvas = Canvas(film, rays * groups.size, len(self.names), moments=moments)
+        for _, some, place, values in self._wavefronts(groups, starts, 2 * len(self.names)):
             planes = [plane for channels in values.values() for plane in channels]
-            canvas.put(place, planes, some.pixels, size)
-            advance(count)
+            canvas.put(place, planes, some.pixels, some.size)
+            advance(some.rays)
         return canvas
 
-    def _trace(self, groups: Groups, start: Start) -> tuple[Any, dict[str, list[Any]]]:
-        """Trace a wavefront; return places on the film and values, by layer and channel, of all rays."""
-        heed()
-        size, pixels, count = groups.size, groups.pixels, len(groups.pixels) * groups.size
-        if mi.variant().startswith("scalar"):
-            places, values = [], dict[str, Any]()
-            for lane in range(count):
-                group, rest = divmod(lane, size)
-                number = rest if groups.first is None else rest + int(groups.first[group])
-                place, found = self._ray(int(pixels[group]), number, start)
-                heed()
-                places.append((0, 0) if place is None else (place.x, place.y))
-                for name, channels in found.items():
-                    values.setdefault(name, []).append(channels)
-            place = np.array(places).T
-            values = {name: list(np.array(planes).T) for name, planes in values.items()}
-        else:
-            group, number = divide(dr.arange(mi.UInt32, count), size)
-            if isinstance(pixels, range):
-                pixel = group + dr.opaque(mi.UInt32, pixels.start)
-            else:
-                pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), group)
-            if groups.first is not None:
-                number += dr.gather(mi.UInt32, mi.UInt32(groups.first), group)
-            place, values = self._ray(pixel, number, start)
-            dr.eval(place, values)
-        self.job.rays["primary"] += count
-        for name, planes in values.items():
-            kind = TABLE[name].counts if name in TABLE else ""
-            if kind:
-                self.job.rays[kind] += round(float(np.sum(np.asarray(planes[0]), dtype=np.float64)))
+    def _wavefronts(
+        self, groups: Groups, starts: Starts, channels: int
+    ) -> Iterator[tuple[slice, Groups, Any, Values]]:
+        """Trace rays in as many wavefronts as fit into memory, with so many channels of each ray.
+
+        Yields which of the groups are in a wavefront, these, the places of their rays on the film, and the
+        values.
+        """
+        width = self.film.width if self.film else self.shader.width
+        most = self.job.workspace.rays_at_once(channels)
+        log.debug("tracing %d rays, at most %d at once", groups.rays, most)
+        for part, some in groups.parts(max(1, most // groups.size), width):
+            heed()
+            trace = self._one_by_one if mi.variant().startswith("scalar") else self._at_once
+            place, values = trace(some, starts)
+            self.job.rays["primary"] += some.rays
+            for name, planes in values.items():
+                kind = TABLE[name].counts if name in TABLE else ""
+                if kind:
+                    self.job.rays[kind] += round(float(np.sum(np.asarray(planes[0]), dtype=np.float64)))
+            yield part, some, place, values
+
+    def _at_once(self, groups: Groups, starts: Starts) -> tuple[mi.Point2f, Values]:
+        """Trace rays in one wavefront."""
+        place, values = self.trace(*groups.lanes(), starts, groups.before)
+        dr.eval(place, values)
         return place, values
 
-    def _ray(self, pixel: Any, number: Any, start: Start) -> tuple[Any, dict[str, list[Any]]]:
+    def _one_by_one(self, groups: Groups, starts: Starts) -> tuple[np.ndarray, Values]:
+        """Trace rays in a loop, as scalar variants do."""
+        places = list[tuple[float, float]]()
+        values = dict[str, list[Any]]()
+        for lane in range(groups.rays):
+            group, number = divmod(lane, groups.size)
+            if groups.first is not None:
+                number += int(groups.first[group])
+            place, traced = self.trace(int(groups.pixels[group]), number, starts, groups.before)
+            heed()
+            places.append((0, 0) if place is None else (place.x, place.y))
+            for name, channels in traced.items():
+                values.setdefault(name, []).append(channels)
+        return np.array(places).T, {name: list(np.array(planes).T) for name, planes in values.items()}
+
+    def trace(
+        self, pixel: mi.UInt32, number: mi.UInt32, starts: Starts, before: int = 0
+    ) -> tuple[Any, Values]:
         """Trace a ray, or one in each lane: return its place on the film, and its values."""
-        place, inside, time, sampler = start(pixel, number)
-        values, film, found = self.shader.values(inside, time, sampler), self.film, dict[str, Any]()
-        if film is not None:
-            found["image"] = mi.Color3f(mi.luminance(values.image)) if film.grey else values.image
-            if film.alpha:
-                found["A"] = dr.select(values.valid, mi.Float(1), 0)
-            if film.bands:
-                sensed = film.sensor.film().prepare_sample
-                bands = sensed(values.spectrum, values.ray.wavelengths, len(film.bands) + 1)
-                found |= zip(film.bands, bands, strict=False)  # without the weight
-            found |= zip(self.shader.aovs, values.aovs, strict=True)
-        found |= {name: TABLE[name].value(values) for name in self.layers}
-        parts = {name: list(value) if dr.size_v(value) > 1 else [value] for name, value in found.items()}
-        return place, {name: [mi.Float(c) for c in channels] for name, channels in parts.items()}
+        start = starts.start(pixel, number, before)
+        rays = self.shader.values(start.picture, start.time, start.sampler)
+        values = {name: _channels(TABLE[name].value(rays)) for name in self.layers}
+        if self.film is not None:
+            values = {OWN: self._own(rays), **values}
+        return start.film, values
+
+    def _own(self, rays: RayValues) -> list[mi.Float]:
+        """Return the channels of the film and the integrator."""
+        film = self.film
+        channels = _channels(mi.Color3f(mi.luminance(rays.image)) if film.grey else rays.image)
+        if film.alpha:
+            channels.append(dr.select(rays.valid, mi.Float(1), 0))
+        if film.bands:
+            sensed = film.sensor.film().prepare_sample
+            bands = sensed(rays.spectrum, rays.ray.wavelengths, len(film.bands) + 1)
+            channels += [mi.Float(band) for band in bands[: len(film.bands)]]  # without the weight
+        return channels + [mi.Float(aov) for aov in rays.aovs]
+
+
+def _channels(value: Any) -> list[mi.Float]:
+    """Return the channels of a value."""
+    parts = list(value) if dr.size_v(value) > 1 else [value]
+    return [mi.Float(part) for part in parts]

@@ -16,12 +16,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.filters.dof import REACH
 from mrt_mitsuba.filters.grid import dilated, window_means
 from mrt_mitsuba.output.error import DOUBTFUL, ErrorEstimate, tail_shape
-from mrt_mitsuba.rendering.exposing import Exposer, Groups, Stack
+from mrt_mitsuba.rendering.exposing import Exposer, FilmStarts, Groups, Independent, Sequences, Stack
 
 HALVES, SCOUTS = [0, 1], [2, 3]
 SUSPECT = 0.5  # shape of a tail where rare rays may rule
@@ -74,21 +75,23 @@ class Halves(Stack):
         """Trace groups of rays."""
         counts = np.concatenate([self.widened(chosen[:2]), chosen[2:]])
         groups = Groups.spread(self.group, counts, self._traced)
-        exposed = self._exposer.expose(
-            groups, self._seed, pictures=4, progressive=True, moments=True, advance=advance
-        )
-        square = exposed.square.mean(-1)
+        scalar = mi.variant().startswith("scalar")
+        sampling = Independent(self._seed, 2**24) if scalar else Sequences(self._seed)
+        starts = FilmStarts(self.film, sampling)
+        exposed = self._exposer.expose(groups, starts, pictures=4, moments=True, advance=advance)
+        total, peak = exposed.total, exposed.peak  # [3, 4, H, W], [4, H, W]
+        square = exposed.square.mean(0)
         bad = ~np.isfinite(square)
         if bad.any():
             self._bad |= bad.any(0)
-            worst = exposed.total[bad].max()
-            self._unfit = float(exposed.peak[bad].max() if np.isfinite(worst) else worst)
-            for values in (exposed.total, square, exposed.peak):
+            worst = total[:, bad].max()
+            self._unfit = float(peak[bad].max() if np.isfinite(worst) else worst)
+            for values in (*total, square, peak):
                 values[bad] = 0
         self._traced += exposed.rays
-        self._total += np.moveaxis(exposed.total, -1, 0)
+        self._total += total
         self._square += square
-        np.maximum(self._peak, exposed.peak[..., 0], out=self._peak)
+        np.maximum(self._peak, peak, out=self._peak)
         with np.errstate(invalid="ignore"):
             self.add(exposed, chosen[:2] > 0)
 

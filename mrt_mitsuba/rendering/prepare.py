@@ -13,10 +13,9 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.plugins.snapshot import Part
-from mrt_mitsuba.rendering.api import Result, render_with
+from mrt_mitsuba.rendering.api import Result, open_with, render_source, session
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import camera_matrices
-from mrt_mitsuba.scene.open import open_scene
 
 
 class Prepared:
@@ -56,12 +55,10 @@ class Prepared:
 
     def _render(self, seed: int) -> Result:
         """Render from scratch; later results differ from this one by the picture."""
-
-        def opened(scene: Any, **how: Any) -> Any:
-            self._source = self._source or open_scene(scene, **how)
-            return self._source
-
-        self._made = render_with(self._scene, replace(self._settings, seed=seed), opener=opened)
+        settings = replace(self._settings, seed=seed)
+        with session(settings) as job:
+            self._source = self._source or open_with(self._scene, settings, job)
+            self._made = render_source(self._source, settings, job)
         return self._made
 
     def _look(self) -> Part:
@@ -78,7 +75,7 @@ class Prepared:
         kinds = sensor.class_name(), sensor.sampler().class_name(), film.rfilter().class_name()
         if not (
             kinds == ("PerspectiveCamera", "IndependentSampler", "BoxFilter")
-            and hasattr(self._source.integrator, "kernel_plan") and plan.variant == "llvm_ad_rgb"
+            and plan.kernel is not None and plan.variant == "llvm_ad_rgb"
             and [step.layers for step in plan.passes] == [{"image"}] and not plan.layers and not plan.motion
             and plan.film in ("", "BoxFilter, rgb") and plan.passes[0].places.size == 1
             and plan.region == plan.seen == (0, 0, *size) and sensor.shutter_open_time() == 0

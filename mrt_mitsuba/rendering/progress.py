@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import logging
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, TextIO
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TextIO
 
 from mrt_mitsuba.interrupts import heed
-from mrt_mitsuba.machine import Workspace
+from mrt_mitsuba.machine import Budget, Workspace
+
+if TYPE_CHECKING:
+    from mrt_mitsuba.output.error import RoundPicture
 
 log = logging.getLogger(__name__)
 
 SECONDS = 0.1  # between two looks at what kernels took
 # What the original program prints before a stage
-SAID = {"anti-aliasing": "Computing Anti aliasing..", "depth of field": "Computing depth of field.."}
+ANNOUNCEMENTS = {"anti-aliasing": "Computing Anti aliasing..", "depth of field": "Computing depth of field.."}
+
+ROUNDS = "Rounds"  # title of the stages in which rays go to where they are needed
 
 Advance = Callable[[int], object]
 
@@ -32,13 +38,18 @@ class Progress:
     def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
         """Receive the records of the kernels that Dr.Jit ran since the last call."""
 
+    shows_rounds = False  #: whether ``round`` wants the picture after each round of rays
+
+    def round(self, picture: RoundPicture) -> None:
+        """Receive the picture after a round of rays."""
+
     @contextlib.contextmanager
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
         """Open a stage of ``total`` steps, and give a function to call with the number of steps just done.
 
         ``title`` names the stage on the bar, ``message`` is printed on a line of its own.
         """
-        yield lambda steps: None
+        yield _ignore
 
 
 class TerminalProgress(Progress):
@@ -56,8 +67,10 @@ class TerminalProgress(Progress):
         file: TextIO | None = None,
         bar_file: TextIO | None = None,
     ) -> None:
-        self.show_plan, self.unit = show_plan, unit
-        self.file, self.bar_file = file or sys.stdout, bar_file or sys.stderr
+        self.show_plan = show_plan
+        self.unit = unit
+        self.file = file or sys.stdout
+        self.bar_file = bar_file or sys.stderr
 
     def plan(self, plan: object) -> None:
         if self.show_plan:
@@ -65,36 +78,117 @@ class TerminalProgress(Progress):
 
     @contextlib.contextmanager
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
-        if message:
+        bars = self.bar_file.isatty() or "ipykernel" in sys.modules
+        on_bar = message if bars and title == ROUNDS else ""  # one line, which each round updates
+        if message and not on_bar:
             print(message, file=self.file, flush=True)
-        if not (self.bar_file.isatty() or "ipykernel" in sys.modules):
-            yield lambda steps: None
+        if not bars:
+            yield _ignore
             return
         from tqdm.auto import tqdm
 
         looks: Any = {"unit": self.unit, "unit_scale": True, "dynamic_ncols": True, "leave": False}
-        with tqdm(total=total, desc=title, file=self.bar_file, **looks) as bar:
+        with tqdm(total=total, desc=title, postfix=on_bar or None, file=self.bar_file, **looks) as bar:
             yield bar.update
 
 
-@dataclass
+class NotebookProgress(TerminalProgress):
+    """Bars in a notebook and, while rays go in rounds, one display of the picture as it gets better."""
+
+    shows_rounds = True
+
+    _display: Any = None  # IPython's handle of the picture
+
+    def round(self, picture: RoundPicture) -> None:
+        from IPython.display import HTML, display
+
+        from mrt_mitsuba.output.files import png
+
+        encoded = base64.b64encode(png(picture.image)).decode()
+        target = "" if picture.target is None else f" (target {picture.target:.2g})"
+        caption = f"error {picture.rmse:.2g}{target}, {picture.spp:.0f} rays a pixel, {picture.seconds:.1f} s"
+        shown = HTML(f'<img src="data:image/png;base64,{encoded}" alt="{caption}"><br>{caption}')
+        if self._display is None:
+            self._display = display(shown, display_id=True)
+        else:
+            self._display.update(shown)
+
+
+def default_progress() -> Progress:
+    """What shows the progress of a render where the caller does not say: nothing, but in notebooks."""
+    return NotebookProgress() if "ipykernel" in sys.modules else Progress()
+
+
+def _ignore(steps: int) -> None:
+    """Take no notice of progress."""
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Seconds of one render; ``load`` and ``passes`` add up to about ``total``."""
+
+    total: float  #: all of the render
+    load: float  #: scene and plan
+    compile: float  #: kernels that were not in the cache
+    kernels: float  #: kernels running
+    passes: Mapping[str, float]  #: by the name of the pass
+
+
 class Job:
     """A render under way: where it reports, how much it does at once, and what it has cost so far."""
 
-    progress: Progress
-    workspace: Workspace
-    passes: dict[str, float] = field(default_factory=dict)  #: seconds by name
-    rays: Counter[str] = field(default_factory=lambda: Counter(primary=0))  #: traced, by kind
-    launches: int = 0  #: of kernels
-    compiling: float = 0.0  #: seconds
-    running: float = 0.0  #: seconds that kernels ran
-    collected: float = 0.0  #: when Dr.Jit's records were read last
+    workspace: Workspace  #: memory for rays and filters, known once there is a plan
+
+    def __init__(
+        self, progress: Progress, budget: Budget, on_round: Callable[[RoundPicture], object] | None = None
+    ) -> None:
+        self.progress = progress
+        self.budget = budget  #: bytes that it may use
+        self._on_round = on_round
+        self.passes: dict[str, float] = {}  #: seconds by name
+        self.rays = Counter(primary=0)  #: traced, by kind
+        self.launches = 0  #: of kernels
+        self.compiling = 0.0  #: seconds
+        self.running = 0.0  #: seconds that kernels ran
+        self._began = time.perf_counter()
+        self._loaded = self._began
+        self._collected = 0.0  # when Dr.Jit's records were read last
+
+    def start(self, plan: object, workspace: Workspace) -> None:
+        """Begin with a plan, and with the memory next to its picture."""
+        self.workspace = workspace
+        self.progress.plan(plan)
+        self._loaded = time.perf_counter()
+
+    @property
+    def on_round(self) -> Callable[[RoundPicture], object] | None:
+        """What is called with the picture after each round of rays, and stops the render by returning False;
+        None where nobody looks."""
+        if not self.progress.shows_rounds:
+            return self._on_round
+
+        def show(picture: RoundPicture) -> object:
+            self.progress.round(picture)
+            return self._on_round(picture) if self._on_round else None
+
+        return show
+
+    def timings(self) -> Timings:
+        """What the render has taken up to now."""
+        return Timings(
+            total=time.perf_counter() - self._began,
+            load=self._loaded - self._began,
+            compile=self.compiling,
+            kernels=self.running,
+            passes=self.passes,
+        )
 
     def collect(self) -> None:
         """Add up what Dr.Jit recorded since the last call. Records hold the kernels' text: many take room."""
         import drjit as dr
 
-        self.collected, records = time.perf_counter(), dr.kernel_history()
+        self._collected = time.perf_counter()
+        records = dr.kernel_history()
         self.progress.kernels(records)
         own = [record for record in records if record["type"] == dr.KernelType.JIT]
         self.launches += len(own)
@@ -106,12 +200,12 @@ class Job:
         """Open a stage of the progress, and measure its time."""
         start = time.perf_counter()
         self.collect()
-        with self.progress.stage(name.capitalize(), total, message or SAID.get(name, "")) as advance:
+        with self.progress.stage(name.capitalize(), total, message or ANNOUNCEMENTS.get(name, "")) as advance:
 
             def advance_and_collect(steps: int) -> None:
                 advance(steps)
                 heed()
-                if time.perf_counter() - self.collected > SECONDS:
+                if time.perf_counter() - self._collected > SECONDS:
                     self.collect()
 
             yield advance_and_collect

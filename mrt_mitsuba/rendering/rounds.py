@@ -63,8 +63,9 @@ def run_rounds(
         done.append(now)
         log.info("round %d: %.1f rays a pixel, error %.3g", len(done), now.spp, now.rmse)
         if on_round is not None:
-            maps = (np.array(values, np.float32) for values in picture.maps())  # its own, to write into
-            if on_round(RoundPicture(now.seconds, now.spp, now.rmse, *maps)) is False:
+            image, deviation, samples = (np.array(values, np.float32) for values in picture.maps())  # copies
+            shown = RoundPicture(now.seconds, now.spp, now.rmse, image, deviation, samples, target)
+            if on_round(shown) is False:
                 return done, picture.error()
         most = min(rays, GROWTH * now.spp)
         if seconds is not None:

@@ -22,9 +22,9 @@ from mrt_mitsuba.options import (
     SWITCH,
     TARGET,
     VECTOR,
-    Kind,
     check,
     choice,
+    instance,
     integer,
     option,
     subset,
@@ -33,6 +33,7 @@ from mrt_mitsuba.options import (
 from mrt_mitsuba.output.layers import LAYERS
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.model import FRESNEL, MODEL_OPTIONS, SIDE, SIZE
+from mrt_mitsuba.target import Goal, Target
 
 if TYPE_CHECKING:
     from mrt_mitsuba.output.error import RoundPicture
@@ -66,8 +67,12 @@ class RenderSettings:
         f"refine all pixels, only edges that a detector finds ({', '.join(DETECTORS)}), or where noise is",
         AAMODE,
     )
-    target: float | Sequence[float] | None = option(
-        None, TARGET, "error to render to (RMSE, linear); OBJ file: what the camera looks at", "none"
+    target: Target | float | str | Sequence[float] | None = option(
+        None,
+        TARGET,
+        "error to render to: an RMSE, linear, or a percentage of the picture's mean luminance, such as 2%; "
+        "OBJ file: what the camera looks at",
+        "none",
     )
     maxspp: int | None = option(
         None, integer(MIN_SPP, 2**24), "rays of a pixel at most, with a target, on average", str(MAX_SPP)
@@ -147,7 +152,7 @@ class RenderSettings:
     )
     progress: Progress | None = option(
         None,
-        Kind("", "a rendering.progress.Progress", lambda value: isinstance(value, Progress)),
+        instance(Progress, "a rendering.progress.Progress"),
         "receives the plan, the stages and their progress",
     )
 
@@ -160,7 +165,7 @@ class RenderSettings:
 
     @classmethod
     def of(cls, **options: Any) -> RenderSettings:
-        """Return the settings of the options that a user gives; raise ``TypeError`` for one that is none."""
+        """Make settings of the options that a user gives; raise ``TypeError`` for an unknown one."""
         for name in options.keys() - cls.__dataclass_fields__.keys():
             close = difflib.get_close_matches(name, cls.__dataclass_fields__, 1)
             raise TypeError(
@@ -168,19 +173,32 @@ class RenderSettings:
             )
         return cls(**options)
 
-    def but(self, **values: Any) -> RenderSettings:
-        """Return the settings with other values, which are known to be right."""
-        other = object.__new__(type(self))
-        vars(other).update(vars(self) | values)
-        return other
-
     @property
-    def rmse(self) -> float | None:
+    def error(self) -> Target | None:
         """The error to render to."""
-        return self.target if isinstance(self.target, float) else None
+        return self.target if isinstance(self.target, Target) else None
+
+    def goal(self, stated: Goal | None = None) -> Goal | None:
+        """How far rounds of rays go; None for a render without rounds.
+
+        ``stated``: what the scene's integrator says, for where no option says how many rays a pixel gets.
+        Raises ``UsageError`` for too few rays.
+        """
+        if self.error is not None:
+            return Goal(self.error, self.maxspp or MAX_SPP, self.maxseconds)
+        if self.aamode == NOISE:
+            if (self.spp or 1) < MIN_SPP:
+                raise UsageError(
+                    f"aamode=noise: give the mean of a pixel's rays as spp, {MIN_SPP} or more, or a target"
+                )
+            return Goal(None, self.maxspp or self.spp or MIN_SPP, self.maxseconds)
+        if stated is None or self.aamode is not None or self.spp is not None:
+            return None
+        seconds = stated.seconds if self.maxseconds is None else self.maxseconds
+        return Goal(stated.target, self.maxspp or stated.most, seconds)
 
     def model(self) -> dict[str, Any]:
-        """Return what is given about a model and its view, as ``obj.obj_scene`` takes it.
+        """What is given about a model and its view, as ``obj.obj_scene`` takes it.
 
         Raises ``UsageError`` for a view that shows nothing.
         """
@@ -188,14 +206,20 @@ class RenderSettings:
             raise UsageError("camera and target are the same point: move one of them")
         if self.up == (0, 0, 0):
             raise UsageError("up=0,0,0: up must have a length, such as up=0,1,0")
-        given = {name: getattr(self, name) for name in MODEL_OPTIONS if name != "target" or not self.rmse}
+        names = [name for name in MODEL_OPTIONS if name != "target" or self.error is None]
+        given = {name: getattr(self, name) for name in names}
         return {name: value for name, value in given.items() if value is not None}
 
     def focus(self, distance: float | None, reach: float) -> tuple[float | None, float]:
-        """Return the distance that is sharp, None for no depth of field, and half of the sharp range; in a
-        scene that suggests ``distance`` and ``reach``, in its units."""
-        distance = distance if self.focaldist is None else self.focaldist
-        return distance or None, reach if self.focalrange is None else self.focalrange
+        """The distance in focus, None for no depth of field, and half of the sharp range, in scene units.
+
+        ``distance`` and ``reach``: what the scene suggests.
+        """
+        if self.focaldist is not None:
+            distance = self.focaldist
+        if self.focalrange is not None:
+            reach = self.focalrange
+        return distance or None, reach
 
 
 #: The options of a render by name, without those that only Python can give

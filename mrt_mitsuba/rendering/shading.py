@@ -12,6 +12,7 @@ import numpy as np
 
 from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
+from mrt_mitsuba.plugins import plugin
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.plugins.parameters import ParameterError
 from mrt_mitsuba.plugins.variants import ByShape
@@ -105,8 +106,8 @@ class RayValues:
 class Shader:
     """An integrator on a scene, seen by a camera that moves by ``motion`` from time 0 to 1.
 
-    An integrator with a ``kernel_plan`` knows layers of its own; any other that follows camera rays gives the
-    picture, and Mitsuba the first hit; the rest give whole pictures only, and no layers.
+    ``mrt_whitted`` has a plan of its kernels and knows layers of its own; any other integrator that follows
+    camera rays gives the picture, and Mitsuba the first hit; the rest give whole pictures and no layers.
     """
 
     facts: SceneFacts | None = None  #: what its kernels depend on; None where it does not say
@@ -121,7 +122,7 @@ class Shader:
         #: names of those that can be traced, without internal ones
         self.layers = frozenset(name for name, layer in TABLE.items() if layer.source == FIRST_HIT)
         self._derivatives = isinstance(integrator, mi.CppADIntegrator)  # such as prb
-        if hasattr(integrator, "kernel_plan"):
+        if isinstance(integrator, plugin("whitted").MrtWhitted):
             try:
                 self._data = integrator.prepare(self.scene)
             except ParameterError as error:

@@ -69,9 +69,9 @@ class Wholes(Halves):
                 self._traced[picture] += count
                 self._total[:, picture] += np.moveaxis(values[..., :3], -1, 0)
                 if picture in HALVES:
-                    self._sums[picture] += values
-                    self._weights[picture] += count
-                    self._amount[picture] += count
+                    self.sums[:, picture] += np.moveaxis(values, -1, 0)
+                    self.weights[picture] += count
+                    self.amount[picture] += count
                     self.rays[picture] += count
         self._bad = np.asarray(~np.isfinite(self._total).all((0, 1)))
         self._unfit = self._total[..., self._bad].max(initial=-np.inf)

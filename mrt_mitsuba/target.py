@@ -1,0 +1,72 @@
+"""The error that a render is to reach."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC
+from dataclasses import dataclass
+
+PERCENT = "%"
+
+
+@dataclass(frozen=True)
+class Target:
+    """An RMSE to the converged picture, linear: a number, or a share of the picture's mean luminance.
+
+    ``str()`` writes it as an option takes it: "0.01" or "2%".
+    """
+
+    value: float  #: of a relative target the share, 0.02 for 2 %
+    relative: bool = False
+
+    @classmethod
+    def of(cls, value: object) -> Target:
+        """Read a target from a number, from a text such as "0.01" or "2%", or from a target.
+
+        Raises ``ValueError`` or ``TypeError`` for anything else.
+        """
+        if isinstance(value, Target):
+            return value
+        if isinstance(value, bool):
+            raise TypeError("a target is a number or a percentage")
+        if not isinstance(value, str):
+            return cls(float(value))  # type: ignore[arg-type]
+        number = value.removesuffix(PERCENT)
+        if number != number.strip() or "_" in number or not number.isascii():
+            raise ValueError(f"{value!r} is neither a number nor a percentage")
+        if number == value:
+            return cls(float(number))
+        return cls(float(number) / 100, relative=True)
+
+    @property
+    def positive(self) -> bool:
+        """Whether it can be reached at all: finite, and more than zero."""
+        return 0 < self.value < math.inf
+
+    @property
+    def plain(self) -> float | str:
+        """The number, or the text of a percentage: what JSON can hold, and ``of`` reads."""
+        return str(self) if self.relative else self.value
+
+    def rmse(self, luminance: float) -> float:
+        """The RMSE to reach in a picture of this mean luminance, linear."""
+        return self.value * luminance if self.relative else self.value
+
+    def __str__(self) -> str:
+        return f"{100 * self.value:g}{PERCENT}" if self.relative else f"{self.value:g}"
+
+
+@dataclass(frozen=True)
+class Goal:
+    """How far rounds of rays go: to a target, or until their rays or seconds are spent."""
+
+    target: Target | None  #: None: all rays are spent
+    most: int  #: rays of a pixel, on average
+    seconds: float | None = None  #: None: no limit
+
+
+class StatesGoal(ABC):  # registered, as Mitsuba's classes take no second base
+    """An integrator that traces no rays itself, but says how far rounds of another one's go."""
+
+    nested: object  #: the integrator that traces
+    goal: Goal
