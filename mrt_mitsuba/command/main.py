@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from mrt_mitsuba.command import registry
 from mrt_mitsuba.command.options import parse
-from mrt_mitsuba.errors import NOT_INSTALLED, MrtError, UsageError, one_line
+from mrt_mitsuba.errors import MrtError, UsageError, needs_extra, one_line
 from mrt_mitsuba.interrupts import Terminated, ending_soon, leave_now
 from mrt_mitsuba.output.replacing import discard_unfinished
 
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _guarded(words: list[str]) -> tuple[int, str]:
     """Run the command; return its exit code, and what went wrong."""
     try:
-        with ending_soon(_end_by_force):
+        with ending_soon(_end_by_force), needs_extra():
             code = _dispatch(words)
             sys.stdout.flush()
         return code, ""
@@ -72,8 +72,7 @@ def _guarded(words: list[str]) -> tuple[int, str]:
             return 1, "" if gone else f"cannot print: {error.strerror}; send the output elsewhere"
         if os.environ.get(TRACEBACK):
             raise
-        absent = isinstance(error, ModuleNotFoundError) and NOT_INSTALLED.format(error.name)
-        return 1, absent or f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)"
+        return 1, f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)"
 
 
 def _dispatch(words: list[str]) -> int:

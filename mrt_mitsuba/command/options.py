@@ -26,6 +26,12 @@ LEVELS = {
 FORM = "mrt FILENAME [SCENE] [name=value ...]"
 
 
+def _scene(value: Any) -> int | str:
+    if value in NUMBERS or (value and "\0" not in value):
+        return value
+    raise ValueError("a path is not empty, and has no null character")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Options(RenderSettings):
     """The arguments of a render and of its output. None: the scene or the machine decides."""
@@ -33,7 +39,7 @@ class Options(RenderSettings):
     filename: str
     scene: int | str = option(
         0,
-        Kind("PATH", "the path of a file", lambda scene: scene in NUMBERS or (scene and "\0" not in scene)),
+        Kind("PATH", "the path of a file", _scene),
         "XML or OBJ file to render in place of a numbered scene",
         "none",
     )
@@ -46,15 +52,15 @@ class Options(RenderSettings):
     log: str = option("warn", choice(*LEVELS), "what to print: warnings; times; every kernel")
 
     def render_arguments(self) -> dict[str, Any]:
-        """Return the options that say how to render, without those about files and messages."""
+        """The options that say how to render, without those about files and messages."""
         return {name: getattr(self, name) for name in (*settings.TABLE, "params")}
 
     def outputs(self) -> list[str]:
-        """Return the paths of the pictures to write."""
+        """The paths of the pictures to write."""
         return [f"{self.filename}.{ending}" for ending in ("png", "exr") if self.format in (ending, "both")]
 
     def inputs(self) -> list[str]:
-        """Return the paths of the files to render."""
+        """The paths of the files to render."""
         return [self.scene] if isinstance(self.scene, str) else []
 
 

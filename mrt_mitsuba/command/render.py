@@ -53,7 +53,11 @@ def run(options: Options) -> int:
     result.save(*options.outputs(), tonemap=options.tonemap)
     if not options.quiet:
         if result.error is not None:
-            print(f"Error: {result.error}, {result.rounds[-1].spp:.1f} rays a pixel")
+            target = result.error.target
+            aim = "" if target is None else f"; target {target:.3g}"
+            if target is not None and options.error is not None and options.error.relative:
+                aim += f", {options.error} of the mean luminance"
+            print(f"Error: {result.error}, {result.rounds[-1].spp:.1f} rays a pixel{aim}")
         print(f"Wrote {printable(' and '.join(options.outputs()))}")
         print(f"Render time: {seconds:.6f}s")
     return 0
@@ -74,7 +78,7 @@ def show_log(level: str) -> None:
 
 
 def banner(options: Options) -> str:
-    """Return the parameters of the render, one per line."""
+    """The parameters of the render, one per line."""
     distance, reach = options.focus(None, FOCAL_RANGE)
     if isinstance(options.scene, int):
         from mrt_mitsuba.scene.report import report_scene
@@ -82,7 +86,7 @@ def banner(options: Options) -> str:
         scene = report_scene(options.scene)
         distance, reach = options.focus(scene.focal_distance, scene.focal_range)
     film = "from the file" if options.inputs() and not is_obj(options.scene, {}) else ""
-    aamode = options.aamode or (NOISE if options.rmse else None)
+    aamode = options.aamode or (NOISE if options.error else None)
     lines = {
         "Scene": printable(str(options.scene)),
         "Width": options.width or film or SIZE[0],

@@ -32,13 +32,13 @@ _COLUMN = 30  # where explanations start
 
 
 def usage() -> str:
-    """Return the help text of the command."""
+    """The help text of the command."""
     options = {
         f"{name}={field.metadata['kind'].form}": f"{field.metadata['help']} "
         f"(default: {field.metadata['shown'] or field.default})"
         for name, field in TABLE.items()
     }
-    commands = {f"{name} {form}".strip(): text for name, (form, text, *_) in COMMANDS.items()}
+    commands = {f"{name} {form}".strip(): text for name, (form, text, _, _) in COMMANDS.items()}
     lines = [
         "usage: mrt FILENAME [SCENE] [name=value ...]",
         f"       mrt {' | '.join(COMMANDS)} ...",
@@ -50,10 +50,10 @@ def usage() -> str:
         lines += ["", f"{title}:"]
         for form, text in entries.items():
             if len(form) > _COLUMN - 3:
-                lines, form = [*lines, f"  {form}"], ""
-            lines += textwrap.wrap(
-                f"{form:<{_COLUMN - 3}} {text}", WIDTH, initial_indent="  ", subsequent_indent=" " * _COLUMN
-            )
+                lines.append(f"  {form}")
+                form = ""
+            entry = f"{form:<{_COLUMN - 3}} {text}"
+            lines += textwrap.wrap(entry, WIDTH, initial_indent="  ", subsequent_indent=" " * _COLUMN)
     return "\n".join(lines) + "\n"
 
 
@@ -118,27 +118,35 @@ def export(place: str, /, *, xml: str, stock: str = "", **given: str) -> int:
     """Write a scene, a number or the path of a file, as XML."""
     scene_word = place if place.isdecimal() else f"scene={place}"
     options = parse(["export", scene_word, *(f"{name}={text}" for name, text in given.items())])
-    strange = given.keys() - {"width", "height", "fresnel", *MODEL_OPTIONS, *(options.params or ())}
+    known = {"width", "height", "fresnel", *MODEL_OPTIONS, *(options.params or ())}
+    if options.error is not None:
+        known.discard("target")  # an error, and not what the camera looks at
+    strange = given.keys() - known
     if strange:  # what is said of the render, which is not in the file
         raise UsageError(
-            f"{min(strange)} is of no use to mrt export. Usage: mrt export {COMMANDS['export'][0]}"
+            f"{min(strange)} is of no use to mrt export. Usage: mrt export {COMMANDS['export'].form}"
         )
     from mrt_mitsuba.scene.export import write_xml
 
     check_target(xml, options.inputs())
     kept = {name: getattr(options, name) for name in ("width", "height", "fresnel", "params")}
     kept |= options.model()
-    print(f"Wrote {' and '.join(write_xml(options.scene, xml, flavor='stock' if stock else 'mrt', **kept))}")
+    paths = write_xml(options.scene, xml, flavor="stock" if stock else "mrt", **kept)
+    print(f"Wrote {' and '.join(paths)}")
     return 0
 
 
 def sweep(out: str, path: str, *, workers: str | None = None, cluster: str | None = None) -> int:
     """Render the sweep that a TOML file describes; return 1 if a job failed."""
     settings = read_toml(path)
-    if own := settings.keys() & {"out", "progress"}:
-        raise UsageError(f"{path}: {min(own)} cannot be set in a file")
+    refused = settings.keys() & {"out", "progress"}
+    if refused:
+        raise UsageError(f"{path}: {min(refused)} cannot be set in a file")
     count = int(workers) if workers and workers.isdecimal() else workers
-    settings |= {k: v for k, v in (("workers", count), ("cluster", cluster)) if v is not None}
+    if count is not None:
+        settings["workers"] = count
+    if cluster is not None:
+        settings["cluster"] = cluster
     grid = dict(_axes(settings.pop("grid", {})))
     scene = settings.pop("scene", None if "scene" in grid else 0)
     table = mrt_mitsuba.sweep(scene, out, grid=grid, **settings)
@@ -149,7 +157,7 @@ def sweep(out: str, path: str, *, workers: str | None = None, cluster: str | Non
 
 
 def _axes(grid: Any, before: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the axes of a grid; keys with a dot that have no quotes make tables in TOML."""
+    """The axes of a grid; keys with a dot that have no quotes make tables in TOML."""
     if not isinstance(grid, Mapping):
         raise UsageError("grid must be a table: write [grid] and a line for each key")
     for key, values in grid.items():
@@ -160,7 +168,7 @@ def _axes(grid: Any, before: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def read_toml(path: str) -> dict[str, Any]:
-    """Return the tables of a TOML file; raise ``UsageError`` where it cannot be read."""
+    """The tables of a TOML file; ``UsageError`` where it cannot be read."""
     try:
         require_file(path)
         with open(path, "rb") as file:

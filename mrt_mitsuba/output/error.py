@@ -27,6 +27,7 @@ class ErrorEstimate:
     low: float
     high: float  #: infinite where the tail is too heavy to say
     tail: float = 0.0  #: Pareto shape k of the largest contributions of rays, see ``DOUBTFUL``
+    target: float | None = None  #: that the render aimed at, linear; None without one
 
     def __str__(self) -> str:
         return f"{self.rmse:.3g} (95 %: {self.low:.3g} to {self.high:.3g})"
@@ -48,6 +49,7 @@ class RoundPicture(Round):
     image: Image  #: [H, W, 3], linear
     error: Image  #: standard error of each pixel, [H, W]
     samples: Image  #: rays of each pixel, [H, W]
+    target: float | None = None  #: RMSE that the render aims at
 
 
 def tail_shape(values: np.ndarray, counts: np.ndarray) -> float:

@@ -58,9 +58,17 @@ def save(
     "normal", [H, W, 3]), with the channels of ``LAYERS``, else R, G, B or Y. Header values are text or
     numbers; anything else is written as JSON. ``inputs``: files that the picture is made from.
 
-    Raises ``OutputError`` for a file that cannot be written, or that is one of ``inputs``.
+    Raises ``OutputError`` for a file that cannot be written, or that is one of ``inputs``; ``UsageError``
+    without a name.
     """
+    if tonemap not in TONEMAPS:
+        raise UsageError(f"tonemap={tonemap!r}: must be {' or '.join(TONEMAPS)}")
     paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    if not paths:
+        raise UsageError('save: give the name of a file, such as "out.exr"')
+    for path in paths:
+        if not isinstance(path, str | os.PathLike):
+            raise UsageError(f'save: {path!r} is no name of a file; give one such as "out.exr"')
     endings = [os.path.splitext(os.fspath(path))[1].lower() for path in paths]
     for path, ending in zip(paths, endings, strict=True):
         if ending not in (".png", ".exr"):
@@ -116,13 +124,21 @@ def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], heade
         if array.shape != (*planes["RGB"].shape[:2], len(names)):
             raise OutputError(f"layer {name} of shape {array.shape} is no {' '.join(names)} of the picture")
         planes |= {each: np.ascontiguousarray(array[:, :, index]) for index, each in enumerate(names)}
-    texts = {name: v if isinstance(v, str | int | float) else json.dumps(v) for name, v in header.items()}
+    texts = {name: _plain(value) for name, value in header.items()}
+
     # The library does not report a full disk when it opens the file itself, so the file is ours. It writes a
     # few rows at a time by code in Python: within its own code, and that of Python's files, a signal would
     # wait until all is written.
-    stream = SimpleNamespace(tell=file.tell, seek=file.seek, write=lambda rows: file.write(rows))
+    def write(rows: bytes) -> int:
+        return file.write(rows)
+
+    stream = SimpleNamespace(tell=file.tell, seek=file.seek, write=write)
     with compressing(image.shape[0] * image.shape[1]) as kind:
         OpenEXR.File({**texts, "compression": kind, "type": OpenEXR.scanlineimage}, planes).write(stream)
+
+
+def _plain(value: object) -> str | int | float:
+    return value if isinstance(value, str | int | float) else json.dumps(value)
 
 
 @contextlib.contextmanager
@@ -142,21 +158,22 @@ def compressing(pixels: int) -> Iterator[Any]:
 
 
 def read_exr(path: Path) -> Picture:
-    """Read an EXR with the channels R, G, B; raise ``OutputError`` if there is none or it is broken."""
+    """Read an EXR with the channels R, G, B; ``OutputError`` if it is none, or broken."""
     import numpy as np
 
     planes, headers = read_channels(path)
-    if missing := [channel for channel in "RGB" if channel not in planes]:
-        raise OutputError(f"cannot read {os.fspath(path)}: it has no channel {missing[0]!r}")
+    for channel in "RGB":
+        if channel not in planes:
+            raise OutputError(f"cannot read {os.fspath(path)}: it has no channel {channel!r}")
     image = np.stack([planes.pop(channel) for channel in "RGB"], axis=-1)  # [H, W, 3]
     return Picture(image, planes, headers["R"])
 
 
 def read_channels(path: Path) -> tuple[dict[str, Image], dict[str, dict[str, Any]]]:
-    """Return every channel of an EXR, [H, W] float32 by name, and the header of each.
+    """Every channel of an EXR, [H, W] float32 by name, and the header of each.
 
     Where a file has several parts, their names come before those of their channels. Raises ``OutputError``
-    for what is none, or broken.
+    for a file that is no EXR, or broken.
     """
     import numpy as np
     import OpenEXR
@@ -179,13 +196,15 @@ def read_channels(path: Path) -> tuple[dict[str, Image], dict[str, dict[str, Any
         raise OutputError(f"cannot read {name}: {error.strerror or error}") from error
     except (RuntimeError, ValueError, TypeError) as error:
         raise OutputError(f"cannot read {name}: not a whole EXR ({error})") from error
-    planes, headers = {}, {}
+    planes = {}
+    headers = {}
     for part in parts:
         if len({values.pixels.shape for values in part.channels.values()}) > 1:
             raise OutputError(f"cannot read {name}: its channels differ in size; write them all at full size")
         for channel, values in part.channels.items():
             key = channel if len(parts) == 1 else f"{part.name()}.{channel}"
-            planes[key], headers[key] = np.asarray(values.pixels, np.float32), dict(part.header)
+            planes[key] = np.asarray(values.pixels, np.float32)
+            headers[key] = dict(part.header)
     return planes, headers
 
 
@@ -204,7 +223,7 @@ def silenced() -> Iterator[None]:
 
 
 def to_8bit(image: Image, tonemap: str = "report") -> NDArray[np.uint8]:
-    """Return a linear picture [H, W, 3] in 8 bit.
+    """A linear picture [H, W, 3] in 8 bit.
 
     "report": trunc(255 c) clamped to 0..255, without gamma. "srgb": the sRGB transfer function (IEC
     61966-2-1) of the values clamped to 0..1, rounded. NaN becomes 0, with a warning.
@@ -217,13 +236,25 @@ def to_8bit(image: Image, tonemap: str = "report") -> NDArray[np.uint8]:
     return pixels
 
 
+def png(image: Image) -> bytes:
+    """A linear picture [H, W, 3] as a PNG file, in sRGB as screens expect it."""
+    import io
+
+    from PIL import Image as Picture
+
+    buffer = io.BytesIO()
+    Picture.fromarray(to_8bit(image, "srgb")).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
 def _blocks(image: Image, tonemap: str) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Yield the picture in 8 bit as ``to_8bit`` has it, some rows at a time with the number of the first."""
+    """The picture in 8 bit as ``to_8bit`` has it, some rows at a time with the number of the first."""
     import numpy as np
 
     if tonemap not in TONEMAPS:
         raise UsageError(f"tonemap={tonemap!r}: must be {' or '.join(TONEMAPS)}")
-    rows, lost = max(1, _PIXELS // image.shape[1]), 0
+    rows = max(1, _PIXELS // image.shape[1])
+    lost = 0
     for row in range(0, len(image), rows):
         block = np.asarray(image[row : row + rows], np.float32)
         lost += int(np.isnan(block).any(axis=-1).sum())

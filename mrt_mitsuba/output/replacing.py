@@ -28,7 +28,7 @@ Path = str | os.PathLike[str]
 
 _TEMPORARY = ".mrt-{}.tmp"
 _OLD = 10.0  # seconds after which a file that nobody has locked was left over
-_unfinished: set[str] = set()  # temporary files and folders of this process
+unfinished: set[str] = set()  #: temporary files and folders of this process
 _tidied: set[str] = set()  # folders
 
 
@@ -50,11 +50,13 @@ def replacing(*paths: Path, inputs: Iterable[Path] = ()) -> Iterator[list[IO[byt
     ``check_target``.
     """
     with contextlib.ExitStack() as stack:
-        files, targets = [], []
+        files = []
+        targets = []
         for path in paths:
             with _explained(path):
-                targets.append(_target(path, inputs))
-                files.append(stack.enter_context(_temporary(os.path.dirname(targets[-1]))))
+                target = _target(path, inputs)
+                files.append(stack.enter_context(_temporary(os.path.dirname(target))))
+                targets.append(target)
         with _explained(*paths):
             yield files
             for file, target in zip(files, targets, strict=True):
@@ -71,22 +73,22 @@ def replacing(*paths: Path, inputs: Iterable[Path] = ()) -> Iterator[list[IO[byt
 
 def discard_unfinished() -> None:
     """Remove the temporary files and folders of this process, which is about to be ended by force."""
-    for temporary in tuple(_unfinished):
+    for temporary in tuple(unfinished):
         with contextlib.suppress(OSError):
             os.unlink(temporary)
         shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextlib.contextmanager
-def temporary_folder(folder: Path) -> Iterator[str]:
-    """Give a new folder in another, which is removed at the end."""
-    name = tempfile.mkdtemp(prefix=".mrt-", dir=folder)
-    _unfinished.add(name)
+def temporary_folder(folder: Path, prefix: str) -> Iterator[str]:
+    """Give a new folder in another, removed at the end; its name begins with ``prefix``."""
+    name = tempfile.mkdtemp(prefix=prefix, dir=folder)
+    unfinished.add(name)
     try:
         yield name
     finally:
         shutil.rmtree(name, ignore_errors=True)
-        _unfinished.discard(name)
+        unfinished.discard(name)
 
 
 @contextlib.contextmanager
@@ -99,7 +101,7 @@ def _explained(*paths: Path) -> Iterator[None]:
 
 
 def _target(path: Path, inputs: Iterable[Path]) -> str:
-    """Return the real path to write; raise ``OutputError`` where replacing a file there would be wrong."""
+    """The real path to write; ``OutputError`` where replacing a file would be wrong."""
     name = os.fspath(path)
     if "\0" in name or os.path.basename(name) in ("", ".", ".."):
         raise OutputError(f"cannot write {name!r}: it names no file")
@@ -110,24 +112,26 @@ def _target(path: Path, inputs: Iterable[Path]) -> str:
         problem = problem if os.path.exists(folder) else "does not exist; create it first"
         raise OutputError(f"cannot write {name}: the place {folder} {problem}")
     try:
-        found, around = os.lstat(target), os.stat(folder)
+        old = os.lstat(target)
     except FileNotFoundError:
         return target
-    mode, sticky = found.st_mode, around.st_mode & stat.S_ISVTX
-    problems = {
-        "its symbolic links lead in a circle": stat.S_ISLNK(mode),
-        "it is a folder; choose another name": stat.S_ISDIR(mode),
-        "it is not a regular file": not stat.S_ISREG(mode),
-        "what is written is made from this file; choose another name": any(
-            os.path.exists(each) and os.path.samefile(target, each) for each in inputs
-        ),
-        # The superuser may write to any file; its owner's "read-only" is respected all the same
-        "the file is read-only; remove it or choose another name": not mode & 0o222
-        or not os.access(target, os.W_OK),
-        "the file is another user's, and only its owner may replace it here; choose another name": sticky
-        and os.geteuid() not in (0, found.st_uid, around.st_uid),
-    }
-    for problem in (problem for problem, holds in problems.items() if holds):
+    around = os.stat(folder)
+    sticky = around.st_mode & stat.S_ISVTX
+    problem = ""
+    if stat.S_ISLNK(old.st_mode):
+        problem = "its symbolic links lead in a circle"
+    elif stat.S_ISDIR(old.st_mode):
+        problem = "it is a folder; choose another name"
+    elif not stat.S_ISREG(old.st_mode):
+        problem = "it is not a regular file"
+    elif any(os.path.exists(each) and os.path.samefile(target, each) for each in inputs):
+        problem = "what is written is made from this file; choose another name"
+    # The superuser may write to any file; its owner's "read-only" is respected all the same
+    elif not old.st_mode & 0o222 or not os.access(target, os.W_OK):
+        problem = "the file is read-only; remove it or choose another name"
+    elif sticky and os.geteuid() not in (0, old.st_uid, around.st_uid):
+        problem = "the file is another user's, and only its owner may replace it here; choose another name"
+    if problem:
         raise OutputError(f"cannot write {name}: {problem}")
     return target
 
@@ -137,15 +141,9 @@ def _temporary(folder: str) -> Iterator[IO[bytes]]:
     """Give a new file in a folder, locked, with the rights of the user's umask; remove it at the end."""
     if folder not in _tidied:
         _tidied.add(folder)
-        for left in Folder(folder).glob(_TEMPORARY.format(16 * "[0-9a-f]")):  # by killed processes
-            with contextlib.suppress(OSError):
-                found = left.lstat()
-                if stat.S_ISREG(found.st_mode) and time.time() - found.st_mtime > _OLD:
-                    with left.open("rb") as locked:
-                        fcntl.flock(locked, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
-                        left.unlink()
+        _tidy(folder)
     name = os.path.join(folder, _TEMPORARY.format(os.urandom(8).hex()))
-    _unfinished.add(name)
+    unfinished.add(name)
     try:
         file = open(name, "x+b")  # noqa: SIM115 - closing it may fail
         try:
@@ -158,4 +156,15 @@ def _temporary(folder: str) -> Iterator[IO[bytes]]:
     finally:
         with contextlib.suppress(OSError):
             os.unlink(name)
-        _unfinished.discard(name)
+        unfinished.discard(name)
+
+
+def _tidy(folder: str) -> None:
+    """Remove the temporary files of killed processes."""
+    for left in Folder(folder).glob(_TEMPORARY.format(16 * "[0-9a-f]")):
+        with contextlib.suppress(OSError):
+            state = left.lstat()
+            if stat.S_ISREG(state.st_mode) and time.time() - state.st_mtime > _OLD:
+                with left.open("rb") as file:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
+                    left.unlink()

@@ -7,7 +7,7 @@ import operator
 import os
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
@@ -19,6 +19,9 @@ from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE, Scene
 from mrt_mitsuba.scene.open import in_terms
 from mrt_mitsuba.scene.report import report_scene
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 FLAVORS = ("mrt", "stock")
 
 # The finite stand-in of a plane, scene units: beyond, float32 makes its intersections visibly wrong
@@ -28,7 +31,7 @@ STOCK_EXTENT = 100.0
 def scene_dict(
     scene: int | Scene, *, width: int = 800, height: int = 600, fresnel: str = "schlick", flavor: str = "mrt"
 ) -> dict[str, Any]:
-    """Return a scene as a plain Mitsuba dict; ``mi.load_dict`` takes it (after ``mrt.register()``).
+    """A scene as a plain Mitsuba dict; ``mi.load_dict`` takes it (after ``mrt.register()``).
 
     ``flavor``: "mrt" for this project's plugins; "stock" for the nearest equivalents among Mitsuba's, which
     any Mitsuba program opens: ``roughplastic`` for the material, ``point`` lights as bright at the camera's
@@ -39,10 +42,12 @@ def scene_dict(
     flavor that cannot be had.
     """
     check("flavor", choice(*FLAVORS), flavor)
-    width, height = check("width", SIDE, width), check("height", SIDE, height)
+    width = check("width", SIDE, width)
+    height = check("height", SIDE, height)
+    fresnel = check("fresnel", FRESNEL, fresnel)
     runtime.use()
     terms = scene if isinstance(scene, Scene) else report_scene(scene)
-    result = terms.to_dict(width=width, height=height, fresnel=check("fresnel", FRESNEL, fresnel))
+    result = terms.to_dict(width=width, height=height, fresnel=fresnel)
     return result if flavor == "mrt" else _stock(result, terms)
 
 
@@ -74,8 +79,9 @@ def write_xml(
     focus: dict[str, Any] = {}  # what Mitsuba's cameras have no parameters for, and ``render`` reads
     if terms is None and isinstance(scene, str | os.PathLike):
         given = {"fresnel": fresnel, "width": width, "height": height, "flavor=stock": flavor == "stock"}
-        if useless := [name for name, value in given.items() if value]:
-            raise UsageError(f"{useless[0]} is of no use with an XML file, which is written as it is")
+        for name, value in given.items():
+            if value:
+                raise UsageError(f"{name} is of no use with an XML file, which is written as it is")
         runtime.use()
         budget = Budget.of(None)
         text, values = load_file(os.fspath(scene), params or {}, budget, as_text=True)
@@ -99,7 +105,8 @@ def write_xml(
             focus = {"focaldist": terms.focal_distance, "focalrange": terms.focal_range}
         inputs = terms.files
     lines = "".join(f'\n    <default name="{name}" value="{value}"/>' for name, value in focus.items())
-    text = re.sub("<scene[^>]*>", lambda tag: tag[0] + lines, text, count=1) + "\n"
+    before, tag, after = re.split("(<scene[^>]*>)", text, maxsplit=1)
+    text = f"{before}{tag}{lines}{after}\n"
     with replacing(*files, path, inputs=inputs) as opened:
         for stream, content in zip(opened, (*files.values(), text.encode()), strict=True):
             stream.write(content)
@@ -119,7 +126,9 @@ def _put_into_files(nodes: dict[str, Any], stem: str, flavor: str) -> dict[str, 
                 "write at most 1000 spheres or 100 objects of another kind"
             )
         if kind == "mrt_mesh" or (kind == "mrt_cone" and flavor == "stock"):
-            file, bsdf, stream = f"{stem}_{name}.ply", node.pop("bsdf"), mi.MemoryStream()
+            file = f"{stem}_{name}.ply"
+            bsdf = node.pop("bsdf")
+            stream = mi.MemoryStream()
             mi.load_dict(node).write_ply(stream)
             files[file] = stream.raw_buffer()
             flat = {"face_normals": True} if kind == "mrt_mesh" else {}
@@ -149,8 +158,9 @@ def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
             result[f"{name}_tube"] = {**result.pop(name), "type": "cylinder"}
             ends = node["p0"], node["p1"]
             for number, (center, opposite) in enumerate((ends, ends[::-1])):
-                place = _facing(center, list(map(operator.sub, center, opposite)), node["radius"])
-                result[f"{name}_disc{number}"] = {"type": "disk", "to_world": place, "bsdf": node["bsdf"]}
+                outwards = list(map(operator.sub, center, opposite))
+                to_world = _facing(center, outwards, node["radius"])
+                result[f"{name}_disc{number}"] = {"type": "disk", "to_world": to_world, "bsdf": node["bsdf"]}
         elif kind.startswith("mrt_"):
             raise SceneError(
                 f"{name} has no counterpart among Mitsuba's plugins: {kind} is made of arrays, or a mesh to "
@@ -160,7 +170,7 @@ def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
 
 
 def _stock_bsdf(node: dict[str, Any]) -> dict[str, Any]:
-    """Return ``roughplastic``, or ``diffuse`` where nothing is reflected; no colour exceeds 1."""
+    """``roughplastic``, or ``diffuse`` where nothing is reflected; no colour exceeds 1."""
     colors = {name: dict(node[name]) for name in ("diffuse_reflectance", "specular_reflectance")}
     for color in colors.values():
         if color["type"] == "rgb":
@@ -178,11 +188,12 @@ def _unit(vector: list[float]) -> list[float]:
     return [c / length for c in vector]
 
 
-def _facing(center: list[float], normal: list[float], half_size: float) -> Any:
-    """Return what takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
+def _facing(center: list[float], normal: list[float], half_size: float) -> mi.ScalarTransform4f:
+    """The transform that takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
     import mitsuba as mi
 
     normal = _unit(normal)
     up = [0, 0, 1] if abs(normal[2]) < 0.9 else [1, 0, 0]
-    to_world = mi.ScalarTransform4f().look_at(center, list(map(operator.add, center, normal)), up)
+    ahead = list(map(operator.add, center, normal))
+    to_world = mi.ScalarTransform4f().look_at(center, ahead, up)
     return to_world.scale([half_size, half_size, 1])

@@ -14,20 +14,22 @@ from mrt_mitsuba.errors import MrtWarning, SceneError
 
 DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from about 3000 on
 LONGEST_LINE = 2**18  # bytes, about 40,000 corners of a face
-MISSING = "is missing or may not be read in"  # what messages say about a file that was not found
+_CONTINUED = b"\\\n"  # at the end of a line that goes on in the next
+MISSING = "is missing or may not be read in"  # what messages say about a file that a scene names
 
 
 def require_file(path: str | os.PathLike[str]) -> None:
     """Raise ``SceneError`` unless ``path`` is a file that may be read: pipes and devices may never end."""
     name = os.fspath(path)
+    problem = ""
     try:
         mode = os.stat(path).st_mode
-        problems = {
-            "it is a folder; name a file in it": stat.S_ISDIR(mode),
-            "it is not a regular file; copy its content into one": not stat.S_ISREG(mode),
-            f"permission denied; try chmod +r {name}": not os.access(path, os.R_OK),
-        }
-        problem = next((problem for problem, holds in problems.items() if holds), "")
+        if stat.S_ISDIR(mode):
+            problem = "it is a folder; name a file in it"
+        elif not stat.S_ISREG(mode):
+            problem = "it is not a regular file; copy its content into one"
+        elif not os.access(path, os.R_OK):
+            problem = f"permission denied; try chmod +r {name}"
     except (FileNotFoundError, NotADirectoryError):
         problem = f"there is no such file in {os.path.dirname(os.path.abspath(name))}"
     except (OSError, ValueError) as error:  # also of a zero byte in the name
@@ -37,7 +39,7 @@ def require_file(path: str | os.PathLike[str]) -> None:
 
 
 def read_text(path: Path) -> bytes:
-    """Return a text file with Unix line ends, one at the end too; raise ``SceneError`` if it is no text.
+    """The bytes of a text file with Unix line ends, one at the end too; ``SceneError`` if it is no text.
 
     Lines that end in a backslash are joined with the next; empty ones after them keep line numbers right.
     """
@@ -46,9 +48,8 @@ def read_text(path: Path) -> bytes:
     if b"\0" in data:
         raise SceneError(f"{path}: is not a text file (it holds a zero byte); export it as OBJ or MTL text")
     data = re.sub(rb"\r\n?", b"\n", data).removeprefix(b"\xef\xbb\xbf") + b"\n"
-    if (end := b"\\\n") in data:
-        continued = re.compile(rb"(?m)^(?:.*\\\n)+.*\n")
-        data = continued.sub(lambda m: m[0].replace(end, b" ") + b"\n" * m[0].count(end), data)
+    if _CONTINUED in data:
+        data = re.sub(rb"(?m)^(?:.*\\\n)+.*\n", _joined, data)
     longest = max(io.BytesIO(data), key=len).removesuffix(b"\n")
     if len(longest) > LONGEST_LINE:
         number = data.count(b"\n", 0, data.find(longest)) + 1
@@ -56,8 +57,12 @@ def read_text(path: Path) -> bytes:
     return data
 
 
+def _joined(lines: re.Match[bytes]) -> bytes:
+    return lines[0].replace(_CONTINUED, b" ") + b"\n" * lines[0].count(_CONTINUED)
+
+
 def decode(data: bytes) -> str:
-    """Return text of unknown encoding: UTF-8, or else the Latin-1 that older exporters wrote."""
+    """Text of unknown encoding: UTF-8, or else the Latin-1 that older exporters wrote."""
     try:
         return data.decode()
     except UnicodeDecodeError:
@@ -65,13 +70,13 @@ def decode(data: bytes) -> str:
 
 
 def find(name: str, folders: list[Path]) -> Path | None:
-    """Return the file ``name``, also with backslashes, in the first folder where it may be read, or None."""
+    """The file ``name``, also with backslashes, in the first folder where it may be read, or None."""
     places = (folder / form for form in (name, name.replace("\\", "/")) for folder in folders)
     return next((place for place in places if os.path.isfile(place) and os.access(place, os.R_OK)), None)
 
 
 def picture_size(path: str) -> tuple[int, int] | None:
-    """Return width and height of a picture without reading its pixels; None if its header does not say."""
+    """Width and height of a picture, by its header alone; None if that does not say."""
     import OpenEXR
     from PIL import Image
 
@@ -80,7 +85,8 @@ def picture_size(path: str) -> tuple[int, int] | None:
             if file.read(4) == b"\x76\x2f\x31\x01":
                 low, high = OpenEXR.File(path, header_only=True).header()["dataWindow"]
                 return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
-        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        limit = Image.MAX_IMAGE_PIXELS
+        Image.MAX_IMAGE_PIXELS = None
         try:
             with Image.open(path) as picture:
                 return picture.size
@@ -91,7 +97,7 @@ def picture_size(path: str) -> tuple[int, int] | None:
 
 
 def warn(findings: Mapping[str, list[str]]) -> None:
-    """Warn of what was found, by kind in the plural: of the first, with the number of the others."""
+    """Warn of findings, by kind in the plural: of the first, with the number of the others."""
     for kind, texts in findings.items():
         more = f" (and so do {len(texts) - 1} more {kind})" if texts[1:] else ""
         if texts:
@@ -99,33 +105,38 @@ def warn(findings: Mapping[str, list[str]]) -> None:
 
 
 def declared(path: str) -> dict[str, str]:
-    """Return the parameters that an XML file declares, with their defaults. Raises ``SceneError``."""
-    return {a.get("name", ""): a.get("value", "") for tag, a in elements(path) if tag == "default"}
+    """The parameters that an XML file declares, with their defaults. Raises ``SceneError``."""
+    defaults = [attributes for tag, attributes in elements(path) if tag == "default"]
+    return {each.get("name", ""): each.get("value", "") for each in defaults}
 
 
 def elements(file: str) -> list[tuple[str, dict[str, str]]]:
-    """Return tag and attributes of each element of an XML file, in order."""
+    """Tag and attributes of each element of an XML file, in order."""
     from xml.parsers import expat
 
     require_file(file)
-    found: list[tuple[str, dict[str, str]]] = []
-    inside: list[str] = []  # the tags around
+    read: list[tuple[str, dict[str, str]]] = []
+    around: list[str] = []  # tags that are still open
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        inside.append(tag)
-        found.append((tag, attributes))
-        if len(inside) > DEEPEST:
+        around.append(tag)
+        read.append((tag, attributes))
+        if len(around) > DEEPEST:
             raise SceneError(f"cannot load {file}: it is nested more than {DEEPEST} levels deep")
+
+    def end(tag: str) -> None:
+        around.pop()
 
     def entity(name: str, *declaration: object) -> None:  # which Mitsuba's parser reads in another way
         raise SceneError(f"cannot load {file}: it declares the entity {name}; write the text in its place")
 
     parser = expat.ParserCreate("utf-8")
-    parser.StartElementHandler, parser.EntityDeclHandler = start, entity
-    parser.EndElementHandler = lambda tag: inside.pop()
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.EntityDeclHandler = entity
     try:
         with open(file, "rb") as stream:
             parser.ParseFile(stream)
     except expat.ExpatError as error:
         raise SceneError(f"cannot load {file}: it must be XML in UTF-8, but has {error}") from None
-    return found
+    return read

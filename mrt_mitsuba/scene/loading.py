@@ -8,7 +8,7 @@ parser would end the process are refused as well.
 
 Objects are made one after the other. In parallel, Mitsuba makes Python objects inside each other, to the
 limit of the stack, and Dr.Jit's messages may wait for each other for ever; one by one takes no longer.
-``mrt_mitsuba.runtime.one_by_one`` makes that the default of Mitsuba's own loaders for our plugins.
+``mrt_mitsuba.mitsuba_changes`` makes that the default of Mitsuba's own loaders for our plugins.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import mitsuba as mi
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.machine import Budget
-from mrt_mitsuba.runtime import mitsuba_first, mitsuba_home, two_threads
+from mrt_mitsuba.mitsuba_changes import mitsuba_first, mitsuba_home, two_threads
 from mrt_mitsuba.scene.files import DEEPEST, elements, picture_size, require_file
 
 MOST_SAMPLES = 2**24  # of a pixel; some samplers divide by none, or never end at 2^31
@@ -41,7 +41,7 @@ _ORIGIN = re.compile(
 def load_dict(
     scene: Mapping[str, Any], name: str = "the dict", budget: Budget | None = None, *, merge: bool = True
 ) -> Any:
-    """Return what a Mitsuba dict describes.
+    """Load a Mitsuba dict: a scene, or any other object.
 
     ``merge``: make one of meshes of the same material, as Mitsuba does, which leaves them in any order.
     Raises ``SceneError`` that calls it ``name``, and ``UsageError`` for a texture too large for the budget.
@@ -57,7 +57,7 @@ def load_dict(
 def load_file(
     path: str, parameters: Mapping[str, Any], budget: Budget | None = None, *, as_text: bool = False
 ) -> tuple[Any, Mapping[str, str]]:
-    """Return the scene of an XML file, and its ``$parameters`` with the values given, or the defaults.
+    """The scene of an XML file, and its ``$parameters`` with the values given, or the defaults.
 
     ``as_text``: return it as XML, with includes and parameters filled in, and files by their whole path.
     Raises ``SceneError``, and ``UsageError`` for another kind of file or a texture too large for the budget.
@@ -86,22 +86,25 @@ def _check_nodes(nodes: Iterable[Any], budget: Budget) -> None:
     """Look at all that Mitsuba would load for what it has parsed."""
     mitsuba_first()  # a <path> of the file puts its folder before
     for node in nodes:
-        kind, filename = node.props.plugin_name(), node.props.get("filename", None)
+        kind = node.props.plugin_name()
+        filename = node.props.get("filename", None)
         _check_plugin(kind)
         samples = node.props.get("sample_count", 1)
         if isinstance(samples, int) and not 1 <= samples <= MOST_SAMPLES:
             raise RuntimeError(f"{kind}: sample_count is {samples}; give 1 to {MOST_SAMPLES}")
         if isinstance(filename, str):
-            found = _check_data(filename, budget.inputs)
-            if kind in _PICTURES and (size := picture_size(found)):
-                budget.take_texture(found, *size, around=kind == "envmap")
+            file = _check_data(filename, budget.inputs)
+            size = picture_size(file) if kind in _PICTURES else None
+            if size:
+                budget.take_texture(file, *size, around=kind == "envmap")
 
 
 def _instantiate(state: Any, merge: bool = True) -> Any:
     config = mi.parser.ParserConfig(mi.variant())
-    config.parallel, config.merge_meshes = False, merge
+    config.parallel = False
+    config.merge_meshes = merge
     mi.parser.transform_all(config, state)
-    with two_threads(), held():  # an interrupt would leave plugins half made, and later renders would crash
+    with two_threads, held():  # an interrupt would leave plugins half made, and later renders would crash
         return mi.parser.instantiate(config, state)
 
 
@@ -167,10 +170,11 @@ def _check_dict(node: Mapping[str, Any], inputs: set[str], place: str = "", dept
 
 def _check_xml(path: str, parameters: Mapping[str, str], inputs: set[str]) -> Mapping[str, str]:
     """Look at an XML file and those that it includes before Mitsuba opens them; return its parameters."""
-    values, files = dict(parameters), [path]
+    values = dict(parameters)
+    files = [path]
     inputs.add(path)
-    for file in files:  # which grows
-        for tag, attributes in elements(file):
+    for including in files:  # which grows
+        for tag, attributes in elements(including):
             if tag == "default":
                 values.setdefault(attributes.get("name", ""), attributes.get("value", ""))
                 continue
@@ -180,7 +184,7 @@ def _check_xml(path: str, parameters: Mapping[str, str], inputs: set[str]) -> Ma
             if tag == "path":
                 mitsuba_first(_resolved(filename))
             elif filename:
-                found = _check_data(filename, inputs)
-                if tag == "include" and os.path.isfile(found) and found not in files:
-                    files.append(found)
+                file = _check_data(filename, inputs)
+                if tag == "include" and os.path.isfile(file) and file not in files:
+                    files.append(file)
     return values

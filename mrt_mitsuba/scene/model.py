@@ -44,11 +44,12 @@ class Camera:
     hfov: float = 60.0
 
     def problem(self) -> str:
-        """Return why it can see nothing, or an empty text."""
+        """Why it can see nothing; an empty text if it can."""
         import numpy as np
 
         for name in ("position", "target", "up"):
-            if not _all_finite(value := getattr(self, name), 3):
+            value = getattr(self, name)
+            if not _all_finite(value, 3):
                 return f"the camera's {name} is {value!r}, but must be three finite numbers up to 3.4e38"
         if not _all_finite([self.hfov], 1) or not 0 < self.hfov < 180:
             return f"the camera's hfov is {self.hfov!r}, but must be more than 0 and less than 180 degrees"
@@ -149,12 +150,10 @@ class Scene:
     files: frozenset[str] = field(default=frozenset(), compare=False)  #: that it was read from
 
     def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> dict[str, Any]:
-        """Return the scene as a Mitsuba dict of this project's plugins, materials shared by reference.
+        """The scene as a Mitsuba dict of this project's plugins, with materials shared by reference.
 
         Raises ``SceneError`` for a camera, a sky or an object of numbers that make no sense.
         """
-        import mitsuba as mi
-
         _check(self)
         names: dict[Material, str] = {}  # one definition for each material that differs
 
@@ -176,34 +175,18 @@ class Scene:
                 shapes[f"{kind}s"] = {**shape, "bsdf": own or bsdf(grouped[0].material)}
         for i, m in enumerate(self.meshes):
             shapes[f"mesh_{i}"] = {**_mesh(m, self.texturing), "bsdf": bsdf(m.material)}
-        camera = self.camera
-        reach = math.dist(camera.position, camera.target)  # of scenes far smaller or larger than the report's
-        to_world = mi.ScalarTransform4f().look_at(list(camera.position), list(camera.target), list(camera.up))
-        film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb"}
-        return {
-            "type": "scene",
-            # by default, Embree lets rays through between slivers
-            **({"embree_use_robust_intersections": True} if self.meshes else {}),
-            "integrator": {"type": "mrt_whitted"},
-            "sensor": {
-                "type": "perspective",
-                "fov": camera.hfov,
-                "fov_axis": "x",
-                "near_clip": 0.01 * min(1.0, reach),
-                "far_clip": 1e5 * max(1.0, reach / 10),
-                # the original's picture is mirrored left to right against a right-handed camera
-                "to_world": to_world.scale([-1, 1, 1]),
-                "film": {**film, "component_format": "float32", "rfilter": {"type": "box"}},
-                "sampler": {"type": "independent", "sample_count": 16},
-            },
-            "sky": {"type": "constant", "radiance": _rgb(self.sky)},
-            **{
-                f"light_{i}": {"type": "mrt_light", "position": list(p.position), "intensity": _rgb(p.color)}
-                for i, p in enumerate(self.lights)
-            },
-            **{name: _mrt_bsdf(material, fresnel, self.texturing) for material, name in names.items()},
-            **shapes,
-        }
+        result: dict[str, Any] = {"type": "scene"}
+        if self.meshes:  # by default, Embree lets rays through between slivers
+            result["embree_use_robust_intersections"] = True
+        result["integrator"] = {"type": "mrt_whitted"}
+        result["sensor"] = _sensor(self.camera, width, height)
+        result["sky"] = {"type": "constant", "radiance": _rgb(self.sky)}
+        for i, light in enumerate(self.lights):
+            place = list(light.position)
+            result[f"light_{i}"] = {"type": "mrt_light", "position": place, "intensity": _rgb(light.color)}
+        for material, name in names.items():
+            result[name] = _mrt_bsdf(material, fresnel, self.texturing)
+        return result | shapes
 
 
 # The plugins of objects; all fields except the material, which comes last, are their parameters
@@ -214,7 +197,7 @@ MOST_SINGLE = {"sphere": 1000, "cone": 100, "cylinder": 100}
 
 
 def _all_finite(values: Sequence[float], count: int) -> bool:
-    """Return whether these are so many numbers that a float32 can hold."""
+    """Whether these are so many numbers, within the range of a float32."""
     try:
         return len(values) == count and all(abs(value) <= LARGEST for value in values)
     except TypeError:
@@ -223,7 +206,8 @@ def _all_finite(values: Sequence[float], count: int) -> bool:
 
 def _check(scene: Scene) -> None:
     """Refuse what Mitsuba would draw as nothing, or as noise, without a word. Plugins check the rest."""
-    if problem := scene.camera.problem():
+    problem = scene.camera.problem()
+    if problem:
         raise SceneError(problem)
     if not _all_finite(scene.sky, 3):
         raise SceneError(f"sky is {scene.sky!r}, but must be three finite numbers: red, green and blue")
@@ -232,8 +216,29 @@ def _check(scene: Scene) -> None:
     for kind in MOST_SINGLE:
         for i, thing in enumerate(getattr(scene, f"{kind}s")):
             *points, radius, _ = vars(thing).values()
-            if not (all(_all_finite(p, 3) for p in points) and _all_finite([radius], 1) and radius > 0):
+            placed = all(_all_finite(point, 3) for point in points)
+            if not (placed and _all_finite([radius], 1) and radius > 0):
                 raise SceneError(f"{kind}s[{i}] is {thing!r}, but must have finite places and a radius > 0")
+
+
+def _sensor(camera: Camera, width: int, height: int) -> dict[str, Any]:
+    """The camera as a Mitsuba dict, with a film for a size in pixels."""
+    import mitsuba as mi
+
+    reach = math.dist(camera.position, camera.target)  # of scenes far smaller or larger than the report's
+    to_world = mi.ScalarTransform4f().look_at(list(camera.position), list(camera.target), list(camera.up))
+    film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb"}
+    return {
+        "type": "perspective",
+        "fov": camera.hfov,
+        "fov_axis": "x",
+        "near_clip": 0.01 * min(1.0, reach),
+        "far_clip": 1e5 * max(1.0, reach / 10),
+        # the original's picture is mirrored left to right against a right-handed camera
+        "to_world": to_world.scale([-1, 1, 1]),
+        "film": {**film, "component_format": "float32", "rfilter": {"type": "box"}},
+        "sampler": {"type": "independent", "sample_count": 16},
+    }
 
 
 def _rgb(color: Color) -> dict[str, Any]:
@@ -241,7 +246,7 @@ def _rgb(color: Color) -> dict[str, Any]:
 
 
 def _group(kind: str, objects: list, fresnel: str) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """Return one shape of many objects, and a BSDF that looks up values by object if they differ."""
+    """One shape of many objects, and a BSDF that looks up values by object if they differ, else None."""
     import mitsuba as mi
     import numpy as np
 

@@ -33,7 +33,7 @@ _WITHOUT_EFFECT = {"d 1", "Tr 0", "illum 0", "illum 1", "illum 2", "sharpness 60
 def read_mtl(
     path: str | os.PathLike[str], *, convention: str = "report", folder: Path | None = None
 ) -> dict[str, Material]:
-    """Return the materials of an MTL file by name.
+    """The materials of an MTL file by name.
 
     ``convention``:
 
@@ -49,13 +49,15 @@ def read_mtl(
 
     Raises ``SceneError`` with file and line for what cannot be read.
     """
-    path, fields = Path(path), CONVENTIONS[convention]
+    path = Path(path)
+    fields = CONVENTIONS[convention]
     findings: dict[str, list[str]] = {}
     blocks: dict[str, dict[str, Any]] = {}
     block: dict[str, Any] | None = None
     for number, line in enumerate(decode(read_text(path)).split("\n"), 1):
-        statement, *rest = line.split("#", 1)[0].strip().split(maxsplit=1)[:2] or [""]
-        text, where = "".join(rest), f"{path}:{number}"
+        words = line.partition("#")[0].strip().split(maxsplit=1)
+        statement, text = [*words, "", ""][:2]
+        where = f"{path}:{number}"
         if statement == "newmtl":
             if not text:
                 raise SceneError(f"{where}: newmtl has no name; write newmtl NAME")
@@ -64,43 +66,54 @@ def read_mtl(
             if block is None:
                 raise SceneError(f"{where}: {statement} comes before any newmtl; write newmtl NAME before it")
             value = _value(statement, text, where, folder or path.parent, path.parent, findings)
-            block |= {fields[statement]: value} if statement in fields else {}
+            if statement in fields:
+                block[fields[statement]] = value
         # the report's reading defines itself; from the standard's, statements may be missing
-        elif (
-            statement
-            and convention == "standard"
-            and re.sub(r"\.0+\b", "", f"{statement} {text}") not in _WITHOUT_EFFECT
-        ):
+        elif convention == "standard" and _has_effect(statement, text):
             findings.setdefault("statements", []).append(f"{where}: {statement} {text[:40]} is not used")
     warn(findings)
     default = DEFAULT_MATERIAL if convention == "report" else _STANDARD
     return {name: replace(default, **block) for name, block in blocks.items()}
 
 
+def _has_effect(statement: str, text: str) -> bool:
+    """Whether a statement that is not used would change the picture."""
+    return bool(statement) and re.sub(r"\.0+\b", "", f"{statement} {text}") not in _WITHOUT_EFFECT
+
+
 def _value(
     statement: str, text: str, where: str, folder: Path, library: Path, findings: dict[str, list[str]]
 ) -> Color | float | str | None:
-    """Return a colour, an index, a roughness, or the path of a picture; None, with a warning, for one that is
-    missing. Raises ``SceneError`` for anything else."""
+    """A colour, an index, a roughness, or the path of a picture; None, with a finding, if it is missing.
+
+    Raises ``SceneError`` for anything else.
+    """
     words = text.split()
     if statement == "map_Kd":
         if not text:
             raise SceneError(f"{where}: map_Kd names no file")
-        # options of any number of words may stand before the name, which may hold blanks
-        names = [text] + [" ".join(words[k:]) for k in range(1, min(len(words), 32)) if text[0] == "-"]
-        found = next(filter(None, (find(name, [folder, library]) for name in names)), None)
-        if found is None:
-            missing = f"{where}: the texture {text} {MISSING} {folder}; Kd is used in its place"
-            findings.setdefault("textures", []).append(missing)
-        return None if found is None else str(found)
+        names = [text]
+        if text.startswith("-"):  # options of some words before the name, which may have blanks in it
+            names += [" ".join(words[k:]) for k in range(1, min(len(words), 32))]
+        for name in names:
+            picture = find(name, [folder, library])
+            if picture is not None:
+                return str(picture)
+        missing = f"{where}: the texture {text} {MISSING} {folder}; Kd is used in its place"
+        findings.setdefault("textures", []).append(missing)
+        return None
+    counts = {1: "one number"}
+    if statement[0] == "K":
+        counts = {1: "one", 3: "three numbers"}
     try:
         values = list(map(float, words))
     except ValueError:
         values = []
-    counts, form = ((1, 3), "one or three numbers") if statement[0] == "K" else ((1,), "one number")
     if len(values) not in counts or not all(0 <= v <= LARGEST for v in values):
-        must = f"must be {form}, finite and not negative, but is"
+        must = f"must be {' or '.join(counts.values())}, finite and not negative, but is"
         raise SceneError(f"{where}: {statement} {must} {text[:80]!r}")
     if statement == "Ns":
         return math.sqrt(2 / (values[0] + 2))
-    return (values[0], values[len(values) // 2], values[-1]) if statement in ("Kd", "Ks") else values[0]
+    if statement in ("Kd", "Ks"):
+        return values[0], values[len(values) // 2], values[-1]
+    return values[0]

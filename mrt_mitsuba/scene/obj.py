@@ -36,7 +36,8 @@ _UNUSED = """g s o mg l p vp deg bmat step cstype curv curv2 surf parm trim hole
     c_interp d_interp lod shadow_obj trace_obj ctech stech call csh maplib usemap"""
 _IGNORED = frozenset(_UNUSED.split())
 
-_GAP, _END = rb"[ \t]{1,99}", rb"[ \t]{0,99}\n"
+_GAP = rb"[ \t]{1,99}"
+_END = rb"[ \t]{0,99}\n"
 _REAL = rb"[-+]?(?:\d{1,99}(?:\.\d{0,99})?|\.\d{1,99})(?:[eE][-+]?\d{1,9})?"
 _INDEX = rb"[-+]?\d{1,18}"  # what fits 64 bits
 # Forms of a corner: the pattern, and the columns of ``_USED`` that its indices refer to
@@ -49,10 +50,14 @@ _CORNERS = {
 
 
 def _run(name: str, word: bytes) -> bytes:
-    """Return the pattern of lines: of "f_3_tn", up to some thousand with the keyword f and three words; of
-    "f_0_tn", one with any number of words. Regular expressions keep a state for each repetition."""
+    """The pattern of lines: of "f_3_tn", up to some thousand with the keyword f and three words; of "f_0_tn",
+    one with any number of words. Regular expressions keep a state for each repetition."""
     keyword, count, *_ = name.split("_")
-    words, most = ((_GAP + word) * int(count), 4096) if int(count) else (b"(?:%s){7,}" % (_GAP + word), 1)
+    words = (_GAP + word) * int(count)
+    most = 4096
+    if int(count) == 0:
+        words = b"(?:%s){7,}" % (_GAP + word)
+        most = 1
     return b"(?P<%s>(?:%s%s%s){1,%d})" % (name.encode(), keyword.encode(), words, _END, most)
 
 
@@ -68,8 +73,8 @@ _NUMBERS_ONLY = bytes(32 if chr(i) in "vtnf/\n" else i for i in range(256))
 def read_obj(
     path: str | os.PathLike[str], *, convention: str = "report"
 ) -> tuple[tuple[Mesh, ...], frozenset[str]]:
-    """Return the meshes of an OBJ file, one for each material that is used, and the paths of all files that
-    belong to the model, used or not.
+    """The meshes of an OBJ file, one for each material that is used, and the paths of all files of the model,
+    used or not.
 
     Faces are ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``, with positive or negative indices. One with more than
     three corners is cut into a fan around its first corner, which is right for convex faces. Normals are used
@@ -115,32 +120,34 @@ class _Reader:
     def read(self, block: re.Match[bytes]) -> None:
         """Read a run of lines."""
         kind, *form = str(block.lastgroup).split("_")
-        lines, words = block[0].count(b"\n"), block[0].translate(_NUMBERS_ONLY)
         if kind == "line":
             self._statement(block[0])
-        elif kind == "f":
-            kinds = _CORNERS[form[1]][1]
+            return
+        lines = block[0].count(b"\n")
+        words = block[0].translate(_NUMBERS_ONLY)
+        if kind == "f":
+            _, kinds = _CORNERS[form[1]]
             index = np.fromstring(words, np.int64, sep=" ").reshape(lines, -1, len(kinds))
-            behind = index + [[*self.counts.values()][kind] for kind in kinds]
-            faces = np.where(index > 0, index - 1, np.where(index < 0, behind, -1))
+            counts = [*self.counts.values()]
+            backwards = index + [counts[kind] for kind in kinds]
+            faces = np.where(index > 0, index - 1, np.where(index < 0, backwards, -1))
             self.faces.append((faces, kinds, self.material, self.line))
-        else:
-            values = np.fromstring(words, np.float64, sep=" ").reshape(lines, -1)[:, : _USED[kind]]
-            used = np.zeros((lines, _USED[kind]), np.float32)
-            with np.errstate(over="ignore"):
-                used[:, : values.shape[1]] = values
-            large = ~np.isfinite(used).all(axis=1)
-            if large.any():
-                self.fail(
-                    f"{kind} holds a number that is too large for a float32", self.line + large.argmax()
-                )
-            self.values[kind].append(used)
-            self.counts[kind] += lines
+            return
+        values = np.fromstring(words, np.float64, sep=" ").reshape(lines, -1)[:, : _USED[kind]]
+        used = np.zeros((lines, _USED[kind]), np.float32)
+        with np.errstate(over="ignore"):
+            used[:, : values.shape[1]] = values
+        large = ~np.isfinite(used).all(axis=1)
+        if large.any():
+            self.fail(f"{kind} has a number that is too large for a float32", self.line + large.argmax())
+        self.values[kind].append(used)
+        self.counts[kind] += lines
 
     def _statement(self, text: bytes) -> None:
         """Read one line of another form."""
         keyword, *words = decode(text.split(b"#", 1)[0]).split() or [""]
-        name, where = decode(text).strip()[len(keyword) :].strip(), f"{self.path}:{self.line}"
+        name = decode(text).strip()[len(keyword) :].strip()
+        where = f"{self.path}:{self.line}"
         if keyword in _FORMS:
             plain = " ".join([keyword, *(word.rstrip("/") for word in words)])
             again = _BLOCKS.fullmatch(plain.encode() + b"\n")
@@ -155,9 +162,10 @@ class _Reader:
         elif keyword == "mtllib":
             folder = self.path.parent
             for each in [name] if find(name, [folder]) else words:
-                if found := find(each, [folder]):
-                    self.libraries.add(str(found))
-                    self.materials |= read_mtl(found, convention=self.convention, folder=folder)
+                library = find(each, [folder])
+                if library:
+                    self.libraries.add(str(library))
+                    self.materials |= read_mtl(library, convention=self.convention, folder=folder)
                 else:
                     missing = f"{where}: the material library {each} {MISSING} {folder}"
                     self.missing.append(f"{missing}; its materials get the default")
@@ -166,7 +174,7 @@ class _Reader:
             self.fail(f"unknown statement {keyword[:40]!r}; {expected}", self.line)
 
     def meshes(self) -> tuple[Mesh, ...]:
-        """Return one mesh for each material, in the order of their first use."""
+        """A mesh for each material, in the order of their first use."""
         unknown = [
             f"{where}: no library has the material {name!r}; it gets the default"
             for name, where in self.named.items()
@@ -175,30 +183,38 @@ class _Reader:
         warn({"libraries": self.missing, "materials": unknown})
         parts: dict[tuple[Material, bool], list[np.ndarray]] = {}
         for faces, kinds, name, line in self.faces:
-            counts = np.array([*self.counts.values()])[kinds]
-            for row, corner, k in np.argwhere((faces < 0) | (faces >= counts))[:1]:
-                index, kind = faces[row, corner, k] + 1, [*_USED][kinds[k]]
-                of = f"the {kind} index {index}, but the file has {counts[k]}"
-                if index < 1:
-                    of = f"a {kind} index of 0, or before the first; indices count from 1, or back from -1"
-                self.fail(f"f has {of}", line + row)
+            self._check_faces(faces, kinds, line)
             material = self.materials.get(name, DEFAULT_MATERIAL)
             if 1 not in kinds:
                 material = replace(material, texture=None)  # no coordinates to look it up
             second = np.arange(1, faces.shape[1] - 1)  # corners of the triangles of a fan
-            fans = np.zeros((*faces.shape[:2], len(_USED)), np.int64)
-            fans[:, :, kinds] = faces
-            fans = fans[:, np.stack([0 * second, second, second + 1], axis=1)].reshape(-1, 3, len(_USED))
-            parts.setdefault((material, self.convention == "standard" and 2 in kinds), []).append(fans)
+            corners = np.zeros((*faces.shape[:2], len(_USED)), np.int64)  # [F, corners, kinds]
+            corners[:, :, kinds] = faces
+            fan = np.stack([0 * second, second, second + 1], axis=1)  # [triangles of a face, 3]
+            triangles = corners[:, fan].reshape(-1, 3, len(_USED))
+            smooth = self.convention == "standard" and 2 in kinds
+            parts.setdefault((material, smooth), []).append(triangles)
         if not parts:
             raise SceneError(f"{self.path}: has no faces; export the model with its geometry")
         values = [np.concatenate(arrays) for arrays in self.values.values()]
         return tuple(_mesh(values, np.concatenate(fans), *which) for which, fans in parts.items())
 
+    def _check_faces(self, faces: np.ndarray, kinds: list[int], line: int) -> None:
+        """Refuse an index of a value that the file does not have."""
+        counts = np.array([*self.counts.values()])[kinds]
+        for row, corner, k in np.argwhere((faces < 0) | (faces >= counts))[:1]:
+            index = faces[row, corner, k] + 1
+            kind = [*_USED][kinds[k]]
+            problem = f"the {kind} index {index}, but the file has {counts[k]}"
+            if index < 1:
+                problem = f"a {kind} index of 0, or before the first; indices count from 1, or back from -1"
+            self.fail(f"f has {problem}", line + row)
+
 
 def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, material: Material, smooth: bool) -> Mesh:
-    """Return the mesh of triangles [T, 3, kinds of values], with the vertices that they use."""
-    (points, uvs, normals), (v, vt, vn) = values, np.moveaxis(triangles, -1, 0)
+    """The mesh of triangles [T, 3, kinds of values], with the vertices that they use."""
+    points, uvs, normals = values
+    v, vt, vn = np.moveaxis(triangles, -1, 0)
     if material.texture is None and not smooth:
         used = np.zeros(len(points), bool)
         used[v] = True
@@ -206,8 +222,13 @@ def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, material: Materia
         return Mesh(points[used], new[v], material)
     # Each corner becomes a vertex: a point may have another texture or normal in another triangle
     faces = np.arange(v.size, dtype=np.uint32).reshape(-1, 3)
-    textured = None if material.texture is None else uvs[vt.ravel()]
-    return Mesh(points[v.ravel()], faces, material, textured, normals[vn.ravel()] if smooth else None)
+    return Mesh(
+        vertices=points[v.ravel()],
+        faces=faces,
+        material=material,
+        uvs=None if material.texture is None else uvs[vt.ravel()],
+        normals=normals[vn.ravel()] if smooth else None,
+    )
 
 
 # ------------------------------------------- Camera and lights -----------------------------------------
@@ -223,7 +244,7 @@ def obj_scene(
     sky: Color = BLUE_SKY,
     **view: Any,
 ) -> Scene:
-    """Return a scene of an OBJ file; camera and lights that are not given are placed by the model's size.
+    """The scene of an OBJ file; camera and lights that are not given are placed by the model's size.
 
     The camera stands in front, towards +z, a little above and to the right, and sees all of it; a light is up
     on each side, the right one brighter. ``texturing`` follows ``convention`` unless given. ``light``: where
@@ -237,14 +258,17 @@ def obj_scene(
     radius = float(np.linalg.norm(high - low)) / 2 or 1.0
     # a ball of radius 1 fills a view of 45° height, that of 60° width in a 4:3 picture, from 2.6 away
     radii = np.array([(0, 0, 0), (1.0, 0.8, 2.4), (4, 5, 4), (-4, 3, 5)])
-    center, eye, right, left = map(tuple, ((low + high) / 2 + radius * radii).tolist())
+    places = (low + high) / 2 + radius * radii
+    center, eye, right, left = map(tuple, places.tolist())
     if light is not None:
         lights = [Light(light, (2.5, 2.5, 2.5))]
     elif lights is None:
-        lights = Light(right, (2.5, 2.5, 2.5)), Light(left, (1.0, 1.0, 1.2))
-    names = {"camera": "position", "fov": "hfov"}
-    camera = replace(Camera(eye, center), **{names.get(name, name): value for name, value in view.items()})
-    if problem := camera.problem():
+        lights = [Light(right, (2.5, 2.5, 2.5)), Light(left, (1.0, 1.0, 1.2))]
+    fields = {"camera": "position", "fov": "hfov"}
+    given = {fields.get(name, name): value for name, value in view.items()}
+    camera = replace(Camera(eye, center), **given)
+    problem = camera.problem()
+    if problem:
         raise UsageError(problem)
     return Scene(
         title=os.path.basename(path),

@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, SupportsIndex
 
 import mitsuba as mi
 
@@ -18,6 +18,7 @@ from mrt_mitsuba.options import is_obj
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene
 from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.target import Goal, StatesGoal
 
 WIDEST_FILTER = 1024  # pixels: the largest radius of a film's filter
 
@@ -27,23 +28,24 @@ class Source:
     """A loaded Mitsuba scene, how to look at it, and the focus it suggests."""
 
     name: str
-    scene: Any
-    sensor: Any
-    integrator: Any
+    scene: mi.Scene
+    sensor: mi.Sensor
+    integrator: mi.Integrator
     width: int
     height: int
     focal_distance: float | None = None
     focal_range: float = FOCAL_RANGE
     fresnel: str | None = None  #: the formula in force, where the scene leaves the choice
     own: bool = False  #: is it someone's own, with a film and a sampler to honour
+    goal: Goal | None = None  #: how far rounds of rays go, where its integrator says so
 
 
 def open_scene(
-    scene: Any,
+    scene: object,
     *,
     size: tuple[int | None, int | None] = (None, None),
     fresnel: str | None = None,
-    integrator: Any = None,
+    integrator: object = None,
     budget: Budget | None = None,
     sensor: int = 0,
     params: Mapping[str, Any] | None = None,
@@ -56,8 +58,9 @@ def open_scene(
     """
     terms = in_terms(scene, model or {})
     # a key of mi.traverse has a dot, the name of a parameter of an XML file has none
-    keys = {key: value for key, value in (params or {}).items() if "." in key}
-    declared = {key: value for key, value in (params or {}).items() if "." not in key}
+    params = params or {}
+    keys = {key: value for key, value in params.items() if "." in key}
+    declared = {key: value for key, value in params.items() if "." not in key}
     if declared and not str(scene).lower().endswith(".xml"):
         raise UsageError(
             f"params: {next(iter(declared))} is not a key of mi.traverse, and only an XML file declares names"
@@ -65,12 +68,17 @@ def open_scene(
     if terms is not None:
         if budget is not None:
             budget.inputs.update(terms.files)
-        size, fresnel = (size[0] or SIZE[0], size[1] or SIZE[1]), fresnel or "schlick"
-        name = str(operator.index(scene)) if hasattr(scene, "__index__") else terms.title or "a scene"
-        nodes = terms.to_dict(width=size[0], height=size[1], fresnel=fresnel)
+        width = size[0] or SIZE[0]
+        height = size[1] or SIZE[1]
+        fresnel = fresnel or "schlick"
+        name = terms.title or "a scene"
+        if isinstance(scene, SupportsIndex):
+            name = str(operator.index(scene))
+        nodes = terms.to_dict(width=width, height=height, fresnel=fresnel)
         # its meshes have a material each: kept apart, they stay in order, and a file has the same layers
         loaded = load_dict(nodes, name, budget, merge=False)
-        distance, reach = terms.focal_distance, terms.focal_range
+        distance = terms.focal_distance
+        reach = terms.focal_range
     else:
         if fresnel is not None:
             raise UsageError(
@@ -79,8 +87,8 @@ def open_scene(
         name, loaded, values = _loaded(scene, budget, declared)
         if keys and loaded is scene:
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
-        # as write_xml writes them
-        distance, reach = _number(values, "focaldist", None), _number(values, "focalrange", FOCAL_RANGE)
+        distance = _number(values, "focaldist", None)  # as write_xml writes it
+        reach = _number(values, "focalrange", FOCAL_RANGE)
     set_parameters(loaded, keys)
     source = opened(name, loaded, _sensor(name, loaded, sensor), _integrator(integrator, loaded))
     return replace(
@@ -95,7 +103,7 @@ def open_scene(
 
 
 def in_terms(scene: Any, model: Mapping[str, Any]) -> Scene | None:
-    """Return a number, a ``Scene`` or the path of an OBJ file in the report's terms; None for anything else.
+    """A number, a ``Scene`` or the path of an OBJ file in the report's terms; None for anything else.
 
     ``model``: options of ``obj_scene``. Raises ``UsageError`` where they are of no use.
     """
@@ -103,12 +111,12 @@ def in_terms(scene: Any, model: Mapping[str, Any]) -> Scene | None:
         from mrt_mitsuba.scene.obj import obj_scene  # with numpy
 
         return obj_scene(scene, **model)
-    if hasattr(scene, "__index__"):
+    if isinstance(scene, SupportsIndex):
         return report_scene(operator.index(scene))
     return scene if isinstance(scene, Scene) else None
 
 
-def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
+def set_parameters(scene: mi.Scene, values: Mapping[str, Any]) -> None:
     """Set values by their ``mi.traverse`` key; raise ``UsageError`` for unknown ones and wrong types."""
     if not values:
         return
@@ -129,12 +137,13 @@ def set_parameters(scene: Any, values: Mapping[str, Any]) -> None:
 @contextmanager
 def sized(source: Source) -> Iterator[None]:
     """Give the film the source's size within the block; a film of another size loses its crop window."""
-    size, before = [source.width, source.height], {}
+    size = [source.width, source.height]
+    before = {}
     if list(source.sensor.film().crop_size()) != size:
         parameters = mi.traverse(source.sensor)
-        wanted = {"film.size": size, "film.crop_size": size, "film.crop_offset": [0, 0]}
-        before = {name: list(parameters[name]) for name in wanted}
-        parameters.update(wanted)
+        changes = {"film.size": size, "film.crop_size": size, "film.crop_offset": [0, 0]}
+        before = {name: list(parameters[name]) for name in changes}
+        parameters.update(changes)
     try:
         yield
     finally:
@@ -143,9 +152,9 @@ def sized(source: Source) -> Iterator[None]:
 
 
 def _loaded(
-    scene: Any, budget: Budget | None, declared: Mapping[str, Any]
-) -> tuple[str, Any, Mapping[str, str]]:
-    """Return the name of someone's own scene, the Mitsuba scene, and the parameters of its file."""
+    scene: object, budget: Budget | None, declared: Mapping[str, Any]
+) -> tuple[str, mi.Scene, Mapping[str, str]]:
+    """The name of someone's own scene, the Mitsuba scene, and the parameters of its file."""
     if isinstance(scene, dict):
         return "a dict", load_dict(scene, budget=budget), {}
     if isinstance(scene, str | os.PathLike):
@@ -157,7 +166,7 @@ def _loaded(
     raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")
 
 
-def _check_variant(name: str, thing: Any) -> None:
+def _check_variant(name: str, thing: object) -> None:
     """Raise ``UsageError`` for an object of Mitsuba that was loaded in another variant."""
     variant = thing.variant_name() if hasattr(thing, "variant_name") else mi.variant()
     if variant != mi.variant():
@@ -167,15 +176,15 @@ def _check_variant(name: str, thing: Any) -> None:
         )
 
 
-def _number(values: Mapping[str, str], name: str, default: Any) -> Any:
-    """Return a number that an XML file declares, or the default."""
+def _number(values: Mapping[str, str], name: str, default: float | None) -> Any:
+    """A number that an XML file declares, or the default."""
     try:
         return max(0.0, float(values[name]))
     except (KeyError, ValueError):
         return default
 
 
-def _sensor(name: str, scene: Any, number: int) -> Any:
+def _sensor(name: str, scene: mi.Scene, number: int) -> mi.Sensor:
     if not isinstance(scene, mi.Scene):
         raise SceneError(f"{name} is a {type(scene).__name__}, not a scene: put it into one, with a sensor")
     sensors = scene.sensors()
@@ -186,21 +195,29 @@ def _sensor(name: str, scene: Any, number: int) -> Any:
     return sensors[number]
 
 
-def opened(name: str, scene: Any, sensor: Any, integrator: Any) -> Source:
-    """Return the source of someone's own loaded scene; raise ``SceneError`` if its sensor sees nothing."""
-    for part in [sensor] if sensor.class_name() != "BatchSensor" else mi.traverse(sensor).hierarchy:
+def opened(name: str, scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator) -> Source:
+    """The source of someone's own loaded scene; ``SceneError`` if its sensor sees nothing."""
+    parts = [sensor]
+    if sensor.class_name() == "BatchSensor":
+        parts = mi.traverse(sensor).hierarchy
+    for part in parts:
         if part.class_name() == "IrradianceMeter" and part.get_shape() is None:  # Mitsuba would crash
             raise SceneError(f"{name} has an irradiancemeter outside of a shape: put it into one")
     film = sensor.film()
-    (width, height), radius = film.crop_size(), film.rfilter().radius()
+    width, height = film.crop_size()
+    radius = film.rfilter().radius()
     if width < 1 or height < 1:
         raise SceneError(f"{name} brings a film of {width}x{height}: give it one pixel at least")
     if not 0 <= radius <= WIDEST_FILTER:
         raise SceneError(f"{name} has a filter of radius {radius:g}: give at most {WIDEST_FILTER} pixels")
-    return Source(name, scene, sensor, integrator, int(width), int(height), own=True)
+    goal = None
+    if isinstance(integrator, StatesGoal):
+        goal = integrator.goal
+        integrator = integrator.nested
+    return Source(name, scene, sensor, integrator, int(width), int(height), own=True, goal=goal)
 
 
-def _integrator(integrator: Any, scene: Any) -> Any:
+def _integrator(integrator: Any, scene: mi.Scene) -> mi.Integrator:
     if integrator is None:
         integrator = scene.integrator() or "mrt_whitted"
     if isinstance(integrator, str):

@@ -49,10 +49,12 @@ def connected(
             logger = logging.getLogger(name)
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
-        count, patience = 1, CONNECTING
+        count = 1
+        patience = CONNECTING
         if cluster is None:
             devices = gpus() if variant.startswith("cuda") else []
-            count, patience = workers or min(len(devices) or usable_cores(), jobs), STARTING
+            count = workers or min(len(devices) or usable_cores(), jobs)
+            patience = STARTING
             cluster = stack.enter_context(_local(count, dashboard, devices))
         try:
             client = cluster
@@ -82,7 +84,7 @@ def _close(client: Client) -> None:
 
 
 def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
-    """Return a scheduler in this process, and workers in processes of their own with one thread for jobs.
+    """A scheduler in this process, and workers in processes of their own with one thread for jobs.
     They do not import the caller's script, so it needs no ``if __name__ == "__main__"``."""
     options = {
         "nthreads": 1,
@@ -107,7 +109,7 @@ def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
 
 
 def gpus() -> list[str]:
-    """Return the GPUs this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
+    """The GPUs this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     if named is None:
         with suppress(OSError, subprocess.SubprocessError):
@@ -117,15 +119,18 @@ def gpus() -> list[str]:
 
 
 def inspect(client: Client, scratch: str, here: str) -> dict[str, int]:
-    """Return how many workers share cores (``render_job``); raise ``ClusterError`` or ``OutputError`` where
-    one has other versions than those ``here`` or cannot be used."""
+    """How many workers share each set of cores, see ``render_job``.
+
+    Raises ``ClusterError`` or ``OutputError`` where one has other versions than those ``here`` or cannot be
+    used.
+    """
     try:
-        found = client.run(worker.describe, scratch)
+        workers = client.run(worker.describe, scratch)
     except Exception as error:  # whatever another Python or another version makes of it
         raise ClusterError(
             f"the workers cannot run this mrt-mitsuba ({type(error).__name__}: {error}): install {here} there"
         ) from error
-    for name, facts in found.items():
+    for name, facts in workers.items():
         if not facts["sees"]:
             raise OutputError(f"the worker {name} cannot write to {scratch}: choose a folder that all share")
         if facts["versions"] != here:
@@ -133,7 +138,7 @@ def inspect(client: Client, scratch: str, here: str) -> dict[str, int]:
                 f"the worker {name} has {facts['versions']} and this process {here}: install the same "
                 "everywhere"
             )
-    return dict(Counter(facts["cores"] for facts in found.values()))
+    return dict(Counter(facts["cores"] for facts in workers.values()))
 
 
 def outcomes(

@@ -42,8 +42,18 @@ class Job(NamedTuple):
         return f"{self.name}.exr"
 
     def files(self, png: bool) -> list[str]:
-        """Return the names of all that it leaves in the folder."""
+        """The names of all that it leaves in the folder."""
         return [self.file, *([f"{self.name}.png"] if png else [])]
+
+    @property
+    def is_tile(self) -> bool:
+        """Whether it is a part of a picture, in a folder of its own."""
+        return os.sep in self.name
+
+    @property
+    def note(self) -> str:
+        """The name of a tile's note in the folder."""
+        return f"{self.name}.json"
 
     @property
     def made_with(self) -> str:
@@ -53,7 +63,7 @@ class Job(NamedTuple):
 
 
 def points(grid: Any, zipped: bool) -> dict[str, dict[str, Any]]:
-    """Return the values of each job by their axes, by the name of its file; the last axis varies fastest.
+    """The values of each job by their axes, by the name of its file; the last axis varies fastest.
 
     ``zipped``: the axes are columns of one list, whose rows are the jobs, and files are numbered.
 
@@ -67,35 +77,37 @@ def points(grid: Any, zipped: bool) -> dict[str, dict[str, Any]]:
     if zipped and len(set(lengths)) > 1:
         raise UsageError(f"zipped axes must be of one length, and those of {', '.join(axes)} are {lengths}")
     rows = zip(*axes.values(), strict=True) if zipped else itertools.product(*axes.values())
-    found = [dict(zip(axes, row, strict=True)) for row in itertools.islice(rows, MOST_JOBS + 1)]
-    if len(found) > MOST_JOBS:
+    combinations = [dict(zip(axes, row, strict=True)) for row in itertools.islice(rows, MOST_JOBS + 1)]
+    if len(combinations) > MOST_JOBS:
         raise UsageError(f"the grid has more than {MOST_JOBS} jobs: make several sweeps of it")
     if zipped:  # as programs for films expect them
-        return {f"frame_{number:04}": point for number, point in enumerate(found)}
-    names = [
-        ",".join(f"{word(key)}={word(value)}" for key, value in point.items()) or "picture" for point in found
-    ]
+        return {f"frame_{number:04}": point for number, point in enumerate(combinations)}
+    names = [_name(point) for point in combinations]
     ((name, count),) = Counter(map(str.casefold, names)).most_common(1)  # some file systems ignore case
     if count > 1:
         raise UsageError(
             f"{count} jobs would write the same file {name}: take values out, or use zipped=True, which "
             "numbers the files"
         )
-    return dict(zip(names, found, strict=True))
+    return dict(zip(names, combinations, strict=True))
+
+
+def _name(point: Mapping[str, Any]) -> str:
+    return ",".join(f"{word(key)}={word(value)}" for key, value in point.items()) or "picture"
 
 
 def _axis(key: Any, values: Any) -> list[Any]:
     values = values.tolist() if hasattr(values, "tolist") else values  # NumPy's
     if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
         raise UsageError(f"grid: {key} is {values!r}; give a list of values, such as [{values!r}]")
-    found = list(itertools.islice(values, MOST_JOBS + 1))  # some never end
-    if not found:
+    first = list(itertools.islice(values, MOST_JOBS + 1))  # some never end
+    if not first:
         raise UsageError(f"grid: {key} is an empty list; give it values, or leave it out")
-    return [value.tolist() if hasattr(value, "tolist") else value for value in found]
+    return [value.tolist() if hasattr(value, "tolist") else value for value in first]
 
 
 def word(value: Any) -> str:
-    """Return a value in letters that file names may have."""
+    """A value in letters that file names may have."""
     if isinstance(value, list | tuple):
         return "x".join(map(word, value)) or "none"
     if isinstance(value, Mapping):
@@ -104,38 +116,41 @@ def word(value: Any) -> str:
         value = Path(value).stem if os.sep in os.fspath(value) else value
     elif isinstance(value, Scene):
         value = value.title or "scene"
-    return re.sub(r"[^\w.+-]+", "-", str(value))
+    return re.sub(r"[^\w.+-]+", "-", str(value).replace("%", "pct"))
 
 
 def jobs(
     scene: Any, named: Mapping[str, Mapping[str, Any]], fixed: Mapping[str, Any], folder: str
 ) -> list[Job]:
-    """Return the job of each point, given what all share, with scenes as workers can open them: numbers and
-    absolute paths. Any other scene is written into a folder.
+    """The job of each point, given what all share, with scenes as workers can open them: numbers and absolute
+    paths. Any other scene is written into a folder.
 
     Raises ``UsageError`` for what ``render`` does not take, is given twice, or cannot be sent to another
     process, and ``SceneError`` for a file that cannot be read.
     """
     axes = {key for point in named.values() for key in point}
-    if twice := axes & {*fixed, "" if scene is None else "scene"}:
+    twice = axes & {*fixed, "" if scene is None else "scene"}
+    if twice:
         raise UsageError(f"{min(twice)} is given twice: as an axis of the grid and for all jobs; drop one")
-    scenes: dict[int, tuple[Any, str]] = {}
-    found = []
+    scenes: dict[int, tuple[Any, str]] = {}  # as sent, and its fingerprint
+    every = []
     for name, point in named.items():
         dotted = {key: value for key, value in point.items() if "." in key}
-        arguments = {**fixed, **{key: value for key, value in point.items() if key not in dotted}}
+        arguments = {**fixed, **{key: value for key, value in point.items() if "." not in key}}
         own = arguments.pop("scene", scene)
         try:
             RenderSettings.of(**arguments)
         except TypeError as error:
             raise UsageError(str(error)) from None
-        if params := {**(fixed.get("params") or {}), **(point.get("params") or {}), **dotted}:
+        params = {**(fixed.get("params") or {}), **(point.get("params") or {}), **dotted}
+        if params:
             arguments["params"] = params
         if id(own) not in scenes:
             sent = _send(own, os.path.join(folder, f"{len(scenes)}{SENT}"))
             scenes[id(own)] = sent, identify(sent)
-        found.append(Job(name, scenes[id(own)][0], arguments, scenes[id(own)][1]))
-    return found
+        sent, identity = scenes[id(own)]
+        every.append(Job(name, sent, arguments, identity))
+    return every
 
 
 def check_parameters(jobs: Sequence[Job]) -> None:
@@ -157,22 +172,23 @@ def _send(scene: Any, path: str) -> Any:
     if isinstance(scene, str | os.PathLike):
         return os.path.abspath(scene)
     if isinstance(scene, SupportsIndex):
-        report_scene(number := operator.index(scene))
+        number = operator.index(scene)
+        report_scene(number)  # refuses a number without a scene
         return number
     Path(path).write_bytes(_encode(scene))
     return path
 
 
 def receive(scene: Any) -> Any:
-    """Return the scene that was sent."""
+    """The scene that was sent."""
     use()  # it may hold Mitsuba's types
     sent = isinstance(scene, str) and scene.endswith(SENT)
     return pickle.loads(Path(scene).read_bytes()) if sent else scene
 
 
 def identify(sent: Any) -> str:
-    """Return the fingerprint of a scene that was sent: of a file, that of its contents, not of the files that
-    it names. Raises ``SceneError`` for a file that cannot be read."""
+    """The fingerprint of a scene that was sent: of a file, that of its contents, not of the files that it
+    names. Raises ``SceneError`` for a file that cannot be read."""
     if isinstance(sent, str):
         require_file(os.path.relpath(sent))
         return fingerprint(Path(sent).read_bytes())
@@ -180,13 +196,15 @@ def identify(sent: Any) -> str:
 
 
 def fingerprint(*values: Any) -> str:
-    """Return 32 letters that differ where the values do."""
+    """32 letters that differ where the values do."""
     return hashlib.sha256(_encode(values)).hexdigest()[:32]
 
 
 def _encode(value: Any) -> bytes:
-    """Return what is made of Python's and NumPy's types as bytes, the same for equal values; raise
-    ``UsageError`` for what lives in this process only, such as a loaded Mitsuba scene."""
+    """A value of Python's and NumPy's types as bytes, the same for equal values.
+
+    Raises ``UsageError`` for what lives in this process only, such as a loaded Mitsuba scene.
+    """
     stream = io.BytesIO()
     pickler = _Pickler(stream, protocol=5)
     pickler.fast = True  # no references to what came before: they would distinguish equal from identical

@@ -7,10 +7,12 @@ picture is written some rows at a time, so that no process ever holds it.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import json
 import os
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,9 @@ from PIL import Image
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
 from mrt_mitsuba.output.files import compressing, silenced
 from mrt_mitsuba.output.replacing import replacing
+from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.open import open_scene
+from mrt_mitsuba.sweeps.folder import Facts
 from mrt_mitsuba.sweeps.jobs import Job, receive
 
 MADE_WITH = "mrt:sweep"  # in the header of each picture: its job's ``made_with``
@@ -30,92 +34,112 @@ BYTES_PER_PIXEL = 128
 LEAST_MEMORY = 2**27
 
 
-def mark(path: str) -> tuple[str | None, bool]:
-    """Return the fingerprint in a picture that a sweep made, "" in any other and None in what is no picture,
-    and whether the picture is whole."""
-    found = None
+def checksum(path: str) -> str:
+    """The SHA-256 of a file, as ``sha256sum`` prints it, and its bytes: "HASH/BYTES"."""
+    total = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(2**20):
+            total.update(block)
+    return f"{total.hexdigest()}/{os.path.getsize(path)}"
+
+
+def mark(path: str) -> str | None:
+    """The fingerprint in a picture that a sweep made: "" in any other, None in what is no picture."""
+    if not os.path.isfile(path):  # a pipe has no end to wait for
+        return None
     try:
-        if not os.path.isfile(path):  # a pipe has no end to wait for
-            return None, False
         if path.endswith(".png"):
-            with Image.open(path) as picture:
-                found = str(picture.info.get(MADE_WITH, ""))
-                picture.verify()  # every chunk to the last, which ``load`` can do without
-        else:
-            with silenced():
-                found = str(OpenEXR.File(path, header_only=True).header().get(MADE_WITH, ""))
-                if found:
-                    _read_last_row(path)
-        return found, True
-    except (OSError, RuntimeError, ValueError, TypeError, SyntaxError):  # what libraries raise for files
-        return found, False
+            with warnings.catch_warnings(), Image.open(path) as picture:
+                return str(picture.info.get(MADE_WITH, ""))
+        with silenced():
+            return str(OpenEXR.File(path, header_only=True).header().get(MADE_WITH, ""))
+    except Exception:  # whatever libraries raise for damaged files
+        return None
 
 
-def is_fresh(job: Job, folder: str, png: bool = False, listed: bool = False) -> bool:
-    """Return whether a job's files are there, whole, and made with the same scene, settings and versions.
+def is_fresh(job: Job, folder: str, noted: Facts | None, png: bool = False) -> bool:
+    """Whether a job's files are as they were written, by the same scene, settings and versions.
 
-    Raises ``OutputError`` for a file of the user's own under their names. A sweep's own has a mark in its
-    header or, where that is broken, a row in the table (``listed``).
+    ``noted``: its row of the table, or the note of a tile; None without one. "checksum" is that of each file.
+    Raises ``OutputError`` for a file of the user's own under their names: one without a sweep's mark, unless
+    it is what damage left of the noted one.
     """
-    wanted, fresh = job.made_with, True
-    for path in (os.path.join(folder, file) for file in job.files(png)):
-        found, whole = mark(path)
-        if os.path.lexists(path) and not (found or (found is None and listed and os.path.isfile(path))):
+    sums = str((noted or {}).get("checksum") or "").split()
+    fresh = True
+    for file, known in itertools.zip_longest(job.files(png), sums[: len(job.files(png))], fillvalue=""):
+        path = os.path.join(folder, file)
+        found = mark(path)
+        if os.path.lexists(path) and not found and (noted is None or not _is_damaged(path, known)):
             text = "was not made by a sweep, which would replace it: move it away, or choose another folder"
             raise OutputError(f"{path} {text}")
-        fresh = fresh and whole and found == wanted
+        fresh = fresh and found == job.made_with and checksum(path) == known
     return fresh
 
 
+def _is_damaged(path: str, known: str) -> bool:
+    """Whether a file without a sweep's mark may be the noted one: no picture at all, or as long."""
+    if not os.path.isfile(path):
+        return False
+    return mark(path) is None or known.endswith(f"/{os.path.getsize(path)}")
+
+
 def cut(job: Job, tiles: Any) -> list[Job]:
-    """Return the jobs of a picture's tiles, row by row, each with a file in a folder named after the picture.
+    """The jobs of a picture's tiles, row by row, each with a file in a folder named after the picture.
 
     ``tiles``: the numbers of rows and of columns. Raises ``UsageError`` if the picture cannot be cut so.
     """
     if not (isinstance(tiles, list | tuple) and [*map(type, tiles)] == [int, int] and min(tiles) > 0):
         raise UsageError(f"tiles={tiles!r}: give rows and columns, such as (4, 4)")
-    if job.arguments.get("target") or job.arguments.get("aamode") == "noise":
+    if RenderSettings.of(**job.arguments).goal() is not None:
         raise UsageError("tiles: target and aamode=noise share the rays out over the whole picture")
     size: Any = job.arguments.get("width"), job.arguments.get("height")
     if None in size:  # only the scene knows
         source = open_scene(receive(job.scene), size=size)
         size = source.width, source.height
-    (width, height), (rows, columns) = size, tiles
+    width, height = size
+    rows, columns = tiles
     if rows > height or columns > width:
         raise UsageError(f"tiles={tiles}: a picture of {width}x{height} pixels has fewer rows or columns")
-    found = []
+    tiles_of_it = []
     for row, column in itertools.product(range(rows), range(columns)):
-        left, top = width * column // columns, height * row // rows
-        wide, high = width * (column + 1) // columns - left, height * (row + 1) // rows - top
+        left = width * column // columns
+        top = height * row // rows
+        wide = width * (column + 1) // columns - left
+        high = height * (row + 1) // rows - top
         memory = max(LEAST_MEMORY, BYTES_PER_PIXEL * wide * high)
         arguments = {"memory": memory, **job.arguments, "region": (left, top, wide, high)}
-        found.append(job._replace(name=f"{job.name}.tiles/{row},{column}", arguments=arguments))
-    return found
+        tiles_of_it.append(job._replace(name=f"{job.name}.tiles/{row},{column}", arguments=arguments))
+    return tiles_of_it
 
 
-def join(job: Job, parts: Sequence[Job], found: Sequence[Mapping[str, Any]], folder: str) -> dict[str, Any]:
-    """Return the facts of a picture, given those of its parts; tiles are put together and removed."""
+def join(job: Job, parts: Sequence[Job], outcomes: Sequence[Facts], folder: str) -> Facts:
+    """The facts of a picture, given those of its parts; tiles are put together and removed."""
     if parts == [job]:
-        return dict(found[0])
-    attempts = max(facts.get("attempts", 1) for facts in found)
-    if error := next((facts["error"] for facts in found if "error" in facts), ""):
-        return {"error": error, "attempts": attempts}
+        return dict(outcomes[0])
+    attempts = max(facts.get("attempts", 1) for facts in outcomes)
+    for facts in outcomes:
+        if "error" in facts:
+            return {"error": facts["error"], "attempts": attempts}
     try:
         _write_rows(job, parts, folder)
+        whole = checksum(os.path.join(folder, job.file))
         for part in parts:
-            os.unlink(os.path.join(folder, part.file))
+            for file in (part.file, part.note):
+                os.unlink(os.path.join(folder, file))
         with contextlib.suppress(OSError):  # something else is in there
             os.rmdir(os.path.join(folder, f"{job.name}.tiles"))
     except (MrtError, OSError, RuntimeError) as error:
         return {"error": f"cannot put {job.name} together: {error}", "attempts": attempts}
-    known = ("seconds", "rays") if all(found) else ()
-    return {"file": job.file, "attempts": attempts, **{name: sum(f[name] for f in found) for name in known}}
+    known = ("seconds", "rays") if all(outcomes) else ()
+    sums = {name: sum(facts[name] for facts in outcomes) for name in known}
+    return {"file": job.file, "attempts": attempts, "checksum": whole, **sums}
 
 
 def _write_rows(job: Job, tiles: Sequence[Job], folder: str) -> None:
     files = [OpenEXR.InputFile(os.path.join(folder, tile.file)) for tile in tiles]
     regions = [tile.arguments["region"] for tile in tiles]
-    own, (left, top, wide, high) = files[0].header(), regions[-1]
+    own = files[0].header()
+    left, top, wide, high = regions[-1]
     names = list(own["channels"])
     header: dict[str, Any] = OpenEXR.Header(left + wide, top + high)
     header |= {name: value for name, value in own.items() if name not in header and name != "type"}

@@ -10,10 +10,10 @@ from itertools import chain
 from typing import Any
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import OutputError, UsageError
+from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
 from mrt_mitsuba.options import check, integer
-from mrt_mitsuba.output.replacing import temporary_folder
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
+from mrt_mitsuba.sweeps.folder import read_note, reserved
 from mrt_mitsuba.sweeps.jobs import Job, check_parameters, jobs, points
 from mrt_mitsuba.sweeps.pictures import cut, is_fresh, join
 from mrt_mitsuba.sweeps.table import Table
@@ -64,10 +64,8 @@ def sweep(
         ClusterError: where workers cannot be reached or the scheduler is gone; a second run goes on from
             there.
     """
-    try:
+    with needs_extra("cluster"):
         from mrt_mitsuba.sweeps.cluster import connected, inspect, outcomes
-    except ModuleNotFoundError:
-        raise UsageError("a sweep needs Dask: pip install 'mrt-mitsuba[cluster]'") from None
     for name, number, least in (
         ("workers", workers, 1),
         ("retries", retries, 0),
@@ -89,17 +87,21 @@ def sweep(
     except (OSError, TypeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise OutputError(f"cannot make the folder {out!s}: {reason}") from error
-    table = Table(folder, named)
     shown = TerminalProgress(unit=" pictures") if progress is None else progress
-    with temporary_folder(folder) as scratch:
+    with reserved(folder) as (scratch, notes):
+        table = Table(folder, named)
+        table.earlier |= notes
         planned = jobs(scene, named, options, scratch)
-        whole = {job.name for job in planned if is_fresh(job, folder, png, job.file in table.earlier)}
+        whole = {job.name for job in planned if is_fresh(job, folder, table.earlier.get(job.file), png)}
         missing = [job for job in planned if not (job.name in whole and resume)]
         parts = {job.name: [job] if tiles is None else cut(job, tiles) for job in missing}
         pictures = {part.name: job for job in missing for part in parts[job.name]}
         every = list(chain(*parts.values()))
-        # Tiles of an earlier sweep, which has kept no facts of them
-        kept = {tile.name: tile for tile in every if tiles is not None and is_fresh(tile, folder) and resume}
+        kept = {}  # tiles of an earlier sweep, which has kept no facts of them but their checksums
+        for tile in every if tiles is not None else ():
+            noted = read_note(os.path.join(folder, tile.note)) or None
+            if is_fresh(tile, folder, noted) and resume:
+                kept[tile.name] = tile
         check_parameters(missing)
         versions = describe(scratch)["versions"]
         for job in planned:
@@ -123,7 +125,7 @@ def sweep(
                 job = pictures[part.name]
                 own = parts[job.name]
                 if all(each.name in made for each in own):
-                    found = [made[each.name] for each in own]
-                    table.add(job.name, join(job, own, found, folder) | {"versions": versions})
+                    outcome = join(job, own, [made[each.name] for each in own], folder)
+                    table.add(job.name, outcome | {"versions": versions})
                 advance(1)
     return table

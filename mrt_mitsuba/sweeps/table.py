@@ -16,7 +16,8 @@ from mrt_mitsuba.output.replacing import check_target, replacing
 from mrt_mitsuba.sweeps.jobs import word
 
 FACTS = {"file": str, "error": str, "seconds": float, "rays": int, "rmse": float, "attempts": int}
-FACTS |= {"worker": str, "versions": str}
+FACTS |= {"worker": str, "versions": str, "checksum": str}
+BEFORE_CHECKSUMS = list(FACTS)[:-1]  # as earlier versions wrote them; pictures without one are made anew
 PAUSE = 1.0  # seconds from one writing to the next, so that short jobs do not rewrite it all the time
 
 
@@ -24,13 +25,14 @@ class Table:
     """The outcome of each job of a sweep.
 
     ``folder``: of the pictures, whose ``table.csv`` it is; ``points``: values of each job by key, by its
-    name; ``earlier``: the facts that the file held before, by the name of the picture.
+    name; ``earlier``: the facts in the file of an earlier sweep, by the name of the picture.
 
     Raises ``OutputError`` for a ``table.csv`` that no sweep made, or that cannot be written.
     """
 
     def __init__(self, folder: str, points: Mapping[str, Mapping[str, Any]]) -> None:
-        self.folder, self.keys = folder, tuple(next(iter(points.values()), ()))
+        self.folder = folder
+        self.keys = tuple(next(iter(points.values()), ()))
         self._points = points
         self._ended: dict[str, dict[str, Any]] = {}
         self._path = os.path.join(folder, "table.csv")
@@ -43,8 +45,9 @@ class Table:
         """A dict for each job that ended, in the order of the grid.
 
         Its parameters by key, then "file" (its name in the folder, "" without one), "error" ("" without one),
-        "seconds", "rays", "rmse", "attempts", "worker" and "versions". None stands for the
-        unknown: what an earlier sweep did not record, an error that the render did not estimate.
+        "seconds", "rays", "rmse", "attempts", "worker", "versions" and "checksum" (SHA-256 and bytes of the
+        EXR, then of the PNG). None stands for the unknown: what an earlier sweep did not record, an error
+        that the render did not estimate.
         """
         return [self._ended[name] for name in self._points if name in self._ended]
 
@@ -79,15 +82,20 @@ def _cell(value: Any) -> Any:
     return json.dumps(value, default=word) if isinstance(value, list | tuple) else word(value)
 
 
+def _facts(names: list[str], row: list[str]) -> dict[str, Any]:
+    """The facts of a row: its last columns, which have these names; "file" always, others where known."""
+    texts = dict(zip(names, row[-len(names) :], strict=True))
+    known = {name: FACTS[name](text) for name, text in texts.items() if text}
+    return {"file": ""} | known
+
+
 def _read(path: str) -> dict[str, dict[str, Any]]:
-    """Return the facts of an earlier table by the name of the file."""
+    """The facts of an earlier table by the name of the file."""
     if not os.path.exists(path):
         return {}
     with suppress(OSError, ValueError, csv.Error), open(path, encoding="utf-8", newline="") as file:
-        head, *rows = (row[-len(FACTS) :] for row in csv.reader(file) if row)
-        if head == [*FACTS]:
-            return {
-                row[0]: {name: FACTS[name](text) for name, text in zip(FACTS, row, strict=True) if text}
-                for row in rows
-            }
+        head, *rows = (row for row in csv.reader(file) if row)
+        for names in ([*FACTS], BEFORE_CHECKSUMS):
+            if head[-len(names) :] == names:
+                return {facts["file"]: facts for facts in (_facts(names, row) for row in rows)}
     raise OutputError(f"{path} is not the table of a sweep: move it away, or choose another folder")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import socket
 import sys
@@ -21,27 +20,28 @@ from mrt_mitsuba.options import SMALLEST_MEMORY
 from mrt_mitsuba.output.files import save, to_8bit
 from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.sweeps.folder import read_note, write_note
 from mrt_mitsuba.sweeps.jobs import Job, identify, receive
-from mrt_mitsuba.sweeps.pictures import MADE_WITH
+from mrt_mitsuba.sweeps.pictures import MADE_WITH, checksum
 
 
 def describe(folder: str) -> dict[str, Any]:
-    """Return what a client asks of each worker before it begins: the versions of what decides about pixels,
-    a name for its cores, which workers that share them have in common, and whether it sees a folder."""
-    found = {**runtime.versions(), "python": f"{sys.version_info[0]}.{sys.version_info[1]}"}
+    """What a client asks each worker before it begins: the versions of all that decides about pixels, a name
+    for its cores, the same for workers that share them, and whether it sees a folder."""
+    versions = {**runtime.versions(), "python": f"{sys.version_info[0]}.{sys.version_info[1]}"}
     return {
-        "versions": ", ".join(f"{name} {version}" for name, version in found.items()),
+        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
         "cores": f"{socket.gethostname()} {sorted(os.sched_getaffinity(0))}",
         "sees": os.access(folder, os.W_OK),
     }
 
 
 def outcome(job: Job, scratch: str) -> dict[str, Any]:
-    """Return what workers have noted of a job: "attempts", and what the last left where that has ended.
-    Notes outlive workers: one may die of its next job before Dask has reported on this."""
-    with contextlib.suppress(FileNotFoundError), open(f"{scratch}/{job.name}.json", "rb") as file:
-        return json.load(file)
-    return {"attempts": 0}
+    """The facts that workers have noted of a job: "attempts", and those of the last if it has ended.
+
+    Notes outlive workers: one may die of its next job before Dask has reported on this.
+    """
+    return {"attempts": 0} | read_note(f"{scratch}/{job.name}.json")
 
 
 def render_job(
@@ -60,10 +60,12 @@ def render_job(
     facts = outcome(job, scratch)
     if facts.get("file"):  # Dask repeats what it cannot get the result of
         return
-    worker, own = get_worker(), os.path.join(scratch, job.name)
-    os.makedirs(os.path.dirname(own), exist_ok=True)  # of tiles
+    worker = get_worker()
+    note = os.path.join(scratch, f"{job.name}.json")
+    with contextlib.suppress(FileExistsError):
+        os.mkdir(os.path.dirname(note))  # of tiles; of a sweep that was killed, nothing is made anew
     facts = {"attempts": facts["attempts"] + 1, "worker": worker.address}
-    _note(own, facts)
+    write_note(note, facts)
     try:
         with runtime.one_at_a_time:
             here = describe(folder)
@@ -77,13 +79,7 @@ def render_job(
         facts |= {"error": one_line(f"{type(error).__name__}: {error}"), "again": True}
         raise
     finally:
-        _note(own, facts)
-
-
-def _note(own: str, facts: Mapping[str, Any]) -> None:
-    with open(f"{own}.note", "w") as file:
-        json.dump(facts, file)
-    os.replace(f"{own}.note", f"{own}.json")
+        write_note(note, facts)
 
 
 def _render(job: Job, folder: str, scratch: str, png: bool, threads: int, limit: Any) -> dict[str, Any]:
@@ -107,10 +103,18 @@ def _render(job: Job, folder: str, scratch: str, png: bool, threads: int, limit:
         mark = PngInfo()
         mark.add_text(MADE_WITH, job.made_with)
         Image.fromarray(to_8bit(result.image)).save(f"{scratch}/{job.name}.png", pnginfo=mark)
+    sums = [checksum(os.path.join(scratch, file)) for file in job.files(png)]
     for file in job.files(png):
         target = os.path.join(folder, file)
         os.makedirs(os.path.dirname(target), exist_ok=True)
         check_target(target, result.inputs)  # a scene may read pictures of earlier sweeps
         os.replace(os.path.join(scratch, file), target)
-    rays, error = int(sum(result.rays.values())), result.error and float(result.error.rmse)
-    return {"file": job.file, "seconds": time.perf_counter() - start, "rays": rays, "rmse": error}
+    if job.is_tile:
+        write_note(os.path.join(folder, job.note), {"checksum": sums[0]})
+    return {
+        "file": job.file,
+        "seconds": time.perf_counter() - start,
+        "rays": int(sum(result.rays.values())),
+        "rmse": result.error and float(result.error.rmse),
+        "checksum": " ".join(sums),
+    }

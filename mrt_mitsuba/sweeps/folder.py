@@ -1,0 +1,115 @@
+"""The folder of a sweep: one sweep at a time, and what a killed one has left there.
+
+A lock on a file in the folder says that a sweep works there. The system frees it when the process ends,
+however it ends, and also on network file systems; one without locks lets two sweeps in, with a warning.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import re
+import shutil
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mrt_mitsuba.errors import MrtWarning, OutputError
+from mrt_mitsuba.output.replacing import temporary_folder, unfinished
+
+LOCK = ".mrt-sweep.lock"
+_SCRATCH = ".mrt-sweep-"  # how the names of folders begin that a sweep removes at its end
+
+Facts = dict[str, Any]  # of a picture, for its row of the table
+
+
+@contextlib.contextmanager
+def reserved(folder: str) -> Iterator[tuple[str, dict[str, Facts]]]:
+    """Keep other sweeps out of a folder within the block.
+
+    Yields a new folder inside, for files that are not complete, and the facts that a killed sweep noted of
+    its pictures, by the name of the file. Raises ``OutputError`` where another sweep works, or nothing can
+    be written.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            alone = stack.enter_context(_locked(folder))
+            notes = _clear(folder) if alone else {}
+            scratch = stack.enter_context(temporary_folder(folder, _SCRATCH))
+        except OSError as error:
+            raise OutputError(f"cannot write to the folder {folder}: {error.strerror or error}") from error
+        yield scratch, notes
+
+
+@contextlib.contextmanager
+def _locked(folder: str) -> Iterator[bool]:
+    """Hold the lock of a folder within the block; yields False where its file system has no locks."""
+    path = os.path.join(folder, LOCK)
+    file = _open_locked(path)
+    unfinished.add(path)
+    if file is None:
+        text = f"the file system of {folder} has no locks: see to it that no other sweep writes there"
+        warnings.warn(text, MrtWarning, stacklevel=7)
+    try:
+        yield file is not None
+    finally:
+        with contextlib.suppress(OSError):
+            os.unlink(path)  # while it is locked: who waits for it sees that it is no longer in its place
+        unfinished.discard(path)
+        if file is not None:
+            fcntl.flock(file, fcntl.LOCK_UN)  # also for a child process that has the file open
+            os.close(file)
+
+
+def _open_locked(path: str) -> int | None:
+    """A descriptor of a locked file; None where the file system has no locks.
+
+    Raises ``OutputError`` where another process has the lock.
+    """
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):
+            os.close(file)
+            reason = "another sweep works there; wait for it, or choose another folder"
+            raise OutputError(f"cannot write to the folder {os.path.dirname(path)}: {reason}") from None
+        except OSError:
+            os.close(file)
+            return None
+        if os.path.exists(path) and os.path.samestat(os.stat(path), os.fstat(file)):
+            return file
+        os.close(file)  # the sweep before has just removed it
+
+
+def _clear(folder: str) -> dict[str, Facts]:
+    """Remove the folders of killed sweeps; returns what they noted, as ``reserved`` has it."""
+    facts: dict[str, Facts] = {}
+    for left in Path(folder).iterdir():
+        if not re.fullmatch(re.escape(_SCRATCH) + "[a-z0-9_]{8}", left.name) or left.is_symlink():
+            continue
+        for note in left.glob("*.json"):
+            noted = read_note(note)
+            if "file" in noted:
+                facts[noted["file"]] = noted
+        shutil.rmtree(left, ignore_errors=True)
+    return facts
+
+
+def read_note(path: str | Path) -> Facts:
+    """The facts in a note; none where it is missing, cut short or damaged."""
+    with contextlib.suppress(OSError, ValueError), open(path, "rb") as file:
+        noted = json.load(file)
+        if isinstance(noted, dict):
+            return noted
+    return {}
+
+
+def write_note(path: str, facts: Facts) -> None:
+    """Write a note, whole or not at all."""
+    with open(f"{path}.new", "w") as file:
+        json.dump(facts, file)
+    os.replace(f"{path}.new", path)
