@@ -27,8 +27,9 @@ STUDIES: dict[str, tuple[str, str, int, int]] = {
     "filters": ("filters", "do detectors chase noise, is the blur like a lens", 9, 120),
     "adaptive": ("adaptive", "are own scenes Mitsuba's, and errors cheap", 6, 60),
     "honest": ("honest", "is the mean right and the error as stated, calm to wild", 20, 1200),
-    "stability": ("stability", "where must float32 give out, and where does it not", 8, 180),
-    "error-vs-time": ("error_vs_time", "what does each setting buy for its time", 9, 480),
+    "stability": ("stability", "where must float32 give out, and where does it not", 16, 220),
+    "error-vs-time": ("error_vs_time", "what does each setting buy for its time", 9, 1500),
+    "needs": ("needs", "what do scenes not need, and what would it cost", 9, 60),
     "speed": ("speed", "how fast against Mitsuba's plugins, other ways, smaller tasks", 20, 300),
 }
 EXTRAS = ("matplotlib", "jinja2", "scipy", "mpmath", "flip_evaluator")
@@ -51,8 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("study", nargs="+", choices=[*STUDIES, "all"], metavar="STUDY", help="one or more, or all")
     add("--list", action="version", version=listing(), help="list the studies and stop")
     add("--quick", action="store_true", help="fewer samples and cases")
-    add("--out", type=Path, default=Path("validation-report"), metavar="DIR",
-        help="folder of the report, made if need be (default: validation-report)")  # fmt: skip
+    about = "folder of the report, made if need be (default: validation-report)"
+    add("--out", type=Path, default=Path("validation-report"), metavar="DIR", help=about)
     options = parser.parse_args(arguments)
     names = [name for name in STUDIES if name in options.study or "all" in options.study]
     with warnings.catch_warnings():

@@ -1,1 +1,1 @@
-"""Checks of anyone's plugins: the laws of a BSDF and of a shape, and every plugin of a scene."""
+"""Checks of anyone's plugins: the laws of BSDFs, shapes and emitters, and every plugin of a scene."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cached_property
-from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -26,6 +26,25 @@ OVERLOOKED = 0.02  # share of samples about which quadrature may know nothing; o
 NARROW = 16 * ROUNDED  # width of a lobe that rounded directions do not resolve
 
 
+@dataclass
+class View:
+    """Samples of a BSDF for one direction of incidence. The first quarter are pilots: they make the cells.
+
+    ``density`` is pdf() at the samples that count, of lobes with a width and not refused; 0 elsewhere.
+    """
+
+    wi: Array  # [3]
+    uv: Array  # [2]
+    u: Array  # [N, 3]
+    samples: Lanes  # [N]
+    density: Array  # [N]
+    pilot: Array  # directions of the pilots that count [P, 3]
+    codes: Array  # cells of the others that count [C]
+    count: int  # of the others
+    share: float  # of the others that count
+    holes: float  # share of samples at which eval() is not finite
+
+
 class Case(Subject, Probe):
     """A BSDF under examination, and what several laws need to know of it."""
 
@@ -38,68 +57,96 @@ class Case(Subject, Probe):
             raise UsageError(f"{kind} is not a BSDF of {mi.variant()}: give a dict or a loaded BSDF")
 
     @cached_property
-    def views(self) -> list[SimpleNamespace]:
-        """Directions of incidence ``wi`` at all angles, each at a ``uv``, and ``samples`` drawn with ``u``.
+    def views(self) -> list[View]:
+        """Samples for directions of incidence at all angles."""
+        angles = QUICK_ANGLES if self.quick else ANGLES
+        return [self._view(angle) for angle in angles]
 
-        ``density``: pdf() at the samples that count, of lobes with a width and not refused; 0 elsewhere. The
-        first quarter (``pilot``, directions) makes the cells in which the other ``count`` are judged, by the
-        ``codes`` of those that count and their ``share``. ``holes``: the share at which eval() is not finite.
-        """
-        found = []
-        for angle in QUICK_ANGLES if self.quick else ANGLES:
-            wi = probe.direction(np.cos(np.radians(angle)), self.rng.uniform(0, 2 * np.pi))
-            uv, u = self.uniform(2), self.uniform(self.count(2**16, 2**19), 3)
-            samples = self.sample(wi, u, uv)
-            value, pdf = self.both(wi, samples.wo, uv)
-            density, first = np.where(live(wi, samples, value, pdf), pdf, 0), len(u) // 4
-            pilot, rest = (samples.wo[part][density[part] > 0] for part in np.s_[:first, first:])
-            known = {"wi": wi, "uv": uv, "u": u, "samples": samples, "density": density, "pilot": pilot}
-            holes, count = ((density > 0) & ~np.isfinite(value).all(axis=1)).mean(), len(u) - first
-            judged = {"codes": encode(rest), "count": count, "share": len(rest) / count, "holes": holes}
-            found.append(SimpleNamespace(**known, **judged))
-        return found
+    def _view(self, angle: float) -> View:
+        wi = probe.direction(np.cos(np.radians(angle)), self.rng.uniform(0, 2 * np.pi))
+        uv = self.uniform(2)
+        u = self.uniform(self.count(2**16, 2**19), 3)
+        samples = self.sample(wi, u, uv)
+        value, pdf = self.both(wi, samples.wo, uv)
+        density = np.where(live(wi, samples, value, pdf), pdf, 0)
+        holes = (density > 0) & ~np.isfinite(value).all(axis=1)
+        first = len(u) // 4
+        rest = samples.wo[first:][density[first:] > 0]
+        return View(
+            wi=wi,
+            uv=uv,
+            u=u,
+            samples=samples,
+            density=density,
+            pilot=samples.wo[:first][density[:first] > 0],
+            codes=encode(rest),
+            count=len(u) - first,
+            share=len(rest) / (len(u) - first),
+            holes=holes.mean(),
+        )
 
     @cached_property
     def drawn(self) -> tuple[Lanes, dict[str, Array]]:
-        """The first samples of all views, and what they were drawn with."""
+        """The first samples of all views, and the ``wi``, ``uv`` and ``u`` that they were drawn with."""
         few = slice(0, self.count(2**12, 2**13))
-        at = {name: np.repeat(rows, few.stop, axis=0) for name, rows in self.incidence.items()}
-        u = np.concatenate([view.u[few] for view in self.views])
-        return joined([view.samples.only(few) for view in self.views]), {**at, "u": u}
+        names = {name: np.repeat(rows, few.stop, axis=0) for name, rows in self.incidence.items()}
+        names["u"] = np.concatenate([view.u[few] for view in self.views])
+        return joined([view.samples.only(few) for view in self.views]), names
 
     @cached_property
     def incidence(self) -> dict[str, Array]:
-        """The directions of incidence and texture coordinates of all views."""
-        return {name: np.array([getattr(view, name) for view in self.views]) for name in ("wi", "uv")}
+        """The directions of incidence ``wi`` and texture coordinates ``uv`` of all views."""
+        wi = np.array([view.wi for view in self.views])
+        uv = np.array([view.uv for view in self.views])
+        return {"wi": wi, "uv": uv}
 
     @cached_property
     def densities(self) -> list[Cells | None]:
         """The integrals of the density for each view, in cells that resolve it; None where none do."""
         return [self._integrals(view) for view in self.views]
 
-    def _integrals(self, view: SimpleNamespace) -> Cells | None:
+    def _integrals(self, view: View) -> Cells | None:
         # around the mirror direction at all scales, where lobes may be that are not sampled
-        around = 10 ** self.rng.uniform(-4, 0, (600, 1)) * self.rng.normal(size=(600, 3))
-        seeds = encode(np.concatenate([view.pilot, unit(view.wi * [-1, -1, 1] + around)]))
+        scales = 10 ** self.rng.uniform(-4, 0, (600, 1))
+        mirrored = view.wi * [-1, -1, 1] + scales * self.rng.normal(size=(600, 3))
+        seeds = encode(np.concatenate([view.pilot, unit(mirrored)]))
         most = max(len(view.u) // 4000, 8)
         cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
-        held = np.bincount(cells.find(encode(view.pilot)), minlength=len(cells.start))[cells.level == DEPTH]
-        # at the normal, all azimuths of the finest cells are one place
-        centre = (np.hypot(*view.pilot.T[:2]) < np.sqrt(2) * 0.5**DEPTH).sum()
-        if max(held[held > 4 * most].sum(), centre) > 0.01 * len(view.pilot):
+        if self._unresolved(view, cells, most):
             return None
-        known = view.codes, np.ones(len(view.codes)), view.count
-        found = integrate(lambda wo: np.maximum(self.pdf(view.wi, wo, view.uv), 0), cells, self.rng, *known)
-        # samples in cells of whose points less than two are expected where the lobe is
-        cell, density = found.find(view.codes), view.density[-view.count :]
-        covered = np.bincount(cell, 1 / (view.count * density[density > 0]), minlength=len(found.start))
-        overlooked = (covered * POINTS < 2 * found.solid_angle)[cell].sum() / view.count
-        return found if found.mean.sum() > view.share or overlooked < OVERLOOKED else None
+        integrals = integrate(
+            lambda wo: np.maximum(self.pdf(view.wi, wo, view.uv), 0),
+            cells,
+            self.rng,
+            view.codes,
+            np.ones(len(view.codes)),
+            view.count,
+        )
+        # samples in cells where fewer than two of the cell's points are expected within the lobe
+        cell = integrals.find(view.codes)
+        density = view.density[-view.count :]
+        weights = 1 / (view.count * density[density > 0])
+        covered = np.bincount(cell, weights, minlength=len(integrals.start))
+        coarse = covered * POINTS < 2 * integrals.solid_angle
+        overlooked = coarse[cell].sum() / view.count
+        known = integrals.mean.sum() > view.share or overlooked < OVERLOOKED
+        return integrals if known else None
+
+    def _unresolved(self, view: View, cells: Cells, most: int) -> bool:
+        """Whether more than a percent of the samples lie closer together than the finest cells resolve."""
+        cell = cells.find(encode(view.pilot))
+        finest = np.bincount(cell, minlength=len(cells.start))[cells.level == DEPTH]
+        crowded = finest[finest > 4 * most].sum()
+        # at the normal, all azimuths of the finest cells are one place
+        radius = np.hypot(*view.pilot.T[:2])
+        centre = (radius < np.sqrt(2) * 0.5**DEPTH).sum()
+        return max(crowded, centre) > 0.01 * len(view.pilot)
 
     def copy(self) -> Case:
-        """Return a case whose parameters can be changed, with a BSDF of its own if it can be loaded."""
+        """A case whose parameters can be changed, with a BSDF of its own if it can be loaded."""
         made = Case(self.plugin if self.description is None else self.load(), self.quick, self.seed)
-        made.description, made.pairs = self.description, self.pairs
+        made.description = self.description
+        made.pairs = self.pairs
         return made
 
     def need_smooth(self) -> None:
@@ -115,20 +162,23 @@ class Case(Subject, Probe):
         ``pdf_off``), and ``eta``, the index of refraction at wo over that at wi.
         """
         count = self.count(2**13, 2**15)
-        wi, uv = self.units(count), self.uniform(count, 2)
+        wi = self.units(count)
+        uv = self.uniform(count, 2)
         s = self.sample(wi, self.uniform(count, 3), uv)
         usable = np.isfinite(s.wo).all(axis=1) & ~s.delta & s.lit
         usable &= (self.rng.random(count) < 0.75) & ~narrow(wi, s)
         wo = unit(np.where(usable[:, None], s.wo, self.units(count)))
-        crosses, eta = wi[:, 2] * wo[:, 2] < 0, np.where(usable, s.eta, np.nan)
-        for side in (wi[:, 2] > 0, wi[:, 2] < 0):
-            there = eta[side & crosses & np.isfinite(eta)]
-            eta[side & crosses & ~usable] = np.median(there) if len(there) else 1
         value, pdf = self.both(wi, wo, uv)
         off = self.spread(lambda *at: np.column_stack(self.both(*at)), wi, wo, uv)
-        eta = np.where(crosses, eta, 1)
         return Lanes(
-            wi=wi, wo=wo, uv=uv, eta=eta, value=value, pdf=pdf, value_off=off[:, :-1], pdf_off=off[:, -1]
+            wi=wi,
+            wo=wo,
+            uv=uv,
+            eta=_indices(wi, wo, np.where(usable, s.eta, np.nan)),
+            value=value,
+            pdf=pdf,
+            value_off=off[:, :-1],
+            pdf_off=off[:, -1],
         )
 
     @cached_property
@@ -138,48 +188,69 @@ class Case(Subject, Probe):
         up = (np.abs(p.wo[:, 2]) > 0.05) & (np.abs(p.wi[:, 2]) > 0.05)
         return p.only(up & np.isfinite(p.value).all(axis=1) & (p.value > 0).any(axis=1))
 
-    def spread(self, quantity: Any, wi: Array, wo: Array, uv: Array, *others: Array) -> Array:
-        """Return the largest change of ``quantity(wi, wo, uv, …)`` as directions move by a rounding."""
+    def spread(
+        self, quantity: Callable[..., Array], wi: Array, wo: Array, uv: Array, *others: Array
+    ) -> Array:
+        """The largest change of ``quantity(wi, wo, uv, …)`` as directions move by a rounding."""
         return probe.spread(lambda i, o: quantity(i, o, uv, *others), (wi, wo), self.rng)
 
 
+def _indices(wi: Array, wo: Array, eta: Array) -> Array:
+    """Indices of refraction [N] at ``wo`` over those at ``wi``; where ``eta`` is NaN, the usual one."""
+    crosses = wi[:, 2] * wo[:, 2] < 0
+    unknown = np.isnan(eta)
+    for side in (wi[:, 2] > 0, wi[:, 2] < 0):
+        known = eta[side & crosses & np.isfinite(eta)]
+        eta[side & crosses & unknown] = np.median(known) if len(known) else 1
+    return np.where(crosses, eta, 1)
+
+
 def live(wi: Array, s: Lanes, value: Array, pdf: Array) -> Array:
-    """Return where samples come from lobes with a width and count for the density.
+    """Where samples come from lobes with a width and count for the density. [N], bool
 
     Weight 0 is how ``sample`` refuses: its direction is then any, or on the wrong side. It may also be that
     the value is 0 there, or that the weight is wrong; but then the stated density is that of the direction.
     """
-    f, crosses = mi.BSDFFlags, wi[..., 2] * s.wo[:, 2] < 0
-    astray = (s.type & np.where(crosses, int(f.Reflection), int(f.Transmission))) != 0
+    crosses = wi[..., 2] * s.wo[:, 2] < 0
+    wrong = np.where(crosses, int(mi.BSDFFlags.Reflection), int(mi.BSDFFlags.Transmission))
+    astray = (s.type & wrong) != 0
     dark = ~s.lit & (value != 0).any(axis=1)
     refused = dark & (astray | ~np.isclose(s.pdf, pdf, rtol=1e-3))
     return ~s.delta & np.isfinite(pdf) & (pdf > 0) & ~refused
 
 
 def narrow(wi: Array, s: Lanes) -> Array:
-    """Return where samples are of a component whose lobe is narrower than rounded directions resolve."""
-    drawn, found = ~s.delta & (s.pdf > 0), np.zeros(len(s.pdf), bool)
+    """Where samples are of a component whose lobe is narrower than rounded directions resolve. [N], bool"""
+    drawn = ~s.delta & (s.pdf > 0)
+    too_narrow = np.zeros(len(s.pdf), bool)
     # a lobe of width w along the plane of incidence is w cos θ wide across: density 1 / (w² cos θ)
     sharpness = s.pdf / np.abs(wi[..., 2])
-    for part in (drawn & (s.component == component) for component in np.unique(s.component[drawn])):
-        found |= part & (np.median(sharpness[part]) > NARROW**-2)
-    return found
+    for component in np.unique(s.component[drawn]):
+        part = drawn & (s.component == component)
+        too_narrow |= part & (np.median(sharpness[part]) > NARROW**-2)
+    return too_narrow
 
 
-def parameters(case: Case) -> Iterator[tuple[str, Any]]:
+def parameters(case: Case) -> Iterator[tuple[str, mi.Float]]:
     """Yield the parameters that hold floating-point numbers which are amounts."""
     params = mi.traverse(case.plugin)
     for key in params.keys():  # noqa: SIM118 - SceneParameters is not a dict
         with suppress(TypeError):  # one that was left out is None, which Dr.Jit cannot read
             value = params[key]
             array = dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)
-            amount = (array or isinstance(value, float)) and not key.endswith(("to_uv", ".wavelengths"))
-            if amount and np.size(np.array(value)) > 0:
+            if not array and not isinstance(value, float):
+                continue
+            if not key.endswith(("to_uv", ".wavelengths")) and np.size(np.array(value)) > 0:
                 yield key, value
 
 
+def affine(factor: float, summand: float, old: mi.Float) -> mi.Float:
+    """A parameter times one number, plus another."""
+    return type(old)(old * factor + summand)
+
+
 @contextmanager
-def changed(case: Case, key: str, change: Any) -> Iterator[None]:
+def changed(case: Case, key: str, change: Callable[[mi.Float], mi.Float]) -> Iterator[None]:
     """Change a parameter for a while."""
     params = mi.traverse(case.plugin)
     before = type(params[key])(params[key])  # else it changes with the BSDF

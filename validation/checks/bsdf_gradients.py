@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks import probe
-from mrt_mitsuba.validation.checks.bsdf_case import Case, changed, live, narrow, parameters
-from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip, figures
+from mrt_mitsuba.validation.checks.bsdf_case import Case, affine, changed, live, narrow, parameters
+from mrt_mitsuba.validation.checks.law import SIGMAS, Figure, Law, Skip, figures
 from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
 IN_THE_MEAN = 5e-2  # where outlines of lobes move, derivatives of samples miss them
 WIDTHS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  # of differences, over the parameter
-DETACHED = "integrators follow a sample's direction as a constant: its density must not change, either"
+BIASED = "biased derivatives: optimisations by AD go wrong"
+DETACHED = f"{BIASED}; integrators follow a direction as a constant, and its density must not change, either"
 
 DERIVATIVE = """params, key = mi.traverse(bsdf), {key!r}
 before = type(params[key])(params[key])
@@ -29,10 +30,10 @@ def value(shift):
 
 shift = mi.Float(0)
 dr.enable_grad(shift)
-found = value(shift)
-if dr.grad_enabled(found):
+moved = value(shift)
+if dr.grad_enabled(moved):
     dr.forward(shift)
-print("derivative:", dr.grad(found), "difference:", (value(1e-3) - value(-1e-3)) / 2e-3)
+print("derivative:", dr.grad(moved), "difference:", (value(1e-3) - value(-1e-3)) / 2e-3)
 """
 SAMPLED = """params, key = mi.traverse(bsdf), {key!r}
 shift = mi.Float(0)
@@ -41,10 +42,10 @@ params[key] = type(params[key])(params[key] + shift)
 params.update()
 bs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))
 value, pdf = bsdf.eval_pdf(ctx, si, dr.detach(bs.wo))
-found, expected = dr.sum(weight, axis=None), dr.sum(value / dr.detach(pdf), axis=None)
+weight, expected = dr.sum(weight, axis=None), dr.sum(value / dr.detach(pdf), axis=None)
 dr.forward(shift)
 print("does the direction move?", dr.grad_enabled(bs.wo))
-print("derivative of the weight:", dr.grad(found), "of eval() over a constant density:", dr.grad(expected))
+print("derivative of the weight:", dr.grad(weight), "of eval() over a constant density:", dr.grad(expected))
 """
 UPDATE = """params, key = mi.traverse(bsdf), {key!r}
 print("eval():", bsdf.eval(ctx, si, wo))
@@ -55,17 +56,43 @@ print("after an update to {number}:", bsdf.eval(ctx, si, wo), "should be", {valu
 
 
 @figures(
-    values=("at most", "derivative of values by {key}{how}, relative, beyond the error of differences",
-            GRADIENT, "differences of two widths agree better, or the difference is allowed for", DERIVATIVE),
-    broken=("none", "derivatives by {key} that are not finite, of finite values", 0,
-            "one of them spoils a whole gradient", DERIVATIVE),
-    mean=("at most", "mean derivative of weights by {key}, of directions that move with it, against that of "
-          f"values, relative, beyond {SIGMAS} standard errors", IN_THE_MEAN, DETACHED, SAMPLED),
-    weights=("at most", "derivative of weights by {key} against that of eval() over a constant density, "
-             "relative", GRADIENT, DETACHED, SAMPLED),
-    reached=("most", "values that loading with another {key} changes, but params.update() does not, relative",
-             GRADIENT, "parameters_changed() has to compute anew what is made of parameters", UPDATE),
-)  # fmt: skip
+    values=Figure(
+        "derivative of values by {key}{how}, relative, beyond the error of differences",
+        statistic="at most",
+        limit=GRADIENT,
+        why=f"{BIASED}; differences of two widths agree better, or the difference is allowed for",
+        snippet=DERIVATIVE,
+    ),
+    broken=Figure(
+        "derivatives by {key} that are not finite, of finite values",
+        statistic="none",
+        limit=0,
+        why="one of them spoils a whole gradient",
+        snippet=DERIVATIVE,
+    ),
+    mean=Figure(
+        "mean derivative of weights by {key}, of directions that move with it, against that of "
+        f"values, relative, beyond {SIGMAS} standard errors",
+        statistic="at most",
+        limit=IN_THE_MEAN,
+        why=DETACHED,
+        snippet=SAMPLED,
+    ),
+    weights=Figure(
+        "derivative of weights by {key} against that of eval() over a constant density, relative",
+        statistic="at most",
+        limit=GRADIENT,
+        why=DETACHED,
+        snippet=SAMPLED,
+    ),
+    reached=Figure(
+        "values that loading with another {key} changes, but params.update() does not, relative",
+        statistic="most",
+        limit=GRADIENT,
+        why=f"{BIASED}; parameters_changed() has to compute anew what is made of parameters",
+        snippet=UPDATE,
+    ),
+)
 def gradients(law: Law, case: Case) -> None:
     """∂/∂π of the mean value, by forward derivatives, against differences, for every parameter π."""
     if "_ad_" not in mi.variant():
@@ -80,8 +107,9 @@ def gradients(law: Law, case: Case) -> None:
         raise Skip("traverse() marks no parameter as differentiable")
     for key in keys:
         number = float(np.mean(np.array(params[key])))
-        inside = 0.9 if number == 1 else 1, 0.1 * (number == 0)  # so that it can be varied both ways
-        with changed(case, key, lambda old, by=inside: type(old)(old * by[0] + by[1])):
+        factor = 0.9 if number == 1 else 1  # so that it can be varied both ways
+        summand = 0.1 if number == 0 else 0
+        with changed(case, key, partial(affine, factor, summand)):
             if _attached(law, case, key):
                 _sampled(law, case, key)
 
@@ -89,35 +117,41 @@ def gradients(law: Law, case: Case) -> None:
 def _attached(law: Law, case: Case, key: str) -> bool:
     """Hold the derivative by one parameter to differences; return False where it is detached, and wrong."""
     few = case.lit
-    (found,), attached = _derivatives(case, key, len(few.wi), lambda: [_values(case)])
-    broken, found = ~np.isfinite(found), np.nan_to_num(found, posinf=0, neginf=0)
+    (derivative,), attached = _derivatives(case, key, len(few.wi), lambda: [_values(case)])
+    broken = ~np.isfinite(derivative)
+    derivative = np.nan_to_num(derivative, posinf=0, neginf=0)
     slope, error = _differences(case, key)
     if not attached and not slope.any():
         law.notes.append(f"{key} changes no value")
         _reached(law, case, key)
-    off, known = np.abs(found - slope), np.isfinite(error)
+    off = np.abs(derivative - slope)
+    known = np.isfinite(error)
     if known.sum() < 20:
         law.notes.append(f"{key}: its least differences move lobes away, and cannot judge derivatives")
         return True
     usual = known & (off <= np.quantile(off[known], 0.98))  # where values have a kink, no slope is
     beyond = np.maximum(off - error, 0)[usual].sum()
-    measured = beyond / max(np.abs(slope)[usual].sum(), np.abs(found)[usual].sum(), 1e-30)
-    i, how = int(np.where(usual, off, 0).argmax()), "" if attached else " (detached)"
+    measured = beyond / max(np.abs(slope)[usual].sum(), np.abs(derivative)[usual].sum(), 1e-30)
+    i = int(np.where(usual, off, 0).argmax())
+    how = "" if attached else " (detached)"
     law.hold("values", measured, wi=few.wi[i], uv=few.uv[i], wo=few.wo[i], key=key, how=how)
     law.hold("broken", broken, wi=few.wi, uv=few.uv, wo=few.wo, key=key)
     return attached or measured <= GRADIENT
 
 
-def _derivatives(case: Case, key: str, count: int, values: Callable[[], list[Any]]) -> tuple[Array, bool]:
-    """Return derivatives [K, N] by a parameter of K arrays that ``values`` makes, and if there are any."""
+def _derivatives(
+    case: Case, key: str, count: int, values: Callable[[], list[mi.Float]]
+) -> tuple[Array, bool]:
+    """Derivatives [K, N] by a parameter of K arrays that ``values`` makes, and whether there are any."""
     shift = mi.Float(0)
     dr.enable_grad(shift)
     with changed(case, key, lambda old: _moved(old, shift)):
-        found = values()
-        attached = any(map(dr.grad_enabled, found))
+        arrays = values()
+        attached = any(map(dr.grad_enabled, arrays))
         if attached:
             dr.forward(shift)
-        return np.array([np.broadcast_to(np.array(dr.grad(v), np.float64), count) for v in found]), attached
+        derivatives = [np.array(dr.grad(array), np.float64) for array in arrays]
+        return np.array([np.broadcast_to(x, count) for x in derivatives]), attached
 
 
 def _sampled(law: Law, case: Case, key: str) -> None:
@@ -127,45 +161,55 @@ def _sampled(law: Law, case: Case, key: str) -> None:
     change otherwise: only means over smooth light are then the same.
     """
     count = case.count(2**14, 2**16)
-    wi, u, uv = case.units(count), case.uniform(count, 3), case.uniform(count, 2)
+    wi = case.units(count)
+    u = case.uniform(count, 3)
+    uv = case.uniform(count, 2)
 
-    def weights() -> list[Any]:
+    def weights() -> list[mi.Float]:
         si = probe.interaction(as_mitsuba("Vector3f", wi), as_mitsuba("Point2f", uv))
-        drawn = as_mitsuba("Float", u[:, 0]), as_mitsuba("Point2f", u[:, 1:])
-        bs, weight = case.plugin.sample(context(), si, *drawn)
+        sample1 = as_mitsuba("Float", u[:, 0])
+        sample2 = as_mitsuba("Point2f", u[:, 1:])
+        bs, weight = case.plugin.sample(context(), si, sample1, sample2)
         value, pdf = case.plugin.eval_pdf(context(), si, dr.detach(bs.wo))
         light = 1 + 0.5 * bs.wo.x + 0.25 * dr.square(bs.wo.z)
         fixed = dr.detach(dr.select(pdf > 0, pdf, 1))
-        return [_total(weight) * light, _total(value) / fixed * dr.detach(light), dr.sum(bs.wo)]
+        by_value = _total(value) / fixed
+        return [_total(weight) * light, by_value * dr.detach(light), dr.sum(bs.wo)]
 
-    (found, expected, moves), attached = _derivatives(case, key, count, weights)
+    (derivative, expected, moves), attached = _derivatives(case, key, count, weights)
     s = case.sample(wi, u, uv)
-    counts = live(wi, s, *case.both(wi, np.nan_to_num(s.wo), uv)) & ~narrow(wi, s)
-    counts &= np.isfinite(found) & np.isfinite(expected) & (np.abs(wi[:, 2]) > 0.05)
+    value, pdf = case.both(wi, np.nan_to_num(s.wo), uv)
+    counts = live(wi, s, value, pdf) & ~narrow(wi, s)
+    counts &= np.isfinite(derivative) & np.isfinite(expected) & (np.abs(wi[:, 2]) > 0.05)
     counts &= (np.abs(s.wo[:, 2]) > 0.05) & (s.pdf < (1024 * ROUNDED) ** -2)  # a rounding shows
     if not attached or counts.sum() < 100:
         return
-    apart = np.where(counts, found - expected, 0)
-    i, known = int(np.abs(apart).argmax()), apart[counts]
+    apart = np.where(counts, derivative - expected, 0)
+    i = int(np.abs(apart).argmax())
+    known = apart[counts]
     size = max(np.abs(expected[counts]).mean(), 1e-3 * np.abs(s.weight[counts]).mean(), 1e-30)
     if np.any(moves):
+        figure = "mean"
         known = np.clip(known, *np.quantile(known, (1e-3, 1 - 1e-3)))
         off = max(abs(known.mean()) - SIGMAS * known.std() / np.sqrt(len(known)), 0)
     else:
+        figure = "weights"
         known = np.abs(known)
         off = known[known <= np.quantile(known, 0.98)].mean()
-    law.hold("mean" if np.any(moves) else "weights", off / size, wi=wi[i], uv=uv[i], u=u[i], key=key)
+    law.hold(figure, off / size, wi=wi[i], uv=uv[i], u=u[i], key=key)
 
 
-def _total(spectrum: Any) -> Any:
+def _total(spectrum: mi.Spectrum) -> mi.Float:
     total = dr.sum(mi.unpolarized_spectrum(spectrum))
     return dr.select(dr.isfinite(total), total, 0)
 
 
 def _reached(law: Law, case: Case, key: str) -> None:
     """A parameter whose updates change no value should change none where it is loaded, either."""
-    name, few = key.removesuffix(".value"), case.lit
-    number = 0.8 * float(np.mean(np.array(mi.traverse(case.plugin)[key]))) or 0.5
+    name = key.removesuffix(".value")
+    few = case.lit
+    usual = float(np.mean(np.array(mi.traverse(case.plugin)[key])))
+    number = 0.8 * usual or 0.5
     if case.description is None or "." in name:
         return
     try:
@@ -173,27 +217,28 @@ def _reached(law: Law, case: Case, key: str) -> None:
     except RuntimeError:  # what is loaded goes by another name, or takes other numbers
         return
     value = other.eval(few.wi, few.wo, few.uv)
-    error = excess(value, few.value, few.value_off)
-    law.hold("reached", error, **{**vars(few), "value": value, "key": key, "number": number})
+    names = {**vars(few), "value": value, "key": key, "number": number}
+    law.hold("reached", excess(value, few.value, few.value_off), **names)
 
 
-def _moved(old: Any, shift: Any) -> Any:
-    """Return a parameter with ``shift`` of each number added: a spectrum's may be of many sizes."""
+def _moved(old: mi.Float, shift: mi.Float) -> mi.Float:
+    """A parameter with ``shift`` of each number added: a spectrum's may be of many sizes."""
     usual = float(np.mean(np.abs(np.array(old)))) or 0.05
-    return type(old)(old + dr.select(old == 0, usual, dr.abs(dr.detach(old))) * shift)
+    size = dr.select(old == 0, usual, dr.abs(dr.detach(old)))
+    return type(old)(old + size * shift)
 
 
-def _values(case: Case) -> Any:
-    """Return values at pairs as a Dr.Jit array with derivatives, each over what it is without a change."""
+def _values(case: Case) -> mi.Float:
+    """Values at pairs, with derivatives, each over what it is without a change. [N]"""
     few = case.lit
-    wi, wo = (as_mitsuba("Vector3f", x) for x in (few.wi, few.wo))
-    si = probe.interaction(wi, as_mitsuba("Point2f", few.uv))
+    wo = as_mitsuba("Vector3f", few.wo)
+    si = probe.interaction(as_mitsuba("Vector3f", few.wi), as_mitsuba("Point2f", few.uv))
     scale = np.maximum(few.value.max(axis=1), 1e-3 * few.value.max())
     return _total(case.plugin.eval(context(), si, wo)) / as_mitsuba("Float", scale)
 
 
 def _differences(case: Case, key: str) -> tuple[Array, Array]:
-    """Return central differences of the width that is off by least, and by how much they may be off.
+    """Central differences [N] of the width that is off by least, and by how much they may be off [N].
 
     That is what the next larger width says otherwise, the rounding of values, and half of what the slopes to
     either side are apart: where a value has a kink, as at the end of a range, either one is a derivative.
@@ -205,11 +250,14 @@ def _differences(case: Case, key: str) -> tuple[Array, Array]:
             return np.array(_values(case), np.float64)
 
     here = at(0.0)
-    ends = np.array([(at(step), at(-step)) for step in WIDTHS])
+    after = np.array([at(step) for step in WIDTHS])
+    before = np.array([at(-step) for step in WIDTHS])
     across = 2 * np.array(WIDTHS)[:, None]
-    slopes = (ends[:, 0] - ends[:, 1]) / across
-    bent = np.abs(ends[:, 0] - 2 * here + ends[:, 1])
+    slopes = (after - before) / across
+    bent = np.abs(after - 2 * here + before)
     sides = np.where(bent <= 0.25 * np.abs(here), bent / across, np.inf)
-    error = 2 * np.abs(np.diff(slopes, axis=0)) + sides[1:] + 2.0**-22 * np.abs(here) / across[1:]
-    best = error.argmin(axis=0)[None]
-    return tuple(np.take_along_axis(x, best, axis=0)[0] for x in (slopes[1:], error))
+    rounding = 2.0**-22 * np.abs(here) / across
+    error = 2 * np.abs(np.diff(slopes, axis=0)) + sides[1:] + rounding[1:]
+    best = error.argmin(axis=0)
+    lanes = np.arange(len(best))
+    return slopes[1:][best, lanes], error[best, lanes]

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import ctypes
 import math
+import re
+import tempfile
 import threading
 import time
 import warnings
@@ -21,6 +23,7 @@ from typing import Any, TypeVar
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
@@ -30,8 +33,11 @@ from mrt_mitsuba.validation.tools.study import Bound, Study, notebook, save_repo
 
 TITLE = "Laws of plugins"
 LEVEL = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction
+ONE_IN_A_MILLION = "one false alarm in a million checks"
 SIGMAS = 6  # the same for a normal distribution: 2e-9
 Found = TypeVar("Found")
+Description = dict[str, Any]  # of a plugin, as ``mi.load_dict`` takes it
+Given = Any  # such a dict, or a loaded plugin
 SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
 TIMEOUT = 120.0  # seconds for each law: sound plugins take a few, those of scalar variants a dozen
 
@@ -45,6 +51,22 @@ class TimedOut(BaseException):
 
 
 @dataclass(frozen=True)
+class Figure:
+    """What a law measures, and the limit that it is held to.
+
+    ``statistic``: a number "at most" or "at least" the limit; or, of N errors, the "most", "none" or the
+    "share" of those that are wrong, or a quantile (a float) without NaN. ``what`` and ``snippet``, the body
+    of a program that shows the worst case, have places for the names given to ``Law.hold``.
+    """
+
+    what: str
+    statistic: str | float
+    limit: float
+    why: str
+    snippet: str = ""
+
+
+@dataclass(frozen=True)
 class Part(Bound):
     """A figure that was measured; the note is the reason for its limit, the snippet shows its worst case."""
 
@@ -52,23 +74,19 @@ class Part(Bound):
     snippet: str = ""
 
 
-def figures(**rows: tuple[Any, ...]) -> Callable[[Any], Any]:
-    """Give a law its figures, by name: how, what is held to which limit, why that, and a snippet's body.
+def figures(**rows: Figure) -> Callable[[Found], Found]:
+    """Give a law the figures that it measures, by name."""
 
-    How: a number "at most" or "at least"; or of N errors the "most", "none" or a "share" of those that are
-    bad, or a quantile, NaN left out.
-    """
-
-    def mark(law: Any) -> Any:
-        law.figures = rows
+    def mark(law: Found) -> Found:
+        vars(law)["figures"] = rows
         return law
 
     return mark
 
 
-def rare(what: str, *body: str) -> tuple[Any, ...]:
-    """Return the row of a figure that is the chance of what was seen, if a plugin is sound."""
-    return "at least", what, LEVEL, "one false alarm in a million checks", *body
+def rare(what: str, snippet: str = "") -> Figure:
+    """The chance of what was seen, if a plugin is sound."""
+    return Figure(what, statistic="at least", limit=LEVEL, why=ONE_IN_A_MILLION, snippet=snippet)
 
 
 @dataclass
@@ -79,60 +97,107 @@ class Law:
     parts: list[Part] = field(default_factory=list)
     skipped: str = ""
     notes: list[str] = field(default_factory=list)
-    figures: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
+    figures: Mapping[str, Figure] = field(default_factory=dict)
     program: Callable[..., str] | None = None  # writes snippets, while the law is checked
 
-    def hold(self, name: str, measured: Any, *, limit: Any = None, **names: Any) -> None:
+    def hold(self, name: str, measured: ArrayLike, *, limit: Any = None, **names: Any) -> None:
         """Hold a figure, a number or N errors, to its limit.
 
         ``names`` fill its words and its snippet: values, or arrays that have a row for each error.
         """
-        how, what, usual, why, *body = self.figures[name]
-        if how not in ("at most", "at least"):
-            errors = np.asarray(measured, np.float64)
-            if isinstance(how, float):
-                measured = np.nanquantile(errors, how)
-                i = int(np.nanargmin(np.abs(errors - measured)))
-            else:
-                i = int(np.where(np.isnan(errors), np.inf, errors).argmax())
-                measured = {"most": errors[i], "none": errors.sum(), "share": errors.mean()}[how]
-            names = {key: x[i] if isinstance(x, np.ndarray) else x for key, x in names.items()}
-        snippet = self.program(*body, **names) if self.program and body else ""
-        figures = float(measured), float(usual if limit is None else limit)
-        self.parts.append(Part(what.format(**names), *figures, how != "at least", why, name, snippet))
+        figure = self.figures[name]
+        limit = figure.limit if limit is None else limit
+        errors = np.asarray(measured, np.float64)
+        if figure.statistic in ("at most", "at least"):
+            amount = float(errors)
+        else:
+            amount, worst = _summary(errors, figure.statistic)
+            names = {key: x[worst] if isinstance(x, np.ndarray) else x for key, x in names.items()}
+        snippet = ""
+        if self.program and figure.snippet:
+            snippet = self.program(figure.snippet, **names)
+        self.parts.append(
+            Part(
+                name=figure.what.format(**names),
+                measured=float(amount),
+                limit=float(limit),
+                at_most=figure.statistic != "at least",
+                note=figure.why,
+                figure=name,
+                snippet=snippet,
+            )
+        )
 
     @property
     def worst(self) -> Part:
-        """Return the figure that uses most of its limit."""
+        """The figure that uses most of its limit."""
+        return max(self.parts, key=_used, default=Part("", math.nan, math.nan))
 
-        def used(part: Part) -> float:
-            over, under = (part.measured, part.limit)[:: 1 if part.at_most else -1]
-            return math.inf if not part.holds else over / under if under > 0 else 0.0
+    @property
+    def measured(self) -> float:
+        return self.worst.measured
 
-        return max(self.parts, key=used, default=Part("", math.nan, math.nan))
+    @property
+    def limit(self) -> float:
+        return self.worst.limit
 
-    measured = property(lambda self: self.worst.measured)
-    limit = property(lambda self: self.worst.limit)
-    why = property(lambda self: self.worst.note)
-    snippet = property(lambda self: self.worst.snippet)
+    @property
+    def why(self) -> str:
+        return self.worst.note
+
+    @property
+    def snippet(self) -> str:
+        return self.worst.snippet
 
     @property
     def holds(self) -> bool:
-        """Return whether every figure is within its limit; a skipped law does not fail."""
-        return bool(self.skipped) or (bool(self.parts) and all(part.holds for part in self.parts))
+        """Whether every figure is within its limit; a skipped law does not fail."""
+        if self.skipped:
+            return True
+        return bool(self.parts) and all(part.holds for part in self.parts)
 
     @property
     def note(self) -> str:
-        """Return what the worst figure is, and remarks."""
-        return "; ".join([*([self.worst.name] if self.parts else []), *self.notes])
+        """The worst figure in words, and remarks."""
+        name = [self.worst.name] if self.parts else []
+        return "; ".join(name + self.notes)
 
     @property
     def verdict(self) -> str:
-        return "skipped" if self.skipped else "holds" if self.holds else "FAILS"
+        if self.skipped:
+            return "skipped"
+        return "holds" if self.holds else "FAILS"
 
     def __str__(self) -> str:
-        figure = f"{self.measured:.4g} {self.worst.sign} {self.limit:.4g}, {self.note}"
-        return f"{self.verdict:<7} {self.name}: {self.skipped or figure}"
+        text = self.skipped
+        if not text:
+            text = f"{self.measured:.4g} {self.worst.sign} {self.limit:.4g}, {self.note}"
+        return f"{self.verdict:<7} {self.name}: {text}"
+
+
+Judge = Callable[[Law, Any], None]  # checks one law of a case
+
+
+def _summary(errors: Array, statistic: str | float) -> tuple[float, int]:
+    """The statistic of N errors, and the index of the error that shows it best."""
+    if isinstance(statistic, float):
+        quantile = np.nanquantile(errors, statistic)
+        return quantile, int(np.nanargmin(np.abs(errors - quantile)))
+    worst = int(np.where(np.isnan(errors), np.inf, errors).argmax())
+    if statistic == "none":
+        return errors.sum(), worst
+    if statistic == "share":
+        return errors.mean(), worst
+    return errors[worst], worst
+
+
+def _used(part: Part) -> float:
+    """The share of its limit that a figure uses; infinity beyond it."""
+    if not part.holds:
+        return math.inf
+    over = part.measured if part.at_most else part.limit
+    under = part.limit if part.at_most else part.measured
+    return over / under if under > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -147,28 +212,30 @@ class Check:
 
     @property
     def failed(self) -> list[str]:
-        """Return the names of the laws that do not hold."""
+        """Names of the laws that do not hold."""
         return [name for name, law in self.laws.items() if not law.holds]
 
     @property
     def passed(self) -> bool:
-        """Return whether something was checked and every law that was holds."""
+        """Whether something was checked and every law that was checked holds."""
         return not self.failed and any(not law.skipped for law in self.laws.values())
 
     def __str__(self) -> str:
-        verdict = "passed" if self.passed else f"FAILED {', '.join(self.failed)}"
-        lines = [f"{self.subject} in {self.variant}: {verdict} ({self.seconds:.1f} s)"]
-        return "\n".join(lines + [f"  {law}" for law in self.laws.values()])
+        verdict = "passed" if self.passed else "skipped, nothing could be checked"
+        if self.failed:
+            verdict = f"FAILED {', '.join(self.failed)}"
+        title = f"{self.subject} in {self.variant}: {verdict} ({self.seconds:.1f} s)"
+        return "\n".join([title, *(f"  {law}" for law in self.laws.values())])
 
     def study(self) -> Study:
-        """Return the findings in the form that pages are made of."""
-        laws = self.laws.values()
+        """The findings in the form that pages are made of."""
         study = Study(self.subject, f"{self.subject}, {self.variant}", seconds=self.seconds)
-        study.bounds += [replace(p, name=f"{law.name}: {p.name}") for law in laws for p in law.parts]
-        rows = [
-            [law.name, law.verdict, law.skipped or law.note, "" if law.holds else law.snippet] for law in laws
-        ]
         columns = ["law", "verdict", "note", "the worst case, to run by itself"]
+        rows = []
+        for law in self.laws.values():
+            study.bounds += [replace(part, name=f"{law.name}: {part.name}") for part in law.parts]
+            snippet = "" if law.holds else law.snippet
+            rows.append([law.name, law.verdict, law.skipped or law.note, snippet])
         study.table("laws", "Laws", columns, rows, first=True)
         return study
 
@@ -188,7 +255,7 @@ class Kept:
     values: np.ndarray
 
     def __repr__(self) -> str:
-        """Return it as Python; there is none of large ones."""
+        """Its source in Python, if it is small."""
         array = f"np.array({self.values.tolist()}, np.float32)"
         return f"mi.{self.kind}({array})" if self.values.size <= 64 else "<many numbers>"
 
@@ -198,69 +265,83 @@ class Subject:
 
     word = "plugin"  # what snippets call it
 
-    def __init__(self, given: Any, quick: bool, seed: int) -> None:
-        self.quick, self.seed, self.rng = quick, seed, np.random.default_rng(seed)
-        self.description: dict[str, Any] | None = None  # None where a loaded object was given
+    def __init__(self, given: Given, quick: bool, seed: int) -> None:
+        self.quick = quick
+        self.seed = seed
+        self.rng = np.random.default_rng(seed)
+        self.description: Description | None = None  # None where a loaded object was given
+        self.unsupported = ""  # what Mitsuba's own warnings say against it
         if isinstance(given, dict):
             self.description = _kept(given)
             self.name = str(given.get("type", "dict"))
-            self.plugin = load_dict(_made(self.description), f"the {self.name}")
+            with _warnings_of_mitsuba() as lines:
+                self.plugin: mi.Object = load_dict(_made(self.description), f"the {self.name}")
+            self.unsupported = _refusal(lines)
         else:
-            self.name, self.plugin = class_name(given), given
+            self.name = class_name(given)
+            self.plugin = given
 
-    def with_(self, **changes: Any) -> dict[str, Any]:
-        """Return the dict with other values of some parameters. Raises ``Skip`` without one."""
+    def with_(self, **changes: Any) -> Description:
+        """The dict with other values of some parameters. Raises ``Skip`` without one."""
         if self.description is None:
             raise Skip("a loaded object was given: this needs the dict that it is made from")
         return {**self.description, **_kept(changes)}
 
-    def load(self, **changes: Any) -> Any:
+    def load(self, **changes: Any) -> mi.Object:
         """Load it in the current variant, with other values of some parameters. Raises ``Skip`` as well."""
         return mi.load_dict(_made(self.with_(**changes)))
 
-    def scene(self, **changes: Any) -> Any:
+    def scene(self, **changes: Any) -> mi.Scene:
         """Load a scene that holds the shape alone, or an instance with its group. Raises ``Skip`` as well."""
         given = self.with_(**changes)
-        nodes: dict[str, Any] = {"shape": given}
+        nodes: Description = {"shape": given}
         for key, value in given.items():
             if given["type"] == "instance" and isinstance(value, dict) and value["type"] == "shapegroup":
                 nodes = {"group": value, "shape": {**given, key: {"type": "ref", "id": "group"}}}
         return mi.load_dict({"type": "scene", **_made(nodes)})
 
     def units(self, count: int) -> Array:
-        """Return directions over the whole sphere."""
+        """Random directions [count, 3], uniform over the sphere."""
         return unit(self.rng.normal(size=(count, 3)))
 
     def uniform(self, *size: int) -> Array:
         return self.rng.random(size, np.float32)
 
     def count(self, quick: int, full: int) -> int:
-        """Return how many lanes to use."""
+        """How many lanes to use."""
         number = quick if self.quick else full
         return max(int(number * SCALAR_SHARE), 64) if is_scalar() else number
 
     def program(self, body: str, **names: Any) -> str:
-        """Return a program that loads the plugin and runs ``body``, filled with ``names``."""
-        word, given = self.word, repr(self.description)
-        text = "".join(setup for name, setup in _SETUP.items() if names.get(name) is not None) + "\n" + body
+        """A program that loads the plugin and runs ``body``, filled with ``names``."""
+        setups = [setup for name, setup in _SETUP.items() if names.get(name) is not None]
+        text = "".join(setups) + "\n" + body
         if "variants" in names:
-            text = f"mi.set_variant(variant)\nprint(variant)\n{word} = load()\n{text}"
+            text = f"mi.set_variant(variant)\nprint(variant)\n{self.word} = load()\n{text}"
             text = "for variant in {variants}:\n" + indent(text, "    ")
-        variant = mi.variant().replace("scalar_", "llvm_ad_" if "PCG32(n)" in text else "scalar_")
-        load = f"# {word}: the object that was checked\nload = lambda: {word}\n"
-        ours, stock = "'mrt_" in given, type(self.plugin).__module__.startswith("mitsuba")
-        with suppress(Exception):  # of what some dicts hold there is no source
-            if eval(given, {"mi": mi, "np": np}):
-                load = "" if ours or stock else f"# register {self.name!r} here\n"
-                whole = f"mi.load_dict({{**{given}, **more}})"
-                load += f"\ndef load(**more):\n    return {whole}\n\n{word} = load()\n"
-        start = "import mrt_mitsuba as mrt  # before mitsuba\n" if ours else ""
-        start += "import drjit as dr\nimport mitsuba as mi\nimport numpy as np\n\n"
-        start += f"mi.set_variant({variant!r})\n" + ("mrt.register()\n" if ours else "")
-        return start + load + text.format(**{name: _written(value) for name, value in names.items()})
+        kind = "llvm_ad_" if "PCG32(n)" in text else "scalar_"
+        variant = mi.variant().replace("scalar_", kind)
+        ours = "'mrt_" in repr(self.description)
+        start = "import drjit as dr\nimport mitsuba as mi\nimport numpy as np\n\n"
+        start += f"mi.set_variant({variant!r})\n"
+        if ours:
+            start = f"import mrt_mitsuba as mrt  # before mitsuba\n{start}mrt.register()\n"
+        values = {name: _written(value) for name, value in names.items()}
+        return start + self._loading(ours) + text.format(**values)
+
+    def _loading(self, ours: bool) -> str:
+        """The part of a program that defines ``load`` and loads the plugin."""
+        source = repr(self.description)
+        with suppress(Exception):  # some dicts hold objects without a source text
+            if eval(source, {"mi": mi, "np": np}):
+                stock = type(self.plugin).__module__.startswith("mitsuba")
+                reminder = "" if ours or stock else f"# register {self.name!r} here\n"
+                loading = f"mi.load_dict({{**{source}, **more}})"
+                return f"{reminder}\ndef load(**more):\n    return {loading}\n\n{self.word} = load()\n"
+        return f"# {self.word}: the object that was checked\nload = lambda: {self.word}\n"
 
     def elsewhere(self, other: str, call: Callable[[], Found]) -> Found:
-        """Return what a function gives in another variant. Raises ``Skip`` where there is none."""
+        """Call a function in another variant. Raises ``Skip`` where that cannot run."""
         if other not in mi.variants() or runtime.obstacle(other):
             raise Skip(f"{other} cannot run here")
         here = mi.variant()
@@ -282,16 +363,72 @@ class Subject:
         return here.replace("scalar_", "llvm_ad_") if is_scalar() else f"scalar_{here.split('_', 2)[-1]}"
 
 
-def class_name(plugin: Any) -> str:
-    """Return the name of a plugin's class: Mitsuba calls all those in Python by that of their base."""
+def class_name(plugin: mi.Object) -> str:
+    """Name of a plugin's class: Mitsuba calls all those in Python by that of their base."""
     python = type(plugin).__module__.split(".")[0] != "mitsuba"
     return type(plugin).__name__ if python or not hasattr(plugin, "class_name") else plugin.class_name()
 
 
 def _reason(problem: BaseException) -> str:
-    """Return the line of an error that says what happened: the last of a traceback that Mitsuba quotes."""
+    """The line of an error that says what happened: the last of a traceback that Mitsuba quotes."""
     text = str(problem).strip()
-    return text.splitlines()[-1 if "Traceback (most recent" in text else 0] if text else ""
+    lines = text.splitlines() or [""]
+    return lines[-1] if "Traceback (most recent" in text else lines[0]
+
+
+_NOT_IMPLEMENTED = re.compile(r"\[(\w+)\] \w+::(\w+)\(\).*not implemented")
+_PURE_VIRTUAL = re.compile(r"(\w+)::(\w+)\(\)'\): tried to call a pure virtual")
+
+
+def _missing_inside(plugin: mi.Object, error: Exception) -> str:
+    """Which method a plugin nested in this one lacks, if an error is about that; else ""."""
+    match = _NOT_IMPLEMENTED.search(str(error)) or _PURE_VIRTUAL.search(str(error))
+    if match is None or match[1] in [base.__name__ for base in type(plugin).__mro__]:
+        return ""
+    return f"the {match[1]} nested in it has no {match[2]}(), which it needs"
+
+
+@contextmanager
+def _warnings_of_mitsuba() -> Iterator[list[str]]:
+    """A list that has the lines of Mitsuba's warnings, once the block is left."""
+    lines: list[str] = []
+    logger = mi.logger()
+    level = logger.log_level()
+    printers = [logger.appender(i) for i in range(logger.appender_count())]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "log")
+        # to a file: a callback in Python may deadlock with Mitsuba's threads
+        appender = mi.StreamAppender(str(path))
+        quiet = level > mi.LogLevel.Warn
+        for printer in printers if quiet else ():
+            logger.remove_appender(printer)
+        logger.add_appender(appender)
+        logger.set_log_level(min(level, mi.LogLevel.Warn))
+        try:
+            yield lines
+        finally:
+            logger.set_log_level(level)
+            logger.remove_appender(appender)
+            for printer in printers if quiet else ():
+                logger.add_appender(printer)
+            del appender
+            lines += path.read_text(errors="replace").splitlines()
+
+
+def _refusal(lines: Iterable[str]) -> str:
+    """The first of Mitsuba's warnings that says that something is not supported; else ""."""
+    for line in lines:
+        words = line.partition(" WARN ")[2].strip()
+        if re.search(r"shouldn't|should not|n.t support|unsupported", words):
+            return f"Mitsuba does not support it: {words}"
+    return ""
+
+
+def refused(description: Description) -> str:
+    """What Mitsuba's warnings say against a plugin of a dict, "" if nothing."""
+    with _warnings_of_mitsuba() as lines, suppress(RuntimeError):
+        mi.load_dict(description)
+    return _refusal(lines)
 
 
 def _kept(value: Any) -> Any:
@@ -309,17 +446,20 @@ def _made(value: Any) -> Any:
 
 
 def _written(value: Any) -> str:
-    """Return a value as Python text; float32 in the fewest digits that give it back."""
+    """A value as Python text; float32 in the fewest digits that give it back."""
     if isinstance(value, np.ndarray):
         inner = ", ".join(str(x) for x in value.astype(np.float32))
-        return inner if value.dtype == np.float32 and len(value) in (2, 3) else f"[{inner}]"
-    return value if isinstance(value, str) else repr(value.item() if isinstance(value, np.generic) else value)
+        vector = value.dtype == np.float32 and len(value) in (2, 3)
+        return inner if vector else f"[{inner}]"
+    if isinstance(value, np.generic):
+        value = value.item()
+    return value if isinstance(value, str) else repr(value)
 
 
 def examine(
-    kind: Callable[[Any, bool, int], Any],
-    given: Any,
-    laws: Mapping[str, Callable[[Law, Any], None]],
+    kind: Callable[[Given, bool, int], Subject],
+    given: Given,
+    laws: Mapping[str, Judge],
     *,
     quick: bool,
     seed: int,
@@ -332,35 +472,53 @@ def examine(
     """
     runtime.use()
     chosen = list(laws if only is None else only)
-    if unknown := [name for name in chosen if name not in laws]:
-        raise UsageError(f"unknown law {unknown[0]!r}: choose from {', '.join(laws)}")
-    start, variant, found, late = time.perf_counter(), mi.variant(), {}, ""
+    for name in chosen:
+        if name not in laws:
+            raise UsageError(f"unknown law {name!r}: choose from {', '.join(laws)}")
+    start = time.perf_counter()
+    variant = mi.variant()
     with settings_restored():
         case = kind(given, quick, seed)
-    for name in (name for name in laws if name in chosen):
-        law = found[name] = Law(name, figures=vars(laws[name])["figures"], program=case.program)
-        try:
-            with settings_restored(), _limited(timeout):
-                if late:
-                    raise Skip(f"a law before it {late}")
-                laws[name](law, case)
-            law.skipped = "" if law.parts else "; ".join(law.notes)
-        except Skip as why:
-            law.skipped = f"{why}: {_reason(why.__cause__)}" if why.__cause__ else str(why)
-        except TimedOut:
-            late = f"took longer than {timeout:g} s"
-            law.parts.append(Part(f"it {late}", math.inf, timeout, note="a plugin must come to an end"))
-        except Exception as error:
+    checked: dict[str, Law] = {}
+    obstacle = case.unsupported  # why the laws that are left cannot be judged
+    for name in laws:
+        if name in chosen:
+            law = Law(name, figures=vars(laws[name])["figures"], program=case.program)
+            obstacle = _judge(law, laws[name], case, obstacle, timeout)
+            law.program = None
+            checked[name] = law
+    return Check(case.name, variant, checked, time.perf_counter() - start, quick)
+
+
+def _judge(law: Law, judge: Judge, case: Subject, obstacle: str, timeout: float) -> str:
+    """Check one law, unless there is an obstacle; the obstacle for the laws after it, "" if none."""
+    if obstacle:
+        law.skipped = obstacle
+        return obstacle
+    try:
+        with settings_restored(), _limited(timeout):
+            judge(law, case)
+        if not law.parts:
+            law.skipped = "; ".join(law.notes)
+    except Skip as why:
+        law.skipped = f"{why}: {_reason(why.__cause__)}" if why.__cause__ else str(why)
+    except TimedOut:
+        late = f"took longer than {timeout:g} s"
+        law.parts.append(Part(f"it {late}", math.inf, timeout, note="a plugin must come to an end"))
+        return f"a law before it {late}"
+    except Exception as error:
+        law.skipped = _missing_inside(case.plugin, error)
+        if not law.skipped:
             what = f"it raised {type(error).__name__}: {_reason(error)}"
             law.parts.append(Part(what, math.inf, 0, note="a plugin must not raise"))
-        law.program = None
-    return Check(case.name, variant, found, time.perf_counter() - start, quick)
+    return ""
 
 
 @contextmanager
 def settings_restored() -> Iterator[None]:
     """Put back the variant and Dr.Jit's flags, which a plugin or a switch of variants may change."""
-    variant, flags = mi.variant(), {f: dr.flag(f) for f in dr.JitFlag if f != dr.JitFlag.Default}
+    variant = mi.variant()
+    flags = {flag: dr.flag(flag) for flag in dr.JitFlag if flag != dr.JitFlag.Default}
     try:
         # what is not finite is the law ``finite``'s to deal with
         with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -378,8 +536,10 @@ def settings_restored() -> Iterator[None]:
 @contextmanager
 def _limited(seconds: float) -> Iterator[None]:
     """Raise ``TimedOut`` in this thread's Python code after so many seconds. A kernel is not interrupted."""
-    start, raised = time.perf_counter(), (ctypes.c_ulong(threading.get_ident()), ctypes.py_object(TimedOut))
-    timer = threading.Timer(seconds, ctypes.pythonapi.PyThreadState_SetAsyncExc, raised)
+    start = time.perf_counter()
+    thread = ctypes.c_ulong(threading.get_ident())
+    interrupt = ctypes.pythonapi.PyThreadState_SetAsyncExc
+    timer = threading.Timer(seconds, interrupt, (thread, ctypes.py_object(TimedOut)))
     timer.daemon = True
     timer.start()
     try:

@@ -28,31 +28,36 @@ REACHES = tuple(2**k for k in (2, 5, 8, 11, 13))  # float32 steps to either side
 
 
 def ecnoise(lines: Array, *, coarse: bool = False) -> Array:
-    """Return the noise [N] of values along lines [P, N], in their own unit; 0 where nothing is noise.
+    """The noise [N] of values along lines [P, N], in their own unit; 0 where nothing is noise.
 
     The first order k counts from which on three estimates agree to a factor of four and whose differences
     have both signs. If none is so, it is the smallest of all; or NaN where the line is too long to tell, for
     the values change along it by more than ``STEEP`` of the largest; and NaN wherever they change by half.
     ``coarse``: the least of all orders from the third, and 0 where values change by half.
     """
-    table, gamma, levels, signs = lines.astype(np.float64), 1.0, [], []
+    table = lines.astype(np.float64)
+    gamma = 1.0
+    levels = []
+    signs = []
     for k in range(1, len(lines)):
-        table, gamma = np.diff(table, axis=0), gamma * 0.5 * k / (2 * k - 1)
+        table = np.diff(table, axis=0)
+        gamma *= 0.5 * k / (2 * k - 1)
         levels.append(np.sqrt(gamma * (table**2).mean(axis=0)))
         signs.append((table.min(axis=0) < 0) & (table.max(axis=0) > 0))
     level = np.array(levels)
     change = np.ptp(lines, axis=0) / np.abs(lines).max(axis=0)
     if coarse:
         return np.where(change > 0.5, 0, level[2:].min(axis=0))
-    found = np.where(change > STEEP, np.nan, level[:-2].min(axis=0))
+    noise = np.where(change > STEEP, np.nan, level[:-2].min(axis=0))
     for k in reversed(range(len(level) - 2)):
         three = level[k : k + 3]
-        found = np.where(signs[k] & (three.max(axis=0) <= 4 * three.min(axis=0)), level[k], found)
-    return np.where(change > 0.5, np.nan, found)
+        agree = three.max(axis=0) <= 4 * three.min(axis=0)
+        noise = np.where(signs[k] & agree, level[k], noise)
+    return np.where(change > 0.5, np.nan, noise)
 
 
 def steps_away(x: Array, count: Array) -> Array:
-    """Return the float32 numbers that lie ``count`` steps from ``x``, beyond zero where it is near."""
+    """The float32 numbers that lie ``count`` steps from ``x``, beyond zero where it is near."""
     ordered = np.ascontiguousarray(x, np.float32).view(np.int32).astype(np.int64)
     ordered = np.where(ordered < 0, -(2**31) - ordered, ordered) + count
     return np.where(ordered < 0, -(2**31) - ordered, ordered).astype(np.int32).view(np.float32)
@@ -70,8 +75,9 @@ def measure(
 ) -> Lanes:
     """Estimate the noise of ``function([M, K]) -> [M]`` at float32 inputs [N, K].
 
-    Return the ``noise`` in roundings (2⁻²⁴) of the value, or of ``size`` [N]; the noise over what inputs,
-    rounded twice, and ``ALLOWANCE`` other roundings explain (``lost``); and the ``stride`` of each line.
+    The result has the ``noise`` in roundings (2⁻²⁴) of the value, or of ``size`` [N]; the noise over what
+    inputs, rounded twice, and ``ALLOWANCE`` other roundings explain (``lost``); and the ``stride`` of each
+    line.
 
     ``strides``: the most float32 steps between points of a line, ascending; the first counts along which the
     value changes at half of them, since lost digits leave stairs, flat where a line is short. ``project``
@@ -79,15 +85,17 @@ def measure(
     high at any step that is large compared with them, unlike kinks and what is left of a smooth function:
     only noise that is ``ALIKE`` at two steps counts.
     """
-    inputs, rng = inputs.astype(np.float32), np.random.default_rng(seed)
+    inputs = inputs.astype(np.float32)
+    rng = np.random.default_rng(seed)
 
     def values(steps: Array, valid: Callable[[Array], Array] = lambda x: x) -> Array:
-        """Return the function that many float32 steps [..., N, K] away. [..., N]"""
-        moved = steps_away(np.broadcast_to(inputs, steps.shape), steps).reshape(-1, inputs.shape[1])
-        return function(valid(moved)).reshape(steps.shape[:-1]).astype(np.float64)
+        """The function that many float32 steps [..., N, K] away. [..., N]"""
+        moved = steps_away(np.broadcast_to(inputs, steps.shape), steps)
+        values = function(valid(moved.reshape(-1, inputs.shape[1])))
+        return values.reshape(steps.shape[:-1]).astype(np.float64)
 
     def along(strides: Sequence[int]) -> Array:
-        """Return steps along a random line for each input and stride. [strides, POINTS, N, K]"""
+        """Steps along a random line for each input and stride. [strides, POINTS, N, K]"""
         ways = np.array([rng.integers(-s, s + 1, inputs.shape) for s in strides])
         return np.arange(POINTS)[:, None, None] * ways[:, None]
 
@@ -95,20 +103,29 @@ def measure(
     flat = (np.diff(lines, axis=1) == 0).mean(axis=1) > 0.5
     chosen = np.where(flat.all(axis=0), len(strides) - 1, flat.argmin(axis=0))
     line = np.take_along_axis(lines, chosen[None, None], axis=0)[0]
-    reaches = np.array(REACHES)[:, None, None, None, None]
-    steps = np.array([1, -1])[:, None, None, None] * reaches * np.eye(inputs.shape[1], dtype=int)[:, None]
-    forth, back = np.moveaxis(values(np.broadcast_to(steps, (*steps.shape[:3], *inputs.shape))), 1, 0)
-    slope = (forth - back) / (2 * reaches[..., 0, 0])
-    # of several widths, the one that agrees best with its neighbour
-    best = np.abs(np.diff(slope, axis=0)).argmin(axis=0)[None]
-    slope = np.take_along_axis(slope[1:], best, axis=0)[0]  # change per step
+    slope = _slope(values, inputs.shape)
     explained = np.sqrt((slope**2).sum(axis=0) / 12)  # a rounded input is within half a step: variance 1/12
     unit = ROUNDING * np.abs(line[0] if size is None else size)
     noise = ecnoise(line)
     if project:
         stairs = np.array([ecnoise(line, coarse=True) for line in values(along(COARSE), project)])
-        small, large = np.minimum(stairs[:-1], stairs[1:]), np.maximum(stairs[:-1], stairs[1:])
-        both = np.where((large <= ALIKE * small) & (small > TABLES * unit), small, 0).max(axis=0)
+        small = np.minimum(stairs[:-1], stairs[1:])
+        large = np.maximum(stairs[:-1], stairs[1:])
+        alike = (large <= ALIKE * small) & (small > TABLES * unit)
+        both = np.where(alike, small, 0).max(axis=0)
         noise = np.where(np.nan_to_num(noise) < both, both, noise)
     lost = np.nan_to_num(noise / unit / np.hypot(2 * explained / unit, ALLOWANCE), posinf=0)
     return Lanes(noise=noise / unit, lost=lost, stride=np.take(strides, chosen))
+
+
+def _slope(values: Callable[[Array], Array], shape: tuple[int, ...]) -> Array:
+    """The change of ``values`` per float32 step of each of K inputs [N, K]. [K, N]"""
+    reaches = np.array(REACHES)[:, None, None, None, None]
+    signs = np.array([1, -1])[:, None, None, None]
+    steps = signs * reaches * np.eye(shape[1], dtype=int)[:, None]
+    steps = np.broadcast_to(steps, (*steps.shape[:3], *shape))
+    forth, back = np.moveaxis(values(steps), 1, 0)
+    slope = (forth - back) / (2 * reaches[..., 0, 0])
+    # of several widths, the one that agrees best with its neighbour
+    best = np.abs(np.diff(slope, axis=0)).argmin(axis=0)[None]
+    return np.take_along_axis(slope[1:], best, axis=0)[0]

@@ -10,24 +10,32 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy import stats
 
 from mrt_mitsuba.validation.checks.probe import Array, Lanes, joined
+from mrt_mitsuba.validation.tools.compare import sidak
 
 DEPTH = 17  # the finest cell is a hundred times what float32 rounding moves a direction by
 SIDE = 6
 POINTS = SIDE**2  # at which a cell is integrated
 HEMISPHERE = 4**DEPTH  # codes of each
+SMALL = 7  # level of cells of about a degree
+ATTEMPTS = 8  # at integrals that are certain enough
 _SPREAD = np.sum([(np.arange(2**DEPTH) >> k & 1) << 2 * k for k in range(DEPTH)], axis=0)  # bits with gaps
 
 
 def encode(wo: Array) -> Array:
-    """Return the Morton codes of directions [N, 3]."""
+    """Morton codes [N] of directions [N, 3]."""
     x, y, z = wo.T.astype(np.float64)
     r = np.sqrt((x * x + y * y) / (1 + np.abs(z)))
     turn = np.arctan2(y, x) / (2 * np.pi) + 0.5
-    places = (np.clip(np.nan_to_num(u) * 2**DEPTH, 0, 2**DEPTH - 1) for u in (r, turn))
-    a, b = (_SPREAD[place.astype(np.int64)] for place in places)
-    return (z < 0) * HEMISPHERE + (a | (b << 1))
+    return (z < 0) * HEMISPHERE + (_bits(r) | (_bits(turn) << 1))
+
+
+def _bits(u: Array) -> Array:
+    """The bits of numbers in [0, 1), with gaps between them for those of another."""
+    place = np.clip(np.nan_to_num(u) * 2**DEPTH, 0, 2**DEPTH - 1)
+    return _SPREAD[place.astype(np.int64)]
 
 
 class Cells(Lanes):
@@ -35,8 +43,9 @@ class Cells(Lanes):
 
     @staticmethod
     def around(codes: Array, most: int, coarsest: int = 4) -> Cells:
-        """Return cells that hold at most ``most`` of the directions each; only the finest may hold more."""
-        codes, done = np.sort(codes), []
+        """Cells that hold at most ``most`` of the directions each; only the finest may hold more."""
+        codes = np.sort(codes)
+        done = []
         start = np.arange(2 * 4**coarsest) * 4 ** (DEPTH - coarsest)
         cells = Cells(start=start, level=np.full(len(start), coarsest))
         while len(cells.start):
@@ -56,35 +65,50 @@ class Cells(Lanes):
 
     @property
     def corner(self) -> tuple[Array, Array]:
-        """Return r and turn, in [0, 1), at the corners of cells."""
+        """r and turn, in [0, 1), at the corners of cells. [C], [C]"""
         bits = self.start % HEMISPHERE
-        a, b = (np.searchsorted(_SPREAD, x & _SPREAD[-1]) for x in (bits, bits >> 1))
-        return a / 2**DEPTH, b / 2**DEPTH
+        r = np.searchsorted(_SPREAD, bits & _SPREAD[-1])
+        turn = np.searchsorted(_SPREAD, bits >> 1 & _SPREAD[-1])
+        return r / 2**DEPTH, turn / 2**DEPTH
+
+    @property
+    def below(self) -> Array:
+        """Whether cells are of the lower hemisphere. [C]"""
+        return self.start >= HEMISPHERE
 
     def find(self, codes: Array) -> Array:
-        """Return the index of the cell in which each direction lies."""
+        """Index of the cell in which each direction lies."""
         return np.searchsorted(self.start, codes, side="right") - 1
 
     def quartered(self) -> Cells:
-        """Return four cells for each, one after the other."""
+        """Four cells for each, one after the other."""
         level = np.repeat(self.level + 1, 4)
         part = np.tile(np.arange(4), len(self.start))
         return Cells(start=np.repeat(self.start, 4) + part * 4 ** (DEPTH - level), level=level)
 
     def at(self, i: Array, j: Array) -> tuple[Array, Array]:
-        """Return directions [C, P, 3] at places of each cell, from 0 to 1, and r there."""
-        (r0, turn0), width = (x[:, None] for x in self.corner), self.width[:, None]
-        r, turn = r0 + width * i, turn0 + width * j
-        z = np.where(self.start >= HEMISPHERE, -1, 1)[:, None] * (1 - r * r)
-        sin, phi = r * np.sqrt(2 - r * r), 2 * np.pi * (turn - 0.5)
+        """Directions [C, P, 3] at places of each cell, from 0 to 1, and r there [C, P]."""
+        r0, turn0 = self.corner
+        width = self.width[:, None]
+        r = r0[:, None] + width * i
+        phi = 2 * np.pi * (turn0[:, None] + width * j - 0.5)
+        z = np.where(self.below, -1, 1)[:, None] * (1 - r * r)
+        sin = r * np.sqrt(2 - r * r)
         return np.stack([sin * np.cos(phi), sin * np.sin(phi), z], axis=-1).astype(np.float32), r
 
     def points(self, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return random directions in each cell, one in each part [C, POINTS, 3], and dω [C, POINTS]."""
+        """Random directions in each cell, one in each part [C, POINTS, 3], and dω [C, POINTS]."""
         i, j = np.divmod(np.arange(POINTS), SIDE)
         shift = rng.random((2, len(self.start), POINTS))
         wo, r = self.at((i + shift[0]) / SIDE, (j + shift[1]) / SIDE)
         return wo, 4 * np.pi * r * (self.width[:, None] / SIDE) ** 2
+
+    @property
+    def middle(self) -> Array:
+        """The directions in the middle of cells. [C, 3]"""
+        half = np.array([0.5])
+        wo, _ = self.at(half, half)
+        return wo[:, 0]
 
     @property
     def solid_angle(self) -> Array:
@@ -92,14 +116,60 @@ class Cells(Lanes):
         return 2 * np.pi * self.width * ((r + self.width) ** 2 - r**2)
 
     def bounds(self, index: int) -> tuple[float, float, float, float, int]:
-        """Return r and φ from … to, and the sign of z, of one cell."""
-        (r, turn), width = (float(x[index]) for x in self.corner), float(self.width[index])
-        phi, sign = 2 * np.pi * (turn - 0.5), -1 if self.start[index] >= HEMISPHERE else 1
-        return r, r + width, phi, phi + 2 * np.pi * width, sign
+        """r and φ from … to, and the sign of z, of one cell."""
+        r, turn = (float(x[index]) for x in self.corner)
+        width = float(self.width[index])
+        phi = 2 * np.pi * (turn - 0.5)
+        return r, r + width, phi, phi + 2 * np.pi * width, -1 if self.below[index] else 1
+
+    def counts(self, wo: Array) -> Array:
+        """How many of the directions [N, 3] lie in each cell. [C]"""
+        return np.bincount(self.find(encode(wo)), minlength=len(self.start))
+
+    def rarest(self, seen: Array, expected: Array, variance: Array, known: float) -> tuple[float, int]:
+        """The least chance of what is ``seen`` in a cell, for their number, and the cell.
+
+        ``variance``: of ``expected``; ``known``: to how much densities are known, relative.
+        """
+        chances = chances_of(seen, expected, variance, known)
+        return sidak(float(chances.min()), 2 * len(chances)), int(chances.argmin())
+
+    def rarest_slice(self, seen: Array, expected: Array, variance: Array, known: float) -> float:
+        """The same for rows of cells of one r or azimuth, and slices along x and y."""
+        r, turn = self.corner
+        x, y, _ = self.middle.T
+        sound = np.isfinite(expected)
+        seen = np.where(sound, seen, 0)
+        expected = np.where(sound, expected, 0)
+        variance = np.where(sound, variance, 0)
+        least = 1.0
+        tests = 0
+        for place in (r, turn, 0.5 + 0.4999 * x, 0.5 + 0.4999 * y):
+            row = np.floor(place / self.width).astype(int) * 2 + self.below
+            chances = chances_of(
+                np.bincount(row, seen), np.bincount(row, expected), np.bincount(row, variance), known
+            )
+            least = min(least, float(chances.min()))
+            tests += 2 * len(chances)
+        return sidak(least, tests)
+
+
+def small_cells() -> Cells:
+    """Cells of about a degree over the whole sphere."""
+    return Cells.around(np.zeros(0, np.int64), 0, SMALL)
+
+
+def chances_of(seen: Array, expected: Array, variance: Array, known: float) -> Array:
+    """Chances of so many or so few where a Poisson distribution expects as many; 1 where that is unknown."""
+    room = 3 * np.sqrt(variance) + known * expected  # is not Poisson's
+    many = stats.poisson.sf(seen - 1, expected + room)
+    few = stats.poisson.cdf(seen, expected - room)
+    either = np.minimum(many, np.where(expected > room, few, 1))
+    return np.where(np.isfinite(expected), either, 1)
 
 
 def in_order(parts: Sequence[Cells]) -> Cells:
-    """Return the cells of several sets, in the order of their codes."""
+    """The cells of several sets, in the order of their codes."""
     cells = joined(parts)
     return cells.only(np.argsort(cells.start))
 
@@ -120,44 +190,57 @@ def integrate(
     """
     done = []
     order = np.argsort(codes)
-    codes, below = codes[order], np.concatenate([[0], np.cumsum(weights[order])]) / samples
-    for attempt in range(8):
+    codes = codes[order]
+    below = np.concatenate([[0], np.cumsum(weights[order])]) / samples
+    for attempt in range(ATTEMPTS):
         first, last = below[np.searchsorted(codes, [cells.start, cells.end])]
+        by_samples = last - first
         wo, omega = cells.points(rng)
         values = np.nan_to_num(function(wo.reshape(-1, 3)), posinf=0, neginf=0)
         values = values.reshape(*omega.shape, -1) * omega[..., None] * POINTS
-        mean, variance = values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
+        mean = values.mean(axis=1)
+        variance = values.var(axis=1) / (POINTS - 1)
         total = np.abs(mean).sum(axis=0) + 1e-12
         # half of what chance does to the count of the samples, or one sample, is known well enough
-        bad = (variance / total**2 > 0.25 * np.abs(mean) / total / samples + 1 / samples**2).any(axis=1)
-        bad |= ((last - first) * samples > 1.5) & (mean[:, 0] < 0.2 * (last - first))
-        bad &= (cells.level < DEPTH) & (attempt < 7)
-        done.append(Cells(**{**vars(cells), "mean": mean, "variance": variance}).only(~bad))
+        enough = 0.25 * np.abs(mean) / total / samples + 1 / samples**2
+        bad = (variance / total**2 > enough).any(axis=1)
+        bad |= (by_samples * samples > 1.5) & (mean[:, 0] < 0.2 * by_samples)
+        bad &= (cells.level < DEPTH) & (attempt < ATTEMPTS - 1)
+        integrals = Cells(**{**vars(cells), "mean": mean, "variance": variance})
+        done.append(integrals.only(~bad))
         if not bad.any():
             break
         cells = cells.only(bad).quartered()
     return in_order(done)
 
 
-def chi_square(found: Cells, codes: Array, count: int, known: float = 0.0) -> tuple[Array, tuple]:
+def chi_square(
+    integrals: Cells, codes: Array, count: int, known: float = 0.0
+) -> tuple[Array, tuple[float, float, float, float, int]]:
     """Compare the counts of samples with those that integrals expect.
 
-    Return χ² and its degrees of freedom [6, 2] in six ways to group cells, so that faults of any width
-    show: neighbours that expect 25 samples or more, a 128th and a 16th of all, and slices along x, y and z of
-    a 16th; and the cell that is most off. ``known``: to how much the density is known, relative.
+    The first result is χ² and its degrees of freedom [6, 2] in six ways to group cells, so that faults of any
+    width show: neighbours that expect 25 samples or more, a 128th and a 16th of all, and slices along x, y
+    and z of a 16th. The second is the cell that is most off. ``known``: to how much the density is known,
+    relative.
     """
-    seen = np.bincount(found.find(codes), minlength=len(found.start))
-    expected, variance = count * found.mean[:, 0], count**2 * found.variance[:, 0]
-    neighbours, tests = np.arange(len(seen)), []
-    middles = found.at(np.array([0.5]), np.array([0.5]))[0][:, 0]
+    seen = np.bincount(integrals.find(codes), minlength=len(integrals.start))
+    expected = count * integrals.mean[:, 0]
+    variance = count**2 * integrals.variance[:, 0]
+    neighbours = np.arange(len(seen))
     ways = [(count / 25, neighbours), (128, neighbours), (16, neighbours)]
-    for parts, order in ways + [(16, np.argsort(axis)) for axis in middles.T]:
-        group = np.floor(np.cumsum(expected[order]) / max(count / parts, 25)).astype(int)
+    ways += [(16, np.argsort(axis)) for axis in integrals.middle.T]
+    tests = []
+    for parts, order in ways:
+        below = np.cumsum(expected[order])
+        group = np.floor(below / max(count / parts, 25)).astype(int)
         group = np.minimum(group, max(group[-1] - 1, 0))
-        seen_in, expected_in, variance_in = (np.bincount(group, x[order]) for x in (seen, expected, variance))
-        used = (seen_in > 0) | (expected_in > 1e-6)
+        seen_in = np.bincount(group, seen[order])
+        expected_in = np.bincount(group, expected[order])
+        variance_in = np.bincount(group, variance[order])
         variance_in += expected_in + (known * expected_in) ** 2
+        used = (seen_in > 0) | (expected_in > 1e-6)
         pull = (seen_in - expected_in)[used] ** 2 / np.maximum(variance_in, 1e-6)[used]
         tests.append((float(pull.sum()), max(len(pull), 1)))
-    cell = int(np.argmax(np.abs(seen - expected) / np.sqrt(expected + variance + 1)))
-    return np.array(tests), found.bounds(cell)
+    worst = np.abs(seen - expected) / np.sqrt(expected + variance + 1)
+    return np.array(tests), integrals.bounds(int(worst.argmax()))

@@ -15,33 +15,38 @@ mp = MPContext()  # of its own: others' digits stay as they are
 mp.dps = 50
 mpf = mp.mpf
 
+Number = Any  # an ``mpf``, a number of any kind at its exact binary value, or a decimal string
+
 FRESNEL_FORMS = ("dielectric", "schlick", "unity")
 
 
-def number(x: Any) -> Any:
-    """Return a number or decimal string as ``mpf``; binary numbers of any precision are not rounded."""
+def number(x: Number) -> Number:
+    """A number or decimal string as ``mpf``; binary numbers of any precision are not rounded."""
     return mpf(x if isinstance(x, (str, mpf)) else float(x))
 
 
-def unit(v: Sequence[Any]) -> list[Any]:
-    """Return a vector made one unit long."""
+def unit(v: Sequence[Number]) -> list[Number]:
+    """A vector made one unit long."""
     components = [number(x) for x in v]
     length = mp.sqrt(sum(x * x for x in components))
     return [x / length for x in components]
 
 
-def f0_from_ior(ext_ior: Any, int_ior: Any) -> Any:
-    n1, n2 = number(ext_ior), number(int_ior)
+def f0_from_ior(ext_ior: Number, int_ior: Number) -> Number:
+    n1 = number(ext_ior)
+    n2 = number(int_ior)
     return ((n2 - n1) / (n2 + n1)) ** 2
 
 
-def fresnel_schlick(cos_theta: Any, f0: Any) -> Any:
+def fresnel_schlick(cos_theta: Number, f0: Number) -> Number:
     return number(f0) + (1 - number(f0)) * (1 - number(cos_theta)) ** 5
 
 
-def fresnel_dielectric(cos_theta: Any, ext_ior: Any, int_ior: Any) -> Any:
-    """Return ½(Rs + Rp) by Snell's law; 1 under total reflection."""
-    c, n1, n2 = number(cos_theta), number(ext_ior), number(int_ior)
+def fresnel_dielectric(cos_theta: Number, ext_ior: Number, int_ior: Number) -> Number:
+    """½(Rs + Rp) by Snell's law; 1 under total reflection."""
+    c = number(cos_theta)
+    n1 = number(ext_ior)
+    n2 = number(int_ior)
     sin2_t = (n1 / n2) ** 2 * (1 - c * c)
     if sin2_t > 1:
         return mpf(1)
@@ -51,20 +56,21 @@ def fresnel_dielectric(cos_theta: Any, ext_ior: Any, int_ior: Any) -> Any:
     return (rs + rp) / 2
 
 
-def fresnel(form: str, cos_theta: Any, ext_ior: Any, int_ior: Any) -> Any:
-    """Return one of ``FRESNEL_FORMS``; Schlick's with F₀ from the indices."""
+def fresnel(form: str, cos_theta: Number, ext_ior: Number, int_ior: Number) -> Number:
+    """One of ``FRESNEL_FORMS``; Schlick's with F₀ from the indices."""
     if form == "dielectric":
         return fresnel_dielectric(cos_theta, ext_ior, int_ior)
     return fresnel_schlick(cos_theta, f0_from_ior(ext_ior, int_ior)) if form == "schlick" else mpf(1)
 
 
-def beckmann_d(cos_theta_h: Any, alpha: Any) -> Any:
-    c, a = number(cos_theta_h), number(alpha)
+def beckmann_d(cos_theta_h: Number, alpha: Number) -> Number:
+    c = number(cos_theta_h)
+    a = number(alpha)
     return mp.exp(-(1 / c**2 - 1) / a**2) / (mp.pi * a**2 * c**4)
 
 
-def smith_g1(v: Any, alpha: Any) -> Any:
-    """Return the rational fit of Walter et al. for a direction above the surface."""
+def smith_g1(v: Number, alpha: Number) -> Number:
+    """The rational fit of Walter et al. for a direction above the surface."""
     x, y, z = map(number, v)
     across = number(alpha) * mp.sqrt(x * x + y * y)
     b = z / across if across else mp.inf
@@ -73,8 +79,8 @@ def smith_g1(v: Any, alpha: Any) -> Any:
     return (mpf("3.535") * b + mpf("2.181") * b**2) / (1 + mpf("2.276") * b + mpf("2.577") * b**2)
 
 
-def visible_cos(v: Any, alpha: Any) -> Any:
-    """Return (1 + Λ) cos θ of a direction above the surface, with Beckmann's own Λ (Heitz 2014, eq. 72)."""
+def visible_cos(v: Number, alpha: Number) -> Number:
+    """(1 + Λ) cos θ of a direction above the surface, with Beckmann's own Λ (Heitz 2014, eq. 72)."""
     x, y, z = map(number, v)
     across = number(alpha) * mp.sqrt(x * x + y * y)
     if across == 0:

@@ -18,7 +18,7 @@ Edges = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def luma_edges(image: np.ndarray) -> Edges:
-    """Return the contrast of ``√(0.299 R + 0.587 G + 0.114 B)`` in the 3×3 neighbourhood."""
+    """The contrast of ``√(0.299 R + 0.587 G + 0.114 B)`` in the 3×3 neighbourhood."""
     red, green, blue = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
     luma = np.sqrt(0.299 * red + 0.587 * green + 0.114 * blue)
     largest = maximum_filter(luma, 3)
@@ -28,7 +28,7 @@ def luma_edges(image: np.ndarray) -> Edges:
 
 
 def sobel_edges(image: np.ndarray) -> Edges:
-    """Return the Sobel gradient of ``int(255 (0.07 R + 0.72 G + 0.21 B))``.
+    """The Sobel gradient of ``int(255 (0.07 R + 0.72 G + 0.21 B))``.
 
     The margin is the distance of the nearest grey of the window, before truncation, from a whole number. Next
     to zero, where truncation goes to zero from both sides, it counts as far away.
@@ -41,7 +41,7 @@ def sobel_edges(image: np.ndarray) -> Edges:
 
 
 def blur_amount(depth: np.ndarray, focal_distance: float, focal_range: float) -> np.ndarray:
-    """Return the height map: ``clamp(|focal_distance − depth| − focal_range, 0, 8)``, and 8 for a miss."""
+    """The height map: ``clamp(|focal_distance − depth| − focal_range, 0, 8)``, and 8 for a miss."""
     amount = np.clip(np.abs(focal_distance - depth.astype(np.float64)) - focal_range, 0, 8)
     return np.where((depth <= 0) | np.isinf(depth), 8, amount)
 
@@ -63,7 +63,7 @@ def gaussian_dof(image: np.ndarray, amount: np.ndarray) -> np.ndarray:
 
 
 def disc_radius(amount: np.ndarray) -> np.ndarray:
-    """Return the radii of the discs of the corrected blur."""
+    """The radii of the discs of the corrected blur."""
     small = amount**2 / (8 - 4 * np.minimum(amount, 1) ** 2)
     return np.where(amount < 1, small, np.sqrt(np.maximum(2 * amount - 23 / 16, 0)) - 0.5)
 
@@ -80,28 +80,32 @@ def corrected_dof(image: np.ndarray, radius: np.ndarray) -> np.ndarray:
     front, same, behind = np.zeros((3, *radius.shape, 4))
 
     def disc(radius: np.ndarray, dx: int, dy: int) -> np.ndarray:
-        """Return how much of its light a disc has in a pixel so far away."""
+        """The share of its light that a disc has in a pixel so far away."""
         cover = [np.clip(radius + 1 - math.hypot(*step), 0, 1) for step in ((dx, dy), *steps)]
         return np.asarray(cover[0] / sum(cover[1:]))[..., None]
 
     for dx, dy in steps:
         there = padded[5 + dy : 5 + dy + len(radius), 5 + dx : 5 + dx + radius.shape[1]]
-        theirs, light, order = np.abs(there[..., 4]), there[..., :4], there[..., 4] - radius
-        own_disc, their_disc = disc(np.abs(radius), dx, dy), disc(theirs, dx, dy)
+        theirs = np.abs(there[..., 4])
+        light = there[..., :4]
+        order = there[..., 4] - radius
+        own_disc = disc(np.abs(radius), dx, dy)
+        their_disc = disc(theirs, dx, dy)
         parts = np.minimum(-order, 1), 1 - abs(order), np.minimum(order, 1)
         nearer, level, farther = (np.maximum(part, 0)[..., None] for part in parts)
         wider_behind = ((order > 0) & (theirs > np.abs(radius)))[..., None]
         front += nearer * their_disc * light
         same += level * np.where(wider_behind, own_disc, their_disc) * light
         behind += farther * own_disc * light
-    hidden, solid = np.minimum(front[..., 3:], 1), np.minimum(same[..., 3:], 1)
+    hidden = np.minimum(front[..., 3:], 1)
+    solid = np.minimum(same[..., 3:], 1)
     gap = np.minimum(1 - solid, behind[..., 3:])
     colors = [layer[..., :3] / np.maximum(layer[..., 3:], 1e-300) for layer in (front, same, behind)]
     return hidden * colors[0] + (1 - hidden) * (solid * colors[1] + gap * colors[2]) / (solid + gap)
 
 
 def _inside(mask: np.ndarray, value: np.ndarray, margin: np.ndarray) -> Edges:
-    """Return a detector's result; the border, whose windows are not whole, is surely no edge."""
+    """A detector's result; the border, whose windows are not whole, is surely no edge."""
     inner = np.zeros(mask.shape, bool)
     inner[1:-1, 1:-1] = True
     return mask & inner, np.where(inner, value, 0), np.where(inner, margin, np.inf)

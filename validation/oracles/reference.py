@@ -57,11 +57,13 @@ def reference_render(
     # The first row is the lowest; the column grows along up × forward: mirrored against a right-handed
     # camera, as in the original
     pixel = np.arange(width * height)
-    x, y = pixel % width + 0.5 + displacement[0], pixel // width + 0.5 + displacement[1]
+    x = pixel % width + 0.5 + displacement[0]
+    y = pixel // width + 0.5 + displacement[1]
     forward = unit(np.subtract(camera.target, camera.position))
     right = unit(np.cross(camera.up, forward))
     half_width = math.tan(math.radians(camera.hfov) / 2)
-    u, v = (2 * x - width) / width * half_width, (2 * y - height) / width * half_width
+    u = (2 * x - width) / width * half_width
+    v = (2 * y - height) / width * half_width
     d = unit(forward + u[:, None] * right + v[:, None] * np.cross(forward, right))
     o = np.broadcast_to(np.array(camera.position, float), d.shape)
     layers = _radiance(scene, o, d, **settings)
@@ -69,7 +71,7 @@ def reference_render(
 
 
 def objects(scene: Scene) -> list[Any]:
-    """Return the objects of a scene in the order of their numbers."""
+    """The objects of a scene in the order of their numbers."""
     return [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
 
 
@@ -84,26 +86,32 @@ def _radiance(
     max_depth: int = 10,
     bounce_budget: str = "report",
 ) -> tuple[Array, Array, Array]:
-    """Return the light [N, 3] that comes back along rays, and the hashes of their paths and lights [N]."""
+    """The light [N, 3] that comes back along rays, and the hashes of their paths and lights [N]."""
     things = objects(scene)
     numbers = np.array([(m.material.ior, m.material.alpha, *m.material.specular) for m in things])
-    light, (path, lights) = np.zeros(d.shape), np.zeros((2, len(d)), np.uint64)
+    light = np.zeros(d.shape)
+    path, lights = np.zeros((2, len(d)), np.uint64)
     rays: list[Array] = [np.arange(len(d)), np.ones(d.shape), np.zeros(len(d), int), o, d]
     while len(rays[0]):
         ray, weight, spent, o, d = rays
         t, thing, n, diffuse = nearest(things, o, d)
-        path[ray], hit = _mix(path[ray], thing), thing >= 0
+        path[ray] = _mix(path[ray], thing)
+        hit = thing >= 0
         light[ray[~hit]] += weight[~hit] * scene.sky
         ray, weight, spent, o, d, t, n, diffuse = (x[hit] for x in (ray, weight, spent, o, d, t, n, diffuse))
         ior, alpha, *specular = numbers.reshape(-1, 5)[thing[hit]].T
-        p, cos, specular = o + t[:, None] * d, -dot(n, d), np.transpose(specular)
+        p = o + t[:, None] * d
+        cos = -dot(n, d)
+        specular = np.transpose(specular)
         start = p + (OFFSET * (np.abs(o).max(axis=1) + t))[:, None] * n
 
         seen = np.zeros(len(ray), int)
         for lamp in scene.lights:
-            to_light, way = unit(lamp.position - p), lamp.position - start
+            to_light = unit(lamp.position - p)
+            way = lamp.position - start
             facing = np.flatnonzero((dot(n, to_light) > 0) & (cos > 0))
-            shadow, reach = unit(way[facing]), np.linalg.norm(way[facing], axis=1)
+            shadow = unit(way[facing])
+            reach = np.linalg.norm(way[facing], axis=1)
             lit = facing[nearest(things, start[facing], shadow, reach)[1] < 0]
             seen *= 3
             seen[facing] += 1
@@ -130,12 +138,12 @@ def _mix(hashed: Array, value: Array) -> Array:
 
 
 def unit(v: Any) -> Array:
-    """Return vectors [..., 3] made one unit long."""
+    """Vectors [..., 3] made one unit long."""
     return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the scalar products of vectors [..., 3]."""
+    """The scalar products of vectors [..., 3]."""
     return np.einsum("...i,...i->...", a, b)
 
 
@@ -143,7 +151,7 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def reflectance(form: str, cos: Array, ior: Array) -> Array:
-    """Return Fresnel's reflectance for a cosine of incidence in [0, 1], from outside of index 1."""
+    """Fresnel's reflectance for a cosine of incidence in [0, 1], from outside of index 1."""
     if form == "unity":
         return np.ones_like(cos)
     if form == "schlick":
@@ -156,9 +164,10 @@ def reflectance(form: str, cos: Array, ior: Array) -> Array:
 
 
 def specular_lobe(n: Array, to_light: Array, to_eye: Array, alpha: Array) -> Array:
-    """Return D G / (4 cos cos) for unit vectors above the surface."""
+    """D G / (4 cos cos) for unit vectors above the surface."""
     h = unit(to_light + to_eye)
-    cos2, sin2 = dot(n, h) ** 2, np.square(np.cross(n, h)).sum(axis=-1)
+    cos2 = dot(n, h) ** 2
+    sin2 = np.square(np.cross(n, h)).sum(axis=-1)
     lobe = np.exp(-sin2 / cos2 / alpha**2) / (math.pi * alpha**2 * cos2**2)
     for way in (to_light, to_eye):
         a = np.minimum(dot(n, way) / (alpha * np.linalg.norm(np.cross(n, way), axis=-1)), 1.6)
@@ -176,19 +185,22 @@ Met = tuple[Array, Callable[[Array], tuple[Array, Any]]]
 
 @np.errstate(all="ignore")
 def nearest(things: Sequence[Any], o: Array, d: Array, reach: Any = np.inf) -> tuple[Array, ...]:
-    """Return what rays (origins [N, 3], unit directions [N, 3]) meet first within ``reach``.
+    """The first hits of rays (origins [N, 3], unit directions [N, 3]) within ``reach``.
 
-    That is the distance [N], inf for none; the number of the object [N], -1 for none; its unit normal
+    They have the distance [N], inf for none; the number of the object [N], -1 for none; its unit normal
     [N, 3]; and its diffuse colour [N, 3].
     """
-    t, thing = np.full(len(o), np.inf), np.full(len(o), -1)
+    t = np.full(len(o), np.inf)
+    thing = np.full(len(o), -1)
     n, diffuse = np.zeros((2, len(o), 3))
     for number, one in enumerate(things):
         met, surface = MEET[type(one)](one, o, d)
         k = np.flatnonzero((met < t) & (met < reach))
         if len(k):
             normal, color = surface(k)
-            t[k], thing[k], n[k] = met[k], number, normal
+            t[k] = met[k]
+            thing[k] = number
+            n[k] = normal
             diffuse[k] = one.material.diffuse if color is None else color
     return t, thing, n, diffuse
 
@@ -216,15 +228,20 @@ def _axial(thing: Cone | Cylinder, o: Array, d: Array) -> Met:
     cone = isinstance(thing, Cone)
     first, other = (thing.apex, thing.base_center) if isinstance(thing, Cone) else (thing.p0, thing.p1)
     length = np.linalg.norm(np.subtract(other, first))
-    axis, start = np.subtract(other, first) / length, 0.0 if cone else thing.radius
+    axis = np.subtract(other, first) / length
+    start = 0.0 if cone else thing.radius
     slope = (thing.radius - start) / length
     passed = -dot(o - first, d)  # from where the ray is nearest to the first end
     off = o - first + passed[:, None] * d
-    height, rise = off @ axis, d @ axis
-    across, drift = off - height[:, None] * axis, d - rise[:, None] * axis
-    wide, widening = start + slope * height, slope * rise
+    height = off @ axis
+    rise = d @ axis
+    across = off - height[:, None] * axis
+    drift = d - rise[:, None] * axis
+    wide = start + slope * height
+    widening = slope * rise
     # |across + t drift|² = (wide + t widening)²
-    a, b = dot(drift, drift) - widening**2, dot(across, drift) - wide * widening
+    a = dot(drift, drift) - widening**2
+    b = dot(across, drift) - wide * widening
     c = dot(across, across) - wide**2
     larger = -(b + np.copysign(np.sqrt(b * b - a * c), b))
     side = np.stack([larger / a, c / larger])
@@ -233,7 +250,8 @@ def _axial(thing: Cone | Cylinder, o: Array, d: Array) -> Met:
     discs = np.stack([(length - height) / rise, -height / rise])
     discs[np.linalg.norm(across + discs[..., None] * drift, axis=-1) > thing.radius] = np.inf
     parts = _ahead(passed + np.concatenate([side, discs[: 2 - cone]]))
-    part, t = parts.argmin(axis=0), parts.min(axis=0)
+    part = parts.argmin(axis=0)
+    t = parts.min(axis=0)
 
     def surface(k: Array) -> tuple[Array, None]:
         outwards = unit(across[k] + (t - passed)[k, None] * drift[k])
@@ -245,21 +263,27 @@ def _axial(thing: Cone | Cylinder, o: Array, d: Array) -> Met:
 
 def _mesh(mesh: Mesh, o: Array, d: Array) -> Met:
     corners = np.asarray(mesh.vertices, float)[mesh.faces]
-    corner, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    corner = corners[:, 0]
+    first = corners[:, 1] - corners[:, 0]
+    second = corners[:, 2] - corners[:, 0]
     whole = np.cross(first, second)
-    t, face = np.full(len(o), np.inf), np.zeros(len(o), int)
+    t = np.full(len(o), np.inf)
+    face = np.zeros(len(o), int)
     step = max(1, BATCH // len(corner))
     for part in (slice(i, i + step) for i in range(0, len(o), step)):
-        moment, scale = np.cross(o[part], d[part]), -1 / (d[part] @ whole.T)
+        moment = np.cross(o[part], d[part])
+        scale = -1 / (d[part] @ whole.T)
         u = (moment @ second.T - d[part] @ np.cross(second, corner).T) * scale
         v = -(moment @ first.T + d[part] @ np.cross(corner, first).T) * scale
         far = _ahead((o[part] @ whole.T - dot(whole, corner)) * scale)
         far[~((u >= 0) & (v >= 0) & (u + v <= 1))] = np.inf
-        t[part], face[part] = far.min(axis=1), far.argmin(axis=1)
+        t[part] = far.min(axis=1)
+        face[part] = far.argmin(axis=1)
 
     def surface(k: Array) -> tuple[Array, Any]:
-        """Return normals, and the texels nearest to the points, as stored."""
-        f, normal = face[k], unit(whole[face[k]])
+        """Normals, and the texels nearest to the points, as stored."""
+        f = face[k]
+        normal = unit(whole[face[k]])
         if not mesh.material.texture:
             return normal, None
         off = o[k] + t[k, None] * d[k] - corner[f]
@@ -270,7 +294,8 @@ def _mesh(mesh: Mesh, o: Array, d: Array) -> Met:
         with Image.open(str(mesh.material.texture)) as picture:
             texels = np.asarray(picture.convert("RGB")) / 255
         rows, columns = texels.shape[:2]
-        row, column = (v * (rows - 1) + 0.5).astype(int), (u * (columns - 1) + 0.5).astype(int)
+        row = (v * (rows - 1) + 0.5).astype(int)
+        column = (u * (columns - 1) + 0.5).astype(int)
         return normal, texels[row % rows, column % columns]
 
     return t, surface

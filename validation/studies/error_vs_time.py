@@ -2,34 +2,161 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
+import mitsuba as mi
+
 import mrt_mitsuba as mrt
+from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.work_precision import Findings, describe, error_vs_time
 
 TITLE = "Error against run time"
 
 MODES = ("none", "luma", "sobel", "geometry")
+SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
 PROMISED = 1 / 16 / 255  # a sixteenth of a step of an 8-bit picture
 CUT_OFFS = (0.0, PROMISED, 1 / 255, 4 / 255, 16 / 255)
 DEPTHS = (1, 2, 3, 5, 10)
+BOX = "Cornell box"
 
 Options = dict[str, Any]
+Number = int | str  # of a scene of the report, or ``BOX``
+
+
+@dataclass(frozen=True)
+class Cost:
+    """How much to measure."""
+
+    size: tuple[int, int]  #: of pictures, pixels
+    path_size: tuple[int, int]  #: of those that paths make
+    amounts: tuple[int, ...]  #: of ``aa``
+    most: int  #: ``aa`` of the reference
+    counts: tuple[int, ...]  #: of rays a pixel
+    path_spp: int  #: of the reference by paths
+    repeats: int
+    rounds: tuple[int, ...] = ()  #: rays a pixel where they go to noise
+    targets: tuple[str, ...] = ()
+    samplers: tuple[str, ...] = ()
+    sampler_counts: tuple[int, ...] = (4, 16)
+    lattices: tuple[str, ...] = ("report", "centered")  #: of pixels that are refined
+    cold: bool = True  #: with every case's kernels compiled anew
+
+
+# the references: even multiples of each amount, since odd ones share samples and with them errors
+QUICK = Cost(
+    size=(40, 30),
+    path_size=(40, 30),
+    amounts=(1, 4),
+    most=24,
+    counts=(1, 16),
+    path_spp=256,
+    repeats=1,
+)
+FULL = Cost(
+    size=(400, 300),
+    path_size=(240, 180),
+    amounts=(1, 2, 4, 8),
+    most=48,
+    counts=(1, 4, 16, 64),
+    path_spp=2048,
+    repeats=5,
+    rounds=(8, 16, 64),
+    targets=("4%", "2%", "1%"),
+    samplers=SAMPLERS,
+    sampler_counts=(4, 16, 64),
+)
+DOCS = Cost(
+    size=(120, 90),
+    path_size=(120, 90),
+    amounts=(1, 2, 4, 8),
+    most=32,
+    counts=(),
+    path_spp=256,
+    repeats=3,
+    rounds=(16,),
+    targets=("2%",),
+    samplers=SAMPLERS,
+    lattices=("centered",),
+    cold=False,
+)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A bound on a figure of what was found."""
+
+    what: str
+    figure: Callable[[Findings], float]
+    most: float
+    why: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trade:
+    """Settings to compare in a scene."""
+
+    title: str  #: of the settings
+    truth: str  #: what the reference is
+    scene: Options
+    cases: dict[str, Options]
+    reference: Any
+    shared: Options = field(default_factory=dict)
+    limits: tuple[Limit, ...] = ()
+
+    def measure(self, cost: Cost, progress: Progress | None = None) -> Findings:
+        """Render all cases."""
+        return error_vs_time(
+            self.scene,
+            self.cases,
+            reference=self.reference,
+            shared=self.shared,
+            repeats=cost.repeats,
+            cold=cost.cold,
+            progress=progress,
+        )
 
 
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
+    cost = QUICK if quick else FULL
     jobs = [(name, number) for name in TRADES for number in ((0,) if quick else SCENES[name])]
     for name, number in study.each("Error against time", jobs):
-        trade, where = TRADES[name](number, quick), f"scene {number}, {name}"
-        scene, cases, *titles, bounds = map(trade.pop, ("scene", "cases", "title", "truth", "bounds"))
-        found = error_vs_time(scene, cases, repeats=1 if quick else 5, **trade)
-        describe(study, found, where, f"Scene {number}: {titles[0]}", titles[1])
-        for what, figure, most, why in () if found.failed else bounds:
-            study.at_most(f"{where}: {what}", figure(found), most, why)
-        del scene, found  # what holds them is freed with them
+        trade = TRADES[name](number, cost)
+        found = trade.measure(cost)
+        where = f"{title_of(number).lower()}, {name}"
+        describe(study, found, where, f"{title_of(number)}: {trade.title}", trade.truth)
+        for limit in () if found.failed else trade.limits:
+            study.at_most(f"{where}: {limit.what}", limit.figure(found), limit.most, limit.why)
+        del trade, found  # what holds them is freed with them
+
+
+def choices(number: Number, cost: Cost = DOCS, progress: Progress | None = None) -> dict[str, Findings]:
+    """Measure all that a user can choose in a scene, by a title for each of the two truths.
+
+    ``mrt_whitted`` and ``path`` converge to pictures of their own. The Cornell box has paths alone; scenes
+    whose highlights are so narrow that rare paths rule the error have none, unless ``cost`` is full.
+    """
+    titles = {"sampling": "rays as in the report (mrt_whitted)", "path": "light paths (path)"}
+    trades = ["path"] if number == BOX else ["sampling"]
+    if number in CALM or (cost is FULL and number != BOX):
+        trades = list(titles)
+    return {
+        f"{title_of(number)}: {titles[name]}": TRADES[name](number, cost).measure(cost, progress)
+        for name in trades
+    }
+
+
+def advice(panels: Mapping[str, Findings]) -> list[dict[str, Any]]:
+    """Return rows that say what to use to get to an error, for each title of ``choices``."""
+    return [{"": title, **row} for title, found in panels.items() for row in found.advice()]
+
+
+def title_of(number: Number) -> str:
+    """Return a scene's name."""
+    return f"Scene {number}" if isinstance(number, int) else number
 
 
 def rmse(found: Findings, case: str) -> float:
@@ -37,50 +164,76 @@ def rmse(found: Findings, case: str) -> float:
     return found.points[case].rmse
 
 
-def judged(case: str) -> tuple[Any, ...]:
-    """Return the bound of the reference's error, by the case of least error."""
-    why = "then it changes no error by more than an eighth, and the judge is better than the judged"
-    what = "error of the reference / least error it judges"
-    return what, lambda found: found.reference_error / rmse(found, case), 0.5, why
+def judged(case: str) -> Limit:
+    """Return the limit of the reference's error, by the case of least error."""
+    return Limit(
+        "error of the reference / least error it judges",
+        lambda found: found.reference_error / rmse(found, case),
+        0.5,
+        "then it changes no error by more than an eighth, and the judge is better than the judged",
+    )
 
 
-def _scene(number: int, quick: bool, **options: Any) -> Options:
-    """Return a scene of the report as a dict."""
-    width, height = (40, 30) if quick else (240, 180)
-    return mrt.scene_dict(number, width=width, height=height, **options)
+def _scene(number: Number, size: tuple[int, int], **options: Any) -> Options:
+    """Return a scene of the report, or Mitsuba's Cornell box, as a dict."""
+    width, height = size
+    if isinstance(number, int):
+        return mrt.scene_dict(number, width=width, height=height, **options)
+    box: Options = mi.cornell_box()
+    box["sensor"]["film"] |= {"width": height, "height": height}
+    return box
 
 
-# Each returns arguments of ``error_vs_time``; titles of settings and reference; "bounds": what, a figure of
-# the findings, the most, why
-def sampling(number: int, quick: bool) -> Options:
+def _with_sampler(nodes: Options, sampler: str) -> Options:
+    return nodes | {"sensor": nodes["sensor"] | {"sampler": {"type": sampler}}}
+
+
+def _rounds(cost: Cost, **options: Any) -> dict[str, Options]:
+    """Return renders whose rays go to noise, so many of them or to an error."""
+    own = {"aa": None, "lattice": None, **options}
+    most = 2 * max(cost.rounds, default=1)
+    cases = {f"aamode=noise spp={spp}": {**own, "aamode": "noise", "spp": spp} for spp in cost.rounds}
+    aims = {f"target={aim}": {**own, "aamode": None, "target": aim, "maxspp": most} for aim in cost.targets}
+    return cases | aims
+
+
+def sampling(number: int, cost: Cost) -> Trade:
     """Return which pixels get how many samples, and where in the pixel."""
-    # the reference: an even multiple of each, since odd ones share samples and with them errors
-    amounts, most = ((1, 4), 24) if quick else ((1, 2, 4, 8), 48)
-    least, greatest = amounts[0], amounts[-1]
-    ends = (("none", least), ("none", greatest), ("sobel", greatest))
-    few, many, edges = (f"{mode} aa={aa} centered" for mode, aa in ends)
+    least = cost.amounts[0]
+    greatest = cost.amounts[-1]
+    few, many = (f"none aa={aa} centered" for aa in (least, greatest))
+    edges = f"sobel aa={greatest} centered"
     why = "an edge of the lattice is known to 1 / aa; twice that: samples that do not help leave 1"
-    return {
-        "scene": _scene(number, quick),
-        "title": "anti-aliasing mode, aa and lattice",
-        "truth": f"{most}x{most} centered samples a pixel; its error: that of three quarters of {most}",
-        "cases": {
-            f"{mode} aa={aa} {lattice}": {"aa": aa, "aamode": mode, "lattice": lattice}
-            for lattice in ("report", "centered")
-            for mode in MODES
-            for aa in amounts
-            if aa > 1 or mode == "none"
-        },
-        "reference": [{"aa": aa, "aamode": "none", "lattice": "centered"} for aa in (most, most * 3 // 4)],
-        "bounds": [
-            (f"RMSE of {many} / {few}", lambda f: rmse(f, many) / rmse(f, few), 2 * least / greatest, why),
-            (f"RMSE of {edges} / {few}", lambda f: rmse(f, edges) / rmse(f, few), 2 * least / greatest, why),
-            judged(many),
-        ],
+    cases = {
+        f"{mode} aa={aa} {lattice}": {"aa": aa, "aamode": mode, "lattice": lattice, "focaldist": 0}
+        for lattice in ("report", "centered")
+        for mode in MODES
+        for aa in cost.amounts
+        if mode == "none" or (aa > 1 and lattice in cost.lattices)
     }
 
+    def against_few(case: str) -> Limit:
+        return Limit(
+            f"RMSE of {case} / {few}",
+            lambda found: rmse(found, case) / rmse(found, few),
+            2 * least / greatest,
+            why,
+        )
 
-def whitted(number: int, quick: bool) -> Options:
+    return Trade(
+        title="anti-aliasing mode, aa and lattice",
+        truth=f"{cost.most}x{cost.most} centered samples a pixel; its error: that of three quarters of them",
+        scene=_scene(number, cost.size),
+        cases=cases | _rounds(cost, focaldist=0),
+        reference=[
+            {"aa": aa, "aamode": "none", "lattice": "centered", "focaldist": 0}
+            for aa in (cost.most, cost.most * 3 // 4)
+        ],
+        limits=(against_few(many), against_few(edges), judged(many)),
+    )
+
+
+def whitted(number: int, cost: Cost) -> Trade:
     """Return cut-off, bounce limit and form of the Fresnel factor, at the same samples."""
 
     def integrator(**parameters: Any) -> Options:
@@ -90,48 +243,65 @@ def whitted(number: int, quick: bool) -> Options:
     default = list(cases)[1]
     cases |= {f"max_depth={depth}": integrator(max_depth=depth) for depth in DEPTHS}
     first, last = (f"max_depth={depth}" for depth in (DEPTHS[0], DEPTHS[-1]))
-    what, why = "largest error of the default cut-off", "as promised; one 16 times too large leaves more"
-    seen = "seen is 6e-4 (scene 9) and above; a limit that has no effect leaves 0"
-    return {
-        "scene": _scene(number, quick, fresnel="dielectric"),
-        "title": "cut-off, bounce limit, Fresnel form",
-        "truth": "no cut-off, max_depth=10, exact Fresnel, the same rays",
-        "cases": {**cases, "fresnel=schlick": {"scene": _scene(number, quick)}},
-        "reference": integrator(min_contribution=0.0),
-        "shared": {"aa": 2, "aamode": "none", "lattice": "report"},
-        "bounds": [
-            (what, lambda f: f.points[default].difference.largest, PROMISED, why),
-            (f"RMSE of {last} - that of {first}", lambda f: rmse(f, last) - rmse(f, first), -3e-4, seen),
-        ],
-    }
+    return Trade(
+        title="cut-off, bounce limit, Fresnel form",
+        truth="no cut-off, max_depth=10, exact Fresnel, the same rays",
+        scene=_scene(number, cost.path_size, fresnel="dielectric"),
+        cases={**cases, "fresnel=schlick": {"scene": _scene(number, cost.path_size)}},
+        reference=integrator(min_contribution=0.0),
+        shared={"aa": 2, "aamode": "none", "lattice": "report"},
+        limits=(
+            Limit(
+                "largest error of the default cut-off",
+                lambda found: found.points[default].difference.largest,
+                PROMISED,
+                "as promised; one 16 times too large leaves more",
+            ),
+            Limit(
+                f"RMSE of {last} - that of {first}",
+                lambda found: rmse(found, last) - rmse(found, first),
+                -3e-4,
+                "seen is 6e-4 (scene 9) and above; a limit that has no effect leaves 0",
+            ),
+        ),
+    )
 
 
-def path(number: int, quick: bool) -> Options:
+def path(number: Number, cost: Cost) -> Trade:
     """Return Mitsuba's path and direct at rising spp, and mrt_whitted, against converged path."""
-    counts, most = ((1, 16), 256) if quick else ((1, 4, 16, 64), 2048)
-    few, many = (f"path spp={spp}" for spp in (counts[0], counts[-1]))
-    gain = (counts[-1] / counts[0]) ** 0.5
-    what = f"|RMSE of {many} / {few} / theory - 1|"
-    why = "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15"
-    return {
-        "scene": _scene(number, quick),
-        "title": "Whitted, direct and path at rising spp",
-        "truth": f"path with spp={most}",
-        "cases": {
-            **{f"{k} spp={n}": {"integrator": k, "spp": n} for k in ("path", "direct") for n in counts},
-            "mrt_whitted": {},
-            "mrt_whitted, no clamp": {"integrator": {"type": "mrt_whitted", "clamp": False}},
-        },
-        "reference": {"integrator": "path", "spp": most},
-        "shared": {"aa": 1, "aamode": "none"},
-        "bounds": [
-            (what, lambda f: abs(rmse(f, many) / rmse(f, few) * gain - 1), 0.15, why),
-            judged(many),
-        ],
-    }
+    nodes = _scene(number, cost.path_size)
+    kinds = ("path", "direct") if number in CALM else ("path",)
+    cases = {f"{kind} spp={spp}": {"integrator": kind, "spp": spp} for kind in kinds for spp in cost.counts}
+    for sampler in cost.samplers:
+        own = {"scene": _with_sampler(nodes, sampler), "integrator": "path"}
+        cases |= {f"{sampler} spp={spp}": {**own, "spp": spp} for spp in cost.sampler_counts}
+    if number in CALM and cost.counts:
+        cases["mrt_whitted"] = {}
+        cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
+    limits: tuple[Limit, ...] = ()
+    if number in CALM and cost.counts:
+        few, many = (f"path spp={spp}" for spp in (cost.counts[0], cost.counts[-1]))
+        gain = (cost.counts[-1] / cost.counts[0]) ** 0.5
+        by_theory = Limit(
+            f"|RMSE of {many} / {few} / theory - 1|",
+            lambda found: abs(rmse(found, many) / rmse(found, few) * gain - 1),
+            0.15,
+            "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15",
+        )
+        limits = (by_theory, judged(many))
+    return Trade(
+        title="Whitted, direct and path at rising spp",
+        truth=f"path with spp={cost.path_spp}",
+        scene=nodes,
+        cases=cases | _rounds(cost, integrator="path"),
+        reference={"integrator": "path", "spp": cost.path_spp},
+        shared={"aa": 1, "aamode": "none"},
+        limits=limits,
+    )
 
 
-TRADES: dict[str, Callable[[int, bool], Options]] = {"sampling": sampling, "whitted": whitted, "path": path}
+TRADES: dict[str, Callable[[Any, Cost], Trade]] = {"sampling": sampling, "whitted": whitted, "path": path}
 ALL = (0, 1, 2, 3, 4, 7, 9)
 # Under path, scenes of broad highlights: elsewhere rare, very bright paths rule every mean square
-SCENES = {"sampling": ALL, "whitted": ALL, "path": (0, 7, 9)}
+CALM = (0, 7, 9)
+SCENES: dict[str, tuple[Number, ...]] = {"sampling": ALL, "whitted": ALL, "path": (*ALL, BOX)}

@@ -31,7 +31,8 @@ TITLE = "Filters: edges against noise, blur against a lens"
 BLURS = ("report", "corrected")
 # Luma contrast of a 3x3 neighbourhood in the converged picture: below, nothing is worth refining; above, it
 # is an edge
-FLAT, EDGE = 0.02, 0.2
+FLAT = 0.02
+EDGE = 0.2
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -51,16 +52,17 @@ def noise(study: Study, *, quick: bool) -> None:
     # scene 0 in Mitsuba's own plugins, lit by a small sphere instead of two points
     stock = mrt.scene_dict(0, width=width, height=height, flavor="stock")
     lamp = {"type": "area", "radiance": {"type": "rgb", "value": 30.0}}
-    scene = load({name: node for name, node in stock.items() if not name.startswith("light")} | {
-        "light": {"type": "sphere", "center": [1, 2, 0.5], "radius": 0.3, "emitter": lamp},
-        "sky": {"type": "constant", "radiance": 0.2},
-        "integrator": {"type": "path", "max_depth": 4},
-    })  # fmt: skip
+    nodes = {name: node for name, node in stock.items() if not name.startswith("light")}
+    nodes["light"] = {"type": "sphere", "center": [1, 2, 0.5], "radius": 0.3, "emitter": lamp}
+    nodes["sky"] = {"type": "constant", "radiance": 0.2}
+    nodes["integrator"] = {"type": "path", "max_depth": 4}
+    scene = load(nodes)
     # where the detectors look
     truth = mrt.render(scene, **AT_CENTRES, spp=16 * counts[-1], seed=78).image
     luma = np.sqrt(truth @ np.array(filters.edges.LUMA_WEIGHTS, np.float32))
     contrast = np.ptp(np.lib.stride_tricks.sliding_window_view(luma, (3, 3)), axis=(2, 3))
-    flat, edge = contrast < FLAT, contrast > EDGE
+    flat = contrast < FLAT
+    edge = contrast > EDGE
     rows: list[dict[str, Any]] = []
     for detector, find in (("luma", filters.luma_edges), ("sobel", filters.sobel_edges)):
         for spp in counts:
@@ -72,17 +74,15 @@ def noise(study: Study, *, quick: bool) -> None:
     note = f"Flat: luma contrast below {FLAT} in the converged picture; edges: above {EDGE}. Blind: the same "
     note += "flat pixels for a detector that does not know the variance."
     study.records("noise", "Does a detector chase noise? Share of pixels refined", rows, note)
-    for hold, what, figure, limit, why in (
-        (study.at_most, "share of flat pixels refined, 4 rays a pixel or more",
-         np.max([row["flat"] for row in rows if row["rays a pixel"] >= 4]), 0.03,
-         "three deviations: 0.3 % for one normal value; estimated from 4 samples, tails are longer"),
-        (study.at_least, "share of edges found with 16 rays",
-         min(row["edges"] for row in rows if row["rays a pixel"] == 16), 0.55,
-         "noise of 0.03, edges from a contrast of 0.2: at three deviations either way, most of them"),
-        (study.at_least, "the same flat pixels without the variance", min(row["blind"] for row in rows), 0.3,
-         "shows that there is noise to chase"),
-    ):  # fmt: skip
-        hold(f"noise: {what}", figure, limit, why)
+    refined_flat = np.max([row["flat"] for row in rows if row["rays a pixel"] >= 4])
+    why = "three deviations: 0.3 % for one normal value; estimated from 4 samples, tails are longer"
+    study.at_most("noise: share of flat pixels refined, 4 rays a pixel or more", refined_flat, 0.03, why)
+    refined_edges = min(row["edges"] for row in rows if row["rays a pixel"] == 16)
+    why = "noise of 0.03, edges from a contrast of 0.2: at three deviations either way, most of them"
+    study.at_least("noise: share of edges found with 16 rays", refined_edges, 0.55, why)
+    blind_flat = min(row["blind"] for row in rows)
+    why = "shows that there is noise to chase"
+    study.at_least("noise: the same flat pixels without the variance", blind_flat, 0.3, why)
 
 
 def depth_of_field(study: Study, *, quick: bool) -> None:
@@ -97,19 +97,20 @@ def depth_of_field(study: Study, *, quick: bool) -> None:
         focus: dict[str, Any] = {"focal_distance": scene.focal_distance, "focal_range": scene.focal_range}
         pictures = {"sharp": sharp.image}
         pictures |= {mode: filters.gaussian_dof(sharp.image, depth, **focus, mode=mode) for mode in BLURS}
-        nodes, lens = scene.to_dict(width=width, height=height), fit_lens(scene, depth)
+        nodes = scene.to_dict(width=width, height=height)
+        lens = fit_lens(scene, depth)
         nodes["sensor"] |= {"type": "thinlens", **lens}
         one, other = (mrt.render(nodes, **options, spp=spp, seed=seed).image for seed in (1, 100_001))
         truth = (one + other) / 2
         errors = {f"RMSE, {mode}": rmse(picture, truth) for mode, picture in pictures.items()}
         sharp_error, report, corrected = errors.values()
-        left, worse = rmse(one, other) / 2, "a correction that is worse is none"
-        for what, figure, limit, why in (
-            ("RMSE of corrected / report", corrected / report, 1, worse),
-            ("RMSE of corrected / no blur at all", corrected / sharp_error, 1, worse),
-            ("noise of the lens / RMSE of corrected", left / corrected, 0.5, "else noise would be compared"),
-        ):
-            study.at_most(f"scene {number}: {what}", figure, limit, why)
+        left = rmse(one, other) / 2
+        worse = "a correction that is worse is none"
+        where = f"scene {number}: "
+        study.at_most(f"{where}RMSE of corrected / report", corrected / report, 1, worse)
+        study.at_most(f"{where}RMSE of corrected / no blur at all", corrected / sharp_error, 1, worse)
+        why = "else noise would be compared"
+        study.at_most(f"{where}noise of the lens / RMSE of corrected", left / corrected, 0.5, why)
         rows.append({"scene": number, **errors, **lens})
         sheet = np.concatenate([*pictures.values(), truth], axis=1)
         caption = f"Left to right: {', '.join(pictures)}, thinlens."
@@ -120,7 +121,8 @@ def depth_of_field(study: Study, *, quick: bool) -> None:
 def fit_lens(scene: Scene, depth: np.ndarray) -> dict[str, float]:
     """Return the lens whose discs are nearest to the report's blur of these hit distances [H, W]."""
     amount = filters.blur_amount(depth, focal_distance=scene.focal_distance, focal_range=scene.focal_range)
-    radius, hit = disc_radius(np.asarray(amount, np.float64)), np.isfinite(depth)
+    radius = disc_radius(np.asarray(amount, np.float64))
+    hit = np.isfinite(depth)
     signed = np.where(depth < scene.focal_distance, -radius, radius)[hit]
     (a, b), *_ = np.linalg.lstsq(np.stack([np.ones(hit.sum()), -1 / depth[hit]], axis=1), signed, rcond=None)
     pixels = depth.shape[1] / (2 * math.tan(math.radians(scene.camera.hfov) / 2))

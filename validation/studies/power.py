@@ -1,8 +1,12 @@
-"""The power of the laws: for each, the least of faults of many sizes that it finds, quick and in full."""
+"""The power of the laws: for each, the least of faults of many sizes that it finds, quick and in full.
+
+A new row is a ``Fault`` in one of the tables at the end, with a function of its size and of what it changes.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -12,56 +16,99 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.checks.bsdf import check_bsdf
-from mrt_mitsuba.validation.checks.law import Check
+from mrt_mitsuba.validation.checks.emitter import check_emitter
+from mrt_mitsuba.validation.checks.law import Check, Description
 from mrt_mitsuba.validation.checks.shape import check_shape
 
-AS_IS: tuple[dict[str, Any], str, Any] = ({}, "", lambda value, *_: value)
+Answer = Any  # of a plugin: numbers, or a record of some
+Change = Callable[..., Answer]
+Changes = tuple[Description, str, Any]  # the BSDF that is changed, the kind of change, and the change
 
 
-def changed_bsdf(changes: Mapping[str, tuple[dict[str, Any], str, Any]]) -> type:
-    """Return a class of BSDFs whose answers are those of another, changed: for ``register_bsdf``.
+def unchanged(value: Answer, *_: Answer) -> Answer:
+    return value
+
+
+AS_IS: Changes = ({}, "", unchanged)
+
+
+def changed_bsdf(changes: Mapping[str, Changes]) -> type:
+    """A class of BSDFs whose answers are those of another, changed: for ``register_bsdf``.
 
     ``changes``: by name, the dict of the BSDF, what is changed, and a function: of (value, ctx, wi, wo) for
     "eval", "pdf", what eval_pdf() alone gives ("pair"), or values and weights ("value"); of (bs, weight, u,
-    ctx) for "sample". "flags" are added, to components as well or to the "whole" alone; "active" is
-    overlooked; an "update" adds a component.
+    ctx) for "sample"; of the random numbers u for "u"; of ctx for "context". "flags" are added, to components
+    as well or to the "whole" alone; "active" is overlooked; an "update" adds a component.
     """
 
     class Changed(mi.BSDF):
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             mi.BSDF.__init__(self, props)
-            self.nested, name = props["nested"], props["change"]
-            _, self.kind, self.change = changes.get(name, AS_IS)[:3]
+            self.nested = props["nested"]
+            _, self.kind, self.change = changes.get(props["change"], AS_IS)[:3]
             more = self.change if self.kind == "flags" else 0
             count = self.nested.component_count()
             self.m_components = [int(self.nested.flags(i)) | more for i in range(count)]
-            self.m_flags = int(self.nested.flags()) | (self.change if self.kind in ("flags", "whole") else 0)
+            self.m_flags = int(self.nested.flags())
+            if self.kind in ("flags", "whole"):
+                self.m_flags |= self.change
 
-        def traverse(self, callback: Any) -> None:
+        def traverse(self, callback: mi.TraversalCallback) -> None:
             callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             if self.kind == "update":
                 self.m_components = [*self.m_components, self.m_flags]
 
-        def changed(self, kinds: Sequence[str], value: Any, *where: Any) -> Any:
+        def changed(self, kinds: Sequence[str], value: Answer, *where: Answer) -> Answer:
             return self.change(value, *where) if self.kind in kinds else value
 
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            value = self.nested.eval(ctx, si, wo, True if self.kind == "active" else active)
+        def eval(
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            wo: mi.Vector3f,
+            active: mi.Mask = True,
+        ) -> mi.Spectrum:
+            asked = self.changed(("context",), ctx)
+            value = self.nested.eval(asked, si, wo, True if self.kind == "active" else active)
             return self.changed(("eval", "value"), value, ctx, si.wi, wo)
 
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.changed(("pdf",), self.nested.pdf(ctx, si, wo, active), ctx, si.wi, wo)
+        def pdf(
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            wo: mi.Vector3f,
+            active: mi.Mask = True,
+        ) -> mi.Float:
+            asked = self.changed(("context",), ctx)
+            return self.changed(("pdf",), self.nested.pdf(asked, si, wo, active), ctx, si.wi, wo)
 
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        def eval_pdf(
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            wo: mi.Vector3f,
+            active: mi.Mask = True,
+        ) -> tuple[mi.Spectrum, mi.Float]:
             pair = self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
             return self.changed(("pair",), pair, ctx, si.wi, wo)
 
-        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
-            bs, weight = self.nested.sample(ctx, si, sample1, sample2, active)
+        def sample(
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            sample1: mi.Float,
+            sample2: mi.Point2f,
+            active: mi.Mask = True,
+        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+            asked = self.changed(("context",), ctx)
+            u = self.changed(("u",), sample2)
+            bs, weight = self.nested.sample(asked, si, sample1, u, active)
             weight = self.changed(("value",), weight, ctx, si.wi, bs.wo)
-            return self.change(bs, weight, sample2, ctx) if self.kind == "sample" else (bs, weight)
+            if self.kind == "sample":
+                return self.change(bs, weight, sample2, ctx)
+            return bs, weight
 
         def to_string(self) -> str:
             return f"Changed[{self.kind}]"
@@ -76,63 +123,121 @@ SAMPLED = ("surface_area", "sample_position", "pdf_position", "sample_direction"
 class ChangedShape:
     """A shape some of whose methods are changed: functions of what they return and of their arguments."""
 
-    def __init__(self, given: Any = None, **changes: Callable[..., Any]) -> None:
+    def __init__(self, given: Description | None = None, **changes: Change) -> None:
         self.shape = mi.load_dict(given or {"type": "cube"})
         self.scene = mi.load_dict({"type": "scene", "shape": self.shape})
         self.changes = changes
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Change:
         if name not in TRACED + SAMPLED:
             raise AttributeError(name)
         sound = getattr(self.scene if name in TRACED else self.shape, name)
-        change = self.changes.get(name, AS_IS[2])
+        change = self.changes.get(name, unchanged)
         return lambda *given: change(sound(*given), *given)
 
 
-def put(record: Any, **members: Any) -> Any:
-    """Return a hit or a sample with other values of some members."""
+def changed_sky(changes: Mapping[str, Change]) -> type:
+    """A class of emitters, constant all around but for changes of what its methods return.
+
+    ``changes``: functions of the samples of directions and their random numbers ("direction"), of their
+    weights and these ("weight"), of densities and the directions ("pdf"), of what eval_direction() ("value")
+    and eval() ("seen") return.
+    """
+
+    def changed(kind: str, value: Answer, *more: Answer) -> Answer:
+        return changes[kind](value, *more) if kind in changes else value
+
+    class Sky(mi.Emitter):
+        def __init__(self, props: mi.Properties) -> None:
+            mi.Emitter.__init__(self, props)
+            self.m_flags = mi.EmitterFlags.Infinite
+            self.sound = mi.load_dict({"type": "constant"})
+
+        def eval(self, si: mi.SurfaceInteraction3f, active: mi.Mask = True) -> mi.Spectrum:
+            return changed("seen", self.sound.eval(si, active))
+
+        def sample_direction(
+            self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Mask = True
+        ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+            ds, weight = self.sound.sample_direction(it, sample, active)
+            ds.emitter = mi.EmitterPtr(self)
+            return changed("direction", ds, sample), changed("weight", weight, sample)
+
+        def pdf_direction(
+            self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Mask = True
+        ) -> mi.Float:
+            return changed("pdf", self.sound.pdf_direction(it, ds, active), ds)
+
+        def eval_direction(
+            self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Mask = True
+        ) -> mi.Spectrum:
+            return changed("value", self.sound.eval_direction(it, ds, active))
+
+        def bbox(self) -> mi.BoundingBox3f:
+            return mi.ScalarBoundingBox3f()
+
+        def to_string(self) -> str:
+            return "Sky"
+
+    return Sky
+
+
+def put(record: Answer, **members: Answer) -> Answer:
+    """A hit or a sample with other values of some members."""
     for name, value in members.items():
         setattr(record, name, value)
     return record
 
 
+@dataclass(frozen=True)
 class Fault:
     """A fault in words, with the figure of a law that should find it.
 
     ``full`` and ``quick``: the least size that such checks find, as docs/check_your_plugin.md states.
-    ``changes``: by a kind of ``changed_bsdf`` or methods of ``ChangedShape``, functions of the size and of
-    what is changed; ``nested``: what is changed, if not a diffuse BSDF or a cube.
+    ``changes``: by a kind of ``changed_bsdf`` or ``changed_sky``, or methods of ``ChangedShape``, functions
+    of the size and of what is changed; ``nested``: what is changed, if not a diffuse BSDF or a cube.
     """
 
-    def __init__(
-        self, figure: str, what: str, full: float, *, quick: float = 0, nested: Any = None, **changes: Any
-    ) -> None:
-        self.figure, self.what, self.full, self.quick = figure, what, full, quick or full
-        self.nested, self.changes = nested, changes
-        self.kind = "shape" if changes.keys() <= {*TRACED, *SAMPLED} else "BSDF"
+    figure: str
+    what: str
+    full: float
+    changes: Mapping[str, Change]
+    quick: float | None = None  # as in full
+    nested: Description | None = None
+    kind: str = "BSDF"
+
+    @property
+    def least_quick(self) -> float:
+        return self.full if self.quick is None else self.quick
 
     def check(self, size: float, *, quick: bool) -> Check:
         """Check a plugin with the fault by the law of its figure. Needs ``register``."""
-        changes, law = {kind: partial(change, size) for kind, change in self.changes.items()}, self.figure
-        options: dict[str, Any] = {"only": [law.split(".")[0]], "quick": quick}
+        changes = {kind: partial(change, size) for kind, change in self.changes.items()}
+        only = [self.figure.split(".")[0]]
         if self.kind == "shape":
-            return check_shape(ChangedShape(self.nested, **changes), **options)
-        nested, name = self.nested or {"type": "diffuse"}, f"{self.what} {size}"
-        FAULTY[name] = (nested, *next(iter(changes.items())))
-        return check_bsdf({"type": "faulty", "change": name, "nested": nested}, **options)
+            return check_shape(ChangedShape(self.nested, **changes), only=only, quick=quick)
+        if self.kind == "emitter":
+            mi.register_emitter("faulty_sky", changed_sky(changes))
+            return check_emitter({"type": "faulty_sky"}, only=only, quick=quick)
+        nested = self.nested or {"type": "diffuse"}
+        name = f"{self.what} {size}"
+        ((kind, change),) = changes.items()
+        FAULTY[name] = (nested, kind, change)
+        return check_bsdf({"type": "faulty", "change": name, "nested": nested}, only=only, quick=quick)
 
     def least_found(self, *, quick: bool) -> float:
-        """Return the least size down to which it is found, by steps; infinity for none."""
+        """The least size that fails, tried from three times that in the table down; infinity for none."""
         least = np.inf
-        for factor in (3, 2, 1, 0.5, 0.3, 0.1):
-            size = factor * (self.quick if quick else self.full)
+        for factor in FACTORS:
+            size = factor * (self.least_quick if quick else self.full)
             if np.isinf(size) or not self.check(size, quick=quick).failed:
                 break
             least = size
         return float(least)
 
 
-FAULTY: dict[str, tuple[dict[str, Any], str, Any]] = {}  # by name, the changes of the BSDF "faulty"
+FACTORS = (3, 2, 1, 0.5, 0.3, 0.1)
+FAULTY: dict[str, Changes] = {}  # by name, the changes of the BSDF "faulty"
 
 
 def register(*variants: str) -> None:
@@ -142,132 +247,603 @@ def register(*variants: str) -> None:
         mi.register_bsdf("faulty", changed_bsdf(FAULTY))
 
 
-GLASS, GLOSS = {"type": "dielectric"}, {"type": "roughconductor", "alpha": 0.2}
+GLASS = {"type": "dielectric"}
+GLOSS = {"type": "roughconductor", "alpha": 0.2}
 SIZE = 2 * 3**0.5  # of the cube: its diagonal
 DEGREE = 0.01745
 PLACE = (0.48, 0.36, 0.8)  # a direction away from all axes
 
+# ------------------------------------ Changes, of a size and a value -----------------------------------
 
-def tilted(n: Any, size: float) -> Any:
-    """Return normals tilted by an angle."""
+
+def larger(size: float, value: Answer, *_: Answer) -> Answer:
+    return (1 + size) * value
+
+
+def smaller(size: float, value: Answer, *_: Answer) -> Answer:
+    return value / (1 + size)
+
+
+def member(name: str, change: Change) -> Change:
+    """A change of a member of a record; what comes with the record stays."""
+
+    def apply(size: float, record: Answer, *given: Answer) -> Answer:
+        return put(record, **{name: change(size, getattr(record, name))})
+
+    return apply
+
+
+def of_sample(change: Change) -> Change:
+    """A change of records as one of the samples of a BSDF, whose weight stays."""
+
+    def apply(size: float, bs: mi.BSDFSample3f, weight: mi.Spectrum, *_: Answer) -> Answer:
+        return change(size, bs), weight
+
+    return apply
+
+
+def of_weight(change: Change) -> Change:
+    """A change of the weights of samples of a BSDF, by their random numbers."""
+
+    def apply(size: float, bs: mi.BSDFSample3f, weight: mi.Spectrum, u: mi.Point2f, _: Answer) -> Answer:
+        return bs, change(size, weight, u)
+
+    return apply
+
+
+def in_tenth(size: float, pdf: mi.Float, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Float:
+    """Larger where a tenth of the samples of a diffuse BSDF go."""
+    return pdf * dr.select(wo.x > 0.687, 1 + size, 1)
+
+
+def in_cone(size: float, pdf: mi.Float, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Float:
+    inside = dr.norm(wo - mi.Vector3f(PLACE)) < DEGREE
+    return pdf * dr.select(inside, 1 - min(size, 0.9), 1)
+
+
+def no_density(size: float, pdf: mi.Float, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Float:
+    """0 in a slice of azimuth, so many degrees wide."""
+    azimuth = dr.atan2(wo.y, wo.x)
+    return dr.select((azimuth > 1) & (azimuth < 1 + size * DEGREE), 0, pdf)
+
+
+def around_slice(size: float, bs: mi.BSDFSample3f) -> mi.BSDFSample3f:
+    """Samples of a diffuse BSDF that keep out of a slice of azimuth, so many degrees wide."""
+    azimuth = dr.atan2(bs.wo.y, bs.wo.x)
+    slice_ = size * DEGREE
+    squeezed = 1 + slice_ + (azimuth + dr.pi) * (1 - slice_ / (2 * dr.pi))
+    radius = dr.hypot(bs.wo.x, bs.wo.y)
+    wo = mi.Vector3f(radius * dr.cos(squeezed), radius * dr.sin(squeezed), bs.wo.z)
+    return put(bs, wo=wo)
+
+
+def stairs_of(size: float, u: mi.Point2f) -> mi.Point2f:
+    """Random numbers in steps."""
+    return mi.Point2f(dr.floor(u.x / size) * size, u.y)
+
+
+def no_number(size: float, weight: mi.Spectrum, u: mi.Point2f) -> mi.Spectrum:
+    """NaN for a share of the random numbers."""
+    return dr.select((u.x > 0.3) & (u.x < 0.3 + size), dr.nan, weight)
+
+
+def no_number_at_the_end(size: float, weight: mi.Spectrum, u: mi.Point2f) -> mi.Spectrum:
+    return dr.select(u.x > 1 - size, dr.nan, weight)
+
+
+def weight_in_stairs(size: float, weight: mi.Spectrum, u: mi.Point2f) -> mi.Spectrum:
+    odd = dr.floor(16 * u.x) - 2 * dr.floor(8 * u.x)
+    return weight * (1 + size * odd)
+
+
+def first_channel(size: float, pair: tuple[mi.Spectrum, mi.Float], *_: Answer) -> Answer:
+    value, pdf = pair
+    return value * mi.Color3f(1 + size, 1, 1), pdf
+
+
+def density_of_pair(size: float, pair: tuple[mi.Spectrum, mi.Float], *_: Answer) -> Answer:
+    value, pdf = pair
+    return value, (1 + size) * pdf
+
+
+def too_bright(size: float, value: mi.Spectrum, *_: Answer) -> mi.Spectrum:
+    """A diffuse BSDF of albedo 0.5 that reflects more than arrives."""
+    return 2 * (1 + size) * value
+
+
+def with_cosine(
+    size: float, value: mi.Spectrum, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f
+) -> Answer:
+    return value * (1 + size * wi.z)
+
+
+def from_one_side(
+    size: float, value: mi.Spectrum, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f
+) -> Answer:
+    return value * (1 + size * (wi.z > 0))
+
+
+def by_mode(size: float, value: mi.Spectrum, ctx: mi.BSDFContext, *_: Answer) -> mi.Spectrum:
+    """Larger in the mode of importance."""
+    return value * (1 + size * (ctx.mode == mi.TransportMode.Importance))
+
+
+def by_component(size: float, value: mi.Spectrum, ctx: mi.BSDFContext, *_: Answer) -> mi.Spectrum:
+    return value * (1 + size * (ctx.component == 0))
+
+
+def by_mask(size: float, value: mi.Spectrum, ctx: mi.BSDFContext, *_: Answer) -> mi.Spectrum:
+    """Larger where lobes are asked for by their types."""
+    every = mi.BSDFContext().type_mask
+    return value * (1 + size * (ctx.type_mask != every))
+
+
+def without_mask(size: float, ctx: mi.BSDFContext) -> mi.BSDFContext:
+    """The types of lobes are ignored, whatever the size."""
+    other = mi.BSDFContext()
+    other.mode = ctx.mode
+    other.component = ctx.component
+    return other
+
+
+def by_variant(size: float, value: mi.Spectrum, *_: Answer) -> mi.Spectrum:
+    """Larger in scalar variants."""
+    return value if dr.is_jit_v(value) else (1 + size) * value
+
+
+def negative_next_to_normal(
+    size: float, value: mi.Spectrum, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f
+) -> mi.Spectrum:
+    return dr.select(dr.minimum(wi.z, wo.z) > 1 - size, -1, 1) * value
+
+
+def stairs_on_slope(
+    size: float, value: mi.Spectrum, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f
+) -> mi.Spectrum:
+    slope = wi.z * wo.z / size
+    return value * (1 + size * (dr.round(slope) - slope))
+
+
+def steeper(size: float, value: mi.Spectrum, *_: Answer) -> mi.Spectrum:
+    """The same number, with a larger derivative."""
+    return value + size * (value - dr.detach(value))
+
+
+def tilted(size: float, n: mi.Normal3f) -> mi.Normal3f:
+    """Normals tilted by an angle."""
     return dr.normalize(n + size * mi.Normal3f(0.6, 0.48, 0.64))
 
 
-def by_mode(s: float, value: Any, ctx: Any, wi: Any, wo: Any) -> Any:
-    """Return values that are larger in the mode of importance."""
-    return value * (1 + s * (ctx.mode == mi.TransportMode.Importance))
+def tilted_frame(size: float, frame: mi.Frame3f) -> mi.Frame3f:
+    return mi.Frame3f(tilted(size, frame.n))
 
 
-FAULTS: Sequence[Fault] = (
-    Fault("sampling.cells", "density too large where a tenth of the samples go", 0.03, quick=0.1,
-          pdf=lambda s, pdf, ctx, wi, wo: pdf * dr.select(wo.x > 0.687, 1 + s, 1)),
-    Fault("sampling.small", "density too small in a cone of 1 degree", 0.5, quick=np.inf,
-          pdf=lambda s, pdf, ctx, wi, wo:
-              pdf * (1 - min(s, 0.9) * (dr.norm(wo - mi.Vector3f(PLACE)) < DEGREE))),
-    Fault("sampling.integral", "density too large everywhere", 0.01, pdf=lambda s, pdf, *_: (1 + s) * pdf),
-    Fault("weights.density", "density that a sample states too large", 3e-3,
-          sample=lambda s, bs, weight, *_: (put(bs, pdf=(1 + s) * bs.pdf), weight)),
-    Fault("weights.weight", "weight of a sample too large", 3e-3,
-          sample=lambda s, bs, weight, *_: (bs, (1 + s) * weight)),
-    Fault("weights.discrete", "probability of a single direction too small", 5e-3,
-          nested={"type": "conductor"},
-          sample=lambda s, bs, weight, *_: (put(bs, pdf=(1 - s) * bs.pdf), weight)),
-    Fault("eval_pdf.value", "value of eval_pdf() too large in one channel", 1e-4,
-          pair=lambda s, pair, *_: (pair[0] * mi.Color3f(1 + s, 1, 1), pair[1])),
-    Fault("eval_pdf.density", "density of eval_pdf() too large", 2e-4, nested=GLOSS,
-          pair=lambda s, pair, *_: (pair[0], (1 + s) * pair[1])),
-    Fault("energy.largest", "albedo above 1", 0.01, value=lambda s, value, *_: 2 * (1 + s) * value),
-    Fault("energy.apart", "value of eval() too large", 0.02, eval=lambda s, value, *_: (1 + s) * value),
-    Fault("reciprocity.swapped", "value that grows with the cosine of wi", 3e-3,
-          value=lambda s, value, ctx, wi, wo: value * (1 + s * wi.z)),
-    Fault("reciprocity.modes", "more light in the mode of importance", 3e-3, value=by_mode),
-    Fault("reciprocity.medium", "index of refraction of reflected light", 3e-7,
-          sample=lambda s, bs, weight, *_: (put(bs, eta=(1 + s) * bs.eta), weight)),
-    Fault("reciprocity.single", "more light through glass from one side", 3e-3, nested=GLASS,
-          value=lambda s, value, ctx, wi, wo: value * (1 + s * (wi.z > 0))),
-    Fault("reciprocity.single_modes", "more light through glass in the mode of importance", 3e-3,
-          nested=GLASS, value=by_mode),
-    Fault("finite.samples", "NaN for a share of the random numbers, at their end", 1e-6,
-          sample=lambda s, bs, weight, u, ctx: (bs, dr.select(u.x > 1 - s, dr.nan, weight))),
-    Fault("finite.values", "negative value where both cosines are so near to 1", 1e-6,
-          value=lambda s, value, ctx, wi, wo: dr.select(dr.minimum(wi.z, wo.z) > 1 - s, -1, 1) * value),
-    Fault("roundoff.lost", "stairs on a slope, of this height", 3e-4, value=lambda s, value, ctx, wi, wo:
-              value * (1 + s * (dr.round(wi.z * wo.z / s) - wi.z * wo.z / s))),
-    Fault("gradients.values", "derivative of values too large", 0.03, nested=GLOSS,
-          value=lambda s, value, *_: value + s * (value - dr.detach(value))),
-    Fault("gradients.weights", "derivative of weights too large", 0.03, nested=GLOSS,
-          sample=lambda s, bs, weight, *_: (bs, weight + s * (weight - dr.detach(weight)))),
-    Fault("components.sum", "a component brighter than its share", 1e-4,
-          eval=lambda s, value, ctx, *_: value * (1 + s * (ctx.component == 0))),
-    Fault("variants.same", "values larger in scalar variants", 3e-3,
-          value=lambda s, value, *_: value if dr.is_jit_v(value) else (1 + s) * value),
-    Fault("hits.ray_test", "ray_test() misses in this share of directions", 1e-5,
-          ray_test=lambda s, found, ray: found & (ray.d.x < 1 - 2 * s)),
-    Fault("surface.on_ray", "hit points off the ray, in sizes", 1e-5,
-          ray_intersect=lambda s, si, ray: put(si, p=si.p + SIZE * s * si.n)),
-    Fault("surface.near_by", "hit points off, in sizes", 5e-7,
-          ray_intersect=lambda s, si, ray: put(si, p=si.p + SIZE * s * si.n)),
-    Fault("surface.behind", "hits too far away, in sizes", 5e-7,
-          ray_intersect=lambda s, si, ray: put(si, t=si.t + SIZE * s, p=si.p + SIZE * s * ray.d)),
-    Fault("surface.missed", "a least distance for this share of directions", 3e-3,
-          ray_intersect=lambda s, si, ray:
-              put(si, t=dr.select((si.t < 0.01) & (ray.d.x > 1 - 2 * s), dr.inf, si.t))),
-    Fault("normals.outwards", "normals inwards on this share of most faces", 3e-3,
-          ray_intersect=lambda s, si, ray:
-              put(si, n=dr.select((si.p.x > 1 - 2 * s) & (si.n.x < 0.5), -1, 1) * si.n)),
-    Fault("normals.length", "normals too long", 3e-5,
-          ray_intersect=lambda s, si, ray: put(si, n=(1 + s) * si.n)),
-    Fault("normals.slant", "normals tilted, in radians", 3e-3,
-          ray_intersect=lambda s, si, ray: put(si, n=tilted(si.n, s))),
-    Fault("normals.slope", "normals tilted as well as derivatives, in radians", 0.03,
-          ray_intersect=lambda s, si, ray: put(si, n=tilted(si.n, s))),
-    Fault("normals.shading", "shading normals tilted, in radians", 3e-3,
-          ray_intersect=lambda s, si, ray: put(si, sh_frame=mi.Frame3f(tilted(si.sh_frame.n, s)))),
-    Fault("normals.step", "dp_du too long", 0.02,
-          ray_intersect=lambda s, si, ray: put(si, dp_du=(1 + s) * si.dp_du)),
-    Fault("watertight.out", "a slit of this width, in sizes", 3e-5, quick=1e-4,
-          ray_intersect=lambda s, si, ray:
-              put(si, t=dr.select(dr.abs(si.p.x - 0.3) < SIZE * s / 2, dr.inf, si.t))),
-    Fault("watertight.odd", "a slit of this width in one face, in sizes", 6e-3,
-          ray_intersect=lambda s, si, ray:
-              put(si, t=dr.select((dr.abs(si.p.x - 0.3) < SIZE * s / 2) & (si.n.z > 0.5), dr.inf, si.t))),
-    Fault("far.missed", "hits off by this part of a distance above a thousand", 1e-5,
-          ray_intersect=lambda s, si, ray:
-              put(si, p=dr.select(si.t > 1000, si.p + s * si.t * si.n, si.p))),
-    Fault("far.missed", "misses from afar in this share of directions", 3e-3,
-          ray_intersect=lambda s, si, ray:
-              put(si, t=dr.select((si.t > 1000) & (ray.d.x > 1 - 2 * s), dr.inf, si.t))),
-    Fault("finite.bad", "NaN where a component of the direction is so small", 1e-12,
-          ray_intersect=lambda s, si, ray: put(si, uv=dr.select(dr.abs(ray.d.x) < s, dr.nan, si.uv))),
-    Fault("sampling.crossings", "area too large, and the density of positions too small", 0.01, quick=0.02,
-          surface_area=lambda s, area: (1 + s) * area, pdf_position=lambda s, pdf, ps: pdf / (1 + s),
-          sample_position=lambda s, ps, *_: put(ps, pdf=ps.pdf / (1 + s))),
-    Fault("sampling.area", "surface_area() too large", 3e-3, surface_area=lambda s, area: (1 + s) * area),
-    Fault("sampling.position", "pdf_position() too large", 3e-3,
-          pdf_position=lambda s, pdf, ps: (1 + s) * pdf),
-    Fault("sampling.spread", "positions crowded to one side: u to the power of 1 and this", 0.03, quick=0.1,
-          nested={"type": "rectangle"}, sample_position=lambda s, ps, time, u:
-              put(ps, p=mi.Point3f(2 * u.x ** (1 + s) - 1, ps.p.y, 0))),
-    Fault("sampling.off", "positions off the surface, in sizes", 1e-5,
-          sample_position=lambda s, ps, *_: put(ps, p=ps.p + SIZE * s * ps.n)),
-    Fault("sampling.normal", "normals of positions tilted, in radians", 0.1,
-          sample_position=lambda s, ps, *_: put(ps, n=tilted(ps.n, s))),
-    Fault("sampling.direction", "pdf_direction() too large", 0.02,
-          pdf_direction=lambda s, pdf, *_: (1 + s) * pdf),
-    Fault("sampling.misses", "distances too short for this share of directions", 0.02,
-          sample_direction=lambda s, ds, it, u: put(ds, dist=ds.dist * dr.select(u.x < s, 0.99, 1))),
-    Fault("sampling.angle", "density of directions too small", 0.03, quick=0.2,
-          pdf_direction=lambda s, pdf, *_: pdf / (1 + s),
-          sample_direction=lambda s, ds, *_: put(ds, pdf=ds.pdf / (1 + s))),
-    Fault("bbox.outside", "a box too small above, in sizes", 3e-5,
-          bbox=lambda s, box: mi.BoundingBox3f(box.min, (1 - 2 * s) * box.max)),
-    Fault("bbox.outside", "a box too small below, in sizes", 3e-5,
-          bbox=lambda s, box: mi.BoundingBox3f((1 - 2 * s) * box.min, box.max)),
-)  # fmt: skip
+def off_surface(size: float, record: mi.Interaction3f, *_: Answer) -> mi.Interaction3f:
+    return put(record, p=record.p + SIZE * size * record.n)
+
+
+def too_far(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
+    return put(si, t=si.t + SIZE * size, p=si.p + SIZE * size * ray.d)
+
+
+def off_from_afar(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
+    return put(si, p=dr.select(si.t > 1000, si.p + size * si.t * si.n, si.p))
+
+
+def in_share(size: float, ray: mi.Ray3f) -> mi.Mask:
+    """Rays of a share of the directions."""
+    return ray.d.x > 1 - 2 * size
+
+
+def missed_in_share(size: float, met: mi.Mask, ray: mi.Ray3f) -> mi.Mask:
+    return met & ~in_share(size, ray)
+
+
+def missed(where: Change) -> Change:
+    """A change of hits that are missed in some places."""
+
+    def apply(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
+        return put(si, t=dr.select(where(size, si, ray), dr.inf, si.t))
+
+    return apply
+
+
+def close(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Mask:
+    return (si.t < 0.01) & in_share(size, ray)
+
+
+def afar(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Mask:
+    return (si.t > 1000) & in_share(size, ray)
+
+
+def slit(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Mask:
+    return dr.abs(si.p.x - 0.3) < SIZE * size / 2
+
+
+def slit_above(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Mask:
+    return slit(size, si, ray) & (si.n.z > 0.5)
+
+
+def inwards(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
+    turned = (si.p.x > 1 - 2 * size) & (si.n.x < 0.5)
+    return put(si, n=dr.select(turned, -1, 1) * si.n)
+
+
+def no_number_along_axis(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
+    return put(si, uv=dr.select(dr.abs(ray.d.x) < size, dr.nan, si.uv))
+
+
+def no_number_in_place(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
+    """NaN for about a share of the rays, in one direction."""
+    inside = (ray.d.x > 0.3) & (ray.d.x < 0.3 + 2 * size)
+    return put(si, uv=dr.select(inside, dr.nan, si.uv))
+
+
+def crowded(size: float, ps: mi.PositionSample3f, time: mi.Float, u: mi.Point2f) -> mi.PositionSample3f:
+    """Positions on a square, crowded to one side."""
+    return put(ps, p=mi.Point3f(2 * u.x ** (1 + size) - 1, ps.p.y, 0))
+
+
+def crowded_azimuth(
+    size: float, ps: mi.PositionSample3f, time: mi.Float, u: mi.Point2f
+) -> mi.PositionSample3f:
+    """Positions on a unit sphere, crowded to one azimuth."""
+    azimuth = 2 * dr.pi * u.y ** (1 + size)
+    radius = dr.hypot(ps.p.x, ps.p.y)
+    p = mi.Point3f(radius * dr.cos(azimuth), radius * dr.sin(azimuth), ps.p.z)
+    return put(ps, p=p, n=mi.Normal3f(p))
+
+
+def crowded_directions(
+    size: float, ds: mi.DirectionSample3f, it: mi.Interaction3f, u: mi.Point2f
+) -> mi.DirectionSample3f:
+    """Directions turned around the one to the middle, to crowd at one azimuth."""
+    frame = mi.Frame3f(dr.normalize(-mi.Vector3f(it.p)))
+    local = frame.to_local(ds.d)
+    turn = dr.atan2(local.y, local.x) / (2 * dr.pi) + 0.5
+    azimuth = 2 * dr.pi * turn ** (1 + size)
+    radius = dr.hypot(local.x, local.y)
+    d = frame.to_world(mi.Vector3f(radius * dr.cos(azimuth), radius * dr.sin(azimuth), local.z))
+    return put(ds, d=d, p=it.p + ds.dist * d)
+
+
+def too_short(
+    size: float, ds: mi.DirectionSample3f, it: mi.Interaction3f, u: mi.Point2f
+) -> mi.DirectionSample3f:
+    return put(ds, dist=ds.dist * dr.select(u.x < size, 0.99, 1))
+
+
+def lower_top(size: float, box: mi.BoundingBox3f) -> mi.BoundingBox3f:
+    return mi.BoundingBox3f(box.min, (1 - 2 * size) * box.max)
+
+
+def higher_bottom(size: float, box: mi.BoundingBox3f) -> mi.BoundingBox3f:
+    return mi.BoundingBox3f((1 - 2 * size) * box.min, box.max)
+
+
+def in_hole(size: float, d: mi.Vector3f) -> mi.Mask:
+    """Directions in a cone, so many degrees across."""
+    return dr.norm(d - mi.Vector3f(PLACE)) < size * DEGREE / 2
+
+
+def around_hole(size: float, ds: mi.DirectionSample3f, u: mi.Point2f) -> mi.DirectionSample3f:
+    """Directions that are never in a cone: they go the other way."""
+    d = dr.select(in_hole(size, ds.d), -ds.d, ds.d)
+    return put(ds, p=ds.p + ds.dist * (d - ds.d), d=d)
+
+
+def no_density_in_hole(size: float, pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:
+    return dr.select(in_hole(size, ds.d), 0, pdf)
+
+
+def no_density_of_sample(size: float, ds: mi.DirectionSample3f, u: mi.Point2f) -> mi.DirectionSample3f:
+    ds = around_hole(size, ds, u)
+    return put(ds, pdf=no_density_in_hole(size, ds.pdf, ds))
+
+
+# ------------------------------------------------ Faults ----------------------------------------------
+
+
+def bsdf_fault(
+    figure: str,
+    what: str,
+    full: float,
+    kind: str,
+    change: Change,
+    *,
+    quick: float | None = None,
+    nested: Description | None = None,
+) -> Fault:
+    """A fault of a BSDF, which changes one kind of answer."""
+    return Fault(figure, what, full, {kind: change}, quick, nested)
+
+
+def shape_fault(
+    figure: str,
+    what: str,
+    full: float,
+    *,
+    quick: float | None = None,
+    nested: Description | None = None,
+    **changes: Change,
+) -> Fault:
+    """A fault of a shape, which changes some of its methods."""
+    return Fault(figure, what, full, changes, quick, nested, "shape")
+
+
+def sky_fault(figure: str, what: str, full: float, *, quick: float | None = None, **changes: Change) -> Fault:
+    """A fault of a constant sky."""
+    return Fault(figure, what, full, changes, quick, None, "emitter")
+
+
+larger_pdf = of_sample(member("pdf", larger))
+smaller_pdf = of_sample(member("pdf", smaller))
+larger_eta = of_sample(member("eta", larger))
+tilted_normal = member("n", tilted)
+
+BSDF_SAMPLES = (
+    bsdf_fault(
+        "sampling.cells",
+        "density too large where a tenth of the samples go",
+        0.03,
+        "pdf",
+        in_tenth,
+        quick=0.1,
+    ),
+    bsdf_fault(
+        "sampling.small", "density too small in a cone of 1 degree", 0.5, "pdf", in_cone, quick=np.inf
+    ),
+    bsdf_fault(
+        "sampling.slices",
+        "samples keep out of a slice of azimuth, in degrees",
+        0.3,
+        "sample",
+        of_sample(around_slice),
+        quick=np.inf,
+    ),
+    bsdf_fault("sampling.dark", "no density in a slice of azimuth, in degrees", 0.3, "pdf", no_density),
+    bsdf_fault("sampling.still", "directions in stairs, in random numbers", 1e-5, "u", stairs_of),
+    bsdf_fault("sampling.integral", "density too large everywhere", 0.01, "pdf", larger),
+    bsdf_fault("weights.density", "density that a sample states too large", 3e-3, "sample", larger_pdf),
+    bsdf_fault("weights.weight", "weight of a sample too large", 3e-3, "sample", of_weight(larger)),
+    bsdf_fault("weights.weight", "weight of a sample in stairs", 3e-3, "sample", of_weight(weight_in_stairs)),
+    bsdf_fault(
+        "weights.discrete",
+        "probability of a single direction too small",
+        5e-3,
+        "sample",
+        smaller_pdf,
+        nested={"type": "conductor"},
+    ),
+    bsdf_fault(
+        "finite.samples",
+        "NaN for a share of the random numbers, at their end",
+        1e-6,
+        "sample",
+        of_weight(no_number_at_the_end),
+    ),
+    bsdf_fault(
+        "finite.million",
+        "NaN for a share of the random numbers, anywhere",
+        1e-6,
+        "sample",
+        of_weight(no_number),
+        quick=4e-6,
+    ),
+)
+
+BSDF_VALUES = (
+    bsdf_fault("eval_pdf.value", "value of eval_pdf() too large in one channel", 1e-4, "pair", first_channel),
+    bsdf_fault(
+        "eval_pdf.density",
+        "density of eval_pdf() too large",
+        2e-4,
+        "pair",
+        density_of_pair,
+        nested=GLOSS,
+    ),
+    bsdf_fault("energy.largest", "albedo above 1", 0.01, "value", too_bright),
+    bsdf_fault("energy.apart", "value of eval() too large", 0.02, "eval", larger),
+    bsdf_fault("reciprocity.swapped", "value that grows with the cosine of wi", 3e-3, "value", with_cosine),
+    bsdf_fault("reciprocity.modes", "more light in the mode of importance", 3e-3, "value", by_mode),
+    bsdf_fault("reciprocity.medium", "index of refraction of reflected light", 3e-7, "sample", larger_eta),
+    bsdf_fault(
+        "reciprocity.single",
+        "more light through glass from one side",
+        3e-3,
+        "value",
+        from_one_side,
+        nested=GLASS,
+    ),
+    bsdf_fault(
+        "reciprocity.single_modes",
+        "more light through glass in the mode of importance",
+        3e-3,
+        "value",
+        by_mode,
+        nested=GLASS,
+    ),
+    bsdf_fault(
+        "finite.values",
+        "negative value where both cosines are so near to 1",
+        1e-6,
+        "value",
+        negative_next_to_normal,
+    ),
+    bsdf_fault("roundoff.lost", "stairs on a slope, of this height", 3e-4, "value", stairs_on_slope),
+    bsdf_fault("gradients.values", "derivative of values too large", 0.03, "value", steeper, nested=GLOSS),
+    bsdf_fault(
+        "gradients.weights",
+        "derivative of weights too large",
+        0.03,
+        "sample",
+        of_weight(steeper),
+        nested=GLOSS,
+    ),
+    bsdf_fault("components.sum", "a component brighter than its share", 1e-4, "eval", by_component),
+    bsdf_fault("components.masked", "lobes brighter where they are asked for by type", 1e-4, "eval", by_mask),
+    bsdf_fault("components.masked_samples", "types of lobes ignored", 1, "context", without_mask),
+    bsdf_fault("variants.same", "values larger in scalar variants", 3e-3, "value", by_variant),
+)
+
+SHAPE_HITS = (
+    shape_fault(
+        "hits.ray_test",
+        "ray_test() misses in this share of directions",
+        1e-5,
+        ray_test=missed_in_share,
+    ),
+    shape_fault("surface.on_ray", "hit points off the ray, in sizes", 1e-5, ray_intersect=off_surface),
+    shape_fault("surface.near_by", "hit points off, in sizes", 5e-7, ray_intersect=off_surface),
+    shape_fault("surface.behind", "hits too far away, in sizes", 5e-7, ray_intersect=too_far),
+    shape_fault(
+        "surface.missed",
+        "a least distance for this share of directions",
+        3e-3,
+        ray_intersect=missed(close),
+    ),
+    shape_fault(
+        "normals.outwards", "normals inwards on this share of most faces", 3e-3, ray_intersect=inwards
+    ),
+    shape_fault("normals.length", "normals too long", 3e-5, ray_intersect=member("n", larger)),
+    shape_fault("normals.slant", "normals tilted, in radians", 3e-3, ray_intersect=tilted_normal),
+    shape_fault(
+        "normals.slope",
+        "normals tilted as well as derivatives, in radians",
+        0.03,
+        ray_intersect=tilted_normal,
+    ),
+    shape_fault(
+        "normals.shading",
+        "shading normals tilted, in radians",
+        3e-3,
+        ray_intersect=member("sh_frame", tilted_frame),
+    ),
+    shape_fault("normals.step", "dp_du too long", 0.02, ray_intersect=member("dp_du", larger)),
+    shape_fault(
+        "watertight.out",
+        "a slit of this width, in sizes",
+        3e-5,
+        quick=1e-4,
+        ray_intersect=missed(slit),
+    ),
+    shape_fault(
+        "watertight.odd",
+        "a slit of this width in one face, in sizes",
+        6e-3,
+        ray_intersect=missed(slit_above),
+    ),
+    shape_fault(
+        "far.missed",
+        "hits off by this part of a distance above a thousand",
+        1e-5,
+        ray_intersect=off_from_afar,
+    ),
+    shape_fault(
+        "far.missed",
+        "misses from afar in this share of directions",
+        3e-3,
+        ray_intersect=missed(afar),
+    ),
+    shape_fault(
+        "finite.bad",
+        "NaN where a component of the direction is so small",
+        1e-12,
+        ray_intersect=no_number_along_axis,
+    ),
+    shape_fault(
+        "finite.million",
+        "NaN for a share of the rays",
+        2e-6,
+        quick=2e-5,
+        ray_intersect=no_number_in_place,
+    ),
+    shape_fault("bbox.outside", "a box too small above, in sizes", 3e-5, bbox=lower_top),
+    shape_fault("bbox.outside", "a box too small below, in sizes", 3e-5, bbox=higher_bottom),
+)
+
+SHAPE_SAMPLES = (
+    shape_fault(
+        "sampling.crossings",
+        "area too large, and the density of positions too small",
+        0.01,
+        quick=0.02,
+        surface_area=larger,
+        pdf_position=smaller,
+        sample_position=member("pdf", smaller),
+    ),
+    shape_fault("sampling.area", "surface_area() too large", 3e-3, surface_area=larger),
+    shape_fault("sampling.position", "pdf_position() too large", 3e-3, pdf_position=larger),
+    shape_fault(
+        "sampling.spread",
+        "positions crowded to one side: u to the power of 1 and this",
+        0.03,
+        quick=0.1,
+        nested={"type": "rectangle"},
+        sample_position=crowded,
+    ),
+    shape_fault(
+        "sampling.spread",
+        "positions on a sphere crowded at one azimuth: u to the power of 1 and this",
+        0.03,
+        quick=0.1,
+        nested={"type": "sphere"},
+        sample_position=crowded_azimuth,
+    ),
+    shape_fault("sampling.off", "positions off the surface, in sizes", 1e-5, sample_position=off_surface),
+    shape_fault(
+        "sampling.normal", "normals of positions tilted, in radians", 0.1, sample_position=tilted_normal
+    ),
+    shape_fault("sampling.direction", "pdf_direction() too large", 0.02, pdf_direction=larger),
+    shape_fault(
+        "sampling.misses",
+        "distances too short for this share of directions",
+        0.02,
+        sample_direction=too_short,
+    ),
+    shape_fault(
+        "sampling.aim",
+        "directions to a sphere crowded at one azimuth: u to the power of 1 and this",
+        0.05,
+        quick=0.1,
+        nested={"type": "sphere"},
+        sample_direction=crowded_directions,
+    ),
+    shape_fault(
+        "sampling.angle",
+        "density of directions too small",
+        0.03,
+        quick=0.2,
+        pdf_direction=smaller,
+        sample_direction=member("pdf", smaller),
+    ),
+)
+
+SKIES = (
+    sky_fault(
+        "sampling.small",
+        "directions keep out of a cone, in degrees across",
+        3,
+        direction=around_hole,
+    ),
+    sky_fault(
+        "sampling.dark",
+        "no density in a cone, in degrees across",
+        3,
+        direction=no_density_of_sample,
+        pdf=no_density_in_hole,
+    ),
+    sky_fault("density.same", "pdf_direction() too large", 3e-3, pdf=larger),
+    sky_fault("weights.weight", "weight of a sample too large", 3e-3, weight=larger),
+    sky_fault("finite.million", "NaN for a share of the random numbers", 1e-6, quick=4e-6, weight=no_number),
+)
+
+FAULTS: Sequence[Fault] = (*BSDF_SAMPLES, *BSDF_VALUES, *SHAPE_HITS, *SHAPE_SAMPLES, *SKIES)
 
 if __name__ == "__main__":  # the table of docs/check_your_plugin.md; inf: none was found
     register(runtime.SLOW, runtime.FAST)
     print("| law | for a | fault | quick | full |\n|---|---|---|---|---|")
     for fault in FAULTS:
-        found = " | ".join(f"{fault.least_found(quick=quick):.1g}" for quick in (True, False))
-        print(f"| {fault.figure.split('.')[0]} | {fault.kind} | {fault.what} | {found} |", flush=True)
+        quick, full = (f"{fault.least_found(quick=quick):.1g}" for quick in (True, False))
+        law = fault.figure.split(".")[0]
+        print(f"| {law} | {fault.kind} | {fault.what} | {quick} | {full} |", flush=True)

@@ -31,7 +31,8 @@ SCALAR_PAIRS = 60  # scalar variants take milliseconds for each
 SHORT = 0.02  # of |ωi + ωo|²: above, Mitsuba's density is right to 3e-6
 NAMES = ("value", "density of visible normals", "density of plain D sampling")
 SAME = "pixels that differ, with the same random numbers"
-RELATIVE, P_VALUE = "relRMSE of the pictures", "probability of so much between equal pictures"
+RELATIVE = "relRMSE of the pictures"
+P_VALUE = "probability of so much between equal pictures"
 LEVEL = 1e-3  # probability with which a test of pictures rejects equal ones
 
 
@@ -81,7 +82,8 @@ def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> dict[str, f
 def pointwise(study: Study, *, quick: bool) -> None:
     """Compare values and densities, over roughness and in every variant that can run here."""
     rows: list[dict[str, Any]] = []
-    before, variants = runtime.use(), runtime.usable_variants()
+    before = runtime.use()
+    variants = runtime.usable_variants()
     if quick:  # every colour mode once, and one scalar variant
         variants = [name for name in variants if not name.startswith("scalar") or name == runtime.SLOW]
     for variant in study.each("points", variants):
@@ -182,10 +184,12 @@ def rendered(study: Study, *, quick: bool) -> None:
     """Compare pictures: equal with equal random numbers, alike with others; ``stock`` has the mistakes."""
     size, renders = (64, 64) if quick else (128, 96)
     for alpha in study.each("pictures", (0.3,) if quick else (0.03, 0.1, 0.3)):
-        found, at = compare_roughconductor(alpha, size=size, renders=renders), f"alpha {alpha:g}"
+        found = compare_roughconductor(alpha, size=size, renders=renders)
+        at = f"alpha {alpha:g}"
         why = "paths that rounding sends past an edge; the ball covers a third of the picture"
         study.at_most(f"share of {SAME}, {at}", found.errors[SAME], 5e-3, why)
-        what, why = f"p of the difference with independent numbers, {at}", "pixels, tiles and the picture"
+        what = f"p of the difference with independent numbers, {at}"
+        why = "pixels, tiles and the picture"
         study.at_least(what, found.errors[P_VALUE], LEVEL, why)
         one, other, difference = found.images.values()
         sheet = np.concatenate([one, other, 20 * np.abs(difference)], axis=1)

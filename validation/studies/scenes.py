@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,32 +35,45 @@ def _crowded(lights: int) -> Scene:
     """Return a few hundred objects of all kinds, looked up in trees and in light buffers."""
     rng = np.random.default_rng(5)
     start = rng.uniform(-2, 2, (330, 3))
-    ends, radii = start + 0.5 * rng.normal(size=(330, 3)), rng.uniform(0.08, 0.2, 330).tolist()
+    ends = start + 0.5 * rng.normal(size=(330, 3))
+    radii = rng.uniform(0.08, 0.2, 330).tolist()
     points = (map(tuple, place.tolist()) for place in (start, ends))
-    things = list(zip(*points, radii, 66 * [SHINY, GREY, GREY, GREY, GREY], strict=True))
-    lamps = (6 * rng.normal(size=(lights, 3)) + [0, 6, 6]).tolist()
+    materials = 66 * [SHINY, GREY, GREY, GREY, GREY]
+    things = list(zip(*points, radii, materials, strict=True))
+    places = (6 * rng.normal(size=(lights, 3)) + [0, 6, 6]).tolist()
+    color = (1.2 / lights, 1.2 / lights, 1.44 / lights)
+    lamps = tuple(Light(tuple(place), color) for place in places)
     return Scene(
         Camera((0, 1, 6), (0, 0, 0)),
         (0.2, 0.3, 0.4),
-        tuple(Light(tuple(p), (1.2 / lights, 1.2 / lights, 1.44 / lights)) for p in lamps),
+        lamps,
         spheres=tuple(Sphere(p, *more) for p, _, *more in things[::3]),
         cones=tuple(Cone(*thing) for thing in things[1::3]),
         cylinders=tuple(Cylinder(*thing) for thing in things[2::3]),
     )
 
 
-LARGE, SMALL = ((320, 240), (120, 90)), ((160, 120), (64, 48))  # in full, and quick
+# in full, and quick
+LARGE = ((320, 240), (120, 90))
+SMALL = ((160, 120), (64, 48))
 SIZES = {4: SMALL, 5: SMALL, 7: ((160, 120), (48, 36))}
 # Bounds for 99 of 100 pixels, three times what was measured: what is left there is rounding in mirrors and
 # highlights, of alpha 1e-3 in scene 3, of balls in scene 4
 MOST = (5e-7, 1e-5, 1.5e-5, 3e-6, 3e-5, 1e-6, 6e-7, 5e-7, 3e-7, 9e-7)
-# Of each scene its bound, its sizes and the form of the Fresnel term
-CASES: dict[str, tuple[Scene, float, Any, str]] = {
-    **{str(i): (report_scene(i), most, SIZES.get(i, LARGE), "dielectric")
-       for i, most in enumerate(MOST)},
-    "crowded": (_crowded(12), 1e-5, SMALL, "schlick"),
-    "crowded, unrolled": (_crowded(4), 7e-6, SMALL, "schlick"),
-}  # fmt: skip
+
+
+class Case(NamedTuple):
+    """A scene, and how it is judged."""
+
+    scene: Scene
+    most: float  #: difference of 99 of 100 pixels
+    sizes: tuple[tuple[int, int], tuple[int, int]] = SMALL  #: in full, and quick
+    fresnel: str = "dielectric"
+
+
+CASES = {str(i): Case(report_scene(i), most, SIZES.get(i, LARGE)) for i, most in enumerate(MOST)}
+CASES["crowded"] = Case(_crowded(12), 1e-5, fresnel="schlick")
+CASES["crowded, unrolled"] = Case(_crowded(4), 7e-6, fresnel="schlick")
 
 
 def judge(
@@ -96,7 +109,8 @@ def draw(scene: Any, size: Any, *, fresnel: str = "dielectric", **integrator: An
 
 def hold(study: Study, name: str, error: np.ndarray, reason: np.ndarray) -> dict[str, Any]:
     """Hold a scene that was judged to its bounds; return the figures by name."""
-    most, left = CASES[name][1], np.sum(reason == REASONS.index("unexplained"))
+    most = CASES[name].most
+    left = np.sum(reason == REASONS.index("unexplained"))
     edges = "rounding sends single pixels to the other side of an edge: measured up to two in ten thousand"
     found = {
         "median difference": (np.median(error), MEDIAN, "least fault: half of the pixels off by 1e-7"),
@@ -112,12 +126,14 @@ def hold(study: Study, name: str, error: np.ndarray, reason: np.ndarray) -> dict
 def run(study: Study, *, quick: bool) -> None:
     """Judge our pictures of all scenes, and the places of samples."""
     rows: list[dict[str, Any]] = []
-    for name, (scene, _, sizes, fresnel) in study.each("Scenes in float64", CASES.items()):
-        error, reason = judge(draw(scene, sizes[quick], fresnel=fresnel), scene, fresnel=fresnel)
+    for name, case in study.each("Scenes in float64", CASES.items()):
+        size = case.sizes[quick]
+        image = draw(case.scene, size, fresnel=case.fresnel)
+        error, reason = judge(image, case.scene, fresnel=case.fresnel)
         found = hold(study, name, error, reason)
         counts = {word: int(np.sum(reason == i)) for i, word in enumerate(REASONS)}
-        size = "{}x{}".format(*sizes[quick])
-        rows.append({"scene": name, "size": size, **found, "largest": error.max(), **counts})
+        shown = "{}x{}".format(*size)
+        rows.append({"scene": name, "size": shown, **found, "largest": error.max(), **counts})
     note = "One sample per pixel. Fresnel is exact, and Schlick's in the crowds. By reason: pixels off."
     study.records("scenes", "Our pictures against the float64 tracer", rows, note)
     lattices(study)

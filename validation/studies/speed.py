@@ -63,13 +63,15 @@ class Pair(NamedTuple):
 
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study. A quick one holds that pairs agree, and says nothing of goals."""
-    extent, rows = QUICK if quick else FULL, []
+    extent = QUICK if quick else FULL
+    rows = []
     runtime.use(runtime.FAST)
     # scenes are loaded when the turn of their pair comes
     for pair in study.each("Speed", [pair for part in PARTS for pair in part(extent)]):
         time, off = compare(pair, extent.repeats)
         study.at_most(f"{pair.name}: difference", off, pair.limit, pair.why)
-        low, high = time["low"], time["high"]
+        low = time["low"]
+        high = time["high"]
         if not quick:
             note = f"quartiles {low:.3g} to {high:.3g} of {extent.repeats} ratios"
             study.goal(pair.name, time["ratio"], pair.goal, note, interval=(low, high))
@@ -81,7 +83,8 @@ def run(study: Study, *, quick: bool) -> None:
 def compare(pair: Pair, repeats: int) -> tuple[dict[str, float], float]:
     """Time a pair in turns, and say by how much it disagrees."""
     ours, other = pair.make()
-    off, time = pair.agree(ours, other), ratio(ours, other, repeats=repeats)
+    off = pair.agree(ours, other)
+    time = ratio(ours, other, repeats=repeats)
     del ours, other
     gc.collect()  # scenes that stay alive slow down the kernels of later ones
     return time, off
@@ -123,7 +126,8 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
 
     def materials(number: int) -> tuple[Run, Run]:
         """Return the scene of Mitsuba's plugins, with either material in place of ``roughplastic``."""
-        stock, keep = nodes(number, flavor="stock"), "specular_reflectance"
+        stock = nodes(number, flavor="stock")
+        keep = "specular_reflectance"
         plastics = {n: m for n, m in stock.items() if isinstance(m, dict) and m["type"] == "roughplastic"}
         ours, theirs = (
             stock | {name: kind(node["alpha"]) | {keep: node[keep]} for name, node in plastics.items()}
@@ -171,10 +175,12 @@ def left_out(nodes: Nodes, change: Nodes, more: dict[str, Any]) -> tuple[Run, Ru
 
 def growth(extent: Extent) -> Iterator[Pair]:
     """Yield tasks against smaller ones; the code must not grow with them."""
-    times, side, small = extent.growth, round(extent.growth**0.5), {"width": 40, "height": 30}
+    times = extent.growth
+    side = round(extent.growth**0.5)
+    small = {"width": 40, "height": 30}
 
     def longer_code(ours: Run, other: Run) -> float:
-        return operations(ours) / operations(other) - 1
+        return sum(operations(ours)) / sum(operations(other)) - 1
 
     why = "numbers are data, not code; a loop that is unrolled makes it as many times longer"
     for name, task, factor, goal in (  # the factor of the task, and the goal

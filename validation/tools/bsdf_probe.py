@@ -30,7 +30,8 @@ def lobe_pairs(count: int, alpha: float, *, seed: int = 1) -> tuple[Array, Array
     Both cosines are at least 0.02. Beyond that slope the lobe is below e^-16 of its peak.
     """
     rng = np.random.default_rng(seed)
-    wi, wo = np.empty((0, 3)), np.empty((0, 3))
+    wi = np.empty((0, 3))
+    wo = np.empty((0, 3))
     while len(wi) < count:
         i = direction(rng.uniform(0.02, 1, 4 * count), rng.uniform(0, 2 * np.pi, 4 * count))
         slope = alpha * 4 * np.sqrt(rng.random(4 * count))

@@ -25,7 +25,9 @@ ROUNDING = 1e-5  # relative size of differences that are float32's: sums in anot
 EPSILON = 0.01  # keeps black pixels, which no relative error describes, from ruling it
 CELL = 16  # pixels, a side of the cells whose means are compared
 BLOCKS = 64  # at most, along a side of the picture, whose signs are changed at a time
-FLIPS, TAIL = 500, 25  # changes of the signs, and how many of the largest results tell an exponential law
+# changes of the signs, and how many of the largest results tell an exponential law
+FLIPS = 500
+TAIL = 25
 MEASURES = ("mae", "rmse", "rel_mse", "psnr", "largest", "flip", "p_value")
 UNDEFINED = {  # why a measure may be None
     "flip": "FLIP needs three channels, finite and not negative, a reference that is not black, and the "
@@ -118,7 +120,8 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
         raise UsageError(f"cannot compare the data windows {window} and {other}: they show other places")
     with np.errstate(all="ignore"):
         difference = np.where(first == second, 0, first - second)  # inf where both are
-        size, square = np.abs(difference), difference**2
+        size = np.abs(difference)
+        square = difference**2
         relative = np.where(np.isinf(square), np.inf, square / (second**2 + EPSILON))
         psnr = 20 * np.log10(peak) - 10 * np.log10(square.mean())
     return Difference(
@@ -260,7 +263,8 @@ def p_values(ours: ArrayLike, theirs: ArrayLike, *, tile: int = 16) -> dict[str,
     if not all(np.isfinite(s).all() for s in sides):
         raise UsageError("renders hold infinite or undefined values")
     light = np.maximum(*(np.abs(s.mean(axis=0)) for s in sides))
-    sizes, found = {"pixel": 1, "tile": tile, "image": max(light.shape)}, {}
+    sizes = {"pixel": 1, "tile": tile, "image": max(light.shape)}
+    found = {}
     for name, size in sizes.items():
         floor = ROUNDING * cell_sums(light + light.mean(), size) + 1e-30
         of_each: list[Any] = []  # mean, standard deviation, count

@@ -20,11 +20,12 @@ import mrt_mitsuba as mrt
 # isort: split
 import mitsuba as mi  # after ours, which finds LLVM for it
 
-SMALL: dict[str, Any] = {"width": 64, "height": 48}
-ONE_RAY: dict[str, Any] = {"aamode": "none", "aa": 1, "lattice": "report", "focaldist": 0}
-SUPERSAMPLED: dict[str, Any] = ONE_RAY | {"aa": 4}
-
 Nodes = dict[str, Any]
+
+SMALL: Nodes = {"width": 64, "height": 48}
+ONE_RAY: Nodes = {"aamode": "none", "aa": 1, "lattice": "report", "focaldist": 0}
+SUPERSAMPLED: Nodes = ONE_RAY | {"aa": 4}
+
 Render = Callable[..., Any]
 
 
@@ -74,7 +75,8 @@ def crowd(number: int, kind: str, **size: Any) -> Nodes:
     nodes = {name: node for name, node in mrt.scene_dict(4, **size).items() if not name.startswith("sphere")}
     bsdf = {"type": "ref", "id": "material_0"}
     rng = np.random.default_rng(5)
-    centers, radii = rng.uniform((1, 0, 1), (7.5, 6.5, 7.5), (number, 3)), rng.uniform(0.05, 0.25, number)
+    centers = rng.uniform((1, 0, 1), (7.5, 6.5, 7.5), (number, 3))
+    radii = rng.uniform(0.05, 0.25, number)
     if kind == "group":
         numbers = mi.Bitmap(np.column_stack([centers, radii]).astype(np.float32))
         return nodes | {"crowd": {"type": "mrt_group", "kind": "sphere", "numbers": numbers, "bsdf": bsdf}}
@@ -90,7 +92,7 @@ def crowd(number: int, kind: str, **size: Any) -> Nodes:
 # ------------------------------------------------- Cases -------------------------------------------------
 
 
-def of_scene(nodes: Callable[..., Nodes], size: tuple[int, int], options: dict[str, Any]) -> Render:
+def of_scene(nodes: Callable[..., Nodes], size: tuple[int, int], options: Nodes) -> Render:
     """Return a render of a scene that is loaded once."""
     return partial(mrt.render, load(nodes(width=size[0], height=size[1])), **options)
 
@@ -129,24 +131,34 @@ def _box(width: int, height: int) -> Nodes:
     return box
 
 
-REPORT = [partial(mrt.scene_dict, number) for number in range(5)]
-LARGE, MIDDLE, LITTLE, TINY = (800, 600), (400, 300), (160, 120), (64, 48)
-PATH: dict[str, Any] = {"integrator": "path"}
-CASES: dict[str, tuple[int, Callable[[], Render]]] = {  # how many renders to average, what makes them
-    **{f"scene {i}": (1, partial(of_scene, nodes, LARGE, SUPERSAMPLED)) for i, nodes in enumerate(REPORT)},
-    "a million triangles": (2, partial(of_scene, partial(with_triangles, 10**6), MIDDLE, SUPERSAMPLED)),
-    "200 lights": (2, partial(of_scene, partial(with_lights, 200), LITTLE, ONE_RAY)),
-    "a thousand cones": (2, partial(of_scene, partial(crowd, 1000, "cone"), MIDDLE, SUPERSAMPLED)),
-    "to an error": (1, partial(of_scene, _box, (96, 96), PATH | {"target": 0.02})),
-    "aamode=noise": (1, partial(of_scene, _box, (96, 96), PATH | {"aamode": "noise", "spp": 64})),
-    "small, prepared": (100, _prepared),
-    "small, loaded": (100, partial(of_scene, REPORT[3], TINY, ONE_RAY)),
-    "small, with an update": (100, _with_update),
-    "small, from its number": (100, lambda: partial(mrt.render, 3, **SMALL, **ONE_RAY)),
-    "small, film": (100, partial(of_scene, REPORT[3], TINY, {"aamode": "none", "aa": 1})),
-    "small, filters": (50, partial(of_scene, REPORT[3], TINY, {"lattice": "report", "focaldist": 2.0})),
-    "small, mi.render": (100, _by_mitsuba),
-}
+PATH: Nodes = {"integrator": "path"}
+NOISE: Nodes = {"aamode": "noise", "spp": 64}
+BLURRED: Nodes = {"lattice": "report", "focaldist": 2.0}
+Make = Callable[[], Render]
+CASES: dict[str, tuple[int, Make]] = {}  # how many renders to average, what makes them
+
+
+def _report(number: int, size: tuple[int, int], options: Nodes) -> Make:
+    return partial(of_scene, partial(mrt.scene_dict, number), size, options)
+
+
+for number in range(5):
+    CASES[f"scene {number}"] = (1, _report(number, (800, 600), SUPERSAMPLED))
+
+TRIANGLES = partial(with_triangles, 10**6)
+CASES["a million triangles"] = (2, partial(of_scene, TRIANGLES, (400, 300), SUPERSAMPLED))
+CASES["200 lights"] = (2, partial(of_scene, partial(with_lights, 200), (160, 120), ONE_RAY))
+CONES = partial(crowd, 1000, "cone")
+CASES["a thousand cones"] = (2, partial(of_scene, CONES, (400, 300), SUPERSAMPLED))
+CASES["to an error"] = (1, partial(of_scene, _box, (96, 96), PATH | {"target": 0.02}))
+CASES["aamode=noise"] = (1, partial(of_scene, _box, (96, 96), PATH | NOISE))
+CASES["small, prepared"] = (100, _prepared)
+CASES["small, loaded"] = (100, _report(3, (64, 48), ONE_RAY))
+CASES["small, with an update"] = (100, _with_update)
+CASES["small, from its number"] = (100, lambda: partial(mrt.render, 3, **SMALL, **ONE_RAY))
+CASES["small, film"] = (100, _report(3, (64, 48), {"aamode": "none", "aa": 1}))
+CASES["small, filters"] = (50, _report(3, (64, 48), BLURRED))
+CASES["small, mi.render"] = (100, _by_mitsuba)
 
 
 def seconds(name: str) -> float:

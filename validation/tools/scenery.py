@@ -6,7 +6,7 @@ The whole ones use Mitsuba's own lights, lenses, materials, filters and samplers
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
@@ -19,13 +19,13 @@ Node = dict[str, Any]
 Point = list[float]
 
 # One ray at a time through the pixel's centre, as the report's lattice has it
-AT_CENTRES: dict[str, Any] = {"aa": 1, "aamode": "none", "lattice": "report"}
+AT_CENTRES: Node = {"aa": 1, "aamode": "none", "lattice": "report"}
 SPP = 64  # of the samplers of ``SCENES``
 
 
 def with_materials(scene: Scene, change: Callable[[Material], Material]) -> Scene:
     """Return a scene whose spheres and planes have other materials."""
-    parts: dict[str, Any] = {
+    parts: Node = {
         kind: tuple(dataclasses.replace(t, material=change(t.material)) for t in getattr(scene, kind))
         for kind in ("spheres", "planes")
     }
@@ -46,7 +46,7 @@ def sensor(
     } | more
 
 
-def ball_scene(bsdf: Mapping[str, Any], *, size: int = 96) -> Any:
+def ball_scene(bsdf: Node, *, size: int = 96) -> mi.Scene:
     """Return a ball of the material on a floor under a sky and a point light, ``size`` × ¾ ``size``."""
     film = {"width": size, "height": size * 3 // 4, "pixel_format": "rgb"}
     return mi.load_dict(
@@ -120,82 +120,130 @@ def _sky(color: Any) -> Node:
     return {"type": "constant", "radiance": rgb(color)}
 
 
-MEMBER = {"type": "instance", "g": {"type": "ref", "id": "group"}}
 SUN = np.full((16, 32, 3), 0.4, np.float32)
 SUN[3:5, 10:12] = 30
 
+
+def _scene_of(view: Node, **content: Node) -> Node:
+    return {"sensor": view, **content}
+
+
+def _envmap() -> Node:
+    return _scene_of(
+        sensor([0, 2, 6], [0, 0.5, 0]),
+        around={"type": "envmap", "bitmap": mi.Bitmap(SUN)},
+        floor=_floor(_diffuse(rgb(0.6))),
+        ball=_ball([0, 1, 0], 1, {"type": "roughconductor", "alpha": 0.2}),
+    )
+
+
+def _instances() -> Node:
+    """Return nine balls that are one, in three rows."""
+    group: Node = {"type": "ref", "id": "group"}
+    nodes = _scene_of(
+        sensor([0, 3, 6], [0, 0.5, 0], "box"),
+        group={"type": "shapegroup", "a": _ball([0, 0, 0], 0.4, _diffuse(rgb(0.7)))},
+        floor=_floor(_diffuse(_checks(8))),
+        sky=_sky((0.3, 0.4, 0.5)),
+        lamp=_lamp([3, 5, 3], 0.7, 20),
+    )
+    for index in range(9):
+        row, column = divmod(index, 3)
+        place = _to().translate([column - 1, 0.4, row - 1])
+        nodes[f"at{index}"] = {"type": "instance", "g": group, "to_world": place}
+    return nodes
+
+
+def _thin_lens() -> Node:
+    lens: Node = {"type": "thinlens", "aperture_radius": 0.2, "focus_distance": 6.0}
+    return _scene_of(
+        sensor([0, 1.5, 6], [0, 0.6, 0], **lens),
+        floor=_floor(_diffuse(_checks(20))),
+        near=_ball([-1, 0.5, 3], 0.5, _diffuse(rgb((0.7, 0.2, 0.2)))),
+        far=_ball([1, 0.5, -2], 0.5, _diffuse(rgb((0.2, 0.2, 0.7)))),
+        sky=_sky((0.6, 0.7, 0.9)),
+    )
+
+
+def _gloss() -> Node:
+    return _scene_of(
+        sensor([0, 1.5, 5], [0, 0.7, 0], "box"),
+        floor=_floor({"type": "roughconductor", "alpha": 0.1}),
+        ball=_ball([0, 0.7, 0], 0.7, {"type": "roughplastic", "alpha": 0.1}),
+        sky=_sky(0.2),
+        lamp=_lamp([1.2, 3, -1], 0.1, 200),
+    )
+
+
+def _rough_glass() -> Node:
+    return _scene_of(
+        sensor([0, 1.2, 5], [0, 0.8, 0]),
+        floor=_floor(_diffuse(_checks(8))),
+        ball=_ball([0, 0.9, 0], 0.8, {"type": "roughdielectric", "alpha": 0.3}),
+        lamp=_lamp([0, 4, 0], 1.0, 6),
+        sky=_sky(0.2),
+    )
+
+
+def _area_light() -> Node:
+    above = _to().translate([0, 4, 0]).rotate([1, 0, 0], 90)
+    behind = _to().translate([0, 2, -2]).scale(4)
+    return _scene_of(
+        sensor([0, 1.5, 6], [0, 1, 0], "mitchell"),
+        floor=_floor(_diffuse(rgb((0.8, 0.4, 0.3)))),
+        wall=_rectangle(behind, bsdf=_diffuse(rgb(0.5))),
+        box=_box(),
+        light=_rectangle(above, emitter={"type": "area", "radiance": rgb(6)}),
+    )
+
+
+def _spot() -> Node:
+    light: Node = {"type": "spot", "intensity": rgb((40, 36, 30)), "cutoff_angle": 25}
+    light["to_world"] = _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])
+    return _scene_of(
+        sensor([0, 3, 6], [0, 0.5, 0], "tent"),
+        floor=_floor(_diffuse(rgb(0.7))),
+        box={"type": "cube", "to_world": _to().translate([0, 0.5, 0]).scale(0.5)},
+        light=light,
+    )
+
+
+def _crop() -> Node:
+    return _scene_of(
+        sensor([0, 2, 6], [0, 0.5, 0], film={"sample_border": True}),
+        floor=_floor(_diffuse(_checks(8))),
+        ball=_ball([0, 1, 0], 1, {"type": "plastic"}),
+        lamp=_lamp([2, 4, 2], 0.5, 15),
+    )
+
+
+def _texture_and_sky() -> Node:
+    return _scene_of(
+        sensor([0, 1.5, 6], [0, 2.5, 0], fov=60),
+        floor=_floor(_diffuse(_checks(30))),
+        ball=_ball([-1, 0.6, 1], 0.6, _diffuse(_checks(12))),
+        sky=_sky((0.5, 0.7, 1.0)),
+    )
+
+
+def _stratified() -> Node:
+    return _scene_of(
+        sensor([0, 2, 6], [0, 0.5, 0], "box", sampler="stratified"),
+        floor=_floor(_diffuse(_checks(8))),
+        box=_box(),
+        lamp=_lamp([0, 4, 1], 1.0, 5),
+    )
+
+
 SCENES: dict[str, Callable[[], Node]] = {
-    "envmap": lambda: {
-        "sensor": sensor([0, 2, 6], [0, 0.5, 0]),
-        "around": {"type": "envmap", "bitmap": mi.Bitmap(SUN)},
-        "floor": _floor(_diffuse(rgb(0.6))),
-        "ball": _ball([0, 1, 0], 1, {"type": "roughconductor", "alpha": 0.2}),
-    },
-    "instances": lambda: {
-        "sensor": sensor([0, 3, 6], [0, 0.5, 0], "box"),
-        "group": {"type": "shapegroup", "a": _ball([0, 0, 0], 0.4, _diffuse(rgb(0.7)))},
-        **{f"at{i}": MEMBER | {"to_world": _to().translate([i % 3 - 1, 0.4, i // 3 - 1])} for i in range(9)},
-        "floor": _floor(_diffuse(_checks(8))),
-        "sky": _sky((0.3, 0.4, 0.5)),
-        "lamp": _lamp([3, 5, 3], 0.7, 20),
-    },
-    "thin_lens": lambda: {
-        "sensor": sensor([0, 1.5, 6], [0, 0.6, 0], type="thinlens", aperture_radius=0.2, focus_distance=6.0),
-        "floor": _floor(_diffuse(_checks(20))),
-        "near": _ball([-1, 0.5, 3], 0.5, _diffuse(rgb((0.7, 0.2, 0.2)))),
-        "far": _ball([1, 0.5, -2], 0.5, _diffuse(rgb((0.2, 0.2, 0.7)))),
-        "sky": _sky((0.6, 0.7, 0.9)),
-    },
-    "gloss": lambda: {
-        "sensor": sensor([0, 1.5, 5], [0, 0.7, 0], "box"),
-        "floor": _floor({"type": "roughconductor", "alpha": 0.1}),
-        "ball": _ball([0, 0.7, 0], 0.7, {"type": "roughplastic", "alpha": 0.1}),
-        "sky": _sky(0.2),
-        "lamp": _lamp([1.2, 3, -1], 0.1, 200),
-    },
-    "rough_glass": lambda: {
-        "sensor": sensor([0, 1.2, 5], [0, 0.8, 0]),
-        "floor": _floor(_diffuse(_checks(8))),
-        "ball": _ball([0, 0.9, 0], 0.8, {"type": "roughdielectric", "alpha": 0.3}),
-        "lamp": _lamp([0, 4, 0], 1.0, 6),
-        "sky": _sky(0.2),
-    },
-    "area_light": lambda: {
-        "sensor": sensor([0, 1.5, 6], [0, 1, 0], "mitchell"),
-        "floor": _floor(_diffuse(rgb((0.8, 0.4, 0.3)))),
-        "wall": _rectangle(_to().translate([0, 2, -2]).scale(4), bsdf=_diffuse(rgb(0.5))),
-        "box": _box(),
-        "light": _rectangle(
-            _to().translate([0, 4, 0]).rotate([1, 0, 0], 90), emitter={"type": "area", "radiance": rgb(6)}
-        ),
-    },
-    "spot": lambda: {
-        "sensor": sensor([0, 3, 6], [0, 0.5, 0], "tent"),
-        "floor": _floor(_diffuse(rgb(0.7))),
-        "box": {"type": "cube", "to_world": _to().translate([0, 0.5, 0]).scale(0.5)},
-        "light": {
-            "type": "spot",
-            "intensity": rgb((40, 36, 30)),
-            "cutoff_angle": 25,
-            "to_world": _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0]),
-        },
-    },
-    "crop": lambda: {
-        "sensor": sensor([0, 2, 6], [0, 0.5, 0], film={"sample_border": True}),
-        "floor": _floor(_diffuse(_checks(8))),
-        "ball": _ball([0, 1, 0], 1, {"type": "plastic"}),
-        "lamp": _lamp([2, 4, 2], 0.5, 15),
-    },
-    "texture_and_sky": lambda: {
-        "sensor": sensor([0, 1.5, 6], [0, 2.5, 0], fov=60),
-        "floor": _floor(_diffuse(_checks(30))),
-        "ball": _ball([-1, 0.6, 1], 0.6, _diffuse(_checks(12))),
-        "sky": _sky((0.5, 0.7, 1.0)),
-    },
-    "stratified": lambda: {
-        "sensor": sensor([0, 2, 6], [0, 0.5, 0], "box", sampler="stratified"),
-        "floor": _floor(_diffuse(_checks(8))),
-        "box": _box(),
-        "lamp": _lamp([0, 4, 1], 1.0, 5),
-    },
+    "envmap": _envmap,
+    "instances": _instances,
+    "thin_lens": _thin_lens,
+    "gloss": _gloss,
+    "rough_glass": _rough_glass,
+    "area_light": _area_light,
+    "spot": _spot,
+    "crop": _crop,
+    "texture_and_sky": _texture_and_sky,
+    "stratified": _stratified,
 }

@@ -200,8 +200,8 @@ def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> 
     return ratio_of(*in_turns(sides, repeats))
 
 
-def operations(render: Callable[..., Any]) -> int:
-    """Return the length of the code of all kernels of a ``mrt.render``, each counted once."""
+def operations(render: Callable[..., Any]) -> list[int]:
+    """Return the length of the code of each kernel of a ``mrt.render``, each counted once."""
     lengths: dict[Any, int] = {}  # by the hash of the code
 
     class Watch(Progress):
@@ -209,7 +209,7 @@ def operations(render: Callable[..., Any]) -> int:
             lengths.update({r["hash"]: r["operation_count"] for r in records if r.get("operation_count")})
 
     render(progress=Watch())
-    return sum(lengths.values())
+    return list(lengths.values())
 
 
 # ---------------------------------------------- The report ---------------------------------------------
@@ -308,10 +308,13 @@ def _drawn(content: Any) -> dict[str, Any]:
     """Return the bytes of a PNG, the class of the picture, and whether it has a row of the page to itself."""
     buffer = io.BytesIO()
     if isinstance(content, np.ndarray):
-        kind, broad = "picture", content.shape[1] > 2 * len(content)
+        kind = "picture"
+        broad = content.shape[1] > 2 * len(content)
         PIL.Image.fromarray(to_8bit(content.astype(np.float32), "srgb")).save(buffer, format="PNG")
     else:
-        kind, broad = "plot", content.get_figwidth() > 6.5  # inches
+        # inches
+        kind = "plot"
+        broad = content.get_figwidth() > 6.5
         content.savefig(buffer, format="png", dpi=110, bbox_inches="tight", facecolor="white")
     return {"data": buffer.getvalue(), "kind": kind, "broad": broad}
 

@@ -13,7 +13,7 @@ import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, count, cycle
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.rendering.api import Result, render
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.open import open_scene
+from mrt_mitsuba.validation.tools import diagrams
 from mrt_mitsuba.validation.tools.compare import Difference, compare, read_layer
 from mrt_mitsuba.validation.tools.study import Study, notebook, save_report
 
@@ -62,14 +63,18 @@ class Point:
     @classmethod
     def of(cls, name: str, times: np.ndarray, gram: np.ndarray, **more: Any) -> Point:
         """Return the figures of the seconds of repeats and their matrix G; ``more``: the other fields."""
-        seconds, squares, repeats = float(np.median(times)), np.diag(gram), len(times)
+        seconds = float(np.median(times))
+        squares = np.diag(gram)
+        repeats = len(times)
         # The standard error of a median is at most √(π/2) times that of a mean
         slower = math.exp(math.sqrt(math.pi / 2) * _reach(np.log(times)))
         mse = max(float(squares.mean()), NOTHING**2)
-        rmse, worse = math.sqrt(mse), math.exp(min(_reach(squares) / mse / 2, 99))
+        rmse = math.sqrt(mse)
+        worse = math.exp(min(_reach(squares) / mse / 2, 99))
         # Pairs of different repeats: their mean varies as twice that of what they have in common
         pairs = (gram.sum(axis=1) - squares) / (repeats - 1 or math.nan)
-        square, width = float(pairs.mean()), 2 * _reach(pairs) if repeats > 2 else math.inf
+        square = float(pairs.mean())
+        width = 2 * _reach(pairs) if repeats > 2 else math.inf
         bias, low, high = np.sqrt(np.maximum([square, square - width, square + width], 0)).tolist()
         variance = float(np.maximum(mse - square, 0))
         return cls(
@@ -151,6 +156,22 @@ class Findings:
             sentences.append(f"RMSE of {error:g}: {verdict}.")
         return sentences
 
+    def advice(self) -> list[dict[str, Any]]:
+        """Return a row for each of ``errors``: the case that gets there first, and the next other curve."""
+        rows = []
+        for error in self.errors:
+            low = sorted((p for p in self.points.values() if p.rmse <= error), key=lambda p: p.seconds)
+            others = [point for point in low if point.family != low[0].family]
+            row: dict[str, Any] = {"to get to an error of": error, "use": "nothing comes so low"}
+            row |= {"seconds": None, "next best": None, "which takes": None}
+            if low:
+                row |= {"use": low[0].name, "seconds": _shown(low[0].seconds, *low[0].seconds_interval)}
+            if others:
+                times = others[0].seconds / low[0].seconds
+                row |= {"next best": others[0].name, "which takes": f"{times:.2g} times as long"}
+            rows.append(row)
+        return rows
+
     def __str__(self) -> str:
         width = max(map(len, [*self.points, *self.failed]), default=0)
         lines = [
@@ -194,7 +215,8 @@ def _crossing(seconds: np.ndarray, errors: np.ndarray, error: float) -> float:
     down = errors < np.minimum.accumulate([math.inf, *errors[:-1]])
     if not down.any():  # NaN: a single repeat has no interval
         return math.nan
-    depths, times = -np.log(np.maximum(errors[down], NOTHING)), np.log(seconds[down])
+    depths = -np.log(np.maximum(errors[down], NOTHING))
+    times = np.log(seconds[down])
     # an error that is met to rounding is met
     return float(np.exp(np.interp(-math.log(error * (1 + 1e-9)), depths, times, right=math.inf)))
 
@@ -216,6 +238,7 @@ def error_vs_time(
     repeats: int = 5,
     shared: Options | None = None,
     errors: Sequence[float] | None = None,
+    cold: bool = True,
     progress: Progress | None = None,
 ) -> Findings:
     """Measure the error and the time of settings of ``render``.
@@ -232,6 +255,7 @@ def error_vs_time(
         repeats: with other seeds, in turn, after a cold and a warm run of each case.
         shared: options of all cases and of the reference.
         errors: RMSEs to give the time for; by default four over the range that was measured.
+        cold: whether the kernels of each case are compiled anew for its first run, which takes longer.
 
     A case that fails is kept, with the reason. Raises ``UsageError`` for wrong arguments, and what
     ``render`` raises for the reference.
@@ -250,8 +274,8 @@ def error_vs_time(
                 f"no claim can be made about an RMSE of {error:g}: the reference's own error is "
                 f"{own_error:.2g}, and only errors above twice that stand out; take a better reference"
             )
-    runs, failed = _measure(run, cases, halves[0], repeats, progress or Progress())
-    points = {name: _point(name, found, halves, own_error) for name, found in runs.items()}
+    runs, failed = _measure(run, cases, halves[0], repeats, cold, progress or Progress())
+    points = {name: _point(name, found, repeats, halves, own_error) for name, found in runs.items()}
     known = [p.rmse for p in points.values() if p.resolved and p.rmse > 1e-9]
     if errors is None and known:  # rounded up, so that there is a case that comes so low
         inside = np.geomspace(max(known), min(known), ERRORS + 2)[1:-1]
@@ -311,21 +335,23 @@ def _picture(result: Result) -> np.ndarray:
 
 
 def _measure(
-    run: Run, cases: Mapping[str, Options], truth: np.ndarray, repeats: int, progress: Progress
+    run: Run, cases: Mapping[str, Options], truth: np.ndarray, repeats: int, cold: bool, progress: Progress
 ) -> tuple[dict[str, list[Result]], dict[str, str]]:
-    """Return the results of cases, the cold and the warm run first, and why others failed.
+    """Return the results of cases, of which the last ``repeats`` count, and why others failed.
 
-    Each runs cold, warm, and ``repeats`` times in turn, so that a load on the machine meets all alike.
+    Each runs first, perhaps with its kernels compiled anew and once more, then ``repeats`` times in turn, so
+    that a load on the machine meets all alike.
     """
     import drjit as dr
 
     failed: dict[str, str] = {}
     runs: dict[str, list[Result]] = {name: [] for name in cases}
-    with progress.stage(TITLE, len(cases) * (repeats + 2)) as advance:
-        for turn in range(-2, repeats):
+    first = -2 if cold else -1
+    with progress.stage(TITLE, len(cases) * (repeats - first)) as advance:
+        for turn in range(first, repeats):
             for name in list(runs):
                 try:
-                    if turn == -2:
+                    if cold and turn == first:
                         dr.flush_kernel_cache()
                     runs[name].append(run(cases[name], max(turn, 0)))
                     compare(_picture(runs[name][-1]), truth)  # raises for another size
@@ -336,19 +362,23 @@ def _measure(
     return runs, failed
 
 
-def _point(name: str, runs: Sequence[Result], halves: Sequence[np.ndarray], own_error: float) -> Point:
-    """Return the figures of a case; its first run was cold, its second is not counted."""
-    image, pictures = runs[2].image, np.array([result.image for result in runs[2:]], np.float64)
+def _point(
+    name: str, runs: Sequence[Result], repeats: int, halves: Sequence[np.ndarray], own_error: float
+) -> Point:
+    """Return the figures of a case; its first run was cold, its last ``repeats`` count."""
+    counted = runs[-repeats:]
+    image = counted[0].image
+    pictures = np.array([result.image for result in counted], np.float64)  # [repeats, H, W, 3]
     errors = [(pictures - half).reshape(len(pictures), -1) for half in halves]
     gram = errors[0] @ errors[1].T / errors[0].shape[1]
     seconds = np.array([result.timings.total - result.timings.load for result in runs])
     return Point.of(
         name,
-        seconds[2:],
+        seconds[-repeats:],
         (gram + gram.T) / 2,
         cold=float(seconds[0]),
         compile=runs[0].timings.compile,
-        rays=dict(runs[2].rays),
+        rays=dict(counted[0].rays),
         image=image,
         difference=compare(image, np.mean(halves, axis=0)),
         reference_error=own_error,
@@ -369,12 +399,15 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
         return
     own = f"about {found.reference_error:.2g}; no claim is made below twice that"
     caption = (
-        "Down and to the left is better. Bars are 95 % intervals, numbers those of the table. Reference: "
-        f"{truth or 'as given'}. Its own RMSE is {own if found.reference_error else 'not known'}. "
+        "Down and to the left is better. Yellow: the best at each error; grey: curves that are never the "
+        f"best. Bars: 95 % intervals. Reference: {truth or 'as given'}. Its own RMSE is "
+        f"{own if found.reference_error else 'not known'}. "
     )
     caption += " ".join(found.verdicts)
-    study.picture(f"{prefix}diagram", f"{title}: work and precision", _diagram(found), caption)
+    drawn = diagrams.work_precision({title: found})
+    study.picture(f"{prefix}diagram", f"{title}: work and precision", drawn, caption)
     if found.errors:
+        study.records(f"{prefix}advice", f"{title}: what to use", found.advice(), first=not name)
         reached = {f"RMSE {error:g}": found.time_to(error) for error in found.errors}
         times = [
             {"curve": curve} | {what: _shown(*t[curve]) for what, t in reached.items()}
@@ -394,7 +427,6 @@ def _rows(found: Findings) -> list[dict[str, Any]]:
 
     return [
         {
-            "#": number,
             "case": p.name,
             "seconds": p.seconds,
             "interval, s": interval(p.seconds_interval),
@@ -410,35 +442,5 @@ def _rows(found: Findings) -> list[dict[str, Any]]:
             "FLIP": p.difference.flip,
             "rays": sum(p.rays.values()),
         }
-        for number, p in enumerate(chain(*found.families.values()), 1)
+        for p in chain(*found.families.values())
     ]
-
-
-def _diagram(found: Findings) -> Any:
-    """Return the work-precision diagram: RMSE against seconds, both with intervals, and the floor.
-
-    Points have the numbers of the table next to them.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    axes, floor, numbers = figure.subplots(), found.reference_error, count(1)
-    errors = [e for e in (floor, *(p.rmse for p in found.points.values())) if e > 0]
-    bottom = 0.4 * min(errors, default=1e-6)  # where cases without error are drawn
-    for (name, curve), marker in zip(found.families.items(), cycle("osD^vP*X<>hp"), strict=False):
-        places = np.array([[p.seconds, max(p.rmse, bottom)] for p in curve]).T
-        ends = np.array([[p.seconds_interval, p.rmse_interval] for p in curve]).transpose(1, 2, 0)
-        x, y = np.nan_to_num(np.maximum(np.stack([places - ends[:, 0], ends[:, 1] - places], axis=1), 0))
-        style: dict[str, Any] = {"marker": marker, "markersize": 5, "linewidth": 1, "capsize": 2}
-        axes.errorbar(places[0], places[1], xerr=x, yerr=y, label=name, **style)
-        for place in places.T:
-            axes.annotate(str(next(numbers)), place, textcoords="offset points", xytext=(4, 4), fontsize=8)
-    if floor:
-        axes.axhspan(bottom / 10, floor, color="0.9", zorder=0, label="within the reference's error")
-    if any(p.rmse == 0 for p in found.points.values()):
-        axes.axhline(bottom, color="0.9", linewidth=8, zorder=0, label="no error")
-    axes.margins(x=0.08, y=0.08)
-    axes.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="RMSE", ylim=(0.8 * bottom, None))
-    axes.grid(alpha=0.3)
-    figure.legend(fontsize=8, ncols=4, loc="outside lower center")
-    return figure

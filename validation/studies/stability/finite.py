@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from mrt_mitsuba import filters, runtime
 from mrt_mitsuba.validation.checks.probe import not_finite
+from mrt_mitsuba.validation.studies.stability.case import Case
 
 SHAPES = ((1, 1), (1, 17), (17, 1), (2, 2), (3, 3), (1, 2), (40, 30))
 MODES = ("report", "corrected")
@@ -22,15 +24,14 @@ EDGES: dict[str, Callable[[np.ndarray, np.ndarray], Any]] = {
     "sobel": lambda image, depth: filters.sobel_edges(image),
     "geometry": lambda image, depth: filters.geometry_edges(np.full_like(image, 3**-0.5), depth),
 }
-Case = tuple[Any, ...]
 
 
 def of_filters(quick: bool) -> Iterator[Case]:
     """Yield the cases of the filters, in both kinds of variants."""
     for variant in (runtime.SLOW, runtime.FAST):
         runtime.use(variant)
-        for name, *case in (*_blurs(), *_detectors()):
-            yield f"{name} ({variant})", *case
+        for case in (*_blurs(), *_detectors()):
+            yield replace(case, name=f"{case.name} ({variant})")
 
 
 def _blurred(image: np.ndarray, depth: np.ndarray, mode: str, f: float = 2.0, r: float = 0.5) -> np.ndarray:
@@ -38,27 +39,31 @@ def _blurred(image: np.ndarray, depth: np.ndarray, mode: str, f: float = 2.0, r:
 
 
 def _blurs() -> Iterator[Case]:
-    excess, damage, rng = 0.0, 0, np.random.default_rng(1)
+    excess = 0.0
+    damage = 0
+    rng = np.random.default_rng(1)
     for shape, mode in product(SHAPES, MODES):
         depth = rng.uniform(0.1, 12, shape).astype(np.float32)  # on both sides of the focus
         depth[rng.random(shape) < 0.1] = np.inf
         image = rng.random((*shape, 3)).astype(np.float32)
         for level in (np.full_like(image, 1e-25), np.full_like(image, 0.3), 1e20 * image - np.float32(3e19)):
-            out, low, high = _blurred(level, depth, mode), level.min(), level.max()
+            out = _blurred(level, depth, mode)
+            low = level.min()
+            high = level.max()
             excess = max(excess, np.maximum(low - out, out - high).max() / max(abs(low), abs(high)))
         for value in (np.nan, np.inf) if shape == SHAPES[-1] else ():
             image[20, 15, 1] = value
             bad = ~np.isfinite(_blurred(image, depth, mode)).all(axis=-1)
             damage += int(bad.sum()) + 1 - 2 * int(bad[20, 15])
     what = "how far means leave the range of values, 1×1 … 40×30, to 1e20"
-    yield "range of a blur", what, "not at all", excess, MEAN
+    yield Case("range of a blur", what, "not at all", excess, MEAN)
     what = "other pixels that are not finite afterwards, and this one where it is hidden"
-    yield "nan or inf in a picture, blur", what, "damage stays local, and to be seen", damage, 0
+    yield Case("nan or inf in a picture, blur", what, "damage stays local, and to be seen", damage, 0)
     image, depth = (np.float32(10 ** rng.uniform(*s)) for s in ((-38, 34, (20, 20, 3)), (-30, 30, (20, 20))))
     settings = product(MODES, (1e-30, 1.0, 1e30), (0.0, 1e-30, 1e30, np.inf))
     found = [_blurred(image, depth, *setting) for setting in settings]
     what = "values that are not finite, pictures 1e-38 … 1e34, depths 1e-30 … 1e30"
-    yield "huge ranges, blur", what, "means are finite", np.sum(~np.isfinite(found)), 0
+    yield Case("huge ranges, blur", what, "means are finite", np.sum(~np.isfinite(found)), 0)
 
 
 def _detectors() -> Iterator[Case]:
@@ -69,17 +74,20 @@ def _detectors() -> Iterator[Case]:
     for name, find in EDGES.items():
         wrong = np.isnan(np.asarray(find(huge, far).value)).sum()
         for value in (np.nan, np.inf):
-            image, depth = np.full((12, 10, 3), 0.5, np.float32), np.full((12, 10), 3, np.float32)
+            image = np.full((12, 10, 3), 0.5, np.float32)
+            depth = np.full((12, 10), 3, np.float32)
             image[6, 5, 2], depth[6, 5] = value, np.nan  # an infinite depth is a miss
             found = find(image, depth)
             wrong += (np.isinf(np.asarray(found.value)) != expected).sum()
             wrong += (~np.asarray(found.mask) & expected).sum()
         what = "pixels not marked in its 3×3, or marked elsewhere; NaN among the values of pictures to ±1e34"
-        yield f"nan or inf in a picture, huge ranges, {name}", what, "reported, and local", wrong, 0
+        yield Case(f"nan or inf in a picture, huge ranges, {name}", what, "reported, and local", wrong, 0)
 
 
 AT_ONCE = 2_500_000
-TINY, NORMAL = 1e-45, 1.2e-38  # the least float32 of all, and the least with all its digits
+# the least float32 of all, and the least with all its digits
+TINY = 1e-45
+NORMAL = 1.2e-38
 _ZERO_UP = (0, TINY, NORMAL, 1e-20, 1e-8, 1e-4, 0.1, 1, 1e2, 1e6, 3e38, np.inf, np.nan)
 ALPHAS: tuple[float, ...] = (*_ZERO_UP, *(-a for a in _ZERO_UP[1:-1]))
 IORS = (1, 1 + 1.2e-7, 1 - 6e-8, TINY, NORMAL, 1e-3, 1e6, 1e9, 3e38, np.inf, np.nan, 0, -1)
@@ -99,27 +107,28 @@ def in_bulk(quick: bool) -> Iterator[Case]:
         seeds = range(-(-count // AT_ONCE))  # one trace serves all
         bad = sum(bad_lanes(form, visible, count // len(seeds), seed) for seed in seeds)
         normals = "visible normals" if visible else "normals by D"
-        yield f"mrt_bsdf, {form}, {normals}", what, "none is bad", bad, 0
+        yield Case(f"mrt_bsdf, {form}, {normals}", what, "none is bad", bad, 0)
 
 
 def bad_lanes(form: str, visible: bool, count: int, seed: int) -> int:
     """Count bad values, densities, samples and mirror reflectances; each lane has its alpha and indices."""
     generator = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))
 
-    def mixed(ordinary: Callable[[Any], Any], extremes: Sequence[float]) -> Any:
+    def mixed(ordinary: Callable[[mi.Float], mi.Float], extremes: Sequence[float]) -> mi.Float:
         """Return a function of uniform numbers, in every third lane an extreme."""
-        found, table = ordinary(generator.next_float32()), mi.Float(np.array(extremes, np.float32))
+        found = ordinary(generator.next_float32())
+        table = mi.Float(np.array(extremes, np.float32))
         index = mi.UInt32(generator.next_float32() * 3 * len(extremes))
         extreme = index < len(extremes)
         return dr.select(extreme, dr.gather(mi.Float, table, index, extreme), found)
 
-    def uniform() -> Any:
+    def uniform() -> mi.Float:
         return mixed(lambda u: u, (0, 6e-8, 0.5, 1 - 6e-8))
 
-    def decades(least: float, most: float, extremes: Sequence[float]) -> Any:
+    def decades(least: float, most: float, extremes: Sequence[float]) -> mi.Float:
         return mixed(lambda u: least * dr.exp(u * float(np.log(most / least))), extremes)
 
-    def direction() -> Any:
+    def direction() -> mi.Vector3f:
         z = mixed(lambda u: 2 * u - 1, COSINES)
         sine, cosine = dr.sincos(2 * dr.pi * uniform())
         r = dr.sqrt(dr.maximum((1 - z) * (1 + z), 0))

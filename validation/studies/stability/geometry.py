@@ -5,9 +5,9 @@ The laws of ``check_shape`` hold what needs no other renderer; here, rays have a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -16,6 +16,7 @@ from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Mesh, Plane, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles.reference import nearest, unit
+from mrt_mitsuba.validation.studies.stability.case import Case
 
 ROUNDING = 2.0**-24
 DECADES = 10.0 ** np.arange(-6, 7, 2)
@@ -30,26 +31,74 @@ FLATTEST = 1e-3
 # powers of ten, so many may be: those whose centre ray passes an outline or the edge of a shadow within the
 # roundings of the scaled numbers, seen directly or through ten mirrors. After moving by n scene sizes, they
 # move by n roundings, enlarged by every curved mirror
-VISIBLE, SHARE_SCALED, SHARE_MOVED = 2 / 255, 0.001, 1e-4
-# Of each place its name, a factor, a number of scene sizes, why, and the most that it holds to, if it can
-STEPS = "coordinates have steps of {:.0e} scene sizes there: normals and outlines move"
-PLACES: tuple[tuple[Any, ...], ...] = (
-    *((f"times {s:g}", s, 0, "the same picture", SHARE_SCALED) for s in (1e-6, 1e-3, 1e3, 1e6)),
-    *((f"moved by {n:g} sizes", 1, n, STEPS.format(n * 2**-23), max(SHARE_MOVED * n, SHARE_SCALED))
-      for n in (1.0, 10.0, 100.0)),
-    *((f"moved by {n:g} sizes", 1, n, STEPS.format(n * 2**-23)) for n in (1e3, 1e4)),
-)  # fmt: skip
+VISIBLE = 2 / 255
+SHARE_SCALED = 0.001
+SHARE_MOVED = 1e-4
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a scene is put, and the largest share of pixels that may change; None where it cannot hold."""
+
+    name: str
+    factor: float  #: of all lengths
+    sizes: float  #: that it is moved by, in scene sizes
+    why: str
+    most: float | None
+
+
+def scaled(factor: float) -> Place:
+    return Place(f"times {factor:g}", factor, 0, "the same picture", SHARE_SCALED)
+
+
+def moved(sizes: float) -> Place:
+    """Return a place so many scene sizes away, of which too many leave no digits for the scene."""
+    step = sizes * 2**-23
+    why = f"coordinates have steps of {step:.0e} scene sizes there: normals and outlines move"
+    most = max(SHARE_MOVED * sizes, SHARE_SCALED) if sizes <= 100 else None
+    return Place(f"moved by {sizes:g} sizes", 1, sizes, why, most)
+
+
+PLACES = (
+    *(scaled(factor) for factor in (1e-6, 1e-3, 1e3, 1e6)),
+    *(moved(sizes) for sizes in (1.0, 10.0, 100.0, 1e3, 1e4)),
+)
 
 WHERE = f"sizes 1e-6 … 1e6, from 1e-6 to {FARTHEST:g} sizes away and from inside"
-# What ``measure`` returns of an object, in this order: what it is, why it must be so, and the most
-FIGURES = (
-    ("place", f"{WHERE}: worst distance error across the surface, in roundings of the largest coordinate",
-     "what intersection and a ray's own t lose", 16),
-    ("hits", f"rays that hit or miss wrongly, {OUTLINE} roundings and more off the outline, or find a "
-     "distance, normal or colour that is no finite number", "the same", 0),
-    ("mirror rays", "mirror rays that meet the surface they leave", "they start off it", 0),
-    ("shadow rays", "points that their own surface hides from a light above it", "the same", 0),
-)  # fmt: skip
+
+
+class Figures(NamedTuple):
+    """Of the rays at one size: the worst place, in roundings, and counts of rays."""
+
+    place: float
+    hits: float
+    mirror_rays: float
+    shadow_rays: float
+
+
+class Limit(NamedTuple):
+    """What a figure is, why it must be so, and the most that it may be."""
+
+    what: str
+    why: str
+    most: float
+
+
+LIMITS = (  # of the figures, in their order
+    Limit(
+        f"{WHERE}: worst distance error across the surface, in roundings of the largest coordinate",
+        "what intersection and a ray's own t lose",
+        16,
+    ),
+    Limit(
+        f"rays that hit or miss wrongly, {OUTLINE} roundings and more off the outline, or find a distance, "
+        "normal or colour that is no finite number",
+        "the same",
+        0,
+    ),
+    Limit("mirror rays that meet the surface they leave", "they start off it", 0),
+    Limit("points that their own surface hides from a light above it", "the same", 0),
+)
 
 MIRROR = Material(1.5, 1.0, (1, 1, 1), (1, 1, 1))
 CORNERS = np.array([(-0.8, -0.5, 0.1), (0.9, -0.3, -0.2), (0.1, 0.9, 0.3)])
@@ -68,20 +117,24 @@ def ends(size: float) -> tuple[Any, Any]:
     return (0.1 * size, 0.6 * size, -0.2 * size), (-0.1 * size, -0.4 * size, 0.2 * size)
 
 
-def cases(quick: bool) -> Iterator[tuple[Any, ...]]:
+def cases(quick: bool) -> Iterator[Case]:
     """Yield single objects, then the report's scenes scaled and moved."""
+    count = 300 if quick else 3000
     for kind in SOLIDS:
         sizes = DECADES[::3] if quick else DECADES
-        worst = np.max([measure(kind, size, 300 if quick else 3000) for size in sizes], axis=0)
-        for (figure, what, why, most), found in zip(FIGURES, worst, strict=True):
-            yield f"{kind}, {figure}", what, why, found, most
+        worst = np.max([measure(kind, size, count) for size in sizes], axis=0)
+        for name, limit, figure in zip(Figures._fields, LIMITS, worst, strict=True):
+            yield Case(f"{kind}, {name.replace('_', ' ')}", limit.what, limit.why, figure, limit.most)
     # Scene 2 shows the horizon, which a far plane can cut off
     for number in (0, 2, 3) if quick else range(5):
         scene = replace(report_scene(number), focal_distance=None)
         base = picture(scene)
-        for name, factor, sizes, why, *held in PLACES:
-            share = np.mean(~(np.abs(picture(placed(scene, factor, sizes)) - base).max(axis=-1) <= VISIBLE))
-            yield f"scene {number} {name}", "share of pixels off by more than 2/255", why, share, *held
+        for place in PLACES:
+            image = picture(placed(scene, place.factor, place.sizes))
+            off = np.abs(image - base).max(axis=-1)
+            share = np.mean(~(off <= VISIBLE))  # NaN is off
+            what = "share of pixels off by more than 2/255"
+            yield Case(f"scene {number} {place.name}", what, place.why, share, place.most)
 
 
 def picture(scene: Scene) -> np.ndarray:
@@ -112,44 +165,71 @@ def placed(scene: Scene, factor: float, sizes: float) -> Scene:
     )
 
 
-def measure(kind: str, size: float, count: int) -> tuple[float, ...]:
+def measure(kind: str, size: float, count: int) -> Figures:
     """Return the figures of rays at one size, from all distances."""
     # None is on the surface
     distances = [1.5 * x if x == size else x for x in DECADES if x <= FARTHEST * size]
-    o, d = map(np.concatenate, zip(*(_rays(size, x, count) for x in distances), strict=True))
+    starts, ways = zip(*(_rays(size, x, count) for x in distances), strict=True)
+    o = np.concatenate(starts)  # [N, 3]
+    d = np.concatenate(ways)
     scale = np.maximum(np.repeat(distances, count), size)
     rounding = ROUNDING * scale / size  # of the largest coordinate, in sizes
-    thing, light = SOLIDS[kind](size), np.array([3.0, 5.0, 4.0]) * size
-    whole: Any = Scene(Camera((0, 0, 9), (0, 0, 0)), (0, 0, 0), (Light(tuple(light.tolist()), (1, 1, 1)),))
-    nodes = replace(whole, **{kind: (thing,)}).to_dict(fresnel="unity")
-    # another kind of shape, so small and far off that no ray meets it
-    aside = {"type": "sphere", "center": [1.7 * size] * 3, "radius": 1e-3 * size, "flip_normals": True}
-    scene = mi.load_dict(nodes | {"aside": aside})
-    whitted = mi.load_dict({"type": "mrt_whitted", "min_contribution": 0.0, "bounce_budget": "plain"})
-    trace = whitted.trace(scene, None, mi.Ray3f(o.T, d.T))
-    found, direct, n = np.array(trace.hit.found), np.array(trace.direct[0]), np.array(trace.hit.si.n).T
+    thing = SOLIDS[kind](size)
+    light = np.array([3.0, 5.0, 4.0]) * size
+    scene = _alone(kind, thing, light, size)  # which rays may still need when their results are read
+    trace = trace_of(scene, o, d)
+    hit = np.array(trace.hit.found)
+    direct = np.array(trace.direct[0])
+    n = np.array(trace.hit.si.n).T
     t = np.array(trace.hit.si.t, np.float64)
 
     length = np.linalg.norm(np.float64(d), axis=1)
+    unit_d = d / length[:, None]
+    distance, _, normal, *_ = nearest([thing], o, unit_d)
     # an object enlarged is the same as rays from nearer by
-    nearer = [o / (1 + k * OUTLINE * rounding)[:, None] for k in (0, 1, -1)]
-    truth, larger, smaller = (nearest([thing], start, d / length[:, None]) for start in nearer)
-    exact, normal = truth[0] / length, truth[2]
-    exists, near_outline = np.isfinite(exact), np.isfinite(larger[0]) != np.isfinite(smaller[0])
-    both = found & exists
+    reach = OUTLINE * rounding[:, None]
+    in_larger = np.isfinite(nearest([thing], o / (1 + reach), unit_d)[0])
+    in_smaller = np.isfinite(nearest([thing], o / (1 - reach), unit_d)[0])
+    exists = np.isfinite(distance)
+    both = hit & exists
     cosine = np.where(both, (normal * d).sum(axis=1), 1)
-    away = np.where(both, exact, 0)
+    away = np.where(both, distance / length, 0)
     p = o + away[:, None] * d
     front = both & (cosine < -FLATTEST)
-    height = ((light - p) * normal).sum(axis=1) / np.linalg.norm(light - p, axis=1)
-    across = np.abs((np.where(both, t, 0) - away) * cosine) / np.maximum(scale, np.abs(p).max(axis=1))
-    finite = np.isfinite(direct) & (~found | np.isfinite(n).all(axis=1) & np.isfinite(t))
-    return (
-        across.max() / ROUNDING if both.sum() >= 100 else np.inf,  # else it means nothing
-        ((found != exists) & ~near_outline | ~finite).sum(),
-        (front & (np.array(trace.bounces) > 1)).sum(),
-        (front & (height > FLATTEST + OUTLINE * rounding) & ~(direct > 0)).sum(),
+    to_light = light - p
+    height = (to_light * normal).sum(axis=1) / np.linalg.norm(to_light, axis=1)
+    largest = np.maximum(scale, np.abs(p).max(axis=1))
+    across = np.abs((np.where(both, t, 0) - away) * cosine) / largest
+    finite = np.isfinite(direct) & (~hit | np.isfinite(n).all(axis=1) & np.isfinite(t))
+    wrong = (hit != exists) & (in_larger == in_smaller)
+    above = height > FLATTEST + OUTLINE * rounding
+    return Figures(
+        place=across.max() / ROUNDING if both.sum() >= 100 else np.inf,  # else it means nothing
+        hits=(wrong | ~finite).sum(),
+        mirror_rays=(front & (np.array(trace.bounces) > 1)).sum(),
+        shadow_rays=(front & above & ~(direct > 0)).sum(),
     )
+
+
+def _alone(kind: str, thing: Any, light: np.ndarray, size: float) -> mi.Scene:
+    """Return a scene with a thing under a light, and another so small and far off that no ray meets it."""
+    nodes = lit(kind, thing, light.tolist())
+    aside = {"type": "sphere", "center": [1.7 * size] * 3, "radius": 1e-3 * size, "flip_normals": True}
+    return mi.load_dict(nodes | {"aside": aside})
+
+
+def lit(kind: str, thing: Any, light: Sequence[float]) -> dict[str, Any]:
+    """Return the nodes of a scene of a thing, of a kind as in ``SOLIDS``, under a light."""
+    x, y, z = light
+    empty: Any = Scene(Camera((0, 0, 9), (0, 0, 0)), (0, 0, 0), (Light((x, y, z), (1, 1, 1)),))
+    nodes: dict[str, Any] = replace(empty, **{kind: (thing,)}).to_dict(fresnel="unity")
+    return nodes
+
+
+def trace_of(scene: mi.Scene, o: np.ndarray, d: np.ndarray) -> Any:
+    """Return what ``mrt_whitted`` finds along rays (o, d [N, 3])."""
+    whitted = mi.load_dict({"type": "mrt_whitted", "min_contribution": 0.0, "bounce_budget": "plain"})
+    return whitted.trace(scene, None, mi.Ray3f(o.T, d.T))
 
 
 def _rays(size: float, distance: float, count: int) -> tuple[np.ndarray, np.ndarray]:

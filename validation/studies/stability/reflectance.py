@@ -14,6 +14,7 @@ from mrt_mitsuba.plugins import fresnel, microfacet
 from mrt_mitsuba.plugins.quadric_kinds import Columns
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.oracles.reference import unit
+from mrt_mitsuba.validation.studies.stability.case import Case
 
 # Of tan²θh / alpha², minus the logarithm of exp(-…): the lobe is at 1e-7 of its peak, and at 1e-20
 IN_BOUND, STEEPEST = -np.log([1e-7, 1e-20])
@@ -32,7 +33,6 @@ NOTE = (
     "terms, since their sum passes through zero."
 )
 
-Case = tuple[Any, ...]
 Arrays = dict[str, np.ndarray]
 
 
@@ -41,27 +41,29 @@ def cases(quick: bool) -> Iterator[Case]:
     lobes = lobes_with_truth(2_000 if quick else 8_000)
     usual = (abs(np.log10(lobes["alpha"]) + 2) < 2) & (lobes["steepness"] <= IN_BOUND)
     for name, error in errors(lobes).items():
-        limits, where = LIMITS.get(name, WITH_EXP), "alpha 1e-4 … 1, D ≥ 1e-7 of its peak"
-        yield f"{name}, p99.9", where, "a few roundings", np.quantile(error[usual], 0.999), limits[0]
-        where, why = "alpha 1e-8 … 100, D ≥ 1e-20 of its peak", "roundings, which exp enlarges by up to 46"
-        yield f"{name}, largest", where, why, error.max(), limits[1]
+        limits = LIMITS.get(name, WITH_EXP)
+        where = "alpha 1e-4 … 1, D ≥ 1e-7 of its peak"
+        yield Case(f"{name}, p99.9", where, "a few roundings", np.quantile(error[usual], 0.999), limits[0])
+        where = "alpha 1e-8 … 100, D ≥ 1e-20 of its peak"
+        why = "roundings, which exp enlarges by up to 46"
+        yield Case(f"{name}, largest", where, why, error.max(), limits[1])
     count = 60 if quick else 600
     uniform = np.random.default_rng(4).uniform(-7, 0.1, count * len(FRESNEL_IORS))
     cosines = np.float32(np.minimum(10**uniform, 1))
     worst = fresnel_error(cosines, np.repeat(FRESNEL_IORS, count))
-    yield "F, largest", "cosines 1e-7 … 1, IOR 1e-3 … 1e6", "a few roundings", worst, 2e-6
+    yield Case("F, largest", "cosines 1e-7 … 1, IOR 1e-3 … 1e6", "a few roundings", worst, 2e-6)
     # where total reflection begins, F ends in a square root: errors are those of g = 0
     iors = np.repeat(np.array([0.5, 0.9, 0.99, 0.9999], np.float32), 81)
     critical = np.float32(np.sqrt((1 - np.float64(iors)) * (1 + np.float64(iors))))
     cosines = (critical.view(np.int32) + np.tile(np.arange(-40, 41, dtype=np.int32), 4)).view(np.float32)
     what = "the 40 float32 cosines on either side of it, IOR 0.5 … 0.9999"
     why = "√ of a rounding: 1 - F is 4 g / (η² cos θ) there, and g² is known to a rounding of cos²"
-    yield "F at the critical angle", what, why, fresnel_error(cosines, iors), 16 * 2.0**-12
+    yield Case("F at the critical angle", what, why, fresnel_error(cosines, iors), 16 * 2.0**-12)
     stride = 2**12 if quick else 1
     what = f"largest error in steps of float32, over float32 cosines in [0, 1], 1 in {stride}"
     why = "about a dozen roundings, some of them doubled by squares"
     for name, formula in OF_COSINE.items():
-        yield name, what, why, largest_error(formula, stride), 16
+        yield Case(name, what, why, largest_error(formula, stride), 16)
 
 
 def fresnel_error(cosines: np.ndarray, iors: np.ndarray) -> float:
@@ -73,7 +75,9 @@ def fresnel_error(cosines: np.ndarray, iors: np.ndarray) -> float:
 
 def errors(lobes: Arrays) -> Arrays:
     """Return the relative errors [N] of the plugin and its functions, by quantity."""
-    alpha, wi, wo = mi.Float(lobes["alpha"]), mi.Vector3f(lobes["wi"].T), mi.Vector3f(lobes["wo"].T)
+    alpha = mi.Float(lobes["alpha"])
+    wi = mi.Vector3f(lobes["wi"].T)
+    wo = mi.Vector3f(lobes["wo"].T)
     dr.enable_grad(alpha)
     bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": "dielectric", "diffuse_reflectance": 0.0})
     parameters = mi.traverse(bsdf)
@@ -101,7 +105,9 @@ OF_COSINE: dict[str, Callable[[Any], Any]] = {
     "exact Fresnel, into n = 1.5": lambda c: fresnel.fresnel_dielectric(c, 1.0, 1.5),
     **{f"Smith's G1, alpha = {alpha}": _g1(float(np.float32(alpha))) for alpha in (0.05, 0.2, 1.0)},
 }
-ONE, LEAST = 0x3F800000, 0x00800000  # the bits of 1, and of the least number with all its digits
+# the bits of 1, and of the least number with all its digits
+ONE = 0x3F800000
+LEAST = 0x00800000
 CHUNK = 2**24
 
 
@@ -119,7 +125,8 @@ def largest_error(formula: Callable[[Any], Any], stride: int) -> float:
         size = min(CHUNK, (ONE - start) // stride + 1)
         bits = dr.opaque(UInt32, start) + dr.arange(UInt32, size) * stride
         cosines = dr.reinterpret_array(Float, dr.select(bits < LEAST, 0, bits))
-        found, wide = formula(cosines), formula(Float64(cosines))
+        found = formula(cosines)
+        wide = formula(Float64(cosines))
         exponent = dr.reinterpret_array(UInt32, Float(wide)) & 0x7F800000
         step = Float64(dr.reinterpret_array(Float, dr.maximum(exponent, LEAST))) * 2.0**-23
         error = dr.select((found == 0) & (wide > 0), 0, dr.abs(Float64(found) - wide) / step)
@@ -134,9 +141,13 @@ def lobes_with_truth(count: int) -> Arrays:
     Of N pairs ``wi`` and ``wo`` [N, 3], ``alpha``, ``ior``, the ``steepness`` tan²θh / alpha², and what
     ``_exact`` says of them.
     """
-    rng, pairs = np.random.default_rng(2), (2, 2 * count)  # a third of them points down
-    alpha, cosine = np.float32(10 ** rng.uniform(-8, 2, pairs[1])), 10 ** rng.uniform(-7, 0, pairs[1])
-    tan, sine = alpha * np.sqrt(STEEPEST * rng.random(pairs[1]) ** 2), np.sqrt((1 - cosine) * (1 + cosine))
+    # a third of them points down
+    rng = np.random.default_rng(2)
+    pairs = (2, 2 * count)
+    alpha = np.float32(10 ** rng.uniform(-8, 2, pairs[1]))
+    cosine = 10 ** rng.uniform(-7, 0, pairs[1])
+    tan = alpha * np.sqrt(STEEPEST * rng.random(pairs[1]) ** 2)
+    sine = np.sqrt((1 - cosine) * (1 + cosine))
     phi, psi = rng.uniform(0, 2 * np.pi, pairs)
     wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine], axis=1)
     m = unit(np.stack([tan * np.cos(psi), tan * np.sin(psi), np.ones(pairs[1])], axis=1))
@@ -154,16 +165,19 @@ def lobes_with_truth(count: int) -> Arrays:
 def _exact(wi: np.ndarray, wo: np.ndarray, alpha: float, ior: float) -> tuple[float, ...]:
     """Return D, G, the value (BSDF times cos θo), the density of visible normals, the value's derivative with
     respect to alpha, and the sum of the sizes of the terms of that derivative."""
-    a, step = exact.number(alpha), exact.number(alpha) * exact.mpf("1e-20")
+    a = exact.number(alpha)
+    step = exact.number(alpha) * exact.mpf("1e-20")
     x, y, z = (exact.number(p) + exact.number(q) for p, q in zip(wi, wo, strict=True))
     tan2 = (x * x + y * y) / (z * z)
     # Components are not rounded again: the cosine between the directions is that of them made one unit long
     sides = zip(exact.unit(list(wi)), exact.unit(list(wo)), strict=True)
     f = exact.fresnel_dielectric(exact.mp.sqrt(sum((p + q) ** 2 for p, q in sides)) / 2, 1, ior)
-    d, g = exact.beckmann_d(1 / exact.mp.sqrt(1 + tan2), a), [exact.smith_g1(v, a) for v in (wi, wo)]
+    d = exact.beckmann_d(1 / exact.mp.sqrt(1 + tan2), a)
+    g = [exact.smith_g1(v, a) for v in (wi, wo)]
     value = d * f * g[0] * g[1] / (4 * exact.number(wi[2]))
     # Of the logarithms of D, 2 (tan²/alpha² - 1) / alpha, and of both G₁
     slopes = [(exact.smith_g1(v, a + step) / g1 - 1) / step for v, g1 in zip((wi, wo), g, strict=True)]
     terms = [2 * tan2 / a**3, -2 / a, *slopes]
-    density, size = d / (4 * exact.visible_cos(wi, a)), sum(map(abs, terms))
+    density = d / (4 * exact.visible_cos(wi, a))
+    size = sum(map(abs, terms))
     return tuple(map(float, (d, g[0] * g[1], value, density, value * sum(terms), value * size)))

@@ -6,8 +6,8 @@ must exceed the bound of the case by a factor of two: so each states, by measure
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,17 @@ import numpy as np
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.validation.oracles.reference import reference_render
+from mrt_mitsuba.validation.studies.stability.case import Case
 
-WIDTH, HEIGHT = 64, 48
+Options = dict[str, Any]
+
+WIDTH = 64
+HEIGHT = 48
 
 # Differences count relative to the value plus a thousandth, and the worst of 95 % of the pixels is held to a
 # bound: the others may show outlines and the edges of shadows
-SMALL, SHARE = 1e-3, 0.95
+SMALL = 1e-3
+SHARE = 0.95
 # For plain cases: some float32 roundings, three times what was measured
 PLAIN = 3e-6
 
@@ -67,68 +72,108 @@ def _hall(specular: float, light: float = 1.0, ior: float = 1.5) -> Scene:
     """Return two mirrors that face each other, with a ball and the camera between them."""
     material = replace(MIRROR, ior=ior, specular=(specular, 0.95 * specular, 0.9 * specular))
     walls = (Plane((0, 0, 1), 2.0, material), Plane((0, 0, -1), 2.0, material), Plane((0, 1, 0), 1.0, GREY))
-    ball, lamp = Sphere((0.3, -0.2, -0.5), 0.4, GREY), Light((0.5, 1.5, 0.3), (light,) * 3)
+    ball = Sphere((0.3, -0.2, -0.5), 0.4, GREY)
+    lamp = Light((0.5, 1.5, 0.3), (light,) * 3)
     return Scene(Camera((0.0, 0.1, 1.0), (0.05, 0.0, -2.0)), (0.2, 0.3, 0.4), (lamp,), (ball,), walls)
 
 
-FULL, OPEN = {"fresnel": "unity"}, {"clamp": False}
+FULL: Options = {"fresnel": "unity"}
+OPEN: Options = {"clamp": False}
 
-# Of each case its name, what it is, a scene that is hard on a path tracer, and one, or settings, that must
-# not pass for it; the limit, settings of both tracers, and the scene whose exact picture it is
-PATHS: Sequence[tuple[Any, ...]] = (
-    ("facing mirrors", "Ks 0.95, ten bounces", _hall(0.95), _hall(0.9499), 2e-5, FULL),
-    ("perfect facing mirrors", "Ks 1, ten bounces", _hall(1), {"max_depth": 9}, 2e-5, FULL),
-    ("facing mirrors, no clamp", "Ks 0.95", _hall(0.95), _hall(0.95, 1.001), 2e-5, {**FULL, **OPEN}),
-    ("mirrors that add light", "Ks 1.5: 58 times", _hall(1.5), _hall(1.501), 2e-5, FULL),
-    ("bounce budget", "index 0.57: a bounce costs five of ten", _hall(0.95, ior=0.57),
-         {"max_depth": 11}, 2e-5, FULL),
-    ("clamp on", "a light of 1e4", _lit((2, 3, 4), 1e4), OPEN),
-    ("clamp off", "a light of 1e4", _lit((2, 3, 4), 1e4), _lit((2, 3, 4), 10001), PLAIN, OPEN),
-    ("light inside a ball", "not lit from outside", _lit((0, 0.5, 0)), _lit((0, 0.8, 0.6))),
-    ("light on the floor", "at height 0", _lit((1.5, 0, 0.5)), _lit((1.5, 0.001, 0.5)), 5e-6),
-    ("light on the ball", "its top", _lit((0, 1, 0)), _lit((0, 1.01, 0)), 5e-6),
-    ("light under the ball", "on its lower side", _under(0), _under(1e-3), 5e-6, {}, _under(1e-6)),
-    ("light at 1e6", "parallel light", _lit((4e5, 6e5, 7e5)), _lit((4.001e5, 6e5, 7e5))),
-    ("light at the camera", "no shadow", _lit(CAMERA.position), _lit((0.2, 0.501, 3))),
-    ("black", "Kd = Ks = 0", _ball(specular=(0,) * 3, diffuse=(0,) * 3),
-         _ball(specular=(1e-3,) * 3), 3e-7),
-    ("over-bright", "Kd 5, Ks 3", _ball(specular=(3,) * 3, diffuse=(5,) * 3),
-         _ball(specular=(3,) * 3, diffuse=(5.001,) * 3), PLAIN, OPEN),
-    ("diffuse", "Kd 0.3, 0.2, 0.1", BASE, _ball(diffuse=(0.3001, 0.2, 0.1))),
-    ("roughness 0", "acts as 1e-8", _highlight(0.0), _highlight(1e-3), 1e-9, {}, _highlight(1e-8)),
-    ("roughness 1e-3", "its highlight from near by", _highlight(1e-3), _highlight(1.001e-3), 3e-4, OPEN),
-    ("roughness 100", "a lobe of 1e-5", _flat(100.0), _flat(99.0), PLAIN, OPEN),
-    ("negative roughness", "alpha -0.4", _shiny(alpha=-0.4), _shiny(alpha=0.4), 5e-6, OPEN),
-    ("index just above 1", "1 + 1e-7", _shiny(ior=1.0000001), _shiny(ior=1.005), 3e-7),
-    ("index 1e6", "a metal", _shiny(ior=1e6), _shiny(ior=1e4), 1e-5),
-    ("index 0.95", "total reflection at grazing angles", _shiny(ior=0.95), _shiny(ior=0.9501), 5e-6),
-    ("no lights", "mirrors of the sky", replace(BASE, lights=()),
-         replace(BASE, lights=(), sky=(0.2001, 0.3, 0.4))),
-    ("inside a ball", "camera and lights in it: its back is black",
-         replace(BASE, spheres=(Sphere((0, 0, 0), 9.0, GREY),)), replace(BASE, spheres=())),
-)  # fmt: skip
+
+@dataclass(frozen=True)
+class Path:
+    """A scene that is hard on a path tracer, and one, or settings, that must not pass for it."""
+
+    name: str
+    what: str
+    scene: Scene
+    fault: Scene | Options
+    limit: float = PLAIN
+    settings: Options = field(default_factory=dict)  #: of both tracers
+    exact: Scene | None = None  #: the scene whose exact picture it is, if not this one
+
+    def truth(self, scene: Scene, **settings: Any) -> np.ndarray:
+        """Return the picture [H, W, 3] of a scene by the float64 tracer, with other settings than its own."""
+        chosen = {"fresnel": "dielectric", "clamp": True, **self.settings, **settings}
+        return reference_render(scene, width=WIDTH, height=HEIGHT, **chosen).image
+
+    def rendered(self) -> np.ndarray:
+        """Return our picture [H, W, 3]."""
+        fresnel = self.settings.get("fresnel", "dielectric")
+        nodes = self.scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=fresnel)
+        clamp = self.settings.get("clamp", True)
+        nodes["integrator"] = {"type": "mrt_whitted", "clamp": clamp, "min_contribution": 0.0}
+        return render(nodes, aa=1, lattice="report").image
+
+
+def mirrors() -> Iterator[Path]:
+    """Yield paths between mirrors that face each other."""
+    hall = _hall(0.95)
+    bright = _hall(1.5)
+    yield Path("facing mirrors", "Ks 0.95, ten bounces", hall, _hall(0.9499), 2e-5, FULL)
+    yield Path("perfect facing mirrors", "Ks 1, ten bounces", _hall(1), {"max_depth": 9}, 2e-5, FULL)
+    yield Path("facing mirrors, no clamp", "Ks 0.95", hall, _hall(0.95, 1.001), 2e-5, FULL | OPEN)
+    yield Path("mirrors that add light", "Ks 1.5: 58 times", bright, _hall(1.501), 2e-5, FULL)
+    costly = _hall(0.95, ior=0.57)
+    yield Path(
+        "bounce budget", "index 0.57: a bounce costs five of ten", costly, {"max_depth": 11}, 2e-5, FULL
+    )
+
+
+def lights() -> Iterator[Path]:
+    """Yield lights that are bright, or in odd places."""
+    bright = _lit((2, 3, 4), 1e4)
+    yield Path("clamp on", "a light of 1e4", bright, OPEN)
+    yield Path("clamp off", "a light of 1e4", bright, _lit((2, 3, 4), 10001), PLAIN, OPEN)
+    yield Path("light inside a ball", "not lit from outside", _lit((0, 0.5, 0)), _lit((0, 0.8, 0.6)))
+    yield Path("light on the floor", "at height 0", _lit((1.5, 0, 0.5)), _lit((1.5, 0.001, 0.5)), 5e-6)
+    yield Path("light on the ball", "its top", _lit((0, 1, 0)), _lit((0, 1.01, 0)), 5e-6)
+    yield Path("light under the ball", "on its lower side", _under(0), _under(1e-3), 5e-6, {}, _under(1e-6))
+    yield Path("light at 1e6", "parallel light", _lit((4e5, 6e5, 7e5)), _lit((4.001e5, 6e5, 7e5)))
+    yield Path("light at the camera", "no shadow", _lit(CAMERA.position), _lit((0.2, 0.501, 3)))
+    dark = replace(BASE, lights=())
+    yield Path("no lights", "mirrors of the sky", dark, replace(dark, sky=(0.2001, 0.3, 0.4)))
+    around = replace(BASE, spheres=(Sphere((0, 0, 0), 9.0, GREY),))
+    what = "camera and lights in it: its back is black"
+    yield Path("inside a ball", what, around, replace(BASE, spheres=()))
+
+
+def materials() -> Iterator[Path]:
+    """Yield materials that are black, bright, smooth, rough or of odd indices."""
+    black = _ball(specular=(0,) * 3, diffuse=(0,) * 3)
+    yield Path("black", "Kd = Ks = 0", black, _ball(specular=(1e-3,) * 3), 3e-7)
+    over = {"specular": (3,) * 3}
+    fault = _ball(**over, diffuse=(5.001,) * 3)
+    yield Path("over-bright", "Kd 5, Ks 3", _ball(**over, diffuse=(5,) * 3), fault, PLAIN, OPEN)
+    yield Path("diffuse", "Kd 0.3, 0.2, 0.1", BASE, _ball(diffuse=(0.3001, 0.2, 0.1)))
+    least = _highlight(1e-8)
+    yield Path("roughness 0", "acts as 1e-8", _highlight(0.0), _highlight(1e-3), 1e-9, {}, least)
+    near = "its highlight from near by"
+    yield Path("roughness 1e-3", near, _highlight(1e-3), _highlight(1.001e-3), 3e-4, OPEN)
+    yield Path("roughness 100", "a lobe of 1e-5", _flat(100.0), _flat(99.0), PLAIN, OPEN)
+    yield Path("negative roughness", "alpha -0.4", _shiny(alpha=-0.4), _shiny(alpha=0.4), 5e-6, OPEN)
+    yield Path("index just above 1", "1 + 1e-7", _shiny(ior=1.0000001), _shiny(ior=1.005), 3e-7)
+    yield Path("index 1e6", "a metal", _shiny(ior=1e6), _shiny(ior=1e4), 1e-5)
+    grazing = "total reflection at grazing angles"
+    yield Path("index 0.95", grazing, _shiny(ior=0.95), _shiny(ior=0.9501), 5e-6)
 
 
 NOTE = "Differences to the float64 tracer, relative to the value plus a thousandth, of 95 % of the pixels."
 
 
-def cases(quick: bool) -> Iterator[tuple[Any, ...]]:
+def cases(quick: bool) -> Iterator[Case]:
     """Yield every case, held to the float64 tracer, and its fault, which must exceed twice its limit."""
-    for name, what, scene, fault, *more in PATHS:
-        others: list[Any] = [PLAIN, {}, scene]
-        limit, own, other = more + others[len(more) :]
-        settings: dict[str, Any] = {"fresnel": "dielectric", "clamp": True, **own}
-        described = scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=settings["fresnel"])
-        described["integrator"] = {"type": "mrt_whitted", "clamp": settings["clamp"], "min_contribution": 0.0}
-        image = render(described, aa=1, lattice="report").image
-        changed, setting = (scene, fault) if isinstance(fault, dict) else (fault, {})
-        truth, wrong = (
-            reference_render(drawn, width=WIDTH, height=HEIGHT, **options).image
-            for drawn, options in ((other, settings), (changed, settings | setting))
-        )
-        yield name, what, "roundings", difference(image, truth), limit
+    for path in (*mirrors(), *lights(), *materials()):
+        truth = path.truth(path.exact or path.scene)
+        if isinstance(path.fault, Scene):
+            wrong = path.truth(path.fault)
+        else:
+            wrong = path.truth(path.scene, **path.fault)
+        yield Case(path.name, path.what, "roundings", difference(path.rendered(), truth), path.limit)
         what = "a scene or setting almost the same"
-        yield f"{name}, its fault", what, "must be seen", difference(wrong, truth), 2 * limit, False
+        seen = difference(wrong, truth)
+        yield Case(f"{path.name}, its fault", what, "must be seen", seen, 2 * path.limit, False)
 
 
 def difference(image: np.ndarray, truth: np.ndarray) -> float:

@@ -1,0 +1,232 @@
+"""Laws of the components of a BSDF, and of its values in other variants."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, parameters
+from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
+from mrt_mitsuba.validation.checks.law import (
+    Figure,
+    Law,
+    Skip,
+    figures,
+)
+from mrt_mitsuba.validation.checks.probe import Array, Probe, context, excess
+
+FLAGS = "print([hex(int(bsdf.flags(i))) for i in range(bsdf.component_count())], hex(int(bsdf.flags())))\n"
+UPDATED = """params = mi.traverse(bsdf)
+print("components before:", bsdf.component_count())
+for key in {keys}:
+    params[key] = 0.9 * params[key]
+params.update()
+print("and after params.update():", bsdf.component_count())
+"""
+MASKED = """ctx.type_mask = {mask}
+print("lobes of type", hex(ctx.type_mask), "alone:", bsdf.eval(ctx, si, wo), "pdf():", bsdf.pdf(ctx, si, wo))
+for i in range(8):
+    bs, weight = bsdf.sample(ctx, si, (i + 0.5) / 8, mi.Point2f(0.3, 0.6))
+    print("a sample of type", hex(int(np.ravel(bs.sampled_type)[0])), "weight", weight)
+"""
+SIDES = "reflection stays on its side, transmission crosses, lobes of one direction have no value"
+SELECTS = "ctx.type_mask selects lobes: integrators that treat some apart count others twice"
+
+
+@figures(
+    flags=Figure(
+        "flags of the whole that no component has, or the other way around",
+        statistic="at most",
+        limit=0,
+        why="flags() is the union of flags(i)",
+        snippet=FLAGS,
+    ),
+    updated=Figure(
+        "components more or fewer after params.update()",
+        statistic="at most",
+        limit=0,
+        why="an update says nothing about lobes",
+        snippet=UPDATED,
+    ),
+    sum=Figure(
+        "sum of the components against the whole, relative",
+        statistic="most",
+        limit=1e-4,
+        why="a sum",
+        snippet=VALUE,
+    ),
+    values=Figure(
+        "results of eval() that contradict the flags of component {component}",
+        statistic="none",
+        limit=0,
+        why=SIDES,
+        snippet=VALUE,
+    ),
+    samples=Figure(
+        "results of sample() that contradict the flags of component {component}",
+        statistic="none",
+        limit=0,
+        why=SIDES,
+        snippet=FLAGS + SAMPLE,
+    ),
+    dark=Figure(
+        "sides that a component's flags name, and from which it is black",
+        statistic="at most",
+        limit=0,
+        why="a flag without a lobe",
+        snippet=FLAGS,
+    ),
+    masked=Figure(
+        "value of lobes of type {mask:#x} against the sum of such components, relative",
+        statistic="most",
+        limit=1e-4,
+        why=SELECTS,
+        snippet=MASKED,
+    ),
+    masked_samples=Figure(
+        "samples and densities of lobes that the mask of types {mask:#x} leaves out",
+        statistic="none",
+        limit=0,
+        why=SELECTS,
+        snippet=MASKED,
+    ),
+)
+def components(law: Law, case: Case) -> None:
+    """Flags of components say what they do; f = Σ fᵢ; ``component`` and ``type_mask`` of ``ctx`` select."""
+    bsdf = case.plugin
+    p = case.pairs
+    flags = [int(bsdf.flags(i)) for i in range(bsdf.component_count())]
+    union = np.bitwise_or.reduce(flags or [0])
+    law.hold("flags", bin(union ^ int(bsdf.flags())).count("1"))
+    if case.description is not None:
+        copy = case.load()
+        old = dict(parameters(case))
+        mi.traverse(copy).update({key: type(value)(value) for key, value in old.items()})
+        law.hold("updated", abs(copy.component_count() - len(flags)), keys=list(old))
+    parts = [case.eval(p.wi, p.wo, p.uv, context(i)) for i in range(len(flags))]
+    law.hold("sum", excess(np.sum(parts, axis=0), p.value, p.value_off), **vars(p))
+    dark = 0
+    for i, (flag, value) in enumerate(zip(flags, parts, strict=True)):
+        dark += _component(law, case, i, flag, value)
+    law.hold("dark", dark)
+    _masks(law, case, flags, parts)
+
+
+def _component(law: Law, case: Case, i: int, flag: int, value: Array) -> int:
+    """Hold values and samples of a component to its flags; the number of sides of these that are black."""
+    p = case.pairs
+    lit = (value != 0).any(axis=1)
+    with_width = flag & ~int(mi.BSDFFlags.Delta)
+    bad = lit & np.isfinite(value).all(axis=1) & ~_allowed(with_width, p.wi, p.wo)
+    law.hold("values", bad, component=i, **vars(p))
+    # samples of one component that go by another name, kind or side
+    count = case.count(2**12, 2**14)
+    wi = case.units(count)
+    u = case.uniform(count, 3)
+    uv = case.uniform(count, 2)
+    s = case.sample(wi, u, uv, context(i))
+    drawn = s.lit & np.isfinite(s.weight).all(axis=1)
+    bad = (s.component != i) | ((s.type & ~flag) != 0) | (s.type == 0)
+    bad |= (np.abs(s.wo[:, 2]) > 1e-6) & ~_allowed(flag, wi, s.wo)
+    law.hold("samples", drawn & bad, component=i, wi=wi, uv=uv, u=u)
+    # sides that flags name and where there is no light, of a component that has some
+    z = np.concatenate([p.wi[lit, 2], wi[drawn, 2]])
+    if not len(z):
+        return 0
+    front = _has(flag, mi.BSDFFlags.FrontSide) and not (z > 0).any()
+    back = _has(flag, mi.BSDFFlags.BackSide) and not (z < 0).any()
+    return front + back
+
+
+def _has(flags: int, flag: mi.BSDFFlags) -> bool:
+    return bool(flags & int(flag))
+
+
+def _allowed(flags: int, wi: Array, wo: Array) -> Array:
+    """Where flags allow light. [N], bool"""
+    reflection = _has(flags, mi.BSDFFlags.Reflection)
+    transmission = _has(flags, mi.BSDFFlags.Transmission)
+    front = _has(flags, mi.BSDFFlags.FrontSide)
+    back = _has(flags, mi.BSDFFlags.BackSide)
+    same_side = wi[:, 2] * wo[:, 2] > 0
+    return np.where(same_side, reflection, transmission) & np.where(wi[:, 2] > 0, front, back)
+
+
+def _masks(law: Law, case: Case, flags: list[int], parts: list[Array]) -> None:
+    """With a mask of types, a BSDF is the sum of the components of these types."""
+    every = int(mi.BSDFFlags.All)
+    kinds = [flag & every for flag in flags]
+    p = case.pairs
+    names = {"wi": p.wi, "uv": p.uv, "wo": p.wo}
+    few = slice(0, case.count(2**12, 2**13))
+    for mask in sorted({*kinds, *(every & ~kind for kind in kinds)} - {0}):
+        ctx = context(type_mask=mask)
+        chosen = [part for kind, part in zip(kinds, parts, strict=True) if kind & ~mask == 0]
+        expected = np.sum([np.zeros_like(p.value), *chosen], axis=0)
+        value, pdf = case.both(p.wi, p.wo, p.uv, ctx)
+        law.hold("masked", excess(value, expected, p.value_off), mask=mask, **names)
+        s = case.sample(p.wi[few], case.uniform(len(p.wi[few]), 3), p.uv[few], ctx)
+        bad = s.lit & np.isfinite(s.weight).all(axis=1) & ((s.type & ~mask) != 0)
+        if not chosen:
+            bad |= (pdf > 0)[few]
+        law.hold("masked_samples", bad, mask=mask, **{name: rows[few] for name, rows in names.items()})
+
+
+@figures(
+    same=Figure(
+        "value and density in {other} against {here}, relative, beyond rounding",
+        statistic="most",
+        limit=POINTWISE,
+        why="the same formula",
+        snippet=VALUE,
+    )
+)
+def variants(law: Law, case: Case) -> None:
+    """Values in the scalar variant, and in the spectral one where colours are grey."""
+    here = mi.variant()
+    case.with_()
+    few = case.pairs.only(np.isfinite(case.pairs.value).all(axis=1)).only(slice(0, case.count(200, 800)))
+    grey = np.ptp(few.value, axis=1).max() <= 1e-5 * few.value.max()
+    others = [case.other_kind]
+    if here.endswith("_rgb") and grey:
+        others.append(here.replace("_rgb", "_spectral"))
+    for other in others:
+        try:
+            value, pdf = case.elsewhere(other, lambda: Probe(case.load()).both(few.wi, few.wo, few.uv))
+        except Skip as reason:
+            law.notes.append(str(reason))
+            continue
+        expected = few.value
+        allowed = few.value_off
+        if not other.endswith("_rgb"):  # the mean of equal channels, however many there are
+            value = value.mean(axis=1)
+            expected = expected.mean(axis=1)
+            allowed = allowed.max(axis=1)
+        error = np.maximum(excess(value, expected, allowed), excess(pdf, few.pdf, few.pdf_off))
+        law.hold("same", error, variants=(here, other), other=other, here=here, **vars(few))
+
+
+@figures(
+    same=Figure(
+        "values of the BSDF {which} after a switch to {other} and back, relative, beyond rounding",
+        statistic="most",
+        limit=1e-4,
+        why="the same formula with the same numbers",
+        snippet=VALUE,
+    )
+)
+def switch(law: Law, case: Case) -> None:
+    """Values after a switch to another variant and back, of the BSDF as it was and loaded anew."""
+    here = mi.variant()
+    few = case.pairs.only(slice(0, case.count(1000, 1000)))
+    other = next(v for v in ("scalar_rgb", *runtime.usable_variants()) if v != here)
+    mi.set_variant(other)
+    mi.set_variant(here)
+    candidates = {"that was loaded before": case.plugin}
+    if case.description is not None:
+        candidates["loaded anew"] = case.load()
+    for which, bsdf in candidates.items():
+        value, pdf = Probe(bsdf).both(few.wi, few.wo, few.uv)
+        error = np.maximum(excess(value, few.value, few.value_off), excess(pdf, few.pdf, few.pdf_off))
+        law.hold("same", error, which=which, other=other, variants=(here, other, here), **vars(few))

@@ -1,0 +1,281 @@
+"""Laws of the samples of a BSDF: their density, weights and energy."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from mrt_mitsuba.validation.checks import probe
+from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, View, live, narrow
+from mrt_mitsuba.validation.checks.bsdf_snippets import CELL, SAMPLE, VALUE, WHOLE
+from mrt_mitsuba.validation.checks.law import (
+    SIGMAS,
+    Figure,
+    Law,
+    figures,
+    rare,
+)
+from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar
+from mrt_mitsuba.validation.checks.sphere import (
+    Cells,
+    chi_square,
+    encode,
+    integrate,
+    small_cells,
+)
+from mrt_mitsuba.validation.tools.compare import sidak
+
+NUDGED = """for moved in np.eye(3) * 2.0**-18 * np.where(np.array(u) < 0.5, 1, -1):
+    a, b, c = map(float, np.array(u) + moved)
+    print("random numbers moved by", moved, "direction:", bsdf.sample(ctx, si, a, mi.Point2f(b, c))[0].wo)
+"""
+UNRESOLVED = "neither float32 directions nor the samples resolve the lobe"
+BROAD = 20.0  # a density per steradian: lobes are then wide against a degree
+NUDGE = 2.0**-18  # of a random number: a hundred roundings of the direction
+GRAZING = (83, 86, 88, 89.5, 94, 92, 90.5)  # degrees
+AGAIN = "the same formula, evaluated once more at a rounded direction"
+FITS = "rational fits of Smith's G1 in use are off by 0.35 %"
+
+
+@figures(
+    cells=rare("least chance of counts at {angles} angles if samples follow pdf(), for their number", CELL),
+    integral=Figure(
+        f"integral of pdf() less the share of samples it stands for, beyond {SIGMAS} standard errors",
+        statistic="most",
+        limit=FIT,
+        why=FITS,
+        snippet=WHOLE,
+    ),
+    small=rare("chance of such counts of all angles in cells of a degree, for their number", CELL),
+    slices=rare("chance of such counts of all angles in slices of a degree or two, for their number", WHOLE),
+    still=Figure(
+        "share of samples that stay where two of their random numbers move by 2^-18",
+        statistic="share",
+        limit=0.05,
+        why="directions fill the sphere, in two dimensions; stairs in random numbers show as patterns",
+        snippet=NUDGED,
+    ),
+    dark=Figure(
+        "share of the light that comes from directions whose pdf() is 0",
+        statistic="at most",
+        limit=1e-4,
+        why="light that samples never find is missing from the picture",
+        snippet=VALUE,
+    ),
+)
+def sampling(law: Law, case: Case) -> None:
+    """Samples against the density: ∫ pdf dω over a cell is the share of samples in it (Pearson's χ²).
+
+    In whole cells of equal counts over both hemispheres; in a full check also in small ones and in narrow
+    slices, for faults in one place at any incidence.
+    """
+    case.need_smooth()
+    _nudged(law, case)
+    _without_density(law, case)
+    judged = [(view, cells) for view, cells in zip(case.views, case.densities, strict=True) if cells]
+    if not judged:
+        law.notes.append(f"{UNRESOLVED} at every angle")
+        return
+    wi = np.array([view.wi for view, _ in judged])
+    uv = np.array([view.uv for view, _ in judged])
+    tests = []  # [angles, 6, 2]
+    worst = []
+    beyond = []
+    for view, cells in judged:
+        test, cell = chi_square(cells, view.codes, view.count, 0.5 * FIT)
+        tests.append(test)
+        worst.append(cell)
+        variance = view.share * (1 - view.share) / view.count + cells.variance.sum()
+        beyond.append(np.abs(view.share - cells.mean.sum()) - SIGMAS * np.sqrt(variance))
+    by_angle = np.array([*tests, np.sum(tests, axis=0)])  # and of all angles together
+    chances = stats.chi2.sf(by_angle[..., 0], by_angle[..., 1])
+    chance = sidak(float(chances.min()), chances.size)
+    i = int(chances[:-1].min(axis=1).argmin())
+    law.hold("cells", chance, wi=wi[i], uv=uv[i], cell=worst[i], angles=len(judged))
+    law.hold("integral", np.maximum(beyond, 0), wi=wi, uv=uv)
+    broad = [view for view in case.views if 0 < view.density.max() < BROAD]
+    if broad and not case.quick and not is_scalar():
+        _in_small_cells(law, case, broad)
+    if len(judged) < len(case.views):
+        law.notes.append(f"{UNRESOLVED} at {len(case.views) - len(judged)} angles, which are left out")
+
+
+def _nudged(law: Law, case: Case) -> None:
+    """Of three random numbers, two at least lead to another direction when they move a little."""
+    drawn, names = case.drawn
+    u = names["u"]
+    changes = np.zeros(len(u), int)
+    for number in range(3):
+        moved = u.copy()
+        moved[:, number] += np.where(u[:, number] < 0.5, NUDGE, -NUDGE)
+        wo = case.sample(names["wi"], moved, names["uv"]).wo
+        changes += (wo != drawn.wo).any(axis=1)
+    smooth = drawn.lit & ~drawn.delta & (drawn.pdf < BROAD) & np.isfinite(drawn.wo).all(axis=1)
+    if smooth.sum() >= 20:
+        still = (changes < 2)[smooth]
+        law.hold("still", still, **{name: rows[smooth] for name, rows in names.items()})
+
+
+def _without_density(law: Law, case: Case) -> None:
+    """Light has a density, from random directions as well as from sampled ones."""
+    count = case.count(2**14, 2**18)
+    rng = np.random.default_rng((case.seed, count))
+    wi, wo = probe.unit(rng.normal(size=(2, count, 3)))
+    uv = rng.random((count, 2), np.float32)
+    value, pdf = case.both(wi, wo, uv)
+    light = np.nan_to_num(value, posinf=0, neginf=0).sum(axis=1)
+    missing = np.where(pdf == 0, light, 0)
+    if light.sum() > 0:
+        i = int(missing.argmax())
+        law.hold("dark", missing.sum() / light.sum(), wi=wi[i], wo=wo[i], uv=uv[i])
+
+
+def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
+    cells = small_cells()
+    wo, omega = cells.points(case.rng)
+    seen = np.zeros(len(omega))
+    expected = np.zeros(len(omega))
+    variance = np.zeros(len(omega))
+    for view in views:
+        seen += cells.counts(view.samples.wo[view.density > 0])
+        pdf = case.pdf(view.wi, wo.reshape(-1, 3), view.uv).reshape(omega.shape) * omega
+        count = len(view.density) * omega.shape[1]
+        expected += count * pdf.mean(axis=1)
+        variance += count**2 * pdf.var(axis=1) / (omega.shape[1] - 1)
+    view = max(views, key=lambda v: v.wi[2])
+    chance, cell = cells.rarest(seen, expected, variance, FIT)
+    law.hold("small", chance, wi=view.wi, uv=view.uv, cell=cells.bounds(cell))
+    law.hold("slices", cells.rarest_slice(seen, expected, variance, FIT), wi=view.wi, uv=view.uv)
+
+
+@figures(
+    density=Figure(
+        f"density of a sample against pdf(), {BEYOND}",
+        statistic="most",
+        limit=POINTWISE,
+        why=AGAIN,
+        snippet=SAMPLE,
+    ),
+    weight=Figure(
+        f"weight of a sample against eval() / pdf(), {BEYOND}",
+        statistic="most",
+        limit=POINTWISE,
+        why=AGAIN,
+        snippet=SAMPLE,
+    ),
+    discrete=Figure(
+        f"probability of a single direction (delta) less its share, beyond {SIGMAS} standard errors",
+        statistic="most",
+        limit=POINTWISE,
+        why="a count",
+        snippet=WHOLE,
+    ),
+)
+def weights(law: Law, case: Case) -> None:
+    """Density and weight of a sample are ``pdf`` and ``eval`` / ``pdf`` of its direction.
+
+    Of lobes of one direction, the density is the probability with which they are drawn.
+    """
+    drawn, names = case.drawn
+    at = names["wi"], np.where(np.isfinite(drawn.wo), drawn.wo, 1), names["uv"]
+    counts = live(names["wi"], drawn, *case.both(*at)) | drawn.lit & ~drawn.delta
+    few = slice(0, len(drawn.pdf) // len(case.views))
+    counts &= ~np.concatenate([narrow(view.wi, view.samples.only(few)) for view in case.views])
+
+    def ratio(i: Array, o: Array, t: Array) -> Array:
+        value, pdf = case.both(i, o, t)
+        return value / np.where(pdf > 0, pdf, np.inf)[:, None]
+
+    for name, stated, function in (("density", drawn.pdf, case.pdf), ("weight", drawn.weight, ratio)):
+        error = excess(stated, function(*at), case.spread(function, *at))
+        law.hold(name, np.where(counts, error, 0), **names)
+    errors = []
+    angles = []
+    for i, view in enumerate(case.views):
+        beyond = _discrete(view.samples)
+        errors += beyond
+        angles += [i] * len(beyond)
+    if errors:
+        law.hold("discrete", np.array(errors), **{name: x[angles] for name, x in case.incidence.items()})
+
+
+def _discrete(s: Lanes) -> list[float]:
+    """How far the share of each lobe of one direction is off its stated probability, beyond chance."""
+    lobe = s.component * 4096 + s.type
+    errors = []
+    for one in np.unique(lobe[s.delta & s.lit]):
+        here = s.delta & (lobe == one)
+        stated = float(np.nan_to_num(s.pdf[here].mean()))
+        sigma = np.sqrt(max(stated * (1 - stated), 0) / len(here))
+        errors.append(max(abs(here.mean() - stated) - SIGMAS * sigma, 0))
+    return errors
+
+
+@figures(
+    largest=Figure(
+        f"largest albedo, less {SIGMAS} standard errors",
+        statistic="most",
+        limit=1 + FIT,
+        why="no more light leaves than arrives; 0.5 % for fits of G1",
+        snippet=WHOLE,
+    ),
+    apart=Figure(
+        f"albedo by quadrature of eval() against mean weight, relative, beyond {SIGMAS} standard errors",
+        statistic="most",
+        limit=2 * FIT,
+        why="0.5 % for fits of G1 in the density",
+        snippet=WHOLE,
+    ),
+)
+def energy(law: Law, case: Case) -> None:
+    """The albedo ∫ f |cos θo| dωo is at most 1, and the same by samples and by quadrature.
+
+    In the mode of importance, in which transmitted energy is not rescaled.
+    """
+    # that surely reached near the horizon, where lobes peak, by samples alone
+    count = case.count(2**12, 2**14)
+    mode = context(importance=True)
+    phi = case.rng.uniform(0, 2 * np.pi, len(GRAZING))
+    wi = probe.direction(np.cos(np.radians(GRAZING)), phi)
+    uv = case.uniform(len(GRAZING), 2)
+    means = []
+    for i, t in zip(wi, uv, strict=True):
+        s = case.sample(i, case.uniform(count, 3), t, mode)
+        means.append(_mean(s.weight))
+    apart = []
+    for view, cells in zip(case.views, case.densities, strict=True):
+        s = case.sample(view.wi, view.u, view.uv, mode)
+        means.append(_mean(s.weight))
+        # where values are NaN, the law ``finite`` says so
+        apart.append(_apart(case, view, cells, s) if cells and view.holes < 0.01 else 0)
+    surely = [(mean - SIGMAS * error).max() for mean, error in means]
+    at = case.incidence
+    law.hold("largest", surely, wi=np.concatenate([wi, at["wi"]]), uv=np.concatenate([uv, at["uv"]]))
+    if any(case.densities):
+        law.hold("apart", apart, **at)
+
+
+def _mean(weight: Array) -> tuple[Array, Array]:
+    """The mean of finite weights [N, channels], and its standard error."""
+    weight = np.nan_to_num(weight, posinf=0, neginf=0).astype(np.float64)
+    return weight.mean(axis=0), weight.std(axis=0) / np.sqrt(len(weight))
+
+
+def _apart(case: Case, view: View, cells: Cells, s: Lanes) -> float:
+    """How far the albedo of samples and the integral of eval() differ, beyond chance, relative."""
+    smooth = np.where(s.delta[:, None], 0, np.nan_to_num(s.weight, posinf=0, neginf=0))
+    mode = context(importance=True)
+    integrals = integrate(
+        lambda wo: case.eval(view.wi, wo, view.uv, mode),
+        cells,
+        case.rng,
+        encode(s.wo),
+        smooth[:, 0],
+        len(smooth),
+    )
+    by_samples, error = _mean(smooth)
+    by_quadrature = integrals.mean.sum(axis=0)
+    sigma = np.sqrt(error**2 + integrals.variance.sum(axis=0))
+    beyond = np.maximum(np.abs(by_samples - by_quadrature) - SIGMAS * sigma, 0)
+    larger = np.maximum(by_samples, by_quadrature)
+    return float((beyond / np.maximum(larger, 1e-3)).max())

@@ -1,0 +1,351 @@
+"""Laws of the values of a BSDF: two ways to one, reciprocity, numbers that are finite and exact."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mrt_mitsuba.validation.checks import bsdf_case, noise, probe
+from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, parameters
+from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
+from mrt_mitsuba.validation.checks.law import (
+    Figure,
+    Law,
+    Skip,
+    figures,
+)
+from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar
+
+TWO_WAYS = "two ways to the same number"
+
+
+@figures(
+    value=Figure(
+        f"value of eval_pdf() against that of eval(), {BEYOND}",
+        statistic="most",
+        limit=1e-4,
+        why=TWO_WAYS,
+        snippet=VALUE,
+    ),
+    density=Figure(
+        f"density of eval_pdf() against that of pdf(), {BEYOND}",
+        statistic="most",
+        limit=1e-4,
+        why=TWO_WAYS,
+        snippet=VALUE,
+    ),
+    inactive=Figure(
+        "values that are not 0 where active is False",
+        statistic="none",
+        limit=0,
+        why="a sum over lanes must not hold those that are switched off",
+        snippet=VALUE,
+    ),
+)
+def eval_pdf(law: Law, case: Case) -> None:
+    """``eval_pdf`` is ``eval`` and ``pdf``; both ways to a value are 0 where ``active`` is False.
+
+    Densities need not be: half of Mitsuba's plugins state one in any lane.
+    """
+    case.need_smooth()
+    p = case.pairs
+    value, pdf = case.pair(p.wi, p.wo, p.uv)
+    law.hold("value", excess(value, p.value, p.value_off), **vars(p))
+    law.hold("density", excess(pdf, p.pdf, p.pdf_off), **vars(p))
+
+    def switched_off(ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> list[mi.Spectrum]:
+        no_lane = wo.z > 2
+        together, _ = case.plugin.eval_pdf(ctx, si, wo, no_lane)
+        return [case.plugin.eval(ctx, si, wo, no_lane), together]
+
+    if not is_scalar():  # where Mitsuba takes ``active`` out of its plugins
+        values = case.ask(switched_off, p.wi, p.wo, p.uv)
+        law.hold("inactive", np.any(values, axis=(0, 2)), **vars(p))
+
+
+RECIPROCITY = """eta = {eta}  # index of refraction at wo over that at wi
+forth = bsdf.eval(ctx, si, wo) / dr.abs(wo.z) * eta**2
+importance = bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), si, wo) / dr.abs(wo.z)
+si.wi, wo = wo, si.wi
+back = bsdf.eval(ctx, si, wo) / dr.abs(wo.z)
+print(forth, "should be", back, "and in the mode of importance", importance)
+"""
+THERE_AND_BACK = """# the way back should lead to where it came from, with the same product
+for u in (({u}), ({back})):
+    bs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))
+    print(si.wi, "->", bs.wo, "probability x weight x eta^2:", bs.pdf * weight * bs.eta**2)
+    si.wi = bs.wo
+"""
+EITHER_WAY = "light can be followed either way; transmitted radiance scales by the squared index"
+
+
+@figures(
+    swapped=Figure(
+        f"f(wi, wo) against f(wo, wi), {BEYOND}",
+        statistic="most",
+        limit=POINTWISE,
+        why=EITHER_WAY,
+        snippet=RECIPROCITY,
+    ),
+    modes=Figure(
+        f"f in the mode of radiance against that of importance, {BEYOND}",
+        statistic="most",
+        limit=POINTWISE,
+        why=EITHER_WAY,
+        snippet=RECIPROCITY,
+    ),
+    medium=Figure(
+        "index of refraction of reflected samples, less 1",
+        statistic="most",
+        limit=probe.ROUNDED,
+        why="one medium",
+        snippet=SAMPLE,
+    ),
+    returns=Figure(
+        "share of single directions (delta) that the way back returns to",
+        statistic="at least",
+        limit=0.05,
+        why="light can be followed either way; of several directions, the way back may draw another",
+        snippet=THERE_AND_BACK,
+    ),
+    single=Figure(
+        f"probability x weight x eta^2 of a single direction (delta) against the way back, {BEYOND}",
+        statistic="most",
+        limit=POINTWISE,
+        why=EITHER_WAY,
+        snippet=THERE_AND_BACK,
+    ),
+    single_modes=Figure(
+        "weight of a single direction (delta) x eta^2 against the mode of importance, relative",
+        statistic="most",
+        limit=POINTWISE,
+        why=EITHER_WAY,
+        snippet=THERE_AND_BACK,
+    ),
+)
+def reciprocity(law: Law, case: Case) -> None:
+    """f(ωi, ωo) η_o² = f(ωo, ωi) η_i², with the indices of the media that the directions are in.
+
+    E. Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, § 5.2.
+    """
+    few = case.pairs.only(np.abs(case.pairs.wi[:, 2] * case.pairs.wo[:, 2]) > 1e-3)
+    at = few.wi, few.wo, few.uv, few.eta
+
+    def forth(i: Array, o: Array, t: Array, eta: Array) -> Array:
+        return case.eval(i, o, t) / np.abs(o[:, 2:]) * eta[:, None] ** 2
+
+    def back(i: Array, o: Array, t: Array, _: Array) -> Array:
+        return case.eval(o, i, t) / np.abs(i[:, 2:])
+
+    def importance(i: Array, o: Array, t: Array, _: Array) -> Array:
+        return case.eval(i, o, t, context(importance=True)) / np.abs(o[:, 2:])
+
+    value = forth(*at)
+    allowed = case.spread(forth, *at)
+    for name, other in (("swapped", back), ("modes", importance)):
+        error = excess(value, other(*at), allowed + case.spread(other, *at))
+        law.hold(name, error, **vars(few))
+    _delta_either_way(law, case)
+    # light that is reflected stays in its medium: integrators multiply by ``eta`` as they go
+    s, names = case.drawn
+    reflected = ((s.type & int(mi.BSDFFlags.Reflection)) != 0) & s.lit
+    if reflected.any():
+        off = np.nan_to_num(np.abs(s.eta - 1), nan=np.inf)
+        law.hold("medium", np.where(reflected, off, 0), **names)
+
+
+def _delta_either_way(law: Law, case: Case) -> None:
+    """Lobes of one direction: probability × weight × η² of a sample, and of the one that goes back."""
+    count = case.count(2**13, 2**15)
+    wi = case.units(count)
+    uv = case.uniform(count, 2)
+    u = case.uniform(count, 3)
+    v = case.uniform(count, 3)
+    forth = case.sample(wi, u, uv)
+    wo = probe.unit(np.where(np.isfinite(forth.wo), forth.wo, 1))
+    back = case.sample(wo, v, uv)
+    same = forth.delta & (forth.type == back.type) & (forth.component == back.component)
+    same &= np.abs(wi[:, 2] * wo[:, 2]) > 1e-3
+    returned = (np.abs(probe.unit(back.wo) - wi) < 1e-3).all(axis=1)
+    if same.sum() < 20:
+        return
+    names = {"wi": wi, "uv": uv, "u": u, "back": v}
+    lost = int((same & ~returned).argmax())
+    law.hold("returns", returned[same].mean(), **{name: rows[lost] for name, rows in names.items()})
+
+    def followed(i: Array, _: Array, t: Array, u: Array) -> Array:
+        s = case.sample(i, u, t)
+        return s.weight * (s.pdf * s.eta.astype(np.float64) ** 2)[:, None]
+
+    there = wi, wo, uv, u
+    and_back = wo, wi, uv, v
+    # next to total reflection, a rounding of the direction is a percent of what is transmitted
+    allowed = case.spread(followed, *there) + case.spread(followed, *and_back)
+    error = excess(followed(*there), followed(*and_back), allowed)
+    law.hold("single", np.where(same & returned, error, 0), **names)
+    other = case.sample(wi, u, uv, context(importance=True))  # by the same random numbers
+    alike = forth.delta & (np.abs(other.wo - forth.wo) < 1e-3).all(axis=1)
+    error = excess(forth.weight * forth.eta[:, None] ** 2, other.weight)
+    law.hold("single_modes", np.where(alike, error, 0), **names)
+
+
+# A dot product of float32 vectors is rarely less than 1e-7
+COSINES = (1, 1 - 6e-8, 0.5, 1e-2, 1e-4, 1e-7, 0)
+AZIMUTHS = (0, np.pi / 2, np.pi, -np.pi / 2, 0.7, 4)
+INDICES = ("eta", "k", "int_ior", "ext_ior")
+UNIFORM = (0, 2.0**-24, 0.5, 1 - 2.0**-24)
+WRONG = "results not finite, or negative{where}: {faults}"
+SPOILS = "one such number spoils a picture"
+
+
+@figures(
+    values=Figure(WRONG, statistic="none", limit=0, why=SPOILS, snippet=VALUE),
+    samples=Figure(WRONG, statistic="none", limit=0, why=SPOILS, snippet=SAMPLE),
+    million=Figure(
+        "samples of {count} at random whose weight, density or value is not finite, or negative",
+        statistic="at most",
+        limit=0,
+        why=SPOILS,
+        snippet=SAMPLE,
+    ),
+)
+def finite(law: Law, case: Case) -> None:
+    """No NaN, no infinity, nothing negative: extreme directions, random numbers and parameters."""
+    extremes = _extremes(case)
+    sound = _finite(law, case, extremes)
+    if not is_scalar():
+        _by_the_million(law, case)
+    for key, value in parameters(case) if sound else ():
+        for end in _ends(key, float(np.mean(np.array(value)))):  # one parameter at a time
+            copy = case.copy()
+            with bsdf_case.changed(copy, key, partial(bsdf_case.affine, 0, end)):
+                _finite(law, copy, extremes, (key, end))
+
+
+def _extremes(case: Case) -> Lanes:
+    """Directions, random numbers ``u`` and ``uv`` at and between the ends of their ranges."""
+    rng = case.rng
+    count = case.count(2**14, 2**17)
+    cosines = np.array([side * cosine for cosine in COSINES for side in (1, -1)])
+    pool = probe.direction(np.repeat(cosines, len(AZIMUTHS)), np.tile(AZIMUTHS, len(cosines)))
+    wi, elsewhere = pool[rng.integers(len(pool), size=(2, count))]
+    mirrored = wi * np.array([-1, -1, 1], np.float32)
+    kinds = [elsewhere, mirrored, -wi, wi]
+    wo = np.choose(rng.integers(len(kinds), size=count)[:, None], kinds)
+    extreme = rng.random((count, 3)) < 0.6
+    u = np.where(extreme, rng.choice(UNIFORM, (count, 3)), case.uniform(count, 3))
+    corner = rng.random((count, 2)) < 0.3
+    uv = np.where(corner, rng.integers(0, 2, (count, 2)), rng.random((count, 2)))
+    return Lanes(wi=wi, wo=wo, u=u.astype(np.float32), uv=uv.astype(np.float32))
+
+
+def _ends(key: str, number: float) -> tuple[float, float]:
+    """The ends of the likely range of a parameter."""
+    name = key.removesuffix(".value").removesuffix(".values").split(".")[-1]
+    if name in INDICES and (number <= 1 or key.endswith(".values")):
+        return 0.5 * number, 2.0 * number  # of metals: 0 makes no sense there
+    return (0.0, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)
+
+
+def _finite(law: Law, case: Case, at: Lanes, setting: tuple[str, float] | None = None) -> bool:
+    """Hold the faults of values, or those of samples where values have none; return whether all is sound."""
+    value, pdf = case.both(at.wi, at.wo, at.uv)
+    value_of_pair, pdf_of_pair = case.pair(at.wi, at.wo, at.uv)
+    s = case.sample(at.wi, at.u, at.uv)
+    length = np.linalg.norm(s.wo.astype(np.float64), axis=1)
+    values = {
+        "eval()": _bad(value),
+        "pdf()": _bad(pdf),
+        "eval_pdf()": _bad(value_of_pair) | _bad(pdf_of_pair),
+    }
+    samples = {
+        "weights of samples": _bad(s.weight),
+        "densities of samples": s.lit & _bad(s.pdf),  # where the weight is 0, nothing more is read
+        "directions of samples": s.lit & ~(np.abs(length - 1) < 1e-3),
+    }
+    wrong_values = np.any([*values.values()])
+    kinds = values if wrong_values else samples
+    words = ", ".join(f"{kind} {faults.sum()}" for kind, faults in kinds.items() if faults.any())
+    if words or not setting:
+        where = f" with {setting[0]} = {setting[1]:g}" if setting else ""
+        name = "values" if wrong_values else "samples"
+        names = {**vars(at), "setting": setting, "where": where, "faults": words or "none"}
+        law.hold(name, np.any([*kinds.values()], axis=0), **names)
+    return not words
+
+
+def _bad(values: Array) -> Array:
+    """Where any of values [N, …] is not finite, or negative. [N]"""
+    sound = np.isfinite(values) & (values >= 0)
+    return ~sound.reshape(len(values), -1).all(axis=1)
+
+
+def _by_the_million(law: Law, case: Case) -> None:
+    """Ordinary samples from all directions, so many that a fault in one of a hundred thousand shows."""
+    count = case.count(2**19, 2**22)
+    rng = probe.random_numbers(count, case.seed)
+    draw = rng.next_float32
+    wi = mi.warp.square_to_uniform_sphere(mi.Point2f(draw(), draw()))
+    uv = mi.Point2f(draw(), draw())
+    u = mi.Point3f(draw(), draw(), draw())
+    si = probe.interaction(wi, uv)
+    with dr.suspend_grad():
+        bs, weight = case.plugin.sample(context(), si, u.x, mi.Point2f(u.y, u.z))
+        weight = mi.unpolarized_spectrum(weight)
+        lit = dr.any(weight != 0)
+        value, pdf = case.plugin.eval_pdf(context(), si, bs.wo, lit)
+        value = mi.unpolarized_spectrum(value)
+        read = probe.not_finite(bs.pdf, value, pdf, least=0)
+        bad = probe.not_finite(weight, least=0) | (lit & read)
+    wrong, first = probe.first_of(bad, wi=wi, uv=uv, u=u)
+    law.hold("million", wrong, count=count, **first)
+
+
+NOISE = """for k in range(9):  # float32 steps in all components: a smooth function would change evenly
+    x = (np.array([{wo}], np.float32).view(np.int32) + {stride} * k).view(np.float32)
+    print(np.ravel(bsdf.{function}(ctx, si, mi.Vector3f(*map(float, x)))))
+"""
+
+
+@figures(
+    lost=Figure(
+        "noise of {function}() over that of 8 roundings with rounded directions, 9 in 10",
+        statistic=0.9,
+        limit=noise.LOST,
+        why="sound formulas stay below 1.6; beyond, digits are lost",
+        snippet=NOISE,
+    )
+)
+def roundoff(law: Law, case: Case) -> None:
+    """Noise of float32 evaluation beyond what the rounding of the directions explains (``noise``)."""
+    case.need_smooth()
+    p = case.pairs
+    steep = (np.abs(p.wi[:, 2]) > 0.1) & (np.abs(p.wo[:, 2]) > 0.1)
+    # far off a lobe, an exponent of 40 makes 40 roundings of one: of nothing
+    lit = p.only(steep & (p.pdf > 1e-3) & (p.value.max(axis=1) > 1e-20))
+    few = lit.only(slice(0, case.count(500, 2000)))
+    if len(few.pdf) < 20:
+        raise Skip("too few pairs of directions with a value")
+    inputs = np.concatenate([few.wi, few.wo], axis=1)
+
+    def brightest(wi: Array, wo: Array, uv: Array) -> Array:
+        return case.eval(wi, wo, uv).max(axis=1)
+
+    for name, function in (("eval", brightest), ("pdf", case.pdf)):
+
+        def at(x: Array, function: Any = function) -> Array:
+            return function(x[:, :3], x[:, 3:], np.tile(few.uv, (len(x) // len(few.uv), 1)))
+
+        estimate = noise.measure(at, inputs, seed=case.seed, project=_both_unit)
+        if np.isnan(estimate.noise).mean() > 0.25:
+            raise Skip("values change too fast for float32 steps to tell noise")
+        law.hold("lost", estimate.lost, function=name, stride=estimate.stride, **vars(few))
+
+
+def _both_unit(x: Array) -> Array:
+    """Pairs of directions [N, 6], each made one unit long."""
+    return probe.unit(x.reshape(-1, 2, 3).astype(np.float64)).reshape(-1, 6)

@@ -1,0 +1,359 @@
+"""``check_emitter``: the laws that any emitter must obey, stock or in Python.
+
+A new law is a function of ``Law`` and ``Case`` and a row of ``LAWS``; see ``bsdf``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import stats
+
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.validation.checks import probe
+from mrt_mitsuba.validation.checks.law import (
+    TIMEOUT,
+    Check,
+    Figure,
+    Law,
+    Skip,
+    Subject,
+    examine,
+    figures,
+    rare,
+)
+from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, excess, lanes
+from mrt_mitsuba.validation.checks.sphere import Cells, chances_of, chi_square, encode, integrate, small_cells
+from mrt_mitsuba.validation.tools.compare import sidak
+
+SAME = 1e-3  # relative: the same formula, evaluated once more
+TURNED = 4 * probe.ROUNDED  # a direction passes through angles, a transform, and back
+SPOILS = "one such number spoils a picture"
+LENGTH = 1e-4  # relative: a square root, and the difference of two points
+DOUBT = 1e-3  # chance below which the integral over a cell is made again
+REPEATS = 64
+DARK = 5e-5  # share of the light: a fifth of a cone of 3 degrees
+
+
+def check_emitter(
+    emitter: Any,
+    *,
+    scene: mi.Scene | None = None,
+    quick: bool = False,
+    seed: int = 0,
+    only: Iterable[str] | None = None,
+    timeout: float = TIMEOUT,
+) -> Check:
+    """Check the laws of an emitter in the current variant: a dict for ``mi.load_dict``, or a loaded one.
+
+    ``scene``: the one that a loaded emitter belongs to; else it lights a sphere of radius 1, and what lights
+    from a surface does so from a square above it. A dict may also be of a shape with an emitter. ``quick``:
+    fewer samples. ``only``: names of ``LAWS``. ``timeout``: seconds after which a law fails that is not done.
+    Raises ``UsageError`` for anything else, and ``SceneError`` for a dict that Mitsuba cannot load.
+    """
+
+    def case(given: Any, quick: bool, seed: int) -> Case:
+        return Case(given, quick, seed, scene)
+
+    return examine(case, emitter, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
+
+
+class Case(Subject):
+    """An emitter of a scene, and points in and about its box from which it is looked at [N, 3]."""
+
+    word = "emitter"
+
+    def __init__(self, given: Any, quick: bool, seed: int, scene: mi.Scene | None = None) -> None:
+        super().__init__(given, quick, seed)
+        if isinstance(self.plugin, mi.Shape) and self.plugin.emitter() is not None:
+            scene = mi.load_dict({"type": "scene", "shape": self.plugin})
+            self.plugin = self.plugin.emitter()
+        if not isinstance(self.plugin, mi.Emitter):
+            kind = type(self.plugin).__name__
+            raise UsageError(f"{kind} is not an emitter of {mi.variant()}: give a dict or a loaded emitter")
+        alone = scene is None
+        self.lit = scene or self._lit_sphere()  # an emitter keeps neither its scene nor its shape alive
+        box = self.lit.bbox()
+        low = np.nan_to_num(np.ravel(np.array(box.min)), posinf=1, neginf=-1)
+        high = np.nan_to_num(np.ravel(np.array(box.max)), posinf=1, neginf=-1)
+        outer = 0.1 * (high - low)
+        points = self.rng.uniform(low - outer, high + outer, (2**12, 3))
+        self.points = np.float32(points)
+        if alone:
+            self._look_from_the_light(float(np.linalg.norm(high - low)))
+        flags = int(self.plugin.flags())
+        # whether light comes from all around, and not from single directions, a surface or a point
+        infinite = flags & int(mi.EmitterFlags.Infinite)
+        self.around = bool(infinite) and not flags & int(mi.EmitterFlags.Delta)
+
+    def _lit_sphere(self) -> mi.Scene:
+        """A scene with the emitter and a sphere; what lights from a surface lights from a square."""
+        nodes: dict[str, Any] = {"type": "scene", "ball": {"type": "sphere"}}
+        if int(self.plugin.flags()) & int(mi.EmitterFlags.Surface):
+            place = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([1, 0, 0], 180)
+            nodes["square"] = {"type": "rectangle", "to_world": place, "light": self.plugin}
+        else:
+            nodes["light"] = self.plugin
+        try:
+            return mi.load_dict(nodes)
+        except RuntimeError as error:
+            fix = "give the scene that it belongs to, or a dict of its shape"
+            raise UsageError(f"the {self.name} cannot light a scene of its own: {fix}") from error
+
+    def _look_from_the_light(self, size: float) -> None:
+        """Look from half of the points along rays that the emitter sends out: it may light few others."""
+        half = len(self.points) // 2
+        u = self.uniform(half, 5)
+        reach = (size * self.rng.uniform(0.1, 1, half)).astype(np.float32)
+
+        def along(time: mi.Float, place: mi.Point2f, way: mi.Point2f, reach: mi.Float) -> list[mi.Point3f]:
+            ray, _ = self.plugin.sample_ray(0, time, place, way)
+            return [ray.o + reach * ray.d]
+
+        columns = ("Float", u[:, 0]), ("Point2f", u[:, 1:3]), ("Point2f", u[:, 3:]), ("Float", reach)
+        try:
+            (points,) = lanes(along, *columns)
+        except (NotImplementedError, RuntimeError):
+            return
+        usable = np.isfinite(points).all(axis=1)
+        self.points[:half][usable] = points[usable]
+
+    @cached_property
+    def samples(self) -> Lanes:
+        """A sample for each point."""
+        return self.sample(self.points)
+
+    def sample(self, points: Array) -> Lanes:
+        """A sample for each point; ``again``: pdf_direction(), ``value``: eval_direction()."""
+
+        def call(p: mi.Point3f, u: mi.Point2f) -> list[Any]:
+            it = _seen_from(p)
+            ds, weight = self.plugin.sample_direction(it, u)
+            value = self.plugin.eval_direction(it, ds)
+            again = self.plugin.pdf_direction(it, ds)
+            return [ds.p, ds.d, ds.dist, ds.pdf, again, ds.delta, weight, value]
+
+        names = ("p", "d", "dist", "pdf", "again", "delta", "weight", "value")
+        try:
+            columns = lanes(call, ("Point3f", points), ("Point2f", self.uniform(len(points), 2)))
+        except (NotImplementedError, RuntimeError) as error:
+            raise Skip("directions cannot be sampled") from error
+        s = Lanes(**dict(zip(names, columns, strict=True)))
+        s.lit = (s.weight != 0).any(axis=1)
+        return s
+
+    def seen(self, d: Array) -> list[Array]:
+        """The density of directions [N] and the light that is seen there [N, channels]."""
+
+        def call(d: mi.Vector3f) -> list[Any]:
+            it = _seen_from(mi.Point3f(*map(float, self.points[0])))
+            ds, _ = self.plugin.sample_direction(it, mi.Point2f(0.5))
+            ds.d = d
+            it.wi = -d
+            return [self.plugin.pdf_direction(it, ds), self.plugin.eval(it)]
+
+        return lanes(call, ("Vector3f", d))
+
+    def density(self, d: Array) -> Array:
+        """The density of directions. [N]"""
+        return self.seen(d)[0]
+
+    @cached_property
+    def spread(self) -> tuple[Array, Array]:
+        """How far ``seen`` changes as directions move by what rounding does; 0 for other lights."""
+        s = self.samples
+        if not self.around:
+            return np.zeros_like(s.pdf), np.zeros_like(s.value)
+        off = probe.spread(lambda d: np.column_stack(self.seen(d)), [s.d], self.rng, TURNED)
+        return off[:, 0], off[:, 1:]
+
+
+def _seen_from(p: mi.Point3f) -> mi.SurfaceInteraction3f:
+    it = dr.zeros(mi.SurfaceInteraction3f)
+    it.p = p
+    return probe.at_wavelengths(it)
+
+
+@figures(
+    same=Figure(
+        f"density of a direction against pdf_direction(), {BEYOND}",
+        statistic="most",
+        limit=SAME,
+        why="one number",
+    )
+)
+def density(law: Law, case: Case) -> None:
+    """The density that a sample states is ``pdf_direction``."""
+    s = case.samples
+    judged = s.lit & ~s.delta
+    if not judged.any():
+        raise Skip("light comes from single directions (delta), or none was sampled")
+    law.hold("same", excess(s.pdf, s.again, case.spread[0])[judged])
+
+
+@figures(
+    place=Figure(
+        "sampled point off the stated direction and distance, relative",
+        statistic="most",
+        limit=LENGTH,
+        why="one place, said in two ways",
+    ),
+    counts=rare("chance of such counts if directions follow pdf_direction()"),
+    small=rare("chance of such counts in cells of a degree, for their number"),
+    slices=rare("chance of such counts in slices of a degree or two, for their number"),
+    dark=Figure(
+        "share of the light, from all around, whose density is 0",
+        statistic="at most",
+        limit=DARK,
+        why="light that samples never find is missing from the picture",
+    ),
+)
+def sampling(law: Law, case: Case) -> None:
+    """p = o + dist · d; light from all around follows its density (Pearson's χ²)."""
+    s = case.samples
+    if not s.lit.any():
+        raise Skip("no sample carries light")
+    points = case.points.astype(np.float64)
+    scale = np.abs(s.dist) + np.abs(points).max(axis=1)
+    off = np.linalg.norm(s.p - points - s.dist[:, None] * s.d, axis=1)
+    law.hold("place", np.nan_to_num((off / scale)[s.lit]))
+    if not case.around:
+        law.notes.append("directions to surfaces are judged with their shapes")
+        return
+    count = 2**12 if probe.is_scalar() else 2**18
+    codes = encode(case.sample(np.repeat(case.points[:1], count, axis=0)).d)
+    pilot = codes[: count // 4]
+    codes = codes[count // 4 :]
+    cells = Cells.around(pilot, max(len(pilot) // 1000, 8))
+    integrals = integrate(case.density, cells, case.rng, codes, np.ones(len(codes)), len(codes))
+    tests, _ = chi_square(integrals, codes, len(codes))
+    chances = stats.chi2.sf(*tests.T)
+    law.hold("counts", sidak(float(chances.min()), len(chances)))
+    _without_density(law, case)
+    if not probe.is_scalar():
+        _in_small_cells(law, case)
+
+
+def _without_density(law: Law, case: Case) -> None:
+    """Light from directions all around has a density."""
+    rng = np.random.default_rng((case.seed, 2))
+    d = probe.unit(rng.normal(size=(case.count(2**18, 2**20), 3)))
+    pdf, value = case.seen(d)
+    light = np.nan_to_num(value, posinf=0, neginf=0).sum(axis=1)
+    if light.sum() > 0:
+        law.hold("dark", light[pdf == 0].sum() / light.sum())
+
+
+def _in_small_cells(law: Law, case: Case) -> None:
+    """Directions in cells of a degree and in slices, for places that are never sampled."""
+    count = case.count(2**21, 2**23)
+    cells = small_cells()
+    rng = np.random.default_rng((case.seed, 3))
+    seen = np.zeros(len(cells.start))
+    for _ in range(count // 2**20):
+        seen += cells.counts(_directions(case, rng.random((2**20, 2), np.float32)))
+    share, variance = _shares(case, cells, rng)
+    # a corner of a bright texel may lie between the points of a cell
+    doubtful = chances_of(seen, count * share, count**2 * variance, SAME) < DOUBT
+    if doubtful.any():
+        again = [_shares(case, cells.only(doubtful), rng) for _ in range(REPEATS)]
+        share[doubtful], variance[doubtful] = np.mean(again, axis=0)
+    expected = count * share
+    variance = count**2 * variance
+    chance, _ = cells.rarest(seen, expected, variance, SAME)
+    law.hold("small", chance)
+    law.hold("slices", cells.rarest_slice(seen, expected, variance, SAME))
+
+
+def _shares(case: Case, cells: Cells, rng: np.random.Generator) -> tuple[Array, Array]:
+    """The integrals of the density over cells, and their variances. [C], [C]"""
+    wo, omega = cells.points(rng)
+    points = omega.shape[1]
+    pdf = case.density(wo.reshape(-1, 3)).reshape(omega.shape) * omega * points
+    return pdf.mean(axis=1), pdf.var(axis=1) / (points - 1)
+
+
+def _directions(case: Case, u: Array) -> Array:
+    """Sampled directions from one point, by random numbers [N, 2]. [N, 3]"""
+    o = mi.Point3f(*map(float, case.points[0]))
+
+    def call(u: mi.Point2f) -> list[mi.Vector3f]:
+        ds, _ = case.plugin.sample_direction(_seen_from(o), u)
+        return [ds.d]
+
+    return lanes(call, ("Point2f", u))[0]
+
+
+@figures(
+    weight=Figure(
+        f"weight against eval_direction() / density, {BEYOND}",
+        statistic="most",
+        limit=SAME,
+        why="one number",
+    ),
+    seen=Figure(
+        f"eval() where it is seen against eval_direction(), {BEYOND}",
+        statistic="most",
+        limit=SAME,
+        why="one number",
+    ),
+)
+def weights(law: Law, case: Case) -> None:
+    """weight · pdf = ``eval_direction`` = what is seen there."""
+    s = case.samples
+    allowed = case.spread[1]
+    counts = s.lit & (s.pdf > 0) & np.isfinite(s.weight).all(axis=1)
+    if not counts.any():
+        raise Skip("no sample carries light")
+    law.hold("weight", excess(s.weight * s.pdf[:, None], s.value, allowed)[counts])
+    if case.around:
+        _, value = case.seen(s.d)
+        law.hold("seen", excess(value, s.value, allowed)[counts])
+
+
+@figures(
+    bad=Figure(
+        "samples that are not finite, or negative, or not of unit length",
+        statistic="none",
+        limit=0,
+        why=SPOILS,
+    ),
+    million=Figure(
+        "samples of {count} from one point whose weight, density or direction is not finite, or negative",
+        statistic="at most",
+        limit=0,
+        why=SPOILS,
+    ),
+)
+def finite(law: Law, case: Case) -> None:
+    """All numbers of samples are finite, directions one unit long, weights and densities not negative."""
+    s = case.samples
+    sound = [np.isfinite(x) & (x >= 0) for x in (s.weight, s.value)]
+    length = np.abs(np.linalg.norm(s.d.astype(np.float64), axis=1) - 1)
+    usable = (length <= LENGTH) & np.isfinite(s.dist) & (s.pdf >= 0)
+    law.hold("bad", ~np.all(sound, axis=(0, 2)) | (s.lit & ~usable))
+    if not probe.is_scalar():
+        _by_the_million(law, case)
+
+
+def _by_the_million(law: Law, case: Case) -> None:
+    """So many samples that a fault in one of a hundred thousand shows."""
+    count = case.count(2**19, 2**22)
+    rng = probe.random_numbers(count, case.seed)
+    with dr.suspend_grad():
+        it = _seen_from(mi.Point3f(*map(float, case.points[0])))
+        ds, weight = case.plugin.sample_direction(it, mi.Point2f(rng.next_float32(), rng.next_float32()))
+        weight = mi.unpolarized_spectrum(weight)
+        lit = dr.any(weight != 0)
+        read = probe.not_finite(ds.pdf, least=0) | probe.not_finite(ds.d)
+        bad = probe.not_finite(weight, least=0) | (lit & read)
+        law.hold("million", int(dr.count(bad)[0]), count=count)
+
+
+_ALL = (density, sampling, weights, finite)
+LAWS = {law.__name__: law for law in _ALL}

@@ -1,0 +1,211 @@
+"""A shape under examination, rays towards it and what they meet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.validation.checks import law as laws
+from mrt_mitsuba.validation.checks.law import (
+    Skip,
+    Subject,
+)
+from mrt_mitsuba.validation.checks.noise import ROUNDING
+from mrt_mitsuba.validation.checks.probe import (
+    Array,
+    Lanes,
+    lanes,
+    unit,
+)
+
+OFFSET = 1500 * ROUNDING  # of the origin of a spawned ray from its surface, over 1 + max |p|
+FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
+MOST_HITS = 16  # along a line
+HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
+TYPICAL = 16  # roundings: twice the most that was measured of sound shapes
+FAR = 1e4  # sizes away
+SMOOTHED = ("SDFGrid", "BSplineCurve", "LinearCurve", "Instance")
+
+RAY = """si = scene.ray_intersect(mi.Ray3f(o, d))
+print(si)
+back = scene.ray_intersect(mi.Ray3f(si.spawn_ray(d).o, -d))
+print("from just behind:", back.n, "at", back.t)
+"""
+
+
+def trace(target: mi.Scene, o: Array, d: Array) -> Lanes:
+    """Trace rays from float32 points [N, 3] in directions [N, 3].
+
+    The hits have whether a ray met anything (``met``), the distance ``t``, the points and vectors ``p``,
+    ``n``, ``shading``, ``du``, ``dv`` [N, 3], ``uv`` [N, 2], the index of the triangle or the like
+    (``part``), and whether the surface is ``steep``: met, and not in passing.
+    """
+
+    def call(origin: mi.Point3f, direction: mi.Vector3f) -> list[Any]:
+        si = target.ray_intersect(mi.Ray3f(origin, direction))
+        return [si.is_valid(), si.t, si.p, si.n, si.sh_frame.n, si.dp_du, si.dp_dv, si.uv, si.prim_index]
+
+    names = ("met", "t", "p", "n", "shading", "du", "dv", "uv", "part")
+    columns = lanes(call, ("Point3f", o), ("Vector3f", d))
+    hits = Lanes(**dict(zip(names, columns, strict=True)))
+    hits.cos = dot(hits.n, d)
+    hits.steep = hits.met & (np.abs(hits.cos) > FLAT)
+    return hits
+
+
+def dot(a: Array, b: Array) -> Array:
+    """The dot products of vectors [N, 3]."""
+    return (a * b).sum(axis=-1)
+
+
+def walk(target: mi.Scene, o: Array, d: Array, first: Lanes | None = None) -> Iterator[tuple[Array, Lanes]]:
+    """Follow N lines through all that they meet; yield hit by hit which lines do, and what they meet."""
+    line = np.arange(len(o))
+    hits = first or trace(target, o, d)
+    for _ in range(MOST_HITS):
+        line = line[hits.met]
+        d = d[hits.met]
+        hits = hits.only(hits.met)
+        if not len(line):
+            return
+        yield line, hits
+        hits = trace(target, leave(hits.p, hits.n, d), d)
+
+
+class Case(Subject):
+    """A shape under examination, rays towards it and what they meet."""
+
+    word = "shape"
+
+    def __init__(self, given: Any, quick: bool, seed: int) -> None:
+        super().__init__(given, quick, seed)
+        if not all(hasattr(self.plugin, name) for name in ("ray_intersect", "ray_test", "bbox")):
+            kind = type(self.plugin).__name__
+            raise UsageError(f"{kind} is not a shape of {mi.variant()}: give a dict or a loaded shape")
+        self.target = self.plugin
+        if laws.class_name(self.plugin) == "Instance":
+            if self.description is None:
+                raise UsageError("a loaded instance does not give its group away: give a dict of both")
+            self.target = self.scene()
+        elif isinstance(self.plugin, mi.Shape):
+            name = self.plugin.id()
+            self.target = mi.load_dict({"type": "scene", "shape": self.plugin})
+            self.plugin.set_id(name)  # which the scene has changed
+            self.unsupported = self.unsupported or _refused(self.plugin)
+        box = self.plugin.bbox()
+        corners = [np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max)]
+        self.box = np.array(corners)
+        if not np.isfinite(self.box).all() or (self.box[1] < self.box[0]).any():
+            raise UsageError(f"the bounding box of the shape is {self.box}: it must be finite")
+        self.points = self.box  # and of a mesh the vertices and the middles of edges
+        params = mi.traverse(self.plugin) if isinstance(self.plugin, mi.Mesh) else {}
+        if "faces" in params:  # a rectangle hides that it is a mesh
+            vertex = np.array(params["vertex_positions"]).reshape(-1, 3)
+            face = np.array(params["faces"]).reshape(-1, 3)
+            middles = [(vertex[face[:, k]] + vertex[face[:, k - 1]]) / 2 for k in range(3)]
+            self.points = np.concatenate([self.box, vertex, *middles])
+        self.low = self.points.min(axis=0)  # the box itself may be wrong
+        self.high = self.points.max(axis=0)
+        self.middle = (self.low + self.high) / 2
+        self.size = float(np.linalg.norm(self.high - self.low))
+
+    def around(self, count: int) -> Array:
+        """Points that look at the shape, from 1.5 sizes away. [count, 3]"""
+        return (self.middle + 1.5 * self.size * self.units(count)).astype(np.float32)
+
+    @cached_property
+    def seen(self) -> tuple[Array, Array, Lanes]:
+        """Rays from all around to points in the box, and what they meet."""
+        o = self.around(self.count(2**14, 2**17))
+        extent = np.maximum(self.high - self.low, 0.01 * self.size)
+        d = unit(self.middle + extent * self.rng.uniform(-0.55, 0.55, o.shape) - o)
+        return o, d, trace(self.target, o, d)
+
+    def first_seen(self, few: slice) -> tuple[Array, Array, Lanes]:
+        """The first of ``seen``."""
+        o, d, hits = self.seen
+        return o[few], d[few], hits.only(few)
+
+    @cached_property
+    def met(self) -> tuple[Array, Array, Lanes]:
+        """The rays that meet the surface and do not graze it, and their hits."""
+        o, d, hits = self.seen
+        if hits.steep.sum() < 20:
+            raise Skip("hardly any ray towards its bounding box meets the shape")
+        return o[hits.steep], d[hits.steep], hits.only(hits.steep)
+
+    @cached_property
+    def behind(self) -> Lanes:
+        """The hits of rays that come back from just behind ``met``."""
+        _, d, hits = self.met
+        return trace(self.target, leave(hits.p, hits.n, d), -d)
+
+    @cached_property
+    def positions(self) -> tuple[list[Array], Array, float]:
+        """Sampled positions: points, normals, densities stated and asked for; their ``u``; and the area."""
+        u = self.uniform(self.count(2**14, 2**19), 2)
+
+        def sample(second: mi.Point2f) -> list[Any]:
+            ps = self.plugin.sample_position(0, second)
+            return [ps.p, ps.n, ps.pdf, self.plugin.pdf_position(ps)]
+
+        try:
+            area = float(np.ravel(np.array(self.plugin.surface_area()))[0])
+            return lanes(sample, ("Point2f", u)), u, area
+        except (AttributeError, RuntimeError) as problem:
+            raise Skip("positions cannot be sampled") from problem
+
+    @cached_property
+    def crossings(self) -> list[tuple[Array, Lanes]]:
+        """Whole lines: hit by hit, which line, and what it meets."""
+        return list(walk(self.target, *self.seen))
+
+    @cached_property
+    def closed(self) -> bool:
+        """Whether most lines cross the surface an even number of times: it is closed, with holes perhaps."""
+        judged, even = self.lines
+        return bool(judged.sum() > 20 and even[judged].mean() > 0.75)
+
+    @cached_property
+    def lines(self) -> tuple[Array, Array]:
+        """Which lines can be judged, and which cross the surface an even number of times; both [N]."""
+        clear = self.seen[2].met.copy()
+        even = np.ones(len(clear), bool)
+        last = np.full((len(clear), 3), np.inf)
+        for line, hits in self.crossings:
+            clear[line] &= (np.abs(hits.cos) > 4 * FLAT) & ~near(hits.p, last[line])
+            even[line] ^= True
+            last[line] = hits.p
+        return clear, even
+
+
+def _refused(shape: mi.Shape) -> str:
+    """What Mitsuba warned of when it loaded a shape of its own, which loading one alike tells."""
+    params = mi.traverse(shape)
+    stock = type(shape).__module__.startswith("mitsuba")
+    if not stock or "to_world" not in params:
+        return ""
+    matrix = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
+    kind = laws.class_name(shape).lower()
+    return laws.refused({"type": kind, "to_world": mi.ScalarTransform4f(matrix)})
+
+
+def offset(p: Array) -> Array:
+    """How far off the surface ``spawn_ray`` starts from points [N, 3]."""
+    return OFFSET * (1 + np.abs(p).max(axis=1))
+
+
+def near(p: Array, q: Array) -> Array:
+    """Whether points [N, 3] are one, for all that a spawned ray can tell. [N]"""
+    return np.linalg.norm(p - q, axis=1) < 4 * offset(p)
+
+
+def leave(p: Array, n: Array, d: Array) -> Array:
+    """Origins [N, 3] off the surface on the side of ``d``, as ``spawn_ray`` has them."""
+    outwards = np.sign(dot(n, d))[:, None] * n
+    return (p + outwards * offset(p)[:, None]).astype(np.float32)

@@ -1,0 +1,605 @@
+"""Laws of the hits of a shape: where rays meet it, from near and far, and what its surface is like."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import stats
+
+from mrt_mitsuba.validation.checks import law as laws
+from mrt_mitsuba.validation.checks import noise
+from mrt_mitsuba.validation.checks.law import (
+    LEVEL,
+    Figure,
+    Law,
+    Skip,
+    figures,
+)
+from mrt_mitsuba.validation.checks.noise import ROUNDING
+from mrt_mitsuba.validation.checks.probe import (
+    Array,
+    Lanes,
+    first_of,
+    is_scalar,
+    lanes,
+    not_finite,
+    random_numbers,
+    unit,
+)
+from mrt_mitsuba.validation.checks.shape_case import (
+    FAR,
+    FLAT,
+    HIT_ROUNDINGS,
+    RAY,
+    SMOOTHED,
+    TYPICAL,
+    Case,
+    dot,
+    leave,
+    near,
+    offset,
+    trace,
+)
+
+MAXT = """ray = mi.Ray3f(o, d)
+print("meets the surface at", scene.ray_intersect(ray).t)
+ray.maxt = float("{maxt}")
+print("up to", ray.maxt, "ray_test():", scene.ray_test(ray), "ray_intersect():", scene.ray_intersect(ray).t)
+"""
+ONE = "one question, one answer; of rays that graze, only those that just miss count"
+
+
+@figures(
+    ray_test=Figure(
+        "share of rays {rays} on which ray_test() is wrong",
+        statistic="share",
+        limit=0,
+        why=ONE,
+        snippet=MAXT,
+    ),
+    ray_intersect=Figure(
+        "share of rays {rays} on which ray_intersect() is wrong",
+        statistic="share",
+        limit=0,
+        why=ONE,
+        snippet=MAXT,
+    ),
+)
+def hits(law: Law, case: Case) -> None:
+    """``ray_test`` and ``ray_intersect`` agree, and respect ``maxt``, from outside and from the surface."""
+    _, _, met = case.met
+    away = case.units(len(met.t))
+    start = leave(met.p, met.n, away)
+    leaving = (start, away, trace(case.target, start, away))
+    _answers(law, case, "without a limit", case.seen, np.inf)
+    _answers(law, case, "up to just before the hit", case.met, 1 - 1e-3)
+    _answers(law, case, "up to just behind the hit", case.met, 1 + 1e-3)
+    _answers(law, case, "that leave the surface", leaving, np.inf)
+
+
+def _answers(law: Law, case: Case, rays: str, traced: tuple[Array, Array, Lanes], reach: float) -> None:
+    """Hold the answers about rays of a length of ``reach`` distances to what they are known to meet."""
+    o, d, seen = traced
+    maxt = (seen.t * reach).astype(np.float32)
+
+    def call(origin: mi.Point3f, direction: mi.Vector3f, most: mi.Float) -> list[mi.Mask]:
+        ray = mi.Ray3f(origin, direction)
+        ray.maxt = most
+        return [case.target.ray_test(ray), case.target.ray_intersect(ray).is_valid()]
+
+    answers = lanes(call, ("Point3f", o), ("Vector3f", d), ("Float", maxt))
+    limit = 5e-4 if np.isinf(reach) else 0
+    for name, answer in zip(("ray_test", "ray_intersect"), answers, strict=True):
+        wrong = (~seen.met | seen.steep) & (answer != (seen.met & (reach > 1)))
+        law.hold(name, wrong, limit=limit, o=o, d=d, maxt=maxt, rays=rays)
+
+
+@figures(
+    on_ray=Figure(
+        "hit point off the ray at its distance, in roundings of the largest number",
+        statistic="most",
+        limit=HIT_ROUNDINGS,
+        why="some dozen operations",
+        snippet=RAY,
+    ),
+    near_by=Figure(
+        "hit point off a ray of a twentieth of the size, in roundings of the largest coordinate, median",
+        statistic=0.5,
+        limit=TYPICAL,
+        why="a few operations",
+        snippet=RAY,
+    ),
+    behind=Figure(
+        "hit points from in front and from behind, across the surface, in roundings of the largest "
+        "coordinate, median",
+        statistic=0.5,
+        limit=TYPICAL,
+        why="a few operations",
+        snippet=RAY,
+    ),
+    again=Figure(
+        "rays from the surface, of {count}, that meet it where they start",
+        statistic="none",
+        limit=0,
+        why="self-intersections are dark spots; grazing rays are left out",
+        snippet=RAY,
+    ),
+    missed=Figure(
+        "share of rays from a thousandth of the size before the surface that do not meet it there",
+        statistic="share",
+        limit=2e-3,
+        why="no absolute limits; outlines hang on roundings",
+        snippet=RAY,
+    ),
+    noise=Figure(
+        f"noise of the {{what}} over that of {noise.ALLOWANCE:g} roundings with a rounded ray, 9 in 10",
+        statistic=0.9,
+        limit=noise.LOST,
+        why="digits are lost inside that could be kept",
+        snippet=RAY,
+    ),
+)
+def surface(law: Law, case: Case) -> None:
+    """p = o + t d is on the surface; spawned rays do not meet it where they start; digits are kept."""
+    o, d, met = case.met
+    largest = np.maximum(np.abs(o).max(axis=1), np.abs(met.p).max(axis=1)) + met.t
+    along = o.astype(np.float64) + met.t[:, None] * d
+    off = np.abs(along - met.p).max(axis=1)
+    law.hold("on_ray", off / (ROUNDING * largest), o=o, d=d)
+    _from_near_by(law, case)
+    _again(law, case)
+    before = (met.p - 1e-3 * case.size * d).astype(np.float32)
+    again = trace(case.target, before, d)
+    missed = ~again.met | (np.linalg.norm(again.p - met.p, axis=1) >= 1e-3 * case.size)
+    law.hold("missed", missed, o=before, d=d)
+    _noise(law, case)
+
+
+def _again(law: Law, case: Case) -> None:
+    """Rays that leave the surface do not meet it where they start."""
+    count = case.count(10**5, 10**6)
+    met = case.met[2]
+    few = met.only(case.rng.integers(len(met.t), size=count))
+    away = case.units(count)
+    start = leave(few.p, few.n, away)
+    again = trace(case.target, start, away)
+    # another part may truly be that near, in a hollow edge
+    alike = np.abs(dot(again.n, few.n)) > np.where(again.part == few.part, 0.9, 0.9999)
+    bad = again.met & near(few.p, again.p) & alike & (np.abs(dot(few.n, away)) > FLAT)
+    law.hold("again", bad, o=start, d=away, count=count)
+
+
+def _noise(law: Law, case: Case) -> None:
+    """The noise of distance, hit point and normal."""
+    o, d, met = case.met
+    first = slice(0, case.count(300, 1000))
+    scale = (np.abs(o).max(axis=1) + met.t)[first]
+    inputs = np.concatenate([o, d], axis=1)[first]
+
+    def hits(x: Array) -> Lanes:
+        return trace(case.target, x[:, :3], x[:, 3:])
+
+    def distance(x: Array) -> Array:
+        return hits(x).t
+
+    def point(x: Array) -> Array:
+        return hits(x).p.sum(axis=1)
+
+    def normal(x: Array) -> Array:
+        return hits(x).n @ [0.6, 0.48, 0.64]
+
+    for what, size, quantity in (
+        ("distance", scale, distance),
+        ("hit point", scale, point),
+        ("normal", 1 + 0 * scale, normal),
+    ):
+        estimate = noise.measure(quantity, inputs, size=size, strides=(64,), seed=case.seed)
+        law.hold("noise", estimate.lost, o=o, d=d, what=what)
+
+
+def _from_near_by(law: Law, case: Case) -> None:
+    """From near by, and from the other side, numbers are small, and points that are off show."""
+    few = slice(0, case.count(2**12, 2**15))
+    reach = 0.05 * case.size
+    d = case.met[1][few]
+    met = case.met[2].only(few)
+    close = (met.p - reach * d).astype(np.float32)
+    again = trace(case.target, close, d)
+    same = again.met & near(met.p, again.p)
+    largest = np.abs(met.p).max(axis=1) + reach
+    along = close + again.t[:, None].astype(np.float64) * d
+    off = np.abs(along - again.p).max(axis=1)
+    # the same line the other way around, from as far behind
+    back = trace(case.target, (met.p + reach * d).astype(np.float32), -d)
+    apart = np.linalg.norm(back.p.astype(np.float64) - again.p, axis=1) * np.abs(dot(met.n, d))
+    alike = same & back.met & (back.part == met.part) & (apart < 0.01 * case.size)
+    alike &= case.behind.met.mean() > 0.5  # else rays pass it from behind
+    for name, error, known in (("near_by", off, same), ("behind", apart, alike)):
+        if known.sum() > 20:
+            law.hold(name, np.where(known, error / (ROUNDING * largest), np.nan), o=close, d=d)
+
+
+NEIGHBOUR = """aside = mi.Vector3f({aside})
+si = scene.ray_intersect(mi.Ray3f(o, d))
+near = scene.ray_intersect(mi.Ray3f(o + 1e-3 * {size} * aside, d))
+step, uv = near.p - si.p, near.uv - si.uv
+print("slope against the normal:", dr.dot(step, si.n) / dr.norm(step))
+print("step", step, "by partial derivatives:", si.dp_du * uv.x + si.dp_dv * uv.y)
+"""
+PARTED = "extrapolated to no step; edges may part neighbours"
+
+
+@figures(
+    outwards=Figure(
+        "share of rays from outside whose normal points the wrong way",
+        statistic="share",
+        limit=1e-3,
+        why="a closed shape has an outside; what edges hide is left room for",
+        snippet=RAY,
+    ),
+    length=Figure(
+        "length of a normal less 1",
+        statistic="most",
+        limit=1e-5,
+        why="a square root and a quotient",
+        snippet=RAY,
+    ),
+    side=Figure(
+        "shading normals on the other side than the geometric one",
+        statistic="none",
+        limit=0,
+        why="one surface",
+        snippet=RAY,
+    ),
+    shading=Figure(
+        "shading normal against the geometric one, except on smoothed meshes, 9 in 10",
+        statistic=0.9,
+        limit=2e-3,
+        why="the same, within some roundings",
+        snippet=RAY,
+    ),
+    turned=Figure(
+        "share of normals that turn where the same point is met from behind",
+        statistic="share",
+        limit=1e-3,
+        why="a surface has one normal; thin parts are left room for",
+        snippet=RAY,
+    ),
+    slant=Figure(
+        "cosine between the normal and a partial derivative of the point",
+        statistic="most",
+        limit=1e-3,
+        why="both are known to a few roundings; near a pole the derivatives are short",
+        snippet=RAY,
+    ),
+    slope=Figure(
+        "slope of the surface against its normal, by differences, 95 in 100",
+        statistic=0.95,
+        limit=1e-2,
+        why=PARTED,
+        snippet=NEIGHBOUR,
+    ),
+    step=Figure(
+        "step along the surface less its partial derivatives, 95 in 100",
+        statistic=0.95,
+        limit=1e-2,
+        why=PARTED,
+        snippet=NEIGHBOUR,
+    ),
+)
+def normals(law: Law, case: Case) -> None:
+    """n has unit length, points outwards, n · ∂p/∂u = n · ∂p/∂v = 0, and differences of points agree."""
+    if case.closed:
+        o, d, seen = case.seen
+        judged, even = case.lines
+        flipped = isinstance(case.plugin, mi.Shape) and case.plugin.has_flipped_normals()
+        law.hold("outwards", judged & even & ((dot(seen.n, d) > 0) != flipped), o=o, d=d)
+    else:
+        law.notes.append("open: there is no outside for normals to point to")
+    o, d, met = case.met
+    length = np.linalg.norm(np.stack([met.n, met.shading]).astype(np.float64), axis=-1)
+    law.hold("length", np.abs(length - 1).max(axis=0), o=o, d=d)
+    law.hold("side", dot(met.n, met.shading) <= 0, o=o, d=d)
+    smoothed = isinstance(case.plugin, mi.Mesh) and case.plugin.has_vertex_normals()
+    if not smoothed and laws.class_name(case.plugin) not in SMOOTHED:
+        law.hold("shading", np.linalg.norm(met.shading - met.n, axis=1), o=o, d=d)
+    # the normal is the surface's, not the ray's: the same for a ray that comes back from behind
+    back = case.behind
+    same = back.met & near(met.p, back.p) & (back.part == met.part)
+    if same.sum() > 20:
+        law.hold("turned", same & (dot(back.n, met.n) < -0.5), o=o, d=d)
+    along_u = np.abs(dot(unit(met.du), met.n))  # NaN where the derivative is 0
+    along_v = np.abs(dot(unit(met.dv), met.n))
+    slant = np.maximum(along_u, along_v)
+    if np.isfinite(slant).any():
+        law.hold("slant", np.where(np.isfinite(slant), slant, 0), o=o, d=d)
+    _differences(law, case)
+
+
+def _differences(law: Law, case: Case) -> None:
+    """Neighbouring hits against normal and partial derivatives; two widths separate curvature from error."""
+    o, d, met = case.met
+    aside = unit(np.cross(d, case.units(len(d))))
+    slopes = []
+    partials = []
+    for h in (2e-3, 1e-3):
+        shifted = (o + h * case.size * aside).astype(np.float32)
+        other = trace(case.target, shifted, d)
+        step = (other.p - met.p).astype(np.float64)
+        length = np.linalg.norm(step, axis=1)
+        ok = other.met & (other.part == met.part) & (dot(other.n, met.n) > 0.9)
+        ok &= (length < 40 * h * case.size) & (length > 0)
+        du, dv = (other.uv - met.uv).T[:, :, None].astype(np.float64)
+        slopes.append(np.where(ok, np.abs(dot(step, met.n)) / length, np.nan))
+        off = np.linalg.norm(step - du * met.du - dv * met.dv, axis=1) / length
+        ok &= (np.abs([du, dv]).max(axis=(0, 2)) < 0.2) & met.du.any()
+        partials.append(np.where(ok, off, np.nan))
+    for name, (wide, narrow) in (("slope", slopes), ("step", partials)):
+        if np.isfinite(wide + narrow).sum() >= 20:
+            law.hold(name, np.maximum(2 * narrow - wide, 0), o=o, d=d, aside=aside, size=case.size)
+
+
+@figures(
+    blind=Figure(
+        "share of rays that pass the surface from behind",
+        statistic="share",
+        limit=1e-2,
+        why="it has two sides; edges have room",
+        snippet=RAY,
+    ),
+    odd=Figure(
+        "share of lines, of {judged}, that cross the surface an odd number of times",
+        statistic="share",
+        limit=1e-3,
+        why="near sharp edges, the offset of a ray that goes on leads out again; grazing lines are left out",
+        snippet=RAY,
+    ),
+    out=Figure(
+        "share of rays from inside, of {count}, that surely meet nothing",
+        statistic="at most",
+        limit=1e-5,
+        why="a closed surface; of a million rays at triangles, some pass along an edge",
+        snippet=RAY,
+    ),
+)
+def watertight(law: Law, case: Case) -> None:
+    """Lines enter and leave in turn, and no ray from inside gets out without a hit."""
+    o, d, met = case.met
+    # else such a ray may fall off an edge, or its offset be larger than the shape
+    steep = (np.abs(met.cos) > 0.5) & (offset(met.p) < 1e-3 * case.size)
+    blind = steep & ~case.behind.met
+    if blind.mean() > 1e-2:
+        law.hold("blind", blind, o=o, d=d)
+        return
+    if not case.closed:
+        raise Skip("the shape is open: lines do not leave it as often as they enter")
+    o, d, _ = case.seen
+    judged, even = case.lines
+    law.hold("odd", judged & ~even, o=o, d=d, judged=judged.sum())
+    inside = _inside(case)
+    if not len(inside):
+        law.notes.append("no room inside to start rays in")
+        return
+    count = case.count(10**5, 10**6)
+    o = inside[case.rng.integers(len(inside), size=count)]
+    d = case.units(count)
+    out = ~trace(case.target, o, d).met
+    surely = stats.binomtest(int(out.sum()), count).proportion_ci(1 - 2 * LEVEL).low  # Clopper and Pearson
+    law.hold("out", surely, o=o[out.argmax()], d=d[out.argmax()], count=count)
+
+
+def _inside(case: Case) -> Array:
+    """Points well inside: the middles of the longer first chords of lines. [N, 3]"""
+    if len(case.crossings) < 2:
+        return np.zeros((0, 3), np.float32)
+    (first, entries), (second, exits) = case.crossings[:2]
+    _, i, j = np.intersect1d(first, second, return_indices=True)
+    entry = entries.p[i]
+    exit_ = exits.p[j]
+    chord = np.linalg.norm(entry - exit_, axis=1)
+    return ((entry + exit_) / 2)[chord >= np.median(chord)].astype(np.float32)
+
+
+SCALED = """print("as it is, t:", scene.ray_intersect(mi.Ray3f(o, d)).t)
+shape = load(to_world=mi.ScalarTransform4f({matrix}))
+scene = mi.load_dict({{"type": "scene", "shape": shape}})
+print("scaled, t over the scale:", scene.ray_intersect(mi.Ray3f(o * 2.0**{power}, d)).t / 2.0**{power})
+"""
+
+
+@figures(
+    answer=Figure(
+        "rays answered otherwise at 2^{power} of the size",
+        statistic="none",
+        limit=0,
+        why="scaling by a power of two rounds nothing; grazing rays are left out",
+        snippet=SCALED,
+    ),
+    off=Figure(
+        "distance (relative) or normal at 2^{power} of the size, off",
+        statistic="most",
+        limit=HIT_ROUNDINGS * ROUNDING,
+        why="some dozen operations, on scaled numbers",
+        snippet=SCALED,
+    ),
+)
+def scale(law: Law, case: Case) -> None:
+    """A millionth and a million times the size: the same, scaled. Powers of two leave no roundings."""
+    matrix = getattr(case.with_().get("to_world"), "values", np.eye(4))
+    few = slice(0, case.count(2**12, 2**14))
+    o, d, seen = case.first_seen(few)
+    for power in (-20, -10, 10, 20):
+        larger = np.diag([2.0**power] * 3 + [1]) @ matrix
+        try:
+            box = case.load(to_world=mi.ScalarTransform4f(larger)).bbox()
+        except RuntimeError as problem:
+            raise Skip("to_world is not accepted") from problem
+        diagonal = np.array(box.max, np.float64) - np.array(box.min, np.float64)
+        grown = np.linalg.norm(np.ravel(diagonal))
+        if not np.isclose(grown, 2.0**power * case.size, rtol=1e-3):
+            raise Skip("to_world does not scale all of it (of curves, the radius stays)")
+        scene = case.scene(to_world=mi.ScalarTransform4f(larger))
+        there = trace(scene, (o * 2.0**power).astype(np.float32), d)
+        both = seen.steep & there.met
+        apart = np.abs(there.t / 2.0**power - seen.t) / np.where(both, seen.t, 1)
+        error = np.where(both, np.maximum(apart, 1 - dot(there.n, seen.n)), 0)
+        otherwise = (~seen.met | seen.steep) & (there.met != seen.met)
+        for name, errors in (("answer", otherwise), ("off", error)):
+            law.hold(name, errors, o=o, d=d, power=power, matrix=larger.tolist())
+
+
+TWICE = """for o in (o, mi.Point3f({other})):
+    dr.make_opaque(o)
+    print("from", o, "it is met at", scene.ray_intersect(mi.Ray3f(o, d)).p)
+"""
+
+
+@figures(
+    missed=Figure(
+        "share of rays from afar that miss what is met from nearby, or meet it "
+        f"{HIT_ROUNDINGS} roundings off",
+        statistic="share",
+        limit=1e-3,
+        why="the origin is rounded, and some dozen operations with it; next to edges, more hangs on them",
+        snippet=TWICE,
+    ),
+)
+def far(law: Law, case: Case) -> None:
+    """Hits from ten thousand sizes away are those of the same lines from nearby, to some roundings."""
+    few = slice(0, case.count(2**12, 2**15))
+    distance = FAR * case.size
+    goal = case.met[2].p[few].astype(np.float64)
+    d = case.met[1][few]
+    exactly = d.astype(np.float64)
+    origin = (goal - distance * exactly).astype(np.float32)
+    closer = (origin + (FAR - 1.5) * case.size * exactly).astype(np.float32)
+    there = trace(case.target, origin, d)
+    here = trace(case.target, closer, d)
+    cos = np.abs(here.cos)
+    apart = np.linalg.norm(there.p.astype(np.float64) - here.p, axis=1)
+    error = apart * cos / (ROUNDING * distance)
+    bad = here.met & (cos > 4 * FLAT) & (~there.met | (error > HIT_ROUNDINGS))
+    # a rounded origin moves the line: only what all lines around it meet counts
+    bad &= np.linalg.norm(here.p - goal, axis=1) < 20 * ROUNDING * distance
+    across = unit(np.cross(d, case.units(len(d))))
+    for side in (across, -across, np.cross(d, across), np.cross(across, d)):
+        start = (closer + 4 * ROUNDING * distance * side).astype(np.float32)
+        aside = trace(case.target, start, d)
+        bad &= aside.met & (dot(aside.n, here.n) > 0.9)
+    law.hold("missed", bad, o=origin, d=d, other=closer)
+
+
+@figures(
+    bad=Figure(
+        "hits with numbers that are not finite",
+        statistic="none",
+        limit=0,
+        why="one NaN spoils a picture",
+        snippet=RAY,
+    ),
+    million=Figure(
+        "hits of {count} rays at random, or sampled positions, with numbers that are not finite",
+        statistic="at most",
+        limit=0,
+        why="one NaN spoils a picture",
+        snippet=RAY,
+    ),
+)
+def finite(law: Law, case: Case) -> None:
+    """Rays along axes, from the surface, the middle, corners and very far: all results are finite."""
+    _, _, met = case.met
+    rng = case.rng
+    count = case.count(2**12, 2**15)
+    corners = np.where(rng.random((count, 3)) < 0.5, case.low, case.high)
+    middles = np.broadcast_to(case.middle, (count, 3))
+    on_surface = met.p[rng.integers(len(met.p), size=count)]
+    distances = case.size * 10.0 ** rng.uniform(0, 5, (count, 1))
+    afar = case.middle + distances * case.units(count)
+    vertices = case.points[rng.integers(len(case.points), size=count)]
+    kinds = (corners, middles, on_surface, afar, vertices)
+    o = np.choose(rng.integers(len(kinds), size=count)[:, None], kinds).astype(np.float32)
+    d = case.units(count)
+    d[rng.random(d.shape) < 0.4] = 0
+    d = unit(d + np.where((d == 0).all(axis=1, keepdims=True), [0, 0, 1], 0))
+    d[(d == 0) & (rng.random(d.shape) < 0.3)] = 1e-30
+    to_middle = case.middle - o
+    towards = unit(np.where(np.abs(to_middle) > 0, to_middle, 1))
+    d = np.where(rng.random((count, 1)) < 0.3, towards, d)
+    hits = trace(case.target, o, d)
+    vectors = (hits.p, hits.n, hits.shading, hits.uv, hits.du, hits.dv)
+    numbers = np.concatenate([hits.t[:, None], *vectors], axis=1)
+    sound = np.isfinite(numbers).all(axis=1) & (hits.t >= 0)
+    law.hold("bad", np.where(hits.met, ~sound, np.isnan(hits.t)), o=o, d=d)  # a miss is infinitely far
+    if not is_scalar():
+        _by_the_million(law, case)
+
+
+def _by_the_million(law: Law, case: Case) -> None:
+    """So many rays and positions that a fault in one of a hundred thousand shows."""
+    count = case.count(2**19, 2**22)
+    rng = random_numbers(count, case.seed)
+    draw = rng.next_float32
+    middle = mi.Point3f(*map(float, case.middle))
+    extent = mi.Vector3f(*map(float, np.maximum(case.high - case.low, 0.01 * case.size)))
+    away = mi.warp.square_to_uniform_sphere(mi.Point2f(draw(), draw()))
+    o = middle + 1.5 * case.size * away
+    goal = middle + extent * (mi.Vector3f(draw(), draw(), draw()) - 0.5)
+    d = dr.normalize(goal - o)
+    si = case.target.ray_intersect(mi.Ray3f(o, d))
+    bad = si.is_valid() & not_finite(si.t, si.p, si.n, si.sh_frame.n, si.dp_du, si.dp_dv, si.uv)
+    with suppress(AttributeError, RuntimeError):
+        ps = case.plugin.sample_position(0, mi.Point2f(draw(), draw()))
+        bad |= not_finite(ps.p, ps.n, ps.pdf)
+    wrong, first = first_of(bad, o=o, d=d)
+    law.hold("million", wrong, count=count, **first)
+
+
+@figures(
+    outside=Figure(
+        "points outside the bounding box, in sizes",
+        statistic="at most",
+        limit=1e-5,
+        why="some roundings",
+        snippet=RAY,
+    ),
+)
+def bbox(law: Law, case: Case) -> None:
+    """Whatever is hit or sampled lies in the bounding box."""
+    o, d, met = case.met
+    points = [met.p, case.points]
+    with suppress(Skip):
+        points.append(case.positions[0][0])
+    p = np.concatenate(points)
+    out = np.maximum(case.box[0] - p, p - case.box[1]).max(axis=1) / case.size
+    i = min(int(out.argmax()), len(o) - 1)
+    law.hold("outside", out.max(), o=o[i], d=d[i])
+
+
+@figures(
+    answer=Figure(
+        "share of rays answered otherwise in {other}",
+        statistic="share",
+        limit=2e-3,
+        why="outlines hang on roundings",
+        snippet=RAY,
+    ),
+    distance=Figure(
+        "distance in {other}, off by roundings of the largest number",
+        statistic="most",
+        limit=4 * HIT_ROUNDINGS,
+        why="some dozen operations each, and another cosine with the surface",
+        snippet=RAY,
+    ),
+)
+def variants(law: Law, case: Case) -> None:
+    """Hits in the scalar variant against those in the vectorised one."""
+    case.with_()
+    other = case.other_kind
+    o, d, seen = case.first_seen(slice(0, case.count(500, 2000)))
+    there = case.elsewhere(other, lambda: trace(case.scene(), o, d))
+    law.hold("answer", (there.met != seen.met) & (seen.steep | ~seen.met), o=o, d=d, other=other)
+    error = np.abs(there.t - seen.t) / (ROUNDING * (np.abs(o).max(axis=1) + seen.t))
+    law.hold("distance", np.where(there.met & seen.steep, error, 0), o=o, d=d, other=other)

@@ -1,0 +1,312 @@
+"""The law of the samples of a shape: positions by area, directions by solid angle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import stats
+
+from mrt_mitsuba.validation.checks.law import (
+    SIGMAS,
+    Figure,
+    Law,
+    figures,
+    rare,
+)
+from mrt_mitsuba.validation.checks.noise import ROUNDING
+from mrt_mitsuba.validation.checks.probe import (
+    Array,
+    Lanes,
+    lanes,
+    unit,
+)
+from mrt_mitsuba.validation.checks.shape_case import (
+    HIT_ROUNDINGS,
+    RAY,
+    Case,
+    dot,
+    leave,
+    near,
+    offset,
+    trace,
+    walk,
+)
+from mrt_mitsuba.validation.tools.compare import sidak
+
+POSITIONS = """n = 100_000
+rng = mi.PCG32(n)
+ps = shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))
+print("mean of 1 / density:", dr.mean(1 / ps.pdf), "surface_area():", shape.surface_area())
+ratio = shape.pdf_position(ps) / ps.pdf
+print("pdf_position() / density:", dr.min(ratio), "...", dr.max(ratio))
+"""
+SAME = "the same number"
+
+
+@figures(
+    position=Figure(
+        "density of a position against pdf_position(), relative",
+        statistic="most",
+        limit=1e-3,
+        why=SAME,
+        snippet=POSITIONS,
+    ),
+    area=Figure(
+        "mean of 1 / density against surface_area(), relative",
+        statistic="at most",
+        limit=1e-3,
+        why=SAME,
+        snippet=POSITIONS,
+    ),
+    off=Figure(
+        "sampled positions off the surface, 9 in 10, in roundings of the largest coordinate",
+        statistic=0.9,
+        limit=2 * HIT_ROUNDINGS,
+        why="a few roundings",
+        snippet=RAY,
+    ),
+    normal=Figure(
+        "normals of sampled positions against those of rays, 1 - cosine, 9 in 10",
+        statistic=0.9,
+        limit=1e-3,
+        why="one surface",
+        snippet=RAY,
+    ),
+    crossings=Figure(
+        f"surface_area() against that by crossings of lines, relative, beyond {SIGMAS} standard errors",
+        statistic="at most",
+        limit=3e-3,
+        why="lines that graze may cross twice within the offset of a spawned ray",
+        snippet=POSITIONS,
+    ),
+    spread=rare("chance of such positions if they follow the area, along the worst of some axes", POSITIONS),
+    direction=Figure(
+        "density of a direction against pdf_direction(), relative, 99 in 100",
+        statistic=0.99,
+        limit=1e-2,
+        why="the same number; near outlines the cosine, and the density with it, hangs on roundings",
+        snippet=RAY,
+    ),
+    misses=Figure(
+        "share of sampled directions that miss the shape, or reach it behind the sampled point",
+        statistic="share",
+        limit=1e-2,
+        why="outlines hang on roundings; small leaks are watertight's business",
+        snippet=RAY,
+    ),
+    aim=rare(
+        "chance of such directions, if they follow their density, from the worst of some places", POSITIONS
+    ),
+    angle=Figure(
+        "solid angle of what is visible, or its middle or width, by samples against uniform "
+        f"directions, beyond {SIGMAS} standard errors",
+        statistic="at most",
+        limit=1e-2,
+        why="the mean of 1 / density over what is seen; lines that graze are left room for",
+        snippet=POSITIONS,
+    ),
+)
+def sampling(law: Law, case: Case) -> None:
+    """Positions by area, judged by where lines cross the surface; directions, and the densities of both.
+
+    E[1 / pdf] is the area, and of directions the solid angle of what is seen.
+    """
+    (p, n, pdf, again), u, area = case.positions
+    law.hold("position", np.abs(pdf / again - 1))
+    law.hold("area", abs(np.mean(1 / pdf) / area - 1))
+    few = slice(0, case.count(2**14, 2**17))
+    # sampled positions, and their normals, as rays meet them
+    start = (p + n * 0.01 * case.size).astype(np.float32)[few]
+    inwards = -n[few]
+    back = trace(case.target, start, unit(inwards))
+    # another part of the surface may be nearer than a hundredth of the size
+    away = np.where(back.met, np.linalg.norm(back.p - p[few], axis=1), np.inf)
+    scale = np.abs(p[few]).max(axis=1) + 0.01 * case.size
+    law.hold("off", away / (ROUNDING * scale), o=start, d=inwards)
+    if back.met.any():
+        cosine = np.minimum(dot(-inwards, back.shading), dot(-inwards, back.n))
+        cosine = cosine / np.linalg.norm(inwards, axis=1)
+        off = np.where(back.met, 1 - cosine, np.nan)
+        law.hold("normal", off, o=start, d=inwards)
+    if case.behind.met.mean() > 0.5:
+        _area(law, case, p, n, area)
+    else:
+        law.notes.append("rays pass it from behind: their crossings do not count its area")
+    _directions(law, case, u[few])
+
+
+def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
+    """Random lines cross a surface in proportion to its area, whatever its form (Crofton)."""
+    count = case.count(2**17, 2**20)
+    radius = 0.5 * case.size * 1.001
+    d = case.units(count)
+    across = unit(np.cross(d, case.units(count)))
+    disk = radius * np.sqrt(case.rng.random((count, 1))) * across
+    start = (case.middle + disk - 2 * radius * d).astype(np.float32)
+    twice = _coinciding(case, p, unit(n))
+    crossed = np.zeros(count)
+    points = []
+    for line, hits in walk(case.target, start, d):
+        crossed[line] += 1
+        points.append(hits.p)
+    crossings = np.concatenate(points)
+    estimate = 2 * np.pi * radius**2 * crossed.mean()
+    error = 2 * np.pi * radius**2 * crossed.std() / np.sqrt(count)
+    beyond = max(abs(estimate - area) - SIGMAS * error, 0)
+    room = 3e-3 + 20 * float(offset(p).max()) / case.size + twice
+    law.hold("crossings", beyond / area, limit=room)
+    if twice > ROOM:
+        law.notes.append("parts of it coincide: where positions lie is not judged")
+        return
+    # crossings of a line come together
+    size = 1 / (1 / len(p) + (crossed**2).sum() / crossed.sum() / len(crossings))
+    axes = case.units(AXES)
+    apart = [_distance(p @ axis, crossings @ axis) for axis in axes]
+    for axis in np.eye(3):
+        if _is_edge_on(crossings, axis):
+            continue
+        for cut in CUTS:
+            azimuths = _angle(p - case.middle, axis, cut)
+            apart.append(_distance(azimuths, _angle(crossings - case.middle, axis, cut)))
+    law.hold("spread", _chance(apart, size))
+
+
+AXES = 12  # aslant, along which positions are compared
+CUTS = (0.0, np.pi / 2)  # where azimuths start and end: crowding there shows less
+ROOM = 2e-3  # lines that graze are left room for
+VIEWS = 3  # from which directions are compared
+
+
+def _coinciding(case: Case, p: Array, n: Array) -> float:
+    """Share of points [N, 3] where two parts of the surface coincide, and a line meets only one of them."""
+    one = trace(case.target, leave(p, n, n), -n)
+    other = trace(case.target, leave(p, n, -n), n)
+    both = one.met & other.met & (one.part != other.part)
+    return float((both & near(p, one.p) & near(p, other.p)).mean())
+
+
+def _is_edge_on(p: Array, axis: Array) -> bool:
+    """Whether points [N, 3] lie in one plane with an axis: then azimuths around it are but two."""
+    across = p - np.outer(p @ axis, axis)
+    widths = np.linalg.svd(np.cov(across.T), compute_uv=False)
+    return bool(widths[1] < 1e-4 * widths[0])
+
+
+def _angle(v: Array, axis: Array, cut: float) -> Array:
+    """Azimuths [N] of vectors [N, 3] around an axis [3]."""
+    across = unit(np.cross(axis, np.add(np.roll(axis, 1), (0.1, 0.2, 0.3))))
+    along = np.cross(axis, across)
+    x = v @ across
+    y = v @ along
+    return np.arctan2(np.sin(cut) * x + np.cos(cut) * y, np.cos(cut) * x - np.sin(cut) * y)
+
+
+def _distance(x: Array, y: Array, weight: Array | None = None) -> float:
+    """The largest distance between the distribution of x [N], with weights [N], and that of y [M]."""
+    if weight is None:
+        weight = np.ones(len(x))
+    order = np.argsort(x)
+    below = np.concatenate([[0], np.cumsum(weight[order])]) / weight.sum()
+    y = np.sort(y)
+    here = below[np.searchsorted(x[order], y, side="right")]
+    return float(np.abs(here - np.arange(1, len(y) + 1) / len(y)).max())
+
+
+def _chance(apart: Sequence[float], size: float) -> float:
+    """The chance of such distances between samples of such a size (Kolmogorov and Smirnov, Šidák)."""
+    beyond = max(max(apart) - ROOM, 0)
+    return sidak(float(stats.kstwobign.sf(beyond * np.sqrt(size))), len(apart))
+
+
+def _directions(law: Law, case: Case, u: Array) -> None:
+    """``sample_direction`` from outside: meets the shape, and states its own density."""
+    o = case.around(len(u))
+    try:
+        d, dist, pdf, again = _sampled(case, o, u)
+    except (RuntimeError, AttributeError):
+        law.notes.append("the shape has no sample_direction()")
+        return
+    drawn = pdf > 0
+    met = trace(case.target, o, d.astype(np.float32))
+    law.hold("direction", np.where(drawn, np.abs(pdf / again - 1), 0), o=o, d=d)
+    before_it = met.steep & (met.t > dist * (1 + 1e-3))
+    law.hold("misses", drawn & np.where(met.met, before_it, True), o=o, d=d)
+    weight = _visible(d, dist, pdf, met)
+    mean, variance = _moments(case, o, d, met.p, weight)
+    # the same by uniform directions into the cone that holds the shape
+    o = case.around(case.count(2**17, 2**19))
+    away = _into_cone(case, o, case.rng)
+    met = trace(case.target, o, away)
+    expected, other = _moments(case, o, away, met.p, np.where(met.met, CONE, 0))
+    off = np.abs(mean - expected) - SIGMAS * np.sqrt(variance + other)
+    law.hold("angle", max(off.max(), 0) / expected[0])
+    if len(u) >= 2**12:
+        law.hold("aim", _aim(case, case.count(2**15, 2**17)))
+
+
+def _sampled(case: Case, o: Array, u: Array) -> list[Array]:
+    """Sampled directions from points [N, 3]: directions, distances, and densities stated and asked for."""
+
+    def sample(origin: mi.Point3f, second: mi.Point2f) -> list[Any]:
+        it = dr.zeros(mi.Interaction3f)
+        it.p = origin
+        ds = case.plugin.sample_direction(it, second)
+        return [ds.d, ds.dist, ds.pdf, case.plugin.pdf_direction(it, ds)]
+
+    return lanes(sample, ("Point3f", o), ("Point2f", u))
+
+
+def _visible(d: Array, dist: Array, pdf: Array, met: Lanes) -> Array:
+    """The solid angle that each sampled direction stands for, 0 where its point is hidden. [N]"""
+    visible = (pdf > 0) & met.met & (met.t > dist * (1 - 1e-3))
+    return np.where(visible, 1 / np.where(pdf > 0, pdf, 1), 0)
+
+
+# solid angle of the sphere around, from 1.5 sizes away: the sine of its half angle is a third
+CONE = 2 * np.pi * (1 - np.sqrt(1 - 1 / 9))
+
+
+def _into_cone(case: Case, o: Array, rng: np.random.Generator) -> Array:
+    """Uniform directions from points [N, 3] into the cone that holds the shape. [N, 3]"""
+    axis = unit(case.middle - o)
+    across = unit(np.cross(axis, unit(rng.normal(size=(len(o), 3)))))
+    cos = 1 - rng.random((len(o), 1)) * CONE / (2 * np.pi)
+    return unit(cos * axis + np.sqrt(1 - cos**2) * across)
+
+
+def _aim(case: Case, count: int) -> float:
+    """The chance of such samples of directions from some places, if their density is as stated."""
+    rng = np.random.default_rng((case.seed, count))
+    apart = []
+    size = np.inf
+    for _ in range(VIEWS):
+        place = (case.middle + 1.5 * case.size * unit(rng.normal(size=3))).astype(np.float32)
+        o = np.tile(place, (count, 1))
+        d, dist, pdf, _ = _sampled(case, o, rng.random((count, 2), np.float32))
+        weight = _visible(d, dist, pdf, trace(case.target, o, d.astype(np.float32)))
+        away = _into_cone(case, o, rng)
+        seen = away[trace(case.target, o, away).met]
+        fewest = count // 16
+        if len(seen) < fewest or np.count_nonzero(weight) < fewest:  # seen edge on
+            continue
+        effective = weight.sum() ** 2 / (weight**2).sum()
+        size = min(size, 1 / (1 / effective + 1 / len(seen)))
+        axis = unit(case.middle - place)
+        apart.append(_distance(d @ axis, seen @ axis, weight))
+        for cut in CUTS:
+            apart.append(_distance(_angle(d, axis, cut), _angle(seen, axis, cut), weight))
+    return _chance(apart, size) if apart else 1.0
+
+
+def _moments(case: Case, o: Array, d: Array, p: Array, weight: Array) -> tuple[Array, Array]:
+    """Means [8] of weights, alone and times place, its squares and the angle, and their variances [8]."""
+    place = (p - case.middle) / case.size
+    cosine = dot(d, unit(case.middle - o))[:, None]
+    angle = (1 - cosine) * 2 * np.pi / CONE
+    factors = np.concatenate([np.ones_like(angle), place, 4 * place**2, angle], axis=1)
+    products = np.where(weight[:, None] > 0, weight[:, None] * factors, 0)
+    return products.mean(axis=0), products.var(axis=0) / len(products)

@@ -1,0 +1,161 @@
+"""Figures of real runs, for the documentation and for scenes of one's own."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mitsuba as mi
+import numpy as np
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.output.files import to_8bit
+from mrt_mitsuba.validation.studies import error_vs_time, needs
+from mrt_mitsuba.validation.studies.stability import curves
+from mrt_mitsuba.validation.tools import diagrams
+from mrt_mitsuba.validation.tools.originals import read_original
+from mrt_mitsuba.validation.tools.study import Study
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Rows = list[dict[str, Any]]
+Drawn = tuple["Figure", Rows]  # and the rows of its table
+
+SMALL = (160, 120)
+
+
+def error_against_time(scene: error_vs_time.Number) -> Drawn:
+    """Return the diagram of all that a user can choose in a scene, and what to use to get to an error."""
+    panels = error_vs_time.choices(scene)
+    return diagrams.work_precision(panels), error_vs_time.advice(panels)
+
+
+def hard_axes(places: int = 21) -> Drawn:
+    """Return errors in roundings of float32 along the axes that are hard on it, and where lines break."""
+    return _of_study("roundings", lambda study: curves.show(study, quick=True, places=places))
+
+
+def left_out() -> Drawn:
+    """Return what the numbered scenes would cost if nothing were left out, and what each goes without."""
+    return _of_study("savings", lambda study: needs.show(study, SMALL, needs.SCENES, 3))
+
+
+def _of_study(name: str, fill: Any) -> Drawn:
+    study = Study("", "")
+    fill(study)
+    table = study.tables[name]
+    rows = [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+    return study.images[name]["content"], rows
+
+
+def beside_the_original(folder: str | os.PathLike[str]) -> Drawn:
+    """Return scenes 0 to 4 by the original program and by ours, with their difference times 100.
+
+    ``folder``: of the pictures ``sN_none_aa4.exr``, whole or shortened.
+    """
+    drawn, plots = diagrams.figure(3, 5, 14, 6.7)
+    rows: Rows = []
+    for scene, column in enumerate(plots.T):
+        original = read_original(Path(folder) / f"s{scene}_none_aa4.exr")
+        result = mrt.render(original.scene, fresnel="dielectric", **original.options)
+        ours = original.like(result.image)
+        difference = np.abs(ours - original.image)
+        for axes, picture in zip(column, (original.image, ours, 100 * difference), strict=True):
+            show_picture(axes, picture)
+        column[0].set_title(f"scene {scene}", loc="left", fontsize=diagrams.LABELS + 2, color=diagrams.TEXT)
+        off = (difference.max(axis=-1) > 1 / 255).mean()
+        rows.append(
+            {"scene": scene, "mean difference": float(difference.mean()), "off by > 1/255": float(off)}
+        )
+    for axes, title in zip(plots[:, 0], ("original", "ours", "|difference| × 100"), strict=True):
+        axes.set_ylabel(title, fontsize=diagrams.LABELS + 2, color=diagrams.TEXT)
+    return drawn, rows
+
+
+def show_picture(axes: Any, picture: np.ndarray) -> None:
+    """Show a linear picture [H, W, 3] as the report writes it."""
+    axes.imshow(to_8bit(np.ascontiguousarray(picture, np.float32), "report"), interpolation="nearest")
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+
+
+def maps(result: mrt.Result) -> Figure:
+    """Return the picture of a render in rounds, its stated error and its rays, pixel by pixel."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.ticker import LogLocator
+    from PIL import Image
+
+    height, width = result.image.shape[:2]
+    drawn, plots = diagrams.figure(1, 3, 14, 14 / 3 * height / width + 0.8)
+    picture, *others = plots[0]
+    picture.imshow(Image.fromarray(to_8bit(result.image, "srgb")))
+    titles = {"error.Y": "stated error of each pixel", "samples.Y": "rays of each pixel"}
+    for axes, (name, title) in zip(others, titles.items(), strict=True):
+        values = result.layers[name]
+        least, most = np.quantile(values[values > 0], (0.01, 1))
+        colors = {"cmap": "viridis", "norm": LogNorm(least, most)}
+        shown = axes.imshow(np.maximum(values, least), **colors)
+        ticks: Any = {"ticks": LogLocator(subs=(1, 2, 5)), "format": "%g"}
+        drawn.colorbar(shown, ax=axes, location="bottom", fraction=0.05, pad=0.02, **ticks).minorticks_off()
+        axes.set_title(title, loc="left", fontsize=diagrams.LABELS + 2, color=diagrams.TEXT)
+    picture.set_title("the picture", loc="left", fontsize=diagrams.LABELS + 2, color=diagrams.TEXT)
+    for axes in plots[0]:
+        axes.set_anchor("N")
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_visible(False)
+    return drawn
+
+
+def tenths(scene: Any, *, seeds: int, truth_spp: int, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the stated and the true error of tenths of the pixels [10], sorted by the stated one.
+
+    ``options``: of renders in rounds, one for each seed. The noise of the truth is taken off its squares.
+    """
+    chosen = mi.load_dict({"type": options["integrator"]})
+    parts = [
+        np.array(mi.render(scene, integrator=chosen, spp=truth_spp // 8, seed=1000 + k)) for k in range(8)
+    ]
+    truth = np.asarray(np.mean(parts, axis=0, dtype=np.float64))[..., :3]
+    noise = np.asarray(np.var(parts, axis=0, ddof=1))[..., :3].mean(axis=-1) / len(parts)
+    stated = []
+    true = []
+    for seed in range(seeds):
+        result = mrt.render(scene, seed=seed, **options)
+        stated.append(np.square(result.layers["error.Y"]))
+        true.append(np.square(result.image - truth).mean(axis=-1) - noise)
+    order = np.array_split(np.argsort(stated, axis=None), 10)
+    return tuple(  # type: ignore[return-value]
+        np.array([max(np.ravel(squares)[part].mean(), 1e-12) ** 0.5 for part in order])
+        for squares in (stated, true)
+    )
+
+
+def stated_and_true(
+    scenes: Mapping[str, Any], *, seeds: int = 8, truth_spp: int = 2048, **options: Any
+) -> Figure:
+    """Return a plot of the true over the stated error of tenths of the pixels, a line for each scene.
+
+    ``scenes``: loaded ones by name; ``options``: by default a mean of 64 rays of ``path`` where needed.
+    """
+    given = {"integrator": "path", "aamode": "noise", "spp": 64, **options}
+    found = {n: tenths(s, seeds=seeds, truth_spp=truth_spp, **given) for n, s in scenes.items()}
+    drawn, plots = diagrams.figure(1, 1, 6.6, 5)
+    axes = plots[0, 0]
+    ends = {}
+    for (name, (stated, true)), color in zip(found.items(), diagrams.COLORS, strict=False):
+        axes.plot(stated, true, marker="o", markersize=4, color=color)
+        ends[name] = (stated[-1], true[-1], color)
+    values = np.concatenate([np.ravel(lines) for lines in found.values()])
+    span = np.array([values.min() / 1.3, values.max() * 1.3])
+    axes.plot(span, span, color=diagrams.TEXT, linewidth=0.8)
+    axes.fill_between(span, span / 3, span * 3, color="0.93", zorder=0)
+    axes.set(xscale="log", yscale="log", xlim=span, ylim=span, xlabel="stated error", ylabel="true error")
+    for scale in (axes.xaxis, axes.yaxis):
+        diagrams.plain_numbers(scale)
+    note = {"fontsize": diagrams.LABELS, "color": diagrams.GREY, "transform": axes.transAxes, "va": "top"}
+    axes.text(0.03, 0.97, "tenths of the pixels, sorted by stated error\ngrey: within a factor of 3", **note)
+    diagrams.label_ends(axes, ends)
+    return drawn

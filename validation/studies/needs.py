@@ -1,0 +1,167 @@
+"""What scenes do not need: rays, kernels, launches and seconds as planned, and where nothing is left out.
+
+In three ways: as the plan has it; with all layers and the code that the plan leaves out of the kernels; and
+with that and as many rays in every pixel as edges get.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import mitsuba as mi
+import numpy as np
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.output import LAYERS
+from mrt_mitsuba.plugins.kernel_plan import KernelPlan
+from mrt_mitsuba.rendering.api import Result
+from mrt_mitsuba.validation.tools import diagrams
+from mrt_mitsuba.validation.tools.study import Study, in_turns, operations
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+TITLE = "What a scene does not need"
+SCENES = range(10)
+PLANNED = "as planned"
+GENERAL = "all code and layers"
+EVERYTHING = "all code, layers and rays"
+# What is compared of each measure: where every pixel gets all rays, there is one pass instead of two
+MEASURES = {"rays": EVERYTHING, "operations": EVERYTHING, "launches": GENERAL, "seconds": EVERYTHING}
+
+REFINED: dict[str, Any] = {"aa": 4, "aamode": "sobel", "lattice": "report"}
+
+Figures = dict[str, dict[str, float]]  # of ``MEASURES``, by the way
+
+
+def general(plan: KernelPlan) -> KernelPlan:
+    """Return a plan that leaves out no code that a kernel may hold."""
+    return replace(
+        plan,
+        mirrors=True,
+        lobes=("diffuse", "specular"),
+        bvh=True,
+        textures=True,
+        shading_frames=True,
+        tangents=True,
+        emission=True,
+        two_sided=True,
+    )
+
+
+def scenes_of(number: int, size: tuple[int, int]) -> tuple[mi.Scene, mi.Scene]:
+    """Return a scene, and the same with kernels that leave nothing out."""
+    width, height = size
+    nodes = mrt.scene_dict(number, width=width, height=height)
+    planned = mi.load_dict(nodes)
+    whole = mi.load_dict(nodes)
+    integrator = whole.integrator()
+    kernels = general(integrator.prepare(whole).plan)
+    integrator.kernel_plan = lambda facts: kernels
+    return planned, whole
+
+
+def measure(number: int, size: tuple[int, int], repeats: int) -> tuple[Figures, Result]:
+    """Return the figures of each way to render a scene, with edges refined, and a result as planned."""
+    planned, whole = scenes_of(number, size)
+    general_way = REFINED | {"layers": "all"}
+    renders: dict[str, Callable[..., Result]] = {
+        PLANNED: partial(mrt.render, planned, **REFINED),
+        GENERAL: partial(mrt.render, whole, **general_way),
+        EVERYTHING: partial(mrt.render, whole, **general_way | {"aamode": "none"}),
+    }
+    figures: Figures = {}
+    for way, render in renders.items():
+        counted = render(count_rays=True)
+        figures[way] = {
+            "rays": float(sum(counted.rays.values())),
+            "operations": float(max(operations(render))),
+            "launches": float(render().kernel_launches),
+        }
+
+    def render_by(way: str, turn: int) -> Result:
+        return renders[way]()
+
+    results = in_turns([partial(render_by, way) for way in renders], repeats)
+    for way, runs in zip(renders, results, strict=True):
+        figures[way]["seconds"] = statistics.median(r.timings.total - r.timings.load for r in runs)
+    return figures, results[0][0]
+
+
+def run(study: Study, *, quick: bool) -> None:
+    """Fill the study; a picture must not depend on what is left out."""
+    size = (64, 48) if quick else (320, 240)
+    show(study, size, (0, 3, 7) if quick else SCENES, 3 if quick else 7)
+
+
+def show(study: Study, size: tuple[int, int], scenes: Sequence[int], repeats: int) -> None:
+    """Add the bars and the table of scenes to a study."""
+    found: dict[int, Figures] = {}
+    rows: list[dict[str, Any]] = []
+    for number in study.each(TITLE, scenes):
+        found[number], result = measure(number, size, repeats)
+        planned = found[number][PLANNED]
+        times = {
+            f"{name}: times as many": found[number][way][name] / planned[name]
+            for name, way in MEASURES.items()
+        }
+        rows.append({"scene": number, **planned, **times, "left out": _left_out(result)})
+        for name in ("rays", "operations"):
+            why = "what is left out costs nothing; least fault: it stays"
+            times_as_many = found[number][MEASURES[name]][name] / planned[name]
+            study.at_least(f"scene {number}: {name} without a plan / with it", times_as_many, 1, why)
+    caption = (
+        "Blue: as planned, with the figure itself next to it. Orange: where nothing is left out: all code in "
+        "the kernels, all layers, and (but for launches) as many rays in every pixel as edges get."
+    )
+    study.picture("savings", "As planned, and with nothing left out", savings(found), caption)
+    columns = "{}x{} pixels; operations: of the largest kernel, in Dr.Jit's own code".format(*size)
+    study.records("savings", "What each scene goes without", rows, columns, first=True)
+
+
+def _left_out(result: Result) -> str:
+    return ", ".join(what for what, _ in result.plan.left_out if what not in LAYERS)
+
+
+def savings(found: Mapping[int, Mapping[str, Mapping[str, float]]]) -> Figure:
+    """Draw how many times as much scenes cost where nothing is left out: a row for each, a plot a measure."""
+    drawn, plots = diagrams.figure(1, len(MEASURES), 14, 0.42 * len(found) + 1.3)
+    titles = ("rays", "size of the tracing kernel", "launches of kernels", "time")
+    rows = np.arange(len(found))
+    for axes, (name, way), title in zip(plots[0], MEASURES.items(), titles, strict=True):
+        planned = np.array([figures[PLANNED][name] for figures in found.values()])
+        times = np.array([figures[way][name] for figures in found.values()]) / planned
+        axes.barh(rows, times, height=0.7, color="#f2b98f")
+        axes.barh(rows, np.ones(len(rows)), height=0.7, color=diagrams.COLORS[0])
+        most = max(times.max(), 1.2)
+        shown = {"va": "center", "fontsize": diagrams.LABELS, "color": diagrams.TEXT}
+        for row, (own, factor) in enumerate(zip(planned, times, strict=True)):
+            axes.text(max(factor, 1) + 0.02 * most, row, f"×{factor:.2g}", **shown)
+            axes.text(-0.02 * most, row, _quantity(own, name), **shown | {"ha": "right"})
+        axes.set_title(title, loc="left", fontsize=diagrams.LABELS + 2, color=diagrams.TEXT)
+        axes.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, 1.15 * most), yticks=[])
+        axes.set_xlabel("times as much as planned")
+        axes.spines["left"].set_visible(False)
+        axes.axvline(1, color=diagrams.TEXT, linewidth=0.6)
+    for row, number in enumerate(found):
+        place: dict[str, Any] = {
+            "transform": plots[0, 0].get_yaxis_transform(),
+            "va": "center",
+            "ha": "right",
+        }
+        plots[0, 0].text(
+            -0.32, row, f"scene {number}", color=diagrams.TEXT, fontsize=diagrams.LABELS + 1, **place
+        )
+    return drawn
+
+
+def _quantity(value: float, name: str) -> str:
+    if name == "seconds":
+        return f"{1000 * value:.0f} ms"
+    if value >= 1e6:
+        return f"{value / 1e6:.2g} M"
+    return f"{value / 1e3:.3g} k" if value >= 1e4 else f"{value:.0f}"

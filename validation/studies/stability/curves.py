@@ -1,0 +1,372 @@
+"""How many roundings a figure is off along the axes that are hard on float32: ours, Mitsuba's, and a formula
+as one would write it first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import mitsuba as mi
+import numpy as np
+
+from mrt_mitsuba.plugins import fresnel
+from mrt_mitsuba.scene.model import Cone, Cylinder, Plane, Sphere
+from mrt_mitsuba.validation.oracles import exact
+from mrt_mitsuba.validation.oracles.reference import unit
+from mrt_mitsuba.validation.studies.roughconductor import ours as lobe
+from mrt_mitsuba.validation.studies.roughconductor import theirs as other_lobe
+from mrt_mitsuba.validation.studies.stability.geometry import MIRROR, ROUNDING, ends, lit, trace_of
+from mrt_mitsuba.validation.tools import diagrams
+from mrt_mitsuba.validation.tools.bsdf_probe import evaluate
+from mrt_mitsuba.validation.tools.study import Study
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+OURS = "ours"
+THEIRS = "Mitsuba"
+FIRST = "as first written"
+LEAST = 0.3  # roundings: as good as exact
+NONE_RIGHT = 2.0**24  # roundings: no digit is right
+OFFSET = 1e-4  # of the first t, so that a ray does not meet the surface that it leaves
+WORST = 0.99  # the share of the rays that stay below what is shown
+
+Curves = dict[str, np.ndarray]  # roundings [places] by ``OURS``, ``THEIRS``, ``FIRST``
+
+
+@dataclass(frozen=True)
+class Axis:
+    """An axis along which something gets hard."""
+
+    title: str
+    label: str  #: of the axis
+    nearest: str  #: what of Mitsuba's comes nearest
+    ends: tuple[float, float]  #: exponents of ten
+    measure: Callable[[float, int], Curves]  #: figures [samples] of one place, from the number of samples
+    limit: float  #: that ours is promised to stay below, in roundings
+
+
+def curves(axis: Axis, *, places: int, count: int) -> tuple[np.ndarray, Curves]:
+    """Return places on an axis, and what nearly all samples stay below there, in roundings."""
+    x = np.logspace(*axis.ends, places)
+    rows = [axis.measure(float(place), count) for place in x]
+    worst = {
+        name: np.array([np.quantile(row[name], WORST, method="lower") for row in rows])
+        for name in (OURS, THEIRS, FIRST)
+    }
+    return x, {name: np.clip(values, LEAST, NONE_RIGHT) for name, values in worst.items()}
+
+
+def show(study: Study, *, quick: bool, places: int = 0) -> None:
+    """Add the diagram of all axes and its table to a study, and hold ours to what is promised."""
+    found = {
+        axis: curves(axis, places=places or (9 if quick else 33), count=24 if quick else 96)
+        for axis in study.each("Axes", AXES)
+    }
+    rows = []
+    for axis, (x, lines) in found.items():
+        why = "the limit of the tables below, in roundings; worst place of this axis"
+        study.at_most(f"roundings along the {axis.label}: {axis.title}", lines[OURS].max(), axis.limit, why)
+        broken = {name: x[values > 100 * axis.limit] for name, values in lines.items()}
+        rows.append(
+            {
+                "what": axis.title,
+                "along": axis.label,
+                "promised": axis.limit,
+                "ours, worst": lines[OURS].max(),
+                f"{THEIRS}, worst": lines[THEIRS].max(),
+                "nearest of Mitsuba's": axis.nearest,
+                "as first written, worst": lines[FIRST].max(),
+                "which breaks at": _span(broken[FIRST]),
+            }
+        )
+    caption = (
+        "Blue: ours. Orange: what of Mitsuba's comes nearest. Grey, dashed: the formula as one would write "
+        "it first, in float32. Dotted: what is promised of ours. At the top no digit is right any more."
+    )
+    study.picture("roundings", "Error in roundings of float32 (6e-8), log scales", roundings(found), caption)
+    note = f"One rounding is 2⁻²⁴. {WORST:.0%} of the samples of a place stay below its figure."
+    study.records("roundings", "Where it breaks, and where ours does not", rows, note, first=True)
+
+
+def roundings(found: Mapping[Axis, tuple[np.ndarray, Curves]]) -> Figure:
+    """Draw errors in roundings of float32 along axes: a small plot for each, all with the same scale."""
+    looks: dict[str, dict[str, Any]] = {
+        FIRST: {"color": diagrams.GREY, "linestyle": (0, (4, 2)), "linewidth": 1.4},
+        THEIRS: {"color": diagrams.COLORS[1], "linewidth": 1.4},
+        OURS: {"color": diagrams.COLORS[0], "linewidth": 2.4},
+    }
+    drawn, plots = diagrams.figure(2, 4, 14, 6.6)
+    for axes, (axis, (x, lines)) in zip(plots.flat, found.items(), strict=True):
+        axes.axhspan(0.1, axis.limit, color="#dcebf7", zorder=0)
+        axes.axhline(axis.limit, color=diagrams.COLORS[0], linestyle=":", linewidth=1)
+        for name, look in looks.items():
+            axes.plot(x, lines[name], **look)
+        axes.set(xscale="log", yscale="log", ylim=(0.2, 10 * NONE_RIGHT), xlabel=axis.label)
+        axes.set_title(axis.title, loc="left", fontsize=diagrams.LABELS + 2, color=diagrams.TEXT)
+        axes.grid(alpha=0.2)
+    for axes in plots[:, 0]:
+        axes.set_ylabel("error in roundings of float32")
+        words = {"color": diagrams.GREY, "fontsize": diagrams.LABELS - 1, "va": "bottom", "ha": "right"}
+        axes.text(0.98, NONE_RIGHT, "no digit is right", transform=axes.get_yaxis_transform(), **words)
+    for axes, (axis, (x, lines)) in zip(plots.flat, found.items(), strict=True):
+        names = {THEIRS: axis.nearest}
+        marks = {names.get(n, n): (x[-1], lines[n][-1], looks[n]["color"]) for n in looks}
+        diagrams.label_ends(axes, marks | {"promised": (x[-1], axis.limit, diagrams.COLORS[0])})
+    return drawn
+
+
+def _span(places: np.ndarray) -> str:
+    return f"{places.min():.0e} … {places.max():.0e}" if len(places) else "nowhere"
+
+
+def _off(value: object, truth: np.ndarray) -> np.ndarray:
+    """Return relative errors in roundings; as many as there can be for values that are no numbers."""
+    error = np.abs(np.asarray(value, np.float64) / truth - 1) / ROUNDING
+    return np.where(np.isfinite(error), error, NONE_RIGHT)
+
+
+# ------------------------------------------ Reflectance ------------------------------------------
+
+
+def _pairs(count: int, cosine: np.ndarray, alpha: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return pairs of directions [N, 3] whose half vector is within twice the slope alpha."""
+    rng = np.random.default_rng(11)
+    phi, psi = rng.uniform(0, 2 * np.pi, (2, count))
+    sine = np.sqrt((1 - cosine) * (1 + cosine))
+    wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine], axis=1)
+    slope = 2 * alpha * np.sqrt(rng.random(count))
+    m = unit(np.stack([slope * np.cos(psi), slope * np.sin(psi), np.ones(count)], axis=1))
+    wi32 = wi.astype(np.float32)
+    wo = (2 * (wi32 * m).sum(axis=1, keepdims=True) * m - wi32).astype(np.float32)
+    up = wo[:, 2] > 0
+    return wi32[up], wo[up]
+
+
+def _lobes(wi: np.ndarray, wo: np.ndarray, alpha: float) -> Curves:
+    """Return the roundings of the lobe D G / (4 cos θi), without Fresnel."""
+    truth = np.array([_exact_lobe(*pair, alpha) for pair in zip(wi, wo, strict=True)])
+    with np.errstate(all="ignore"):
+        first = _first_lobe(wi, wo, np.float32(alpha))
+    found = {
+        OURS: evaluate(mi.load_dict(lobe(alpha)), wi, wo)[0][:, 0],
+        THEIRS: evaluate(mi.load_dict(other_lobe(alpha)), wi, wo)[0][:, 0],
+        FIRST: first,
+    }
+    return {name: _off(values, truth) for name, values in found.items()}
+
+
+def _exact_lobe(wi: np.ndarray, wo: np.ndarray, alpha: float) -> float:
+    a = exact.number(np.float32(alpha))
+    x, y, z = (exact.number(p) + exact.number(q) for p, q in zip(wi, wo, strict=True))
+    cosine = 1 / exact.mp.sqrt(1 + (x * x + y * y) / (z * z))
+    g = exact.smith_g1(wi, a) * exact.smith_g1(wo, a)
+    return float(exact.beckmann_d(cosine, a) * g / (4 * exact.number(wi[2])))
+
+
+def _first_lobe(wi: np.ndarray, wo: np.ndarray, alpha: np.float32) -> np.ndarray:
+    """Return the lobe as the report has it, of cosines alone, in float32."""
+    half = wi + wo
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    c = half[:, 2]
+    d = np.exp((c**2 - 1) / (c**2 * alpha**2)) / (np.float32(np.pi) * alpha**2 * c**4)
+    g = _first_g1(wi[:, 2], alpha) * _first_g1(wo[:, 2], alpha)
+    return np.asarray(d * g / (4 * wi[:, 2] * wo[:, 2]) * wo[:, 2])
+
+
+def _first_g1(cosine: np.ndarray, alpha: np.float32) -> np.ndarray:
+    tangent = np.sqrt(1 - cosine**2) / cosine
+    b = 1 / (alpha * tangent)
+    fit = (np.float32(3.535) * b + np.float32(2.181) * b**2) / (
+        1 + np.float32(2.276) * b + np.float32(2.577) * b**2
+    )
+    return np.where(b < np.float32(1.6), fit, np.float32(1))
+
+
+def roughness(alpha: float, count: int) -> Curves:
+    """Measure the lobe at a roughness, for directions that are not grazing."""
+    alpha = float(np.float32(alpha))
+    cosine = np.random.default_rng(3).uniform(0.2, 1, count)
+    return _lobes(*_pairs(count, cosine, alpha), alpha)
+
+
+def grazing(cosine: float, count: int) -> Curves:
+    """Measure a lobe of roughness 0.3 at so small a cosine of the light's direction."""
+    return _lobes(*_pairs(count, np.full(count, cosine), 0.3), float(np.float32(0.3)))
+
+
+def index(above: float, count: int) -> Curves:
+    """Measure Fresnel's reflectance at an index of so much above 1."""
+    n = np.float32(1 + above)
+    cosines = np.linspace(0.02, 1, count, dtype=np.float32)
+    truth = np.array([float(exact.fresnel_dielectric(c, 1, n)) for c in cosines])
+    one = np.float32(1)
+    c = cosines
+    with np.errstate(all="ignore"):
+        below = np.sqrt(one - (one / n) ** 2 * (one - c**2))
+        rs = ((c - n * below) / (c + n * below)) ** 2
+        rp = ((below - n * c) / (below + n * c)) ** 2
+        first = (rs + rp) / 2
+    found = {
+        OURS: fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(n)),
+        THEIRS: mi.fresnel(mi.Float(cosines), mi.Float(n))[0],
+        FIRST: first,
+    }
+    return {name: _off(values, truth) for name, values in found.items()}
+
+
+# -------------------------------------------- Geometry --------------------------------------------
+
+
+def _hits(
+    thing: Cone | Cylinder | Plane | Sphere,
+    rays: tuple[np.ndarray, np.ndarray],
+    distance: Callable[[np.ndarray], np.ndarray],
+    first: np.ndarray,
+    stock: Mapping[str, object] | None = None,
+) -> Curves:
+    """Return how far hits of rays (o, d [N, 3], float32) are off a surface, in roundings of coordinates.
+
+    ``distance``: of points [N, 3] from the surface, in float64; ``first``: t of a formula in float32.
+    ``stock``: a shape of Mitsuba's, for what it has no shape of our own for: there it sees our mesh.
+    """
+    o, d = rays
+    scene = mi.load_dict(lit(f"{type(thing).__name__.lower()}s", thing, (9e6, 9e6, 9e6)))
+    other = mi.load_dict({"type": "scene", "shape": dict(stock)}) if stock else scene
+    ray = mi.Ray3f(o.T, d.T)
+    found = {
+        OURS: np.array(trace_of(scene, o, d).hit.si.t),
+        THEIRS: np.array(other.ray_intersect(ray).t),
+        FIRST: first,
+    }
+    errors = {}
+    for name, t in found.items():
+        hit = np.isfinite(t) & (t > 0)
+        p = o + np.where(hit, t, 0).astype(np.float64)[:, None] * d
+        scale = np.maximum(np.abs(o).max(axis=1), np.abs(p).max(axis=1))
+        errors[name] = np.where(hit, np.abs(distance(p)) / scale / ROUNDING, NONE_RIGHT)
+    return errors
+
+
+def _aimed(targets: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    o = eyes.astype(np.float32)
+    return o, unit(targets - o).astype(np.float32)
+
+
+def _quadratic(
+    a: np.ndarray, b: np.ndarray, c: np.ndarray, holds: Callable[[np.ndarray], np.ndarray] = np.isfinite
+) -> np.ndarray:
+    """Return the first root t by the formula of schoolbooks beyond an offset, in float32, which ``holds``.
+
+    Infinite without one.
+    """
+    with np.errstate(all="ignore"):
+        root = np.sqrt(b * b - 4 * a * c)
+        both = np.stack([(-b - root) / (2 * a), (-b + root) / (2 * a)])
+        both[~((both > OFFSET) & holds(both))] = np.inf
+    return np.asarray(both.min(axis=0))
+
+
+def sphere(scale: float, far: float, count: int) -> Curves:
+    """Measure hits of a ball of a scale seen from so many radii."""
+    rng = np.random.default_rng(5)
+    eyes = unit(rng.normal(size=(count, 3))) * scale * far
+    across = unit(np.cross(eyes, rng.normal(size=(count, 3)))) * scale
+    o, d = _aimed(across * rng.uniform(0, 0.9, (count, 1)), eyes)
+    r = np.float32(scale)
+    a = (d * d).sum(axis=1)
+    b = 2 * (o * d).sum(axis=1)
+    c = (o * o).sum(axis=1) - r * r
+    ball = Sphere((0, 0, 0), float(r), MIRROR)
+
+    def distance(p: np.ndarray) -> np.ndarray:
+        return np.asarray(np.linalg.norm(p, axis=1) - float(r))
+
+    stock = {"type": "sphere", "radius": float(r)}
+    return _hits(ball, (o, d), distance, _quadratic(a, b, c), stock)
+
+
+def floor(far: float, count: int) -> Curves:
+    """Measure where rays meet a floor, so many heights of the eye away."""
+    rng = np.random.default_rng(6)
+    normal = np.array([0.6, 0.64, 0.48])
+    up = unit(normal.astype(np.float32).astype(np.float64))
+    o, d = _aimed(far * unit(np.cross(rng.normal(size=(count, 3)), up)), np.tile(up, (count, 1)))
+    up32 = up.astype(np.float32)
+    first = -(o @ up32) / (d @ up32)
+    turned = mi.ScalarTransform4f().look_at([0, 0, 0], up.tolist(), [0, 0, 1]).scale(2 * far)
+    stock = {"type": "rectangle", "to_world": turned}
+    return _hits(Plane(tuple(normal), 0.0, MIRROR), (o, d), lambda p: p @ up, first, stock)
+
+
+def cone(slender: float, count: int) -> Curves:
+    """Measure hits on the side of a cone of so many radii of height."""
+    return _axial(Cone, slender, count)
+
+
+def cylinder(slender: float, count: int) -> Curves:
+    """Measure hits on the side of a cylinder of so many radii of height."""
+    return _axial(Cylinder, slender, count)
+
+
+def _axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Curves:
+    """Measure hits on the side of a thing on an axis aslant, whose larger extent is 1."""
+    rng = np.random.default_rng(7)
+    height = min(slender, 1.0)
+    radius = min(1 / slender, 1.0)
+    axis = unit(np.subtract(*ends(1.0)))
+    tip = (height / 2 * axis).astype(np.float32).astype(np.float64)
+    base = (-height / 2 * axis).astype(np.float32).astype(np.float64)
+    along = unit(tip - base)
+    height = float(np.linalg.norm(tip - base))
+    outwards = unit(np.cross(along, rng.normal(size=(count, 3))))
+    down = rng.uniform(0.2, 0.8, (count, 1))
+    growth = down if kind is Cone else 1.0
+    targets = tip - down * height * along + radius * growth * outwards
+    normal = unit(height * outwards + radius * along) if kind is Cone else outwards
+    eyes = targets + 3 * unit(normal + 0.3 * rng.normal(size=(count, 3)))
+    rays = _aimed(targets, eyes)
+
+    def distance(p: np.ndarray) -> np.ndarray:
+        depth = (tip - p) @ along
+        r = np.linalg.norm(p - tip + depth[:, None] * along, axis=1)
+        if kind is Cylinder:
+            return np.asarray(r - radius)
+        return np.asarray((r * height - depth * radius) / np.hypot(height, radius))
+
+    tangent = np.float32(radius / height) if kind is Cone else np.float32(0)
+    first = _first_side(rays, tip, along, tangent, np.float32(0 if kind is Cone else radius))
+    stock = {"type": "cylinder", "p0": base, "p1": tip, "radius": radius} if kind is Cylinder else None
+    thing = kind(tuple(tip.tolist()), tuple(base.tolist()), radius, MIRROR)
+    return _hits(thing, rays, distance, first, stock)
+
+
+def _first_side(
+    rays: tuple[np.ndarray, np.ndarray], tip: np.ndarray, axis: np.ndarray, tangent: np.float32, r: np.float32
+) -> np.ndarray:
+    """Return t of |q|² = (r + tangent · depth)², q across the axis, as one would write it first."""
+    o, d = rays
+    axis32 = -axis.astype(np.float32)
+    from_tip = o - tip.astype(np.float32)
+    depth = from_tip @ axis32
+    faster = d @ axis32
+    q = from_tip - depth[:, None] * axis32
+    across = d - faster[:, None] * axis32
+    k = tangent**2
+    a = (across**2).sum(axis=1) - k * faster**2
+    b = 2 * ((q * across).sum(axis=1) - k * depth * faster)
+    c = (q**2).sum(axis=1) - k * depth**2 - r * r
+    return _quadratic(a, b, c, lambda t: depth + t * faster >= 0)  # one half of a double cone
+
+
+AXES = (
+    Axis("value of a highlight", "roughness α", "roughconductor", (-5, 0), roughness, 2e-5 / ROUNDING),
+    Axis("Fresnel reflectance", "index of refraction − 1", "mi.fresnel", (-7, 8), index, 2e-6 / ROUNDING),
+    Axis("value of a highlight", "cosine of the light", "roughconductor", (-8, 0), grazing, 2e-5 / ROUNDING),
+    Axis("hit with a floor", "distance / height of the eye", "rectangle", (0, 6), floor, 16),
+    Axis("hit with a cone", "height / radius", "256-sided mesh", (-4, 4), cone, 16),
+    Axis("hit with a cylinder", "height / radius", "cylinder", (-4, 4), cylinder, 16),
+    Axis("hit with a ball", "scale of the scene", "sphere", (-6, 6), lambda s, n: sphere(s, 3.0, n), 16),
+    Axis("hit with a ball", "distance / radius", "sphere", (1, 5), lambda far, n: sphere(1.0, far, n), 16),
+)

@@ -1,0 +1,57 @@
+"""Pictures of the original program, whole or shortened, and renders made comparable with them."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mrt_mitsuba.output.files import read_exr
+
+EXACT = 24  # significant bits of a float32
+
+
+@dataclass(frozen=True)
+class Original:
+    """A picture of the original program; a shortened one is a window, or means of blocks, in fewer bits."""
+
+    image: np.ndarray  #: float32 [H, W, 3], linear
+    options: dict[str, Any]  #: of ``render``, by which the original program was called
+    scene: int
+    window: tuple[int, int, int, int]  #: first column and row, width and height, in pixels of the whole
+    block: int  #: side in pixels of the squares whose means are kept; 1: every pixel
+    bits: int  #: significant ones of each value
+    layers: dict[str, np.ndarray]  #: float32 [H, W] by channel
+
+    def like(self, picture: np.ndarray) -> np.ndarray:
+        """Shorten a whole picture [H, W, 3] in the same way, so that both lose the same to rounding."""
+        return shortened(picture, self.window, self.block, self.bits)
+
+
+def read_original(path: str | os.PathLike[str]) -> Original:
+    """Read an EXR of the original program, which has its options in the header."""
+    picture = read_exr(path)
+    options = json.loads(picture.header["comments"])
+    whole = f"0 0 {options['width']} {options['height']}"
+    x, y, width, height = map(int, picture.header.get("mrt:window", whole).split())
+    return Original(
+        image=picture.image,
+        scene=options.pop("scene"),
+        options=options,
+        window=(x, y, width, height),
+        block=int(picture.header.get("mrt:block", 1)),
+        bits=int(picture.header.get("mrt:bits", EXACT)),
+        layers=dict(picture.layers),
+    )
+
+
+def shortened(picture: np.ndarray, window: tuple[int, int, int, int], block: int, bits: int) -> np.ndarray:
+    """Return a window of a picture, the means of its blocks, with so many significant bits."""
+    x, y, width, height = window
+    part = picture[y : y + height, x : x + width].astype(np.float64)
+    part = part.reshape(height // block, block, width // block, block, -1).mean(axis=(1, 3))
+    digits, exponent = np.frexp(part)
+    return np.ldexp(np.round(digits * 2.0**bits), exponent - bits).astype(np.float32)
