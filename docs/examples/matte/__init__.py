@@ -6,5 +6,5 @@ from mrt_mitsuba.plugins import register_modules
 
 
 def register() -> None:
-    """Register in the current variant, and in every one switched to later. Idempotent."""
+    """Register in this variant, and in every one switched to later."""
     register_modules(__name__, ["bsdf"])

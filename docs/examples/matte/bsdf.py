@@ -13,18 +13,20 @@ from mrt_mitsuba.plugins.variants import first, is_jit, updatable
 
 
 class Matte(mi.BSDF):
-    """Oren and Nayar's reflection of a surface with random slopes, seen from above.
+    """Oren and Nayar's reflection of a surface with random slopes.
 
-    =============== ================ ======== ===========================================
-    name            type             default  unit or range
-    =============== ================ ======== ===========================================
-    ``reflectance`` spectrum/texture 0.5      0 to 1
-    ``sigma``       float            0.3      >= 0, standard deviation of the slopes in
-                                              radians; 0 is Lambert's surface
-    =============== ================ ======== ===========================================
+    =============== ================ ======= ==============================
+    name            type             default unit or range
+    =============== ================ ======= ==============================
+    ``reflectance`` spectrum/texture 0.5     0 to 1
+    ``sigma``       float            0.3     >= 0, standard deviation of
+                                             the slopes in radians; 0 is
+                                             Lambert's surface
+    =============== ================ ======= ==============================
 
-    At grazing angles a white surface gives back up to 1.5 % more than it receives: a flaw
-    of the model. Nearest stock plugin: ``diffuse``, which is ``sigma`` 0.
+    At grazing angles a white surface gives back up to 1.5 % more than it
+    receives: a flaw of the model. Nearest stock plugin: ``diffuse``, which
+    is ``sigma`` 0.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -34,23 +36,25 @@ class Matte(mi.BSDF):
         self._update()
 
     def _update(self) -> None:
-        # Data of the kernel, not part of its text: a new value needs no new kernel
+        # Data of the kernel, not part of its text: a value needs no new one
         dr.make_opaque(self.sigma)
         flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
         if self.reflectance.is_spatially_varying():
             flags |= mi.BSDFFlags.SpatiallyVarying
         self.m_components, self.m_flags = [flags], flags
 
-    # ------------------------------ Scene parameters ---------------------------------
+    # ------------------------- Scene parameters -------------------------
 
     def traverse(self, callback: Any) -> None:
-        callback.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)
+        callback.put(
+            "reflectance", self.reflectance, mi.ParamFlags.Differentiable
+        )
         callback.put("sigma", self.sigma, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Any = ()) -> None:
         self._update()
 
-    # ------------------------------ Value and density --------------------------------
+    # ------------------------ Value and density -------------------------
 
     def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         return self.eval_pdf(ctx, si, wo, active)[0]
@@ -58,21 +62,32 @@ class Matte(mi.BSDF):
     def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         return self.eval_pdf(ctx, si, wo, active)[1]
 
-    def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+    def eval_pdf(
+        self, ctx: Any, si: Any, wo: Any, active: Any = True
+    ) -> tuple[Any, Any]:
         active = active & ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
         active &= (si.wi.z > 0) & (wo.z > 0)
-        # Masked lanes get harmless input before the division, not a repaired result after it
+        # Masked lanes get harmless input before the division
         up = mi.Vector3f(0, 0, 1)
-        wi, wo = dr.select(active, si.wi, up), dr.select(active, wo, up)
+        wi = dr.select(active, si.wi, up)
+        wo = dr.select(active, wo, up)
         # As the array that it is: an entry of an array has no derivative
         sigma = self.sigma if is_jit() else first(self.sigma)
-        value = self.reflectance.eval(si, active) * oren_nayar_cos(wi, wo, sigma)
-        value, density = dr.select(active, value, 0), dr.select(active, dr.inv_pi * wo.z, 0)
-        return mi.depolarizer(value), density
+        cosine = oren_nayar_cos(wi, wo, sigma)
+        value = self.reflectance.eval(si, active) * cosine
+        density = dr.select(active, dr.inv_pi * wo.z, 0)
+        return mi.depolarizer(dr.select(active, value, 0)), density
 
-    # ----------------------------------- Sampling ------------------------------------
+    # ----------------------------- Sampling -----------------------------
 
-    def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
+    def sample(
+        self,
+        ctx: Any,
+        si: Any,
+        sample1: Any,
+        sample2: Any,
+        active: Any = True,
+    ) -> Any:
         bs = mi.BSDFSample3f()
         bs.wo = mi.warp.square_to_cosine_hemisphere(sample2)
         bs.eta = mi.Float(1)
@@ -86,7 +101,8 @@ class Matte(mi.BSDF):
         return self.reflectance.eval(si, active)
 
     def to_string(self) -> str:
-        return f"Matte[sigma={first(self.sigma):g}, reflectance={self.reflectance}]"
+        sigma = first(self.sigma)
+        return f"Matte[sigma={sigma:g}, reflectance={self.reflectance}]"
 
 
 mi.register_bsdf("matte", Matte)

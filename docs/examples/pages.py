@@ -1,0 +1,71 @@
+"""What pages of the documentation share: pictures next to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from mrt_mitsuba.output import to_8bit
+from mrt_mitsuba.rendering.progress import Progress
+
+#: Options of a picture on a page, without bars of progress
+SIZE = {"width": 400, "height": 300, "progress": Progress()}
+
+
+def show(*pictures: np.ndarray, columns: int = 3) -> Image.Image:
+    """Pictures [H, W, 3] of one size in rows, in sRGB."""
+    starts = range(0, len(pictures), columns)
+    rows = [np.hstack(pictures[start : start + columns]) for start in starts]
+    return Image.fromarray(
+        to_8bit(np.vstack(rows).astype(np.float32), "srgb")
+    )
+
+
+def grey(values: np.ndarray) -> np.ndarray:
+    """A map [H, W] as a picture [H, W, 3]."""
+    return np.repeat(values[..., None], 3, axis=2)
+
+
+def enlarged(image: np.ndarray, x: float, y: float) -> np.ndarray:
+    """A fifth of a picture five times as large, from (x, y), 0 to 1."""
+    height, width = image.shape[:2]
+    part = image[int(y * height) :, int(x * width) :]
+    return (
+        part[: height // 5, : width // 5].repeat(5, axis=0).repeat(5, axis=1)
+    )
+
+
+class Markdown(str):
+    """Text that a page shows as Markdown."""
+
+    def _repr_markdown_(self) -> str:
+        return str(self)
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> Markdown:
+    """Rows with the same keys as a table."""
+
+    def cells(values: Iterable[Any]) -> str:
+        shown = (
+            f"{value:.3g}"
+            if isinstance(value, float)
+            else ""
+            if value is None
+            else value
+            for value in values
+        )
+        return f"| {' | '.join(map(str, shown))} |"
+
+    names = list(rows[0])
+    return Markdown(
+        "\n".join(
+            [
+                cells(names),
+                "|---" * len(names) + "|",
+                *(cells(row.values()) for row in rows),
+            ]
+        )
+    )
